@@ -1,0 +1,6 @@
+"""xreset: dexterous robot policies from human demonstrations used as reset states.
+
+Importing this package loads nothing heavy: no torch, no physics engine, no display.
+"""
+
+__version__ = "0.1.0"

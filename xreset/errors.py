@@ -1,0 +1,41 @@
+"""What xreset raises when the user can mend the cause.
+
+The command line prints these without a traceback; anything else that is raised is a defect of xreset.
+A message says what was found, what was expected, and what to do.
+"""
+
+
+class XResetError(Exception):
+    """Base of every error that a user can mend."""
+
+
+class FileFormatError(XResetError):
+    """A file is not what its reader needs: wrong schema, missing key, wrong shape or type, damaged, or bad values."""
+
+
+class RobotError(XResetError):
+    """A robot description is wrong or a robot is unknown."""
+
+
+class ObjectError(XResetError):
+    """An object is unknown or its geometry cannot be used."""
+
+
+class DemoError(XResetError):
+    """Demonstrations cannot be read or do not hold what they must."""
+
+
+class BackendUnavailableError(XResetError):
+    """A physics engine cannot be used here: the message says why, and which command mends it."""
+
+
+class CapabilityError(XResetError):
+    """A backend cannot do what was asked: the message names the capability, the backend and a way out."""
+
+
+class PolicyError(XResetError):
+    """A policy does not fit the robot, the observation layout or the task it is asked to run with."""
+
+
+class RunError(XResetError):
+    """A training run or its folder is not in a state that allows what was asked."""

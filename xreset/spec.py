@@ -1,0 +1,242 @@
+"""What a scene is made of: frozen data that says everything a physics engine needs, and nothing about any engine.
+
+SI units and radians. Quaternions are (w, x, y, z). ``T_a_b`` is the pose of b in a, a 4x4 matrix. The world frame has z up and the
+table's top at z = 0. Shape letters: J actuated joints, E fingertips.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+GRAVITY = 9.81
+"""Magnitude of gravity in m/s^2; it points along -z."""
+
+KEYPOINTS = ("wrist",) + tuple(f"{finger}{i}" for finger in ("thumb", "index", "middle", "ring", "little") for i in range(1, 5))
+"""The 21 human hand keypoints in the order of the demonstrations: the wrist, then each finger from base (1) to tip (4)."""
+
+FINGERS = ("thumb", "index", "middle", "ring", "little")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Geometry:
+    """A convex shape in its own frame."""
+
+    kind: Literal["box", "sphere", "cylinder", "capsule", "hull"]
+    """``hull`` is the convex hull of ``vertices``; cylinders and capsules lie along z."""
+    size: tuple[float, ...] = ()
+    """box: the three half extents. sphere: radius. cylinder, capsule: radius, half length (of a capsule's cylindrical part)."""
+    vertices: np.ndarray | None = None
+    """[V, 3] hull vertices (``hull`` only)."""
+    faces: np.ndarray | None = None
+    """[F, 3] triangles over ``vertices``, outward (``hull`` only)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape:
+    """A geometry placed in the frame of a link or of an object."""
+
+    geometry: Geometry
+    T_body_shape: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """[4, 4] pose of the shape in the body's frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveSpec:
+    """An implicit PD position drive: torque = kp (target - q) - kd qd, limited to the effort limit."""
+
+    kp: float
+    """Stiffness [N m/rad] (prismatic: N/m)."""
+    kd: float
+    """Damping [N m s/rad] (prismatic: N s/m)."""
+    effort: float
+    """Largest torque [N m] (force [N]) of the drive."""
+    armature: float = 0.0
+    """Rotor inertia as seen at the joint [kg m^2] (mass [kg])."""
+    friction_loss: float = 0.0
+    """Dry friction [N m] ([N])."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointSpec:
+    """One actuated joint."""
+
+    name: str
+    """Its name in the URDF."""
+    group: Literal["arm", "hand"]
+    """Arm joints take a position change per control step, hand joints an absolute target."""
+    drive: DriveSpec
+    home: float
+    """Home position [rad or m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MimicSpec:
+    """A joint that follows an actuated one: q = multiplier * q_source + offset."""
+
+    joint: str
+    source: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FingertipSpec:
+    """A fingertip: a frame at the pad, and the links whose contact counts as this finger's."""
+
+    name: str
+    """``thumb`` must exist; the other names are free."""
+    link: str
+    """URDF link (a fixed frame) at the tip."""
+    contact_links: tuple[str, ...]
+    """URDF links whose contact with the object counts as this finger's contact; they have the fingertip's friction."""
+    keypoint: str
+    """The human keypoint that it follows, one of :data:`KEYPOINTS`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeypointSpec:
+    """Which robot link follows a human keypoint during retargeting."""
+
+    keypoint: str
+    """One of :data:`KEYPOINTS`."""
+    link: str
+    """URDF link whose origin follows it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotSpec:
+    """A robot: a URDF and one small typed description. See :func:`xreset.robots.load`."""
+
+    name: str
+    """Such as ``ur7e-sharpa``."""
+    urdf: Path
+    """The URDF file: the one source of kinematics, inertias and collision shapes for every engine."""
+    joints: tuple[JointSpec, ...]
+    """Actuated joints. This order is the joint order everywhere (length J)."""
+    mimics: tuple[MimicSpec, ...] = ()
+    """Joints that follow an actuated one."""
+    base_pos: tuple[float, float, float]
+    """Position of the URDF's root link in the world [m]."""
+    base_quat: tuple[float, float, float, float]
+    """Orientation of the URDF's root link in the world (w, x, y, z)."""
+    palm: str
+    """Link that stands for the hand: origin near the palm's centre, x towards the fingers, z out of the palm's back."""
+    fingertips: tuple[FingertipSpec, ...]
+    """Fingertips, thumb first (length E)."""
+    keypoints: tuple[KeypointSpec, ...]
+    """Links that follow human keypoints during retargeting."""
+    hand_root: str
+    """Link that carries the whole hand: the arm's inverse kinematics aims at its pose."""
+    palm_R_human: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Fixed rotation that turns the canonical human hand frame (x wrist to middle knuckle, z out of the back) into the palm's."""
+    self_collision_links: tuple[str, ...] = ()
+    """Links that collide with each other in physics (retargeting checks every link). Neighbours never do."""
+    collision_exclude: tuple[tuple[str, str], ...] = ()
+    """Further pairs of links that never collide, in physics and in retargeting."""
+    table_exclude: tuple[str, ...] = ()
+    """Links that never collide with the table (the base stands on it)."""
+    gravity_compensated: bool = True
+    """Whether the robot's own weight is taken off (as an arm's controller does); the object's load stays."""
+    home_std: tuple[float, float] = (0.075, 0.10)
+    """Spread of the home configuration: standard deviation of arm and hand joints [rad], the paper's Table IX."""
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the actuated joints, in joint order."""
+        return tuple(joint.name for joint in self.joints)
+
+    @property
+    def fingertip_names(self) -> tuple[str, ...]:
+        """Names of the fingertips, thumb first."""
+        return tuple(tip.name for tip in self.fingertips)
+
+    @property
+    def home(self) -> np.ndarray:
+        """[J] home configuration."""
+        return np.array([joint.home for joint in self.joints])
+
+    @property
+    def arm_indices(self) -> np.ndarray:
+        """Indices of the arm's joints in joint order."""
+        return np.array([i for i, joint in enumerate(self.joints) if joint.group == "arm"], dtype=np.int64)
+
+    @property
+    def hand_indices(self) -> np.ndarray:
+        """Indices of the hand's joints in joint order."""
+        return np.array([i for i, joint in enumerate(self.joints) if joint.group == "hand"], dtype=np.int64)
+
+    @property
+    def tracked_links(self) -> tuple[str, ...]:
+        """Links whose pose a backend reports: the palm, then the fingertips (length 1 + E)."""
+        return (self.palm, *(tip.link for tip in self.fingertips))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectSpec:
+    """A rigid object in the frame of its mesh, which is the frame of the demonstrations' object poses."""
+
+    name: str
+    """Such as ``005_tomato_soup_can``."""
+    pieces: tuple[Shape, ...]
+    """Convex collision pieces."""
+    mass: float
+    """[kg]"""
+    com: np.ndarray
+    """[3] centre of mass [m]."""
+    inertia: np.ndarray
+    """[3, 3] about the centre of mass, along the mesh frame's axes [kg m^2]."""
+    vertices: np.ndarray
+    """[V, 3] surface mesh, for point clouds, distances and pictures."""
+    faces: np.ndarray
+    """[F, 3] triangles, outward."""
+    source: str = "stand-in"
+    """Where the geometry comes from: ``stand-in`` or the mesh file's SHA-256."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableSpec:
+    """A fixed box whose top is at z = 0."""
+
+    center: tuple[float, float] = (0.57, 0.30)
+    """Centre of the top [m]."""
+    half_size: tuple[float, float, float] = (0.70, 0.50, 0.02)
+    """Half extents [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairFriction:
+    """Coulomb friction of the *pairs* that touch the object; each engine solves for its own per-body coefficients."""
+
+    tip: float = 0.8
+    """Object against fingertip links."""
+    link: float = 0.5
+    """Object against any other robot link."""
+    table: float = 0.6
+    """Object against the table."""
+    torsional: float = 0.002
+    """Torsional friction of every pair, as a length [m]: torque <= torsional * normal force."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSpec:
+    """Everything that a backend may read."""
+
+    robot: RobotSpec
+    objects: tuple[ObjectSpec, ...]
+    """The objects of the scene; each world holds exactly one of them."""
+    table: TableSpec = TableSpec()
+    friction: PairFriction = PairFriction()
+    """Friction until a world's is set."""
+    timestep: float = 1.0 / 240.0
+    """Physics timestep [s]."""
+    substeps: int = 4
+    """Physics steps per control step (60 Hz)."""
+
+    @property
+    def control_dt(self) -> float:
+        """Duration of a control step [s]."""
+        return self.timestep * self.substeps

@@ -124,15 +124,13 @@ class RobotSpec:
     base_quat: tuple[float, float, float, float]
     """Orientation of the URDF's root link in the world (w, x, y, z)."""
     palm: str
-    """Link that stands for the hand: origin near the palm's centre, x towards the fingers, z out of the palm's back."""
+    """Link that stands for the hand: origin near the palm's centre, x towards the fingers, z out of the palm's inner side."""
     fingertips: tuple[FingertipSpec, ...]
     """Fingertips, thumb first (length E)."""
     keypoints: tuple[KeypointSpec, ...]
     """Links that follow human keypoints during retargeting."""
     hand_root: str
     """Link that carries the whole hand: the arm's inverse kinematics aims at its pose."""
-    palm_R_human: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """Fixed rotation that turns the canonical human hand frame (x wrist to middle knuckle, z out of the back) into the palm's."""
     self_collision_links: tuple[str, ...] = ()
     """Links that collide with each other in physics (retargeting checks every link). Neighbours never do."""
     collision_exclude: tuple[tuple[str, str], ...] = ()

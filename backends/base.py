@@ -1,0 +1,212 @@
+"""The physics interface: state in, state out. No reward, no observation, no viewer.
+
+Shape letters: N worlds, M selected worlds, J actuated joints, E fingertips, K = 1 + E tracked links (the palm, then the fingertips).
+Tensors are float32 on the backend's device. World frame, SI units, quaternions (w, x, y, z), joint order of ``scene.robot.joints``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from typing import ClassVar, Literal, Self
+
+import torch
+from torch import Tensor
+
+from xreset.errors import BackendUnavailableError, CapabilityError
+from xreset.spec import SceneSpec
+
+Capability = Literal["object_mass", "friction", "object_gravity", "object_wrench", "overflow"]
+"""What a backend may be unable to do: per-world object mass, pair friction or gravity fraction; a wrench; counting overflows."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """The full state of worlds. Setting it leaves nothing of the past: no warm start, no old target, no external force."""
+
+    joint_pos: Tensor
+    """[N, J] rad (m)."""
+    joint_vel: Tensor
+    """[N, J] rad/s (m/s)."""
+    joint_target: Tensor
+    """[N, J] drive targets, rad (m)."""
+    object_pos: Tensor
+    """[N, 3] origin of the object's mesh frame."""
+    object_quat: Tensor
+    """[N, 4]"""
+    object_linvel: Tensor
+    """[N, 3] velocity of the mesh-frame origin."""
+    object_angvel: Tensor
+    """[N, 3] world frame, rad/s."""
+
+    def __getitem__(self, worlds) -> Self:
+        """The states of some worlds."""
+        return type(self)(**{f.name: getattr(self, f.name)[worlds] for f in fields(self)})
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same on another device."""
+        return type(self)(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Links:
+    """Poses and velocities of the tracked links (palm, then fingertips)."""
+
+    pos: Tensor
+    """[N, K, 3]"""
+    quat: Tensor
+    """[N, K, 4]"""
+    linvel: Tensor
+    """[N, K, 3] velocity of the link frame's origin."""
+    angvel: Tensor
+    """[N, K, 3]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contacts:
+    """Contact forces *on the object*, world frame, of the last physics step (zero right after a state is set)."""
+
+    tip_force: Tensor
+    """[N, E, 3] net force of each finger's contact links on the object [N]."""
+    tip_touch: Tensor
+    """[N, E] bool: whether any of them touches the object (a contact with a non-zero normal force)."""
+    table_force: Tensor
+    """[N, 3] net force of the table on the object [N]; a resting object reads +m g along z."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Health:
+    """What went wrong in a world since its state was last set."""
+
+    nonfinite: Tensor
+    """[N] bool: a position or velocity is not finite."""
+    overflow: Tensor
+    """[N] bool: contacts or constraints were dropped for want of room."""
+
+
+class Backend(ABC):
+    """N worlds of one scene in one physics engine. World i holds object ``scene.objects[object_index[i]]``.
+
+    Contracts that the conformance suite checks:
+
+    - After :meth:`set_state`, :meth:`state` and :meth:`links` report it at once, without a step.
+    - Tensors that a getter returns are snapshots or views that are valid until the next call that changes the worlds; treat them as read-only.
+    - A joint target stays until it is replaced. Drives, joint limits, dry friction and armature are as the robot spec says.
+    - Mimic joints follow their source, and are set with it.
+    - Worlds never influence one another.
+    """
+
+    name: ClassVar[str]
+    """Name in the registry."""
+    capabilities: ClassVar[frozenset[Capability]]
+    """What this backend can do beyond the obligatory."""
+
+    def __init__(self, scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None, device: str = "cpu") -> None:
+        """Build the worlds; every world starts with the robot at home and its object at rest height at the table's centre.
+
+        Args:
+            scene: what to simulate.
+            num_worlds: N.
+            object_index: [N] which of ``scene.objects`` each world holds; default: world i holds object i modulo their number.
+            device: ``cpu`` or ``cuda[:i]``.
+        """
+        if num_worlds < 1:
+            raise ValueError(f"num_worlds is {num_worlds}, expected at least 1")
+        if not scene.objects:
+            raise ValueError("the scene has no object; each world holds exactly one")
+        self.scene = scene
+        self.num_worlds = num_worlds
+        self.device = torch.device(device)
+        if object_index is None:
+            object_index = torch.arange(num_worlds) % len(scene.objects)
+        self.object_index = torch.as_tensor(object_index, dtype=torch.long).to(self.device)
+        if self.object_index.shape != (num_worlds,) or bool(((self.object_index < 0) | (self.object_index >= len(scene.objects))).any()):
+            raise ValueError(f"object_index must be [{num_worlds}] indices below {len(scene.objects)}")
+
+    # Availability ----------------------------------------------------------------------------------------------------------------
+
+    @classmethod
+    @abstractmethod
+    def engine_version(cls) -> str:
+        """Version of the engine; ``BackendUnavailableError`` with reason and remedy if it cannot be imported or used here."""
+
+    # State -----------------------------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def set_state(self, state: State, worlds: Tensor | None = None) -> None:
+        """Set the full state of the selected worlds.
+
+        Args:
+            state: [M, ...] one state per selected world.
+            worlds: [M] long indices without repetition; None means all (M = N).
+        """
+
+    @abstractmethod
+    def state(self) -> State:
+        """State of all worlds."""
+
+    @abstractmethod
+    def set_joint_targets(self, targets: Tensor) -> None:
+        """Set the drive targets of all worlds: [N, J] rad (m)."""
+
+    @abstractmethod
+    def step(self, substeps: int | None = None) -> None:
+        """Advance all worlds by that many physics steps (default: ``scene.substeps``, one control step)."""
+
+    # Readings --------------------------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def links(self) -> Links:
+        """Poses and velocities of the tracked links, up to date with :meth:`state`."""
+
+    @abstractmethod
+    def contacts(self) -> Contacts:
+        """Contact forces on the object."""
+
+    @abstractmethod
+    def health(self) -> Health:
+        """What went wrong since each world's state was last set."""
+
+    # Physical parameters: each stays through set_state -----------------------------------------------------------------------------
+
+    @abstractmethod
+    def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
+        """Set the object's mass [M] kg; its inertia scales with it, its centre of mass stays."""
+
+    @abstractmethod
+    def set_friction(self, friction: Tensor, worlds: Tensor | None = None) -> None:
+        """Set the friction of the pairs object-fingertip, object-other link, object-table: [M, 3]."""
+
+    @abstractmethod
+    def set_object_gravity(self, fraction: Tensor, worlds: Tensor | None = None) -> None:
+        """Set the object's gravity fraction [M]: an upward force (1 - fraction) m g acts at its centre of mass.
+
+        The robot is not affected (the paper, appendix D.e).
+        """
+
+    @abstractmethod
+    def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
+        """Set an external force [N, 3] N at the object's centre of mass and a torque [N, 3] N m, world frame; stays until replaced."""
+
+    # The end ---------------------------------------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Free what the worlds hold. Calling it twice does no harm."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+    # For implementers ------------------------------------------------------------------------------------------------------------
+
+    def _require(self, capability: Capability, remedy: str) -> None:
+        """Raise the error that the contract asks for if a capability is missing."""
+        if capability not in self.capabilities:
+            raise CapabilityError(f"the backend {self.name!r} cannot set {capability.replace('_', ' ')}: {remedy}")
+
+
+def unavailable(package: str, extra: str, error: Exception) -> BackendUnavailableError:
+    """The error for an engine that cannot be imported."""
+    return BackendUnavailableError(f"{package} cannot be imported ({error}). Install it with: pip install 'xreset[{extra}]'")

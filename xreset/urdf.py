@@ -1,0 +1,238 @@
+"""A URDF as plain data: the kinematic tree that every part of xreset builds from.
+
+Each engine's own URDF reader has habits of its own (invented masses, fused fixed links, joint order, effort as a force range). So a URDF is
+read once, here, and the backends build their models from a :class:`RobotTree`.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+from xml.etree import ElementTree
+
+import numpy as np
+
+from xreset.errors import RobotError
+from xreset.spec import Geometry, RobotSpec, Shape
+
+JointType = Literal["revolute", "prismatic", "fixed"]
+
+_MASSLESS = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Link:
+    """A link, its inertia and its shapes."""
+
+    name: str
+    mass: float
+    """[kg]; 0 where the URDF gives none."""
+    com: np.ndarray
+    """[3] centre of mass in the link frame [m]."""
+    inertia: np.ndarray
+    """[3, 3] about the centre of mass, along the link frame's axes [kg m^2]."""
+    collisions: tuple[Shape, ...]
+    """Convex collision shapes in the link frame; a mesh is its convex hull."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Joint:
+    """A joint between two links."""
+
+    name: str
+    type: JointType
+    parent: str
+    child: str
+    T_parent_joint: np.ndarray
+    """[4, 4] pose of the child's frame in the parent's at position 0."""
+    axis: np.ndarray
+    """[3] unit axis in the joint (child) frame."""
+    lower: float
+    """Lower position limit [rad or m]; -inf for a continuous joint."""
+    upper: float
+    velocity: float
+    """Largest speed [rad/s or m/s]; inf where the URDF gives none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotTree:
+    """The links and joints of a URDF, parents before children."""
+
+    name: str
+    root: str
+    links: tuple[Link, ...]
+    joints: tuple[Joint, ...]
+    """Joint i's child is link i + 1."""
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """Names of all links, root first."""
+        return tuple(link.name for link in self.links)
+
+    def link(self, name: str) -> Link:
+        """The link of that name; ``RobotError`` if there is none."""
+        for link in self.links:
+            if link.name == name:
+                return link
+        raise RobotError(f"robot {self.name!r} has no link {name!r}; it has {', '.join(self.link_names)}.")
+
+    def joint(self, name: str) -> Joint:
+        """The joint of that name; ``RobotError`` if there is none."""
+        for joint in self.joints:
+            if joint.name == name:
+                return joint
+        raise RobotError(f"robot {self.name!r} has no joint {name!r}; it has {', '.join(j.name for j in self.joints)}.")
+
+    def moving_ancestor(self, name: str) -> str:
+        """The link of the rigid body that ``name`` belongs to: itself, or the nearest ancestor that a joint moves (or the root)."""
+        by_child = {joint.child: joint for joint in self.joints}
+        while name in by_child and by_child[name].type == "fixed":
+            name = by_child[name].parent
+        return name
+
+
+def robot_tree(robot: RobotSpec) -> RobotTree:
+    """The tree of a robot's URDF (read once per file and modification)."""
+    return load_urdf(robot.urdf)
+
+
+def load_urdf(path: str | Path) -> RobotTree:
+    """Read a URDF.
+
+    ``<capsule radius length/>`` is understood in addition to the standard shapes. Mesh files are looked for beside the URDF
+    (``package://NAME/`` is tried below the URDF's folder and each folder above it).
+
+    Raises:
+        RobotError: the file is missing or damaged, a mesh is missing, the links form no tree, or a joint type is not supported.
+    """
+    path = Path(path).resolve()
+    if not path.is_file():
+        raise RobotError(f"there is no URDF at {path}.")
+    return _load(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=16)
+def _load(path: Path, _modified: int) -> RobotTree:
+    import yourdfpy
+
+    try:
+        xml = ElementTree.parse(path)
+        for element in xml.iter("geometry"):  # yourdfpy knows no capsules: they travel as negative cylinders
+            for capsule in element.findall("capsule"):
+                capsule.tag = "cylinder"
+                capsule.set("radius", f"-{capsule.get('radius')}")
+        robot = yourdfpy.URDF.load(
+            io.BytesIO(ElementTree.tostring(xml.getroot())),
+            build_scene_graph=False,
+            load_meshes=False,
+            filename_handler=lambda name: name,
+        ).robot
+    except (ElementTree.ParseError, ValueError, TypeError, AttributeError, KeyError) as error:
+        raise RobotError(f"{path} cannot be read as a URDF: {error}") from error
+
+    joints = {joint.child: joint for joint in robot.joints}
+    names = [link.name for link in robot.links]
+    if len(set(names)) != len(names):
+        raise RobotError(f"{path}: a link name occurs twice.")
+    roots = [name for name in names if name not in joints]
+    if len(roots) != 1:
+        raise RobotError(f"{path}: expected one root link, found {len(roots)} ({', '.join(roots) or 'none'}).")
+    children: dict[str, list[str]] = {}
+    for joint in robot.joints:
+        for end in (joint.parent, joint.child):
+            if end not in names:
+                raise RobotError(f"{path}: joint {joint.name!r} names link {end!r}, which the file does not define.")
+        children.setdefault(joint.parent, []).append(joint.child)
+    order: list[str] = []
+    stack = [roots[0]]
+    while stack:
+        name = stack.pop()
+        order.append(name)
+        stack.extend(reversed(children.get(name, [])))
+    if len(order) != len(names):
+        raise RobotError(f"{path}: links {sorted(set(names) - set(order))} are not connected to the root {roots[0]!r}.")
+
+    by_name = {link.name: link for link in robot.links}
+    return RobotTree(
+        name=robot.name or path.stem,
+        root=roots[0],
+        links=tuple(_link(by_name[name], path) for name in order),
+        joints=tuple(_joint(joints[name], path) for name in order[1:]),
+    )
+
+
+def _link(link, path: Path) -> Link:
+    inertial = link.inertial
+    if inertial is None or not inertial.mass:
+        mass, com, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
+    else:
+        origin = np.eye(4) if inertial.origin is None else np.asarray(inertial.origin, dtype=float)
+        about = np.zeros((3, 3)) if inertial.inertia is None else np.asarray(inertial.inertia, dtype=float)
+        mass, com, inertia = float(inertial.mass), origin[:3, 3], origin[:3, :3] @ about @ origin[:3, :3].T
+    shapes = []
+    for collision in link.collisions:
+        T = np.eye(4) if collision.origin is None else np.asarray(collision.origin, dtype=float)
+        geometry = collision.geometry
+        if geometry.box is not None:
+            shape = Geometry(kind="box", size=tuple(float(s) / 2 for s in geometry.box.size))
+        elif geometry.sphere is not None:
+            shape = Geometry(kind="sphere", size=(float(geometry.sphere.radius),))
+        elif geometry.cylinder is not None:
+            radius, half = float(geometry.cylinder.radius), float(geometry.cylinder.length) / 2
+            shape = Geometry(kind="capsule" if radius < 0 else "cylinder", size=(abs(radius), half))
+        elif geometry.mesh is not None:
+            shape = _hull(geometry.mesh, link.name, path)
+        else:
+            raise RobotError(f"{path}: link {link.name!r} has a collision without a geometry.")
+        shapes.append(Shape(geometry=shape, T_body_shape=T))
+    return Link(name=link.name, mass=mass, com=com, inertia=inertia, collisions=tuple(shapes))
+
+
+def _hull(mesh, link: str, path: Path) -> Geometry:
+    import trimesh
+
+    file = find_mesh(mesh.filename, path)
+    if file is None:
+        raise RobotError(f"{path}: link {link!r} uses the mesh {mesh.filename!r}, which is not there. Put it beside the URDF.")
+    loaded = trimesh.load(file, force="mesh")
+    scale = np.ones(3) if mesh.scale is None else np.broadcast_to(np.asarray(mesh.scale, dtype=float), 3)
+    hull = trimesh.Trimesh(np.asarray(loaded.vertices) * scale, loaded.faces).convex_hull
+    return Geometry(kind="hull", vertices=np.asarray(hull.vertices, dtype=float), faces=np.asarray(hull.faces, dtype=np.int64))
+
+
+def find_mesh(name: str, urdf: Path) -> Path | None:
+    """The file that a URDF's mesh name means, or None."""
+    relative = Path(name.split("://", 1)[1]) if "://" in name else Path(name)
+    candidates = [relative] if relative.is_absolute() else [folder / relative for folder in urdf.parents]
+    if name.startswith("package://"):  # the package's own folder may be one of the URDF's ancestors
+        candidates += [folder / Path(*relative.parts[1:]) for folder in urdf.parents]
+    return next((file for file in candidates if file.is_file()), None)
+
+
+def _joint(joint, path: Path) -> Joint:
+    if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
+        raise RobotError(f"{path}: joint {joint.name!r} has type {joint.type!r}; supported are revolute, continuous, prismatic and fixed.")
+    axis = np.array([1.0, 0, 0]) if joint.axis is None else np.asarray(joint.axis, dtype=float)
+    if joint.type != "fixed" and not np.linalg.norm(axis) > _MASSLESS:
+        raise RobotError(f"{path}: joint {joint.name!r} has the axis {axis}, expected a direction.")
+    lower, upper, velocity = -math.inf, math.inf, math.inf
+    if joint.limit is not None:
+        if joint.type != "continuous":
+            lower = 0.0 if joint.limit.lower is None else float(joint.limit.lower)
+            upper = 0.0 if joint.limit.upper is None else float(joint.limit.upper)
+        velocity = math.inf if joint.limit.velocity is None else float(joint.limit.velocity)
+    return Joint(
+        name=joint.name,
+        type="revolute" if joint.type == "continuous" else joint.type,
+        parent=joint.parent,
+        child=joint.child,
+        T_parent_joint=np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=float),
+        axis=axis / max(float(np.linalg.norm(axis)), _MASSLESS),
+        lower=lower,
+        upper=upper,
+        velocity=velocity,
+    )

@@ -1,0 +1,1 @@
+"""OpenArm v1.0, right arm with its parallel gripper."""

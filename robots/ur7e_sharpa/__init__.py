@@ -1,0 +1,1 @@
+"""UR7e arm with the Sharpa Wave right hand."""

@@ -1,0 +1,70 @@
+"""The command line: ``xreset COMMAND ...``.
+
+The first word picks a module of this package, which is only then imported, so that ``xreset --help`` is instant. A command module holds typed
+functions; tyro turns their signatures and docstrings into flags.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+COMMANDS: dict[str, str] = {
+    "demos": "Import, make and describe human demonstrations.",
+    "objects": "List objects and import meshes.",
+    "robots": "List robots, and check one.",
+    "backends": "List physics engines and whether they can be used here.",
+    "conformance": "Test that a physics engine keeps the interface's contracts.",
+    "retarget": "Turn human demonstrations into robot trajectories.",
+    "resets": "Try retargeted states in physics and keep the stable ones.",
+    "train": "Train a policy.",
+    "eval": "Evaluate a policy, or a baseline, in one or several engines.",
+    "report": "Make a self-contained HTML page of a run's evaluations.",
+}
+"""Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``: a function, or a dictionary of sub-commands."""
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Entry point of the console script. Exits with 1 after an error that the user can mend, 2 after wrong usage, 130 after Ctrl-C."""
+    from xreset.errors import XResetError
+
+    argv = sys.argv[1:] if argv is None else argv
+    if not argv or argv[0] in ("-h", "--help"):
+        print(_usage())
+        return
+    if argv[0] == "--version":
+        from xreset import __version__
+
+        print(f"xreset {__version__}")
+        return
+    if argv[0] not in COMMANDS:
+        print(f"xreset: there is no command {argv[0]!r}.\n\n{_usage()}", file=sys.stderr)
+        raise SystemExit(2)
+    try:
+        _run(argv[0], argv[1:])
+    except XResetError as error:
+        print(f"xreset {argv[0]}: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        print("\nstopped.", file=sys.stderr)
+        raise SystemExit(130) from None
+    except BrokenPipeError:  # `xreset ... | head`
+        sys.stderr.close()
+        raise SystemExit(0) from None
+
+
+def _run(name: str, arguments: list[str]) -> None:
+    import tyro
+
+    command = import_module(f"xreset.cli.{name}").COMMAND
+    program = f"xreset {name}"
+    if isinstance(command, dict):
+        tyro.extras.subcommand_cli_from_dict(command, prog=program, description=COMMANDS[name], args=arguments)
+    else:
+        tyro.cli(command, prog=program, description=COMMANDS[name], args=arguments)
+
+
+def _usage() -> str:
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
+    return "\n".join(["usage: xreset COMMAND ...", "", *lines, "", "xreset COMMAND --help shows the options of one command."])

@@ -1,0 +1,1 @@
+"""Human hand-object demonstrations: the archive, DexYCB, and synthetic ones."""

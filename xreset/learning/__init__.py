@@ -1,0 +1,1 @@
+"""Learning: rsl-rl PPO with a PointNet, LSTM and MLP model."""

@@ -1,0 +1,1 @@
+"""Objects: parametric stand-ins for the YCB objects, import of real meshes, surface points."""

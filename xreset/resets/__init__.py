@@ -1,0 +1,1 @@
+"""Reset banks: retargeted states that a physics engine has found stable."""

@@ -1,0 +1,1 @@
+"""Retargeting: human hand motion to robot joint trajectories."""

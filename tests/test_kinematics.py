@@ -1,0 +1,105 @@
+import tempfile
+import unittest
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.toy_robot import toy_hand_arm, write_urdf
+from xreset.errors import RobotError
+from xreset.kinematics import Kinematics
+
+
+class KinematicsTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        folder = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(folder.cleanup)
+        cls.folder = Path(folder.name)
+        cls.robot = toy_hand_arm(cls.folder)
+        cls.kinematics = Kinematics(cls.robot)
+        generator = torch.Generator().manual_seed(0)
+        low, high = cls.kinematics.lower, cls.kinematics.upper
+        cls.q = low + (high - low) * torch.rand(3, 5, len(low), dtype=torch.float64, generator=generator)
+
+    def test_link_poses_agree_with_mujoco(self):
+        import mujoco
+
+        model = mujoco.MjModel.from_xml_path(str(self.robot.urdf))
+        data = mujoco.MjData(model)
+        kinematics = self.kinematics
+        identity = torch.eye(4, dtype=torch.float64)
+        poses = kinematics.link_poses(self.q, base=identity)
+        mimics = {mimic.joint: mimic for mimic in self.robot.mimics}
+        for index in np.ndindex(3, 5):
+            for j in range(model.njnt):
+                name = model.joint(j).name
+                mimic = mimics.get(name)
+                value = self.q[index][kinematics.joint_names.index(mimic.source if mimic else name)].item()
+                data.qpos[model.jnt_qposadr[j]] = mimic.multiplier * value + mimic.offset if mimic else value
+            mujoco.mj_kinematics(model, data)
+            for i, name in enumerate(kinematics.link_names):
+                if name == kinematics.root:
+                    continue
+                body = model.body(name).id
+                np.testing.assert_allclose(poses[index][i, :3, 3], data.xpos[body], atol=1e-9)
+                np.testing.assert_allclose(poses[index][i, :3, :3], data.xmat[body].reshape(3, 3), atol=1e-9)
+
+    def test_jacobian_is_the_derivative(self):
+        links = ["tip_a", "finger_a2", "palm", "tip_b"]
+        offsets = torch.tensor([[0.01, 0.02, -0.03], [0, 0, 0], [0.1, 0, 0], [0, 0.01, 0]], dtype=torch.float64)
+        jacobian = self.kinematics.jacobian(self.q, links, offsets)
+        torch.testing.assert_close(jacobian.pos, self.kinematics.points(self.q, links, offsets))
+        step = 1e-6
+        for j in range(self.q.shape[-1]):
+            shift = torch.zeros(self.q.shape[-1], dtype=torch.float64)
+            shift[j] = step
+            ahead, behind = self.kinematics.link_poses(self.q + shift, links), self.kinematics.link_poses(self.q - shift, links)
+            points = [T[..., :3, 3] + (T[..., :3, :3] @ offsets[..., None])[..., 0] for T in (ahead, behind)]
+            torch.testing.assert_close(jacobian.linear[..., j], (points[0] - points[1]) / (2 * step), atol=1e-8, rtol=0)
+            spin = (ahead - behind)[..., :3, :3] / (2 * step) @ jacobian.rot.mT  # the cross-product matrix of the angular velocity
+            omega = torch.stack((spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]), dim=-1)
+            torch.testing.assert_close(jacobian.angular[..., j], omega, atol=1e-8, rtol=0)
+
+    def test_base_places_the_robot_in_the_world(self):
+        kinematics = self.kinematics
+        root = kinematics.link_poses(self.q, [kinematics.root])[0, 0, 0]
+        np.testing.assert_allclose(root[:3, 3], self.robot.base_pos)
+        moved = torch.eye(4, dtype=torch.float64)
+        moved[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+        torch.testing.assert_close(
+            kinematics.link_poses(self.q, base=moved @ kinematics.base), moved @ kinematics.link_poses(self.q), atol=1e-12, rtol=0
+        )
+
+    def test_a_subtree_moves_as_in_the_whole(self):
+        hand = Kinematics(self.robot, root="palm")
+        self.assertEqual(hand.joint_names, tuple(self.robot.joint_names[i] for i in self.robot.hand_indices))
+        whole = self.kinematics.link_poses(self.q, hand.link_names)
+        palm = self.kinematics.link_poses(self.q, ["palm"])[..., 0, :, :]
+        torch.testing.assert_close(hand.link_poses(self.q[..., hand.joint_indices], base=palm), whole, atol=1e-12, rtol=0)
+
+    def test_joint_order_is_the_descriptions(self):
+        self.assertEqual(self.kinematics.joint_names, self.robot.joint_names)
+        self.assertNotEqual(self.robot.joint_names, tuple(j.name for j in self.kinematics.tree.joints if j.name in self.robot.joint_names))
+
+    def test_limits_take_the_mimic_joint_into_account(self):
+        column = self.robot.joint_names.index("jaw_a")
+        self.assertAlmostEqual(self.kinematics.upper[column].item(), 0.025)  # the mimic, at half its travel, is the first to end
+
+    def test_errors_name_the_cause(self):
+        with self.assertRaisesRegex(RobotError, "no link 'nose' below"):
+            self.kinematics.points(self.q, ["nose"])
+        with self.assertRaisesRegex(ValueError, "expected"):
+            self.kinematics.link_poses(self.q[..., :2])
+        import dataclasses
+
+        passive = dataclasses.replace(self.robot, mimics=())
+        with self.assertRaisesRegex(RobotError, "jaw_b"):
+            Kinematics(passive)
+        misnamed = dataclasses.replace(self.robot, urdf=write_urdf(self.folder / "other.urdf", rename={"arm_2": "arm_two"}))
+        with self.assertRaisesRegex(RobotError, "arm_two"):
+            Kinematics(misnamed)
+
+
+if __name__ == "__main__":
+    unittest.main()

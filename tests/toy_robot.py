@@ -1,0 +1,71 @@
+"""A small robot for tests: an arm of three joints, a hand of two fingers, and a pair of jaws that mimic one another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
+
+_JOINTS = (
+    # name, type, parent, child, xyz, rpy, axis, lower, upper
+    ("arm_1", "revolute", "base", "shoulder", "0 0 0.2", "0 0 0", "0 0 1", -3.0, 3.0),
+    ("arm_2", "revolute", "shoulder", "upper", "0.02 0.05 0", "1.2 -0.3 0.5", "0.6 0 0.8", -2.0, 2.0),
+    ("arm_3", "prismatic", "upper", "fore", "0.3 0 0.1", "0 0.4 0", "0 1 0", -0.1, 0.3),
+    ("mount", "fixed", "fore", "palm", "0 0.1 0.05", "0.2 0.1 -0.4", None, 0, 0),
+    ("finger_a1", "revolute", "palm", "finger_a1", "0.05 0.02 0", "0 0 0.3", "0 1 0", -0.5, 1.6),
+    ("finger_a2", "revolute", "finger_a1", "finger_a2", "0.04 0 0", "0.1 0 0", "0 1 0", 0.0, 1.6),
+    ("end_a", "fixed", "finger_a2", "tip_a", "0.03 0 0", "0 0 0", None, 0, 0),
+    ("finger_b1", "revolute", "palm", "finger_b1", "0.05 -0.02 0", "0 0 -0.3", "0 -1 0", -1.6, 0.5),
+    ("end_b", "fixed", "finger_b1", "tip_b", "0.06 0 0", "0 0 0", None, 0, 0),
+    ("jaw_a", "prismatic", "palm", "jaw_a", "0 0.03 0", "0 0 0", "0 1 0", 0.0, 0.04),
+    ("jaw_b", "prismatic", "palm", "jaw_b", "0 -0.03 0", "0 0 0", "0 -1 0", 0.0, 0.055),
+)
+
+
+def write_urdf(path: Path, rename: dict[str, str] | None = None) -> Path:
+    """Write the test robot's URDF; ``rename`` changes joint names."""
+    inertia = '<inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/>'
+    links = {"base", *(joint[3] for joint in _JOINTS)}
+    lines = ['<robot name="toy">', '<mujoco><compiler fusestatic="false" angle="radian"/></mujoco>']
+    for link in sorted(links):
+        lines.append(
+            f'<link name="{link}"><inertial><mass value="0.1"/>{inertia}</inertial>'
+            '<collision><geometry><sphere radius="0.01"/></geometry></collision></link>'
+        )
+    for name, kind, parent, child, xyz, rpy, axis, lower, upper in _JOINTS:
+        name = (rename or {}).get(name, name)
+        moves = f'<axis xyz="{axis}"/><limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>' if axis else ""
+        lines.append(
+            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{xyz}" rpy="{rpy}"/>{moves}</joint>'
+        )
+    path.write_text("\n".join([*lines, "</robot>"]))
+    return path
+
+
+def toy_hand_arm(folder: Path) -> RobotSpec:
+    """The test robot; its URDF is written into ``folder``. Its joint order is not the URDF's."""
+    drive = DriveSpec(kp=1.0, kd=0.1, effort=1.0)
+    order = ("arm_3", "arm_1", "arm_2", "finger_b1", "finger_a1", "finger_a2", "jaw_a")
+    return RobotSpec(
+        name="toy",
+        urdf=write_urdf(folder / "toy.urdf"),
+        joints=tuple(JointSpec(name=n, group="arm" if n.startswith("arm") else "hand", drive=drive, home=0.01) for n in order),
+        mimics=(MimicSpec(joint="jaw_b", source="jaw_a", multiplier=2.0, offset=0.005),),
+        base_pos=(0.1, -0.2, 0.3),
+        base_quat=(0.5, 0.5, 0.5, 0.5),
+        palm="palm",
+        fingertips=(
+            FingertipSpec(name="thumb", link="tip_b", contact_links=("finger_b1",), keypoint="thumb4"),
+            FingertipSpec(name="index", link="tip_a", contact_links=("finger_a2",), keypoint="index4"),
+        ),
+        keypoints=(
+            KeypointSpec(keypoint="wrist", link="palm"),
+            KeypointSpec(keypoint="index1", link="finger_a1"),
+            KeypointSpec(keypoint="index2", link="finger_a2"),
+            KeypointSpec(keypoint="index4", link="tip_a"),
+            KeypointSpec(keypoint="thumb1", link="finger_b1"),
+            KeypointSpec(keypoint="thumb4", link="tip_b"),
+        ),
+        hand_root="palm",
+    )

@@ -6,7 +6,8 @@ table's top at z = 0. Shape letters: J actuated joints, E fingertips.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import hashlib
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -171,6 +172,12 @@ class RobotSpec:
     def tracked_links(self) -> tuple[str, ...]:
         """Links whose pose a backend reports: the palm, then the fingertips (length 1 + E)."""
         return (self.palm, *(tip.link for tip in self.fingertips))
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 over the description and the URDF's bytes: equal where the robot is the same, wherever its files lie."""
+        description = repr(replace(self, urdf=Path(self.urdf.name)))
+        return hashlib.sha256(description.encode() + self.urdf.read_bytes()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)

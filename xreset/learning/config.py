@@ -1,0 +1,103 @@
+"""Learning's typed configuration. Defaults are the paper's Table VIII; what it leaves open is said in the docstrings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from xreset.task.config import TaskConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """Actor and critic: PointNet per cloud frame, LSTM with layer norm on its output, MLP."""
+
+    pointnet: tuple[int, ...] = (64, 128, 64)
+    """Widths of the per-point MLP 3 -> 64 -> 128 -> 64; the maximum over points is the frame's embedding."""
+    lstm: int = 512
+    """Units of the LSTM."""
+    mlp: tuple[int, ...] = (512, 256, 128)
+    activation: str = "elu"
+    initial_std: float = 1.0
+    """Initial standard deviation of the Gaussian policy. Its logarithm does not depend on the state and is learned. Not in the paper."""
+    normalize_observations: bool = True
+    """Running normalisation of the flat observations (not of the clouds). Not in the paper; its library's usual setting."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoConfig:
+    """Proximal policy optimisation."""
+
+    horizon: int = 16
+    """Control steps per world and iteration."""
+    sequence_length: int = 4
+    """Length of truncated back-propagation through time; divides the horizon."""
+    mini_epochs: int = 5
+    minibatch_size: int = 32768
+    """Transitions per minibatch. With fewer transitions per iteration than two of these, an iteration is one minibatch."""
+    discount: float = 0.99
+    gae_lambda: float = 0.95
+    learning_rate: float = 1e-3
+    schedule: Literal["adaptive", "fixed"] = "adaptive"
+    """``adaptive``: the rate is divided (multiplied) by 1.5 where the policy moved more than twice (less than half) ``desired_kl``."""
+    desired_kl: float = 0.01
+    clip: float = 0.2
+    entropy: float = 0.005
+    value_loss: float = 1.0
+    """Weight of the value loss. Not in the paper."""
+    grad_norm: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """A whole training run: all that is saved in the run folder before it starts."""
+
+    task: TaskConfig = field(default_factory=TaskConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    ppo: PpoConfig = field(default_factory=PpoConfig)
+    iterations: int = 10000
+    save_interval: int = 50
+    """Iterations between checkpoints."""
+    random_episode_start: bool = True
+    """Start the first episodes at random times, so that worlds do not end in step."""
+
+
+def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
+    """The nested dictionary that rsl-rl's runner takes."""
+    m, p = config.model, config.ppo
+    if p.horizon % p.sequence_length:
+        raise ValueError(f"sequence_length {p.sequence_length} does not divide the horizon {p.horizon}")
+    network: dict[str, Any] = {
+        "class_name": "xreset.learning.model:PointNetLstmModel",
+        "hidden_dims": list(m.mlp),
+        "activation": m.activation,
+        "obs_normalization": m.normalize_observations,
+        "pointnet_dims": list(m.pointnet),
+        "lstm_dim": m.lstm,
+    }
+    gaussian = {"class_name": "GaussianDistribution", "init_std": m.initial_std, "std_type": "log", "learn_std": True}
+    return {
+        "num_steps_per_env": p.horizon,
+        "save_interval": config.save_interval,
+        "obs_groups": {
+            "actor": ["policy", "proprio", "perception"],
+            "critic": ["policy", "proprio", "privileged", "perception"],
+        },
+        "actor": network | {"distribution_cfg": gaussian},
+        "critic": dict(network),
+        "algorithm": {
+            "class_name": "xreset.learning.ppo:SequencePpo",
+            "sequence_length": p.sequence_length,
+            "num_learning_epochs": p.mini_epochs,
+            "num_mini_batches": max(1, min(num_envs * p.horizon // p.minibatch_size, num_envs * p.horizon // p.sequence_length // 2)),
+            "clip_param": p.clip,
+            "gamma": p.discount,
+            "lam": p.gae_lambda,
+            "value_loss_coef": p.value_loss,
+            "entropy_coef": p.entropy,
+            "learning_rate": p.learning_rate,
+            "max_grad_norm": p.grad_norm,
+            "schedule": p.schedule,
+            "desired_kl": p.desired_kl,
+        },
+    }

@@ -1,0 +1,90 @@
+"""PPO over short sequences: Table VIII's sequence length 4 inside a horizon of 16, on top of rsl-rl's PPO.
+
+rsl-rl back-propagates through whole horizons. Here a rollout [T, N] is cut into pieces [T / L, L, N]; each piece starts from the LSTM state
+that the rollout had there, an episode's end inside a piece zeroes the state, and pieces are shuffled. Returns still use the whole horizon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.env import VecEnv
+from rsl_rl.storage import RolloutStorage
+from rsl_rl.utils import resolve_class, resolve_obs_groups
+from tensordict import TensorDict
+from torch import Tensor
+
+
+class SequenceStorage(RolloutStorage):
+    """A rollout that is handed out as shuffled sequences of fixed length."""
+
+    def __init__(self, sequence_length: int, *args: Any, **options: Any) -> None:
+        """Allocate; ``sequence_length`` divides the number of steps."""
+        super().__init__(*args, **options)
+        self.sequence_length = sequence_length
+
+    def recurrent_mini_batch_generator(
+        self, num_mini_batches: int, num_epochs: int = 8
+    ) -> Generator[RolloutStorage.Batch, None, None]:
+        """Yield minibatches of sequences [L, M, ...]; ``masks`` [L, M] is True where a step is the first of an episode."""
+        length, pieces = self.sequence_length, self.num_transitions_per_env // self.sequence_length
+        total = pieces * self.num_envs
+        first = torch.zeros_like(self.dones, dtype=torch.bool)
+        first[1:] = self.dones[:-1].bool()  # step 0 begins with the state that was saved there, zeroed where an episode had ended
+
+        def cut(value: Tensor | TensorDict) -> Any:
+            """[T, N, ...] -> [L, pieces * N, ...], a view where possible."""
+            return value.unflatten(0, (pieces, length)).transpose(0, 1).flatten(1, 2)
+
+        observations, starts = cut(self.observations), cut(first).squeeze(-1)
+        actions, values, returns = cut(self.actions), cut(self.values), cut(self.returns)
+        advantages, log_prob = cut(self.advantages), cut(self.actions_log_prob)
+        distribution = tuple(cut(p) for p in self.distribution_params or ())
+        # [T, 1, N, lstm] -> the state at each piece's first step, [1, pieces * N, lstm]
+        states = [
+            tuple(s[::length].squeeze(1).flatten(0, 1)[None] for s in saved) if saved is not None else None
+            for saved in (self.saved_hidden_state_a, self.saved_hidden_state_c)
+        ]
+        for _ in range(num_epochs):
+            for pick in torch.randperm(total, device=self.device).tensor_split(num_mini_batches):
+                yield RolloutStorage.Batch(
+                    observations=observations[:, pick],
+                    actions=actions[:, pick],
+                    values=values[:, pick],
+                    advantages=advantages[:, pick],
+                    returns=returns[:, pick],
+                    old_actions_log_prob=log_prob[:, pick],
+                    old_distribution_params=tuple(p[:, pick] for p in distribution),
+                    hidden_states=tuple(tuple(s[:, pick] for s in state) if state is not None else None for state in states),  # pyright: ignore[reportArgumentType]
+                    masks=starts[:, pick],
+                )
+
+
+class SequencePpo(PPO):
+    """rsl-rl's PPO with :class:`SequenceStorage`."""
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Sample actions; the very first step of a run starts from a zero LSTM state, which is stored like any other."""
+        for model in (self.actor, self.critic):
+            if model.is_recurrent and model.get_hidden_state() is None:
+                with torch.no_grad():
+                    model(obs)
+                h, c = model.get_hidden_state()  # pyright: ignore[reportGeneralTypeIssues]
+                model.reset(hidden_state=(torch.zeros_like(h), torch.zeros_like(c)))
+        return super().act(obs)
+
+    @staticmethod
+    def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> PPO:
+        """Build models, storage and algorithm from the runner's configuration."""
+        alg_class, alg_cfg = resolve_class(cfg["algorithm"])
+        actor_class, actor_cfg = resolve_class(cfg["actor"])
+        critic_class, critic_cfg = resolve_class(cfg["critic"])
+        groups = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
+        actor = actor_class(obs, groups, "actor", env.num_actions, **actor_cfg).to(device)
+        critic = critic_class(obs, groups, "critic", 1, **critic_cfg).to(device)
+        length = alg_cfg.pop("sequence_length")
+        storage = SequenceStorage(length, "rl", env.num_envs, cfg["num_steps_per_env"], obs, [env.num_actions], device)
+        return alg_class(actor, critic, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])

@@ -1,0 +1,171 @@
+"""Policies as evaluation sees them: something that turns observations into actions, world by world.
+
+A trained policy is an ONNX file that carries its own contract: robot, joint order, observation layout, action mapping and control rate.
+Running one needs neither warp nor rsl-rl.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xreset.errors import PolicyError
+from xreset.spec import RobotSpec
+from xreset.task.config import TaskConfig
+from xreset.task.observations import layout
+
+if TYPE_CHECKING:
+    from tensordict import TensorDict
+
+SCHEMA = "xreset-policy/1"
+
+
+class Policy(Protocol):
+    """What evaluation asks of a policy."""
+
+    name: str
+
+    def reset(self, worlds: Tensor | None = None) -> None:
+        """Forget the past of some worlds [M] (None: of all)."""
+        ...
+
+    def act(self, observations: TensorDict) -> Tensor:
+        """[N, J] actions in [-1, 1]."""
+        ...
+
+
+def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]) -> dict[str, Any]:
+    """Everything that must agree between training and evaluation, as JSON."""
+    return {
+        "schema": SCHEMA,
+        "robot": robot.name,
+        "robot_fingerprint": robot.fingerprint,
+        "joint_names": list(robot.joint_names),
+        "fingertip_names": list(robot.fingertip_names),
+        "objects": list(objects),
+        "observation_layout": layout(len(robot.joints), len(robot.fingertips), task.observation),
+        "control_dt": task.timestep * task.substeps,
+        "task": asdict(task),
+    }
+
+
+def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task: TaskConfig) -> None:
+    """Refuse to run a policy where its observations or actions would mean something else.
+
+    Raises:
+        PolicyError: names the first thing that differs.
+    """
+    here = policy_contract(robot, task, ())
+    if contract.get("schema") != SCHEMA:
+        raise PolicyError(f"{source} has policy schema {contract.get('schema')!r}, expected {SCHEMA!r}. Export it again.")
+    for key, what in (("robot", "robot"), ("joint_names", "joint order"), ("fingertip_names", "fingertips")):
+        if contract[key] != here[key]:
+            raise PolicyError(f"{source} was trained with another {what}: {contract[key]}, here it is {here[key]}. Use --robot {contract['robot']}.")
+    if contract["robot_fingerprint"] != here["robot_fingerprint"]:
+        raise PolicyError(f"{source} was trained on another version of {robot.name!r}: its URDF or description has changed. Train again.")
+    if contract["observation_layout"] != here["observation_layout"]:
+        differing = [
+            f"{group}.{term}: {theirs.get(term)} in the policy, {ours.get(term)} here"
+            for group in here["observation_layout"]
+            for theirs, ours in [(contract["observation_layout"].get(group, {}), here["observation_layout"][group])]
+            for term in dict.fromkeys([*theirs, *ours])
+            if theirs.get(term) != ours.get(term)
+        ]
+        raise PolicyError(f"{source} was trained with another observation layout ({'; '.join(differing)}). Use the run's own configuration.")
+    if abs(contract["control_dt"] - here["control_dt"]) > 1e-9:
+        raise PolicyError(f"{source} acts every {contract['control_dt']:.6f} s, here a control step lasts {here['control_dt']:.6f} s.")
+
+
+class OnnxPolicy:
+    """A trained policy from an ONNX file, with its recurrent state."""
+
+    def __init__(self, path: str | Path) -> None:
+        """Load the file.
+
+        Raises:
+            PolicyError: it is missing, damaged, or not a policy of xreset.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise PolicyError(f"there is no policy file {path}.")
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise PolicyError(f"onnxruntime cannot be imported ({error}). Install it with: pip install 'xreset[eval]'") from error
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 3
+        try:
+            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:
+            raise PolicyError(f"{path} cannot be read as an ONNX policy: {error}") from error
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        if "xreset" not in metadata:
+            raise PolicyError(f"{path} is an ONNX file without xreset's contract: it was not exported by xreset.")
+        self.contract: dict[str, Any] = json.loads(metadata["xreset"])
+        self.name = path.stem if path.stem != "policy" else path.resolve().parent.name
+        self._lstm_dim = int(self._session.get_inputs()[2].shape[2])
+        self._state: list[np.ndarray] | None = None
+
+    def reset(self, worlds: Tensor | None = None) -> None:
+        """Zero the recurrent state."""
+        if worlds is None:
+            self._state = None
+        elif self._state is not None:
+            for part in self._state:
+                part[:, worlds.cpu().numpy()] = 0.0
+
+    def act(self, observations: TensorDict) -> Tensor:
+        """[N, J] mean action, on the observations' device."""
+        flat = torch.cat((observations["policy"], observations["proprio"]), dim=-1)
+        n = flat.shape[0]
+        if self._state is None or self._state[0].shape[1] != n:
+            self._state = [np.zeros((1, n, self._lstm_dim), dtype=np.float32) for _ in range(2)]
+        feed = {
+            "flat": flat.cpu().numpy(),
+            "cloud": observations["perception"].cpu().numpy(),
+            "h_in": self._state[0],
+            "c_in": self._state[1],
+        }
+        actions, h, c = self._session.run(None, feed)
+        self._state = [np.array(h), np.array(c)]
+        return torch.as_tensor(actions, device=flat.device).clamp(-1.0, 1.0)
+
+
+class ZeroPolicy:
+    """Action zero: the arm stays, the hand goes to the middle of its range. A baseline and a smoke test."""
+
+    name = "zero"
+
+    def __init__(self, num_actions: int) -> None:
+        self._num_actions = num_actions
+
+    def reset(self, worlds: Tensor | None = None) -> None:
+        """Nothing to forget."""
+
+    def act(self, observations: TensorDict) -> Tensor:
+        """[N, J] zeros."""
+        flat = observations["policy"]
+        return torch.zeros(flat.shape[0], self._num_actions, device=flat.device)
+
+
+class RandomPolicy:
+    """Uniform actions in [-1, 1], the same for the same seed in every engine."""
+
+    name = "random"
+
+    def __init__(self, num_actions: int, seed: int) -> None:
+        self._num_actions, self._generator = num_actions, torch.Generator().manual_seed(seed)
+
+    def reset(self, worlds: Tensor | None = None) -> None:
+        """Nothing to forget."""
+
+    def act(self, observations: TensorDict) -> Tensor:
+        """[N, J] uniform."""
+        flat = observations["policy"]
+        return (2.0 * torch.rand(flat.shape[0], self._num_actions, generator=self._generator) - 1.0).to(flat.device)

@@ -1,0 +1,165 @@
+"""The task's one typed configuration. Defaults are the paper's; where it is silent, the docstring says what was chosen.
+
+"Table VIII", "Table IX" and "appendix D" name parts of the X-RESET paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionConfig:
+    """How a policy's output in [-1, 1] becomes joint targets (Table VIII: relative arm commands, absolute hand targets)."""
+
+    arm_step: float = 0.05
+    """Largest change of an arm joint's target per control step [rad]: 3 rad/s at 60 Hz, the UR7e's own limit. Not in the paper."""
+    arm_lead: float = 0.15
+    """Farthest that an arm target may run ahead of the joint [rad], so that a blocked arm does not wind up. Not in the paper."""
+    hand_smoothing: float = 1.0
+    """Share of the new hand target that is taken per control step, in (0, 1]; 1 is the paper's plain absolute target."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseConfig:
+    """Standard deviations of the observation noise. The paper says what is noisy, not how much."""
+
+    joint_pos: float = 0.005
+    """[rad]"""
+    joint_vel: float = 0.05
+    """[rad/s]"""
+    object_pos: float = 0.003
+    """[m]"""
+    object_rot: float = 0.02
+    """[rad], about a random axis."""
+    cloud: float = 0.002
+    """[m], per point."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationConfig:
+    """What the policy sees (appendix C): groups ``policy``, ``proprio``, ``perception``; the critic's ``privileged``."""
+
+    cloud_points: int = 64
+    """Points per cloud (P)."""
+    cloud_history: int = 5
+    """Frames of cloud history (H), oldest first."""
+    contact_force_scale: float = 0.1
+    """Factor on fingertip forces [1/N] before they are limited to [-1, 1]."""
+    joint_vel_scale: float = 0.1
+    """Factor on joint velocities [s/rad]."""
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardConfig:
+    """Weights and widths of the reward (appendix D.d)."""
+
+    reach: float = 1.0
+    reach_width: float = 0.1
+    """Distance [m] at which 1 - tanh(d / width) falls to 0.24. Not in the paper."""
+    grasp: float = 1.0
+    position: float = 4.0
+    position_width: float = 0.2
+    """[m]"""
+    rotation: float = 4.0
+    rotation_width: float = 1.5
+    """[rad]"""
+    success: float = 10.0
+    success_position: float = 0.02
+    """[m] (section V)"""
+    success_rotation: float = 0.2617993877991494
+    """[rad], 15 degrees (section V)"""
+    action: float = -0.005
+    action_rate: float = -0.005
+    out_of_bounds: float = -500.0
+    contact_threshold: float = 0.1
+    """Force [N] from which a finger counts as in contact. Not in the paper."""
+    scale: float = 0.01
+    """Factor on the total (Table VIII)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TerminationConfig:
+    """When an episode ends. The paper names the out-of-bounds termination, not its bounds."""
+
+    episode_seconds: float = 5.0
+    """Time limit [s]; not a failure: its value is bootstrapped."""
+    object_low: float = -0.05
+    """The object is out of bounds when its origin is below this height [m]: it has left the table."""
+    object_high: float = 1.0
+    """... or above this height [m]."""
+    margin: float = 0.10
+    """... or farther than this outside the table's edges [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResetConfig:
+    """The reset mixture (sections IV-B, appendix D.c, D.e, Table IX)."""
+
+    demo_probability: float = 0.5
+    """p: share of resets from the bank; 0 is X-Sim."""
+    pre_contact_only: bool = False
+    """Use only bank states before first contact."""
+    random_gravity: bool = True
+    """Bank resets: gravity fraction U(0, 1); False: 1 (the fixed-gravity ablation)."""
+    home_gravity_std: float = 1.0
+    """Home resets: standard deviation of the object's gravity [m/s^2] around 9.81; 0 is exactly full gravity."""
+    home_gravity_clip: float = 0.3
+    """Home resets: the gravity fraction stays within 1 +- this. The paper clips and does not say where."""
+    spawn_xy: float = 0.02
+    """Home resets: the object is moved by U(-x, x) in both directions [m]."""
+    spawn_yaw: float = 0.4363323129985824
+    """Home resets: the object is turned about the vertical by U(-y, y) [rad], 25 degrees."""
+    home_noise: bool = True
+    """Home resets: joints start around home with the robot's ``home_std``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomizationConfig:
+    """Physical parameters drawn at each reset (Table IX)."""
+
+    enabled: bool = True
+    friction: tuple[float, float] = (0.5, 1.0)
+    """Range of the object material's coefficient."""
+    friction_buckets: int = 250
+    """Number of distinct materials."""
+    elastomer: float = 0.8
+    """Coefficient of the fingertips' material. A pair's friction is the mean of its two materials, the rule of the paper's simulator."""
+    metal: float = 0.1
+    """Coefficient of every other link's material."""
+    table: float = 0.5
+    """Coefficient of the table's material. Not in the paper."""
+    mass_scale: tuple[float, float] = (0.7, 1.3)
+    """Range of the factor on the object's mass."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig:
+    """Everything that defines the task apart from robot, objects and reset bank."""
+
+    action: ActionConfig = field(default_factory=ActionConfig)
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    termination: TerminationConfig = field(default_factory=TerminationConfig)
+    reset: ResetConfig = field(default_factory=ResetConfig)
+    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
+    timestep: float = 1.0 / 240.0
+    """Physics timestep [s]."""
+    substeps: int = 4
+    """Physics steps per control step: control at 60 Hz. Not in the paper."""
+    distance_points: int = 256
+    """Surface points per object for fingertip distances."""
+
+
+def evaluation_task(task: TaskConfig) -> TaskConfig:
+    """The task as a policy is evaluated: from home at full gravity, nominal physics, no observation noise; spawns stay perturbed."""
+    from dataclasses import replace
+
+    zero = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
+    return replace(
+        task,
+        observation=replace(task.observation, noise=zero),
+        reset=replace(task.reset, demo_probability=0.0, home_gravity_std=0.0),
+        randomization=replace(task.randomization, enabled=False),
+    )

@@ -1,0 +1,132 @@
+"""Observations (the paper's appendix C), as pure functions, and the layout that a policy file carries.
+
+Groups: ``policy`` (object pose, goal pose, gravity fraction, previous action), ``proprio`` (joints, palm, fingertips, contact forces),
+``perception`` (cloud history) and, for the critic only, ``privileged``. Shape letters: N worlds, J joints, E fingertips, P points, H history.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from xreset.rotations import quat_conjugate, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_axis_angle
+from xreset.task.config import NoiseConfig, ObservationConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationInput:
+    """What observations are made of: world frame, quaternions (w, x, y, z)."""
+
+    joint_pos: Tensor
+    """[N, J]"""
+    joint_vel: Tensor
+    """[N, J]"""
+    joint_lower: Tensor
+    """[J]"""
+    joint_upper: Tensor
+    """[J]"""
+    object_pos: Tensor
+    object_quat: Tensor
+    object_linvel: Tensor
+    object_angvel: Tensor
+    goal_pos: Tensor
+    goal_quat: Tensor
+    gravity_fraction: Tensor
+    """[N]"""
+    previous_action: Tensor
+    """[N, J]"""
+    palm_pos: Tensor
+    palm_quat: Tensor
+    palm_linvel: Tensor
+    palm_angvel: Tensor
+    tip_pos: Tensor
+    """[N, E, 3]"""
+    tip_force: Tensor
+    """[N, E, 3] force on the object [N]."""
+    tip_distance: Tensor
+    """[N, E]"""
+    reward: Tensor
+    """[N]"""
+
+
+def layout(num_joints: int, num_tips: int, c: ObservationConfig) -> dict[str, dict[str, int]]:
+    """Width of every term of the flat groups, in order; a policy fits a task only if this is equal.
+
+    ``perception`` is listed with its number of values H * P * 3.
+    """
+    return {
+        "policy": {"object_pos": 3, "object_quat": 4, "goal_pos": 3, "goal_quat": 4, "gravity_fraction": 1, "previous_action": num_joints},
+        "proprio": {
+            "joint_pos": num_joints,
+            "joint_vel": num_joints,
+            "palm_pos": 3,
+            "palm_quat": 4,
+            "palm_linvel": 3,
+            "palm_angvel": 3,
+            "tip_pos": 3 * num_tips,
+            "tip_force": 3 * num_tips,
+        },
+        "perception": {"cloud": c.cloud_history * c.cloud_points * 3},
+    }
+
+
+def policy_group(x: ObservationInput, noise: NoiseConfig, generator: torch.Generator) -> Tensor:
+    """[N, 15 + J] object pose (noisy), goal pose, gravity fraction, previous action."""
+    pos = x.object_pos + noise.object_pos * _normal(x.object_pos, generator)
+    turn = quat_from_axis_angle(noise.object_rot * _normal(x.object_pos, generator))
+    quat = _positive(quat_multiply(turn, x.object_quat))
+    return torch.cat((pos, quat, x.goal_pos, _positive(x.goal_quat), x.gravity_fraction[:, None], x.previous_action), dim=-1)
+
+
+def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
+    """[N, 2 J + 13 + 6 E] joints (position within the limits as [-1, 1], scaled velocity), palm, fingertips, limited contact forces."""
+    pos = x.joint_pos + c.noise.joint_pos * _normal(x.joint_pos, generator)
+    vel = x.joint_vel + c.noise.joint_vel * _normal(x.joint_vel, generator)
+    force = (c.contact_force_scale * x.tip_force).clamp(-1.0, 1.0)
+    return torch.cat(
+        (
+            2.0 * (pos - x.joint_lower) / (x.joint_upper - x.joint_lower) - 1.0,
+            c.joint_vel_scale * vel,
+            x.palm_pos,
+            _positive(x.palm_quat),
+            x.palm_linvel,
+            x.palm_angvel,
+            x.tip_pos.flatten(1),
+            force.flatten(1),
+        ),
+        dim=-1,
+    )
+
+
+def privileged_group(x: ObservationInput) -> Tensor:
+    """[N, 15] object velocities, pose error to the goal, closest fingertip distance, gravity fraction, current reward (critic only)."""
+    rotation_error = quat_to_axis_angle(quat_multiply(x.goal_quat, quat_conjugate(x.object_quat)))
+    return torch.cat(
+        (
+            x.object_linvel,
+            x.object_angvel,
+            x.goal_pos - x.object_pos,
+            rotation_error,
+            x.tip_distance.min(dim=-1, keepdim=True).values,
+            x.gravity_fraction[:, None],
+            x.reward[:, None],
+        ),
+        dim=-1,
+    )
+
+
+def cloud_frame(points: Tensor, object_pos: Tensor, object_quat: Tensor, noise: float, generator: torch.Generator) -> Tensor:
+    """[N, P, 3] the object's points [N, P, 3] (object frame) in the world frame, with noise [m]."""
+    cloud = quat_rotate(object_quat[:, None], points) + object_pos[:, None]
+    return cloud + noise * _normal(cloud, generator)
+
+
+def _normal(like: Tensor, generator: torch.Generator) -> Tensor:
+    return torch.randn(like.shape, generator=generator, device=like.device, dtype=like.dtype)
+
+
+def _positive(quat: Tensor) -> Tensor:
+    """The same rotation with w >= 0: a policy must not see two numbers for one pose."""
+    return torch.where(quat[..., :1] < 0, -quat, quat)

@@ -1,0 +1,76 @@
+"""The object-centric reward of the paper's appendix D.d, a pure function.
+
+r = r_reach + r_grasp + 4 r_p + 4 r_R + 10 r_success - 0.005 |a_t|^2 - 0.005 |a_t - a_{t-1}|^2 - 500 r_oob
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from xreset.rotations import quat_angle
+from xreset.task.config import RewardConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardInput:
+    """What the reward looks at; N worlds, E fingertips with the thumb first."""
+
+    tip_distance: Tensor
+    """[N, E] distance from each fingertip to the object's surface [m]."""
+    best_reach: Tensor
+    """[N] smallest mean fingertip distance of the episode, this step included [m]."""
+    tip_force: Tensor
+    """[N, E] magnitude of each finger's contact force [N]."""
+    object_pos: Tensor
+    object_quat: Tensor
+    goal_pos: Tensor
+    goal_quat: Tensor
+    action: Tensor
+    """[N, J] this step's action."""
+    previous_action: Tensor
+    out_of_bounds: Tensor
+    """[N] bool"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reward:
+    """Weighted terms and what they rest on."""
+
+    total: Tensor
+    """[N] scaled sum of the terms."""
+    terms: dict[str, Tensor]
+    """Name -> [N] weighted term, before ``scale``."""
+    grasped: Tensor
+    """[N] bool, the contact gate: the thumb and at least one other finger."""
+    success: Tensor
+    """[N] bool, contact-gated pose success."""
+
+
+def contact_gate(tip_force: Tensor, threshold: float) -> Tensor:
+    """[N] bool: the thumb (first) and at least one other finger press with more than ``threshold`` [N]."""
+    pressing = tip_force > threshold
+    return pressing[:, 0] & pressing[:, 1:].any(dim=-1)
+
+
+def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
+    """The reward of one control step."""
+    gate = contact_gate(x.tip_force, c.contact_threshold)
+    position_error = (x.object_pos - x.goal_pos).norm(dim=-1)
+    rotation_error = quat_angle(x.object_quat, x.goal_quat)
+    success = gate & (position_error < c.success_position) & (rotation_error < c.success_rotation)
+    gate_f = gate.to(position_error.dtype)
+    terms = {
+        "reach": c.reach * (1.0 - torch.tanh(x.best_reach / c.reach_width)),
+        "grasp": c.grasp * gate_f,
+        "position": c.position * gate_f * (1.0 - torch.tanh(position_error / c.position_width)),
+        "rotation": c.rotation * gate_f * (1.0 - torch.tanh(rotation_error / c.rotation_width)),
+        "success": c.success * success.to(gate_f.dtype),
+        "action": c.action * x.action.square().sum(dim=-1),
+        "action_rate": c.action_rate * (x.action - x.previous_action).square().sum(dim=-1),
+        "out_of_bounds": c.out_of_bounds * x.out_of_bounds.to(gate_f.dtype),
+    }
+    total = c.scale * torch.stack(list(terms.values())).sum(dim=0)
+    return Reward(total=total, terms=terms, grasped=gate, success=success)

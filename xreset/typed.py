@@ -1,0 +1,53 @@
+"""Frozen dataclasses to JSON and back, strictly: an unknown or missing entry is an error, never ignored."""
+
+from __future__ import annotations
+
+import types
+import typing
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar
+
+from xreset.errors import FileFormatError
+
+T = TypeVar("T")
+
+
+def from_dict(cls: type[T], data: Any, where: str = "configuration") -> T:
+    """Build a dataclass from nested dictionaries as :func:`dataclasses.asdict` and JSON make them.
+
+    Raises:
+        FileFormatError: names the entry that is unknown, missing or of the wrong type.
+    """
+    if not isinstance(data, dict):
+        raise FileFormatError(f"{where} is {data!r}, expected an object with the entries of {cls.__name__}.")
+    hints = typing.get_type_hints(cls)
+    names = {f.name for f in fields(cls)}  # pyright: ignore[reportArgumentType]
+    unknown, missing = sorted(set(data) - names), sorted(names - set(data))
+    if unknown or missing:
+        problems = [f"unknown: {', '.join(unknown)}"] * bool(unknown) + [f"missing: {', '.join(missing)}"] * bool(missing)
+        raise FileFormatError(f"{where} does not fit {cls.__name__} ({'; '.join(problems)}). Was it written by another version of xreset?")
+    return cls(**{name: _value(hints[name], value, f"{where}.{name}") for name, value in data.items()})
+
+
+def _value(hint: Any, value: Any, where: str) -> Any:
+    if is_dataclass(hint):
+        return from_dict(typing.cast(type, hint), value, where)
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return None if value is None else _value(next(a for a in args if a is not type(None)), value, where)
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise FileFormatError(f"{where} is {value!r}, expected a list.")
+        kinds = [args[0]] * len(value) if len(args) == 2 and args[1] is Ellipsis else list(args)
+        if len(kinds) != len(value):
+            raise FileFormatError(f"{where} has {len(value)} entries, expected {len(kinds)}.")
+        return tuple(_value(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(kinds, value, strict=True)))
+    if origin is typing.Literal:
+        if value not in args:
+            raise FileFormatError(f"{where} is {value!r}, expected one of {', '.join(map(repr, args))}.")
+        return value
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
+        raise FileFormatError(f"{where} is {value!r}, expected {hint.__name__}.")
+    return value

@@ -1,0 +1,620 @@
+"""Worlds of a CPU engine in a pool of processes, behind :class:`~xreset.backends.base.Backend`.
+
+An engine is added by writing a :class:`World` (one world, numpy) and a :class:`PoolBackend` that names it.
+
+Each worker is a fresh interpreter (``python -c``), so it inherits neither torch's threads nor the caller's ``__main__``: scripts need no
+main guard. Numbers travel through one file that every process maps and that the parent then unlinks; commands travel through the worker's
+standard input, and the worker ends with it. So whatever way the parent dies, its workers end and nothing is left behind.
+
+Shape letters as in :mod:`xreset.backends.base`; arrays of one world have no leading N.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import tempfile
+import traceback
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xreset.backends.base import Backend, Contacts, Health, Links, State
+from xreset.errors import CapabilityError, XResetError
+from xreset.spec import SceneSpec, Shape
+
+STATE_FIELDS = tuple(field.name for field in fields(State))
+
+
+class World(ABC):
+    """One world of a scene in one process. Arrays are numpy float64; conventions are those of :class:`~xreset.backends.base.Backend`.
+
+    The state is undefined until :meth:`set_state`, which the pool calls first. A world that reports a non-finite state is not stepped
+    again before its state is set.
+    """
+
+    @abstractmethod
+    def __init__(self, scene: SceneSpec, object_index: int) -> None:
+        """Build the world with ``scene.objects[object_index]`` in it."""
+
+    @abstractmethod
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Set every field of :class:`~xreset.backends.base.State`; nothing of the past may remain (but physical parameters do)."""
+
+    @abstractmethod
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Every field of :class:`~xreset.backends.base.State`."""
+
+    @abstractmethod
+    def set_joint_targets(self, targets: np.ndarray) -> None:
+        """Set the drive targets (J,)."""
+
+    @abstractmethod
+    def step(self, n: int) -> None:
+        """Advance by n physics steps."""
+
+    @abstractmethod
+    def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Tracked links: position (K, 3), orientation (K, 4), velocity of the origin (K, 3), angular velocity (K, 3)."""
+
+    @abstractmethod
+    def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """On the object in the last physics step: tip force (E, 3), tip touch (E,) bool, table force (3,). Zero right after set_state."""
+
+    @abstractmethod
+    def health(self) -> tuple[bool, bool]:
+        """Whether, now, the state is not finite, and whether contacts overflowed in the last :meth:`step`."""
+
+    @abstractmethod
+    def set_object_mass(self, mass: float) -> None:
+        """Set the object's mass [kg]; the inertia scales with it."""
+
+    @abstractmethod
+    def set_friction(self, friction: np.ndarray) -> None:
+        """Set the friction of the pairs object-tip, object-other link, object-table (3,)."""
+
+    @abstractmethod
+    def set_object_gravity(self, fraction: float) -> None:
+        """Set the object's gravity fraction."""
+
+    @abstractmethod
+    def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
+        """Set the force (3,) at the object's centre of mass and the torque (3,); called before every :meth:`step`."""
+
+    def close(self) -> None:  # noqa: B027 (most engines need nothing)
+        """Free what the engine holds."""
+
+
+class PoolBackend(Backend):
+    """N worlds of a CPU engine, spread over worker processes.
+
+    A subclass sets ``name``, ``capabilities`` and ``world_class`` and says its engine's version. Getters return views of shared memory.
+    One :meth:`step` is one round trip to each worker, after which every getter is free.
+    """
+
+    world_class: ClassVar[type[World]]
+    """Must be importable by name: a class that a script defines in ``__main__`` works with ``workers=0`` only."""
+
+    def __init__(
+        self,
+        scene: SceneSpec,
+        num_worlds: int,
+        *,
+        object_index: Tensor | None = None,
+        device: str = "cpu",
+        workers: int | None = None,
+        **world_options: Any,
+    ) -> None:
+        """Build the worlds.
+
+        Args:
+            scene: what to simulate.
+            num_worlds: N.
+            object_index: [N] which object each world holds.
+            device: ``cpu``.
+            workers: number of processes; 0 runs the worlds in this process. Default: one per usable core, but no more than worlds, and
+                this process if there is one world only.
+            world_options: further keywords of the world class (picklable).
+
+        Raises:
+            CapabilityError: the device is not the CPU.
+        """
+        if torch.device(device).type != "cpu":
+            raise CapabilityError(
+                f"the backend {self.name!r} runs on the CPU only, found device {device!r}. Use device 'cpu', or the backend 'mujoco-warp'."
+            )
+        super().__init__(scene, num_worlds, object_index=object_index, device=device)
+        if workers is None:
+            workers = 0 if num_worlds == 1 else min(_usable_cores(), num_worlds)
+        if workers < 0:
+            raise ValueError(f"workers is {workers}, expected 0 or more")
+        workers = min(workers, num_worlds)
+        layout = _layout(num_worlds, len(scene.robot.joints), len(scene.robot.fingertips))
+        owned = np.array_split(np.arange(num_worlds), max(workers, 1))
+        jobs = [
+            _Job(self.name, self.world_class, dict(world_options), scene, int(w[0]), tuple(self.object_index[w].tolist())) for w in owned
+        ]
+        if workers == 0:
+            self._arrays = {name: np.zeros(shape, dtype) for name, (shape, dtype) in layout.items()}
+            self._team: _Local | _Team = _Local(jobs[0], self._arrays)
+        else:
+            self._team = _Team(jobs, layout)
+            self._arrays = self._team.arrays
+        self._close = weakref.finalize(self, self._team.close)  # also runs when the interpreter exits
+
+        views = {name: torch.from_numpy(array) for name, array in self._arrays.items()}
+        self._state = State(**{name: views[name] for name in STATE_FIELDS})
+        self._links = Links(pos=views["link_pos"], quat=views["link_quat"], linvel=views["link_linvel"], angvel=views["link_angvel"])
+        self._contacts = Contacts(tip_force=views["tip_force"], tip_touch=views["tip_touch"], table_force=views["table_force"])
+        self._health = Health(nonfinite=views["nonfinite"], overflow=views["overflow"])
+        for i, index in enumerate(self.object_index.tolist()):
+            for name, value in initial_state(scene, index).items():
+                self._arrays[name][i] = value
+        try:
+            self._command("build")
+        except BaseException:
+            self.close()
+            raise
+
+    def set_state(self, state: State, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_state`. The external wrench of those worlds ends."""
+        index = self._selected(worlds)
+        values = {name: self._checked(name, getattr(state, name), len(index)) for name in STATE_FIELDS}
+        for name, value in values.items():
+            self._arrays[name][index] = value
+        self._arrays["wrench"][index] = 0.0
+        self._command("set_state", index)
+
+    def state(self) -> State:
+        """See :meth:`Backend.state`: views of shared memory."""
+        self._must_be_open()
+        return self._state
+
+    def set_joint_targets(self, targets: Tensor) -> None:
+        """See :meth:`Backend.set_joint_targets`; the worlds read them at the next step."""
+        self._must_be_open()
+        self._arrays["joint_target"][:] = self._checked("joint_target", targets, self.num_worlds)
+
+    def step(self, substeps: int | None = None) -> None:
+        """See :meth:`Backend.step`."""
+        substeps = self.scene.substeps if substeps is None else substeps
+        if substeps < 1:
+            raise ValueError(f"substeps is {substeps}, expected at least 1")
+        self._command("step", argument=substeps)
+
+    def links(self) -> Links:
+        """See :meth:`Backend.links`: views of shared memory."""
+        self._must_be_open()
+        return self._links
+
+    def contacts(self) -> Contacts:
+        """See :meth:`Backend.contacts`: views of shared memory."""
+        self._must_be_open()
+        return self._contacts
+
+    def health(self) -> Health:
+        """See :meth:`Backend.health`: views of shared memory."""
+        self._must_be_open()
+        return self._health
+
+    def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_object_mass`."""
+        self._require("object_mass", "build a scene whose objects have the mass.")
+        self._set_parameter("object_mass", mass, worlds)
+
+    def set_friction(self, friction: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_friction`."""
+        self._require("friction", "build a scene with that friction.")
+        self._set_parameter("friction", friction, worlds)
+
+    def set_object_gravity(self, fraction: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_object_gravity`."""
+        self._require("object_gravity", "use another backend for gravity fractions.")
+        self._set_parameter("object_gravity", fraction, worlds)
+
+    def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
+        """See :meth:`Backend.set_object_wrench`; the worlds read it at the next step."""
+        self._require("object_wrench", "use another backend for external wrenches.")
+        self._must_be_open()
+        wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
+        self._arrays["wrench"][:] = self._checked("wrench", wrench, self.num_worlds)
+
+    def close(self) -> None:
+        """End the workers. Calling it twice does no harm."""
+        self._close()
+
+    def _set_parameter(self, name: str, value: Tensor, worlds: Tensor | None) -> None:
+        index = self._selected(worlds)
+        self._arrays[name][index] = self._checked(name, value, len(index))
+        self._command(f"set_{name}", index)
+
+    def _selected(self, worlds: Tensor | None) -> np.ndarray:
+        if worlds is None:
+            return np.arange(self.num_worlds)
+        index = torch.as_tensor(worlds, dtype=torch.long).detach().cpu().numpy()
+        if index.ndim != 1 or (index.size and (index.min() < 0 or index.max() >= self.num_worlds)):
+            raise ValueError(f"worlds must be a list of indices in 0..{self.num_worlds - 1}, found {worlds}")
+        return index
+
+    def _checked(self, name: str, value: Tensor, rows: int) -> np.ndarray:
+        array = torch.as_tensor(value).detach().cpu().numpy()
+        expected = (rows, *self._arrays[name].shape[1:])
+        if array.shape != expected:
+            raise ValueError(f"{name} has shape {array.shape}, expected {expected}")
+        return array
+
+    def _command(self, method: str, worlds: np.ndarray | None = None, argument: Any = None) -> None:
+        self._must_be_open()
+        try:
+            self._team.command(method, worlds, argument)
+        except _WorldFailure as failure:
+            if failure.kind is not None:
+                raise failure.kind(f"world {failure.world}: {failure.message}") from failure
+            raise RuntimeError(f"backend {self.name!r}, world {failure.world}, {method}: {failure.message}\n{failure.trace}") from failure
+        except BaseException:  # the workers and this process no longer agree on what has been done (Ctrl-C, a dead worker)
+            self.close()
+            raise
+
+    def _must_be_open(self) -> None:
+        if not self._close.alive:
+            raise XResetError(f"the backend {self.name!r} is closed (by close(), Ctrl-C or the death of a worker). Build a new one.")
+
+
+# The state that every world starts in --------------------------------------------------------------------------------------------------
+
+
+def initial_state(scene: SceneSpec, object_index: int) -> dict[str, np.ndarray]:
+    """Fields of :class:`~xreset.backends.base.State` for one world: robot at home and at rest, object upright on the table's centre."""
+    robot = scene.robot
+    height = -lowest_point(scene.objects[object_index].pieces)
+    return {
+        "joint_pos": robot.home,
+        "joint_vel": np.zeros(len(robot.joints)),
+        "joint_target": robot.home,
+        "object_pos": np.array([*scene.table.center, height]),
+        "object_quat": np.array([1.0, 0.0, 0.0, 0.0]),
+        "object_linvel": np.zeros(3),
+        "object_angvel": np.zeros(3),
+    }
+
+
+def lowest_point(shapes: Sequence[Shape]) -> float:
+    """Smallest z of the shapes, in the frame of their body [m]."""
+    return min(_lowest(shape) for shape in shapes)
+
+
+def _lowest(shape: Shape) -> float:
+    geometry, z = shape.geometry, shape.T_body_shape[2, 3]
+    row = shape.T_body_shape[2, :3]  # height of a point p of the shape's own frame: z + row . p
+    if geometry.kind == "hull":
+        return float(z + (geometry.vertices @ row).min())
+    if geometry.kind == "box":
+        return float(z - np.abs(row) @ geometry.size)
+    if geometry.kind == "sphere":
+        return float(z - geometry.size[0])
+    radius, half = geometry.size
+    if geometry.kind == "capsule":
+        return float(z - abs(row[2]) * half - radius)
+    return float(z - abs(row[2]) * half - radius * np.hypot(row[0], row[1]))
+
+
+# Shared arrays -------------------------------------------------------------------------------------------------------------------------
+
+Layout = Mapping[str, tuple[tuple[int, ...], type]]
+
+
+def _layout(n: int, joints: int, tips: int) -> Layout:
+    """Name -> shape and type of every shared array. The state is both what a world is set to and what it reports."""
+    links = 1 + tips
+    f = np.float32
+    return {
+        "joint_pos": ((n, joints), f),
+        "joint_vel": ((n, joints), f),
+        "joint_target": ((n, joints), f),
+        "object_pos": ((n, 3), f),
+        "object_quat": ((n, 4), f),
+        "object_linvel": ((n, 3), f),
+        "object_angvel": ((n, 3), f),
+        "link_pos": ((n, links, 3), f),
+        "link_quat": ((n, links, 4), f),
+        "link_linvel": ((n, links, 3), f),
+        "link_angvel": ((n, links, 3), f),
+        "tip_force": ((n, tips, 3), f),
+        "tip_touch": ((n, tips), np.bool_),
+        "table_force": ((n, 3), f),
+        "nonfinite": ((n,), np.bool_),
+        "overflow": ((n,), np.bool_),
+        "object_mass": ((n,), f),
+        "friction": ((n, 3), f),
+        "object_gravity": ((n,), f),
+        "wrench": ((n, 6), f),
+    }
+
+
+_ALIGNMENT = 64
+
+
+def _size(layout: Layout) -> int:
+    return sum(-(-int(np.prod(shape)) * np.dtype(dtype).itemsize // _ALIGNMENT) * _ALIGNMENT for shape, dtype in layout.values())
+
+
+def _map(path: str, layout: Layout) -> dict[str, np.ndarray]:
+    """The arrays of a layout over a file that all processes map."""
+    with open(path, "r+b") as file:
+        memory = mmap.mmap(file.fileno(), _size(layout))
+    arrays, offset = {}, 0
+    for name, (shape, dtype) in layout.items():
+        count = int(np.prod(shape))
+        arrays[name] = np.frombuffer(memory, dtype, count, offset).reshape(shape)
+        offset += -(-count * np.dtype(dtype).itemsize // _ALIGNMENT) * _ALIGNMENT
+    return arrays
+
+
+def _usable_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+# The worlds of one process -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Which worlds a process runs: ``first``, ``first + 1``, ... as many as it has object indices."""
+
+    backend: str
+    world_class: type[World]
+    options: Mapping[str, Any]
+    scene: SceneSpec
+    first: int
+    object_index: tuple[int, ...]
+
+
+class _WorldFailure(Exception):
+    """A world raised. Crosses process boundaries, so it holds text; ``kind`` is set for errors that the user can mend."""
+
+    def __init__(self, world: int, kind: type[XResetError] | None, message: str, trace: str) -> None:
+        super().__init__(world, kind, message, trace)
+        self.world, self.kind, self.message, self.trace = world, kind, message, trace
+
+
+@contextlib.contextmanager
+def _naming(world: int) -> Iterator[None]:
+    try:
+        yield
+    except XResetError as error:
+        raise _WorldFailure(world, type(error), str(error), traceback.format_exc()) from error
+    except Exception as error:
+        raise _WorldFailure(world, None, f"{type(error).__name__}: {error}", traceback.format_exc()) from error
+
+
+class _Local:
+    """The worlds of one job in this process."""
+
+    def __init__(self, job: _Job, arrays: Mapping[str, np.ndarray]) -> None:
+        self._job = job
+        self._arrays = arrays
+        self._numbers = range(job.first, job.first + len(job.object_index))
+        self._worlds: list[World] = []
+
+    def command(self, method: str, worlds: Sequence[int] | np.ndarray | None, argument: Any) -> None:
+        """Run one of the methods below for the given worlds (all if None)."""
+        action = getattr(self, f"_{method}")
+        for number in self._numbers if worlds is None else worlds:
+            with _naming(int(number)):
+                action(int(number), argument)
+
+    def close(self) -> None:
+        """Close the worlds."""
+        while self._worlds:
+            self._worlds.pop().close()
+
+    def _world(self, i: int) -> World:
+        return self._worlds[i - self._job.first]
+
+    def _build(self, i: int, _) -> None:
+        job = self._job
+        self._worlds.append(job.world_class(job.scene, job.object_index[i - job.first], **job.options))
+        self._set_state(i, _)
+
+    def _set_state(self, i: int, _) -> None:
+        self._world(i).set_state({name: self._arrays[name][i].astype(np.float64) for name in STATE_FIELDS})
+        self._arrays["nonfinite"][i] = self._arrays["overflow"][i] = False
+        self._publish(i)
+
+    def _step(self, i: int, n: int) -> None:
+        if self._arrays["nonfinite"][i]:
+            return
+        world = self._world(i)
+        world.set_joint_targets(self._arrays["joint_target"][i].astype(np.float64))
+        wrench = self._arrays["wrench"][i].astype(np.float64)
+        world.set_object_wrench(wrench[:3], wrench[3:])
+        world.step(n)
+        self._publish(i)
+
+    def _set_object_mass(self, i: int, _) -> None:
+        self._world(i).set_object_mass(float(self._arrays["object_mass"][i]))
+
+    def _set_friction(self, i: int, _) -> None:
+        self._world(i).set_friction(self._arrays["friction"][i].astype(np.float64))
+
+    def _set_object_gravity(self, i: int, _) -> None:
+        self._world(i).set_object_gravity(float(self._arrays["object_gravity"][i]))
+
+    def _publish(self, i: int) -> None:
+        world, arrays = self._world(i), self._arrays
+        for name, value in world.get_state().items():
+            arrays[name][i] = value
+        arrays["link_pos"][i], arrays["link_quat"][i], arrays["link_linvel"][i], arrays["link_angvel"][i] = world.links()
+        arrays["tip_force"][i], arrays["tip_touch"][i], arrays["table_force"][i] = world.contacts()
+        nonfinite, overflow = world.health()
+        arrays["nonfinite"][i] |= nonfinite
+        arrays["overflow"][i] |= overflow
+
+
+# Worker processes ----------------------------------------------------------------------------------------------------------------------
+
+_BOOT = "import sys; sys.path[:] = {path!r}; from xreset.backends.pool import serve; serve()"
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+class _Team:
+    """Worker processes, each with one job."""
+
+    def __init__(self, jobs: Sequence[_Job], layout: Layout) -> None:
+        world_class = jobs[0].world_class
+        if world_class.__module__ == "__main__" or "<locals>" in world_class.__qualname__:
+            raise XResetError(
+                f"{world_class.__qualname__} is defined in {world_class.__module__!r}, where worker processes cannot import it. "
+                "Move it to a module, or pass workers=0."
+            )
+        shared = Path("/dev/shm")
+        folder = str(shared) if os.access(shared, os.W_OK) else None  # memory where there is some, else the temporary folder
+        descriptor, path = tempfile.mkstemp(prefix="xreset-", dir=folder)
+        self._workers: list[_Worker] = []
+        try:
+            try:
+                os.truncate(descriptor, _size(layout))
+            finally:
+                os.close(descriptor)
+            self.arrays = _map(path, layout)
+            self._workers += [_Worker(job) for job in jobs]  # they start while others are still being asked
+            for worker in self._workers:
+                worker.send((path, layout, worker.job))
+            for worker in self._workers:
+                worker.receive("start")
+        except BaseException:
+            self.close()
+            raise
+        finally:
+            os.unlink(path)
+
+    def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> None:
+        """Have all workers concerned run it at the same time, and wait for all of them."""
+        asked = []
+        for worker in self._workers:
+            mine = None if worlds is None else worlds[(worlds >= worker.first) & (worlds < worker.stop)]
+            if mine is None or mine.size:
+                worker.send((method, mine, argument))
+                asked.append(worker)
+        failures = []
+        for worker in asked:
+            try:
+                worker.receive(method)
+            except _WorldFailure as failure:
+                failures.append(failure)
+        if failures:
+            raise failures[0]
+
+    def close(self) -> None:
+        """Close the workers' input, which ends them; kill those that do not end in time."""
+        for worker in self._workers:
+            worker.hang_up()
+        for worker in self._workers:
+            worker.wait()
+        self._workers.clear()
+
+
+class _Worker:
+    """One worker process, as its parent sees it."""
+
+    _PATIENCE = 5.0
+    """Seconds that a worker may take to end."""
+
+    def __init__(self, job: _Job) -> None:
+        self.job = job
+        self.first, self.stop = job.first, job.first + len(job.object_index)
+        path = [str(Path(entry or ".").absolute()) for entry in sys.path]
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _BOOT.format(path=path)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, **_ONE_THREAD},
+            start_new_session=True,  # Ctrl-C is for the parent, which then hangs up
+        )
+
+    def send(self, message: Any) -> None:
+        """Send a message; a dead worker is noticed at the reply."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(pickle.dumps(message))
+            self._process.stdin.flush()
+
+    def receive(self, doing: str) -> None:
+        """Wait for the reply: None, or an exception to raise."""
+        assert self._process.stdout is not None
+        try:
+            reply = pickle.load(self._process.stdout)
+        except (EOFError, pickle.UnpicklingError) as error:
+            raise XResetError(self._obituary(doing)) from error
+        if reply is not None:
+            raise reply
+
+    def hang_up(self) -> None:
+        """Close the worker's input."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+
+    def wait(self) -> None:
+        """Wait for the end, and force it if need be."""
+        assert self._process.stdout is not None
+        try:
+            self._process.wait(self._PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+
+    def _obituary(self, doing: str) -> str:
+        self.hang_up()
+        self.wait()
+        code = self._process.returncode
+        how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        hint = " It may have run out of memory: use fewer worlds or workers." if code == -signal.SIGKILL else ""
+        return (
+            f"a worker process of the backend {self.job.backend!r} {how} during {doing!r}; it ran worlds {self.first} to {self.stop - 1}."
+            f"{hint} What it said is on standard error; workers=0 runs the worlds in this process, where a debugger can see them."
+        )
+
+
+def serve() -> None:
+    """Main function of a worker process: read a job and then commands from standard input until it ends, reply on standard output.
+
+    Whatever the engine prints goes to standard error instead.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    commands, replies = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+
+    def attempt(action, *arguments) -> Any:
+        error, result = None, None
+        try:
+            result = action(*arguments)
+        except _WorldFailure as failure:
+            error = failure
+        except Exception:
+            error = XResetError(f"a worker process failed:\n{traceback.format_exc()}")
+        replies.write(pickle.dumps(error))
+        replies.flush()
+        return result
+
+    def start() -> _Local:
+        path, layout, job = pickle.load(commands)
+        return _Local(job, _map(path, layout))
+
+    with contextlib.suppress(EOFError, pickle.UnpicklingError, BrokenPipeError):  # the parent is gone, or done with us
+        local = attempt(start)
+        while local is not None:
+            attempt(local.command, *pickle.load(commands))

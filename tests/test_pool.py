@@ -1,0 +1,355 @@
+"""The process pool, with a toy world: what is checked here holds for every engine that runs in it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import textwrap
+import time
+import unittest
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from xreset.backends.base import State
+from xreset.backends.pool import PoolBackend, World, initial_state, lowest_point
+from xreset.errors import CapabilityError, RobotError, XResetError
+from xreset.spec import DriveSpec, FingertipSpec, Geometry, JointSpec, ObjectSpec, RobotSpec, SceneSpec, Shape
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+class ToyWorld(World):
+    """Joints jump to their targets; the object moves at its velocity plus force / mass; readings are simple functions of the state."""
+
+    def __init__(self, scene: SceneSpec, object_index: int, *, gain: float = 1.0) -> None:
+        self.scene, self.object_index, self.gain = scene, object_index, gain
+        self.mass = scene.objects[object_index].mass
+        self.friction = np.zeros(3)
+        self.force = np.zeros(3)
+        self.contact = np.zeros(3)
+
+    def set_state(self, state):
+        self.state = {name: value.copy() for name, value in state.items()}
+        self.contact = np.zeros(3)
+
+    def get_state(self):
+        return self.state
+
+    def set_joint_targets(self, targets):
+        if targets[0] == 666.0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if targets[0] == 13.0:
+            raise ZeroDivisionError("unlucky")
+        if targets[0] == 14.0:
+            raise RobotError("not like that")
+        self.state["joint_target"] = targets
+
+    def step(self, n):
+        self.state["joint_pos"] = self.gain * self.state["joint_target"]
+        self.state["object_linvel"] = self.state["object_linvel"] + n * self.force / self.mass
+        self.state["object_pos"] = self.state["object_pos"] + n * self.state["object_linvel"]
+        self.contact = np.array([0.0, 0.0, float(n)])
+
+    def links(self):
+        k = len(self.scene.robot.tracked_links)
+        quat = np.tile([1.0, 0.0, 0.0, 0.0], (k, 1))
+        return np.full((k, 3), self.state["joint_pos"][0]), quat, np.full((k, 3), 2.0), np.full((k, 3), float(self.object_index))
+
+    def contacts(self):
+        return np.tile(self.contact, (2, 1)), np.array([self.contact[2] > 0, False]), -self.contact
+
+    def health(self):
+        return not np.isfinite(self.state["object_pos"]).all(), bool(self.state["joint_target"][0] == 5.0)
+
+    def set_object_mass(self, mass):
+        self.mass = mass
+
+    def set_friction(self, friction):
+        self.friction = friction
+
+    def set_object_gravity(self, fraction):
+        raise NotImplementedError
+
+    def set_object_wrench(self, force, torque):
+        self.force = force
+
+
+class ToyBackend(PoolBackend):
+    name = "toy"
+    capabilities = frozenset({"object_mass", "friction", "object_wrench"})
+    world_class = ToyWorld
+
+    @classmethod
+    def engine_version(cls) -> str:
+        return "1"
+
+
+def toy_scene() -> SceneSpec:
+    joints = tuple(JointSpec(name=f"j{i}", group="arm", drive=DriveSpec(kp=1.0, kd=0.1, effort=1.0), home=0.1 * (i + 1)) for i in range(2))
+    tips = tuple(FingertipSpec(name=n, link=n, contact_links=(n,), keypoint="thumb4") for n in ("thumb", "index"))
+    robot = RobotSpec(
+        name="toy", urdf=Path("toy.urdf"), joints=joints, base_pos=(0, 0, 0), base_quat=(1, 0, 0, 0), palm="palm",
+        fingertips=tips, keypoints=(), hand_root="palm",
+    )  # fmt: skip
+    objects = tuple(
+        ObjectSpec(
+            name=f"o{i}", pieces=(Shape(geometry=Geometry(kind="sphere", size=(0.1 * (i + 1),))),), mass=1.0 + i, com=np.zeros(3),
+            inertia=np.eye(3), vertices=np.zeros((4, 3)), faces=np.zeros((1, 3), dtype=int),
+        )
+        for i in range(2)
+    )  # fmt: skip
+    return SceneSpec(robot=robot, objects=objects)
+
+
+def random_state(n: int, seed: int) -> State:
+    rng = torch.Generator().manual_seed(seed)
+    width = {"object_pos": 3, "object_quat": 4, "object_linvel": 3, "object_angvel": 3}
+    return State(**{f.name: torch.rand(n, width.get(f.name, 2), generator=rng) for f in fields(State)})
+
+
+class PoolTest(unittest.TestCase):
+    """Every test runs in this process and in two workers."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.pools = [ToyBackend(toy_scene(), 5, workers=workers) for workers in (0, 2)]
+
+    @classmethod
+    def tearDownClass(cls):
+        for pool in cls.pools:
+            pool.close()
+
+    def each(self):
+        for pool, kind in zip(self.pools, ("in process", "two workers"), strict=True):
+            with self.subTest(kind):
+                pool.set_state(random_state(5, 0))
+                yield pool
+
+    def test_starts_at_home_with_the_object_on_the_table(self):
+        with ToyBackend(toy_scene(), 3, workers=0) as pool:
+            torch.testing.assert_close(pool.state().joint_pos, torch.tensor([[0.1, 0.2]]).expand(3, 2))
+            torch.testing.assert_close(pool.state().object_pos[:, 2], torch.tensor([0.1, 0.2, 0.1]))
+
+    def test_state_round_trip_and_subset(self):
+        for pool in self.each():
+            pool.set_state(random_state(2, 1), torch.tensor([4, 1]))
+            expected = {f.name: getattr(random_state(5, 0), f.name) for f in fields(State)}
+            for f in fields(State):
+                expected[f.name][[4, 1]] = getattr(random_state(2, 1), f.name)
+                torch.testing.assert_close(getattr(pool.state(), f.name), expected[f.name], rtol=0, atol=0)
+
+    def test_step_moves_each_world_by_its_own_inputs(self):
+        for pool in self.each():
+            before = pool.state().to("cpu")
+            start, velocity = before.object_pos.clone(), before.object_linvel.clone()
+            targets = torch.arange(10.0).reshape(5, 2) / 100
+            pool.set_joint_targets(targets)
+            torch.testing.assert_close(pool.state().joint_target, targets)
+            force = torch.zeros(5, 3)
+            force[2, 1] = 0.5
+            pool.set_object_wrench(force, torch.zeros(5, 3))
+            pool.step(3)
+            state = pool.state()
+            torch.testing.assert_close(state.joint_pos, targets)
+            torch.testing.assert_close(pool.links().pos[:, 1, 2], targets[:, 0])
+            torch.testing.assert_close(pool.links().angvel[:, 0, 0], torch.tensor([0.0, 1.0, 0.0, 1.0, 0.0]))
+            velocity[2, 1] += 3 * 0.5 / 1.0
+            torch.testing.assert_close(state.object_linvel, velocity)
+            torch.testing.assert_close(state.object_pos, start + 3 * velocity)
+            torch.testing.assert_close(pool.contacts().tip_force[:, :, 2], torch.full((5, 2), 3.0))
+            self.assertEqual(pool.contacts().tip_touch.tolist(), [[True, False]] * 5)
+            pool.set_state(random_state(1, 2), torch.tensor([3]))
+            self.assertEqual(pool.contacts().table_force[:, 2].tolist(), [-3.0, -3.0, -3.0, 0.0, -3.0])
+
+    def test_setting_a_state_ends_the_wrench(self):
+        for pool in self.each():
+            pool.set_object_wrench(torch.ones(5, 3), torch.zeros(5, 3))
+            pool.set_state(random_state(1, 2), torch.tensor([0]))
+            before = pool.state().object_linvel.clone()
+            pool.step(1)
+            change = (pool.state().object_linvel - before)[:, 0]
+            torch.testing.assert_close(change, torch.tensor([0.0, 0.5, 1.0, 0.5, 1.0]))
+
+    def test_mass_of_some_worlds(self):
+        for pool in self.each():
+            pool.set_object_mass(torch.tensor([4.0, 8.0]), torch.tensor([4, 0]))
+            pool.set_object_wrench(torch.ones(5, 3), torch.zeros(5, 3))
+            before = pool.state().object_linvel.clone()
+            pool.step(1)
+            torch.testing.assert_close((pool.state().object_linvel - before)[:, 0], torch.tensor([0.125, 0.5, 1.0, 0.5, 0.25]))
+            pool.set_object_mass(torch.tensor([1.0, 1.0]), torch.tensor([4, 0]))
+
+    def test_health_sticks_until_the_state_is_set_and_a_broken_world_rests(self):
+        for pool in self.each():
+            bad = random_state(5, 0)
+            bad.object_pos[1, 0] = float("nan")
+            bad.joint_target[2, 0] = 5.0
+            pool.set_state(bad)
+            self.assertEqual(pool.health().nonfinite.tolist(), [False, True, False, False, False])
+            self.assertEqual(pool.health().overflow.tolist(), [False, False, True, False, False])
+            pool.set_joint_targets(torch.zeros(5, 2))
+            pool.step(1)
+            self.assertEqual(pool.health().overflow.tolist(), [False, False, True, False, False])
+            torch.testing.assert_close(pool.state().joint_pos[1], bad.joint_pos[1])
+            torch.testing.assert_close(pool.state().joint_pos[0], torch.zeros(2))
+            pool.set_state(random_state(5, 0))
+            self.assertFalse(pool.health().nonfinite.any() or pool.health().overflow.any())
+
+    def test_an_exception_names_its_world_and_leaves_the_pool_usable(self):
+        for pool in self.each():
+            targets = torch.zeros(5, 2)
+            targets[3, 0] = 13.0
+            pool.set_joint_targets(targets)
+            with self.assertRaisesRegex(RuntimeError, r"(?s)'toy', world 3, step: ZeroDivisionError: unlucky.*in set_joint_targets"):
+                pool.step(1)
+            targets[3, 0] = 14.0
+            pool.set_joint_targets(targets)
+            with self.assertRaisesRegex(RobotError, "world 3: not like that"):
+                pool.step(1)
+            pool.set_joint_targets(torch.ones(5, 2))
+            pool.step(1)
+            torch.testing.assert_close(pool.state().joint_pos, torch.ones(5, 2))
+
+    def test_wrong_input(self):
+        for pool in self.each():
+            with self.assertRaisesRegex(ValueError, r"joint_target has shape \(5, 3\), expected \(5, 2\)"):
+                pool.set_joint_targets(torch.zeros(5, 3))
+            with self.assertRaisesRegex(ValueError, "joint_pos has shape"):
+                pool.set_state(random_state(4, 0))
+            with self.assertRaisesRegex(ValueError, "indices in 0..4"):
+                pool.set_state(random_state(1, 0), torch.tensor([5]))
+            with self.assertRaisesRegex(CapabilityError, "'toy' cannot set object gravity"):
+                pool.set_object_gravity(torch.ones(5))
+        with self.assertRaisesRegex(CapabilityError, "CPU only"):
+            ToyBackend(toy_scene(), 1, device="cuda")
+
+    def test_options_reach_the_worlds(self):
+        with ToyBackend(toy_scene(), 2, workers=1, gain=3.0) as pool:
+            pool.set_joint_targets(torch.ones(2, 2))
+            pool.step(1)
+            torch.testing.assert_close(pool.state().joint_pos, torch.full((2, 2), 3.0))
+
+    def test_closed(self):
+        for workers in (0, 1):
+            pool = ToyBackend(toy_scene(), 2, workers=workers)
+            pool.close()
+            pool.close()
+            with self.assertRaisesRegex(XResetError, "is closed"):
+                pool.step()
+
+    def test_a_failing_constructor(self):
+        for workers in (0, 1):
+            with self.subTest(workers=workers), self.assertRaisesRegex(RuntimeError, "world 0, build: TypeError"):
+                ToyBackend(toy_scene(), 2, workers=workers, nonsense=1)
+
+
+class DeathTest(unittest.TestCase):
+    def test_a_dead_worker_is_reported_and_closes_the_pool(self):
+        pool = ToyBackend(toy_scene(), 4, workers=2)
+        targets = torch.zeros(4, 2)
+        targets[2, 0] = 666.0
+        pool.set_joint_targets(targets)
+        with self.assertRaisesRegex(XResetError, "SIGKILL during 'step'; it ran worlds 2 to 3"):
+            pool.step(1)
+        with self.assertRaisesRegex(XResetError, "is closed"):
+            pool.step(1)
+
+    def script(self, body: str, **options):
+        source = "from tests.test_pool import *\n" + textwrap.dedent(body)
+        with tempfile.NamedTemporaryFile("w", suffix=".py") as file:
+            file.write(source)
+            file.flush()
+            process = subprocess.Popen(
+                [sys.executable, file.name], env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, text=True,
+                stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options,
+            )  # fmt: skip
+            yield process
+            if process.poll() is None:
+                process.kill()
+            process.communicate()
+
+    def test_a_script_without_main_guard_or_close_ends_cleanly(self):
+        body = """
+        pool = ToyBackend(toy_scene(), 2, workers=1)
+        pool.step()
+        print(pool._team._workers[0]._process.pid)
+        """
+        for process in self.script(body):
+            out, err = process.communicate(timeout=60)
+            self.assertEqual((process.returncode, err), (0, ""))
+            self.assert_gone(int(out))
+
+    def test_ctrl_c_and_a_killed_parent_leave_no_worker(self):
+        body = """
+        pool = ToyBackend(toy_scene(), 2, workers=1)
+        print(pool._team._workers[0]._process.pid, flush=True)
+        while True:
+            pool.step()
+        """
+        for number in (signal.SIGINT, signal.SIGKILL):
+            for process in self.script(body):
+                worker = int(process.stdout.readline())
+                process.send_signal(number)
+                _, err = process.communicate(timeout=60)
+                self.assertEqual(err.count("Traceback"), 1 if number == signal.SIGINT else 0, err)
+                self.assert_gone(worker)
+
+    def assert_gone(self, pid: int):
+        for _ in range(100):
+            try:
+                os.kill(pid, 0)
+            except ProcessLookupError:
+                return
+            if "Z" in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]:
+                return  # nobody's child any more, waiting for init
+            time.sleep(0.05)
+        self.fail(f"worker {pid} still runs")
+
+    def test_a_world_class_of_a_script_is_refused(self):
+        body = """
+        class Mine(ToyWorld): pass
+        class MineBackend(ToyBackend): world_class = Mine
+        try:
+            MineBackend(toy_scene(), 2, workers=1)
+        except XResetError as error:
+            print(error)
+        """
+        for process in self.script(body):
+            out, _ = process.communicate(timeout=60)
+            self.assertIn("Move it to a module, or pass workers=0", out)
+
+
+class RestHeightTest(unittest.TestCase):
+    def test_lowest_points(self):
+        from scipy.spatial.transform import Rotation
+
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix()
+        T[:3, 3] = (0.3, -0.2, 0.5)
+        angles = np.linspace(0, 2 * np.pi, 2001)
+        rim = np.stack([0.2 * np.cos(angles), 0.2 * np.sin(angles), np.zeros_like(angles)], axis=1)
+        cylinder = np.concatenate([rim + np.array([0, 0, 0.3]), rim - np.array([0, 0, 0.3])])
+        corners = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.2, 0.2) for z in (-0.3, 0.3)])
+        cases = [
+            (Geometry(kind="box", size=(0.1, 0.2, 0.3)), corners, 0.0),
+            (Geometry(kind="cylinder", size=(0.2, 0.3)), cylinder, 0.0),
+            (Geometry(kind="capsule", size=(0.2, 0.3)), np.array([[0, 0, 0.3], [0, 0, -0.3]]), 0.2),
+            (Geometry(kind="sphere", size=(0.25,)), np.zeros((1, 3)), 0.25),
+            (Geometry(kind="hull", vertices=corners, faces=np.zeros((1, 3), dtype=int)), corners, 0.0),
+        ]
+        for geometry, points, margin in cases:
+            expected = (points @ T[:3, :3].T + T[:3, 3])[:, 2].min() - margin
+            self.assertAlmostEqual(lowest_point([Shape(geometry=geometry, T_body_shape=T)]), expected, places=5, msg=geometry.kind)
+
+    def test_initial_state_has_every_field(self):
+        self.assertEqual(set(initial_state(toy_scene(), 0)), {f.name for f in fields(State)})
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,159 @@
+"""Writing URDFs of the built-in robots from tables of published figures.
+
+The figures become a :class:`~xreset.urdf.RobotTree`, the same plain data that a URDF is read into, so writing and reading are inverse.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+
+from xreset.spec import Geometry, MimicSpec, Shape
+from xreset.urdf import Joint, Link, RobotTree
+
+FRAME_MASS = 1e-4
+"""Mass [kg] of a link that is only a frame: some engines invent a mass (1 kg) for a link that has none."""
+FRAME_INERTIA = 1e-7
+"""Its moment of inertia about every axis [kg m^2]."""
+
+
+def pose(xyz: Sequence[float] = (0, 0, 0), *, rpy: Sequence[float] = (0, 0, 0), quat: Sequence[float] | None = None) -> np.ndarray:
+    """[4, 4] pose from a position [m] and roll, pitch, yaw about fixed axes [rad], or a quaternion (w, x, y, z) of any length."""
+    from scipy.spatial.transform import Rotation
+
+    rotation = Rotation.from_euler("xyz", rpy) if quat is None else Rotation.from_quat(np.array(quat, dtype=float), scalar_first=True)
+    T = np.eye(4)
+    T[:3, :3] = rotation.as_matrix()
+    T[:3, 3] = xyz
+    return T
+
+
+def inertia_matrix(ixx: float, ixy: float, ixz: float, iyy: float, iyz: float, izz: float) -> np.ndarray:
+    """[3, 3] symmetric matrix from its six figures in the order of a URDF."""
+    return np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+
+
+def box(size: Sequence[float], center: Sequence[float] = (0, 0, 0)) -> Shape:
+    """A box of full edge lengths ``size`` [m]."""
+    return Shape(geometry=Geometry(kind="box", size=tuple(s / 2 for s in size)), T_body_shape=pose(center))
+
+
+def capsule(start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
+    """A capsule whose axis runs from ``start`` to ``end`` [m]; the round ends lie beyond them."""
+    return _between("capsule", start, end, radius)
+
+
+def cylinder(start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
+    """A cylinder whose axis runs from ``start`` to ``end`` [m]."""
+    return _between("cylinder", start, end, radius)
+
+
+def frame(name: str) -> Link:
+    """A link that is only a frame: no shape, and a mass too small to matter."""
+    return Link(name=name, mass=FRAME_MASS, com=np.zeros(3), inertia=np.eye(3) * FRAME_INERTIA, collisions=())
+
+
+def fixed(parent: str, child: str, T_parent_child: np.ndarray) -> Joint:
+    """A fixed joint."""
+    return Joint(
+        name=f"{child}_fixed",
+        type="fixed",
+        parent=parent,
+        child=child,
+        T_parent_joint=T_parent_child,
+        axis=np.array([1.0, 0, 0]),
+        lower=-math.inf,
+        upper=math.inf,
+        velocity=math.inf,
+    )
+
+
+def urdf_text(tree: RobotTree, effort: Mapping[str, float], *, mimics: Sequence[MimicSpec] = (), comment: str = "") -> str:
+    """The URDF of a tree.
+
+    Args:
+        tree: links and joints.
+        effort: largest torque [N m] or force [N] of each moving joint that has a drive; 0 is written for the others (mimic joints).
+        mimics: joints that follow another.
+        comment: where the figures come from; stands at the top.
+
+    Returns:
+        The file's text. Numbers have nine significant digits, so the same figures give the same text.
+    """
+    robot = Element("robot", name=tree.name)
+    for link in tree.links:
+        _write_link(robot, link)
+    by_joint = {mimic.joint: mimic for mimic in mimics}
+    for joint in tree.joints:
+        element = SubElement(robot, "joint", name=joint.name, type=joint.type)
+        _write_origin(element, joint.T_parent_joint)
+        SubElement(element, "parent", link=joint.parent)
+        SubElement(element, "child", link=joint.child)
+        if joint.type == "fixed":
+            continue
+        SubElement(element, "axis", xyz=_numbers(joint.axis))
+        limit = {"lower": joint.lower, "upper": joint.upper, "effort": effort.get(joint.name, 0.0), "velocity": joint.velocity}
+        SubElement(element, "limit", {key: _number(value) for key, value in limit.items()})
+        if mimic := by_joint.get(joint.name):
+            SubElement(element, "mimic", joint=mimic.source, multiplier=_number(mimic.multiplier), offset=_number(mimic.offset))
+    ElementTree.indent(robot)
+    head = "".join(f"  {line}\n" for line in comment.splitlines())
+    return f'<?xml version="1.0"?>\n<!--\n{head}-->\n{ElementTree.tostring(robot, encoding="unicode")}\n'
+
+
+def _between(kind: str, start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
+    from scipy.spatial.transform import Rotation
+
+    a, b = np.array(start, dtype=float), np.array(end, dtype=float)
+    length = float(np.linalg.norm(b - a))
+    direction = (b - a) / length
+    T = np.eye(4)
+    T[:3, 3] = (a + b) / 2
+    turn = np.cross([0.0, 0, 1], direction)
+    sine = float(np.linalg.norm(turn))
+    if sine > 1e-9:
+        T[:3, :3] = Rotation.from_rotvec(turn / sine * math.atan2(sine, direction[2])).as_matrix()
+    return Shape(geometry=Geometry(kind="capsule" if kind == "capsule" else "cylinder", size=(radius, length / 2)), T_body_shape=T)
+
+
+def _write_link(robot: Element, link: Link) -> None:
+    element = SubElement(robot, "link", name=link.name)
+    inertial = SubElement(element, "inertial")
+    SubElement(inertial, "origin", xyz=_numbers(link.com))
+    SubElement(inertial, "mass", value=_number(link.mass))
+    names = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+    SubElement(inertial, "inertia", {name: _number(link.inertia[at]) for name, at in names.items()})
+    for shape in link.collisions:
+        collision = SubElement(element, "collision")
+        _write_origin(collision, shape.T_body_shape)
+        geometry, size = SubElement(collision, "geometry"), shape.geometry.size
+        if shape.geometry.kind == "box":
+            SubElement(geometry, "box", size=_numbers(2 * s for s in size))
+        else:
+            SubElement(geometry, shape.geometry.kind, radius=_number(size[0]), length=_number(2 * size[1]))
+
+
+def _write_origin(element: Element, T: np.ndarray) -> None:
+    SubElement(element, "origin", xyz=_numbers(T[:3, 3]), rpy=_numbers(_roll_pitch_yaw(T[:3, :3])))
+
+
+def _roll_pitch_yaw(R: np.ndarray) -> tuple[float, float, float]:
+    """Angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad]; yaw is 0 where pitch is +-90 degrees and only the sum of the two is defined."""
+    level = math.hypot(R[0, 0], R[1, 0])
+    pitch = math.atan2(-R[2, 0], level)
+    if level < 1e-5:
+        return math.atan2(-R[1, 2], R[1, 1]), pitch, 0.0
+    return math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])
+
+
+def _numbers(values) -> str:
+    return " ".join(_number(value) for value in values)
+
+
+def _number(value: float) -> str:
+    text = f"{round(float(value), 12):.9g}"
+    return "0" if text == "-0" else text

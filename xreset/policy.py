@@ -23,6 +23,8 @@ from xreset.task.observations import layout
 if TYPE_CHECKING:
     from tensordict import TensorDict
 
+    from xreset.env import ManipulationEnv
+
 SCHEMA = "xreset-policy/1"
 
 
@@ -31,8 +33,8 @@ class Policy(Protocol):
 
     name: str
 
-    def reset(self, worlds: Tensor | None = None) -> None:
-        """Forget the past of some worlds [M] (None: of all)."""
+    def begin(self, env: ManipulationEnv) -> None:
+        """Called when episodes have just begun in every world of the environment."""
         ...
 
     def act(self, observations: TensorDict) -> Tensor:
@@ -66,7 +68,9 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
         raise PolicyError(f"{source} has policy schema {contract.get('schema')!r}, expected {SCHEMA!r}. Export it again.")
     for key, what in (("robot", "robot"), ("joint_names", "joint order"), ("fingertip_names", "fingertips")):
         if contract[key] != here[key]:
-            raise PolicyError(f"{source} was trained with another {what}: {contract[key]}, here it is {here[key]}. Use --robot {contract['robot']}.")
+            raise PolicyError(
+                f"{source} was trained with another {what}: {contract[key]}, here it is {here[key]}. Use --robot {contract['robot']}."
+            )
     if contract["robot_fingerprint"] != here["robot_fingerprint"]:
         raise PolicyError(f"{source} was trained on another version of {robot.name!r}: its URDF or description has changed. Train again.")
     if contract["observation_layout"] != here["observation_layout"]:
@@ -77,7 +81,9 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
             for term in dict.fromkeys([*theirs, *ours])
             if theirs.get(term) != ours.get(term)
         ]
-        raise PolicyError(f"{source} was trained with another observation layout ({'; '.join(differing)}). Use the run's own configuration.")
+        raise PolicyError(
+            f"{source} was trained with another observation layout ({'; '.join(differing)}). Use the run's own configuration."
+        )
     if abs(contract["control_dt"] - here["control_dt"]) > 1e-9:
         raise PolicyError(f"{source} acts every {contract['control_dt']:.6f} s, here a control step lasts {here['control_dt']:.6f} s.")
 
@@ -112,13 +118,9 @@ class OnnxPolicy:
         self._lstm_dim = int(self._session.get_inputs()[2].shape[2])
         self._state: list[np.ndarray] | None = None
 
-    def reset(self, worlds: Tensor | None = None) -> None:
+    def begin(self, env: ManipulationEnv) -> None:
         """Zero the recurrent state."""
-        if worlds is None:
-            self._state = None
-        elif self._state is not None:
-            for part in self._state:
-                part[:, worlds.cpu().numpy()] = 0.0
+        self._state = None
 
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] mean action, on the observations' device."""
@@ -145,7 +147,7 @@ class ZeroPolicy:
     def __init__(self, num_actions: int) -> None:
         self._num_actions = num_actions
 
-    def reset(self, worlds: Tensor | None = None) -> None:
+    def begin(self, env: ManipulationEnv) -> None:
         """Nothing to forget."""
 
     def act(self, observations: TensorDict) -> Tensor:
@@ -162,7 +164,7 @@ class RandomPolicy:
     def __init__(self, num_actions: int, seed: int) -> None:
         self._num_actions, self._generator = num_actions, torch.Generator().manual_seed(seed)
 
-    def reset(self, worlds: Tensor | None = None) -> None:
+    def begin(self, env: ManipulationEnv) -> None:
         """Nothing to forget."""
 
     def act(self, observations: TensorDict) -> Tensor:

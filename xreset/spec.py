@@ -16,10 +16,10 @@ import numpy as np
 GRAVITY = 9.81
 """Magnitude of gravity in m/s^2; it points along -z."""
 
-KEYPOINTS = ("wrist",) + tuple(f"{finger}{i}" for finger in ("thumb", "index", "middle", "ring", "little") for i in range(1, 5))
-"""The 21 human hand keypoints in the order of the demonstrations: the wrist, then each finger from base (1) to tip (4)."""
-
 FINGERS = ("thumb", "index", "middle", "ring", "little")
+
+KEYPOINTS = ("wrist", *(f"{finger}{i}" for finger in FINGERS for i in range(1, 5)))
+"""The 21 human hand keypoints in the order of the demonstrations: the wrist, then each finger from base (1) to tip (4)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """The command line: ``xreset COMMAND ...``.
 
-The first word picks a module of this package, which is only then imported, so that ``xreset --help`` is instant. A command module holds typed
-functions; tyro turns their signatures and docstrings into flags.
+The first word picks a module of this package, which is only then imported, so that ``xreset --help`` is instant. A command module holds
+typed functions; tyro turns their signatures and docstrings into flags.
 """
 
 from __future__ import annotations

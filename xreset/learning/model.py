@@ -37,7 +37,9 @@ class PointNet(nn.Module):
 class Trunk(nn.Module):
     """From observations to the MLP's input: what training and the exported policy share."""
 
-    def __init__(self, flat_dim: int, history: int, pointnet_dims: list[int], lstm_dim: int, activation: str, normalizer: nn.Module) -> None:
+    def __init__(
+        self, flat_dim: int, history: int, pointnet_dims: list[int], lstm_dim: int, activation: str, normalizer: nn.Module
+    ) -> None:
         """Build normaliser, PointNet, LSTM and layer norm."""
         super().__init__()
         self.normalizer = normalizer

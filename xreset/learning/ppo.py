@@ -6,6 +6,8 @@ that the rollout had there, an episode's end inside a piece zeroes the state, an
 
 from __future__ import annotations
 
+import contextlib
+import io
 from collections.abc import Generator
 from typing import Any
 
@@ -26,9 +28,7 @@ class SequenceStorage(RolloutStorage):
         super().__init__(*args, **options)
         self.sequence_length = sequence_length
 
-    def recurrent_mini_batch_generator(
-        self, num_mini_batches: int, num_epochs: int = 8
-    ) -> Generator[RolloutStorage.Batch, None, None]:
+    def recurrent_mini_batch_generator(self, num_mini_batches: int, num_epochs: int = 8) -> Generator[RolloutStorage.Batch, None, None]:
         """Yield minibatches of sequences [L, M, ...]; ``masks`` [L, M] is True where a step is the first of an episode."""
         length, pieces = self.sequence_length, self.num_transitions_per_env // self.sequence_length
         total = pieces * self.num_envs
@@ -82,7 +82,8 @@ class SequencePpo(PPO):
         alg_class, alg_cfg = resolve_class(cfg["algorithm"])
         actor_class, actor_cfg = resolve_class(cfg["actor"])
         critic_class, critic_cfg = resolve_class(cfg["critic"])
-        groups = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
+        with contextlib.redirect_stdout(io.StringIO()):
+            groups = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
         actor = actor_class(obs, groups, "actor", env.num_actions, **actor_cfg).to(device)
         critic = critic_class(obs, groups, "critic", 1, **critic_cfg).to(device)
         length = alg_cfg.pop("sequence_length")

@@ -1,7 +1,8 @@
 """Observations (the paper's appendix C), as pure functions, and the layout that a policy file carries.
 
 Groups: ``policy`` (object pose, goal pose, gravity fraction, previous action), ``proprio`` (joints, palm, fingertips, contact forces),
-``perception`` (cloud history) and, for the critic only, ``privileged``. Shape letters: N worlds, J joints, E fingertips, P points, H history.
+``perception`` (cloud history) and, for the critic only, ``privileged``.
+Shape letters: N worlds, J joints, E fingertips, P points, H history.
 """
 
 from __future__ import annotations

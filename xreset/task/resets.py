@@ -6,7 +6,9 @@ The goal is the last object pose of the same demonstration.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Self
 
 import numpy as np
 import torch
@@ -37,6 +39,15 @@ class Reset:
     sequence: Tensor
     """[M] index of the demonstration."""
 
+    @classmethod
+    def stack(cls, parts: Sequence[Self]) -> Self:
+        """Several resets as one."""
+        return cls(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(cls)})
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same on another device."""
+        return type(self)(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
 
 class ResetDistribution:
     """Draws resets for worlds of given objects from a bank; all tensors live on one device, nothing is copied per draw."""
@@ -56,7 +67,7 @@ class ResetDistribution:
         Raises:
             DemoError: an object of the scene has no demonstration in the bank.
         """
-        self.config = config
+        self.config, self.device = config, torch.device(device)
         if config.pre_contact_only:
             bank = bank.select(pre_contact_only=True)
         missing = [name for name in object_names if name not in bank.sequence_object]

@@ -1,0 +1,128 @@
+"""Evaluation results as files: one JSON per engine, its episodes and traces beside it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from xreset.eval.rollout import Episode, Rollouts, Trace
+from xreset.eval.stats import bootstrap_ci95
+from xreset.files import Field, read_json, read_npz, write_json, write_npz
+
+SCHEMA = "xreset-eval/1"
+TRACE_SCHEMA = "xreset-trace/1"
+
+_TRACE_FIELDS = {
+    "time": Field(("T",), "f"),
+    "joint_names": Field(("J",), "U"),
+    "joint_pos": Field(("K", "T", "J"), "f"),
+    "object_pos": Field(("K", "T", 3), "f"),
+    "object_quat_wxyz": Field(("K", "T", 4), "f"),
+    "goal_pos": Field(("K", 3), "f"),
+    "goal_quat_wxyz": Field(("K", 4), "f"),
+    "object_name": Field(("K",), "U"),
+    "sequence_index": Field(("K",), "i"),
+}
+
+
+def summarize(
+    rollouts: Rollouts, *, backend: str, backend_version: str, robot: str, policy: str, seed: int, repetitions: int, inputs: dict[str, str],
+    objects_folder: str | None,
+) -> dict[str, Any]:  # fmt: skip
+    """The content of ``eval/BACKEND.json``."""
+    episodes = rollouts.episodes
+    progress = np.array([e.task_progress for e in episodes])
+    groups = np.array([e.sequence for e in episodes])
+
+    def rate(name: str) -> float:
+        return round(float(np.mean([getattr(e, name) for e in episodes])), 6)
+
+    return {
+        "schema": SCHEMA,
+        "backend": backend,
+        "backend_version": backend_version,
+        "robot": robot,
+        "objects": sorted({e.object for e in episodes}),
+        "objects_folder": objects_folder,
+        "policy": policy,
+        "episodes": len(episodes),
+        "episodes_per_demo": repetitions,
+        "seed": seed,
+        "task_progress": {"mean": round(float(progress.mean()), 6), "ci95": [round(x, 6) for x in bootstrap_ci95(progress, groups)]},
+        "approach_rate": rate("approach"),
+        "grasp_rate": rate("grasp"),
+        "reorient_rate": rate("reorient"),
+        "reorient_once_rate": rate("reorient_once"),
+        "reorientation_progress": rate("reorientation_progress"),
+        "per_demo": [_per_demo([e for e in episodes if e.sequence == s]) for s in dict.fromkeys(groups.tolist())],
+        "health": {name: sum(getattr(e, name) for e in episodes) for name in ("nonfinite", "overflow", "out_of_bounds")},
+        "control_steps_per_second": round(rollouts.control_steps_per_second, 1),
+        "inputs": inputs,
+    }
+
+
+def write_results(folder: Path, summary: dict[str, Any], rollouts: Rollouts, joint_names: tuple[str, ...]) -> Path:
+    """Write ``BACKEND.json``, ``BACKEND.episodes.json`` and ``BACKEND.trace.npz``; returns the first."""
+    name = summary["backend"]
+    write_json(folder / f"{name}.episodes.json", {"schema": "xreset-episodes/1", "episodes": [asdict(e) for e in rollouts.episodes]})
+    traces = rollouts.traces
+    write_npz(
+        folder / f"{name}.trace.npz",
+        TRACE_SCHEMA,
+        {
+            "time": traces[0].time,
+            "joint_names": np.array(joint_names),
+            "joint_pos": np.stack([t.joint_pos for t in traces]),
+            "object_pos": np.stack([t.object_pos for t in traces]),
+            "object_quat_wxyz": np.stack([t.object_quat for t in traces]),
+            "goal_pos": np.stack([t.goal_pos for t in traces]),
+            "goal_quat_wxyz": np.stack([t.goal_quat for t in traces]),
+            "object_name": np.array([t.object for t in traces]),
+            "sequence_index": np.array([t.sequence for t in traces]),
+        },
+    )
+    write_json(folder / f"{name}.json", summary)
+    return folder / f"{name}.json"
+
+
+def read_results(folder: Path) -> list[dict[str, Any]]:
+    """Every engine's summary in an ``eval`` folder, in order of name."""
+    files = sorted(f for f in folder.glob("*.json") if not f.name.endswith(".episodes.json"))
+    return [read_json(file, SCHEMA) for file in files]
+
+
+def read_traces(folder: Path, backend: str) -> tuple[Trace, ...]:
+    """The traces of one engine."""
+    a = read_npz(folder / f"{backend}.trace.npz", TRACE_SCHEMA, _TRACE_FIELDS, what="an evaluation trace")
+    return tuple(
+        Trace(
+            sequence=int(a["sequence_index"][i]),
+            object=str(a["object_name"][i]),
+            goal_pos=a["goal_pos"][i],
+            goal_quat=a["goal_quat_wxyz"][i],
+            time=a["time"],
+            joint_pos=a["joint_pos"][i],
+            object_pos=a["object_pos"][i],
+            object_quat=a["object_quat_wxyz"][i],
+        )
+        for i in range(len(a["object_name"]))
+    )
+
+
+def _per_demo(episodes: list[Episode]) -> dict[str, Any]:
+    def mean(name: str) -> float:
+        return round(float(np.mean([getattr(e, name) for e in episodes])), 6)
+
+    return {
+        "sequence": episodes[0].sequence_name,
+        "object": episodes[0].object,
+        "episodes": len(episodes),
+        "task_progress": mean("task_progress"),
+        "approach_rate": mean("approach"),
+        "grasp_rate": mean("grasp"),
+        "reorient_rate": mean("reorient"),
+        "reorientation_progress": mean("reorientation_progress"),
+    }

@@ -1,0 +1,206 @@
+"""Rollouts of a policy in one engine: the same episodes, from the same states, in every engine."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from xreset.backends import make_backend
+from xreset.env import ManipulationEnv, make_scene
+from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
+from xreset.objects import keypoints
+from xreset.policy import Policy
+from xreset.resets.bank import ResetBank
+from xreset.schedule import schedule
+from xreset.spec import ObjectSpec, RobotSpec
+from xreset.task.config import TaskConfig
+from xreset.task.resets import Reset, ResetDistribution
+from xreset.task.terminations import out_of_bounds
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """Result of one episode."""
+
+    sequence: int
+    """Index of the demonstration."""
+    sequence_name: str
+    object: str
+    repetition: int
+    """Which perturbation of the demonstration's start."""
+    approach: bool
+    grasp: bool
+    reorient: bool
+    reorient_once: bool
+    """Whether the object was at the goal at any time."""
+    reorientation_progress: float
+    task_progress: float
+    out_of_bounds: bool
+    nonfinite: bool
+    overflow: bool
+    """Whether the engine dropped contacts or constraints."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trace:
+    """States of one episode, for pictures."""
+
+    sequence: int
+    object: str
+    goal_pos: np.ndarray
+    goal_quat: np.ndarray
+    time: np.ndarray
+    """[T] s"""
+    joint_pos: np.ndarray
+    """[T, J]"""
+    object_pos: np.ndarray
+    object_quat: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rollouts:
+    """All episodes of one policy in one engine."""
+
+    episodes: tuple[Episode, ...]
+    traces: tuple[Trace, ...]
+    """The first episode of each object."""
+    control_steps_per_second: float
+    """World steps per second of wall time, policy and observations included."""
+
+
+def roll_out(
+    policy: Policy,
+    backend_name: str,
+    robot: RobotSpec,
+    objects: tuple[ObjectSpec, ...],
+    demos: ResetBank,
+    task: TaskConfig,
+    *,
+    repetitions: int,
+    seed: int,
+    num_envs: int,
+    device: str = "cpu",
+    trace_interval: float = 0.05,
+    metrics: MetricsConfig | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Rollouts:
+    """Run every demonstration ``repetitions`` times.
+
+    Args:
+        policy: what acts.
+        backend_name: engine.
+        robot: robot.
+        objects: objects of the demonstrations.
+        demos: starts and goals (its states are not used).
+        task: usually :func:`xreset.task.config.evaluation_task` of the policy's own.
+        repetitions: episodes per demonstration, each with its own perturbation of robot and object.
+        seed: of the perturbations: the same in every engine and for every number of worlds.
+        num_envs: worlds at a time.
+        device: of GPU engines.
+        trace_interval: time between the states of a trace [s].
+        metrics: thresholds.
+        progress: called with (control steps done, control steps in all).
+    """
+    names = tuple(o.name for o in objects)
+    sequences = np.repeat(np.arange(len(demos.sequence_name)), repetitions)
+    repetition = np.tile(np.arange(repetitions), len(demos.sequence_name))
+    object_of = np.array([names.index(name) for name in demos.sequence_object])[sequences]
+    plan = schedule(object_of, num_envs)
+    first_of_object = {int(np.flatnonzero(object_of == i)[0]) for i in np.unique(object_of)}
+    scene = make_scene(robot, objects, task)
+    found: dict[int, Episode] = {}
+    traces: list[Trace] = []
+    steps, spent = 0, 0.0
+    options = {"device": device} if device != "cpu" else {}
+    with make_backend(backend_name, scene, len(plan.object_index), object_index=torch.as_tensor(plan.object_index), **options) as backend:
+        resets = ResetDistribution(demos, robot, names, task.reset, backend.device)
+        env = ManipulationEnv(backend, task, resets, seed=seed)
+        points = torch.stack([torch.as_tensor(keypoints(o), dtype=torch.float32) for o in objects]).to(backend.device)[backend.object_index]
+        every = max(1, round(trace_interval / scene.control_dt))
+        for number, (items, fresh) in enumerate(plan):
+            env.reset(start=_starts(resets, sequences[items], repetition[items], seed, demos, robot, names, task))
+            policy.begin(env)
+            reading = env.reading()
+            result = EpisodeMetrics(reading, env.goal_pos, env.goal_quat, points, metrics or MetricsConfig())
+            recorder = _Recorder([int(w) for w in np.flatnonzero(fresh & np.isin(items, list(first_of_object)))])
+            recorder.add(0.0, reading)
+            for step in range(env.max_episode_length):
+                before = time.perf_counter()
+                reading, _ = env.advance(policy.act(env.get_observations()))
+                result.update(reading, out_of_bounds(reading.state.object_pos, scene.table, task.termination))
+                spent += time.perf_counter() - before
+                if (step + 1) % every == 0:
+                    recorder.add((step + 1) * scene.control_dt, reading)
+                progress(number * env.max_episode_length + step + 1, len(plan.rounds) * env.max_episode_length)
+            steps += env.max_episode_length * backend.num_worlds
+            traces += recorder.traces(env, names)
+            for world in np.flatnonzero(fresh):
+                found[int(items[world])] = _episode(result, int(world), int(sequences[items[world]]), int(repetition[items[world]]), demos)
+    episodes = tuple(found[i] for i in sorted(found))
+    return Rollouts(episodes=episodes, traces=tuple(sorted(traces, key=lambda t: t.sequence)), control_steps_per_second=steps / spent)
+
+
+def _starts(
+    resets: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int, demos: ResetBank, robot: RobotSpec,
+    names: tuple[str, ...], task: TaskConfig,
+) -> Reset:  # fmt: skip
+    """One start per world. Each has random numbers of its own, drawn on the CPU, so engine and number of worlds change nothing."""
+    on_cpu = resets if resets.device.type == "cpu" else ResetDistribution(demos, robot, names, task.reset)
+    parts = []
+    for s, r in zip(sequence.tolist(), repetition.tolist(), strict=True):
+        generator = torch.Generator().manual_seed(int(np.random.SeedSequence([seed, s, r]).generate_state(1)[0]))
+        parts.append(on_cpu.home(torch.tensor([s]), generator))
+    return Reset.stack(parts).to(resets.device)
+
+
+def _episode(result: EpisodeMetrics, world: int, sequence: int, repetition: int, demos: ResetBank) -> Episode:
+    return Episode(
+        sequence=sequence,
+        sequence_name=str(demos.sequence_name[sequence]),
+        object=str(demos.sequence_object[sequence]),
+        repetition=repetition,
+        approach=bool(result.approach[world]),
+        grasp=bool(result.grasp[world]),
+        reorient=bool(result.reorient[world]),
+        reorient_once=bool(result.reorient_once[world]),
+        reorientation_progress=round(float(result.reorientation_progress[world]), 6),
+        task_progress=round(float(result.task_progress[world]), 6),
+        out_of_bounds=bool(result.out_of_bounds[world]),
+        nonfinite=bool(result.nonfinite[world]),
+        overflow=bool(result.overflow[world]),
+    )
+
+
+class _Recorder:
+    """States of some worlds over an episode."""
+
+    def __init__(self, worlds: list[int]) -> None:
+        self._worlds, self._time, self._frames = worlds, [], []
+
+    def add(self, time: float, reading) -> None:
+        if self._worlds:
+            s = reading.state
+            self._time.append(time)
+            self._frames.append([x[self._worlds].cpu().numpy().copy() for x in (s.joint_pos, s.object_pos, s.object_quat)])
+
+    def traces(self, env: ManipulationEnv, names: tuple[str, ...]) -> list[Trace]:
+        out = []
+        for i, world in enumerate(self._worlds):
+            joint_pos, object_pos, object_quat = (np.stack([frame[part][i] for frame in self._frames]) for part in range(3))
+            out.append(
+                Trace(
+                    sequence=int(env.sequence[world]),
+                    object=names[int(env.backend.object_index[world])],
+                    goal_pos=env.goal_pos[world].cpu().numpy(),
+                    goal_quat=env.goal_quat[world].cpu().numpy(),
+                    time=np.array(self._time),
+                    joint_pos=joint_pos,
+                    object_pos=object_pos,
+                    object_quat=object_quat,
+                )
+            )
+        return out

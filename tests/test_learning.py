@@ -1,0 +1,204 @@
+"""The model, the sequence storage, the export and the run folder; no physics."""
+
+import json
+import tempfile
+import unittest
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+
+from xreset.errors import FileFormatError, PolicyError, RunError
+from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig, rsl_rl_config
+from xreset.learning.export import export_onnx
+from xreset.learning.model import PointNetLstmModel
+from xreset.learning.ppo import SequencePpo, SequenceStorage
+from xreset.policy import OnnxPolicy
+from xreset.task.config import ObservationConfig, TaskConfig
+from xreset.typed import from_dict
+
+N, T, L, A = 3, 8, 4, 5
+GROUPS = {"actor": ["policy", "proprio", "perception"], "critic": ["policy", "proprio", "privileged", "perception"]}
+SMALL = {"hidden_dims": [16], "pointnet_dims": [8, 6], "lstm_dim": 12}
+
+
+def observations(*batch: int, seed: int = 0) -> TensorDict:
+    g = torch.Generator().manual_seed(seed)
+    widths = {"policy": (7,), "proprio": (9,), "perception": (5, 10, 3), "privileged": (4,)}
+    return TensorDict({k: torch.randn(*batch, *w, generator=g) for k, w in widths.items()}, batch_size=list(batch))
+
+
+def make_model(kind: str = "actor") -> PointNetLstmModel:
+    torch.manual_seed(0)
+    gaussian = {"class_name": "GaussianDistribution", "std_type": "log"} if kind == "actor" else None
+    return PointNetLstmModel(observations(N), GROUPS, kind, A if kind == "actor" else 1, distribution_cfg=gaussian, **SMALL)
+
+
+class ModelTest(unittest.TestCase):
+    def test_update_sees_what_the_rollout_saw(self):
+        """Step by step with resets at episode ends gives the same outputs as one sequence with masks."""
+        model, obs = make_model(), observations(T, N)
+        dones = torch.zeros(T, N, dtype=torch.bool)
+        dones[2, 0] = dones[5, 2] = True
+        stepwise = []
+        for t in range(T):
+            stepwise.append(model(obs[t]))
+            model.reset(dones[t])
+        first = torch.zeros_like(dones)
+        first[1:] = dones[:-1]
+        zero = torch.zeros(1, N, SMALL["lstm_dim"])
+        together = model(obs, masks=first, hidden_state=(zero, zero))
+        torch.testing.assert_close(together, torch.stack(stepwise))
+        unmasked = model(obs, masks=torch.zeros_like(first), hidden_state=(zero, zero))
+        self.assertGreater(float((unmasked - together).detach()[3:, 0].abs().max()), 1e-4)
+
+    def test_gradients_do_not_cross_an_episode_end(self):
+        model, obs = make_model(), observations(T, N)
+        obs["policy"].requires_grad_(True)
+        first = torch.zeros(T, N, dtype=torch.bool)
+        first[3] = True
+        zero = torch.zeros(1, N, SMALL["lstm_dim"])
+        model(obs, masks=first, hidden_state=(zero, zero))[3:].sum().backward()
+        self.assertEqual(float(obs["policy"].grad[:3].abs().max()), 0.0)
+        self.assertGreater(float(obs["policy"].grad[3:].abs().max()), 0.0)
+
+    def test_points_may_come_in_any_order(self):
+        model, obs = make_model(), observations(N)
+        shuffled = obs.clone()
+        shuffled["perception"] = obs["perception"][:, :, torch.randperm(10)]
+        first = model(obs)
+        model.reset()
+        torch.testing.assert_close(model(shuffled), first)
+
+    def test_log_std_is_learned_and_does_not_depend_on_the_state(self):
+        model = make_model()
+        self.assertEqual(tuple(model.distribution.log_std_param.shape), (A,))
+        self.assertTrue(model.distribution.log_std_param.requires_grad)
+
+
+class StorageTest(unittest.TestCase):
+    def test_sequences_cover_the_rollout_once_with_their_states(self):
+        storage = SequenceStorage(L, "rl", N, T, observations(N), [A], "cpu")
+        code = torch.arange(T * N, dtype=torch.float32).view(T, N, 1)
+        for t in range(T):
+            tr = SequenceStorage.Transition()
+            tr.observations, tr.actions, tr.rewards = observations(N, seed=t), code[t].expand(N, A), code[t, :, 0]
+            tr.dones = torch.tensor([t == 2, t == 3, False])
+            tr.values, tr.actions_log_prob = code[t], code[t, :, 0]
+            tr.distribution_params = (code[t].expand(N, A), code[t].expand(N, A))
+            state = code[t].expand(N, 12)[None]
+            tr.hidden_states = ((state, state), (state, state))
+            storage.add_transition(tr)
+        storage.returns, storage.advantages = code.clone(), code.clone()
+        seen = []
+        for batch in storage.recurrent_mini_batch_generator(2, 1):
+            seen += batch.values.flatten().tolist()
+            torch.testing.assert_close(batch.values[1:] - batch.values[:-1], torch.full_like(batch.values[1:], N))
+            torch.testing.assert_close(batch.hidden_states[0][0][0, :, 0], batch.values[0, :, 0])
+            # a step is the first of an episode where the step before it, in the same piece, was the last
+            world, step = (batch.values % N).squeeze(-1), (batch.values // N).squeeze(-1)
+            expected = (world == 0) & (step == 3)
+            self.assertTrue(torch.equal(batch.masks & (step % L != 0), expected))
+        self.assertEqual(sorted(seen), list(range(T * N)))
+
+    def test_ppo_improves_a_bandit(self):
+        """The whole algorithm on an environment whose reward is -|action - 0.5|: the mean action moves to 0.5."""
+
+        class Bandit:
+            num_envs, num_actions, device = 64, A, "cpu"
+
+            def get_observations(self):
+                return observations(self.num_envs)
+
+        config = TrainConfig(
+            model=ModelConfig(pointnet=(8, 6), lstm=12, mlp=(16,), initial_std=0.5), ppo=PpoConfig(horizon=8, minibatch_size=128)
+        )
+        cfg = rsl_rl_config(config, 64) | {"multi_gpu": None}
+        torch.manual_seed(0)
+        alg = SequencePpo.construct_algorithm(observations(64), Bandit(), cfg, "cpu")
+        obs = observations(64)
+        before = float((alg.actor(obs) - 0.5).abs().mean())
+        alg.actor.reset()
+        for _ in range(40):
+            with torch.no_grad():
+                for _ in range(8):
+                    actions = alg.act(obs)
+                    alg.process_env_step(obs, -(actions - 0.5).abs().mean(-1), torch.zeros(64), {})
+                alg.compute_returns(obs)
+            alg.update()
+        alg.actor.reset()
+        self.assertLess(float((alg.actor(obs) - 0.5).abs().mean()), 0.5 * before)
+
+
+class ExportTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        folder = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(folder.cleanup)
+        cls.file = Path(folder.name) / "policy.onnx"
+        cls.model = make_model()
+        cls.model.update_normalization(observations(50, seed=9))
+        task = {"observation": {"cloud_history": 5, "cloud_points": 10}}
+        export_onnx(cls.model, cls.file, {"schema": "xreset-policy/1", "task": task})
+
+    def test_exported_equals_eager_over_50_steps(self):
+        policy = OnnxPolicy(self.file)
+        self.model.reset()
+        with torch.no_grad():
+            for t in range(50):
+                obs = observations(4, seed=t)
+                torch.testing.assert_close(policy.act(obs), self.model(obs).clamp(-1, 1), atol=1e-5, rtol=0)
+
+    def test_begin_forgets(self):
+        policy = OnnxPolicy(self.file)
+        obs = observations(2)
+        fresh = policy.act(obs)
+        self.assertGreater(float((policy.act(obs) - fresh).abs().max()), 1e-6)
+        policy.begin(None)
+        torch.testing.assert_close(policy.act(obs), fresh)
+
+    def test_a_foreign_or_damaged_file_is_refused(self):
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "broken.onnx"
+            file.write_bytes(self.file.read_bytes()[:200])
+            with self.assertRaisesRegex(PolicyError, "cannot be read"):
+                OnnxPolicy(file)
+            with self.assertRaisesRegex(PolicyError, "no policy file"):
+                OnnxPolicy(Path(folder) / "none.onnx")
+
+
+class ConfigTest(unittest.TestCase):
+    def test_round_trip_through_json(self):
+        from dataclasses import asdict
+
+        config = TrainConfig(task=TaskConfig(observation=ObservationConfig(cloud_history=3)), iterations=7)
+        self.assertEqual(from_dict(TrainConfig, json.loads(json.dumps(asdict(config)))), config)
+
+    def test_an_unknown_entry_is_an_error(self):
+        from dataclasses import asdict
+
+        data = asdict(TrainConfig())
+        data["task"]["reward"]["bonus"] = 1.0
+        with self.assertRaisesRegex(FileFormatError, r"task\.reward.*unknown: bonus"):
+            from_dict(TrainConfig, data)
+
+    def test_table_viii(self):
+        cfg = rsl_rl_config(TrainConfig(), 4096)
+        self.assertEqual(cfg["algorithm"]["num_mini_batches"], 2)
+        self.assertEqual((cfg["num_steps_per_env"], cfg["algorithm"]["sequence_length"]), (16, 4))
+
+    def test_a_sequence_length_that_does_not_divide_the_horizon(self):
+        config = TrainConfig()
+        with self.assertRaisesRegex(ValueError, "does not divide"):
+            rsl_rl_config(replace(config, ppo=replace(config.ppo, sequence_length=5)), 8)
+
+    def test_a_folder_without_a_run(self):
+        from xreset.learning.run import read_run
+
+        with tempfile.TemporaryDirectory() as folder, self.assertRaisesRegex(RunError, "not a run folder"):
+            read_run(folder)
+
+
+if __name__ == "__main__":
+    unittest.main()

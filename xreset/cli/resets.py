@@ -1,0 +1,68 @@
+"""``xreset resets``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def resets(
+    retargeted: Annotated[Path, tyro.conf.Positional],
+    *,
+    out: Path,
+    backend: Annotated[list[str], tyro.conf.UseAppendAction] | None = None,
+    robot: str | None = None,
+    objects: Path | None = None,
+    num_envs: int = 64,
+    device: str = "cpu",
+) -> None:
+    """Try retargeted states in physics and keep the stable ones.
+
+    Args:
+        retargeted: File made by `xreset retarget`.
+        out: Reset bank to write.
+        backend: Physics engine to try the states in; give it again to keep only states that are stable in all of them. Default: mujoco.
+        robot: Folder of the robot, if it is not one that is known by name.
+        objects: Folder of real meshes; default: the built-in stand-ins.
+        num_envs: Worlds at a time.
+        device: Where GPU engines run: cpu or cuda.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
+
+    from xreset import robots
+    from xreset.files import file_hash
+    from xreset.objects import load_objects
+    from xreset.resets.bank import check_robot, write_bank
+    from xreset.resets.filter import acceptance_table, make_bank
+    from xreset.retarget.pipeline import read_retargeted
+
+    backends = backend or ["mujoco"]
+    console = Console()
+    data = read_retargeted(retargeted)
+    spec = robots.load(robot or data.robot)
+    check_robot(
+        retargeted, "retargeted file", spec, name=data.robot, joint_names=tuple(data.joint_names), fingerprint=data.robot_fingerprint
+    )
+    loaded = load_objects(sorted({*map(str, data.object_name)}), objects)
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task(f"states in {', '.join(backends)}")
+        bank = make_bank(
+            data, spec, loaded, backends, num_envs=num_envs, device=device,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )  # fmt: skip
+    write_bank(out, bank, config={"backends": backends, "num_envs": num_envs}, inputs={"retargeted": file_hash(retargeted)})
+    table = Table(
+        "object", "phase", "accepted", "tried", "rejected because of", title=f"{spec.name}: states stable in {', '.join(backends)}"
+    )
+    for name, phase, accepted, tried, reasons in acceptance_table(bank):
+        share = f"{accepted} ({accepted / tried:.0%})" if tried else "0"
+        table.add_row(name, phase, share, str(tried), ", ".join(f"{reason} {n}" for reason, n in reasons.items()))
+    console.print(table)
+    console.print(f"{bank.num_states} states of {bank.num_states + len(bank.rejected_reason)} kept in {out}")
+
+
+COMMAND = resets

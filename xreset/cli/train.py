@@ -1,0 +1,65 @@
+"""``xreset train``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from xreset.learning.config import TrainConfig
+
+
+def train(
+    *,
+    out: Path,
+    robot: str | None = None,
+    resets: Path | None = None,
+    objects: Path | None = None,
+    backend: str = "mujoco-warp",
+    device: str | None = None,
+    num_envs: int = 4096,
+    iterations: int | None = None,
+    seed: int = 0,
+    resume: bool = False,
+    config: TrainConfig = TrainConfig(),  # noqa: B008 (frozen)
+) -> None:
+    """Train a policy.
+
+    Args:
+        out: Run folder to make, or to continue.
+        robot: Name or folder of the robot.
+        resets: Reset bank, made by `xreset resets`.
+        objects: Folder of real meshes; default: the built-in stand-ins.
+        backend: Physics engine to train on.
+        device: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
+        num_envs: Worlds to simulate (per GPU).
+        iterations: Iterations in all; default: the configuration's.
+        seed: Seed of every random number.
+        resume: Continue the run in --out from its newest checkpoint.
+        config: Task, model and algorithm.
+    """
+    from dataclasses import replace
+
+    from xreset.errors import RunError
+    from xreset.learning import train as training
+
+    if resume:
+        training.train(out, training.resumed(out, iterations=iterations), resume=True)
+        return
+    if robot is None or resets is None:
+        raise RunError("a new run needs --robot and --resets; --resume continues the run in --out.")
+    if iterations is not None:
+        config = replace(config, iterations=iterations)
+    info = training.start_run(
+        robot=robot,
+        resets=resets,
+        objects=objects,
+        backend=backend,
+        device=device or training.default_device(backend),
+        num_envs=num_envs,
+        seed=seed,
+        config=config,
+        out=out,
+    )
+    training.train(out, info)
+
+
+COMMAND = train

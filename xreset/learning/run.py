@@ -1,0 +1,76 @@
+"""The run folder: what a training was, where its checkpoints and its policy are.
+
+RUN/run.json                 everything that the training was started with
+RUN/checkpoints/000050.pt    model, optimiser, random state and counters after 50 iterations
+RUN/policy.onnx              the policy, with its contract
+RUN/events.out.tfevents.*    TensorBoard
+RUN/eval/, RUN/report/       made by ``xreset eval`` and ``xreset report``
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from xreset import __version__
+from xreset.errors import RunError
+from xreset.files import read_json, write_json
+from xreset.learning.config import TrainConfig
+from xreset.typed import from_dict
+
+SCHEMA = "xreset-run/1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunInfo:
+    """Contents of ``run.json``."""
+
+    robot: str
+    """Name or folder, as given."""
+    resets: str
+    """Path of the reset bank."""
+    resets_hash: str
+    """Its SHA-256."""
+    objects: str | None
+    """Folder of object meshes; None: the built-in stand-ins."""
+    backend: str
+    backend_version: str
+    device: str
+    num_envs: int
+    seed: int
+    config: TrainConfig
+    contract: dict[str, Any]
+    """:func:`xreset.policy.policy_contract`."""
+
+
+def write_run(folder: Path, info: RunInfo) -> None:
+    """Write ``run.json``."""
+    write_json(folder / "run.json", {"schema": SCHEMA, "xreset": __version__} | asdict(info))
+
+
+def read_run(folder: str | Path) -> RunInfo:
+    """Read ``run.json``.
+
+    Raises:
+        RunError: the folder is no run.
+    """
+    folder = Path(folder)
+    if not (folder / "run.json").is_file():
+        raise RunError(f"{folder} is not a run folder: it has no run.json. Make one with: xreset train --out {folder} ...")
+    data = read_json(folder / "run.json", SCHEMA)
+    config = from_dict(TrainConfig, data["config"], "run.json: config")
+    return RunInfo(**{k: v for k, v in data.items() if k not in ("schema", "xreset", "config")}, config=config)
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """Checkpoints, oldest first."""
+    return sorted((folder / "checkpoints").glob("[0-9]*.pt"))
+
+
+def latest_checkpoint(folder: Path) -> Path:
+    """The newest checkpoint; ``RunError`` if there is none."""
+    found = checkpoints(folder)
+    if not found:
+        raise RunError(f"{folder} has no checkpoint yet. Train it further: xreset train --out {folder} --resume")
+    return found[-1]

@@ -1,0 +1,242 @@
+"""The training loop on rsl-rl's runner: progress, TensorBoard, checkpoints, a clean stop."""
+
+from __future__ import annotations
+
+import io
+import signal
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rsl_rl.runners import OnPolicyRunner
+from torch import Tensor
+
+from xreset.env import ManipulationEnv
+from xreset.errors import RunError
+from xreset.files import atomic_write
+from xreset.learning.config import TrainConfig, rsl_rl_config
+
+
+class TrainingRunner(OnPolicyRunner):
+    """Runs PPO iterations on a :class:`~xreset.env.ManipulationEnv`."""
+
+    def __init__(self, env: ManipulationEnv, config: TrainConfig, folder: Path) -> None:
+        """Build algorithm and models; rsl-rl's own logging stays off."""
+        self.folder = folder
+        self.train_config = config
+        super().__init__(env, rsl_rl_config(config, env.num_envs), log_dir=None, device=str(env.device))  # pyright: ignore[reportArgumentType]
+        self.iteration = 0
+        self.env_steps = 0
+        self.elapsed = 0.0
+        self.is_main = self.gpu_global_rank == 0
+
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
+        """Train until ``num_learning_iterations`` iterations are done in all; returns early, checkpoint written, after Ctrl-C."""
+        env, alg, horizon = self.env, self.alg, self.cfg["num_steps_per_env"]
+        if init_at_random_ep_len:
+            env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
+        alg.train_mode()
+        if self.is_distributed:
+            alg.broadcast_parameters()
+        obs = env.get_observations()
+        log = _Log(self.folder, env.num_envs, str(env.device), num_learning_iterations) if self.is_main else None
+        saved_at = self.iteration
+        with _stop_on_interrupt() as stop:
+            while self.iteration < num_learning_iterations and not stop:
+                start = time.perf_counter()
+                with torch.no_grad():
+                    for _ in range(horizon):
+                        obs, reward, done, extras = env.step(alg.act(obs))
+                        alg.process_env_step(obs, reward, done, extras)
+                        if log is not None:
+                            log.add(reward, done, extras["log"])
+                    self._check_finite(obs)
+                    collected = time.perf_counter()
+                    alg.compute_returns(obs)
+                losses = alg.update()
+                now = time.perf_counter()
+                self.iteration += 1
+                self.env_steps += horizon * env.num_envs * self.gpu_world_size
+                self.elapsed += now - start
+                if log is not None:
+                    log.write(self, losses, collect=collected - start, learn=now - collected)
+                if self.iteration % self.train_config.save_interval == 0:
+                    self.save_checkpoint()
+                    saved_at = self.iteration
+        if self.iteration != saved_at or not self.iteration:
+            self.save_checkpoint()
+        if log is not None:
+            log.close(stopped=bool(stop))
+
+    def save_checkpoint(self) -> None:
+        """Write ``checkpoints/ITERATION.pt`` whole or not at all (main process only)."""
+        if not self.is_main:
+            return
+        content = self.alg.save() | {
+            "iteration": self.iteration,
+            "env_steps": self.env_steps,
+            "elapsed": self.elapsed,
+            "learning_rate": self.alg.learning_rate,
+            "env_rng": self.env.rng_state(),  # pyright: ignore[reportAttributeAccessIssue]
+            "torch_rng": torch.get_rng_state(),
+            "cuda_rng": torch.cuda.get_rng_state() if torch.cuda.is_available() else None,
+        }
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        with atomic_write(self.folder / "checkpoints" / f"{self.iteration:06d}.pt") as file:
+            file.write(buffer.getbuffer())
+
+    def load_checkpoint(self, path: Path) -> None:
+        """Continue from a checkpoint: models, optimiser, learning rate, counters and random state."""
+        content = read_checkpoint(path, self.device)
+        self.alg.load(content, None, strict=True)
+        self.alg.learning_rate = content["learning_rate"]
+        self.iteration, self.env_steps, self.elapsed = content["iteration"], content["env_steps"], content["elapsed"]
+        torch.set_rng_state(content["torch_rng"].cpu())
+        if content["cuda_rng"] is not None and torch.cuda.is_available():
+            torch.cuda.set_rng_state(content["cuda_rng"].cpu())
+        if content["env_rng"].shape == self.env.rng_state().shape:  # pyright: ignore[reportAttributeAccessIssue]
+            self.env.set_rng_state(content["env_rng"])  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _check_finite(self, obs: Any) -> None:
+        """One look per iteration: what is not finite here comes from a world whose health said that it was sound."""
+        for group, value in obs.items():
+            bad = ~value.flatten(1).isfinite().all(dim=1)
+            if bool(bad.any()):
+                worlds = bad.nonzero().squeeze(-1)[:10].tolist()
+                raise RunError(
+                    f"the observation group {group!r} is not finite in {int(bad.sum())} worlds (first: {worlds}) "
+                    f"at iteration {self.iteration}. "
+                    f"Continue from the last checkpoint: xreset train --out {self.folder} --resume"
+                )
+
+
+def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str, Any]:
+    """Read a checkpoint; only tensors and plain values are accepted.
+
+    Raises:
+        RunError: the file is damaged or no checkpoint.
+    """
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+        return {key: content[key] for key in (*_CHECKPOINT_KEYS,)}
+    except KeyError as error:
+        raise RunError(f"{path} is not a checkpoint of xreset: it has no entry {error}.") from error
+    except Exception as error:
+        raise RunError(f"{path} cannot be read as a checkpoint: {error}. Delete it to continue from the one before.") from error
+
+
+_CHECKPOINT_KEYS = (
+    "actor_state_dict",
+    "critic_state_dict",
+    "optimizer_state_dict",
+    "iteration",
+    "env_steps",
+    "elapsed",
+    "learning_rate",
+    "env_rng",
+    "torch_rng",
+    "cuda_rng",
+)
+
+
+class _Log:
+    """Sums on the device during an iteration; one progress line and one set of TensorBoard scalars after it."""
+
+    def __init__(self, folder: Path, num_envs: int, device: str, total: int) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer = SummaryWriter(log_dir=str(folder), flush_secs=10)
+        self._returns, self._lengths = torch.zeros(num_envs, device=device), torch.zeros(num_envs, device=device)
+        self._finished = torch.zeros(3, device=device)  # sum of returns, sum of lengths, number of episodes
+        self._recent: deque[list[float]] = deque(maxlen=20)
+        self._sums: dict[str, Tensor] = {}
+        self._steps = 0
+        self._console = Console()
+        self._total = total
+        self._progress = Progress(
+            TextColumn("iteration"),
+            MofNCompleteColumn(),
+            BarColumn(bar_width=20),
+            TextColumn("{task.fields[text]}"),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._progress.start()
+        self._task = self._progress.add_task("training", total=total, text="")
+        self._last_line = 0.0
+
+    def add(self, reward: Tensor, done: Tensor, log: dict[str, Tensor]) -> None:
+        ended = done.float()
+        self._returns += reward
+        self._lengths += 1
+        self._finished += torch.stack(((self._returns * ended).sum(), (self._lengths * ended).sum(), ended.sum()))
+        self._returns *= 1 - ended
+        self._lengths *= 1 - ended
+        for name, value in log.items():
+            self._sums[name] = self._sums.get(name, 0.0) + value
+        self._steps += 1
+
+    def write(self, runner: TrainingRunner, losses: dict[str, float], *, collect: float, learn: float) -> None:
+        it, alg = runner.iteration, runner.alg
+        means = {name: float(value) / self._steps for name, value in self._sums.items()}
+        self._recent.append(self._finished.tolist())
+        returns, lengths, episodes = (sum(column) for column in zip(*self._recent, strict=True))
+        fps = self._steps * runner.env.num_envs * runner.gpu_world_size / (collect + learn)
+        scalars = means | {f"loss/{name}": value for name, value in losses.items()}
+        scalars |= {
+            "policy/std": float(alg.get_policy().output_std.mean()),
+            "policy/learning_rate": alg.learning_rate,
+            "speed/env_steps_per_second": fps,
+            "speed/collect_seconds": collect,
+            "speed/learn_seconds": learn,
+        }
+        if episodes:
+            scalars |= {"episode/return": returns / episodes, "episode/length": lengths / episodes}
+        for name, value in scalars.items():
+            self._writer.add_scalar(name, value, it)
+        text = (
+            f"return {returns / max(episodes, 1):7.3f}  grasped {means['task/grasped']:5.1%}  success {means['task/success']:5.1%}  "
+            f"{fps:,.0f} steps/s"
+        )
+        self._progress.update(self._task, completed=it, text=text)
+        if not self._console.is_terminal and (time.monotonic() - self._last_line > 10 or it == self._total):
+            self._last_line = time.monotonic()
+            print(f"iteration {it}/{self._total}  {text}", flush=True)
+        self._finished.zero_()
+        self._sums, self._steps = {}, 0
+
+    def close(self, *, stopped: bool) -> None:
+        self._progress.stop()
+        self._writer.close()
+        if stopped:
+            self._console.print("stopped after the current iteration; a checkpoint is written.")
+
+
+@contextmanager
+def _stop_on_interrupt() -> Iterator[list[int]]:
+    """The first Ctrl-C (or SIGTERM) puts an entry into the list that is yielded; a second one interrupts at once."""
+    requests: list[int] = []
+
+    def ask(number: int, _frame: Any) -> None:
+        if requests:
+            raise KeyboardInterrupt
+        requests.append(number)
+
+    try:
+        before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:  # not in the main thread: signals go elsewhere
+        yield requests
+        return
+    try:
+        yield requests
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

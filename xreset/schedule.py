@@ -1,0 +1,45 @@
+"""Sharing work among worlds: world i always holds the same object, so each world works through items of one object."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """Which world does which item in which round."""
+
+    object_index: np.ndarray
+    """[N] object of each world."""
+    rounds: np.ndarray
+    """[R, N] item of each world and round. A world whose items have run out does its object's last item again."""
+    fresh: np.ndarray
+    """[R, N] bool: False where an item is only repeated to keep the world busy."""
+
+    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """The rounds: items [N], fresh [N]."""
+        return iter(zip(self.rounds, self.fresh, strict=True))
+
+
+def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
+    """Spread items over worlds in proportion to their number per object.
+
+    Args:
+        item_object: [I] object index of each item.
+        max_worlds: worlds to use at most (more where there are more objects than that).
+    """
+    objects, counts = np.unique(item_object, return_counts=True)
+    worlds = np.clip(np.round(max_worlds * counts / counts.sum()).astype(int), 1, counts)
+    num_rounds = int(np.max(-(-counts // worlds)))
+    columns, fresh = [], []
+    for number, count, width in zip(objects, counts, worlds, strict=True):
+        queue = np.flatnonzero(item_object == number)
+        position = np.arange(num_rounds * width).reshape(num_rounds, width)
+        columns.append(queue[np.minimum(position, count - 1)])
+        fresh.append(position < count)
+    return Schedule(
+        object_index=np.repeat(objects, worlds), rounds=np.concatenate(columns, axis=1), fresh=np.concatenate(fresh, axis=1)
+    )

@@ -1,0 +1,387 @@
+"""A scene as a MuJoCo model: what both MuJoCo backends run.
+
+The model is built from :class:`~xreset.backends.rigid.Mechanism`, not by MuJoCo's URDF reader, which turns effort limits into joint force
+ranges. Links that are fixed to another are fused into its body (fewer bodies are faster on a GPU); :class:`SceneModel` says where every
+link, joint and shape of the scene has gone.
+
+The settings follow from measurements against other engines: an elliptic friction cone with impratio 10 holds grasps that a pyramidal cone
+loses, contacts are as stiff as the timestep allows (time constant of two timesteps), and condim 4 gives torsional friction.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from xreset.backends.rigid import Body, Inertia, Mechanism, mechanism, object_inertia
+from xreset.errors import ObjectError, XResetError
+from xreset.spec import GRAVITY, Geometry, ObjectSpec, SceneSpec
+from xreset.urdf import Joint
+
+TABLE, OTHER_LINK, OBJECT = -1, -2, -3
+"""Values of :attr:`SceneModel.geom_role` beside the fingertip indices 0..E-1."""
+
+# Collision bits: a pair collides if one's contype meets the other's conaffinity.
+_HIT_OBJECT, _HIT_TABLE, _HIT_SELF = 1, 2, 4
+
+_IMPRATIO = 10.0
+_SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
+_SOLIMP_MIMIC = (0.99, 0.999, 0.001, 0.5, 2.0)
+_TIME_CONSTANT_STEPS = 2.016  # solref time constant in timesteps; MuJoCo's own minimum is 2
+_CONDIM = 4
+_ROLLING = 1e-4  # MuJoCo wants a positive number although condim 4 does not use it
+_MIN_FRICTION = 1e-4  # of the object's own shapes: a pair takes the larger of its two, so the other shape decides
+_ARENA = 16 << 20  # bytes for contacts and constraints of one MjData
+
+_KINDS = ("box", "sphere", "capsule", "cylinder", "hull")
+_GEOM_TYPES = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "hull": mujoco.mjtGeom.mjGEOM_MESH,
+}
+_PARKED_SIZE = 1e-6
+_PARKED_POS = (0.0, 0.0, 1e3)  # in the object's frame: out of everything's reach wherever the object is
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneModel:
+    """A compiled model and where the scene's parts are in it.
+
+    Letters: J actuated joints, Q mimic joints, K tracked links, E fingertips, G geoms.
+    """
+
+    model: mujoco.MjModel
+    joint_qpos: np.ndarray
+    """[J] addresses in qpos, in joint order."""
+    joint_dof: np.ndarray
+    """[J] addresses in qvel. Actuator i drives joint i."""
+    mimic_qpos: np.ndarray
+    """[Q]"""
+    mimic_dof: np.ndarray
+    """[Q]"""
+    mimic_source: np.ndarray
+    """[Q] index of the source in joint order."""
+    mimic_multiplier: np.ndarray
+    """[Q]"""
+    mimic_offset: np.ndarray
+    """[Q]"""
+    link_body: np.ndarray
+    """[K] body that each tracked link is part of."""
+    link_pos: np.ndarray
+    """[K, 3] position of the tracked link in that body's frame."""
+    link_quat: np.ndarray
+    """[K, 4]"""
+    object_body: int
+    """Its frame is the object's mesh frame."""
+    object_qpos: int
+    """First of 7 addresses in qpos."""
+    object_dof: int
+    """First of 6 addresses in qvel."""
+    geom_role: np.ndarray
+    """[G] what a geom is: index of the fingertip it belongs to, or TABLE, OTHER_LINK, OBJECT."""
+    parked: np.ndarray
+    """[G] bool: an object's shape slot that this object does not use."""
+
+    def geom_friction(self, pair: np.ndarray) -> np.ndarray:
+        """[..., G] sliding friction of each geom that gives the pairs object-tip, object-other link, object-table the friction [..., 3]."""
+        column = np.select([self.geom_role >= 0, self.geom_role == OTHER_LINK, self.geom_role == TABLE], [0, 1, 2], default=3)
+        floor = np.full((*pair.shape[:-1], 1), _MIN_FRICTION)
+        return np.maximum(np.concatenate((pair, floor), axis=-1), _MIN_FRICTION)[..., column]
+
+
+def compile_scene(scene: SceneSpec, object_index: int, *, slots_for: Sequence[int] = ()) -> SceneModel:
+    """The model of a scene that holds ``scene.objects[object_index]``.
+
+    Args:
+        scene: the scene.
+        object_index: the object in it.
+        slots_for: also make room for the shapes of these objects: the models of one scene with the same ``slots_for`` agree in the
+            type and number of all geoms and in all meshes, so one engine model can hold any of the objects. Slots without use are parked.
+
+    Raises:
+        RobotError: the robot cannot be simulated.
+        ObjectError: the object cannot be simulated.
+    """
+    robot = mechanism(scene.robot)
+    spec = _empty_spec(scene)
+    roles = _add_robot(spec, scene, robot)
+    spec.worldbody.add_geom(
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=scene.table.half_size,
+        pos=(*scene.table.center, -scene.table.half_size[2]),
+        contype=0,
+        conaffinity=_HIT_OBJECT | _HIT_TABLE,
+        **_contact(scene.friction.table, scene),
+    )
+    roles["table"] = TABLE
+    parked = _add_object(spec, scene, object_index, slots_for)
+    _add_drives(spec, scene)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        thing = scene.objects[object_index].name
+        raise XResetError(f"MuJoCo refuses the robot {scene.robot.name!r} with the object {thing!r}: {error}") from error
+    model.body_gravcomp[model.body("object").id] = 0.0
+    return _locate(robot, model, roles, parked)
+
+
+# Options -------------------------------------------------------------------------------------------------------------------------------
+
+
+def _empty_spec(scene: SceneSpec) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.modelname = scene.robot.name
+    spec.memory = _ARENA
+    spec.compiler.degree = False
+    spec.compiler.autolimits = False
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    option = spec.option
+    option.timestep = scene.timestep
+    option.gravity = (0.0, 0.0, -GRAVITY)
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = _IMPRATIO
+    option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world must be seen, not silently put back to its start
+    return spec
+
+
+def _solref(scene: SceneSpec) -> tuple[float, float]:
+    return (_TIME_CONSTANT_STEPS * scene.timestep, 1.0)
+
+
+def _contact(friction: float, scene: SceneSpec) -> dict:
+    """Contact attributes of a geom."""
+    return {
+        "friction": (max(friction, _MIN_FRICTION), scene.friction.torsional, _ROLLING),
+        "solref": _solref(scene),
+        "solimp": _SOLIMP,
+        "condim": _CONDIM,
+    }
+
+
+# Robot ---------------------------------------------------------------------------------------------------------------------------------
+
+
+def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism) -> dict[str, int]:
+    """Add bodies, joints and geoms; returns the role of each geom by name."""
+    description = robot.robot
+    added: list[mujoco.MjsBody] = []
+    roles: dict[str, int] = {}
+    geoms: list[list[tuple[str, str]]] = []  # of each body: (geom, link)
+    for body in robot.bodies:
+        if body.joint is None:
+            parent, pos, quat = spec.worldbody, np.array(description.base_pos), np.array(description.base_quat)
+        else:
+            parent, (pos, quat) = added[body.parent], _pose(body.T_parent_body)
+        element = parent.add_body(
+            name=_body_name(body), pos=pos, quat=quat, gravcomp=float(description.gravity_compensated), explicitinertial=True
+        )
+        if body.inertia is not None:
+            _set_inertia(element, body.inertia)
+        if body.joint is not None:
+            _add_joint(element, body.joint, scene)
+        added.append(element)
+        geoms.append([])
+        for i, (link, shape) in enumerate((item.link, item.shape) for item in body.shapes):
+            name = f"{_body_name(body)}/{i}"
+            roles[name] = role = robot.tip_of.get(link, OTHER_LINK)
+            self_bit = _HIT_SELF if link in description.self_collision_links else 0
+            table_bit = 0 if link in description.table_exclude else _HIT_TABLE
+            pos, quat = _pose(shape.T_body_shape)
+            mesh = _add_mesh(spec, name, shape.geometry) if shape.geometry.kind == "hull" else ""
+            element.add_geom(
+                name=name,
+                pos=pos,
+                quat=quat,
+                contype=self_bit | table_bit,
+                conaffinity=_HIT_OBJECT | self_bit,
+                **_geometry(shape.geometry, mesh),
+                **_contact(scene.friction.link if role == OTHER_LINK else scene.friction.tip, scene),
+            )
+            if self_bit:
+                geoms[-1].append((name, link))
+    _limit_self_collision(spec, scene, robot, geoms)
+    return roles
+
+
+def _body_name(body: Body) -> str:
+    return f"robot/{body.name}"
+
+
+def _set_inertia(element: mujoco.MjsBody, inertia: Inertia) -> None:
+    element.mass, element.ipos, element.inertia, element.iquat = inertia.mass, inertia.com, inertia.moments, inertia.quat
+
+
+def _add_joint(element: mujoco.MjsBody, joint: Joint, scene: SceneSpec) -> None:
+    drive = {j.name: j.drive for j in scene.robot.joints}.get(joint.name)  # a mimic joint has none
+    limited = bool(np.isfinite(joint.lower) and np.isfinite(joint.upper))
+    element.add_joint(
+        name=joint.name,
+        type=mujoco.mjtJoint.mjJNT_HINGE if joint.type == "revolute" else mujoco.mjtJoint.mjJNT_SLIDE,
+        axis=joint.axis,
+        limited=limited,
+        range=(joint.lower, joint.upper) if limited else (0.0, 0.0),
+        solref_limit=_solref(scene),
+        solimp_limit=_SOLIMP,
+        armature=drive.armature if drive else 0.0,
+        frictionloss=drive.friction_loss if drive else 0.0,
+    )
+
+
+def _limit_self_collision(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, geoms: list[list[tuple[str, str]]]) -> None:
+    """Keep the collisions between bodies that :meth:`Mechanism.may_collide` allows.
+
+    MuJoCo excludes whole bodies. Where only some links of two bodies may collide, the bodies are excluded and those links' geoms paired.
+    """
+    friction = (scene.friction.link, scene.friction.link, scene.friction.torsional, _ROLLING, _ROLLING)
+    for (i, mine), (j, others) in combinations(enumerate(geoms), 2):
+        if not mine or not others:
+            continue
+        allowed = [(a, b) for a, link_a in mine for b, link_b in others if robot.may_collide(link_a, link_b)]
+        if len(allowed) == len(mine) * len(others):
+            continue
+        spec.add_exclude(bodyname1=_body_name(robot.bodies[i]), bodyname2=_body_name(robot.bodies[j]))
+        for a, b in allowed:
+            spec.add_pair(geomname1=a, geomname2=b, condim=_CONDIM, friction=friction, solref=_solref(scene), solimp=_SOLIMP)
+
+
+def _add_drives(spec: mujoco.MjSpec, scene: SceneSpec) -> None:
+    for joint in scene.robot.joints:
+        drive = joint.drive
+        spec.add_actuator(
+            name=joint.name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            target=joint.name,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            gainprm=_padded((drive.kp,)),
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            biasprm=_padded((0.0, -drive.kp, -drive.kd)),
+            ctrllimited=False,
+            forcelimited=True,
+            forcerange=(-drive.effort, drive.effort),
+        )
+    for mimic in scene.robot.mimics:
+        spec.add_equality(
+            name=mimic.joint,
+            type=mujoco.mjtEq.mjEQ_JOINT,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            name1=mimic.joint,
+            name2=mimic.source,
+            data=_padded((mimic.offset, mimic.multiplier), mujoco.mjNEQDATA),
+            solref=_solref(scene),
+            solimp=_SOLIMP_MIMIC,
+        )
+
+
+def _padded(values: Sequence[float], length: int = mujoco.mjNGAIN) -> np.ndarray:
+    out = np.zeros(length)
+    out[: len(values)] = values
+    return out
+
+
+# Object --------------------------------------------------------------------------------------------------------------------------------
+
+
+def _add_object(spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Sequence[int]) -> set[str]:
+    """Add the object and empty slots; returns the names of the geoms that are parked."""
+    thing = scene.objects[index]
+    held = sorted({*slots_for, index})
+    meshes = {i: _add_hulls(spec, scene.objects[i], i) for i in held}
+    slots: Counter[str] = Counter()
+    for i in held:
+        slots |= Counter(piece.geometry.kind for piece in scene.objects[i].pieces)  # the larger of the two counts
+
+    body = spec.worldbody.add_body(name="object", gravcomp=1.0, explicitinertial=True)  # MuJoCo ignores it unless it is set while compiling
+    _set_inertia(body, object_inertia(thing))
+    body.add_joint(name="object", type=mujoco.mjtJoint.mjJNT_FREE, align=mujoco.mjtAlignFree.mjALIGNFREE_FALSE)
+    parked = set()
+    common = {"contype": _HIT_OBJECT, "conaffinity": 0, **_contact(0.0, scene)}
+    spare = next((name for names in meshes.values() for name in names), "")
+    for kind in _KINDS:
+        pieces = [piece for piece in thing.pieces if piece.geometry.kind == kind]
+        for slot in range(slots[kind]):
+            name = f"object/{kind}/{slot}"
+            if slot < len(pieces):
+                mesh = meshes[index][slot] if kind == "hull" else ""
+                pos, quat = _pose(pieces[slot].T_body_shape)
+                body.add_geom(name=name, pos=pos, quat=quat, **_geometry(pieces[slot].geometry, mesh), **common)
+            else:
+                parked.add(name)
+                size = (_PARKED_SIZE,) * 3
+                body.add_geom(
+                    name=name, type=_GEOM_TYPES[kind], pos=_PARKED_POS, size=size, meshname=spare if kind == "hull" else "", **common
+                )
+    return parked
+
+
+def _add_hulls(spec: mujoco.MjSpec, thing: ObjectSpec, index: int) -> list[str]:
+    if not thing.pieces:
+        raise ObjectError(f"object {thing.name!r} has no collision piece; it needs at least one.")
+    hulls = [piece.geometry for piece in thing.pieces if piece.geometry.kind == "hull"]
+    return [_add_mesh(spec, f"object/{index}/{i}", hull) for i, hull in enumerate(hulls)]
+
+
+# Shapes --------------------------------------------------------------------------------------------------------------------------------
+
+
+def _geometry(geometry: Geometry, mesh: str) -> dict:
+    size = np.zeros(3)
+    size[: len(geometry.size)] = geometry.size
+    return {"type": _GEOM_TYPES[geometry.kind], "size": size, "meshname": mesh}
+
+
+def _add_mesh(spec: mujoco.MjSpec, name: str, hull: Geometry) -> str:
+    spec.add_mesh(
+        name=name,
+        uservert=np.asarray(hull.vertices, dtype=np.float64).ravel(),
+        userface=np.asarray(hull.faces, dtype=np.int32).ravel(),
+        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,
+    )
+    return name
+
+
+def _pose(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+
+
+# Where everything is -------------------------------------------------------------------------------------------------------------------
+
+
+def _locate(robot: Mechanism, model: mujoco.MjModel, roles: dict[str, int], parked: set[str]) -> SceneModel:
+    joints, mimics = robot.robot.joint_names, robot.robot.mimics
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    frames = [robot.frames[link] for link in robot.robot.tracked_links]
+    poses = [_pose(T) for _, T in frames]
+    qpos = {model.joint(i).name: int(model.jnt_qposadr[i]) for i in range(model.njnt)}
+    dof = {model.joint(i).name: int(model.jnt_dofadr[i]) for i in range(model.njnt)}
+
+    def addresses(table: dict[str, int], joints: Sequence[str]) -> np.ndarray:
+        return np.array([table[name] for name in joints], dtype=np.int64)
+
+    return SceneModel(
+        model=model,
+        joint_qpos=addresses(qpos, joints),
+        joint_dof=addresses(dof, joints),
+        mimic_qpos=addresses(qpos, [mimic.joint for mimic in mimics]),
+        mimic_dof=addresses(dof, [mimic.joint for mimic in mimics]),
+        mimic_source=np.array([joints.index(mimic.source) for mimic in mimics], dtype=np.int64),
+        mimic_multiplier=np.array([mimic.multiplier for mimic in mimics], dtype=np.float64),
+        mimic_offset=np.array([mimic.offset for mimic in mimics], dtype=np.float64),
+        link_body=np.array([model.body(_body_name(robot.bodies[i])).id for i, _ in frames], dtype=np.int64),
+        link_pos=np.array([pos for pos, _ in poses]),
+        link_quat=np.array([quat for _, quat in poses]),
+        object_body=model.body("object").id,
+        object_qpos=qpos["object"],
+        object_dof=dof["object"],
+        geom_role=np.array([roles.get(name, OBJECT) for name in names], dtype=np.int64),
+        parked=np.array([name in parked for name in names]),
+    )

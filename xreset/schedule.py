@@ -25,14 +25,16 @@ class Schedule:
 
 
 def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
-    """Spread items over worlds in proportion to their number per object.
+    """Spread items over worlds so that the fewest rounds are needed.
 
     Args:
         item_object: [I] object index of each item.
         max_worlds: worlds to use at most (more where there are more objects than that).
     """
     objects, counts = np.unique(item_object, return_counts=True)
-    worlds = np.clip(np.round(max_worlds * counts / counts.sum()).astype(int), 1, counts)
+    worlds = np.ones_like(counts)
+    for _ in range(min(max_worlds, len(item_object)) - len(objects)):
+        worlds[np.argmax(counts / worlds)] += 1  # to the object whose worlds have most to do
     num_rounds = int(np.max(-(-counts // worlds)))
     columns, fresh = [], []
     for number, count, width in zip(objects, counts, worlds, strict=True):

@@ -1,0 +1,52 @@
+"""A small reset bank for tests: objects ``soup`` and ``spam``, three demonstrations, six states; every number can be told from every other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from xreset.resets.bank import ResetBank
+from xreset.spec import RobotSpec
+
+SOUP, SPAM = "005_tomato_soup_can", "010_potted_meat_can"
+
+
+def toy_bank(robot: RobotSpec, **changes: Any) -> ResetBank:
+    """The bank; ``changes`` replace fields.
+
+    Demonstrations 0 (soup), 1 (spam) and 2 (soup) start at x = 0.50, 0.51, 0.52 and end 0.2 higher, turned by 90 degrees about x. States:
+    two of each, the second after first contact, and the object's x of state i is 0.6 + i / 100.
+    """
+    num = len(robot.joints)
+    sequence = np.array([0, 0, 1, 1, 2, 2], dtype=np.int32)
+    owners = np.array([SOUP, SPAM, SOUP])
+    upright, turned = np.array([1.0, 0, 0, 0]), np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])
+    start = np.stack([[0.50 + s / 100, 0.3, 0.05] for s in range(3)])
+    fields: dict[str, Any] = {
+        "robot": robot.name,
+        "robot_fingerprint": robot.fingerprint,
+        "backends": ("mujoco",),
+        "joint_names": robot.joint_names,
+        "joint_pos": (np.arange(6)[:, None] * 0.01 + np.arange(num) * 0.001).astype(np.float32),
+        "object_pos": np.stack([[0.6 + i / 100, 0.3, 0.15] for i in range(6)]).astype(np.float32),
+        "object_quat_wxyz": np.tile(upright, (6, 1)).astype(np.float32),
+        "object_name": owners[sequence],
+        "sequence_index": sequence,
+        "frame_index": np.array([3, 9, 4, 8, 5, 7], dtype=np.int32),
+        "post_contact": np.array([False, True] * 3),
+        "sequence_name": np.array(["demo_a", "demo_b", "demo_c"]),
+        "sequence_object": owners,
+        "start_pos": start.astype(np.float32),
+        "start_quat_wxyz": np.tile(upright, (3, 1)).astype(np.float32),
+        "goal_pos": (start + [0, 0, 0.2]).astype(np.float32),
+        "goal_quat_wxyz": np.tile(turned, (3, 1)).astype(np.float32),
+        "object_names": (SOUP, SPAM),
+        "object_sources": ("stand-in", "stand-in"),
+        "rejected_sequence_index": np.array([0, 1, 1], dtype=np.int32),
+        "rejected_frame_index": np.array([1, 2, 5], dtype=np.int32),
+        "rejected_post_contact": np.array([False, False, True]),
+        "rejected_reason": np.array([0, 1, 1], dtype=np.int32),
+        "reason_names": ("out of bounds", "object linear velocity"),
+    }
+    return ResetBank(**(fields | changes))

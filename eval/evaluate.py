@@ -1,0 +1,238 @@
+"""Evaluation from files: a policy and demonstrations in, one result per engine out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from xreset import robots
+from xreset.backends.registry import backend_class
+from xreset.errors import FileFormatError, PolicyError
+from xreset.eval.baselines import KinematicRetargeting
+from xreset.eval.results import summarize, write_results
+from xreset.eval.rollout import roll_out
+from xreset.files import file_hash
+from xreset.objects import load_objects
+from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
+from xreset.resets.bank import ResetBank, check_robot
+from xreset.retarget.pipeline import Retargeted, read_retargeted, retarget
+from xreset.spec import ObjectSpec, RobotSpec
+from xreset.task.config import TaskConfig, evaluation_task
+from xreset.typed import from_dict
+
+BASELINES = ("zero", "random", "ik")
+"""Policies that are known by name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """What is to be evaluated."""
+
+    policy: Callable[[RobotSpec, Retargeted | None], Policy]
+    """Makes the policy (a fresh one for each engine)."""
+    label: str
+    robot: RobotSpec
+    task: TaskConfig
+    """The policy's own task, as trained."""
+    folder: Path
+    """Where results go by default."""
+    objects_folder: str | None
+    """Folder of meshes that it was trained with."""
+    inputs: dict[str, str]
+
+
+def resolve(policy: str, robot: str | None, seed: int) -> Subject:
+    """Find out what ``RUN | POLICY.onnx | zero | random | ik`` means.
+
+    Raises:
+        PolicyError: there is no such policy, or it does not fit the robot.
+    """
+    if policy in BASELINES:
+        if robot is None:
+            raise PolicyError(f"the baseline {policy!r} needs --robot.")
+        spec = robots.load(robot)
+        makers: dict[str, Callable[[RobotSpec, Retargeted | None], Policy]] = {
+            "zero": lambda r, _: ZeroPolicy(len(r.joints)),
+            "random": lambda r, _: RandomPolicy(len(r.joints), seed),
+            "ik": lambda _, trajectories: KinematicRetargeting(_given(trajectories)),
+        }
+        folder = Path("runs") / f"{policy}-{spec.name}" / "eval"
+        return Subject(policy=makers[policy], label=policy, robot=spec, task=TaskConfig(), folder=folder, objects_folder=None, inputs={})
+    path = Path(policy)
+    objects_folder = None
+    if path.is_dir():
+        from xreset.learning.run import read_run
+        from xreset.learning.train import ensure_policy
+
+        run = read_run(path)
+        file, folder, objects_folder, robot = ensure_policy(path), path / "eval", run.objects, robot or run.robot
+        label = path.name
+    elif path.suffix == ".onnx":
+        file, folder, label = path, path.parent / "eval", path.stem
+    else:
+        raise PolicyError(f"there is no policy {policy!r}: expected a run folder, a .onnx file, or one of {', '.join(BASELINES)}.")
+    contract = OnnxPolicy(file).contract
+    spec = robots.load(robot or contract["robot"])
+    task = from_dict(TaskConfig, contract["task"], f"{file}: task")
+    check_contract(str(file), contract, spec, task)
+    return Subject(
+        policy=lambda *_: OnnxPolicy(file),
+        label=label,
+        robot=spec,
+        task=task,
+        folder=folder,
+        objects_folder=objects_folder,
+        inputs={"policy": file_hash(file)},
+    )
+
+
+def load_motion(path: Path, robot: RobotSpec, objects_folder: Path | None, *, trajectories: bool) -> tuple[ResetBank, Retargeted | None]:
+    """Starts and goals of demonstrations, and the robot's trajectories if asked for.
+
+    Args:
+        path: demonstrations (``xreset demos``) or retargeted trajectories (``xreset retarget``).
+        robot: the robot.
+        objects_folder: folder of meshes; None: stand-ins.
+        trajectories: whether robot trajectories are needed; demonstrations are then retargeted here.
+    """
+    from xreset.demos.archive import SCHEMA as DEMOS
+    from xreset.demos.archive import read_demos
+    from xreset.retarget.pipeline import SCHEMA as RETARGETED
+    from xreset.retarget.pipeline import rest_on_table
+
+    schema = _schema_of(path)
+    if schema == RETARGETED:
+        data = read_retargeted(path)
+        check_robot(
+            path, "retargeted file", robot, name=data.robot, joint_names=tuple(data.joint_names), fingerprint=data.robot_fingerprint
+        )
+    elif schema == DEMOS:
+        demos = read_demos(path)
+        objects = load_objects(sorted({*map(str, demos.object_name)}), objects_folder)
+        if trajectories:
+            data = retarget(demos, robot, objects)
+        else:
+            demos = rest_on_table(demos, objects)
+            return _starts_and_goals(robot, demos.sequence_name, demos.object_name, demos.frame_offsets, demos), None
+    else:
+        raise FileFormatError(f"{path} states schema {schema!r}, expected {DEMOS!r} (xreset demos) or {RETARGETED!r} (xreset retarget).")
+    return _starts_and_goals(robot, data.sequence_name, data.object_name, data.frame_offsets, data), data
+
+
+def evaluate(
+    subject: Subject,
+    backends: list[str],
+    demos: Path,
+    *,
+    episodes: int,
+    seed: int,
+    num_envs: int,
+    device: str,
+    objects_folder: Path | None,
+    out: Path,
+    progress: Callable[[str, int, int], None] = lambda name, done, total: None,
+) -> list[dict[str, Any]]:
+    """Evaluate in each engine and write the results.
+
+    Args:
+        subject: what to evaluate.
+        backends: engines; all are checked before the first rollout.
+        demos: demonstrations or retargeted trajectories.
+        episodes: episodes per demonstration.
+        seed: of the perturbations and of the random policy.
+        num_envs: worlds at a time.
+        device: where GPU engines run.
+        objects_folder: folder of meshes; None: the policy's own, or the stand-ins.
+        out: folder for the results.
+        progress: called with (engine, control steps done, control steps in all).
+
+    Returns:
+        The summaries that were written, in the order of ``backends``.
+    """
+    versions = {name: backend_class(name).engine_version() for name in backends}
+    folder = objects_folder or (Path(subject.objects_folder) if subject.objects_folder else None)
+    bank, trajectories = load_motion(demos, subject.robot, folder, trajectories=subject.label == "ik")
+    objects: tuple[ObjectSpec, ...] = tuple(load_objects(sorted({*map(str, bank.sequence_object)}), folder))
+    task = evaluation_task(subject.task)
+    summaries = []
+    for name in backends:
+        rollouts = roll_out(
+            subject.policy(subject.robot, trajectories),
+            name,
+            subject.robot,
+            objects,
+            bank,
+            task,
+            repetitions=episodes,
+            seed=seed,
+            num_envs=num_envs,
+            device=device if "cuda" in getattr(backend_class(name), "devices", lambda: ["cpu"])() else "cpu",
+            progress=lambda done, total, name=name: progress(name, done, total),
+        )
+        summary = summarize(
+            rollouts,
+            backend=name,
+            backend_version=versions[name],
+            robot=subject.robot.name,
+            policy=subject.label,
+            seed=seed,
+            repetitions=episodes,
+            inputs=subject.inputs | {"demos": file_hash(demos)},
+            objects_folder=str(folder) if folder else None,
+        )
+        write_results(out, summary, rollouts, subject.robot.joint_names)
+        summaries.append(summary)
+    return summaries
+
+
+def _given(trajectories: Retargeted | None) -> Retargeted:
+    assert trajectories is not None, "the ik baseline needs trajectories"
+    return trajectories
+
+
+def _schema_of(path: Path) -> str | None:
+    if not path.is_file():
+        raise FileFormatError(f"there is no {path} (demonstrations or retargeted trajectories).")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return str(file["schema"]) if "schema" in file.files else None
+    except Exception as error:
+        raise FileFormatError(f"{path} cannot be read as an npz file: {error}. It is damaged, truncated, or something else.") from error
+
+
+def _starts_and_goals(robot: RobotSpec, names: Any, object_names: Any, offsets: np.ndarray, motion: Any) -> ResetBank:
+    """A bank without states from anything that has ``object_pos`` and ``object_quat_wxyz`` per frame."""
+    names, object_names = np.asarray(names), np.asarray(object_names)
+    first, last = offsets[:-1], offsets[1:] - 1
+    unique = tuple(sorted(set(object_names.tolist())))
+    none_i, none_f = np.zeros(0, np.int32), np.zeros((0, 3), np.float32)
+    return ResetBank(
+        robot=robot.name,
+        robot_fingerprint=robot.fingerprint,
+        backends=(),
+        joint_names=robot.joint_names,
+        joint_pos=np.zeros((0, len(robot.joints)), np.float32),
+        object_pos=none_f,
+        object_quat_wxyz=np.zeros((0, 4), np.float32),
+        object_name=np.zeros(0, np.str_),
+        sequence_index=none_i,
+        frame_index=none_i,
+        post_contact=np.zeros(0, bool),
+        sequence_name=names,
+        sequence_object=object_names,
+        start_pos=motion.object_pos[first].astype(np.float32),
+        start_quat_wxyz=motion.object_quat_wxyz[first].astype(np.float32),
+        goal_pos=motion.object_pos[last].astype(np.float32),
+        goal_quat_wxyz=motion.object_quat_wxyz[last].astype(np.float32),
+        object_names=unique,
+        object_sources=("",) * len(unique),
+        rejected_sequence_index=none_i,
+        rejected_frame_index=none_i,
+        rejected_post_contact=np.zeros(0, bool),
+        rejected_reason=none_i,
+        reason_names=(),
+    )

@@ -1,0 +1,68 @@
+"""``xreset eval``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def evaluate(
+    policy: Annotated[str, tyro.conf.Positional],
+    *,
+    backend: Annotated[list[str], tyro.conf.UseAppendAction],
+    demos: Path,
+    episodes: int = 5,
+    seed: int = 0,
+    robot: str | None = None,
+    objects: Path | None = None,
+    num_envs: int = 64,
+    device: str = "cpu",
+    out: Path | None = None,
+) -> None:
+    """Evaluate a policy, or a baseline, in one or several engines.
+
+    Args:
+        policy: Run folder, exported policy (.onnx), or a baseline: zero, random, ik (open-loop kinematic retargeting).
+        backend: Physics engine; give it again for more engines.
+        demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the path of ik.
+        episodes: Episodes per demonstration, each with another perturbation of robot and object.
+        seed: Seed of the perturbations; they are the same in every engine.
+        robot: Name or folder of the robot; default: the policy's.
+        objects: Folder of real meshes; default: what the policy was trained with, else the stand-ins.
+        num_envs: Worlds at a time.
+        device: Where GPU engines run: cpu or cuda.
+        out: Folder for the results; default: eval/ in the run folder or beside the policy, runs/BASELINE-ROBOT/eval for a baseline.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from xreset.errors import XResetError
+    from xreset.eval.evaluate import evaluate, resolve
+    from xreset.eval.table import rich_table
+
+    if episodes < 1 or num_envs < 1:
+        raise XResetError(f"--episodes and --num-envs must be at least 1, found {episodes} and {num_envs}.")
+    console = Console()
+    subject = resolve(policy, robot, seed)
+    folder = out or subject.folder
+    with Progress(console=console, transient=True) as bar:
+        tasks = {name: bar.add_task(name, total=None) for name in backend}
+        summaries = evaluate(
+            subject,
+            list(dict.fromkeys(backend)),
+            demos,
+            episodes=episodes,
+            seed=seed,
+            num_envs=num_envs,
+            device=device,
+            objects_folder=objects,
+            out=folder,
+            progress=lambda name, done, total: bar.update(tasks[name], completed=done, total=total),
+        )
+    console.print(rich_table(summaries))
+    console.print(f"results in {folder}")
+
+
+COMMAND = evaluate

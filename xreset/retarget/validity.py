@@ -1,0 +1,84 @@
+"""When a retargeted frame may be used, and why not.
+
+The paper (appendix D.b): frames are valid only when wrist position and orientation error, retargeting error and arm-joint jumps remain
+below thresholds. Collisions and missing annotations count as well; every invalid frame has one reason, the first that applies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+REASONS = (
+    "valid",
+    "not annotated",
+    "hand error",
+    "joint limit",
+    "wrist position",
+    "wrist orientation",
+    "arm jump",
+    "table collision",
+    "self collision",
+)
+"""Why a frame is invalid, in the order of precedence. ``joint limit``: the wrist pose is missed with an arm joint at its limit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thresholds:
+    """Limits of a valid frame."""
+
+    hand_error: float = 0.030
+    """Mean distance of the fingertips from the human's [m]."""
+    wrist_position: float = 0.010
+    """Distance of the hand root from its target [m]."""
+    wrist_orientation: float = 0.0873
+    """Angle of the hand root to its target [rad] (5 degrees)."""
+    arm_jump: float = 0.35
+    """Largest change of an arm joint since the frame before [rad or m]."""
+    table_depth: float = 0.003
+    """Depth of the robot's shapes in the table [m]."""
+    self_depth: float = 0.003
+    """Depth of the robot's shapes in one another [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measures:
+    """What is measured of frames; every tensor has the same shape."""
+
+    annotated: Tensor
+    """bool: whether the human hand was annotated."""
+    hand_error: Tensor
+    """Mean fingertip distance [m]."""
+    wrist_position: Tensor
+    """[m]"""
+    wrist_orientation: Tensor
+    """[rad]"""
+    at_limit: Tensor
+    """bool: an arm joint is at its limit."""
+    arm_jump: Tensor
+    """[rad or m]; 0 in the first annotated frame."""
+    table_clearance: Tensor
+    """Lowest height of the robot's shapes above the table [m]."""
+    self_clearance: Tensor
+    """Smallest signed distance between the robot's shapes [m]."""
+
+
+def classify(measures: Measures, thresholds: Thresholds) -> Tensor:
+    """Index into :data:`REASONS` of every frame; 0 is valid. A value that is not a number counts as beyond its threshold."""
+    position = ~(measures.wrist_position <= thresholds.wrist_position)
+    orientation = ~(measures.wrist_orientation <= thresholds.wrist_orientation)
+    applies = {
+        "not annotated": ~measures.annotated,
+        "hand error": ~(measures.hand_error <= thresholds.hand_error),
+        "joint limit": (position | orientation) & measures.at_limit,
+        "wrist position": position,
+        "wrist orientation": orientation,
+        "arm jump": ~(measures.arm_jump <= thresholds.arm_jump),
+        "table collision": ~(measures.table_clearance >= -thresholds.table_depth),
+        "self collision": ~(measures.self_clearance >= -thresholds.self_depth),
+    }
+    reason = measures.annotated.long() * 0
+    for name in reversed(REASONS[1:]):
+        reason[applies[name]] = REASONS.index(name)
+    return reason

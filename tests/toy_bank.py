@@ -1,4 +1,4 @@
-"""A small reset bank for tests: objects ``soup`` and ``spam``, three demonstrations, six states; every number can be told from every other."""
+"""A small reset bank for tests: soup and spam, three demonstrations, six states; every number can be told from every other."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def toy_bank(robot: RobotSpec, **changes: Any) -> ResetBank:
         "sequence_object": owners,
         "start_pos": start.astype(np.float32),
         "start_quat_wxyz": np.tile(upright, (3, 1)).astype(np.float32),
-        "goal_pos": (start + [0, 0, 0.2]).astype(np.float32),
+        "goal_pos": (start + np.array([0, 0, 0.2])).astype(np.float32),
         "goal_quat_wxyz": np.tile(turned, (3, 1)).astype(np.float32),
         "object_names": (SOUP, SPAM),
         "object_sources": ("stand-in", "stand-in"),

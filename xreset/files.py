@@ -143,7 +143,7 @@ def read_npz(
     path = Path(path)
     _must_exist(path, what)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:  # numpy leaves a file open that it cannot read
             arrays = {name: file[name] for name in file.files}
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
         raise FileFormatError(f"{path} cannot be read as {what}: {error}. It is damaged or truncated, or not an npz file.") from error

@@ -160,9 +160,13 @@ def _check(arrays: dict[str, np.ndarray]) -> str | None:
     for name in ("object_quat_wxyz", "start_quat_wxyz", "goal_quat_wxyz"):
         if len(arrays[name]) and np.abs(np.linalg.norm(arrays[name], axis=-1) - 1).max() > 1e-3:
             return f"array {name!r} holds quaternions that are not unit."
-    num_sequences = len(arrays["sequence_name"])
-    if (arrays["sequence_index"] >= num_sequences).any() or (arrays["sequence_index"] < 0).any():
-        return f"array 'sequence_index' points beyond the {num_sequences} sequences."
+    for name, owner, what in (
+        ("sequence_index", "sequence_name", "sequences"),
+        ("rejected_sequence_index", "sequence_name", "sequences"),
+        ("rejected_reason", "reason_names", "reasons"),
+    ):
+        if (arrays[name] >= len(arrays[owner])).any() or (arrays[name] < 0).any():
+            return f"array {name!r} points beyond the {len(arrays[owner])} {what}."
     if (arrays["sequence_object"][arrays["sequence_index"]] != arrays["object_name"]).any():
         return "a state names another object than its sequence."
     missing = set(arrays["sequence_object"].tolist()) - set(arrays["object_names"].tolist())

@@ -1,0 +1,363 @@
+"""Files: whole or not at all, checked before use; typed configuration; the reset bank's refusals."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import unittest
+import zipfile
+from dataclasses import asdict, dataclass, replace
+from errno import ENOSPC
+from pathlib import Path
+from typing import Literal
+from unittest import mock
+
+import numpy as np
+
+from tests.toy_bank import SOUP, SPAM, toy_bank
+from tests.toy_robot import toy_hand_arm
+from xreset.errors import FileFormatError, XResetError
+from xreset.files import Field, atomic_write, meta_of, read_json, read_npz, write_json, write_npz
+from xreset.resets.bank import check_objects, read_bank, write_bank
+from xreset.spec import ObjectSpec
+from xreset.task.config import TaskConfig
+from xreset.typed import from_dict
+
+SCHEMA = {
+    "points": Field(("F", 3), "f"),
+    "offsets": Field(("S+1",), "i"),
+    "names": Field(("S",), "U"),
+    "good": Field(("F",), "b"),
+    "note": Field((), "U", required=False),
+}
+ARRAYS = {
+    "points": np.arange(12.0).reshape(4, 3),
+    "offsets": np.array([0, 1, 4]),
+    "names": np.array(["a", "b"]),
+    "good": np.array([True, False, True, True]),
+}
+
+
+class InFolder(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name)
+        self.file = self.folder / "file.npz"
+
+    def assert_only(self, *names: str):
+        self.assertEqual(sorted(f.name for f in self.folder.iterdir()), sorted(names))
+
+    def refused(self, *words: str):
+        return self.assertRaisesRegex(FileFormatError, "(?s)" + ".*".join(words))
+
+
+class AtomicWriteTest(InFolder):
+    def test_a_failure_in_the_block_leaves_the_old_file_alone(self):
+        path = self.folder / "a.txt"
+        path.write_text("old")
+        with self.assertRaises(ZeroDivisionError), atomic_write(path, "w") as file:
+            file.write("new")
+            raise ZeroDivisionError
+        self.assertEqual(path.read_text(), "old")
+        self.assert_only("a.txt")
+
+    def test_replaces_the_file_and_makes_its_folder(self):
+        path = self.folder / "deep" / "er" / "a.txt"
+        for text in ("first", "second"):
+            with atomic_write(path, "w") as file:
+                file.write(text)
+            self.assertEqual(path.read_text(), text)
+        self.assertEqual([f.name for f in path.parent.iterdir()], ["a.txt"])
+
+    def test_the_file_has_the_usual_permissions(self):
+        before = os.umask(0o022)
+        self.addCleanup(os.umask, before)
+        write_json(self.folder / "a.json", {})
+        self.assertEqual((self.folder / "a.json").stat().st_mode & 0o777, 0o644)
+
+    def test_a_disk_that_is_full_at_the_last_moment(self):
+        path = self.folder / "a.json"
+        write_json(path, {"old": 1})
+        full = OSError(ENOSPC, os.strerror(ENOSPC))
+        with mock.patch("os.fsync", side_effect=full), self.assertRaisesRegex(XResetError, "No space left.*free some space"):
+            write_json(path, {"new": 2})
+        self.assertEqual(read_json(path), {"old": 1})
+        self.assert_only("a.json")
+
+    def test_a_write_that_the_system_cuts_short(self):
+        """A real one: the process may write no file larger than 64 kB, and the archive is larger."""
+        write_npz(self.file, "test/1", {"x": np.zeros(3)})
+        before = self.file.read_bytes()
+        program = (
+            "import resource, signal, sys, numpy as np\n"
+            "from xreset.errors import XResetError\n"
+            "from xreset.files import write_npz\n"
+            "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+            "resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536))\n"
+            "try:\n"
+            "    write_npz(sys.argv[1], 'test/1', {'x': np.random.default_rng(0).random(100_000)})\n"
+            "except XResetError as error:\n"
+            "    print('refused:', error)\n"
+        )
+        result = subprocess.run([sys.executable, "-c", program, str(self.file)], capture_output=True, text=True, check=True)
+        self.assertIn("refused: cannot write", result.stdout)
+        self.assertEqual(self.file.read_bytes(), before)
+        self.assert_only("file.npz")
+
+    def test_a_folder_that_cannot_be_made(self):
+        (self.folder / "a").write_text("a file, not a folder")
+        with self.assertRaisesRegex(XResetError, "cannot write"):
+            write_json(self.folder / "a" / "b.json", {})
+
+
+class JsonTest(InFolder):
+    def test_non_finite_numbers_are_refused_and_nothing_is_written(self):
+        with self.assertRaises(ValueError):
+            write_json(self.folder / "a.json", {"x": float("nan")})
+        self.assert_only()
+
+    def test_refusals(self):
+        path = self.folder / "a.json"
+        with self.refused("there is no", "a.json"):
+            read_json(path)
+        with self.refused("is a folder"):
+            read_json(self.folder)
+        for text, words in (('{"schema": "x/1"', "not valid JSON"), ("[1]", "a JSON list"), ("\xff\xfe", "not valid JSON")):
+            path.write_text(text, encoding="latin-1")
+            with self.subTest(text), self.refused(words):
+                read_json(path)
+        path.write_text('{"schema": "x/1"}')
+        with self.refused("schema version 'x/1'", "reads 'x/2'"):
+            read_json(path, "x/2")
+        with self.refused("states schema 'x/1', expected 'y/1'"):
+            read_json(path, "y/1")
+
+
+class NpzTest(InFolder):
+    def write(self, schema: str = "test/1", **changes):
+        write_npz(self.file, schema, {k: v for k, v in (ARRAYS | changes).items() if v is not None}, config={"p": 0.5}, inputs={"a": "ff"})
+
+    def read(self):
+        return read_npz(self.file, "test/1", SCHEMA, what="a test file")
+
+    def test_round_trip(self):
+        self.write(note="hello")
+        found = self.read()
+        for name, value in ARRAYS.items():
+            np.testing.assert_array_equal(found[name], value)
+            self.assertEqual(found[name].dtype, value.dtype)
+        self.assertEqual(str(found["note"]), "hello")
+        self.assertEqual(meta_of(found)["config"], {"p": 0.5})
+        self.assertEqual(meta_of(found)["inputs"], {"a": "ff"})
+
+    def test_the_same_content_gives_the_same_bytes(self):
+        self.write()
+        first = self.file.read_bytes()
+        with mock.patch("time.time", return_value=2e9), mock.patch("time.localtime", return_value=(2033, 5, 18, 3, 33, 20, 2, 138, 0)):
+            self.write()
+        self.assertEqual(self.file.read_bytes(), first)
+        self.write(points=ARRAYS["points"] + 1)
+        self.assertNotEqual(self.file.read_bytes(), first)
+
+    def test_objects_are_neither_written_nor_read(self):
+        with self.assertRaisesRegex(TypeError, "object"):
+            self.write(names=np.array([{}, {}], dtype=object))
+        self.assert_only()
+        np.savez(self.file, schema="test/1", **(ARRAYS | {"names": np.array(["a", None], dtype=object)}), allow_pickle=True)
+        with self.refused("cannot be read as a test file"):
+            self.read()
+
+    def test_damaged_files(self):
+        self.write()
+        whole = self.file.read_bytes()
+        damaged = {"half": whole[: len(whole) // 2], "empty": b"", "text": b"hello", "array": None}
+        for name, content in damaged.items():
+            with self.subTest(name):
+                if content is None:
+                    np.save(self.folder / "x.npy", np.zeros(3))
+                    content = (self.folder / "x.npy").read_bytes()
+                self.file.write_bytes(content)
+                with self.refused("cannot be read as a test file", "damaged or truncated"):
+                    self.read()
+
+    def test_flipped_bits(self):
+        self.write(points=np.random.default_rng(0).random((4, 3)))
+        content = bytearray(self.file.read_bytes())
+        with zipfile.ZipFile(self.file) as archive:
+            info = archive.getinfo("points.npy")
+        content[info.header_offset + 60 + info.compress_size // 2] ^= 0xFF
+        self.file.write_bytes(content)
+        with self.refused("cannot be read"):
+            self.read()
+
+    def test_wrong_schema_and_version(self):
+        self.write("test/2")
+        with self.refused("schema version 'test/2'", "reads 'test/1'", "Make the file again"):
+            self.read()
+        self.write("other/1")
+        with self.refused("states schema 'other/1', expected 'test/1'"):
+            self.read()
+        np.savez(self.file, **ARRAYS)
+        with self.refused("states no schema"):
+            self.read()
+
+    def test_wrong_content_is_named(self):
+        for words, change in (
+            ("no array 'names'; found good, meta, offsets", {"names": None}),
+            (r"'points' has shape \(4, 2\), expected \(F, 3\)", {"points": np.zeros((4, 2))}),
+            (r"'points' has shape \(12,\), expected \(F, 3\)", {"points": np.zeros(12)}),
+            ("'points' has type int64, expected floating-point", {"points": np.zeros((4, 3), dtype=np.int64)}),
+            (r"'good' has shape \(5,\), but F = 4 by array 'points'", {"good": np.ones(5, dtype=bool)}),
+            (r"'names' has shape \(3,\), but S = 2 by array 'offsets'", {"names": np.array(["a", "b", "c"])}),
+            ("'note' has type", {"note": 3.0}),
+        ):
+            self.write(**change)
+            with self.subTest(words), self.refused("not valid as a test file", words):
+                self.read()
+
+    def test_unsigned_integers_are_integers(self):
+        self.write(offsets=np.array([0, 1, 4], dtype=np.uint16))
+        self.assertEqual(self.read()["offsets"].tolist(), [0, 1, 4])
+
+    def test_a_further_check_may_refuse(self):
+        self.write()
+        with self.refused("the offsets are odd"):
+            read_npz(self.file, "test/1", SCHEMA, what="a test file", check=lambda arrays: "the offsets are odd")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inner:
+    size: float
+    mode: Literal["a", "b"] = "a"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outer:
+    inner: Inner
+    widths: tuple[int, ...]
+    pair: tuple[float, float]
+    name: str | None = None
+    on: bool = False
+
+
+class TypedTest(unittest.TestCase):
+    GOOD = Outer(inner=Inner(size=1.5, mode="b"), widths=(1, 2, 3), pair=(0.0, 1.0), name="x", on=True)
+
+    def test_round_trip_through_json(self):
+        for value in (self.GOOD, replace(self.GOOD, name=None)):
+            self.assertEqual(from_dict(Outer, json.loads(json.dumps(asdict(value)))), value)
+        task = TaskConfig(timestep=0.01)
+        self.assertEqual(from_dict(TaskConfig, json.loads(json.dumps(asdict(task)))), task)
+
+    def test_an_integer_is_a_float_but_not_the_other_way_round(self):
+        data = asdict(self.GOOD) | {"pair": [0, 1]}
+        self.assertIsInstance(from_dict(Outer, data).pair[0], float)
+        with self.assertRaisesRegex(FileFormatError, r"widths\[1\] is 2.5, expected int"):
+            from_dict(Outer, data | {"widths": [1, 2.5]})
+
+    def test_refusals_name_the_entry(self):
+        good = asdict(self.GOOD)
+        for words, data in (
+            ("unknown: extra", good | {"extra": 1}),
+            ("missing: pair", {k: v for k, v in good.items() if k != "pair"}),
+            ("configuration.inner does not fit Inner.*missing: mode", good | {"inner": {"size": 1.0}}),
+            ("inner.mode is 'c', expected one of 'a', 'b'", good | {"inner": {"size": 1.0, "mode": "c"}}),
+            ("pair has 3 entries, expected 2", good | {"pair": [1.0, 2.0, 3.0]}),
+            ("pair is 1.0, expected a list", good | {"pair": 1.0}),
+            ("on is 1, expected bool", good | {"on": 1}),
+            (r"widths\[0\] is True, expected int", good | {"widths": [True]}),
+            ("name is 3, expected str", good | {"name": 3}),
+            ("configuration is 3, expected an object", 3),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
+                from_dict(Outer, data)
+
+
+class BankTest(InFolder):
+    def setUp(self):
+        super().setUp()
+        self.robot = toy_hand_arm(self.folder)
+
+    def write(self, **changes):
+        write_bank(self.file, toy_bank(self.robot, **changes), config={"steps": 8}, inputs={"retargeted": "ab"})
+
+    def test_round_trip(self):
+        for changes in ({}, {"rejected_reason": np.zeros(3, dtype=np.int32)}):
+            self.write(**changes)
+            found, made = read_bank(self.file, robot=self.robot), toy_bank(self.robot, **changes)
+            for name, value in vars(made).items():
+                self.assertEqual(type(getattr(found, name)), type(value), name)
+                np.testing.assert_array_equal(getattr(found, name), value, name)
+
+    def test_a_bank_without_a_state_still_has_starts_and_goals(self):
+        none = toy_bank(self.robot).select(sequences=np.zeros(3, dtype=bool))
+        write_bank(self.file, none, config={}, inputs={})
+        found = read_bank(self.file, robot=self.robot)
+        self.assertEqual((found.num_states, len(found.goal_pos)), (0, 3))
+
+    def test_select(self):
+        bank = toy_bank(self.robot)
+        chosen = bank.select(sequences=np.array([True, False, True]), pre_contact_only=True)
+        np.testing.assert_array_equal(chosen.sequence_index, [0, 2])
+        np.testing.assert_array_equal(chosen.frame_index, [3, 5])
+        np.testing.assert_array_equal(chosen.joint_pos, bank.joint_pos[[0, 4]])
+        self.assertEqual(chosen.sequence_name.tolist(), ["demo_a", "demo_b", "demo_c"])
+
+    def test_a_bank_of_another_robot(self):
+        other = replace(toy_bank(self.robot), robot="openarm", joint_names=("j1", "j2"), joint_pos=np.zeros((6, 2), dtype=np.float32))
+        write_bank(self.file, other, config={}, inputs={})
+        with self.refused("for the robot 'openarm' with 2 joints", "--robot toy"):
+            read_bank(self.file, robot=self.robot)
+        self.assertEqual(read_bank(self.file).robot, "openarm")
+
+    def test_a_bank_of_the_robot_before_it_was_changed(self):
+        self.write()
+        self.robot.urdf.write_text(self.robot.urdf.read_text().replace('mass value="0.1"', 'mass value="0.2"'))
+        with self.refused("another version of 'toy'", "Make it again"):
+            read_bank(self.file, robot=self.robot)
+
+    def test_bad_content(self):
+        bank = toy_bank(self.robot)
+
+        def with_value(name, index, value):
+            array = getattr(bank, name).copy()
+            array[index] = value
+            return {name: array}
+
+        for words, changes in (
+            ("'joint_pos' holds non-finite", with_value("joint_pos", (2, 1), np.nan)),
+            ("'goal_pos' holds non-finite", with_value("goal_pos", (0, 1), np.inf)),
+            ("'goal_quat_wxyz' holds quaternions that are not unit", with_value("goal_quat_wxyz", 1, [2, 0, 0, 0])),
+            ("'sequence_index' points beyond the 3 sequences", with_value("sequence_index", 1, 3)),
+            ("'sequence_index' points beyond the 3 sequences", with_value("sequence_index", 1, -1)),
+            ("another object than its sequence", with_value("object_name", 0, SPAM)),
+            (f"does not list \\['{SPAM}'\\]", {"object_names": (SOUP,), "object_sources": ("stand-in",)}),
+            ("'rejected_sequence_index' points beyond the 3 sequences", with_value("rejected_sequence_index", 0, 7)),
+            ("'rejected_reason' points beyond the 2 reasons", with_value("rejected_reason", 0, 2)),
+            ("'object_sources' has shape", {"object_sources": ("stand-in",)}),
+            ("but L = 6", {"post_contact": np.ones(5, dtype=bool)}),
+            ("but J = 7", {"joint_pos": np.zeros((6, 8), dtype=np.float32)}),
+        ):
+            self.write(**changes)
+            with self.subTest(words), self.refused("not valid as a reset bank", words):
+                read_bank(self.file, robot=self.robot)
+
+    def test_objects_must_be_those_that_it_was_made_with(self):
+        def obj(name: str, source: str) -> ObjectSpec:
+            nothing = np.zeros((0, 3))
+            return ObjectSpec(
+                name=name, pieces=(), mass=1.0, com=np.zeros(3), inertia=np.eye(3), vertices=nothing, faces=nothing, source=source
+            )
+
+        bank = toy_bank(self.robot, object_sources=("stand-in", "ab12"))
+        check_objects("bank.npz", bank, (obj(SOUP, "stand-in"), obj(SPAM, "ab12"), obj("011_banana", "ff")))
+        with self.refused(f"built-in stand-in of {SOUP}, but here is an imported mesh", "--objects"):
+            check_objects("bank.npz", bank, (obj(SOUP, "ab12"),))
+        with self.refused(f"an imported mesh of {SPAM}, but here is an imported mesh", "another one"):
+            check_objects("bank.npz", bank, (obj(SPAM, "ab13"),))
+
+
+if __name__ == "__main__":
+    unittest.main()

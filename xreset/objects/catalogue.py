@@ -7,7 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from xreset.errors import ObjectError
-from xreset.objects.standins import MASSES, stand_in
+from xreset.objects.standins import STAND_INS, stand_in
 from xreset.spec import ObjectSpec
 
 ALIASES = {
@@ -27,13 +27,13 @@ ALIASES = {
 def object_names(folder: Path | None = None) -> tuple[str, ...]:
     """Official names of the built-in objects, or of the meshes in a folder."""
     if folder is None:
-        return tuple(MASSES)
+        return STAND_INS
     from xreset.objects.meshes import mesh_files
 
     return tuple(mesh_files(folder))
 
 
-def canonical_name(name: str, known: Iterable[str] = tuple(MASSES)) -> str:
+def canonical_name(name: str, known: Iterable[str] = STAND_INS) -> str:
     """The official name of an object: from itself, its name without the number, or the paper's name for it.
 
     Raises:

@@ -13,20 +13,8 @@ from itertools import pairwise
 import numpy as np
 
 from xreset.objects.geometry import box, cylinder, hull, loft, mass_properties, prism, section, surface_of
+from xreset.objects.ycb import MASSES
 from xreset.spec import ObjectSpec, Shape
-
-MASSES = {
-    "003_cracker_box": 0.411,
-    "005_tomato_soup_can": 0.349,
-    "006_mustard_bottle": 0.603,
-    "007_tuna_fish_can": 0.171,
-    "010_potted_meat_can": 0.370,
-    "011_banana": 0.066,
-    "019_pitcher_base": 0.178,
-    "035_power_drill": 0.895,
-    "037_scissors": 0.082,
-}
-"""Published masses [kg] (Calli et al. 2015)."""
 
 MM = 1e-3
 UP = np.array([0.0, 0.0, 1.0])
@@ -182,3 +170,6 @@ _MAKERS: dict[str, Callable[[], tuple[Shape, ...]]] = {
     "035_power_drill": _power_drill,
     "037_scissors": _scissors,
 }
+
+STAND_INS = tuple(_MAKERS)
+"""Official names of the objects that have a stand-in."""

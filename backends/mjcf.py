@@ -27,6 +27,9 @@ from xreset.urdf import Joint
 TABLE, OTHER_LINK, OBJECT = -1, -2, -3
 """Values of :attr:`SceneModel.geom_role` beside the fingertip indices 0..E-1."""
 
+MIN_FRICTION = 1e-4
+"""Sliding friction of the object's own geoms, and the smallest of any pair."""
+
 # Collision bits: a pair collides if one's contype meets the other's conaffinity.
 _HIT_OBJECT, _HIT_TABLE, _HIT_SELF = 1, 2, 4
 
@@ -36,7 +39,6 @@ _SOLIMP_MIMIC = (0.99, 0.999, 0.001, 0.5, 2.0)
 _TIME_CONSTANT_STEPS = 2.016  # solref time constant in timesteps; MuJoCo's own minimum is 2
 _CONDIM = 4
 _ROLLING = 1e-4  # MuJoCo wants a positive number although condim 4 does not use it
-_MIN_FRICTION = 1e-4  # of the object's own shapes: a pair takes the larger of its two, so the other shape decides
 _ARENA = 16 << 20  # bytes for contacts and constraints of one MjData
 
 _KINDS = ("box", "sphere", "capsule", "cylinder", "hull")
@@ -90,11 +92,13 @@ class SceneModel:
     parked: np.ndarray
     """[G] bool: an object's shape slot that this object does not use."""
 
-    def geom_friction(self, pair: np.ndarray) -> np.ndarray:
-        """[..., G] sliding friction of each geom that gives the pairs object-tip, object-other link, object-table the friction [..., 3]."""
-        column = np.select([self.geom_role >= 0, self.geom_role == OTHER_LINK, self.geom_role == TABLE], [0, 1, 2], default=3)
-        floor = np.full((*pair.shape[:-1], 1), _MIN_FRICTION)
-        return np.maximum(np.concatenate((pair, floor), axis=-1), _MIN_FRICTION)[..., column]
+    @property
+    def friction_column(self) -> np.ndarray:
+        """[G] which of the frictions (object-tip, object-other link, object-table) a geom decides; 3 for the object's own geoms.
+
+        MuJoCo gives a pair the larger friction of its geoms, and the object's own stays at :data:`MIN_FRICTION`.
+        """
+        return np.select([self.geom_role >= 0, self.geom_role == OTHER_LINK, self.geom_role == TABLE], [0, 1, 2], default=3)
 
 
 def compile_scene(scene: SceneSpec, object_index: int, *, slots_for: Sequence[int] = ()) -> SceneModel:
@@ -150,7 +154,6 @@ def _empty_spec(scene: SceneSpec) -> mujoco.MjSpec:
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = _IMPRATIO
-    option.disableflags = mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world must be seen, not silently put back to its start
     return spec
 
 
@@ -161,7 +164,7 @@ def _solref(scene: SceneSpec) -> tuple[float, float]:
 def _contact(friction: float, scene: SceneSpec) -> dict:
     """Contact attributes of a geom."""
     return {
-        "friction": (max(friction, _MIN_FRICTION), scene.friction.torsional, _ROLLING),
+        "friction": (max(friction, MIN_FRICTION), scene.friction.torsional, _ROLLING),
         "solref": _solref(scene),
         "solimp": _SOLIMP,
         "condim": _CONDIM,

@@ -19,7 +19,7 @@ try:
 except ImportError as error:
     raise unavailable("mujoco", "mujoco", error) from error
 
-from xreset.backends.mjcf import OBJECT, TABLE, SceneModel, compile_scene
+from xreset.backends.mjcf import MIN_FRICTION, OBJECT, TABLE, SceneModel, compile_scene
 
 
 class MujocoWorld(World):
@@ -31,6 +31,7 @@ class MujocoWorld(World):
             mujoco.set_mju_user_warning(lambda _: None)
         self._at: SceneModel = _compiled(_Same(scene), object_index)
         self._model = copy(self._at.model)  # each world has parameters of its own
+        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world must be seen, not silently put back
         self._data = mujoco.MjData(self._model)
         self._stepped = False
 
@@ -135,7 +136,8 @@ class MujocoWorld(World):
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
-        self._model.geom_friction[:, 0] = self._at.geom_friction(friction)
+        pairs = np.maximum((*friction, 0.0), MIN_FRICTION)
+        self._model.geom_friction[:, 0] = pairs[self._at.friction_column]
 
     def set_object_gravity(self, fraction: float) -> None:
         """See :meth:`World.set_object_gravity`."""

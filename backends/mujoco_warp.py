@@ -1,0 +1,451 @@
+"""MuJoCo-Warp: thousands of worlds on a GPU (or a few on the CPU, for tests), sharing memory with torch."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xreset.backends.base import Backend, Capability, Contacts, Health, Links, State, unavailable
+from xreset.backends.pool import initial_state
+from xreset.errors import BackendUnavailableError, XResetError
+from xreset.spec import SceneSpec
+
+try:
+    import mujoco_warp as mjw
+    import warp as wp
+except ImportError as error:
+    raise unavailable("mujoco_warp", "mujoco-warp", error) from error
+
+from xreset.backends import mujoco_warp_kernels as kernels
+from xreset.backends.mjcf import MIN_FRICTION, compile_scene
+
+wp.config.log_level = wp.LOG_WARNING  # else a line for each of some hundred kernels; what a user needs to know is announced below
+
+_SET_PER_WORLD = (
+    "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "body_gravcomp", "geom_friction",
+)  # fmt: skip
+"""Model fields that the setters change: they and all that MuJoCo derives from them must be batched, or every world gets world 0's."""
+
+_OVERFLOW = int(
+    mjw.OverflowType.NEFC
+    | mjw.OverflowType.NJMAX_NNZ
+    | mjw.OverflowType.BROADPHASE
+    | mjw.OverflowType.NARROWPHASE
+    | mjw.OverflowType.CCD
+    | mjw.OverflowType.EPA_HORIZON
+)
+"""Overflows that lose a contact or a constraint."""
+
+
+class MujocoWarpBackend(Backend):
+    """MuJoCo-Warp.
+
+    The worlds share one model; what differs between worlds (the object's shapes, masses, friction) is a batched field of it. A captured
+    CUDA graph holds pointers to the arrays that existed when it was captured, so no array is ever replaced after ``__init__``, only written.
+
+    All work is queued on torch's current stream; no method waits for the GPU.
+    """
+
+    name: ClassVar[str] = "mujoco-warp"
+    capabilities: ClassVar[frozenset[Capability]] = frozenset(("object_mass", "friction", "object_gravity", "object_wrench", "overflow"))
+
+    def __init__(
+        self,
+        scene: SceneSpec,
+        num_worlds: int,
+        *,
+        object_index: Tensor | None = None,
+        device: str = "cpu",
+        contacts_per_world: int = 64,
+        convex_contacts_per_world: int = 32,
+        constraints_per_world: int = 220,
+        solver_iterations: int = 50,
+    ) -> None:
+        """Build the worlds, compile the kernels and capture the CUDA graphs.
+
+        Args:
+            scene: what to simulate.
+            num_worlds: N.
+            object_index: [N] which object each world holds.
+            device: ``cuda[:i]`` or ``cpu``.
+            contacts_per_world: contacts are pooled: all worlds together may have N times as many. Pairs of shapes that are near each other
+                count while contacts are being found, so more are needed than touch.
+            convex_contacts_per_world: likewise, pairs of a type that overlap and need the general convex algorithm.
+            constraints_per_world: rows of constraints (4 a contact, 1 a dry friction, joint limit or mimic joint) in any one world.
+            solver_iterations: most Newton iterations; worlds that have converged stop earlier.
+
+        Raises:
+            BackendUnavailableError: there is no such device.
+        """
+        super().__init__(scene, num_worlds, object_index=object_index, device=device)
+        wp.init()
+        self.device = _existing_device(self.device)
+        self.object_index = self.object_index.to(self.device)
+        self._warp_device = wp.device_from_torch(self.device)
+        self._streams: dict[int, Any] = {}
+        held = self.object_index.unique().tolist()
+        scenes = {i: compile_scene(scene, i, slots_for=held) for i in held}
+        at = max(scenes.values(), key=lambda s: s.model.nC)  # the mass matrix with the fullest structure has room for every object's
+        at.model.opt.iterations = solver_iterations
+        self._at = at
+        with wp.ScopedDevice(self._warp_device):
+            differing = _differing_fields([s.model for s in scenes.values()])
+            self._model = mjw.put_model(at.model, batch_sizes=dict.fromkeys((*_SET_PER_WORLD, *differing), num_worlds))
+            self._model.opt.warn_overflow = 0  # overflows are counted, see health(); printing them from the GPU would flood the terminal
+            self._data = mjw.make_data(
+                at.model, nworld=num_worlds, nconmax=contacts_per_world, nccdmax=convex_contacts_per_world, njmax=constraints_per_world
+            )
+            self._fill_batched({i: s.model for i, s in scenes.items()}, {i: s.parked for i, s in scenes.items()}, differing)
+            self._allocate()
+            with _announced(self._warp_device):
+                self._prepare()
+        self._set_initial_state()
+
+    # Availability ----------------------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def engine_version(cls) -> str:
+        """See :meth:`Backend.engine_version`."""
+        return mjw.__version__
+
+    @classmethod
+    def devices(cls) -> list[str]:
+        """Kinds of devices that can be used here."""
+        return ["cuda", "cpu"] if torch.cuda.is_available() else ["cpu"]
+
+    # State -----------------------------------------------------------------------------------------------------------------------
+
+    def set_state(self, state: State, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_state`. The external wrench of those worlds ends."""
+        self._must_be_open()
+        index = self._every_world if worlds is None else torch.as_tensor(worlds, dtype=torch.int64, device=self.device)
+        new = {f.name: self._checked(f.name, getattr(state, f.name), len(index)) for f in fields(State)}
+        if not len(index):
+            return
+        d, out, at = self._data, self._out, self._at
+        with self._on_stream():
+            wp.launch(
+                kernels.write_state,
+                dim=len(index),
+                inputs=[
+                    wp.from_torch(index.contiguous()), wp.from_torch(new["joint_pos"]), wp.from_torch(new["joint_vel"]),
+                    wp.from_torch(new["joint_target"]), wp.from_torch(new["object_pos"], dtype=wp.vec3),
+                    wp.from_torch(new["object_quat"], dtype=wp.quat), wp.from_torch(new["object_linvel"], dtype=wp.vec3),
+                    wp.from_torch(new["object_angvel"], dtype=wp.vec3), *self._addresses, *self._mimic, at.object_qpos, at.object_dof,
+                    at.object_body,
+                ],
+                outputs=[
+                    d.qpos, d.qvel, d.ctrl, d.qacc_warmstart, d.xfrc_applied, d.overflow, out["nonfinite"], out["tip_force"],
+                    out["tip_touch"], out["table_force"],
+                ],
+            )  # fmt: skip
+            self._run("refresh")
+
+    def state(self) -> State:
+        """See :meth:`Backend.state`: views of the engine's memory."""
+        self._must_be_open()
+        return self._state
+
+    def set_joint_targets(self, targets: Tensor) -> None:
+        """See :meth:`Backend.set_joint_targets`."""
+        self._must_be_open()
+        self._ctrl.copy_(self._checked("joint_target", targets, self.num_worlds))
+
+    def step(self, substeps: int | None = None) -> None:
+        """See :meth:`Backend.step`."""
+        self._must_be_open()
+        substeps = self.scene.substeps if substeps is None else substeps
+        if substeps < 1:
+            raise ValueError(f"substeps is {substeps}, expected at least 1")
+        with self._on_stream():
+            for _ in range(substeps):
+                self._run("step")
+            self._run("contacts")
+            self._run("refresh")
+
+    # Readings --------------------------------------------------------------------------------------------------------------------
+
+    def links(self) -> Links:
+        """See :meth:`Backend.links`: views of the engine's memory."""
+        self._must_be_open()
+        return self._links
+
+    def contacts(self) -> Contacts:
+        """See :meth:`Backend.contacts`: views of the engine's memory."""
+        self._must_be_open()
+        return self._contacts
+
+    def health(self) -> Health:
+        """See :meth:`Backend.health`. Contacts are pooled: when the pool is full, every world reports an overflow."""
+        self._must_be_open()
+        return Health(nonfinite=self._nonfinite, overflow=(self._overflow & _OVERFLOW) != 0)
+
+    # Physical parameters ---------------------------------------------------------------------------------------------------------
+
+    def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_object_mass`."""
+        index = self._selected(worlds)
+        nominal = {name: value[index] for name, value in self._nominal.items()}
+        mass = self._rows(mass, nominal["mass"].shape)
+        ratio = (mass / nominal["mass"])[:, None]
+        body, dofs = self._at.object_body, slice(self._at.object_dof, self._at.object_dof + 6)
+        view = self._field
+        view["body_mass"][index, body] = mass
+        view["body_inertia"][index, body] = nominal["inertia"] * ratio
+        view["body_subtreemass"][index, body] = mass
+        view["body_subtreemass"][index, 0] = nominal["total_mass"] + mass - nominal["mass"]
+        view["body_invweight0"][index, body] = nominal["body_invweight"] / ratio  # of a free body: the inverse of mass and inertia
+        view["dof_invweight0"][index, dofs] = nominal["dof_invweight"] / ratio
+
+    def set_friction(self, friction: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_friction`."""
+        index = self._selected(worlds)
+        friction = self._rows(friction, (len(self._nominal["mass"][index]), 3))
+        pairs = torch.nn.functional.pad(friction, (0, 1)).clamp_min(MIN_FRICTION)
+        self._field["geom_friction"][index, :, 0] = pairs[:, self._friction_column]
+
+    def set_object_gravity(self, fraction: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_object_gravity`."""
+        index = self._selected(worlds)
+        fraction = self._rows(fraction, self._nominal["mass"][index].shape)
+        self._field["body_gravcomp"][index, self._at.object_body] = 1.0 - fraction
+
+    def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
+        """See :meth:`Backend.set_object_wrench`."""
+        self._must_be_open()
+        wrench = torch.cat((self._rows(force, (self.num_worlds, 3)), self._rows(torque, (self.num_worlds, 3))), dim=-1)
+        self._xfrc_applied[:, self._at.object_body] = wrench
+
+    def close(self) -> None:
+        """Free the worlds' memory once nobody else holds a view of it."""
+        self._graphs = self._model = self._data = None
+
+    # Building --------------------------------------------------------------------------------------------------------------------
+
+    def _fill_batched(self, models: dict[int, Any], parked: dict[int, np.ndarray], names: list[str]) -> None:
+        """Give each world its object's values of the fields in which the objects differ."""
+        order = list(models)
+        row = torch.tensor([order.index(i) for i in self.object_index.tolist()], device=self.device)
+        for name in names:
+            values = [np.array(getattr(models[i], name)) for i in order]
+            if name == "geom_dataid":
+                values = [np.where(parked[i], -1, value) for i, value in zip(order, values, strict=True)]  # -1: no mesh in this world
+            view = wp.to_torch(getattr(self._model, name))
+            table = torch.as_tensor(np.stack(values), device=self.device).to(view.dtype).reshape(len(order), *view.shape[1:])
+            view.copy_(table[row])
+
+    def _allocate(self) -> None:
+        """Allocate what the worlds are read into, and name what setters write to."""
+        n, joints, tips = self.num_worlds, len(self.scene.robot.joints), len(self.scene.robot.fingertips)
+        at, links = self._at, 1 + tips
+
+        def zeros(shape: int | tuple[int, ...], dtype: Any) -> Any:
+            return wp.zeros(shape, dtype=dtype)
+
+        def ints(values: np.ndarray) -> Any:
+            return wp.array(values.astype(np.int32), dtype=int)
+
+        self._out = {
+            "joint_pos": zeros((n, joints), float),
+            "joint_vel": zeros((n, joints), float),
+            "object_pos": zeros(n, wp.vec3),
+            "object_quat": zeros(n, wp.quat),
+            "object_linvel": zeros(n, wp.vec3),
+            "object_angvel": zeros(n, wp.vec3),
+            "nonfinite": zeros(n, wp.bool),
+            "link_pos": zeros((n, links), wp.vec3),
+            "link_quat": zeros((n, links), wp.quat),
+            "link_linvel": zeros((n, links), wp.vec3),
+            "link_angvel": zeros((n, links), wp.vec3),
+            "tip_force": zeros((n, tips), wp.vec3),
+            "tip_touch": zeros((n, tips), wp.bool),
+            "table_force": zeros(n, wp.vec3),
+        }
+        self._addresses = [ints(at.joint_qpos), ints(at.joint_dof)]
+        self._mimic = [
+            ints(at.mimic_qpos), ints(at.mimic_dof), ints(at.mimic_source),
+            wp.array(at.mimic_multiplier, dtype=float), wp.array(at.mimic_offset, dtype=float),
+        ]  # fmt: skip
+        self._link_arrays = [ints(at.link_body), wp.array(at.link_pos, dtype=wp.vec3), wp.array(at.link_quat, dtype=wp.quat)]
+        self._geom_role = ints(at.geom_role)
+
+        view = {name: wp.to_torch(array) for name, array in self._out.items()}
+        self._ctrl, self._xfrc_applied = wp.to_torch(self._data.ctrl), wp.to_torch(self._data.xfrc_applied)
+        self._overflow, self._nonfinite = wp.to_torch(self._data.overflow), view["nonfinite"]
+        self._state = State(
+            joint_target=self._ctrl,
+            **{name: view[name] for name in ("joint_pos", "joint_vel", "object_pos", "object_quat", "object_linvel", "object_angvel")},
+        )
+        self._links = Links(pos=view["link_pos"], quat=view["link_quat"], linvel=view["link_linvel"], angvel=view["link_angvel"])
+        self._contacts = Contacts(tip_force=view["tip_force"], tip_touch=view["tip_touch"], table_force=view["table_force"])
+        self._every_world = torch.arange(n, device=self.device)
+        self._field = {name: wp.to_torch(getattr(self._model, name)) for name in _SET_PER_WORLD}
+        self._friction_column = torch.as_tensor(at.friction_column, device=self.device)
+        body, dofs = at.object_body, slice(at.object_dof, at.object_dof + 6)
+        self._nominal = {
+            "mass": self._field["body_mass"][:, body].clone(),
+            "inertia": self._field["body_inertia"][:, body].clone(),
+            "total_mass": self._field["body_subtreemass"][:, 0].clone(),
+            "body_invweight": self._field["body_invweight0"][:, body].clone(),
+            "dof_invweight": self._field["dof_invweight0"][:, dofs].clone(),
+        }
+
+    def _prepare(self) -> None:
+        """Run each sequence of kernels once, which compiles it, and on a GPU capture it as a graph."""
+        self._sequences: dict[str, Callable[[], None]] = {"step": self._step, "contacts": self._read_contacts, "refresh": self._refresh}
+        self._graphs: dict[str, Any] | None = {}
+        for sequence in self._sequences.values():
+            sequence()
+        if self._warp_device.is_cuda:
+            for name, sequence in self._sequences.items():
+                with wp.ScopedCapture(device=self._warp_device) as capture:
+                    sequence()
+                self._graphs[name] = capture.graph
+        wp.synchronize_device(self._warp_device)
+
+    def _set_initial_state(self) -> None:
+        states = [initial_state(self.scene, i) for i in range(len(self.scene.objects))]
+        rows = {name: torch.as_tensor(np.stack([s[name] for s in states]), dtype=torch.float32).to(self.device) for name in states[0]}
+        self.set_state(State(**{name: value[self.object_index] for name, value in rows.items()}))
+
+    # What the GPU runs -------------------------------------------------------------------------------------------------------------
+
+    def _step(self) -> None:
+        mjw.step(self._model, self._data)
+
+    def _read_contacts(self) -> None:
+        """Read the forces of the last step's contacts; their arrays stay until the next step."""
+        d, out = self._data, self._out
+        for name in ("tip_force", "tip_touch", "table_force"):
+            out[name].zero_()
+        wp.launch(
+            kernels.read_contacts,
+            dim=d.naconmax,
+            inputs=[
+                self._geom_role, d.nacon, d.naconmax, d.njmax, d.contact.worldid, d.contact.geom, d.contact.frame, d.contact.efc_address,
+                d.efc.force,
+            ],
+            outputs=[out["tip_force"], out["tip_touch"], out["table_force"]],
+        )  # fmt: skip
+
+    def _refresh(self) -> None:
+        """Bring link poses and velocities up to date with qpos and qvel, and translate all of it."""
+        m, d, out, at = self._model, self._data, self._out, self._at
+        mjw.kinematics(m, d)
+        mjw.com_pos(m, d)
+        mjw.com_vel(m, d)
+        wp.launch(
+            kernels.read_state,
+            dim=self.num_worlds,
+            inputs=[*self._addresses, at.object_qpos, at.object_dof, d.qpos, d.qvel],
+            outputs=[
+                out["joint_pos"], out["joint_vel"], out["object_pos"], out["object_quat"], out["object_linvel"], out["object_angvel"],
+                out["nonfinite"],
+            ],
+        )  # fmt: skip
+        wp.launch(
+            kernels.read_links,
+            dim=out["link_pos"].shape,
+            inputs=[*self._link_arrays, m.body_rootid, d.xpos, d.xquat, d.cvel, d.subtree_com],
+            outputs=[out["link_pos"], out["link_quat"], out["link_linvel"], out["link_angvel"]],
+        )
+
+    def _run(self, name: str) -> None:
+        if self._warp_device.is_cuda:
+            wp.capture_launch(self._graphs[name])
+        else:
+            self._sequences[name]()
+
+    @contextmanager
+    def _on_stream(self) -> Iterator[None]:
+        """Have Warp work on torch's current stream, so that what either queues comes in the order of the program."""
+        with wp.ScopedDevice(self._warp_device):
+            if not self._warp_device.is_cuda:
+                yield
+                return
+            stream = torch.cuda.current_stream(self.device)
+            known = self._streams.get(stream.cuda_stream)
+            if known is None:
+                known = self._streams[stream.cuda_stream] = wp.stream_from_torch(stream)
+            with wp.ScopedStream(known, sync_enter=False):
+                yield
+
+    # Checking ----------------------------------------------------------------------------------------------------------------------
+
+    def _selected(self, worlds: Tensor | None) -> Tensor | slice:
+        self._must_be_open()
+        return slice(None) if worlds is None else torch.as_tensor(worlds, dtype=torch.int64, device=self.device)
+
+    def _rows(self, value: Tensor, shape: tuple[int, ...]) -> Tensor:
+        value = torch.as_tensor(value, dtype=torch.float32, device=self.device).detach()
+        if value.shape != shape:
+            raise ValueError(f"found shape {tuple(value.shape)}, expected {tuple(shape)}")
+        return value.contiguous()
+
+    def _checked(self, name: str, value: Tensor, rows: int) -> Tensor:
+        try:
+            return self._rows(value, (rows, *getattr(self._state, name).shape[1:]))
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+
+    def _must_be_open(self) -> None:
+        if self._data is None:
+            raise XResetError(f"the backend {self.name!r} is closed. Build a new one.")
+
+
+def _existing_device(device: torch.device) -> torch.device:
+    """The device with its index; ``BackendUnavailableError`` if it is not there."""
+    if device.type == "cpu":
+        return device
+    if device.type != "cuda":
+        raise BackendUnavailableError(f"the backend 'mujoco-warp' runs on devices 'cuda' and 'cpu', found {str(device)!r}.")
+    if "cuda" not in MujocoWarpBackend.devices():
+        raise BackendUnavailableError(
+            "no CUDA device can be used here. Use device 'cpu', or the backend 'mujoco', which is faster on CPUs."
+        )
+    index = torch.cuda.current_device() if device.index is None else device.index
+    if index >= torch.cuda.device_count():
+        raise BackendUnavailableError(f"there is no device 'cuda:{index}'; there are {torch.cuda.device_count()} CUDA devices.")
+    return torch.device("cuda", index)
+
+
+def _differing_fields(models: list[Any]) -> list[str]:
+    """Model fields that can be batched and are not the same in all models."""
+    first, *others = models
+    names = []
+    for field in fields(mjw.Model):
+        shape = getattr(field.type, "shape", ())
+        if not shape or shape[0] != "*" or not hasattr(first, field.name):
+            continue
+        value = np.asarray(getattr(first, field.name))
+        if any(not np.array_equal(value, np.asarray(getattr(other, field.name))) for other in others):
+            names.append(field.name)
+    return names
+
+
+_PATIENCE = 3.0
+"""Seconds after which the wait for kernels is explained. From the cache they take less."""
+
+
+@contextmanager
+def _announced(device: Any) -> Iterator[None]:
+    """Tell the user what takes so long, if it does."""
+    text = (
+        f"mujoco-warp: compiling kernels for {device}, one to three minutes the first time; they are kept in {wp.config.kernel_cache_dir}"
+        " (set WARP_CACHE_PATH to choose another folder)."
+    )
+    timer = threading.Timer(_PATIENCE, lambda: print(text, file=sys.stderr, flush=True))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

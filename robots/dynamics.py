@@ -10,8 +10,8 @@ from xreset.spec import RobotSpec
 def mass_matrix(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
     """[J, J] mass matrix of the robot without armature [kg m^2, kg for a prismatic joint].
 
-    M(q) = sum over links of m Jv^T Jv + Jw^T I Jw, with Jv and Jw the Jacobians of the link's centre of mass and of its orientation, and I its
-    inertia about the centre of mass; mimic joints count through the joint that they follow.
+    M(q) = sum over links of m Jv^T Jv + Jw^T I Jw, with Jv and Jw the Jacobians of the link's centre of mass and of its orientation, and I
+    its inertia about the centre of mass; mimic joints count through the joint that they follow.
 
     Args:
         robot: the robot.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Literal
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
@@ -29,6 +30,13 @@ def pose(xyz: Sequence[float] = (0, 0, 0), *, rpy: Sequence[float] = (0, 0, 0), 
     T = np.eye(4)
     T[:3, :3] = rotation.as_matrix()
     T[:3, 3] = xyz
+    return T
+
+
+def axes(*, x: Sequence[float], z: Sequence[float]) -> np.ndarray:
+    """[4, 4] rotation whose first and third columns are the unit vectors ``x`` and ``z``."""
+    T = np.eye(4)
+    T[:3, :3] = np.stack((x, np.cross(z, x), z), axis=1)
     return T
 
 
@@ -105,7 +113,7 @@ def urdf_text(tree: RobotTree, effort: Mapping[str, float], *, mimics: Sequence[
     return f'<?xml version="1.0"?>\n<!--\n{head}-->\n{ElementTree.tostring(robot, encoding="unicode")}\n'
 
 
-def _between(kind: str, start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
+def _between(kind: Literal["capsule", "cylinder"], start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
     from scipy.spatial.transform import Rotation
 
     a, b = np.array(start, dtype=float), np.array(end, dtype=float)
@@ -117,7 +125,7 @@ def _between(kind: str, start: Sequence[float], end: Sequence[float], radius: fl
     sine = float(np.linalg.norm(turn))
     if sine > 1e-9:
         T[:3, :3] = Rotation.from_rotvec(turn / sine * math.atan2(sine, direction[2])).as_matrix()
-    return Shape(geometry=Geometry(kind="capsule" if kind == "capsule" else "cylinder", size=(radius, length / 2)), T_body_shape=T)
+    return Shape(geometry=Geometry(kind=kind, size=(radius, length / 2)), T_body_shape=T)
 
 
 def _write_link(robot: Element, link: Link) -> None:

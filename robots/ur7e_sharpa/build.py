@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.robots.writer import box, capsule, cylinder, fixed, frame, inertia_matrix, pose, urdf_text
+from xreset.robots.writer import axes, box, capsule, cylinder, fixed, frame, inertia_matrix, pose, urdf_text
 from xreset.spec import Shape
 from xreset.urdf import Joint, Link, RobotTree
 
@@ -304,15 +304,9 @@ def _moving_parts() -> Iterator[tuple[Joint, Link, float]]:
 
 def _frames() -> Iterator[tuple[str, str, np.ndarray]]:
     """Palm and fingertip frames: x along the fingers, z out of the palm's inner side or the fingertip's pad."""
-    yield "palm", HAND_ROOT.name, pose(PALM_CENTER) @ _axes((0, 0, 1), (1, 0, 0))
+    yield "palm", HAND_ROOT.name, pose(PALM_CENTER) @ axes(x=(0, 0, 1), z=(1, 0, 0))
     for finger, length in (("thumb", THUMB_LENGTH), *((finger, FINGER_LENGTH) for finger in FINGERS)):
-        yield f"{finger}_tip", f"right_{finger}_DP", pose((length, 0, 0)) @ _axes((1, 0, 0), (0, 1, 0))
-
-
-def _axes(x: Vector, z: Vector) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, 0], T[:3, 1], T[:3, 2] = x, np.cross(z, x), z
-    return T
+        yield f"{finger}_tip", f"right_{finger}_DP", pose((length, 0, 0)) @ axes(x=(1, 0, 0), z=(0, 1, 0))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,505 @@
+"""The task's pure functions, and what a policy is refused for. Expected numbers come from the paper's formulas, not from the code."""
+
+import math
+import tempfile
+import unittest
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.toy_bank import SOUP, SPAM, toy_bank
+from tests.toy_robot import toy_hand_arm
+from xreset.errors import DemoError, PolicyError
+from xreset.policy import OnnxPolicy, RandomPolicy, ZeroPolicy, check_contract, policy_contract
+from xreset.rotations import quat_angle, quat_from_axis_angle, quat_rotate
+from xreset.spec import TableSpec
+from xreset.task import observations as obs
+from xreset.task.actions import ActionSpace
+from xreset.task.config import (
+    ActionConfig,
+    NoiseConfig,
+    ObservationConfig,
+    RandomizationConfig,
+    ResetConfig,
+    RewardConfig,
+    TaskConfig,
+    TerminationConfig,
+    evaluation_task,
+)
+from xreset.task.randomization import pair_friction, sample_friction, sample_mass_scale
+from xreset.task.resets import Reset, ResetDistribution
+from xreset.task.rewards import RewardInput, compute_reward, contact_gate
+from xreset.task.terminations import episode_steps, out_of_bounds
+
+IDENTITY = torch.tensor([1.0, 0, 0, 0])
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def turned(degrees: float, axis=(0.0, 0.0, 1.0)) -> torch.Tensor:
+    return quat_from_axis_angle(torch.tensor(axis) * math.radians(degrees))
+
+
+class WithRobot(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        folder = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(folder.cleanup)
+        cls.robot = toy_hand_arm(Path(folder.name))
+
+
+class RewardTest(unittest.TestCase):
+    def reward(self, config: RewardConfig | None = None, **changes):
+        """One world: three fingers that do not press, object at its goal, no action; ``changes`` replace inputs (without batch)."""
+        x = {
+            "tip_distance": torch.full((3,), 0.2),
+            "best_reach": torch.tensor(0.2),
+            "tip_force": torch.zeros(3),
+            "object_pos": torch.tensor([0.5, 0.3, 0.1]),
+            "object_quat": IDENTITY,
+            "goal_pos": torch.tensor([0.5, 0.3, 0.1]),
+            "goal_quat": IDENTITY,
+            "action": torch.zeros(4),
+            "previous_action": torch.zeros(4),
+            "out_of_bounds": torch.tensor(False),
+        } | changes
+        return compute_reward(RewardInput(**{k: v[None] for k, v in x.items()}), config or RewardConfig())
+
+    PRESS = torch.tensor([1.0, 0.0, 1.0])
+
+    def assert_terms(self, reward, **expected: float):
+        """The named terms have these values, every other term is zero, and the total is a hundredth of the sum."""
+        for name, value in reward.terms.items():
+            self.assertAlmostEqual(float(value), expected.get(name, 0.0), places=5, msg=name)
+        self.assertLessEqual(set(expected), set(reward.terms))
+        self.assertAlmostEqual(float(reward.total), 0.01 * sum(expected.values()), places=5)
+
+    def test_reach_alone(self):
+        self.assert_terms(self.reward(), reach=1 - math.tanh(2.0))
+        self.assert_terms(self.reward(best_reach=torch.tensor(0.03)), reach=1 - math.tanh(0.3))
+
+    def test_every_tracking_term_needs_contact(self):
+        """At the goal with no contact nothing but reach is paid; with it, 1 + 4 + 4 + 10."""
+        far = torch.tensor(1e3)
+        self.assert_terms(self.reward(best_reach=far))
+        self.assert_terms(self.reward(best_reach=far, tip_force=self.PRESS), grasp=1, position=4, rotation=4, success=10)
+
+    def test_position_and_rotation(self):
+        reward = self.reward(
+            best_reach=torch.tensor(1e3),
+            tip_force=self.PRESS,
+            object_pos=torch.tensor([0.5, 0.3 + 0.06, 0.1 - 0.08]),
+            object_quat=turned(60, (0.0, 0.6, 0.8)),
+        )
+        position, rotation = 4 * (1 - math.tanh(0.1 / 0.2)), 4 * (1 - math.tanh(math.pi / 3 / 1.5))
+        self.assert_terms(reward, grasp=1, position=position, rotation=rotation)
+
+    def test_a_quaternion_and_its_negative_are_one_rotation(self):
+        a = self.reward(tip_force=self.PRESS, object_quat=turned(40))
+        b = self.reward(tip_force=self.PRESS, object_quat=-turned(40))
+        torch.testing.assert_close(a.total, b.total)
+
+    def test_success_needs_two_centimetres_and_fifteen_degrees_and_contact(self):
+        def success(distance: float, degrees: float, force=self.PRESS) -> bool:
+            where = torch.tensor([0.5, 0.3, 0.1 + distance])
+            reward = self.reward(object_pos=where, object_quat=turned(degrees, (1.0, 0, 0)), tip_force=force)
+            self.assertEqual(float(reward.terms["success"]), 10.0 * float(reward.success))
+            return bool(reward.success)
+
+        self.assertTrue(success(0.0195, 14.8))
+        self.assertFalse(success(0.0205, 14.8))
+        self.assertFalse(success(0.0195, 15.2))
+        self.assertFalse(success(0.0, 0.0, torch.zeros(3)))
+
+    def test_action_penalties(self):
+        action, previous = torch.tensor([1.0, -0.5, 0, 0]), torch.tensor([1.0, 0.5, 0.2, 0])
+        reward = self.reward(best_reach=torch.tensor(1e3), action=action, previous_action=previous)
+        self.assert_terms(reward, action=-0.005 * 1.25, action_rate=-0.005 * 1.04)
+
+    def test_leaving_the_scene(self):
+        self.assert_terms(self.reward(best_reach=torch.tensor(1e3), out_of_bounds=torch.tensor(True)), out_of_bounds=-500)
+
+    def test_weights_and_scale_come_from_the_configuration(self):
+        config = RewardConfig(grasp=3.0, position=0.0, rotation=0.0, success=0.0, reach=0.0, scale=1.0)
+        self.assertAlmostEqual(float(self.reward(config, tip_force=self.PRESS).total), 3.0)
+
+    def test_the_contact_gate_needs_the_thumb_and_another_finger(self):
+        forces = torch.tensor([[1.0, 0, 0], [0, 1, 1], [1, 0, 1], [1, 1, 0], [0.09, 1, 1], [1, 0.1, 0.1], [0, 0, 0]])
+        self.assertEqual(contact_gate(forces, 0.1).tolist(), [False, False, True, True, False, False, False])
+
+
+class TerminationTest(unittest.TestCase):
+    def test_bounds(self):
+        table, c = TableSpec(center=(0.5, 0.3), half_size=(0.7, 0.5, 0.02)), TerminationConfig()
+        inside = [[0.5, 0.3, 0.0], [1.29, 0.3, 0.5], [0.5, -0.29, 0.99], [0.5, 0.3, -0.049]]
+        outside = [[1.31, 0.3, 0.1], [-0.31, 0.3, 0.1], [0.5, 0.91, 0.1], [0.5, -0.31, 0.1], [0.5, 0.3, -0.051], [0.5, 0.3, 1.01]]
+        self.assertEqual(out_of_bounds(torch.tensor(inside), table, c).tolist(), [False] * 4)
+        self.assertEqual(out_of_bounds(torch.tensor(outside), table, c).tolist(), [True] * 6)
+
+    def test_time_limit(self):
+        self.assertEqual(episode_steps(TerminationConfig(episode_seconds=5.0), 1 / 60), 300)
+        self.assertEqual(episode_steps(TerminationConfig(episode_seconds=1e-3), 1 / 60), 1)
+
+
+class ActionTest(WithRobot):
+    def space(self, **changes) -> ActionSpace:
+        return ActionSpace.of(self.robot, ActionConfig(**changes))
+
+    def test_joint_order_and_limits_are_the_robots(self):
+        space = self.space()
+        self.assertEqual(space.is_arm.tolist(), [True] * 3 + [False] * 4)
+        torch.testing.assert_close(space.lower, torch.tensor([-0.1, -3.0, -2.0, -1.6, -0.5, 0.0, 0.0]))
+        torch.testing.assert_close(space.upper, torch.tensor([0.3, 3.0, 2.0, 0.5, 1.6, 1.6, 0.04]))
+
+    def test_hand_is_absolute_and_arm_relative(self):
+        space, zero = self.space(arm_step=0.05), torch.zeros(1, 7)
+        target = torch.tensor([[0.1, 0.5, -0.5, 0.0, 0.0, 0.3, 0.01]])
+        still = space.targets(zero, target, target)
+        torch.testing.assert_close(still[:, :3], target[:, :3])
+        torch.testing.assert_close(still[:, 3:], torch.tensor([[-0.55, 0.55, 0.8, 0.02]]))
+        full = space.targets(torch.ones(1, 7), target, target)
+        torch.testing.assert_close(full, torch.tensor([[0.15, 0.55, -0.45, 0.5, 1.6, 1.6, 0.04]]))
+        torch.testing.assert_close(space.targets(torch.full((1, 7), 5.0), target, target), full, msg="actions are limited to [-1, 1]")
+
+    def test_arm_targets_stay_near_the_joint_and_within_its_limits(self):
+        space = self.space(arm_step=0.05, arm_lead=0.15)
+        blocked = torch.zeros(1, 7)
+        target = blocked.clone()
+        for _ in range(10):
+            target = space.targets(torch.tensor([[0.0, 1, -1, 0, 0, 0, 0]]), target, blocked)
+        torch.testing.assert_close(target[:, 1:3], torch.tensor([[0.15, -0.15]]))
+        near = torch.tensor([[0.29, 2.99, -1.99, 0, 0, 0, 0]])
+        moved = space.targets(torch.tensor([[1.0, 1, -1, 0, 0, 0, 0]]), near, near)
+        torch.testing.assert_close(moved[:, :3], torch.tensor([[0.3, 3.0, -2.0]]))
+
+    def test_an_arm_that_sags_is_commanded_from_its_target(self):
+        """Otherwise a loaded arm would sink a little further at every step of zero action."""
+        space, target = self.space(), torch.zeros(1, 7)
+        sagging = torch.full((1, 7), -0.02)
+        torch.testing.assert_close(space.targets(torch.zeros(1, 7), target, sagging)[:, :3], torch.zeros(1, 3))
+
+    def test_smoothing_takes_a_share_of_the_way(self):
+        target = torch.zeros(1, 7)
+        moved = self.space(hand_smoothing=0.25).targets(torch.ones(1, 7), target, target)
+        torch.testing.assert_close(moved[:, 3:], torch.tensor([[0.125, 0.4, 0.4, 0.01]]))
+
+    def test_action_for_undoes_targets(self):
+        g = generator()
+        for smoothing in (1.0, 0.4):
+            space = self.space(hand_smoothing=smoothing)
+            target = space.lower + (space.upper - space.lower) * torch.rand(50, 7, generator=g)
+            action = 2 * torch.rand(50, 7, generator=g) - 1
+            wanted = space.targets(action, target, target)
+            again = space.targets(space.action_for(wanted, target), target, target)
+            torch.testing.assert_close(again, wanted, atol=1e-5, rtol=0)
+
+    def test_action_for_goes_as_far_as_it_can(self):
+        space = self.space()
+        action = space.action_for(torch.tensor([[0.3, 0, 0, 9, 0, 0, 0]]), torch.zeros(1, 7))
+        self.assertEqual(action[0, 0], 1.0)  # 0.3 away in steps of 0.05
+        self.assertEqual(action[0, 3], 1.0)  # beyond the limit
+
+
+class RandomizationTest(unittest.TestCase):
+    def test_a_pairs_friction_is_the_mean_of_its_materials(self):
+        c = RandomizationConfig(elastomer=0.8, metal=0.1, table=0.5)
+        torch.testing.assert_close(pair_friction(torch.tensor([0.5, 1.0]), c), torch.tensor([[0.65, 0.3, 0.5], [0.9, 0.55, 0.75]]))
+
+    def test_friction_comes_from_the_buckets(self):
+        c = RandomizationConfig(friction=(0.5, 1.0), friction_buckets=250)
+        material = 2 * sample_friction(20_000, c, generator())[:, 2] - c.table
+        self.assertGreaterEqual(float(material.min()), 0.5)
+        self.assertLessEqual(float(material.max()), 1.0)
+        self.assertEqual(len(material.mul(1e5).round().unique()), 250)
+        self.assertAlmostEqual(float(material.mean()), 0.75, delta=0.005)
+        few = 2 * sample_friction(1000, replace(c, friction_buckets=2), generator())[:, 2] - c.table
+        torch.testing.assert_close(few.mul(1e5).round().unique() / 1e5, torch.tensor([0.625, 0.875]))
+
+    def test_mass_scale(self):
+        scale = sample_mass_scale(20_000, RandomizationConfig(), generator())
+        self.assertTrue(0.7 <= float(scale.min()) < 0.71 and 1.29 < float(scale.max()) <= 1.3)
+        self.assertAlmostEqual(float(scale.mean()), 1.0, delta=0.01)
+
+    def test_disabled_means_nominal(self):
+        c = RandomizationConfig(enabled=False)
+        torch.testing.assert_close(sample_friction(3, c, generator()), pair_friction(torch.full((3,), 0.75), c))
+        torch.testing.assert_close(sample_mass_scale(3, c, generator()), torch.ones(3))
+
+
+class ResetTest(WithRobot):
+    SOUPS = torch.zeros(4000, dtype=torch.long)
+
+    def distribution(self, objects=(SOUP, SPAM), bank=None, **config) -> ResetDistribution:
+        return ResetDistribution(bank or toy_bank(self.robot), self.robot, objects, ResetConfig(**config))
+
+    def test_share_of_bank_resets(self):
+        for p in (0.0, 0.25, 0.5, 1.0):
+            reset = self.distribution(demo_probability=p).sample(self.SOUPS, generator())
+            self.assertAlmostEqual(float(reset.from_bank.float().mean()), p, delta=0.03 * (0 < p < 1))
+
+    def test_bank_resets_are_states_of_the_bank(self):
+        bank = toy_bank(self.robot)
+        index = torch.tensor([0, 1] * 500)
+        reset = self.distribution(demo_probability=1.0).sample(index, generator())
+        state = ((reset.object_pos[:, 0] - 0.6) * 100).round().long()  # the toy bank numbers its states
+        for i in range(2):
+            own = {j for j in range(6) if bank.object_name[j] == (SOUP, SPAM)[i]}
+            self.assertEqual(set(state[index == i].tolist()), own, "every state of the object, and of no other")
+        torch.testing.assert_close(reset.joint_pos, torch.as_tensor(bank.joint_pos)[state])
+        torch.testing.assert_close(reset.object_quat, torch.as_tensor(bank.object_quat_wxyz)[state])
+        self.assertEqual(reset.sequence.tolist(), bank.sequence_index[state].tolist())
+        torch.testing.assert_close(reset.goal_pos, torch.as_tensor(bank.goal_pos)[reset.sequence])
+        torch.testing.assert_close(reset.goal_quat, torch.as_tensor(bank.goal_quat_wxyz)[reset.sequence])
+
+    def test_objects_may_come_in_another_order_and_be_fewer_than_the_banks(self):
+        for objects in ((SPAM, SOUP), (SPAM,)):
+            reset = self.distribution(objects, demo_probability=0.5).sample(torch.zeros(200, dtype=torch.long), generator())
+            self.assertEqual(set(reset.sequence.tolist()), {1})
+            self.assertEqual(set(((reset.object_pos[reset.from_bank, 0] - 0.6) * 100).round().tolist()), {2.0, 3.0})
+
+    def test_pre_contact_only(self):
+        reset = self.distribution(demo_probability=1.0, pre_contact_only=True).sample(self.SOUPS, generator())
+        self.assertEqual(set(((reset.object_pos[:, 0] - 0.6) * 100).round().tolist()), {0.0, 4.0})
+
+    def test_an_object_without_states_starts_at_home(self):
+        none = toy_bank(self.robot).select(sequences=np.array([True, False, True]))
+        reset = self.distribution(bank=none, demo_probability=1.0).sample(torch.tensor([0, 1] * 100), generator())
+        self.assertEqual(reset.from_bank.tolist(), [True, False] * 100)
+        self.assertEqual(set(reset.sequence[1::2].tolist()), {1})
+        empty = toy_bank(self.robot).select(sequences=np.zeros(3, dtype=bool))
+        reset = self.distribution(bank=empty, demo_probability=1.0).sample(torch.tensor([0, 1] * 100), generator())
+        self.assertFalse(bool(reset.from_bank.any()))
+
+    def test_an_object_without_demonstration_is_an_error(self):
+        with self.assertRaisesRegex(DemoError, "no demonstration of 011_banana; it has 005_tomato_soup_can, 010_potted_meat_can"):
+            self.distribution((SOUP, "011_banana"))
+
+    def test_gravity_of_bank_resets_is_uniform_and_may_be_fixed(self):
+        gravity = self.distribution(demo_probability=1.0).sample(self.SOUPS, generator()).gravity_fraction
+        self.assertTrue(0 <= float(gravity.min()) < 0.01 and 0.99 < float(gravity.max()) <= 1)
+        self.assertAlmostEqual(float(gravity.mean()), 0.5, delta=0.02)
+        fixed = self.distribution(demo_probability=1.0, random_gravity=False).sample(self.SOUPS, generator())
+        self.assertTrue(bool((fixed.gravity_fraction == 1).all()))
+
+    def test_gravity_of_home_resets_is_near_one(self):
+        """alpha = 1 + eta / 9.81 with eta ~ N(0, 1), clipped."""
+        gravity = self.distribution(demo_probability=0.0).sample(self.SOUPS, generator()).gravity_fraction
+        self.assertAlmostEqual(float(gravity.mean()), 1.0, delta=0.01)
+        self.assertAlmostEqual(float(gravity.std()), 1 / 9.81, delta=0.005)
+        clipped = self.distribution(demo_probability=0.0, home_gravity_clip=0.1).sample(self.SOUPS, generator()).gravity_fraction
+        self.assertAlmostEqual(float(clipped.min()), 0.9, places=6)
+        self.assertAlmostEqual(float(clipped.max()), 1.1, places=6)
+        exact = self.distribution(demo_probability=0.0, home_gravity_std=0.0).sample(self.SOUPS, generator())
+        self.assertTrue(bool((exact.gravity_fraction == 1).all()))
+
+    def test_home_spawns_are_uniform_around_the_demonstrations_start(self):
+        bank = toy_bank(self.robot)
+        reset = self.distribution(demo_probability=0.0).sample(self.SOUPS, generator())
+        self.assertEqual(set(reset.sequence.tolist()), {0, 2})
+        offset = reset.object_pos - torch.as_tensor(bank.start_pos)[reset.sequence]
+        for axis in range(2):
+            self.assertAlmostEqual(float(offset[:, axis].min()), -0.02, delta=2e-4)
+            self.assertAlmostEqual(float(offset[:, axis].max()), 0.02, delta=2e-4)
+        self.assertEqual(float(offset[:, 2].abs().max()), 0.0)
+        up = quat_rotate(reset.object_quat, torch.tensor([0.0, 0, 1]))
+        torch.testing.assert_close(up, torch.tensor([0.0, 0, 1]).expand_as(up))
+        yaw = quat_angle(reset.object_quat, torch.as_tensor(bank.start_quat_wxyz)[reset.sequence]).rad2deg()
+        self.assertAlmostEqual(float(yaw.max()), 25.0, delta=0.1)
+        self.assertAlmostEqual(float(yaw.mean()), 12.5, delta=0.5)
+        unmoved = self.distribution(demo_probability=0.0, spawn_xy=0.0, spawn_yaw=0.0).sample(self.SOUPS, generator())
+        torch.testing.assert_close(unmoved.object_pos, torch.as_tensor(bank.start_pos)[unmoved.sequence])
+
+    def test_home_turns_about_the_worlds_vertical(self):
+        lying = toy_bank(self.robot, start_quat_wxyz=np.tile(turned(90, (1.0, 0, 0)).numpy(), (3, 1)))
+        reset = self.distribution(bank=lying, demo_probability=0.0).sample(self.SOUPS, generator())
+        axis = quat_rotate(reset.object_quat, torch.tensor([0.0, 1, 0]))  # the object's y axis stands upright
+        torch.testing.assert_close(axis, torch.tensor([0.0, 0, 1]).expand_as(axis), atol=1e-6, rtol=0)
+
+    def test_home_joints_spread_as_the_paper_says_and_stay_within_limits(self):
+        reset = self.distribution(demo_probability=0.0).sample(self.SOUPS, generator())
+        joints, space = reset.joint_pos, ActionSpace.of(self.robot, ActionConfig())
+        self.assertTrue(bool(((joints >= space.lower) & (joints <= space.upper)).all()))
+        spread = (joints - torch.as_tensor(self.robot.home, dtype=torch.float32)).std(dim=0)
+        self.assertAlmostEqual(float(spread[1]), 0.075, delta=0.004)  # an arm joint far from its limits
+        self.assertAlmostEqual(float(spread[4]), 0.10, delta=0.005)  # a finger joint
+        quiet = self.distribution(demo_probability=0.0, home_noise=False).sample(self.SOUPS[:5], generator())
+        torch.testing.assert_close(quiet.joint_pos, torch.full((5, 7), 0.01))
+
+    def test_the_seed_decides(self):
+        distribution = self.distribution()
+        draws = [distribution.sample(self.SOUPS, generator(seed)) for seed in (3, 3, 4)]
+        for name, value in vars(draws[0]).items():
+            self.assertTrue(torch.equal(value, getattr(draws[1], name)), name)
+        self.assertFalse(torch.equal(draws[0].joint_pos, draws[2].joint_pos))
+
+    def test_stack(self):
+        distribution = self.distribution()
+        one, two = (distribution.home(torch.tensor([s]), generator(s)) for s in (0, 1))
+        both = Reset.stack([one, two])
+        self.assertEqual(both.sequence.tolist(), [0, 1])
+        torch.testing.assert_close(both.joint_pos[1:], two.joint_pos)
+
+
+QUIET = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
+
+
+class ObservationTest(unittest.TestCase):
+    N, J, E = 5, 7, 2
+
+    def setUp(self):
+        g = generator()
+
+        def rand(*shape: int) -> torch.Tensor:
+            return torch.randn(self.N, *shape, generator=g)
+
+        def quat() -> torch.Tensor:
+            return torch.nn.functional.normalize(rand(4), dim=-1)
+
+        self.x = obs.ObservationInput(
+            joint_pos=rand(self.J), joint_vel=rand(self.J), joint_lower=torch.full((self.J,), -2.0), joint_upper=torch.full((self.J,), 3.0),
+            object_pos=rand(3), object_quat=quat(), object_linvel=rand(3), object_angvel=rand(3), goal_pos=rand(3), goal_quat=quat(),
+            gravity_fraction=rand(), previous_action=rand(self.J), palm_pos=rand(3), palm_quat=quat(), palm_linvel=rand(3),
+            palm_angvel=rand(3), tip_pos=rand(self.E, 3), tip_force=10 * rand(self.E, 3), tip_distance=rand(self.E).abs(), reward=rand(),
+        )  # fmt: skip
+        self.config = ObservationConfig(noise=QUIET, contact_force_scale=0.1, joint_vel_scale=0.2)
+        widths = obs.layout(self.J, self.E, self.config)
+        self.policy = self.split(obs.policy_group(self.x, QUIET, generator()), widths["policy"])
+        self.proprio = self.split(obs.proprio_group(self.x, self.config, generator()), widths["proprio"])
+
+    def split(self, group: torch.Tensor, widths: dict[str, int]) -> dict[str, torch.Tensor]:
+        self.assertEqual(tuple(group.shape), (self.N, sum(widths.values())))
+        return dict(zip(widths, group.split(list(widths.values()), dim=-1), strict=True))
+
+    def test_without_noise_the_policy_group_is_exact(self):
+        for name in ("object_pos", "goal_pos", "previous_action"):
+            torch.testing.assert_close(self.policy[name], getattr(self.x, name))
+        torch.testing.assert_close(self.policy["gravity_fraction"][:, 0], self.x.gravity_fraction)
+
+    def test_without_noise_the_proprio_group_is_exact(self):
+        for name in ("palm_pos", "palm_linvel", "palm_angvel"):
+            torch.testing.assert_close(self.proprio[name], getattr(self.x, name))
+        torch.testing.assert_close(self.proprio["tip_pos"], self.x.tip_pos.reshape(self.N, -1))
+        torch.testing.assert_close(self.proprio["joint_vel"], 0.2 * self.x.joint_vel)
+        torch.testing.assert_close(self.proprio["joint_pos"], (self.x.joint_pos - 0.5) / 2.5)  # limits -2, 3 become -1, 1
+        force = self.proprio["tip_force"]
+        self.assertEqual(float(force.abs().max()), 1.0)
+        small = self.x.tip_force.abs() < 10
+        torch.testing.assert_close(force.view(self.N, self.E, 3)[small], 0.1 * self.x.tip_force[small])
+
+    def test_one_rotation_is_one_observation(self):
+        negated = replace(self.x, object_quat=-self.x.object_quat, goal_quat=-self.x.goal_quat, palm_quat=-self.x.palm_quat)
+        torch.testing.assert_close(obs.policy_group(negated, QUIET, generator()), obs.policy_group(self.x, QUIET, generator()))
+        again = obs.proprio_group(negated, self.config, generator())
+        torch.testing.assert_close(again, obs.proprio_group(self.x, self.config, generator()))
+        for name, quat, own in (("object_quat", self.policy, self.x.object_quat), ("palm_quat", self.proprio, self.x.palm_quat)):
+            self.assertTrue(bool((quat[name][:, 0] >= 0).all()), name)
+            torch.testing.assert_close(quat_angle(quat[name], own), torch.zeros(self.N), atol=1e-3, rtol=0)
+        torch.testing.assert_close(obs.privileged_group(negated)[:, 9:12].norm(dim=-1), quat_angle(self.x.object_quat, self.x.goal_quat))
+
+    def test_privileged_group(self):
+        found = obs.privileged_group(self.x)
+        self.assertEqual(tuple(found.shape), (self.N, 15))
+        expected = torch.cat((self.x.object_linvel, self.x.object_angvel, self.x.goal_pos - self.x.object_pos), 1)
+        torch.testing.assert_close(found[:, :9], expected)
+        axis = torch.tensor([1.0, 0, 0]).expand(self.N, 3)
+        corrected = quat_rotate(quat_from_axis_angle(found[:, 9:12]), quat_rotate(self.x.object_quat, axis))
+        torch.testing.assert_close(corrected, quat_rotate(self.x.goal_quat, axis), atol=1e-5, rtol=0)
+        torch.testing.assert_close(found[:, 12:], torch.stack((self.x.tip_distance.amin(1), self.x.gravity_fraction, self.x.reward), 1))
+
+    def test_cloud(self):
+        points = torch.randn(self.N, 10, 3, generator=generator(1))
+        cloud = obs.cloud_frame(points, self.x.object_pos, self.x.object_quat, 0.0, generator())
+        self.assertEqual(tuple(cloud.shape), (self.N, 10, 3))
+        expected = quat_rotate(self.x.object_quat[2], points[2, 7]) + self.x.object_pos[2]
+        torch.testing.assert_close(cloud[2, 7], expected)
+
+    def test_noise_has_the_configured_spread_and_touches_only_what_is_measured(self):
+        many = 4000
+        per_world = {k: v for k, v in vars(self.x).items() if k not in ("joint_lower", "joint_upper")}
+        x = replace(self.x, **{k: v[:1].expand(many, *v.shape[1:]) for k, v in per_world.items()})
+        noise = NoiseConfig(joint_pos=0.01, joint_vel=0.1, object_pos=0.02, object_rot=0.05, cloud=0.03)
+        policy = obs.policy_group(x, noise, generator()) - obs.policy_group(x, QUIET, generator())
+        for i in range(3):
+            self.assertAlmostEqual(float(policy[:, i].std()), 0.02, delta=0.002)
+        self.assertEqual(float(policy[:, 7:].abs().max()), 0.0)
+        noisy = obs.policy_group(x, noise, generator())[:, 3:7]
+        torch.testing.assert_close(noisy.norm(dim=-1), torch.ones(many))
+        self.assertAlmostEqual(float(quat_angle(noisy, x.object_quat).square().mean().sqrt()), 0.05 * math.sqrt(3), delta=0.005)
+        c = replace(self.config, noise=noise)
+        proprio = obs.proprio_group(x, c, generator()) - obs.proprio_group(x, self.config, generator())
+        self.assertAlmostEqual(float(proprio[:, : self.J].std()), 0.01 / 2.5, delta=2e-4)
+        self.assertAlmostEqual(float(proprio[:, self.J : 2 * self.J].std()), 0.1 * 0.2, delta=1e-3)
+        self.assertEqual(float(proprio[:, 2 * self.J :].abs().max()), 0.0)
+        origin = torch.zeros(1, many, 3)
+        cloud = obs.cloud_frame(origin, torch.zeros(1, 3), IDENTITY[None], 0.03, generator())
+        self.assertAlmostEqual(float(cloud.std()), 0.03, delta=0.001)
+
+
+class EvaluationTaskTest(unittest.TestCase):
+    def test_only_what_evaluation_fixes_is_changed(self):
+        task = TaskConfig(action=ActionConfig(arm_step=0.03), reset=ResetConfig(spawn_xy=0.05, demo_probability=0.5))
+        found = evaluation_task(task)
+        self.assertEqual(found.observation.noise, QUIET)
+        self.assertEqual((found.reset.demo_probability, found.reset.home_gravity_std, found.randomization.enabled), (0.0, 0.0, False))
+        back = replace(found, observation=task.observation, reset=task.reset, randomization=task.randomization)
+        self.assertEqual(back, task)
+        self.assertEqual(found.reset.spawn_xy, 0.05)
+
+
+class PolicyTest(WithRobot):
+    TASK = TaskConfig()
+
+    def refused(self, words: str, task: TaskConfig | None = None, **changes):
+        contract = policy_contract(self.robot, self.TASK, (SOUP,)) | changes
+        with self.subTest(words), self.assertRaisesRegex(PolicyError, f"(?s)p.onnx.*{words}"):
+            check_contract("p.onnx", contract, self.robot, task or self.TASK)
+
+    def test_its_own_robot_and_task_are_accepted(self):
+        contract = policy_contract(self.robot, self.TASK, (SOUP,))
+        check_contract("p.onnx", contract, self.robot, self.TASK)
+        check_contract("p.onnx", contract, self.robot, evaluation_task(self.TASK))
+
+    def test_the_contract_states_the_observations_widths(self):
+        widths = policy_contract(self.robot, self.TASK, ())["observation_layout"]
+        self.assertEqual(sum(widths["policy"].values()), 15 + 7)
+        self.assertEqual(sum(widths["proprio"].values()), 2 * 7 + 13 + 6 * 2)
+        self.assertEqual(widths["perception"]["cloud"], 5 * 64 * 3)
+
+    def test_refusals_name_what_differs(self):
+        self.refused("another robot: openarm, here it is toy.*--robot openarm", robot="openarm")
+        self.refused("schema 'xreset-policy/9', expected 'xreset-policy/1'", schema="xreset-policy/9")
+        self.refused("another joint order", joint_names=list(reversed(self.robot.joint_names)))
+        self.refused("another fingertips", fingertip_names=["index", "thumb"])
+        self.refused("another version of 'toy'", robot_fingerprint="00")
+        fewer = replace(self.TASK, observation=replace(self.TASK.observation, cloud_history=3))
+        self.refused("observation layout .perception.cloud: 960 in the policy, 576 here", task=fewer)
+        extra = policy_contract(self.robot, self.TASK, ())["observation_layout"]
+        self.refused(r"policy.tactile: 4 in the policy, None here", observation_layout=extra | {"policy": extra["policy"] | {"tactile": 4}})
+        self.refused("acts every 0.016667 s, here a control step lasts 0.020833 s", task=replace(self.TASK, substeps=5))
+
+    def test_files_that_are_no_policies(self):
+        with tempfile.TemporaryDirectory() as name:
+            path = Path(name) / "policy.onnx"
+            with self.assertRaisesRegex(PolicyError, "there is no policy file"):
+                OnnxPolicy(path)
+            path.write_bytes(b"hello")
+            with self.assertRaisesRegex(PolicyError, "cannot be read as an ONNX policy"):
+                OnnxPolicy(path)
+
+    def test_policies_without_training(self):
+        observations = {"policy": torch.zeros(3, 22)}
+        self.assertEqual(float(ZeroPolicy(7).act(observations).abs().max()), 0.0)
+        runs = [RandomPolicy(7, seed) for seed in (1, 1, 2)]
+        actions = [torch.stack([run.act(observations) for _ in range(50)]) for run in runs]
+        self.assertTrue(torch.equal(actions[0], actions[1]))
+        self.assertFalse(torch.equal(actions[0], actions[2]))
+        self.assertEqual(tuple(actions[0].shape), (50, 3, 7))
+        self.assertTrue(-1 <= float(actions[0].min()) < -0.97 and 0.97 < float(actions[0].max()) <= 1)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,583 @@
+"""Bullet, through PyBullet, on the CPU.
+
+What differs from PyBullet's defaults, and why:
+
+- Gravity is off, and every step applies the object's weight as a force at its centre of mass: the robot is then compensated exactly and
+  gravity fractions cost nothing. (A robot without compensation gets its weight from the engine.)
+- Drives are torques computed here (:class:`_Drives`). PyBullet's own position control holds objects with a wrong force.
+- Friction of a pair is the *product* of its bodies' coefficients, and its torsional friction is s_a mu_b + s_b mu_a. With mu = 1 and s = 0
+  on the object, the other body's coefficients are the pair's.
+- Poses and linear velocities of bodies refer to the centre of mass and the principal axes; they are converted here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from xreset.backends.base import unavailable
+from xreset.backends.pool import PoolBackend, World
+from xreset.backends.rigid import (
+    Inertia,
+    Mechanism,
+    conjugate,
+    cross,
+    matrix_to_quat,
+    mechanism,
+    multiply,
+    nearer,
+    object_inertia,
+    rotate,
+)
+from xreset.errors import XResetError
+from xreset.spec import GRAVITY, Geometry, ObjectSpec, SceneSpec, Shape
+
+
+@dataclass(frozen=True, kw_only=True)
+class PybulletSettings:
+    """Bullet's dials."""
+
+    internal_steps: int = 2
+    """Bullet steps per physics step: drives are explicit and contacts are solved once per step, so both gain from 480 Hz."""
+    solver_iterations: int = 50
+    """Sweeps of the contact solver."""
+    friction_cone: bool = False
+    """Whether friction is limited by a cone instead of a pyramid. The cone holds grasps less well; the pyramid lets objects slide up to
+    1.4 times less easily along its diagonals."""
+    explicit_limit: float = 0.5
+    """A drive is applied as a plain PD torque while (dt kd + dt^2 kp) / inertia is below this (2 is the limit of stability); beyond it
+    is made implicit, which is stable but softens the drive in contact."""
+
+
+_DEFAULTS = PybulletSettings()
+
+
+class PybulletWorld(World):
+    """One world of Bullet, in a client of its own."""
+
+    def __init__(self, scene: SceneSpec, object_index: int, *, settings: PybulletSettings = _DEFAULTS) -> None:
+        self._p = p = _engine()
+        self._client = p.connect(p.DIRECT)
+        if self._client < 0:
+            raise XResetError("PyBullet gives this process no further client. Use more workers, or close backends that are done.")
+        self._internal_steps = settings.internal_steps
+        dt = scene.timestep / settings.internal_steps
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=dt,
+            numSubSteps=0,
+            numSolverIterations=settings.solver_iterations,
+            enableConeFriction=int(settings.friction_cone),
+            deterministicOverlappingPairs=1,  # or a world would depend on what was in it before
+            enableSAT=1,  # a hull at rest on a face gets all the contacts of that face, instead of one
+            enableFileCaching=0,
+            physicsClientId=self._client,
+        )
+        self._world_gravity = 0.0 if scene.robot.gravity_compensated else -GRAVITY
+        p.setGravity(0, 0, self._world_gravity, physicsClientId=self._client)
+
+        self._mechanism = robot = mechanism(scene.robot)
+        thing = scene.objects[object_index]
+        self._inertia = object_inertia(thing)
+        self._robot_parts, self._object_parts = _robot_parts(robot), _object_parts(thing)
+        table = Shape(geometry=Geometry(kind="box", size=scene.table.half_size))
+        table_parts = [_Part(body=0, link="table", shapes=(table,))]
+        with tempfile.TemporaryDirectory(prefix="xreset-") as folder:
+            self._robot = self._load(_robot_urdf(robot, self._robot_parts, Path(folder)), scene.robot.base_pos, scene.robot.base_quat)
+            self._object = self._load(_rigid_urdf(self._object_parts, self._inertia, Path(folder)), (0.0, 0.0, _FAR), fixed=False)
+            self._table = self._load(_rigid_urdf(table_parts, _WEIGHTLESS, Path(folder)), (*scene.table.center, -scene.table.half_size[2]))
+        for body, parts in ((self._robot, self._robot_parts), (self._object, self._object_parts), (self._table, table_parts)):
+            self._remove_defaults(body, parts)
+        self._set_collision_pairs(scene)
+
+        self._drives = _Drives(p, self._client, self._robot, robot, dt, settings.explicit_limit)
+        self._base = (np.array(scene.robot.base_pos), np.array(scene.robot.base_quat))
+        self._frames = [
+            (body - 1, T[:3, 3], matrix_to_quat(T[:3, :3])) for body, T in (robot.frames[link] for link in scene.robot.tracked_links)
+        ]
+        self._mass, self._fraction = self._inertia.mass, 1.0
+        self._force, self._torque = np.zeros(3), np.zeros(3)
+        self._torsional = scene.friction.torsional
+        self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
+        self._fresh = True
+        self._quat = np.array([1.0, 0.0, 0.0, 0.0])
+        self._clean = p.saveState(physicsClientId=self._client)
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """See :meth:`World.set_state`."""
+        p, client = self._p, self._client
+        p.restoreState(self._clean, physicsClientId=client)
+        p.performCollisionDetection(physicsClientId=client)  # with the object far away: what touched it before is forgotten
+        self._drives.reset(state["joint_pos"], state["joint_vel"], state["joint_target"])
+        self._quat = np.array(state["object_quat"])
+        arm = rotate(self._quat, self._inertia.com)
+        turn = multiply(self._quat, self._inertia.quat)
+        p.resetBasePositionAndOrientation(self._object, state["object_pos"] + arm, _xyzw(turn), physicsClientId=client)
+        omega = state["object_angvel"]
+        p.resetBaseVelocity(self._object, state["object_linvel"] + cross(omega, arm), omega, physicsClientId=client)
+        self._force, self._torque = np.zeros(3), np.zeros(3)
+        self._fresh = True
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """See :meth:`World.get_state`."""
+        p, client = self._p, self._client
+        com, turn = p.getBasePositionAndOrientation(self._object, physicsClientId=client)
+        linear, angular = (np.array(v) for v in p.getBaseVelocity(self._object, physicsClientId=client))
+        self._quat = nearer(multiply(_wxyz(turn), conjugate(self._inertia.quat)), self._quat)
+        arm = rotate(self._quat, self._inertia.com)
+        position, velocity = self._drives.read()
+        return {
+            "joint_pos": position[self._drives.driven],
+            "joint_vel": velocity[self._drives.driven],
+            "joint_target": self._drives.target,
+            "object_pos": np.array(com) - arm,
+            "object_quat": self._quat,
+            "object_linvel": linear - cross(angular, arm),
+            "object_angvel": angular,
+        }
+
+    def set_joint_targets(self, targets: np.ndarray) -> None:
+        """See :meth:`World.set_joint_targets`."""
+        self._drives.target = targets
+
+    def step(self, n: int) -> None:
+        """See :meth:`World.step`."""
+        p, client = self._p, self._client
+        weight = np.array([0.0, 0.0, self._mass * (-GRAVITY * self._fraction - self._world_gravity)])
+        force = weight + self._force
+        turned = bool(self._torque.any())
+        for i in range(n * self._internal_steps):
+            self._drives.apply(renew=i % self._internal_steps == 0)
+            com, _ = p.getBasePositionAndOrientation(self._object, physicsClientId=client)
+            p.applyExternalForce(self._object, -1, force, com, p.WORLD_FRAME, physicsClientId=client)
+            if turned:
+                p.applyExternalTorque(self._object, -1, self._torque, p.WORLD_FRAME, physicsClientId=client)
+            p.stepSimulation(physicsClientId=client)
+        self._fresh = False
+
+    def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """See :meth:`World.links`."""
+        k = len(self._frames)
+        pos, quat, linvel, angvel = np.zeros((k, 3)), np.zeros((k, 4)), np.zeros((k, 3)), np.zeros((k, 3))
+        for i, (link, frame_pos, frame_quat) in enumerate(self._frames):
+            com = velocity = omega = np.zeros(3)
+            origin, turn = self._base
+            if link >= 0:
+                state = self._p.getLinkState(
+                    self._robot, link, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=self._client
+                )
+                com, origin, velocity, omega = (np.array(state[j]) for j in (0, 4, 6, 7))
+                turn = _wxyz(state[5])
+            pos[i] = origin + rotate(turn, frame_pos)
+            quat[i] = multiply(turn, frame_quat)
+            linvel[i] = velocity + cross(omega, pos[i] - com)
+            angvel[i] = omega
+        return pos, quat, linvel, angvel
+
+    def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See :meth:`World.contacts`: of the last internal step."""
+        tips = len(self._mechanism.robot.fingertips)
+        tip_force, tip_touch, table_force = np.zeros((tips, 3)), np.zeros(tips, dtype=bool), np.zeros(3)
+        if self._fresh:
+            return tip_force, tip_touch, table_force
+        p, client = self._p, self._client
+        for contact in p.getContactPoints(self._object, self._robot, physicsClientId=client):
+            tip = self._robot_parts[contact[4] + 1].tip
+            if tip is not None and contact[9] > 0:
+                tip_force[tip] += _force_on_first(contact)
+                tip_touch[tip] = True
+        for contact in p.getContactPoints(self._object, self._table, physicsClientId=client):
+            table_force += _force_on_first(contact)
+        return tip_force, tip_touch, table_force
+
+    def health(self) -> tuple[bool, bool]:
+        """See :meth:`World.health`. Bullet allocates contacts as it needs them: none is ever dropped."""
+        values = [*self._p.getBasePositionAndOrientation(self._object, physicsClientId=self._client)[0]]
+        return not bool(np.isfinite(values).all() and all(np.isfinite(x).all() for x in self._drives.read())), False
+
+    def set_object_mass(self, mass: float) -> None:
+        """See :meth:`World.set_object_mass`."""
+        self._mass = mass
+        moments = self._inertia.moments * (mass / self._inertia.mass)
+        self._p.changeDynamics(self._object, -1, mass=mass, physicsClientId=self._client)  # also invents an inertia
+        self._p.changeDynamics(self._object, -1, localInertiaDiagonal=moments, physicsClientId=self._client)
+
+    def set_friction(self, friction: np.ndarray) -> None:
+        """See :meth:`World.set_friction`."""
+        p, client = self._p, self._client
+        tip, link, table = friction
+        for i in range(len(self._object_parts)):
+            p.changeDynamics(self._object, i - 1, lateralFriction=1.0, spinningFriction=0.0, physicsClientId=client)
+        p.changeDynamics(self._table, -1, lateralFriction=table, spinningFriction=self._torsional, physicsClientId=client)
+        for i, part in enumerate(self._robot_parts):
+            mu = link if part.tip is None else tip
+            p.changeDynamics(self._robot, i - 1, lateralFriction=mu, spinningFriction=self._torsional, physicsClientId=client)
+
+    def set_object_gravity(self, fraction: float) -> None:
+        """See :meth:`World.set_object_gravity`."""
+        self._fraction = fraction
+
+    def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
+        """See :meth:`World.set_object_wrench`."""
+        self._force, self._torque = force, torque
+
+    def close(self) -> None:
+        """See :meth:`World.close`."""
+        if self._client >= 0:
+            self._p.disconnect(physicsClientId=self._client)
+            self._client = -1
+
+    def _load(
+        self, urdf: Path, pos: tuple[float, float, float], quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0), *, fixed: bool = True
+    ) -> int:
+        p = self._p
+        return p.loadURDF(
+            str(urdf),
+            basePosition=pos,
+            baseOrientation=_xyzw(quat),
+            useFixedBase=fixed,
+            flags=p.URDF_USE_INERTIA_FROM_FILE
+            | p.URDF_USE_SELF_COLLISION
+            | p.URDF_MAINTAIN_LINK_ORDER
+            | p.URDF_USE_IMPLICIT_CYLINDER
+            | p.URDF_INITIALIZE_SAT_FEATURES,
+            physicsClientId=self._client,
+        )
+
+    def _remove_defaults(self, body: int, parts: Sequence[_Part]) -> None:
+        """Take away the damping, sleep and margins that Bullet gives every link."""
+        p, client = self._p, self._client
+        for i, part in enumerate(parts):
+            p.changeDynamics(body, i - 1, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, physicsClientId=client)
+            p.changeDynamics(body, i - 1, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client)
+            if part.is_hull:
+                p.changeDynamics(body, i - 1, collisionMargin=0.0, physicsClientId=client)
+
+    def _set_collision_pairs(self, scene: SceneSpec) -> None:
+        def allow(a: int, b: int, link_a: int, link_b: int, yes: bool) -> None:
+            self._p.setCollisionFilterPair(a, b, link_a - 1, link_b - 1, int(yes), physicsClientId=self._client)
+
+        pieces = range(len(self._object_parts))
+        for k in pieces:
+            allow(self._object, self._table, k, 0, True)
+            for other in range(k):
+                allow(self._object, self._object, k, other, False)
+        for i, part in enumerate(self._robot_parts):
+            allow(self._robot, self._table, i, 0, part.link not in scene.robot.table_exclude)
+            for k in pieces:
+                allow(self._robot, self._object, i, k, True)
+            for j, other in enumerate(self._robot_parts[:i]):
+                allow(self._robot, self._robot, i, j, self._mechanism.may_collide(part.link, other.link))
+
+
+class PybulletBackend(PoolBackend):
+    """N worlds of Bullet; the keyword ``settings`` takes :class:`PybulletSettings`."""
+
+    name = "pybullet"
+    capabilities = frozenset({"object_mass", "friction", "object_gravity", "object_wrench", "overflow"})
+    world_class = PybulletWorld
+
+    @classmethod
+    def engine_version(cls) -> str:
+        """See :meth:`Backend.engine_version`."""
+        _engine()
+        return version("pybullet")
+
+
+# Drives ----------------------------------------------------------------------------------------------------------------------------------
+
+
+class _Drives:
+    """Joint torques: PD drives with effort limits, armature, dry friction and mimic couplings.
+
+    Arrays are over the D moving joints in the order of the bodies, which is Bullet's link order. With M the mass matrix and c the Coriolis
+    torque, drives that have armature A and are implicit in their damping give the acceleration a = (M + B)^-1 (tau - c), where tau is the
+    PD torque and B = diag(A + dt kd). Bullet integrates a = M^-1 (tau' - c), so it does the same when given tau' = tau - B a. Mimic joints
+    are coupled by a stiff spring and damper, which add J^T (dt^2 k + dt b) J to B.
+
+    This is exact in free motion. In contact the true acceleration is another than a, and tau' is off by B times the difference: small
+    where B is small beside M, as in an arm, but enough to lose a grasp in a hand. So drives that need none of it (no armature, and damping
+    that is stable when explicit) get the PD torque as it is.
+    """
+
+    def __init__(self, engine: Any, client: int, body: int, robot: Mechanism, dt: float, explicit_limit: float) -> None:
+        self._p, self._client, self._body, self._dt = engine, client, body, dt
+        spec, names = robot.robot, robot.joint_names
+        self._links = list(range(len(names)))
+        self.driven = np.array([names.index(name) for name in spec.joint_names])
+        """[J] position of each actuated joint among the moving ones."""
+        self.target = spec.home
+        """[J] drive targets."""
+        self._mimic = np.array([names.index(mimic.joint) for mimic in spec.mimics], dtype=int)
+        self._source = np.array([spec.joint_names.index(mimic.source) for mimic in spec.mimics], dtype=int)
+        self._multiplier = np.array([mimic.multiplier for mimic in spec.mimics])
+        self._offset = np.array([mimic.offset for mimic in spec.mimics])
+        drives = [joint.drive for joint in spec.joints]
+        self._kp, self._kd, self._effort, self._armature, loss = (
+            np.array([getattr(drive, field) for drive in drives]) for field in ("kp", "kd", "effort", "armature", "friction_loss")
+        )
+
+        self.reset(spec.home, np.zeros(len(drives)), spec.home)
+        M = self._mass_matrix(spec.home)
+        inertia = 1.0 / np.diag(np.linalg.inv(M))
+        stiff = dt * self._kd + dt**2 * self._kp > explicit_limit * inertia[self.driven]
+        self._implicit = stiff | (self._armature > 0)
+        self._loss = np.where(self._implicit, loss, 0.0)
+        self._J = np.zeros((len(self._mimic), len(names)))
+        """Rate of each mimic joint's lag behind its source, by joint."""
+        rows = np.arange(len(self._mimic))
+        self._J[rows, self._mimic] = -1.0
+        self._J[rows, self.driven[self._source]] = self._multiplier
+        self._stiffness = _COUPLING * inertia[self._mimic] / dt**2
+        self._damping = 2.0 * np.sqrt(_COUPLING) * inertia[self._mimic] / dt
+        self._coupling = self._J.T @ ((dt**2 * self._stiffness + dt * self._damping)[:, None] * self._J)
+        self._plain = not (self._implicit.any() or len(self._mimic))
+        self._inverse, self._added, self._saturated = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0, dtype=bool)
+
+        friction = np.zeros(len(names))  # Bullet's velocity motor towards 0 with a limited force is dry friction
+        friction[self.driven] = np.where(self._implicit, 0.0, loss)
+        engine.setJointMotorControlArray(body, self._links, engine.VELOCITY_CONTROL, forces=friction, physicsClientId=client)
+
+    def reset(self, position: np.ndarray, velocity: np.ndarray, target: np.ndarray) -> None:
+        """Set positions, velocities and targets [J] of the actuated joints; mimic joints follow."""
+        q, v = self._all(position, self._offset), self._all(velocity, np.zeros_like(self._offset))
+        self._p.resetJointStatesMultiDof(
+            self._body, self._links, [[x] for x in q], targetVelocities=[[x] for x in v], physicsClientId=self._client
+        )
+        self.target = target
+
+    def read(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities [D] of all moving joints."""
+        states = self._p.getJointStates(self._body, self._links, physicsClientId=self._client)
+        return np.array([state[0] for state in states]), np.array([state[1] for state in states])
+
+    def apply(self, *, renew: bool) -> None:
+        """Apply the torques of one Bullet step; ``renew`` updates the mass matrix."""
+        q, v = self.read()
+        dt, driven = self._dt, self.driven
+        wanted = self._kp * (self.target - q[driven]) - self._kd * v[driven]
+        tau = np.zeros(len(q))
+        tau[driven] = np.clip(wanted, -self._effort, self._effort)
+        if not self._plain:
+            if len(self._mimic):
+                lag = self._multiplier * q[driven[self._source]] + self._offset - q[self._mimic]
+                rate = self._J @ v
+                tau -= self._J.T @ (self._stiffness * (lag + dt * rate) + self._damping * rate)
+            saturated = np.abs(wanted) > self._effort
+            if renew or not np.array_equal(saturated, self._saturated):
+                self._factorise(q, saturated)
+            bias = self._p.calculateInverseDynamics(self._body, list(q), list(v), [0.0] * len(q), physicsClientId=self._client)
+            net = tau - bias
+            if self._loss.any():
+                compliance = np.diag(self._inverse)[driven]
+                stopping = -(v / dt + self._inverse @ net)[driven] / compliance
+                brake = np.clip(stopping, -self._loss, self._loss)
+                tau[driven] += brake
+                net[driven] += brake
+            tau -= self._added @ (self._inverse @ net)
+        self._p.setJointMotorControlArray(self._body, self._links, self._p.TORQUE_CONTROL, forces=tau, physicsClientId=self._client)
+
+    def _all(self, actuated: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        values = np.zeros(len(self._links))
+        values[self.driven] = actuated
+        values[self._mimic] = self._multiplier * actuated[self._source] + offset
+        return values
+
+    def _mass_matrix(self, q: np.ndarray) -> np.ndarray:
+        return np.array(self._p.calculateMassMatrix(self._body, list(q), physicsClientId=self._client))
+
+    def _factorise(self, q: np.ndarray, saturated: np.ndarray) -> None:
+        """Invert M + B; a drive at its effort limit has no damping left to be implicit in."""
+        added = np.zeros(len(q))
+        added[self.driven] = np.where(self._implicit, self._armature + np.where(saturated, 0.0, self._dt * self._kd), 0.0)
+        self._added = self._coupling + np.diag(added)
+        self._inverse = np.linalg.inv(self._mass_matrix(q) + self._added)
+        self._saturated = saturated
+
+
+_COUPLING = 1.0
+"""Natural frequency of a mimic joint's coupling, squared, in units of 1 / dt^2; its damping is critical."""
+
+
+# Models ----------------------------------------------------------------------------------------------------------------------------------
+# Bullet reads URDF files written here from the fused bodies, so every mass and inertia is the one of the other engines.
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Part:
+    """A link of a Bullet model: a moving body, or a fixed piece of one."""
+
+    body: int
+    """Index of the body that it is (part of)."""
+    link: str
+    """URDF link whose shapes it has; for an object its name."""
+    shapes: tuple[Shape, ...]
+    tip: int | None = None
+    """Index of the fingertip that it is part of."""
+
+    @property
+    def is_hull(self) -> bool:
+        """Whether its only shape is a convex hull."""
+        return any(shape.geometry.kind == "hull" for shape in self.shapes)
+
+
+def _groups(shapes: Sequence[Shape]) -> list[tuple[Shape, ...]]:
+    """Shapes that may share a Bullet link: the primitives together, every hull alone, for only then can its margin be removed."""
+    hulls = [(shape,) for shape in shapes if shape.geometry.kind == "hull"]
+    primitives = tuple(shape for shape in shapes if shape.geometry.kind != "hull")
+    return [primitives, *hulls] if primitives or not hulls else hulls
+
+
+def _robot_parts(robot: Mechanism) -> list[_Part]:
+    """The base and the moving bodies, then the fixed pieces: so Bullet's link i is body i + 1 and moving joint i."""
+    moving, fixed = [], []
+    for i, body in enumerate(robot.bodies):
+        for link in dict.fromkeys((body.name, *(s.link for s in body.shapes))):
+            parts = [
+                _Part(body=i, link=link, shapes=group, tip=robot.tip_of.get(link))
+                for group in _groups([s.shape for s in body.shapes if s.link == link])
+            ]
+            if link == body.name:
+                moving.append(parts.pop(0))
+            fixed += parts
+    return moving + fixed
+
+
+def _object_parts(spec: ObjectSpec) -> list[_Part]:
+    return [_Part(body=0, link=spec.name, shapes=group) for group in _groups(spec.pieces)]
+
+
+_FAR = 100.0
+"""A height [m] where nothing touches the object."""
+
+_WEIGHTLESS = Inertia(mass=1e-9, com=np.zeros(3), quat=np.array([1.0, 0, 0, 0]), moments=np.full(3, 1e-14))
+"""Of fixed pieces, whose mass is counted in their body: Bullet would invent one for a link without."""
+
+
+def _robot_urdf(robot: Mechanism, parts: Sequence[_Part], folder: Path) -> Path:
+    text = []
+    for i, part in enumerate(parts):
+        body = robot.bodies[part.body]
+        text.append(_link_text(i, (body.inertia if i == part.body else None) or _WEIGHTLESS, part.shapes, folder))
+        if i != part.body:
+            text.append(_fixed_joint_text(i, part.body))
+        elif body.joint is not None:
+            joint = body.joint
+            limited = np.isfinite(joint.lower) and np.isfinite(joint.upper)
+            kind = "prismatic" if joint.type == "prismatic" else "revolute" if limited else "continuous"
+            lower, upper = (joint.lower, joint.upper) if limited else (0.0, -1.0)
+            text.append(
+                f'<joint name="joint{i}" type="{kind}"><parent link="link{body.parent}"/><child link="link{i}"/>'
+                f'{_origin(body.T_parent_body)}<axis xyz="{_numbers(joint.axis)}"/>'
+                f'<limit lower="{lower!r}" upper="{upper!r}" effort="0" velocity="0"/></joint>'
+            )
+    return _write(folder / "robot.urdf", text)
+
+
+def _rigid_urdf(parts: Sequence[_Part], inertia: Inertia, folder: Path) -> Path:
+    text = []
+    for i, part in enumerate(parts):
+        text.append(_link_text(i, _WEIGHTLESS if i else inertia, part.shapes, folder))
+        text.append(_fixed_joint_text(i, 0) if i else "")
+    return _write(folder / "rigid.urdf", text)
+
+
+def _fixed_joint_text(link: int, parent: int) -> str:
+    return f'<joint name="joint{link}" type="fixed"><parent link="link{parent}"/><child link="link{link}"/></joint>'
+
+
+def _write(path: Path, text: Sequence[str]) -> Path:
+    path.write_text("\n".join(['<robot name="xreset">', *text, "</robot>"]))
+    return path
+
+
+def _link_text(index: int, inertia: Inertia, shapes: Sequence[Shape], folder: Path) -> str:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = _matrix(inertia.quat), inertia.com
+    x, y, z = (float(m) for m in inertia.moments)
+    text = [
+        f'<link name="link{index}"><inertial>{_origin(T)}<mass value="{inertia.mass!r}"/>'
+        f'<inertia ixx="{x!r}" iyy="{y!r}" izz="{z!r}" ixy="0" ixz="0" iyz="0"/></inertial>'
+    ]
+    for i, shape in enumerate(shapes):
+        geometry = _geometry_text(shape, folder / f"{index}_{i}.obj")
+        text.append(f"<collision>{_origin(shape.T_body_shape)}<geometry>{geometry}</geometry></collision>")
+    return "".join([*text, "</link>"])
+
+
+def _geometry_text(shape: Shape, mesh: Path) -> str:
+    geometry = shape.geometry
+    if geometry.kind == "hull":
+        lines = [f"v {_numbers(v)}" for v in geometry.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in geometry.faces]
+        mesh.write_text("\n".join(lines) + "\n")
+        return f'<mesh filename="{mesh.name}"/>'
+    if geometry.kind == "box":
+        return f'<box size="{_numbers(2.0 * np.array(geometry.size))}"/>'
+    if geometry.kind == "sphere":
+        return f'<sphere radius="{geometry.size[0]!r}"/>'
+    radius, half = geometry.size
+    return f'<{geometry.kind} radius="{radius!r}" length="{2.0 * half!r}"/>'
+
+
+def _origin(T: np.ndarray) -> str:
+    R = T[:3, :3]
+    run = float(np.hypot(R[0, 0], R[1, 0]))  # cosine of the pitch: 0 where roll and yaw are one
+    roll, yaw = (np.arctan2(R[2, 1], R[2, 2]), np.arctan2(R[1, 0], R[0, 0])) if run > 1e-9 else (np.arctan2(-R[1, 2], R[1, 1]), 0.0)
+    return f'<origin xyz="{_numbers(T[:3, 3])}" rpy="{_numbers((roll, np.arctan2(-R[2, 0], run), yaw))}"/>'
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _matrix(quat: np.ndarray) -> np.ndarray:
+    return np.stack([rotate(quat, axis) for axis in np.eye(3)], axis=1)
+
+
+# Bullet's habits ------------------------------------------------------------------------------------------------------------------------
+
+
+def _xyzw(q: Sequence[float] | np.ndarray) -> tuple[float, float, float, float]:
+    return (q[1], q[2], q[3], q[0])
+
+
+def _wxyz(q: Sequence[float]) -> np.ndarray:
+    return np.array((q[3], q[0], q[1], q[2]))
+
+
+def _force_on_first(contact: Sequence[Any]) -> np.ndarray:
+    """[3] force of a contact point on the body that was asked for first."""
+    normal, force, side, along, other_side, other = contact[7], contact[9], contact[10], contact[11], contact[12], contact[13]
+    return force * np.array(normal) + side * np.array(along) + other_side * np.array(other)
+
+
+def _engine() -> Any:
+    """The module ``pybullet``; ``BackendUnavailableError`` if it cannot be imported."""
+    try:
+        with _silent():
+            import pybullet
+    except ImportError as error:
+        raise unavailable("pybullet", "pybullet", error) from error
+    return pybullet
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Swallow what C code prints: PyBullet announces its build time whenever it is imported."""
+    saved = [(stream, os.dup(stream)) for stream in (1, 2)]
+    with open(os.devnull, "w") as nowhere:
+        for stream, _ in saved:
+            os.dup2(nowhere.fileno(), stream)
+    try:
+        yield
+    finally:
+        for stream, copy in saved:
+            os.dup2(copy, stream)
+            os.close(copy)

@@ -1,0 +1,228 @@
+"""A robot as moving rigid bodies: what the backends build that must know masses and frames themselves.
+
+Links that are fixed to one another are fused into one body with their common mass, centre of mass and inertia; :class:`Mechanism` says
+where every link has gone. Also the few numpy operations on single quaternions (w, x, y, z) that a backend needs every step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from xreset.errors import ObjectError, RobotError, XResetError
+from xreset.spec import ObjectSpec, RobotSpec, Shape
+from xreset.urdf import Joint, Link, RobotTree, robot_tree
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inertia:
+    """Mass properties along principal axes."""
+
+    mass: float
+    """[kg]"""
+    com: np.ndarray
+    """[3] centre of mass in the body's frame [m]."""
+    quat: np.ndarray
+    """[4] orientation of the principal axes in the body's frame."""
+    moments: np.ndarray
+    """[3] principal moments about the centre of mass [kg m^2]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkShape:
+    """A collision shape in the frame of the body that its link belongs to."""
+
+    link: str
+    """URDF link that it belongs to."""
+    shape: Shape
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body:
+    """A moving rigid body, or the robot's fixed base."""
+
+    name: str
+    """The link whose frame is the body's."""
+    parent: int
+    """Index of the parent body; -1 for the base."""
+    joint: Joint | None
+    """The joint that moves it; None for the base."""
+    T_parent_body: np.ndarray
+    """[4, 4] pose in the parent's frame at joint position 0."""
+    inertia: Inertia | None
+    """None for the base, which does not move."""
+    shapes: tuple[LinkShape, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mechanism:
+    """The bodies of a robot, the base first and parents before children. Joint i moves body i + 1."""
+
+    robot: RobotSpec
+    bodies: tuple[Body, ...]
+    frames: dict[str, tuple[int, np.ndarray]]
+    """Link -> index of its body, and its pose [4, 4] in that body's frame."""
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of all moving joints, mimics included, in the order of the bodies."""
+        return tuple(body.joint.name for body in self.bodies if body.joint is not None)
+
+    @cached_property
+    def tip_of(self) -> dict[str, int]:
+        """Link -> index of the fingertip that it is a contact link of."""
+        return {link: i for i, tip in enumerate(self.robot.fingertips) for link in tip.contact_links}
+
+    def may_collide(self, a: str, b: str) -> bool:
+        """Whether two links of the robot collide with each other in physics.
+
+        Both must be among ``self_collision_links``; links of one body or of neighbouring bodies never do, nor do excluded pairs.
+        """
+        robot = self.robot
+        if a not in robot.self_collision_links or b not in robot.self_collision_links:
+            return False
+        i, j = self.frames[a][0], self.frames[b][0]
+        neighbours = i == j or self.bodies[i].parent == j or self.bodies[j].parent == i
+        return not (neighbours or (a, b) in robot.collision_exclude or (b, a) in robot.collision_exclude)
+
+
+def mechanism(robot: RobotSpec) -> Mechanism:
+    """Fuse the fixed links of a robot.
+
+    Raises:
+        RobotError: the description names links or joints that the URDF lacks, a moving joint is neither driven nor a mimic, a driven
+            joint is fixed, or a moving body has impossible mass properties.
+    """
+    tree = robot_tree(robot)
+    _check_names(robot, tree)
+    joints: list[Joint | None] = [None, *tree.joints]
+    frames: dict[str, tuple[int, np.ndarray]] = {}
+    members: list[list[Link]] = []
+    placed: list[tuple[Joint | None, int, np.ndarray]] = []
+    for link, joint in zip(tree.links, joints, strict=True):
+        parent, T = (-1, np.eye(4)) if joint is None else frames[joint.parent]
+        T = T if joint is None else T @ joint.T_parent_joint
+        if joint is not None and joint.type == "fixed":
+            frames[link.name] = (parent, T)
+            members[parent].append(link)
+        else:
+            frames[link.name] = (len(members), np.eye(4))
+            members.append([link])
+            placed.append((joint, parent, T))
+    bodies = tuple(
+        Body(
+            name=links[0].name,
+            parent=parent,
+            joint=joint,
+            T_parent_body=T,
+            inertia=None if joint is None else _fused_inertia(robot, links, frames),
+            shapes=tuple(
+                LinkShape(link=link.name, shape=Shape(geometry=s.geometry, T_body_shape=frames[link.name][1] @ s.T_body_shape))
+                for link in links
+                for s in link.collisions
+            ),
+        )
+        for links, (joint, parent, T) in zip(members, placed, strict=True)
+    )
+    return Mechanism(robot=robot, bodies=bodies, frames=frames)
+
+
+def object_inertia(spec: ObjectSpec) -> Inertia:
+    """Mass properties of an object; ``ObjectError`` if no body can have them."""
+    return principal(spec.mass, spec.com, spec.inertia, ObjectError, f"the object {spec.name!r}")
+
+
+def principal(mass: float, com: np.ndarray, inertia: np.ndarray, error: type[XResetError], what: str) -> Inertia:
+    """Turn an inertia matrix [3, 3] about the centre of mass into principal moments and axes; ``error`` if no body can have it."""
+    if not mass > 0:
+        raise error(f"{what} has the mass {mass} kg, expected a positive one. Give it an <inertial> in the URDF, or a mass.")
+    moments, axes = np.linalg.eigh(inertia)
+    if not (moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - 1e-6)):
+        shown = ", ".join(f"{m:.3g}" for m in moments)
+        raise error(f"{what} has principal moments of inertia ({shown}) kg m^2, expected positive ones, none above the sum of the others.")
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    return Inertia(mass=float(mass), com=np.asarray(com, dtype=float), quat=matrix_to_quat(axes), moments=moments)
+
+
+def _check_names(robot: RobotSpec, tree: RobotTree) -> None:
+    for link in (
+        *robot.tracked_links, *robot.self_collision_links, *robot.table_exclude,
+        *(name for tip in robot.fingertips for name in tip.contact_links), *(name for pair in robot.collision_exclude for name in pair),
+    ):  # fmt: skip
+        tree.link(link)
+    for name in (*robot.joint_names, *(name for mimic in robot.mimics for name in (mimic.joint, mimic.source))):
+        if tree.joint(name).type == "fixed":
+            raise RobotError(f"robot {robot.name!r}: the joint {name!r} is driven or mimics another, but it is fixed in the URDF.")
+    for mimic in robot.mimics:
+        if mimic.source not in robot.joint_names:
+            raise RobotError(f"robot {robot.name!r}: the joint {mimic.joint!r} mimics {mimic.source!r}, expected a driven joint.")
+    known = {*robot.joint_names, *(mimic.joint for mimic in robot.mimics)}
+    for joint in tree.joints:
+        if joint.type != "fixed" and joint.name not in known:
+            raise RobotError(
+                f"robot {robot.name!r}: the joint {joint.name!r} moves, but is neither driven nor a mimic. Describe it, or make it fixed."
+            )
+
+
+def _fused_inertia(robot: RobotSpec, links: list[Link], frames: dict[str, tuple[int, np.ndarray]]) -> Inertia:
+    mass = sum(link.mass for link in links)
+    com, inertia = np.zeros(3), np.zeros((3, 3))
+    if mass > 0:
+        poses = [frames[link.name][1] for link in links]
+        points = [T[:3, :3] @ link.com + T[:3, 3] for T, link in zip(poses, links, strict=True)]
+        com = sum((link.mass * point for link, point in zip(links, points, strict=True)), np.zeros(3)) / mass
+        for T, link, point in zip(poses, links, points, strict=True):
+            r = point - com  # parallel axes
+            inertia += T[:3, :3] @ link.inertia @ T[:3, :3].T + link.mass * (r @ r * np.eye(3) - np.outer(r, r))
+    return principal(mass, com, inertia, RobotError, f"robot {robot.name!r}: the link {links[0].name!r}")
+
+
+# Single quaternions ----------------------------------------------------------------------------------------------------------------------
+# Written out in scalars: numpy's own calls cost more than the arithmetic on arrays this small.
+
+
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[4] Hamilton product: rotation b first, then a."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return np.array(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        )
+    )
+
+
+def conjugate(q: np.ndarray) -> np.ndarray:
+    """[4] inverse of a unit quaternion."""
+    return np.array((q[0], -q[1], -q[2], -q[3]))
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[3] vector product."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+
+
+def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """[3] vector v turned by the unit quaternion q."""
+    u = np.asarray(q[1:])
+    t = 2.0 * cross(u, v)
+    return v + q[0] * t + cross(u, t)
+
+
+def matrix_to_quat(R: np.ndarray) -> np.ndarray:
+    """[4] unit quaternion of a rotation matrix [3, 3]."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(R).as_quat(scalar_first=True)
+
+
+def nearer(q: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """[4] q or -q, whichever is nearer to the reference: engines flip the sign as they please."""
+    return -q if q @ reference < 0 else q

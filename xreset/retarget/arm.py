@@ -122,10 +122,16 @@ class ArmModel:
         self.carrier_of = torch.tensor([0 if name in in_hand else self.carriers.index(name) for name in self.kinematics.link_names])
         """[L] index of the carrier of every link."""
         self.arm_collision = SelfCollision(robot, self.kinematics, moved_by_arm=True)
+        self._hand_collision = SelfCollision(robot, hand, only=robot.self_collision_links)
 
     def hand_support(self, hand_joints: Tensor) -> Tensor:
         """[..., H, 3] the hand's support points in the frame of the hand root."""
         return self.hand.points(hand_joints, self.hand_links, self.hand_points)
+
+    def hand_clearance(self, hand_joints: Tensor) -> Tensor:
+        """[...] smallest signed distance between those of the hand's shapes that collide in physics [m]."""
+        poses = self.hand.link_poses(hand_joints.flatten(0, -2)).numpy()
+        return torch.as_tensor(self._hand_collision.clearance(poses, _SELF_SEARCH)).view(hand_joints.shape[:-1])
 
     def full(self, arm: Tensor, hand_joints: Tensor) -> Tensor:
         """[..., J] all joints in joint order."""
@@ -256,13 +262,13 @@ def _first_frames(model: ArmModel, targets: ArmTargets, support: Tensor, config:
     sequences, restarts = len(targets.annotated), config.restarts
     home = torch.as_tensor(model.robot.home[model.robot.arm_indices])
     generator = torch.Generator().manual_seed(config.seed)
-    spread = torch.rand(sequences, restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0
-    spread[:, 0] = 0.0
+    spread = torch.rand(restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0  # every sequence gets the same
+    spread[0] = 0.0
     lower, upper = torch.maximum(model.lower, home - torch.pi), torch.minimum(model.upper, home + torch.pi)
     start = torch.where(spread < 0, home + spread * (home - lower), home + spread * (upper - home))
     wide = torch.arange(sequences).repeat_interleave(restarts)
     frame = _frame(_take(targets, wide), support[wide], 0, None)
-    solved = _solve(model, frame, start.flatten(0, 1), config, config.first_iterations, None)
+    solved = _solve(model, frame, start.repeat(sequences, 1), config, config.first_iterations, None)
     cost = _system(model, frame, solved, config, None).cost.view(sequences, restarts)
     solved = solved.view(sequences, restarts, -1)
     order = (cost + _HOME_BIAS * (solved - home).square().sum(-1)).argsort(dim=1)

@@ -18,6 +18,7 @@ from torch import Tensor
 from xreset.errors import XResetError
 from xreset.kinematics import Kinematics
 from xreset.spec import Geometry, RobotSpec, TableSpec
+from xreset.urdf import RobotTree
 
 _RIM = 16
 """Support points on each rim of a cylinder."""
@@ -107,7 +108,7 @@ class SelfCollision:
 
         Args:
             robot: the robot.
-            kinematics: of the whole robot.
+            kinematics: of the whole robot, or of its hand.
             moved_by_arm: only pairs whose relative pose depends on an arm joint.
             only: only pairs among these links.
 
@@ -139,33 +140,10 @@ class SelfCollision:
         self._T_link_shape = np.array(local).reshape(-1, 4, 4)
         self._center, self._radius = np.array(centers).reshape(-1, 3), np.array(radii)
 
-        bodies = {name: tree.moving_ancestor(name) for name in kinematics.link_names}
-        parent = {joint.child: bodies[joint.parent] for joint in tree.joints}
-        arm = {robot.joint_names[i] for i in robot.arm_indices}
-        by_child = {joint.child: joint for joint in tree.joints}
-
-        def arm_joints(name: str) -> frozenset[str]:
-            found = set()
-            while name in by_child:
-                if by_child[name].name in arm:
-                    found.add(by_child[name].name)
-                name = by_child[name].parent
-            return frozenset(found)
-
-        excluded = {frozenset((bodies[a], bodies[b])) for a, b in robot.collision_exclude if a in bodies and b in bodies}
-        pairs = []
-        for i, j in combinations(range(len(self._link)), 2):
-            a, b = (kinematics.link_names[self._link[k]] for k in (i, j))
-            body_a, body_b = bodies[a], bodies[b]
-            if body_a == body_b or frozenset((body_a, body_b)) in excluded:
-                continue
-            if parent.get(body_a) == body_b or parent.get(body_b) == body_a:
-                continue
-            if moved_by_arm and arm_joints(a) == arm_joints(b):
-                continue
-            pairs.append((i, j))
+        owners = [kinematics.link_names[index] for index in self._link]
+        pairs = [(i, j) for i, j in combinations(range(len(owners)), 2) if _may_collide(robot, tree, owners[i], owners[j], moved_by_arm)]
         self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-        home = kinematics.link_poses(kinematics.clamp(kinematics.lower.new_tensor(robot.home)))[None].numpy()
+        home = kinematics.link_poses(kinematics.clamp(kinematics.lower.new_tensor(robot.home[kinematics.joint_indices])))[None].numpy()
         overlapping = self.near(home, 0.0)
         never = {tuple(sorted(pair)) for pair in overlapping.links.tolist()}
         keep = [tuple(sorted((self._link[i], self._link[j]))) not in never for i, j in self._pairs]
@@ -220,6 +198,32 @@ class SelfCollision:
         clearance = np.full(len(link_poses), margin)
         np.minimum.at(clearance, near.configuration, near.distance)
         return clearance
+
+
+def _may_collide(robot: RobotSpec, tree: RobotTree, a: str, b: str, moved_by_arm: bool) -> bool:
+    """Whether a pair of links counts: see :class:`SelfCollision`."""
+    parents = {joint.child: joint for joint in tree.joints}
+    body_a, body_b = tree.moving_ancestor(a), tree.moving_ancestor(b)
+
+    def parent_body(body: str) -> str | None:
+        return tree.moving_ancestor(parents[body].parent) if body in parents else None
+
+    if body_a == body_b or parent_body(body_a) == body_b or parent_body(body_b) == body_a:
+        return False
+    if any({tree.moving_ancestor(name) for name in pair} == {body_a, body_b} for pair in robot.collision_exclude):
+        return False
+    if not moved_by_arm:
+        return True
+    arm = {joint.name for joint in robot.joints if joint.group == "arm"}
+
+    def arm_joints(link: str) -> set[str]:
+        found = set()
+        while link in parents:
+            found |= {parents[link].name} & arm
+            link = parents[link].parent
+        return found
+
+    return arm_joints(a) != arm_joints(b)
 
 
 def _coal_geometry(coal, geometry: Geometry):

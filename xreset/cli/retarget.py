@@ -1,0 +1,77 @@
+"""``xreset retarget``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def retarget(
+    demos: Annotated[Path, tyro.conf.Positional], *, robot: str, out: Path, objects: Path | None = None, max_per_object: int | None = None
+) -> None:
+    """Turn human demonstrations into robot trajectories.
+
+    Args:
+        demos: Archive of demonstrations (see `xreset demos`).
+        robot: Name of a robot, or the folder of its description.
+        out: File to write.
+        objects: Folder of real meshes; default: the built-in stand-ins.
+        max_per_object: Only the first so many sequences of each object.
+    """
+    from dataclasses import asdict
+
+    import numpy as np
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
+
+    from xreset import robots
+    from xreset.demos import demo_objects, read_demos
+    from xreset.files import file_hash
+    from xreset.retarget import pipeline
+
+    console = Console()
+    spec = robots.load(robot)
+    chosen = read_demos(demos)
+    if max_per_object is not None:
+        chosen = chosen.select(max_per_object=max_per_object)
+    specs = demo_objects(chosen, objects)
+    config = pipeline.RetargetConfig()
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("sequences", total=chosen.num_sequences)
+        result = pipeline.retarget(
+            chosen, spec, list(specs.values()), config, progress=lambda done, total: bar.update(task, completed=done, total=total)
+        )
+    pipeline.write_retargeted(
+        out,
+        result,
+        config={"retarget": asdict(config), "robot": robot, "max_per_object": max_per_object},
+        inputs={"demos": file_hash(demos), "robot": spec.fingerprint} | {f"object {s.name}": s.source for s in specs.values()},
+    )
+
+    table = Table(
+        "object", "sequences", "frames", "annotated", "valid", "fingertips [mm]", "invalid because of", title=f"retargeted to {spec.name}"
+    )
+    owner = np.repeat(np.arange(len(result.object_name)), np.diff(result.frame_offsets))
+    names = result.object_name[owner]
+    for name in [*sorted(specs), "all"]:
+        mine = (names == name) | (name == "all")
+        annotated, valid = result.annotated & mine, result.valid & mine
+        counts = np.bincount(result.reason[annotated], minlength=len(result.reason_names))
+        table.add_row(
+            name,
+            str(len(set(owner[mine]))),
+            str(int(mine.sum())),
+            str(int(annotated.sum())),
+            f"{int(valid.sum())} ({valid.sum() / max(annotated.sum(), 1):.0%})",
+            f"{1e3 * result.hand_error[annotated].mean():.1f}" if annotated.any() else "-",
+            ", ".join(f"{reason} {n}" for reason, n in zip(result.reason_names[1:], counts[1:], strict=True) if n),
+            end_section=name == sorted(specs)[-1],
+        )
+    console.print(table)
+    console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}")
+
+
+COMMAND = retarget

@@ -1,0 +1,185 @@
+"""From human demonstrations to robot trajectories: contacts, hand, arm, validity (the paper, appendix D.b)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xreset.demos.align import grounded, levelled
+from xreset.demos.archive import Demos
+from xreset.errors import DemoError
+from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
+from xreset.retarget.contacts import Surface, keypoint_contacts
+from xreset.retarget.file import SCHEMA, Retargeted, read_retargeted, write_retargeted
+from xreset.retarget.hand import HandConfig, HandModel, HandTargets, retarget_hand
+from xreset.retarget.validity import REASONS, Thresholds, classify
+from xreset.rotations import matrix_to_quat
+from xreset.spec import ObjectSpec, RobotSpec
+
+__all__ = ["SCHEMA", "RetargetConfig", "Retargeted", "read_retargeted", "rest_on_table", "retarget", "write_retargeted"]
+
+_SEQUENCES_PER_BATCH = 24
+"""Enough to make batching pay; few enough to keep memory below about 1 GB and progress visible."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RetargetConfig:
+    """Everything that decides the result, besides robot, objects and demonstrations."""
+
+    hand: HandConfig = field(default_factory=HandConfig)
+    arm: ArmConfig = field(default_factory=ArmConfig)
+    thresholds: Thresholds = field(default_factory=Thresholds)
+    contact_distance: float = 0.020
+    """A human keypoint nearer than this to the object's surface touches it [m]."""
+
+
+def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
+    """The demonstrations over a level table on which each object rests in its first frame (the paper, appendix D.a).
+
+    Raises:
+        DemoError: an object of the demonstrations is not among ``objects``.
+    """
+    return grounded(levelled(demos), _by_name(demos, objects))
+
+
+def retarget(
+    demos: Demos,
+    robot: RobotSpec,
+    objects: Sequence[ObjectSpec],
+    config: RetargetConfig | None = None,
+    *,
+    progress: Callable[[float, int], None] = lambda done, total: None,
+) -> Retargeted:
+    """Retarget demonstrations; sequences are independent of one another, and the result depends on nothing but the arguments.
+
+    Args:
+        demos: human demonstrations; they need not rest on the table yet.
+        robot: the robot.
+        objects: geometry of every object that the demonstrations name.
+        config: weights and thresholds.
+        progress: called with (sequences done, sequences in all).
+
+    Returns:
+        Trajectories of every sequence; a sequence whose hand was never annotated stays at home, without a valid frame.
+
+    Raises:
+        DemoError: an object of the demonstrations is not among ``objects``.
+        RobotError: the robot's description does not allow retargeting.
+    """
+    config = config or RetargetConfig()
+    by_name = _by_name(demos, objects)
+    demos = rest_on_table(demos, objects)
+    hand, arm = HandModel(robot), ArmModel(robot)
+    surfaces = {name: Surface(spec.vertices, spec.faces) for name, spec in by_name.items()}
+
+    touched, touches = _contacts(demos, surfaces, config.contact_distance)
+    joint_pos = np.tile(robot.home, (demos.num_frames, 1))
+    reason = np.full(demos.num_frames, REASONS.index("not annotated"), dtype=np.int32)
+    hand_error, wrist_error = np.full(demos.num_frames, np.inf), np.full(demos.num_frames, np.inf)
+    todo = [i for i in range(demos.num_sequences) if demos.hand_valid[demos.frames(i)].any()]
+    for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
+        batch = todo[begin : begin + _SEQUENCES_PER_BATCH]
+
+        def report(share: float, start: int = begin, size: int = len(batch)) -> None:
+            progress(start + share * size, len(todo))
+
+        targets = _hand_targets(demos, hand, batch, touched, touches)
+        motion = retarget_hand(hand, targets, config.hand, lambda share, r=report: r(0.5 * share))
+        error = (motion.keypoints - targets.keypoints)[:, :, torch.as_tensor(hand.is_tip)].norm(dim=-1).mean(-1)
+        arm_targets = ArmTargets(
+            root_pos=motion.root_pos,
+            root_quat=motion.root_quat,
+            hand_joints=motion.joints,
+            annotated=targets.annotated,
+            hand_error=error,
+            hand_clearance=arm.hand_clearance(motion.joints),
+        )
+        joints, measures = track(arm, arm_targets, config.thresholds, config.arm, lambda share, r=report: r(0.5 + 0.5 * share))
+        _scatter(demos, batch, arm.full(joints, motion.joints), joint_pos)
+        _scatter(demos, batch, classify(measures, config.thresholds), reason)
+        _scatter(demos, batch, error.masked_fill(~targets.annotated, np.inf), hand_error)
+        _scatter(demos, batch, measures.wrist_position.masked_fill(~targets.annotated, np.inf), wrist_error)
+    progress(len(todo), len(todo))
+
+    links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
+    contact = touches.any(axis=1)
+    return Retargeted(
+        robot=robot.name,
+        robot_fingerprint=robot.fingerprint,
+        sequence_name=demos.sequence_name,
+        object_name=demos.object_name,
+        hand_side=demos.hand_side,
+        frame_offsets=demos.frame_offsets,
+        fps=demos.fps,
+        joint_names=robot.joint_names,
+        joint_pos=joint_pos,
+        palm_pos=links[:, 0, :3, 3].numpy(),
+        palm_quat_wxyz=matrix_to_quat(links[:, 0, :3, :3]).numpy(),
+        fingertip_names=robot.fingertip_names,
+        fingertip_pos=links[:, 1:, :3, 3].numpy(),
+        object_pos=demos.object_pos.astype(np.float64),
+        object_quat_wxyz=demos.object_quat_wxyz.astype(np.float64),
+        goal_pos=demos.goal_pose[0].astype(np.float64),
+        goal_quat_wxyz=demos.goal_pose[1].astype(np.float64),
+        annotated=demos.hand_valid,
+        valid=reason == 0,
+        reason=reason,
+        reason_names=REASONS,
+        contact=contact,
+        first_contact=np.array([_first(contact[demos.frames(i)]) for i in range(demos.num_sequences)], dtype=np.int32),
+        hand_error=hand_error,
+        wrist_error=wrist_error,
+    )
+
+
+def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpec]:
+    by_name = {spec.name: spec for spec in objects}
+    if missing := sorted(set(demos.object_name.tolist()) - set(by_name)):
+        raise DemoError(f"the demonstrations hold objects that were not given: {', '.join(missing)}; given were {', '.join(by_name)}.")
+    return {name: by_name[name] for name in sorted(set(demos.object_name.tolist()))}
+
+
+def _contacts(demos: Demos, surfaces: dict[str, Surface], distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Contact points [F, 21, 3] and contact [F, 21] of all human keypoints."""
+    points, contact = np.zeros((demos.num_frames, 21, 3)), np.zeros((demos.num_frames, 21), dtype=bool)
+    for i, name in enumerate(demos.object_name.tolist()):
+        rows = demos.frames(i)
+        keypoints = np.where(demos.hand_valid[rows, None, None], demos.hand_keypoints[rows].astype(np.float64), np.nan)
+        points[rows], contact[rows] = keypoint_contacts(
+            surfaces[name], keypoints, demos.object_pos[rows].astype(np.float64), demos.object_quat_wxyz[rows].astype(np.float64), distance
+        )
+    return points, contact
+
+
+def _hand_targets(demos: Demos, hand: HandModel, sequences: Sequence[int], touched: np.ndarray, touches: np.ndarray) -> HandTargets:
+    """Targets of some sequences, padded with frames that are not annotated."""
+    lengths = [len(range(*demos.frames(i).indices(demos.num_frames))) for i in sequences]
+    shape = (len(sequences), max(lengths))
+    keypoints, points = np.zeros((*shape, len(hand.names), 3)), np.zeros((*shape, len(hand.names), 3))
+    annotated, contact = np.zeros(shape, dtype=bool), np.zeros((*shape, len(hand.names)), dtype=bool)
+    for s, (i, length) in enumerate(zip(sequences, lengths, strict=True)):
+        rows, chosen = demos.frames(i), hand.keypoint_indices
+        annotated[s, :length] = demos.hand_valid[rows]
+        keypoints[s, :length] = np.where(demos.hand_valid[rows, None, None], demos.hand_keypoints[rows][:, chosen], 0.0)
+        points[s, :length], contact[s, :length] = touched[rows][:, chosen], touches[rows][:, chosen]
+    return HandTargets(
+        keypoints=torch.as_tensor(keypoints),
+        annotated=torch.as_tensor(annotated),
+        contact_points=torch.as_tensor(points),
+        in_contact=torch.as_tensor(contact),
+    )
+
+
+def _scatter(demos: Demos, sequences: Sequence[int], values: Tensor, out: np.ndarray) -> None:
+    """Write [S, T, ...] padded values into the frames of their sequences."""
+    for s, i in enumerate(sequences):
+        rows = demos.frames(i)
+        out[rows] = values[s, : rows.stop - rows.start].numpy()
+
+
+def _first(flags: np.ndarray) -> int:
+    return int(flags.argmax()) if flags.any() else -1

@@ -11,6 +11,8 @@ import numpy as np
 
 from xreset import robots
 from xreset.backends.registry import backend_class
+from xreset.demos.archive import SCHEMA_NAME as DEMOS
+from xreset.demos.archive import demo_objects, read_demos
 from xreset.errors import FileFormatError, PolicyError
 from xreset.eval.baselines import KinematicRetargeting
 from xreset.eval.results import summarize, write_results
@@ -19,7 +21,8 @@ from xreset.files import file_hash
 from xreset.objects import load_objects
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
 from xreset.resets.bank import ResetBank, check_robot
-from xreset.retarget.pipeline import Retargeted, read_retargeted, retarget
+from xreset.retarget.pipeline import SCHEMA as RETARGETED
+from xreset.retarget.pipeline import Retargeted, read_retargeted, rest_on_table, retarget
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
 from xreset.typed import from_dict
@@ -99,20 +102,14 @@ def load_motion(path: Path, robot: RobotSpec, objects_folder: Path | None, *, tr
         objects_folder: folder of meshes; None: stand-ins.
         trajectories: whether robot trajectories are needed; demonstrations are then retargeted here.
     """
-    from xreset.demos.archive import SCHEMA as DEMOS
-    from xreset.demos.archive import read_demos
-    from xreset.retarget.pipeline import SCHEMA as RETARGETED
-    from xreset.retarget.pipeline import rest_on_table
-
     schema = _schema_of(path)
     if schema == RETARGETED:
         data = read_retargeted(path)
-        check_robot(
-            path, "retargeted file", robot, name=data.robot, joint_names=tuple(data.joint_names), fingerprint=data.robot_fingerprint
-        )
+        names = tuple(data.joint_names)
+        check_robot(path, "retargeted file", robot, name=data.robot, joint_names=names, fingerprint=data.robot_fingerprint)
     elif schema == DEMOS:
         demos = read_demos(path)
-        objects = load_objects(sorted({*map(str, demos.object_name)}), objects_folder)
+        objects = tuple(demo_objects(demos, objects_folder).values())
         if trajectories:
             data = retarget(demos, robot, objects)
         else:

@@ -1,8 +1,9 @@
 """The paper's evaluation metrics (section V and appendix A), accumulated over an episode for N worlds.
 
-Stages: approach (a fingertip within 5 cm of the object), grasp (thumb and one other finger in contact while the object is lifted by at least
-1 cm), reorientation (object within 2 cm and 15 degrees of the goal at the episode's end). Task progress is 0, 0.33, 0.66 or 1 for the
-highest stage. Reorientation progress is 1 - min_t d(o_t, g) / d(o_0, g) with d the largest distance of four object keypoints, in [0, 1].
+Stages: approach (a fingertip within 5 cm of the object), grasp (thumb and one other finger in contact while the object is lifted by at
+least 1 cm), reorientation (object within 2 cm and 15 degrees of the goal at the episode's end). Task progress is 0, 0.33, 0.66 or 1 for
+the highest stage. Reorientation progress is 1 - min_t d(o_t, g) / d(o_0, g), in [0, 1], with d the largest distance of four object
+keypoints.
 """
 
 from __future__ import annotations

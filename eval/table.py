@@ -9,8 +9,17 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 COLUMNS = (
-    "engine", "version", "task progress [95 %]", "approach", "grasp", "reorient", "reorientation progress", "not finite", "overflow", "steps/s",
-)  # fmt: skip
+    "engine",
+    "version",
+    "task progress [95 %]",
+    "approach",
+    "grasp",
+    "reorient",
+    "reorientation progress",
+    "not finite",
+    "overflow",
+    "steps/s",
+)
 
 
 def rows(summaries: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
@@ -41,7 +50,8 @@ def rich_table(summaries: Sequence[dict[str, Any]]) -> Table:
     from rich.table import Table
 
     first = summaries[0]
-    title = f"{first['policy']} on {first['robot']}: {first['episodes']} episodes of {len(first['per_demo'])} demonstrations, seed {first['seed']}"
+    count = f"{first['episodes']} episodes of {len(first['per_demo'])} demonstrations"
+    title = f"{first['policy']} on {first['robot']}: {count}, seed {first['seed']}"
     table = Table(*COLUMNS, title=title)
     for row in rows(summaries):
         table.add_row(*row)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from xreset.errors import FileFormatError
 from xreset.eval.rollout import Episode, Rollouts, Trace
 from xreset.eval.stats import bootstrap_ci95
 from xreset.files import Field, read_json, read_npz, write_json, write_npz
@@ -94,9 +95,19 @@ def read_results(folder: Path) -> list[dict[str, Any]]:
     return [read_json(file, SCHEMA) for file in files]
 
 
-def read_traces(folder: Path, backend: str) -> tuple[Trace, ...]:
-    """The traces of one engine."""
-    a = read_npz(folder / f"{backend}.trace.npz", TRACE_SCHEMA, _TRACE_FIELDS, what="an evaluation trace")
+def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tuple[Trace, ...]:
+    """The traces of one engine.
+
+    Raises:
+        FileFormatError: the file is damaged, or its joints are not ``joint_names`` in that order.
+    """
+    path = folder / f"{backend}.trace.npz"
+    a = read_npz(path, TRACE_SCHEMA, _TRACE_FIELDS, what="an evaluation trace")
+    found = tuple(a["joint_names"].tolist())
+    if found != joint_names:
+        raise FileFormatError(
+            f"{path} is a trace of the joints {', '.join(found)}; the robot has {', '.join(joint_names)}. Evaluate again."
+        )
     return tuple(
         Trace(
             sequence=int(a["sequence_index"][i]),

@@ -1,0 +1,299 @@
+"""Metrics on constructed trajectories, confidence intervals, result files."""
+
+import json
+import math
+import tempfile
+import unittest
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.toy_bank import SOUP, SPAM
+from xreset.backends.base import Contacts, Health, Links, State
+from xreset.env import Reading
+from xreset.errors import FileFormatError
+from xreset.eval.metrics import EpisodeMetrics, MetricsConfig, keypoint_distance
+from xreset.eval.results import read_results, read_traces, summarize, write_results
+from xreset.eval.rollout import Episode, Rollouts, Trace
+from xreset.eval.stats import bootstrap_ci95
+from xreset.rotations import quat_from_axis_angle
+
+CORNERS = torch.tensor([[-1.0, -1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]]) * 0.05
+IDENTITY = torch.tensor([1.0, 0, 0, 0])
+START, GOAL = torch.tensor([0.5, 0.3, 0.05]), torch.tensor([0.5, 0.3, 0.25])
+PRESS, LIGHT = (1.0, 0.0, 1.0), (0.0, 1.0, 1.0)
+
+
+def reading(pos=START, quat=IDENTITY, tips=(0.2, 0.2, 0.2), press=(0.0, 0.0, 0.0), nonfinite=False, overflow=False) -> Reading:
+    """One world with three fingers (thumb first): the object's pose, fingertip distances [m], contact forces [N]."""
+    zero3, quats = torch.zeros(1, 3), IDENTITY.expand(1, 4, 4)
+    joints = torch.zeros(1, 2)
+    force = torch.tensor(press)[None, :, None] * torch.tensor([0.0, 0.6, 0.8])
+    return Reading(
+        state=State(
+            joint_pos=joints, joint_vel=joints, joint_target=joints,
+            object_pos=torch.as_tensor(pos)[None], object_quat=torch.as_tensor(quat)[None], object_linvel=zero3, object_angvel=zero3,
+        ),
+        links=Links(pos=torch.zeros(1, 4, 3), quat=quats, linvel=torch.zeros(1, 4, 3), angvel=torch.zeros(1, 4, 3)),
+        contacts=Contacts(tip_force=force, tip_touch=force.norm(dim=-1) > 0, table_force=zero3),
+        health=Health(nonfinite=torch.tensor([nonfinite]), overflow=torch.tensor([overflow])),
+        tip_distance=torch.tensor(tips)[None],
+    )  # fmt: skip
+
+
+def raised(height: float) -> torch.Tensor:
+    return START + torch.tensor([0.0, 0.0, height])
+
+
+def turned(degrees: float) -> torch.Tensor:
+    return quat_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(degrees)]))
+
+
+def episode(*steps: Reading, start: Reading | None = None, goal_quat=IDENTITY, lost_at: int | None = None) -> EpisodeMetrics:
+    metrics = EpisodeMetrics(start or reading(), GOAL[None], goal_quat[None], CORNERS[None], MetricsConfig())
+    for i, step in enumerate(steps):
+        metrics.update(step, torch.tensor([i == lost_at]))
+    return metrics
+
+
+class MetricsTest(unittest.TestCase):
+    def assert_stages(self, m: EpisodeMetrics, approach: bool, grasp: bool, reorient: bool):
+        self.assertEqual((bool(m.approach), bool(m.grasp), bool(m.reorient)), (approach, grasp, reorient))
+        expected = 1.0 if reorient else 0.66 if grasp else 0.33 if approach else 0.0
+        self.assertAlmostEqual(float(m.task_progress), expected, places=6)
+
+    def test_nothing(self):
+        m = episode(reading(tips=(0.06, 0.051, 0.2)))
+        self.assert_stages(m, False, False, False)
+        self.assertEqual(float(m.reorientation_progress), 0.0)
+
+    def test_approach_is_one_finger_within_five_centimetres_at_any_time(self):
+        self.assert_stages(episode(reading(tips=(0.2, 0.049, 0.2)), reading()), True, False, False)
+        self.assert_stages(episode(reading(), start=reading(tips=(0.2, 0.2, 0.04))), True, False, False)
+
+    def test_grasp_needs_thumb_and_finger_and_a_lift_at_once(self):
+        near = {"tips": (0.0, 0.0, 0.0)}
+        self.assert_stages(episode(reading(raised(0.011), press=PRESS, **near)), True, True, False)
+        self.assert_stages(episode(reading(raised(0.009), press=PRESS, **near)), True, False, False)
+        self.assert_stages(episode(reading(raised(0.011), press=LIGHT, **near)), True, False, False)
+        self.assert_stages(episode(reading(raised(0.011), press=(0.09, 1, 1), **near)), True, False, False)
+        apart = episode(reading(press=PRESS, **near), reading(raised(0.05), **near))
+        self.assert_stages(apart, True, False, False)
+
+    def test_a_grasp_counts_though_the_object_is_dropped_later(self):
+        self.assert_stages(episode(reading(raised(0.05), press=PRESS, tips=(0, 0, 0)), reading()), True, True, False)
+
+    def test_reorientation_is_judged_at_the_episodes_end(self):
+        self.assert_stages(episode(reading(GOAL)), False, False, True)
+        left = episode(reading(GOAL), reading(raised(0.1)))
+        self.assert_stages(left, False, False, False)
+        self.assertTrue(bool(left.reorient_once))
+
+    def test_reorientation_within_two_centimetres_and_fifteen_degrees(self):
+        off = GOAL + torch.tensor([0.0, 0.0195, 0.0])
+        self.assert_stages(episode(reading(off, turned(14.8))), False, False, True)
+        self.assert_stages(episode(reading(off, -turned(14.8))), False, False, True)
+        self.assert_stages(episode(reading(off, turned(15.2))), False, False, False)
+        self.assert_stages(episode(reading(GOAL + torch.tensor([0.0, 0.0205, 0.0]))), False, False, False)
+
+    def test_pose_error_is_the_largest_keypoint_distance(self):
+        """Half a turn about z moves every corner of the tetrahedron by 2 sqrt(2) 5 cm; a shift adds to it in the worst corner."""
+        args = (START[None], IDENTITY[None], START[None])
+        self.assertAlmostEqual(float(keypoint_distance(*args, turned(180)[None], CORNERS[None])), 0.1 * math.sqrt(2), places=6)
+        shift = torch.tensor([[0.1, 0.1, 0.0]])
+        found = keypoint_distance(START[None] + shift, IDENTITY[None], START[None], turned(180)[None], CORNERS[None])
+        self.assertAlmostEqual(float(found), 0.2 * math.sqrt(2), places=6)
+
+    def test_reorientation_progress_is_the_best_of_the_episode(self):
+        """The goal is 0.20 above the start without a turn, so every keypoint is that far."""
+        m = episode(reading(raised(0.05)), reading(raised(0.15)), reading(raised(0.1)))
+        self.assertAlmostEqual(float(m.reorientation_progress), 0.75, places=5)
+        self.assertEqual(float(episode(reading(raised(-0.1))).reorientation_progress), 0.0)
+        self.assertEqual(float(episode(reading(GOAL)).reorientation_progress), 1.0)
+        there = episode(reading(GOAL), start=reading(GOAL))  # a start at the goal leaves nothing to do: no division by zero
+        self.assertTrue(0.0 <= float(there.reorientation_progress) <= 1.0)
+
+    def test_a_world_that_left_the_scene_is_no_longer_looked_at(self):
+        m = episode(reading(), reading(raised(0.05), press=PRESS, tips=(0, 0, 0)), reading(GOAL), lost_at=1)
+        self.assert_stages(m, False, False, False)
+        self.assertEqual(float(m.reorientation_progress), 0.0)
+        self.assertTrue(bool(m.out_of_bounds))
+
+    def test_what_was_reached_before_leaving_counts_but_not_the_goal(self):
+        m = episode(reading(raised(0.1), press=PRESS, tips=(0, 0, 0)), reading(GOAL), reading(GOAL), lost_at=2)
+        self.assert_stages(m, True, True, False)
+        self.assertTrue(bool(m.reorient_once))
+
+    def test_a_world_that_is_not_finite_is_counted_and_no_longer_looked_at(self):
+        nan = torch.full((3,), math.nan)
+        broken = reading(nan, tips=(math.nan,) * 3, press=(math.nan,) * 3, nonfinite=True)
+        m = episode(reading(raised(0.05)), broken, broken, reading(GOAL, tips=(0, 0, 0), nonfinite=True))
+        self.assert_stages(m, False, False, False)
+        self.assertAlmostEqual(float(m.reorientation_progress), 0.25, places=5)
+        self.assertEqual((bool(m.nonfinite), bool(m.out_of_bounds)), (True, False))
+
+    def test_overflow_is_counted_but_ends_nothing(self):
+        m = episode(reading(overflow=True), reading(GOAL))
+        self.assertTrue(bool(m.overflow))
+        self.assert_stages(m, False, False, True)
+
+    def test_worlds_are_judged_one_by_one(self):
+        def both(a: Reading, b: Reading) -> Reading:
+            return Reading(
+                state=State(**{k: torch.cat((v, getattr(b.state, k))) for k, v in vars(a.state).items()}),
+                links=a.links,
+                contacts=Contacts(**{k: torch.cat((v, getattr(b.contacts, k))) for k, v in vars(a.contacts).items()}),
+                health=Health(**{k: torch.cat((v, getattr(b.health, k))) for k, v in vars(a.health).items()}),
+                tip_distance=torch.cat((a.tip_distance, b.tip_distance)),
+            )
+
+        start = both(reading(), reading())
+        m = EpisodeMetrics(start, GOAL.expand(2, 3), IDENTITY.expand(2, 4), CORNERS.expand(2, 4, 3), MetricsConfig())
+        m.update(both(reading(tips=(0.01, 0.2, 0.2)), reading(GOAL)), torch.tensor([False, True]))
+        m.update(both(reading(GOAL), reading(GOAL)), torch.tensor([False, False]))
+        torch.testing.assert_close(m.task_progress, torch.tensor([1.0, 0.0]))
+        self.assertEqual(m.out_of_bounds.tolist(), [False, True])
+
+
+class BootstrapTest(unittest.TestCase):
+    def test_one_value_has_no_spread(self):
+        self.assertEqual(bootstrap_ci95(np.array([0.3])), (0.3, 0.3))
+        self.assertEqual(bootstrap_ci95(np.full(9, 0.66)), (0.66, 0.66))
+
+    def test_the_same_values_give_the_same_interval(self):
+        values = np.random.default_rng(1).random(30)
+        self.assertEqual(bootstrap_ci95(values), bootstrap_ci95(values))
+        self.assertNotEqual(bootstrap_ci95(values), bootstrap_ci95(values, seed=1))
+
+    def test_agrees_with_the_normal_approximation(self):
+        values = np.random.default_rng(2).normal(5.0, 2.0, 400)
+        low, high = bootstrap_ci95(values)
+        half = 1.96 * values.std() / math.sqrt(len(values))
+        self.assertAlmostEqual(low, values.mean() - half, delta=0.1 * half)
+        self.assertAlmostEqual(high, values.mean() + half, delta=0.1 * half)
+
+    def covered(self, cluster: bool) -> float:
+        """Share of 200 experiments whose interval holds the true mean: 15 demonstrations, 5 episodes each, which are nearly alike."""
+        rng, hits = np.random.default_rng(3), 0
+        for _ in range(200):
+            groups = np.repeat(np.arange(15), 5)
+            values = rng.normal(0, 1, 15)[groups] + 0.1 * rng.normal(size=75)
+            low, high = bootstrap_ci95(values, groups if cluster else None, draws=400)
+            hits += low <= 0 <= high
+        return hits / 200
+
+    def test_whole_demonstrations_are_drawn(self):
+        self.assertGreater(self.covered(cluster=True), 0.87)
+        self.assertLess(self.covered(cluster=False), 0.75)
+
+    def test_groups_may_differ_in_size(self):
+        low, high = bootstrap_ci95(np.array([1.0, 1, 1, 1, 0]), np.array([7, 7, 7, 7, 2]))
+        self.assertEqual((low, high), (0.0, 1.0))
+        alone = bootstrap_ci95(np.array([1.0, 0, 1, 0]), np.zeros(4))
+        self.assertTrue(0 <= alone[0] < 0.5 < alone[1] <= 1)
+
+
+def make_rollouts() -> Rollouts:
+    def made(sequence: int, repetition: int, **changes) -> Episode:
+        nothing = dict.fromkeys(("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow"), False)
+        base = nothing | {"reorientation_progress": 0.0, "task_progress": 0.0}
+        return Episode(
+            sequence=sequence, sequence_name=f"demo_{sequence}", object=(SOUP, SPAM)[sequence], repetition=repetition, **(base | changes)
+        )
+
+    def trace(sequence: int) -> Trace:
+        t, rng = 5, np.random.default_rng(sequence)
+        quat = np.tile([1.0, 0, 0, 0], (t, 1))
+        return Trace(
+            sequence=sequence, object=(SOUP, SPAM)[sequence], goal_pos=rng.random(3), goal_quat=quat[0], time=np.arange(t) * 0.05,
+            joint_pos=rng.random((t, 3)), object_pos=rng.random((t, 3)), object_quat=quat,
+        )  # fmt: skip
+
+    episodes = (
+        made(0, 0, approach=True, grasp=True, reorient=True, reorient_once=True, reorientation_progress=0.9, task_progress=1.0),
+        made(0, 1, approach=True, reorientation_progress=0.1, task_progress=0.33, overflow=True),
+        made(1, 0, approach=True, grasp=True, reorientation_progress=0.5, task_progress=0.66, out_of_bounds=True),
+        made(1, 1, nonfinite=True),
+    )
+    return Rollouts(episodes=episodes, traces=(trace(0), trace(1)), control_steps_per_second=1234.56)
+
+
+def make_summary(backend: str = "mujoco", rollouts: Rollouts | None = None) -> dict:
+    return summarize(
+        rollouts or make_rollouts(), backend=backend, backend_version="4.0.0", robot="toy", policy="zero", seed=3, repetitions=2,
+        inputs={"demos": "ab"}, objects_folder=None,
+    )  # fmt: skip
+
+
+class ResultsTest(unittest.TestCase):
+    JOINTS = ("a", "b", "c")
+
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name)
+
+    def test_summary(self):
+        s = make_summary()
+        self.assertEqual(s["schema"], "xreset-eval/1")
+        self.assertEqual((s["backend"], s["robot"], s["policy"], s["seed"], s["episodes"]), ("mujoco", "toy", "zero", 3, 4))
+        self.assertEqual(s["objects"], [SOUP, SPAM])
+        self.assertAlmostEqual(s["task_progress"]["mean"], (1 + 0.33 + 0.66) / 4)
+        low, high = s["task_progress"]["ci95"]
+        self.assertEqual((low, high), (0.33, 0.665))  # two demonstrations: the interval spans their means
+        self.assertEqual((s["approach_rate"], s["grasp_rate"], s["reorient_rate"]), (0.75, 0.5, 0.25))
+        self.assertAlmostEqual(s["reorientation_progress"], 0.375)
+        self.assertEqual(s["health"], {"nonfinite": 1, "overflow": 1, "out_of_bounds": 1})
+        self.assertEqual(s["control_steps_per_second"], 1234.6)
+        self.assertEqual([d["sequence"] for d in s["per_demo"]], ["demo_0", "demo_1"])
+        self.assertAlmostEqual(s["per_demo"][0]["task_progress"], 0.665)
+        self.assertEqual((s["per_demo"][1]["grasp_rate"], s["per_demo"][1]["object"], s["per_demo"][1]["episodes"]), (0.5, SPAM, 2))
+
+    def test_files(self):
+        rollouts = make_rollouts()
+        for name in ("sapien", "mujoco"):
+            write_results(self.folder, make_summary(name, rollouts), rollouts, self.JOINTS)
+        self.assertEqual([s["backend"] for s in read_results(self.folder)], ["mujoco", "sapien"])
+        self.assertEqual(read_results(self.folder)[0], make_summary("mujoco"))
+        traces = read_traces(self.folder, "mujoco", self.JOINTS)
+        for found, made in zip(traces, rollouts.traces, strict=True):
+            for name, value in vars(made).items():
+                np.testing.assert_array_equal(getattr(found, name), value, name)
+        episodes = json.loads((self.folder / "mujoco.episodes.json").read_text())["episodes"]
+        self.assertEqual(Episode(**episodes[2]), rollouts.episodes[2])
+
+    def test_writing_twice_gives_the_same_bytes(self):
+        contents = []
+        for name in ("one", "two"):
+            write_results(self.folder / name, make_summary(), make_rollouts(), self.JOINTS)
+            contents.append([f.read_bytes() for f in sorted((self.folder / name).iterdir())])
+        self.assertEqual(len(contents[0]), 3)
+        self.assertEqual(contents[0], contents[1])
+
+    def test_refusals(self):
+        rollouts = make_rollouts()
+        write_results(self.folder, make_summary(), rollouts, self.JOINTS)
+        with self.assertRaisesRegex(FileFormatError, "joints a, b, c.*robot has a, c, b"):
+            read_traces(self.folder, "mujoco", ("a", "c", "b"))
+        trace = self.folder / "mujoco.trace.npz"
+        trace.write_bytes(trace.read_bytes()[:200])
+        with self.assertRaisesRegex(FileFormatError, "cannot be read as an evaluation trace"):
+            read_traces(self.folder, "mujoco", self.JOINTS)
+        (self.folder / "sapien.json").write_text('{"schema": "xreset-eval/0"}')
+        with self.assertRaisesRegex(FileFormatError, "schema version 'xreset-eval/0'"):
+            read_results(self.folder)
+
+    def test_a_result_that_is_not_a_number_is_not_written(self):
+        rollouts = make_rollouts()
+        bad = replace(rollouts.episodes[0], reorientation_progress=math.nan)
+        with self.assertRaises(ValueError):
+            write_results(
+                self.folder, make_summary(rollouts=replace(rollouts, episodes=(bad,))), replace(rollouts, episodes=(bad,)), self.JOINTS
+            )
+        self.assertEqual(list(self.folder.iterdir()), [])
+
+
+if __name__ == "__main__":
+    unittest.main()

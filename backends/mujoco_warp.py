@@ -49,7 +49,7 @@ class MujocoWarpBackend(Backend):
     """MuJoCo-Warp.
 
     The worlds share one model; what differs between worlds (the object's shapes, masses, friction) is a batched field of it. A captured
-    CUDA graph holds pointers to the arrays that existed when it was captured, so no array is ever replaced after ``__init__``, only written.
+    CUDA graph holds pointers to the arrays that existed when it was captured: ``__init__`` allocates all, and none is ever replaced.
 
     All work is queued on torch's current stream; no method waits for the GPU.
     """

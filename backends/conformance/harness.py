@@ -1,0 +1,222 @@
+"""How the suite measures: results, and the worlds that the checks run in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xreset.backends.base import Backend, State
+from xreset.backends.conformance.scene import gripper
+from xreset.backends.pool import initial_state
+from xreset.kinematics import Kinematics
+from xreset.spec import SceneSpec
+
+
+class MakeBackend(Protocol):
+    """Builds the backend under test."""
+
+    def __call__(self, scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None) -> Backend:
+        """Build ``num_worlds`` worlds."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measure:
+    """One number of a check."""
+
+    what: str
+    """Such as ``joint_pos``."""
+    error: float
+    """Distance from what it should be."""
+    tolerance: float
+    unit: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the error is within the tolerance; a number that is not finite is not."""
+        return math.isfinite(self.error) and self.error <= self.tolerance
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckResult:
+    """Outcome of a check."""
+
+    name: str
+    claim: str
+    """What the check asserts."""
+    status: Literal["passed", "failed", "unsupported"]
+    """``unsupported``: the backend states that it lacks the capability, and refuses as the contract asks."""
+    measures: tuple[Measure, ...] = ()
+    problem: str = ""
+    """What was raised, if something was."""
+    hint: str = ""
+    """Likely cause of a failure."""
+    seconds: float = 0.0
+
+    @property
+    def worst(self) -> Measure | None:
+        """The measure nearest to its tolerance, or furthest beyond it."""
+        return max(self.measures, key=lambda m: m.error / m.tolerance if math.isfinite(m.error) else math.inf, default=None)
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-able content; a number that is not finite becomes text."""
+        data = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "measures"}
+        data["measures"] = [
+            {
+                "what": m.what,
+                "error": m.error if math.isfinite(m.error) else str(m.error),
+                "tolerance": m.tolerance,
+                "unit": m.unit,
+                "ok": m.ok,
+            }
+            for m in self.measures
+        ]
+        return data
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """A contract and how to test it."""
+
+    name: str
+    claim: str
+    hint: str
+    run: Callable[[Bench], list[Measure]]
+    capability: str | None = None
+    """Capability that a backend may lack."""
+    own_robot_only: bool = False
+    """Whether it needs the suite's own robot."""
+
+
+class Bench:
+    """The backend under test on a scene, built once and shared by the checks, which each begin from a known state.
+
+    World i of the shared worlds holds object i modulo the number of objects.
+    """
+
+    NUM_WORLDS = 4
+
+    def __init__(self, make: MakeBackend, scene: SceneSpec) -> None:
+        self._make = make
+        self.scene = scene
+        self.own_robot = scene.robot.name == gripper().name
+        self.kinematics = Kinematics(scene.robot)
+        self.object_index = torch.arange(self.NUM_WORLDS) % len(scene.objects)
+        self._shared: Backend | None = None
+        self._altered = False
+
+    @property
+    def objects(self) -> list:
+        """The object of each shared world."""
+        return [self.scene.objects[i] for i in self.object_index.tolist()]
+
+    def backend(self) -> Backend:
+        """The shared worlds in their initial state, with nominal parameters."""
+        if self._shared is None:
+            self._shared = self._make(self.scene, self.NUM_WORLDS, object_index=self.object_index)
+        backend = self._shared
+        if self._altered:
+            _set_nominal(backend, self.objects, self.scene)
+            self._altered = False
+        backend.set_state(self.start(backend.device))
+        return backend
+
+    def altered(self) -> Backend:
+        """The same, for a check that changes physical parameters: they are put back before the next check."""
+        backend = self.backend()
+        self._altered = True
+        return backend
+
+    @contextmanager
+    def other(self, scene: SceneSpec, num_worlds: int, object_index: Tensor | None = None) -> Iterator[Backend]:
+        """Worlds of another scene, closed at the end of the block."""
+        backend = self._make(scene, num_worlds, object_index=object_index)
+        try:
+            yield backend
+        finally:
+            backend.close()
+
+    def start(self, device: torch.device | str = "cpu") -> State:
+        """[N] initial states, the object resting where the robot is not."""
+        state = start_state(self.scene, self.object_index)
+        place = torch.tensor(self.place, dtype=torch.float32)
+        return replace_fields(state, object_pos=torch.cat((place.expand(self.NUM_WORLDS, 2), state.object_pos[:, 2:]), dim=1)).to(device)
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """A place on the table, far from the robot's base and from its hand at home."""
+        (x, y), (hx, hy, _) = self.scene.table.center, self.scene.table.half_size
+        corners = [(x + sx * (hx - 0.25), y + sy * (hy - 0.2)) for sx in (-1, 1) for sy in (-1, 1)]
+        home = self.kinematics.link_poses(torch.as_tensor(self.scene.robot.home), [self.scene.robot.palm])[0, :2, 3].numpy()
+        avoid = np.stack((home, np.array(self.scene.robot.base_pos[:2])))
+        return max(corners, key=lambda c: float(np.linalg.norm(avoid - np.array(c), axis=1).min()))
+
+    def close(self) -> None:
+        """Close the shared worlds."""
+        if self._shared is not None:
+            self._shared.close()
+
+
+def start_state(scene: SceneSpec, object_index: Tensor) -> State:
+    """[N] the states that a new backend begins with."""
+    rows = [initial_state(scene, i) for i in object_index.tolist()]
+    return State(**{name: torch.as_tensor(np.stack([row[name] for row in rows]), dtype=torch.float32) for name in rows[0]})
+
+
+def replace_fields(state: State, **changes: Tensor) -> State:
+    """The state with some fields replaced; values broadcast over the worlds."""
+    values = {f.name: getattr(state, f.name) for f in fields(State)}
+    for name, value in changes.items():
+        values[name] = torch.as_tensor(value, dtype=torch.float32, device=values[name].device).expand_as(values[name]).clone()
+    return State(**values)
+
+
+def snapshot(state: State) -> State:
+    """A copy that later steps do not change, on the CPU."""
+    return State(**{f.name: getattr(state, f.name).detach().cpu().clone() for f in fields(State)})
+
+
+def largest(difference: Tensor) -> float:
+    """The largest absolute value; NaN if there is one."""
+    return float(difference.detach().abs().double().max()) if difference.numel() else 0.0
+
+
+def compare_states(found: State, expected: State, tolerances: Mapping[str, tuple[float, str]]) -> list[Measure]:
+    """A measure for each field; quaternions are the same with the opposite sign."""
+    measures = []
+    for name, (tolerance, unit) in tolerances.items():
+        a, b = getattr(found, name).cpu(), getattr(expected, name).cpu()
+        if name == "object_quat":
+            a = torch.where((a * b).sum(-1, keepdim=True) < 0, -a, a)
+        measures.append(Measure(what=name, error=largest(a - b), tolerance=tolerance, unit=unit))
+    return measures
+
+
+ROUND_TRIP: dict[str, tuple[float, str]] = {
+    "joint_pos": (2e-6, "rad, m"),
+    "joint_vel": (2e-5, "rad/s, m/s"),
+    "joint_target": (2e-6, "rad, m"),
+    "object_pos": (2e-6, "m"),
+    "object_quat": (2e-6, ""),
+    "object_linvel": (2e-5, "m/s"),
+    "object_angvel": (2e-5, "rad/s"),
+}
+"""Tolerance of a state that is read back: the rounding of float32, and of a change of frame."""
+
+
+def _set_nominal(backend: Backend, objects: list, scene: SceneSpec) -> None:
+    n, device = backend.num_worlds, backend.device
+    if "object_mass" in backend.capabilities:
+        backend.set_object_mass(torch.tensor([o.mass for o in objects], dtype=torch.float32, device=device))
+    if "friction" in backend.capabilities:
+        pair = torch.tensor([scene.friction.tip, scene.friction.link, scene.friction.table], device=device)
+        backend.set_friction(pair.expand(n, 3).contiguous())
+    if "object_gravity" in backend.capabilities:
+        backend.set_object_gravity(torch.ones(n, device=device))

@@ -1,0 +1,199 @@
+"""Checks of free motion: gravity, inertia, external forces, drives."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from xreset.backends.conformance.harness import Bench, Check, Measure, largest, replace_fields, snapshot
+from xreset.spec import GRAVITY, ObjectSpec
+from xreset.urdf import robot_tree
+
+_HEIGHT = 1.5  # m, above everything
+_STEPS = 24
+
+
+def free_fall(bench: Bench) -> list[Measure]:
+    """Throw spinning objects; each one's centre of mass must fly a parabola and its axes turn as Euler's equations say.
+
+    The mesh-frame origin is off the centre of mass, so it matters what the linear velocity refers to. A semi-implicit step of length h
+    falls g t h / 2 lower than the parabola; the vertical tolerance allows for that much either way.
+    """
+    backend = bench.backend()
+    start = bench.start()
+    linvel, angvel, quat = np.array([0.4, -0.3, 0.6]), np.array([3.0, -2.0, 4.0]), np.array([0.8, 0.2, -0.4, 0.4])
+    quat = quat / np.linalg.norm(quat)
+    start = replace_fields(
+        start,
+        object_pos=torch.tensor([*bench.place, _HEIGHT]),
+        object_quat=torch.tensor(quat),
+        object_linvel=torch.tensor(linvel),
+        object_angvel=torch.tensor(angvel),
+    )
+    backend.set_state(start.to(backend.device))
+    backend.step(_STEPS)
+    end = snapshot(backend.state())
+
+    h = bench.scene.timestep
+    t = _STEPS * h
+    errors = {name: 0.0 for name in ("pos, horizontal", "pos, vertical", "linvel", "orientation", "angvel")}
+    for i, thing in enumerate(bench.objects):
+        turn, omega = _spin(thing, quat, angvel, t)
+        arm = Rotation.from_quat(quat, scalar_first=True).apply(thing.com)
+        com_velocity = linvel + np.cross(angvel, arm)
+        com = start.object_pos[i].double().numpy() + arm + com_velocity * t - np.array([0.0, 0.0, GRAVITY * t * t / 2])
+        velocity = com_velocity - np.array([0.0, 0.0, GRAVITY * t]) - np.cross(omega, turn.apply(thing.com))
+        off = end.object_pos[i].double().numpy() - (com - turn.apply(thing.com))
+        found = Rotation.from_quat(end.object_quat[i].double().numpy(), scalar_first=True)
+        for name, error in {
+            "pos, horizontal": np.abs(off[:2]).max(),
+            "pos, vertical": abs(off[2]),
+            "linvel": np.abs(end.object_linvel[i].double().numpy() - velocity).max(),
+            "orientation": (found * turn.inv()).magnitude(),
+            "angvel": np.abs(end.object_angvel[i].double().numpy() - omega).max(),
+        }.items():
+            errors[name] = max(errors[name], float(error)) if np.isfinite(error) else float("nan")
+    limits = {
+        "pos, horizontal": (5e-4, "m"),
+        "pos, vertical": (1.1 * GRAVITY * t * h / 2 + 5e-4, "m"),
+        "linvel": (0.01, "m/s"),
+        "orientation": (0.02, "rad"),
+        "angvel": (0.2, "rad/s"),  # engines differ in how they treat gyroscopic torque
+    }
+    return [Measure(what=name, error=error, tolerance=limits[name][0], unit=limits[name][1]) for name, error in errors.items()]
+
+
+def object_gravity(bench: Bench) -> list[Measure]:
+    """Let objects fall with different gravity fractions, set before the state."""
+    backend = bench.altered()
+    fraction = torch.tensor([0.0, 0.5, 1.0, 0.25])
+    backend.set_object_gravity(fraction.to(backend.device))
+    backend.set_state(_in_the_air(bench).to(backend.device))
+    backend.step(_STEPS)
+    fallen = -snapshot(backend.state()).object_linvel[:, 2]
+    expected = fraction * GRAVITY * _STEPS * bench.scene.timestep
+    full = GRAVITY * _STEPS * bench.scene.timestep
+    spin = largest(backend.state().object_angvel)
+    return [
+        Measure(what="velocity gained", error=largest(fallen - expected) / full, tolerance=0.005, unit="of g t"),
+        Measure(what="spin gained", error=spin, tolerance=0.01, unit="rad/s"),
+    ]
+
+
+def object_wrench(bench: Bench) -> list[Measure]:
+    """Push and twist objects in the air, for one world in two with another mass if that can be set; setting a state ends it."""
+    backend = bench.altered()
+    factor = torch.ones(bench.NUM_WORLDS)
+    if "object_mass" in backend.capabilities:
+        factor = torch.tensor([1.5, 1.0, 0.5, 2.0])
+        backend.set_object_mass((factor * torch.tensor([o.mass for o in bench.objects])).float().to(backend.device))
+    backend.set_state(_in_the_air(bench).to(backend.device))
+    force, twist = torch.tensor([1.2, -0.8, 0.5]), torch.tensor([2e-3, -1e-3, 1.5e-3])
+    n, device = bench.NUM_WORLDS, backend.device
+    backend.set_object_wrench(force.expand(n, 3).contiguous().to(device), twist.expand(n, 3).contiguous().to(device))
+    steps = 8
+    backend.step(steps)
+    state = snapshot(backend.state())
+    t = steps * bench.scene.timestep
+    linear, angular = 0.0, 0.0
+    for i, thing in enumerate(bench.objects):
+        mass, inertia = float(factor[i]) * thing.mass, float(factor[i]) * thing.inertia
+        gained = force.double().numpy() / mass * t - np.array([0.0, 0.0, GRAVITY * t])
+        omega = np.linalg.solve(inertia, twist.double().numpy()) * t  # the object has hardly turned
+        arm = Rotation.from_quat(state.object_quat[i].double().numpy(), scalar_first=True).apply(thing.com)
+        com_velocity = state.object_linvel[i].double().numpy() + np.cross(state.object_angvel[i].double().numpy(), arm)
+        linear = max(linear, float(np.abs(com_velocity - gained).max() / np.abs(gained).max()))
+        angular = max(angular, float(np.abs(state.object_angvel[i].double().numpy() - omega).max() / np.abs(omega).max()))
+    backend.set_state(_in_the_air(bench).to(device))
+    backend.step(steps)
+    rest = largest(snapshot(backend.state()).object_linvel[:, :2])
+    return [
+        Measure(what="velocity of the centre of mass", error=linear, tolerance=0.01, unit="of its own"),
+        Measure(what="angular velocity", error=angular, tolerance=0.05, unit="of its own"),
+        Measure(what="push after the state was set", error=rest, tolerance=1e-3, unit="m/s"),
+    ]
+
+
+def drive_response(bench: Bench) -> list[Measure]:
+    """Step the target of the vertical slide and compare with the drive's differential equation, effort limit and armature included.
+
+    (m + armature) x'' = clip(kp (target - x) - kd x', effort). The robot's weight is compensated, so it does not appear.
+    """
+    robot = bench.scene.robot
+    index = robot.joint_names.index("lift")
+    drive = robot.joints[index].drive
+    tree = robot_tree(robot)
+    carried = sum(tree.link(name).mass for name in ("carriage", "wrist", "palm", "jaw_a", "jaw_b", "finger_b"))
+    steps = torch.tensor([0.01, -0.01, 0.08, -0.08])  # the last two run into the effort limit
+    backend = bench.backend()
+    target = bench.start().joint_pos.clone()
+    target[:, index] += steps
+    backend.set_joint_targets(target.to(backend.device))
+    found = []
+    for _ in range(12):
+        backend.step(4)
+        found.append(snapshot(backend.state()).joint_pos[:, index].double().numpy())
+    times = 4 * bench.scene.timestep * np.arange(1, 13)
+    measures = []
+    for i, step in enumerate(steps.tolist()):
+
+        def motion(_, y: np.ndarray, goal: float = step) -> list[float]:
+            effort = np.clip(drive.kp * (goal - y[0]) - drive.kd * y[1], -drive.effort, drive.effort)
+            return [y[1], effort / (carried + drive.armature)]
+
+        exact = solve_ivp(motion, (0.0, times[-1]), [0.0, 0.0], t_eval=times, rtol=1e-6, atol=1e-9, max_step=1e-3).y[0]
+        error = np.abs(np.array([x[i] for x in found]) - robot.joints[index].home - exact).max() / abs(step)
+        measures.append(Measure(what=f"step of {step:+.2f} m", error=float(error), tolerance=0.06, unit="of the step"))
+    return measures
+
+
+def _in_the_air(bench: Bench):
+    return replace_fields(bench.start(), object_pos=torch.tensor([*bench.place, _HEIGHT]))
+
+
+def _spin(thing: ObjectSpec, quat: np.ndarray, angvel: np.ndarray, t: float) -> tuple[Rotation, np.ndarray]:
+    """Orientation and angular velocity (world) after a time t without torque: Euler's equations in the body's frame."""
+    inertia = np.asarray(thing.inertia)
+    body = Rotation.from_quat(quat, scalar_first=True)
+
+    def motion(_, y: np.ndarray) -> np.ndarray:
+        q, w = y[:4], y[4:]
+        turn = 0.5 * np.array([-q[1:] @ w, *(q[0] * w + np.cross(q[1:], w))])
+        return np.concatenate((turn, np.linalg.solve(inertia, -np.cross(w, inertia @ w))))
+
+    end = solve_ivp(motion, (0.0, t), np.concatenate((quat, body.inv().apply(angvel))), rtol=1e-9, atol=1e-9).y[:, -1]
+    turned = Rotation.from_quat(end[:4], scalar_first=True)
+    return turned, turned.apply(end[4:])
+
+
+CHECKS = (
+    Check(
+        name="free_fall",
+        claim="thrown, spinning objects fly as rigid bodies do; linear velocity is that of the mesh-frame origin",
+        hint="linear velocity refers to the centre of mass; or angular velocity is in the body's frame; or the engine damps by default",
+        run=free_fall,
+    ),
+    Check(
+        name="object_gravity",
+        claim="the object feels its gravity fraction, world by world, and setting a state keeps it",
+        hint="the fraction is ignored, shared by all worlds, lost with the state, or acts off the centre of mass",
+        run=object_gravity,
+        capability="object_gravity",
+    ),
+    Check(
+        name="object_wrench",
+        claim="a wrench accelerates the object by F/m and I^-1 tau, until a state is set",
+        hint="the force acts at the mesh-frame origin; or it is cleared after one step; or it survives the state; or inertia ignores the mass",
+        run=object_wrench,
+        capability="object_wrench",
+    ),
+    Check(
+        name="drive_response",
+        claim="a drive is a PD position drive with effort limit and armature",
+        hint="gains are scaled, armature or effort limit are missing, joint damping or friction is added, or gravity is not compensated",
+        run=drive_response,
+        own_robot_only=True,
+    ),
+)

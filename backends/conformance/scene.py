@@ -1,0 +1,125 @@
+"""The scene of the conformance suite: small, quick to build, and with nothing symmetric, centred or in the engine's likely order."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from xreset.spec import (
+    DriveSpec,
+    FingertipSpec,
+    Geometry,
+    JointSpec,
+    KeypointSpec,
+    MimicSpec,
+    ObjectSpec,
+    PairFriction,
+    RobotSpec,
+    SceneSpec,
+    Shape,
+)
+
+
+@cache
+def gripper() -> RobotSpec:
+    """The suite's own robot, hung above the table: five joints, one of which another one mimics, and two fingertips.
+
+    Its joint order is neither the URDF's nor alphabetical.
+    """
+    return RobotSpec(
+        name="conformance-gripper",
+        urdf=Path(__file__).with_name("gripper.urdf"),
+        joints=(
+            _joint("lift", "arm", 0.0, kp=2000.0, kd=120.0, effort=40.0, armature=0.5),
+            _joint("swing", "arm", 0.1, kp=200.0, kd=20.0, effort=60.0, armature=0.1),
+            _joint("finger_b_bend", "hand", 0.0, kp=5.0, kd=0.1, effort=5.0),
+            _joint("turn", "arm", 0.0, kp=40.0, kd=2.0, effort=20.0, armature=0.01),
+            _joint("jaw_a_slide", "hand", 0.04, kp=800.0, kd=30.0, effort=30.0),
+        ),
+        mimics=(MimicSpec(joint="jaw_b_slide", source="jaw_a_slide", multiplier=1.1, offset=-0.002),),
+        base_pos=(0.57, 0.05, 0.1),
+        base_quat=tuple(Rotation.from_euler("z", np.pi / 2 - 0.2).as_quat(scalar_first=True)),
+        palm="palm",
+        fingertips=(
+            FingertipSpec(name="thumb", link="tip_a", contact_links=("jaw_a",), keypoint="thumb4"),
+            FingertipSpec(name="index", link="tip_b", contact_links=("pad_b", "finger_b"), keypoint="index4"),
+        ),
+        keypoints=(
+            KeypointSpec(keypoint="wrist", link="palm"),
+            KeypointSpec(keypoint="thumb4", link="tip_a"),
+            KeypointSpec(keypoint="index4", link="tip_b"),
+        ),
+        hand_root="wrist",
+        self_collision_links=("jaw_a", "pad_b", "column"),
+        collision_exclude=(("jaw_a", "column"),),
+        table_exclude=("base",),
+    )
+
+
+def _joint(name: str, group: str, home: float, **drive: float) -> JointSpec:
+    return JointSpec(name=name, group=group, home=home, drive=DriveSpec(**drive))  # pyright: ignore[reportArgumentType]
+
+
+@cache
+def objects() -> tuple[ObjectSpec, ...]:
+    """A brick (a box), a can (a cylinder) and a bracket (two hulls); the centres of mass are off the origin of the mesh frame."""
+    brick = _shape("box", (0.02, 0.03, 0.025), (0.01, 0.005, -0.004), yaw=0.3)
+    can = _shape("cylinder", (0.033, 0.05), (0.0, 0.0, 0.01))
+    foot, arm = _shape("hull", (0.05, 0.02, 0.01), (0.0, 0.0, -0.02)), _shape("hull", (0.012, 0.02, 0.03), (-0.038, 0.0, 0.02))
+    return (
+        _object("brick", 0.25, (brick,), shift=(0.004, -0.003, 0.002), twist=0.2),
+        _object("can", 0.35, (can,), shift=(0.002, 0.0, -0.003), twist=0.0),
+        _object("bracket", 0.30, (foot, arm), shift=(0.0, 0.001, 0.0), twist=0.0),
+    )
+
+
+def scene(robot: RobotSpec | None = None) -> SceneSpec:
+    """The suite's scene: its own robot or another one, and its three objects."""
+    return SceneSpec(robot=robot or gripper(), objects=objects(), friction=PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002))
+
+
+def reorder_joints(scene: SceneSpec) -> SceneSpec:
+    """The same scene with its joints named in reverse order."""
+    return replace(scene, robot=replace(scene.robot, joints=scene.robot.joints[::-1]))
+
+
+def _shape(kind: str, size: tuple[float, ...], pos: tuple[float, float, float], yaw: float = 0.0) -> Shape:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_euler("z", yaw).as_matrix(), pos
+    if kind == "hull":  # a box, given as vertices
+        mesh = trimesh.creation.box(extents=2.0 * np.array(size))
+        geometry = Geometry(kind="hull", vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces))
+    else:
+        geometry = Geometry(kind=kind, size=size)  # pyright: ignore[reportArgumentType]
+    return Shape(geometry=geometry, T_body_shape=T)
+
+
+def _object(name: str, mass: float, pieces: tuple[Shape, ...], *, shift: tuple[float, float, float], twist: float) -> ObjectSpec:
+    """An object with the inertia of its shape at even density, then its centre of mass shifted and its principal axes turned."""
+    mesh = trimesh.util.concatenate([_mesh(piece) for piece in pieces])
+    R = Rotation.from_euler("xyz", (twist, -twist, twist)).as_matrix()
+    return ObjectSpec(
+        name=name,
+        pieces=pieces,
+        mass=mass,
+        com=np.asarray(mesh.center_mass) + np.array(shift),
+        inertia=R @ np.asarray(mesh.moment_inertia) * (mass / mesh.mass) @ R.T,
+        vertices=np.asarray(mesh.vertices),
+        faces=np.asarray(mesh.faces),
+    )
+
+
+def _mesh(shape: Shape) -> trimesh.Trimesh:
+    geometry = shape.geometry
+    if geometry.kind == "box":
+        mesh = trimesh.creation.box(extents=2.0 * np.array(geometry.size))
+    elif geometry.kind == "cylinder":
+        mesh = trimesh.creation.cylinder(radius=geometry.size[0], height=2.0 * geometry.size[1], sections=32)
+    else:
+        mesh = trimesh.Trimesh(geometry.vertices, geometry.faces)
+    return mesh.apply_transform(shape.T_body_shape)

@@ -11,7 +11,7 @@ import tyro
 def evaluate(
     policy: Annotated[str, tyro.conf.Positional],
     *,
-    backend: Annotated[list[str], tyro.conf.UseAppendAction],
+    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ("mujoco",),
     demos: Path,
     episodes: int = 5,
     seed: int = 0,
@@ -25,7 +25,7 @@ def evaluate(
 
     Args:
         policy: Run folder, exported policy (.onnx), or a baseline: zero, random, ik (open-loop kinematic retargeting).
-        backend: Physics engine; give it again for more engines.
+        backend: Physics engine; give it again for more engines. Default: mujoco.
         demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the path of ik.
         episodes: Episodes per demonstration, each with another perturbation of robot and object.
         seed: Seed of the perturbations; they are the same in every engine.

@@ -12,7 +12,7 @@ def resets(
     retargeted: Annotated[Path, tyro.conf.Positional],
     *,
     out: Path,
-    backend: Annotated[list[str], tyro.conf.UseAppendAction] | None = None,
+    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     robot: str | None = None,
     objects: Path | None = None,
     num_envs: int = 64,
@@ -40,7 +40,7 @@ def resets(
     from xreset.resets.filter import acceptance_table, make_bank
     from xreset.retarget.pipeline import read_retargeted
 
-    backends = backend or ["mujoco"]
+    backends = list(dict.fromkeys(backend)) or ["mujoco"]
     console = Console()
     data = read_retargeted(retargeted)
     spec = robots.load(robot or data.robot)

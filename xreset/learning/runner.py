@@ -192,7 +192,7 @@ class _Log:
         fps = self._steps * runner.env.num_envs * runner.gpu_world_size / (collect + learn)
         scalars = means | {f"loss/{name}": value for name, value in losses.items()}
         scalars |= {
-            "policy/std": float(alg.get_policy().output_std.mean()),
+            "policy/std": float(alg.get_policy().output_std.detach().mean()),
             "policy/learning_rate": alg.learning_rate,
             "speed/env_steps_per_second": fps,
             "speed/collect_seconds": collect,

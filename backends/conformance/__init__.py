@@ -3,8 +3,8 @@
     from xreset.backends.conformance import run
     results = run(lambda scene, num_worlds, **kw: MyBackend(scene, num_worlds, **kw))
 
-Every check compares with something computed independently of any engine (kinematics of the URDF, equations of motion, m g), and says what it
-asserts, its tolerance, what it measured, and the likely cause of a failure.
+Every check compares with something computed independently of any engine (kinematics of the URDF, equations of motion, m g), and says
+what it asserts, its tolerance, what it measured, and the likely cause of a failure.
 """
 
 from __future__ import annotations
@@ -70,12 +70,12 @@ def _run_one(check: Check, bench: Bench) -> CheckResult:
 
     try:
         measures = check.run(bench)
+        lacking = set(check.capabilities) - bench.backend().capabilities
     except CapabilityError as error:
-        if check.capability is not None and check.capability not in bench.backend().capabilities:
-            return result("unsupported", problem=str(error))
-        return result("failed", problem=f"CapabilityError: {error}")
+        lacking = set(check.capabilities) - bench.backend().capabilities
+        return result("unsupported" if lacking else "failed", problem=str(error))
     except Exception as error:
         return result("failed", problem=f"{type(error).__name__}: {error}")
-    if check.capability is not None and check.capability not in bench.backend().capabilities:
-        return result("failed", measures, f"the backend says that it lacks {check.capability!r}, but did not refuse it")
+    if lacking:
+        return result("failed", measures, f"the backend says that it cannot set {', '.join(sorted(lacking))}, but did not refuse to")
     return result("passed" if all(m.ok for m in measures) else "failed", measures)

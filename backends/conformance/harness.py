@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.base import Backend, State
+from xreset.backends.base import Backend, Capability, State
 from xreset.backends.conformance.scene import gripper
 from xreset.backends.pool import initial_state
 from xreset.kinematics import Kinematics
@@ -89,8 +89,8 @@ class Check:
     claim: str
     hint: str
     run: Callable[[Bench], list[Measure]]
-    capability: str | None = None
-    """Capability that a backend may lack."""
+    capabilities: tuple[Capability, ...] = ()
+    """Capabilities that it needs and that a backend may lack."""
     own_robot_only: bool = False
     """Whether it needs the suite's own robot."""
 

@@ -38,7 +38,7 @@ def free_fall(bench: Bench) -> list[Measure]:
 
     h = bench.scene.timestep
     t = _STEPS * h
-    errors = {name: 0.0 for name in ("pos, horizontal", "pos, vertical", "linvel", "orientation", "angvel")}
+    errors = dict.fromkeys(("pos, horizontal", "pos, vertical", "linvel", "orientation", "angvel"), 0.0)
     for i, thing in enumerate(bench.objects):
         turn, omega = _spin(thing, quat, angvel, t)
         arm = Rotation.from_quat(quat, scalar_first=True).apply(thing.com)
@@ -180,14 +180,14 @@ CHECKS = (
         claim="the object feels its gravity fraction, world by world, and setting a state keeps it",
         hint="the fraction is ignored, shared by all worlds, lost with the state, or acts off the centre of mass",
         run=object_gravity,
-        capability="object_gravity",
+        capabilities=("object_gravity",),
     ),
     Check(
         name="object_wrench",
         claim="a wrench accelerates the object by F/m and I^-1 tau, until a state is set",
-        hint="the force acts at the mesh-frame origin; or it is cleared after one step; or it survives the state; or inertia ignores the mass",
+        hint="the force acts at the mesh-frame origin, is cleared after one step, or survives the state; or inertia ignores the mass",
         run=object_wrench,
-        capability="object_wrench",
+        capabilities=("object_wrench",),
     ),
     Check(
         name="drive_response",

@@ -250,7 +250,9 @@ def broken_world(bench: Bench) -> list[Measure]:
     backend.set_state(good[[1]].to(backend.device), torch.tensor([1], device=backend.device))
     backend.step(1)
     measures.append(Measure(what="worlds broken after healing", error=float(backend.health().nonfinite.sum()), tolerance=0.5))
-    measures.append(Measure(what="healed object_pos", error=largest(backend.state().object_pos[1].cpu() - good.object_pos[1]), tolerance=1e-3))
+    measures.append(
+        Measure(what="healed object_pos", error=largest(backend.state().object_pos[1].cpu() - good.object_pos[1]), tolerance=1e-3)
+    )
     return measures
 
 
@@ -271,13 +273,13 @@ CHECKS = (
     Check(
         name="state_round_trip",
         claim="a state that is set is read back, every field of it",
-        hint="a field is dropped, permuted, or changed by the engine: velocities, quaternion order, body-frame angular velocity, joint order",
+        hint="a field is dropped, permuted or changed: velocities, quaternion order, body-frame angular velocity, joint order",
         run=state_round_trip,
     ),
     Check(
         name="links_after_set",
         claim="link poses and velocities belong to the state just set, without a step",
-        hint="kinematics are stale after a write; or a velocity refers to a centre of mass or is in the body's frame; or a mimic joint is not set",
+        hint="kinematics are stale after a write; a velocity is of a centre of mass or in the body's frame; a mimic joint is not set",
         run=links_after_set,
     ),
     Check(

@@ -11,6 +11,7 @@ train     the whole PPO iteration with the paper's model
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 import tempfile
@@ -25,6 +26,8 @@ from rich.table import Table
 
 from xreset import robots
 from xreset.backends import backend_names, backend_status, make_backend
+from xreset.backends.pool import PoolBackend
+from xreset.backends.registry import backend_class
 from xreset.env import ManipulationEnv, make_scene
 from xreset.eval.evaluate import load_motion
 from xreset.objects import load_objects
@@ -32,7 +35,7 @@ from xreset.task.config import TaskConfig
 from xreset.task.resets import ResetDistribution
 
 
-def rate(step: Callable[[], None], seconds: float, device: str) -> float:
+def rate(step: Callable[[], object], seconds: float, device: str) -> float:
     """Calls per second, after two calls of warm-up."""
 
     def wait() -> None:
@@ -49,6 +52,19 @@ def rate(step: Callable[[], None], seconds: float, device: str) -> float:
         wait()
         count += 5
     return count / (time.perf_counter() - start)
+
+
+def raw_loop(backend) -> tuple[Callable[[], object], int]:
+    """One control step of the engine alone, and how many worlds it advances."""
+    substeps = backend.scene.substeps
+    if backend.name == "mujoco-warp":
+        return lambda: [backend._run("step") for _ in range(substeps)], backend.num_worlds
+    world = backend.world_class(backend.scene, 0)
+    if backend.name == "mujoco":
+        import mujoco
+
+        return lambda: mujoco.mj_step(world._model, world._data, substeps), 1
+    return lambda: world.step(substeps), 1
 
 
 def demonstrations(robot, folder: Path):
@@ -68,17 +84,18 @@ def measure(name: str, options: argparse.Namespace, folder: Path) -> list[str]:
     objects = tuple(load_objects(["005_tomato_soup_can"], None))
     task = TaskConfig()
     scene = make_scene(robot, objects, task)
-    kwargs = {"device": device} if device != "cpu" else {}
+    pooled = issubclass(backend_class(name), PoolBackend)
+    cores = min(len(os.sched_getaffinity(0)), options.num_envs) if pooled else 1
+    kwargs = {"workers": cores} if pooled else {"device": device}
     with make_backend(name, scene, options.num_envs, **kwargs) as backend:
-        cores = max(1, getattr(backend, "num_workers", 1))
         worlds = options.num_envs
-        raw_step, raw_worlds = backend.raw_step()  # pyright: ignore[reportAttributeAccessIssue]
+        raw_step, raw_worlds = raw_loop(backend)
         raw = rate(raw_step, options.seconds, device) * raw_worlds
         wrapped = rate(backend.step, options.seconds, device) * worlds
         bank = demonstrations(robot, folder)
         env = ManipulationEnv(backend, task, ResetDistribution(bank, robot, bank.object_names, task.reset, backend.device))
         action = torch.zeros(worlds, env.num_actions, device=backend.device)
-        stepped = rate(lambda: env.step(action) and None, options.seconds, device) * worlds
+        stepped = rate(lambda: env.step(action), options.seconds, device) * worlds
         row = [
             name,
             device,

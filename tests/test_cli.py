@@ -1,0 +1,83 @@
+"""The command line: quick to start, and clear when it is used wrongly."""
+
+import contextlib
+import io
+import json
+import subprocess
+import sys
+import unittest
+
+from xreset.cli import COMMANDS, main
+
+HEAVY = ("torch", "warp", "mujoco", "mujoco_warp", "pybullet", "sapien", "matplotlib", "trimesh", "scipy", "rsl_rl", "tyro", "numpy")
+
+
+def modules_after(code: str) -> set[str]:
+    """Top-level modules that are loaded after running some code in a new interpreter."""
+    code += "; import sys, json; print('\\n' + json.dumps(sorted({m.split('.')[0] for m in sys.modules})))"
+    out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    return set(json.loads(out.strip().splitlines()[-1]))
+
+
+def run(*argv: str) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of a command."""
+    out, err = io.StringIO(), io.StringIO()
+    code = 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main(list(argv))
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    return code, out.getvalue(), err.getvalue()
+
+
+class LightnessTest(unittest.TestCase):
+    def test_import_loads_nothing_heavy(self):
+        self.assertFalse(modules_after("import xreset") & set(HEAVY))
+
+    def test_help_loads_nothing_heavy(self):
+        self.assertFalse(modules_after("from xreset.cli import main; main(['--help'])") & set(HEAVY))
+
+    def test_help_of_train_loads_no_torch_and_no_engine(self):
+        code = "from xreset.cli import main\ntry: main(['train', '--help'])\nexcept SystemExit: pass\npass"
+        self.assertFalse(modules_after(code) & {"torch", "warp", "mujoco", "mujoco_warp", "pybullet", "sapien", "rsl_rl"})
+
+
+class UsageTest(unittest.TestCase):
+    def test_every_command_has_help(self):
+        for name in COMMANDS:
+            with self.subTest(name):
+                code, out, _ = run(name, "--help")
+                self.assertEqual(code, 0)
+                self.assertIn("usage: xreset", out)
+
+    def test_version(self):
+        from xreset import __version__
+
+        self.assertEqual(run("--version"), (0, f"xreset {__version__}\n", ""))
+
+    def test_unknown_command(self):
+        code, _, err = run("trian")
+        self.assertEqual(code, 2)
+        self.assertIn("no command 'trian'", err)
+        self.assertIn("train", err)
+
+    def test_an_error_that_the_user_can_mend_is_one_message(self):
+        code, _, err = run("resets", "/nowhere/retargeted.npz", "--out", "/nowhere/bank.npz")
+        self.assertEqual(code, 1)
+        self.assertRegex(err, r"^xreset resets: there is no /nowhere/retargeted\.npz")
+        self.assertNotIn("Traceback", err)
+
+    def test_an_engine_that_does_not_exist(self):
+        code, _, err = run("conformance", "--backend", "bulet")
+        self.assertEqual(code, 1)
+        self.assertRegex(err, "no backend 'bulet'; there are .*pybullet")
+
+    def test_a_policy_that_does_not_exist(self):
+        code, _, err = run("eval", "nonsense", "--demos", "x.npz")
+        self.assertEqual(code, 1)
+        self.assertIn("expected a run folder, a .onnx file, or one of zero, random, ik", err)
+
+
+if __name__ == "__main__":
+    unittest.main()

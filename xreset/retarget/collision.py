@@ -149,6 +149,11 @@ class SelfCollision:
         keep = [tuple(sorted((self._link[i], self._link[j]))) not in never for i, j in self._pairs]
         self._pairs = self._pairs[np.array(keep, dtype=bool)]
 
+    @property
+    def link_pairs(self) -> list[tuple[int, int]]:
+        """Pairs of links that count, as indices in the kinematics' order."""
+        return list(dict.fromkeys((self._link[i], self._link[j]) for i, j in self._pairs))
+
     def near(self, link_poses: np.ndarray, margin: float) -> Approaches:
         """Every pair of shapes nearer than ``margin`` [m].
 

@@ -12,7 +12,7 @@ Shape letters: S sequences padded to T frames, B = S T frames, P mapped keypoint
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -23,7 +23,10 @@ from torch import Tensor
 from xreset.errors import RobotError
 from xreset.kinematics import Kinematics
 from xreset.retarget import terms
+from xreset.retarget.balls import hand_balls
 from xreset.retarget.chain import solve_chain
+from xreset.retarget.collision import SelfCollision, height_above_table
+from xreset.retarget.surface import Surface
 from xreset.rotations import (
     matrix_to_quat,
     quat_conjugate,
@@ -33,9 +36,9 @@ from xreset.rotations import (
     quat_to_axis_angle,
     quat_to_matrix,
 )
-from xreset.spec import FINGERS, KEYPOINTS, RobotSpec
+from xreset.spec import FINGERS, KEYPOINTS, RobotSpec, TableSpec
 
-_FRAMES_PER_CHUNK = 2048
+_FRAMES_PER_CHUNK = 1024
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +57,12 @@ class HandConfig:
     """Distance between contact link and contact point that costs nothing [m]."""
     contact_knee: float = 0.002
     """Excess over the margin below which the contact cost is quadratic [m]."""
+    clearance_weight: float = 500.0
+    """Depth of the hand in the object, the table and itself, beyond what is allowed."""
+    object_depth: float = 0.001
+    """Depth of the hand in the object that is allowed: it touches [m]."""
+    self_depth: float = 0.002
+    """Depth of the hand's links in one another that is allowed [m]."""
     smoothness_weight: float = 2.0
     """Change of joints and root between neighbouring frames."""
     length_scale: float = 0.05
@@ -76,6 +85,23 @@ class HandTargets:
     """[S, T, P, 3] object surface points that the keypoints touch."""
     in_contact: Tensor
     """[S, T, P] bool"""
+    object_pos: Tensor
+    """[S, T, 3]"""
+    object_quat: Tensor
+    """[S, T, 4]"""
+    surfaces: tuple[Surface, ...]
+    """(S) each sequence's object."""
+
+    def select(self, sequences: Tensor) -> HandTargets:
+        """Those of some sequences."""
+        tensors = {name: value[sequences] for name, value in vars(self).items() if name != "surfaces"}
+        return HandTargets(**tensors, surfaces=tuple(self.surfaces[i] for i in sequences.tolist()))
+
+    def by_surface(self) -> Iterator[tuple[Tensor, Surface]]:
+        """Every object, and the frames [.] (of the S T) that it is in."""
+        frames = torch.arange(self.annotated.numel()).view(self.annotated.shape)
+        for surface in dict.fromkeys(self.surfaces):
+            yield frames[[i for i, other in enumerate(self.surfaces) if other is surface]].flatten(), surface
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +123,7 @@ class HandMotion:
 class HandModel:
     """A robot's hand as a floating tree, and which of its links follow which human keypoints."""
 
-    def __init__(self, robot: RobotSpec) -> None:
+    def __init__(self, robot: RobotSpec, table: TableSpec | None = None) -> None:
         """Raises ``RobotError`` where the description does not allow retargeting: the message says which entry is wrong."""
         self.robot = robot
         self.kinematics = Kinematics(robot, root=robot.hand_root)
@@ -129,18 +155,52 @@ class HandModel:
         self.home = torch.as_tensor(robot.home[robot.hand_indices])
         """[J] home configuration of the hand."""
 
+        collision = SelfCollision(robot, self.kinematics, only=robot.self_collision_links)
+        self.balls = hand_balls(robot, self.kinematics, collision)
+        """What keeps the hand out of the object, the table and itself."""
+        self.table = table or TableSpec()
+        self._bodies = tuple(dict.fromkeys((*self.links, *self.balls.links)))
+        self._keypoint_bodies = [self._bodies.index(link) for link in self.links]
+        self.ball_links = torch.tensor([self._bodies.index(link) for link in self.balls.links], dtype=torch.long)
+        """[Q] index of each ball's link among the bodies."""
+
     def keypoints(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Tensor:
         """[..., P, 3] positions of the keypoint links."""
         return self.kinematics.points(joints, self.links, base=_pose(root_pos, root_quat))
 
-    def keypoint_jacobian(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> tuple[Tensor, Tensor]:
-        """Keypoints [..., P, 3] and their Jacobian [..., P, 3, J + 6]: joints, then root translation, then root rotation (world axes)."""
-        base = _pose(root_pos, root_quat)
-        points = self.kinematics.jacobian(joints, self.links, base=base)
-        arm = points.pos - root_pos[..., None, :]
-        identity = torch.eye(3, dtype=arm.dtype)
-        turn = torch.linalg.cross(identity.expand(*arm.shape[:-1], 3, 3), arm[..., None, :])  # row i: e_i x arm
-        return points.pos, torch.cat((points.linear, identity.expand_as(turn), turn.mT), dim=-1)
+    def bodies(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> _Bodies:
+        """Links of the hand at joints [B, J] and root poses, and their Jacobians by the variables.
+
+        Variables: joints, then translation of the root, then rotation of the root about its origin (both along the world's axes).
+        """
+        links = self.kinematics.jacobian(joints, self._bodies, base=_pose(root_pos, root_quat))
+        identity = torch.eye(3, dtype=links.pos.dtype).expand(*links.pos.shape[:-1], 3, 3)
+        turn = torch.linalg.cross(identity, (links.pos - root_pos[:, None])[..., None, :])  # row i: e_i x r
+        return _Bodies(
+            pos=links.pos,
+            rot=links.rot,
+            linear=torch.cat((links.linear, identity, turn.mT), dim=-1),
+            angular=torch.cat((links.angular, torch.zeros_like(identity), identity), dim=-1),
+        )
+
+    def keypoints_of(self, bodies: _Bodies) -> tuple[Tensor, Tensor]:
+        """Keypoints [B, P, 3] and their Jacobian [B, P, 3, n]."""
+        return bodies.pos[:, self._keypoint_bodies], bodies.linear[:, self._keypoint_bodies]
+
+    def ball_slope(self, bodies: _Bodies, frame: Tensor, ball: Tensor, centers: Tensor, direction: Tensor) -> Tensor:
+        """[A, n] how the centre of a ball moves along a direction: n . (v + w x r) = n . v + (r x n) . w.
+
+        Args:
+            bodies: the hand.
+            frame: [A]
+            ball: [A]
+            centers: [B, Q, 3] of all balls.
+            direction: [A, 3] unit vectors n.
+        """
+        link = self.ball_links[ball]
+        lever = torch.linalg.cross(centers[frame, ball] - bodies.pos[frame, link], direction)
+        along = direction[:, None] @ bodies.linear[frame, link] + lever[:, None] @ bodies.angular[frame, link]
+        return along[:, 0]
 
 
 def keypoint_pairs(names: Sequence[str], links: Sequence[str]) -> list[tuple[int, int]]:
@@ -171,42 +231,75 @@ def retarget_hand(
     """
     config = config or HandConfig()
     sequences, frames = targets.annotated.shape
-    joints = model.kinematics.clamp(model.home).expand(sequences, frames, -1).clone()
     root_pos, root_quat = _align_root(model, targets)
+    state = _State(joints=model.kinematics.clamp(model.home).expand(sequences, frames, -1).clone(), root_pos=root_pos, root_quat=root_quat)
     damping = torch.full((sequences,), 1e-3, dtype=torch.float64)
-    cost = _cost(model, targets, config, joints, root_pos, root_quat)
     active = torch.arange(sequences)
+    now, system = state, _system(model, targets, config, state)
+    final = system.cost.clone()
     for iteration in range(config.iterations):
         if progress:
             progress(iteration / config.iterations)
-        if not len(active):
+        trial = _retract(model, now, _limited_step(model, config, now, system, damping))
+        tried = _system(model, targets.select(active), config, trial)
+        better = tried.cost < system.cost
+        gain = (system.cost - tried.cost) / system.cost.clamp_min(1e-12)
+        now = _State(**{name: torch.where(better[:, None, None], value, getattr(now, name)) for name, value in vars(trial).items()})
+        system = _System(
+            cost=torch.where(better, tried.cost, system.cost),
+            diagonal=torch.where(better[:, None, None, None], tried.diagonal, system.diagonal),
+            gradient=torch.where(better[:, None, None], tried.gradient, system.gradient),
+        )
+        damping = torch.where(better, damping * 0.2, damping * 8.0)
+        for name, value in vars(now).items():
+            getattr(state, name)[active] = value
+        final[active] = system.cost
+        left = ~((better & (gain < config.tolerance)) | (damping > 1e6))
+        if not bool(left.any()):
             break
-        now = _select(targets, active)
-        q, p, r = joints[active], root_pos[active], root_quat[active]
-        diagonal, coupling, gradient = _normal_equations(model, now, config, q, p, r)
-        step = _limited_step(model, q, diagonal, coupling, gradient, damping[active])
-        trial = _retract(model, q, p, r, step)
-        trial_cost = _cost(model, now, config, *trial)
-        better = trial_cost < cost[active]
-        chosen = active[better]
-        joints[chosen], root_pos[chosen], root_quat[chosen] = (x[better] for x in trial)
-        gain = (cost[active] - trial_cost) / cost[active].clamp_min(1e-12)
-        cost[chosen] = trial_cost[better]
-        damping[active] = torch.where(better, damping[active] * 0.2, damping[active] * 8.0)
-        done = (better & (gain < config.tolerance)) | (damping[active] > 1e6)
-        active = active[~done]
-    return HandMotion(
-        joints=joints, root_pos=root_pos, root_quat=root_quat, keypoints=model.keypoints(joints, root_pos, root_quat), cost=cost
-    )
+        active, damping = active[left], damping[left]
+        now = _State(**{name: value[left] for name, value in vars(now).items()})
+        system = _System(**{name: value[left] for name, value in vars(system).items()})
+    keypoints = model.keypoints(state.joints, state.root_pos, state.root_quat)
+    return HandMotion(joints=state.joints, root_pos=state.root_pos, root_quat=state.root_quat, keypoints=keypoints, cost=final)
 
 
-def _select(targets: HandTargets, sequences: Tensor) -> HandTargets:
-    return HandTargets(
-        keypoints=targets.keypoints[sequences],
-        annotated=targets.annotated[sequences],
-        contact_points=targets.contact_points[sequences],
-        in_contact=targets.in_contact[sequences],
-    )
+@dataclass(frozen=True)
+class _State:
+    """The variables."""
+
+    joints: Tensor
+    """[S, T, J]"""
+    root_pos: Tensor
+    """[S, T, 3]"""
+    root_quat: Tensor
+    """[S, T, 4]"""
+
+
+@dataclass(frozen=True)
+class _System:
+    """Cost and its Gauss-Newton approximation; blocks beside the diagonal are minus the squared smoothness scale."""
+
+    cost: Tensor
+    """[S]"""
+    diagonal: Tensor
+    """[S, T, n, n] diagonal blocks."""
+    gradient: Tensor
+    """[S, T, n] half the gradient."""
+
+
+@dataclass(frozen=True)
+class _Bodies:
+    """Links of the hand and how they move with the variables."""
+
+    pos: Tensor
+    """[B, L, 3]"""
+    rot: Tensor
+    """[B, L, 3, 3]"""
+    linear: Tensor
+    """[B, L, 3, n] derivative of the position."""
+    angular: Tensor
+    """[B, L, 3, n] angular velocity per variable."""
 
 
 def _pose(pos: Tensor, quat: Tensor) -> Tensor:
@@ -240,10 +333,14 @@ def _nearest_annotated(annotated: Tensor) -> Tensor:
     return distance.masked_fill(~annotated[:, None, :], len(time) * 2).argmin(dim=-1)
 
 
-def _retract(model: HandModel, joints: Tensor, root_pos: Tensor, root_quat: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    count = joints.shape[-1]
-    turned = quat_normalize(quat_multiply(quat_from_axis_angle(step[..., count + 3 :]), root_quat))
-    return model.kinematics.clamp(joints + step[..., :count]), root_pos + step[..., count : count + 3], turned
+def _retract(model: HandModel, state: _State, step: Tensor) -> _State:
+    count = state.joints.shape[-1]
+    turned = quat_normalize(quat_multiply(quat_from_axis_angle(step[..., count + 3 :]), state.root_quat))
+    return _State(
+        joints=model.kinematics.clamp(state.joints + step[..., :count]),
+        root_pos=state.root_pos + step[..., count : count + 3],
+        root_quat=turned,
+    )
 
 
 def _smoothness_scale(config: HandConfig, joints: int) -> Tensor:
@@ -253,10 +350,10 @@ def _smoothness_scale(config: HandConfig, joints: int) -> Tensor:
     return scale * config.smoothness_weight**0.5
 
 
-def _changes(joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Tensor:
+def _changes(state: _State) -> Tensor:
     """[S, T-1, n] change of every variable between neighbouring frames; rotations as rotation vectors in world axes."""
-    turn = quat_to_axis_angle(quat_multiply(root_quat[:, 1:], quat_conjugate(root_quat[:, :-1])))
-    return torch.cat((joints.diff(dim=1), root_pos.diff(dim=1), turn), dim=-1)
+    turn = quat_to_axis_angle(quat_multiply(state.root_quat[:, 1:], quat_conjugate(state.root_quat[:, :-1])))
+    return torch.cat((state.joints.diff(dim=1), state.root_pos.diff(dim=1), turn), dim=-1)
 
 
 def _weights(model: HandModel, targets: HandTargets, config: HandConfig) -> tuple[Tensor, Tensor, Tensor]:
@@ -268,71 +365,103 @@ def _weights(model: HandModel, targets: HandTargets, config: HandConfig) -> tupl
     return local, on * config.global_weight * tip, on * config.contact_weight * targets.in_contact.flatten(0, 1)
 
 
-def _cost(model: HandModel, targets: HandTargets, config: HandConfig, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Tensor:
-    """[S] the cost of each sequence."""
-    scale = config.length_scale
-    x = model.keypoints(joints, root_pos, root_quat).flatten(0, 1) / scale
-    h, c = targets.keypoints.flatten(0, 1) / scale, targets.contact_points.flatten(0, 1) / scale
-    local, alignment, touch = _weights(model, targets, config)
-    none = x.new_zeros(*x.shape, 0)
-    cost = terms.contact_cost(x, c, touch, config.contact_margin / scale, config.contact_knee / scale)
-    for residual in (
-        terms.bone_lengths(x, none, h, model.pairs, local),
-        terms.bone_directions(x, none, h, model.pairs, local),
-        terms.global_alignment(x, none, h, alignment),
-    ):
-        cost = cost + residual.value.square().sum(-1)
-    smooth = (_changes(joints, root_pos, root_quat) * _smoothness_scale(config, joints.shape[-1])).square().sum((1, 2))
-    return cost.view(targets.annotated.shape).sum(1) + smooth
-
-
-def _normal_equations(
-    model: HandModel, targets: HandTargets, config: HandConfig, joints: Tensor, root_pos: Tensor, root_quat: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Gauss-Newton system: diagonal blocks [S, T, n, n], coupling [S, T-1, n] (see :func:`solve_chain`) and half gradient [S, T, n]."""
-    sequences, frames, count = joints.shape
-    scale = config.length_scale
+def _system(model: HandModel, targets: HandTargets, config: HandConfig, state: _State) -> _System:
+    """Cost of every sequence and its Gauss-Newton approximation."""
+    sequences, frames, count = state.joints.shape
     n = count + 6
-    h, c = targets.keypoints.flatten(0, 1) / scale, targets.contact_points.flatten(0, 1) / scale
-    weights = _weights(model, targets, config)
-    flat = (joints.flatten(0, 1), root_pos.flatten(0, 1), root_quat.flatten(0, 1))
-    H = torch.zeros(sequences * frames, n, n, dtype=torch.float64)
-    g = torch.zeros(sequences * frames, n, dtype=torch.float64)
-    for begin in range(0, len(H), _FRAMES_PER_CHUNK):
-        part = slice(begin, begin + _FRAMES_PER_CHUNK)
-        x, J = model.keypoint_jacobian(*(v[part] for v in flat))
-        x, J = x / scale, J / scale
-        local, alignment, touch = (w[part] for w in weights)
-        for value, jacobian in (
-            terms.bone_lengths(x, J, h[part], model.pairs, local),
-            terms.bone_directions(x, J, h[part], model.pairs, local),
-            terms.global_alignment(x, J, h[part], alignment),
-            terms.contact(x, J, c[part], touch, config.contact_margin / scale, config.contact_knee / scale),
-        ):
-            H[part] += jacobian.mT @ jacobian
-            g[part] += (jacobian.mT @ value[..., None])[..., 0]
-    H, g = H.view(sequences, frames, n, n), g.view(sequences, frames, n)
+    scale = config.length_scale
+    cost = torch.zeros(sequences, dtype=torch.float64)
+    H = torch.zeros(sequences, frames, n, n, dtype=torch.float64)
+    g = torch.zeros(sequences, frames, n, dtype=torch.float64)
+    for part in torch.arange(sequences).split(max(1, _FRAMES_PER_CHUNK // frames)):
+        now = targets.select(part)
+        bodies = model.bodies(*(value[part].flatten(0, 1) for value in (state.joints, state.root_pos, state.root_quat)))
+        x, J = model.keypoints_of(bodies)
+        x, J, h, c = x / scale, J / scale, now.keypoints.flatten(0, 1) / scale, now.contact_points.flatten(0, 1) / scale
+        local, alignment, touch = _weights(model, now, config)
+        distance, slope, frame = _clearances(model, now, config, bodies)
+        touching = terms.contact(x, J, c, touch, config.contact_margin / scale, config.contact_knee / scale)
+        squares = (
+            terms.bone_lengths(x, J, h, model.pairs, local),
+            terms.bone_directions(x, J, h, model.pairs, local),
+            terms.global_alignment(x, J, h, alignment),
+            terms.clearance(distance / scale, slope / scale, frame, len(x), config.clearance_weight, 0.0),
+        )
+        per_frame = terms.contact_cost(x, c, touch, config.contact_margin / scale, config.contact_knee / scale)
+        for residual in squares:
+            per_frame = per_frame + residual.value.square().sum(-1)
+        cost[part] = per_frame.view(len(part), frames).sum(1)
+        value, jacobian = (torch.cat(rows, dim=1) for rows in zip(touching, *squares, strict=True))
+        H[part] = (jacobian.mT @ jacobian).view(len(part), frames, n, n)
+        g[part] = (jacobian.mT @ value[..., None]).view(len(part), frames, n)
 
     squared = _smoothness_scale(config, count).square()
-    change = _changes(joints, root_pos, root_quat) * squared
+    change = _changes(state)
+    cost += (change.square() * squared).sum((1, 2))
     neighbours = torch.full((frames,), 2.0, dtype=torch.float64)
     neighbours[0] -= 1.0
     neighbours[-1] -= 1.0
     H.diagonal(dim1=-2, dim2=-1).add_(neighbours[:, None] * squared)
-    g[:, 1:] += change
-    g[:, :-1] -= change
-    return H, -squared.expand(sequences, frames - 1, n), g
+    g[:, 1:] += change * squared
+    g[:, :-1] -= change * squared
+    return _System(cost=cost, diagonal=H, gradient=g)
 
 
-def _limited_step(model: HandModel, joints: Tensor, diagonal: Tensor, coupling: Tensor, gradient: Tensor, damping: Tensor) -> Tensor:
+def _clearances(model: HandModel, targets: HandTargets, config: HandConfig, bodies: _Bodies) -> tuple[Tensor, Tensor, Tensor]:
+    """Balls of the hand that come too near to the object, the table or each other.
+
+    Returns:
+        [A] distance, less what is allowed [m]; [A, n] its derivative; [A] frame, ascending.
+    """
+    balls = model.balls
+    centers = bodies.pos[:, model.ball_links] + (bodies.rot[:, model.ball_links] @ balls.centers[..., None])[..., 0]  # [B, Q, 3]
+    annotated = targets.annotated.flatten()
+    found: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]] = []  # frame, first ball, second ball or -1, distance, direction
+
+    table = height_above_table(centers, balls.radii, model.table)
+    frame, ball = ((table < 0) & annotated[:, None]).nonzero(as_tuple=True)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=centers.dtype)
+    found.append((frame, ball, torch.full_like(ball, -1), table[frame, ball], up.expand(len(frame), 3)))
+
+    for rows, surface in targets.by_surface():
+        T = quat_to_matrix(targets.object_quat.flatten(0, 1)[rows])
+        local = (centers[rows] - targets.object_pos.flatten(0, 1)[rows][:, None]) @ T  # R^T p, as a row
+        reach = balls.radii[:, None] + torch.zeros(3)
+        low, high = torch.as_tensor(surface.low) - reach, torch.as_tensor(surface.high) + reach
+        row, ball = (((local > low) & (local < high)).all(-1) & annotated[rows][:, None]).nonzero(as_tuple=True)
+        distance, slope = surface.signed_distance(local[row, ball])
+        distance = distance - balls.radii[ball] + config.object_depth
+        near = distance < 0
+        row, ball = row[near], ball[near]
+        direction = (T[row] @ slope[near][..., None])[..., 0]
+        found.append((rows[row], ball, torch.full_like(ball, -1), distance[near], direction))
+
+    a, b = balls.pairs.unbind(1)
+    gap = centers[:, a] - centers[:, b]
+    distance = gap.norm(dim=-1)
+    apart = distance - balls.radii[a] - balls.radii[b] + config.self_depth
+    frame, pair = ((apart < 0) & annotated[:, None]).nonzero(as_tuple=True)
+    direction = gap[frame, pair] / distance[frame, pair, None].clamp_min(1e-9)
+    found.append((frame, a[pair], b[pair], apart[frame, pair], direction))
+
+    frame, first, second, distance, direction = (torch.cat(values) for values in zip(*found, strict=True))
+    order = frame.argsort(stable=True)
+    frame, first, second, distance, direction = frame[order], first[order], second[order], distance[order], direction[order]
+    slope = model.ball_slope(bodies, frame, first, centers, direction)
+    both = (second >= 0).nonzero()[:, 0]
+    slope[both] -= model.ball_slope(bodies, frame[both], second[both], centers, direction[both])
+    return distance, slope, frame
+
+
+def _limited_step(model: HandModel, config: HandConfig, state: _State, system: _System, damping: Tensor) -> Tensor:
     """[S, T, n] Levenberg-Marquardt step in which joints at a limit stay there if the cost pulls them outwards (Bertsekas' projection)."""
+    joints = state.joints
     count = joints.shape[-1]
-    lower, upper = model.kinematics.lower, model.kinematics.upper
-    free = torch.ones_like(gradient)
-    pull = gradient[..., :count]
-    free[..., :count] = (~((joints <= lower + 1e-9) & (pull > 0)) & ~((joints >= upper - 1e-9) & (pull < 0))).to(torch.float64)
-    H = diagonal * free[..., :, None] * free[..., None, :]
-    ridge = damping[:, None, None] * diagonal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6) * free + (1.0 - free)
-    H = H + torch.diag_embed(ridge)
-    link = coupling * free[:, 1:] * free[:, :-1]
-    return solve_chain(H, link, -gradient * free)
+    pull = system.gradient[..., :count]
+    outward = ((joints <= model.kinematics.lower) & (pull > 0)) | ((joints >= model.kinematics.upper) & (pull < 0))
+    free = torch.ones_like(system.gradient)
+    free[..., :count] = (~outward).to(free.dtype)
+    ridge = damping[:, None, None] * system.diagonal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6) * free + (1.0 - free)
+    H = system.diagonal * free[..., :, None] * free[..., None, :] + torch.diag_embed(ridge)
+    coupling = -_smoothness_scale(config, count).square() * free[:, 1:] * free[:, :-1]
+    return solve_chain(H, coupling, -system.gradient * free)

@@ -13,9 +13,9 @@ from xreset.demos.align import grounded, levelled
 from xreset.demos.archive import Demos
 from xreset.errors import DemoError
 from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
-from xreset.retarget.contacts import Surface, keypoint_contacts
 from xreset.retarget.file import SCHEMA, Retargeted, read_retargeted, write_retargeted
 from xreset.retarget.hand import HandConfig, HandModel, HandTargets, retarget_hand
+from xreset.retarget.surface import Surface, keypoint_contacts
 from xreset.retarget.validity import REASONS, Thresholds, classify
 from xreset.rotations import matrix_to_quat
 from xreset.spec import ObjectSpec, RobotSpec
@@ -74,7 +74,7 @@ def retarget(
     by_name = _by_name(demos, objects)
     demos = rest_on_table(demos, objects)
     hand, arm = HandModel(robot), ArmModel(robot)
-    surfaces = {name: Surface(spec.vertices, spec.faces) for name, spec in by_name.items()}
+    surfaces = {name: Surface(spec) for name, spec in by_name.items()}
 
     touched, touches = _contacts(demos, surfaces, config.contact_distance)
     joint_pos = np.tile(robot.home, (demos.num_frames, 1))
@@ -87,7 +87,7 @@ def retarget(
         def report(share: float, start: int = begin, size: int = len(batch)) -> None:
             progress(start + share * size, len(todo))
 
-        targets = _hand_targets(demos, hand, batch, touched, touches)
+        targets = _hand_targets(demos, hand, batch, surfaces, touched, touches)
         motion = retarget_hand(hand, targets, config.hand, lambda share, r=report: r(0.5 * share))
         error = (motion.keypoints - targets.keypoints)[:, :, torch.as_tensor(hand.is_tip)].norm(dim=-1).mean(-1)
         arm_targets = ArmTargets(
@@ -155,22 +155,27 @@ def _contacts(demos: Demos, surfaces: dict[str, Surface], distance: float) -> tu
     return points, contact
 
 
-def _hand_targets(demos: Demos, hand: HandModel, sequences: Sequence[int], touched: np.ndarray, touches: np.ndarray) -> HandTargets:
+def _hand_targets(
+    demos: Demos, hand: HandModel, sequences: Sequence[int], surfaces: dict[str, Surface], touched: np.ndarray, touches: np.ndarray
+) -> HandTargets:
     """Targets of some sequences, padded with frames that are not annotated."""
-    lengths = [len(range(*demos.frames(i).indices(demos.num_frames))) for i in sequences]
-    shape = (len(sequences), max(lengths))
-    keypoints, points = np.zeros((*shape, len(hand.names), 3)), np.zeros((*shape, len(hand.names), 3))
-    annotated, contact = np.zeros(shape, dtype=bool), np.zeros((*shape, len(hand.names)), dtype=bool)
-    for s, (i, length) in enumerate(zip(sequences, lengths, strict=True)):
-        rows, chosen = demos.frames(i), hand.keypoint_indices
-        annotated[s, :length] = demos.hand_valid[rows]
-        keypoints[s, :length] = np.where(demos.hand_valid[rows, None, None], demos.hand_keypoints[rows][:, chosen], 0.0)
-        points[s, :length], contact[s, :length] = touched[rows][:, chosen], touches[rows][:, chosen]
+    keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0)[:, hand.keypoint_indices]
+
+    def padded(values: np.ndarray) -> Tensor:
+        rows = [demos.frames(i) for i in sequences]
+        out = np.zeros((len(rows), max(row.stop - row.start for row in rows), *values.shape[1:]), dtype=values.dtype)
+        for s, row in enumerate(rows):
+            out[s, : row.stop - row.start] = values[row]
+        return torch.as_tensor(out)
+
     return HandTargets(
-        keypoints=torch.as_tensor(keypoints),
-        annotated=torch.as_tensor(annotated),
-        contact_points=torch.as_tensor(points),
-        in_contact=torch.as_tensor(contact),
+        keypoints=padded(keypoints.astype(np.float64)),
+        annotated=padded(demos.hand_valid),
+        contact_points=padded(touched[:, hand.keypoint_indices]),
+        in_contact=padded(touches[:, hand.keypoint_indices]),
+        object_pos=padded(demos.object_pos.astype(np.float64)),
+        object_quat=padded(demos.object_quat_wxyz.astype(np.float64)),
+        surfaces=tuple(surfaces[name] for name in demos.object_name[list(sequences)].tolist()),
     )
 
 

@@ -91,6 +91,27 @@ def contact_cost(x: Tensor, contact_point: Tensor, weight: Tensor, margin: float
     return (weight * torch.where(excess < knee, excess**2 / knee, 2.0 * excess - knee)).sum(-1)
 
 
+def clearance(distance: Tensor, J: Tensor, frame: Tensor, frames: int, weight: float, least: float) -> Residual:
+    """What keeps bodies apart: r = sqrt(w) [least - d]_+ for every distance d, in units of the length scale.
+
+    Args:
+        distance: [A] signed distances.
+        J: [A, n] their derivatives.
+        frame: [A] the frame of each, ascending.
+        frames: B.
+        weight: w.
+        least: distance from which on there is no cost.
+    """
+    value = weight**0.5 * (least - distance).clamp_min(0.0)
+    count = torch.bincount(frame, minlength=frames)
+    slot = torch.arange(len(frame)) - (count.cumsum(0) - count)[frame]  # place among the frame's own, so that rows stay dense and few
+    width = int(count.max()) if len(frame) else 0
+    values, rows = J.new_zeros(frames, width), J.new_zeros(frames, width, J.shape[-1])
+    values[frame, slot] = value
+    rows[frame, slot] = -(weight**0.5) * (distance < least).to(J.dtype)[:, None] * J
+    return Residual(values, rows)
+
+
 def _weighted(value: Tensor, J: Tensor, weight: Tensor) -> Residual:
     scale = weight.sqrt()[..., None]
     return Residual((scale * value).flatten(1), (scale[..., None] * J).flatten(1, 2))

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from xreset.backends.conformance import contact_checks, motion_checks, state_checks
 from xreset.backends.conformance.harness import Bench, Check, CheckResult, MakeBackend, Measure
 from xreset.backends.conformance.scene import scene
-from xreset.errors import CapabilityError
+from xreset.errors import BackendUnavailableError, CapabilityError
 from xreset.spec import RobotSpec
 
 CHECKS: tuple[Check, ...] = (*state_checks.CHECKS, *motion_checks.CHECKS, *contact_checks.CHECKS, *state_checks.LAST)
@@ -41,6 +41,7 @@ def run(
 
     Raises:
         ValueError: ``only`` names a check that does not exist.
+        BackendUnavailableError: the backend cannot be used here.
     """
     wanted = None if only is None else set(only)
     if wanted and (unknown := wanted - {check.name for check in CHECKS}):
@@ -74,6 +75,8 @@ def _run_one(check: Check, bench: Bench) -> CheckResult:
     except CapabilityError as error:
         lacking = set(check.capabilities) - bench.backend().capabilities
         return result("unsupported" if lacking else "failed", problem=str(error))
+    except BackendUnavailableError:  # nothing can be tested
+        raise
     except Exception as error:
         return result("failed", problem=f"{type(error).__name__}: {error}")
     if lacking:

@@ -146,6 +146,10 @@ class SelfCollision:
         home = kinematics.link_poses(kinematics.clamp(kinematics.lower.new_tensor(robot.home[kinematics.joint_indices])))[None].numpy()
         overlapping = self.near(home, 0.0)
         never = {tuple(sorted(pair)) for pair in overlapping.links.tolist()}
+        self.overlapping_at_home: tuple[tuple[str, str], ...] = tuple(
+            (kinematics.link_names[int(i)], kinematics.link_names[int(j)]) for i, j in sorted(never)
+        )
+        """Pairs of links that were left out because they overlap at home."""
         keep = [tuple(sorted((self._link[i], self._link[j]))) not in never for i, j in self._pairs]
         self._pairs = self._pairs[np.array(keep, dtype=bool)]
 

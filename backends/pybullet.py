@@ -49,9 +49,9 @@ class PybulletSettings:
     """Bullet steps per physics step: drives are explicit and contacts are solved once per step, so both gain from 480 Hz."""
     solver_iterations: int = 50
     """Sweeps of the contact solver."""
-    friction_cone: bool = False
-    """Whether friction is limited by a cone instead of a pyramid. The cone holds grasps less well; the pyramid lets objects slide up to
-    1.4 times less easily along its diagonals."""
+    friction_cone: bool = True
+    """Whether friction is limited by a cone instead of a pyramid. Without it objects slide 30 % less far along the pyramid's diagonals, and
+    Bullet leaves out torsional friction altogether. Grasps hold equally well with either."""
     explicit_limit: float = 0.5
     """A drive is applied as a plain PD torque while (dt kd + dt^2 kp) / inertia is below this (2 is the limit of stability); beyond it
     is made implicit, which is stable but softens the drive in contact."""

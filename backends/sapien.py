@@ -1,0 +1,543 @@
+"""PhysX, through SAPIEN, on the CPU.
+
+What differs from SAPIEN's defaults, and why:
+
+- The TGS solver, a contact offset of 2 mm (the default of 10 mm loses grasps), no sleeping, no damping, no joint friction (the default of
+  0.05 is no torque, and brakes).
+- Friction of a pair is the *average* of its materials. With 0 on the object, the other material has twice the pair's coefficient.
+  Torsional friction is mu times ``min_patch_radius``, so that radius is torsional / mu.
+- The robot feels no gravity (if it is compensated). The object's weight is applied as a force, which gives gravity fractions.
+- PhysX reports the normal forces of contacts only; friction is worked out from the object's momentum (:func:`_friction`).
+- Linear velocities refer to the centre of mass; they are converted here. PhysX computes in single precision.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from xreset.backends.base import unavailable
+from xreset.backends.pool import PoolBackend, World
+from xreset.backends.rigid import (
+    Inertia,
+    Mechanism,
+    conjugate,
+    cross,
+    matrix_to_quat,
+    mechanism,
+    multiply,
+    nearer,
+    object_inertia,
+    rotate,
+)
+from xreset.errors import RobotError, XResetError
+from xreset.spec import GRAVITY, Geometry, MimicSpec, SceneSpec, Shape
+
+
+@dataclass(frozen=True, kw_only=True)
+class SapienSettings:
+    """PhysX's dials."""
+
+    position_iterations: int = 10
+    """Sweeps of the solver over positions."""
+    velocity_iterations: int = 1
+    """Sweeps of the solver over velocities."""
+    contact_offset: float = 0.002
+    """Distance [m] at which contacts are generated."""
+
+
+_DEFAULTS = SapienSettings()
+
+
+class SapienWorld(World):
+    """One world of PhysX, in a scene of its own."""
+
+    def __init__(self, scene: SceneSpec, object_index: int, *, settings: SapienSettings = _DEFAULTS) -> None:
+        self._sapien = sapien = _engine()
+        _configure(sapien.physx, settings)
+        self._system = sapien.physx.PhysxCpuSystem()
+        self._system.timestep = self._dt = scene.timestep
+        self._scene = sapien.Scene([self._system])
+
+        self._mechanism = robot = mechanism(scene.robot)
+        self._inertia = object_inertia(scene.objects[object_index])
+        self._torsional = scene.friction.torsional
+        self._materials = {role: sapien.physx.PhysxMaterial(0.0, 0.0, 0.0) for role in ("tip", "link", "table", "object")}
+        self._surfaces: dict[Any, _Surface] = {}
+        self._add_table(scene)
+        self._bodies = self._add_robot()
+        self._object = self._add_object(scene.objects[object_index].pieces)
+        self._joints = _Joints(self._bodies, robot, scene.timestep)
+        self._frames = [
+            (self._bodies[i], robot.bodies[i].inertia, T[:3, 3], matrix_to_quat(T[:3, :3]))
+            for i, T in (robot.frames[link] for link in scene.robot.tracked_links)
+        ]
+        self._mass, self._moments, self._fraction = self._inertia.mass, self._inertia.moments, 1.0
+        self._force, self._torque = np.zeros(3), np.zeros(3)
+        self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
+        self._quat = np.array([1.0, 0.0, 0.0, 0.0])
+        self._last_step: tuple[_Motion, np.ndarray, np.ndarray] | None = None
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """See :meth:`World.set_state`."""
+        self._joints.reset(state["joint_pos"], state["joint_vel"], state["joint_target"])
+        self._quat = np.array(state["object_quat"])
+        self._object.entity.pose = self._sapien.Pose(state["object_pos"], self._quat)
+        omega = state["object_angvel"]
+        self._object.linear_velocity = state["object_linvel"] + cross(omega, rotate(self._quat, self._inertia.com))
+        self._object.angular_velocity = omega
+        self._force, self._torque = np.zeros(3), np.zeros(3)
+        self._last_step = None
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """See :meth:`World.get_state`."""
+        pose = self._object.entity.pose
+        self._quat = nearer(pose.q.astype(np.float64), self._quat)
+        omega = self._object.angular_velocity.astype(np.float64)
+        position, velocity = self._joints.read()
+        return {
+            "joint_pos": position,
+            "joint_vel": velocity,
+            "joint_target": self._joints.target,
+            "object_pos": pose.p.astype(np.float64),
+            "object_quat": self._quat,
+            "object_linvel": self._object.linear_velocity - cross(omega, rotate(self._quat, self._inertia.com)),
+            "object_angvel": omega,
+        }
+
+    def set_joint_targets(self, targets: np.ndarray) -> None:
+        """See :meth:`World.set_joint_targets`."""
+        self._joints.set_targets(targets)
+
+    def step(self, n: int) -> None:
+        """See :meth:`World.step`."""
+        body = self._object
+        force = self._force - np.array([0.0, 0.0, self._mass * GRAVITY * self._fraction])
+        for _ in range(n):
+            self._joints.brake()
+            body.add_force_torque(force, self._torque)
+            start = _Motion(body.linear_velocity, body.angular_velocity, multiply(body.entity.pose.q, self._inertia.quat))
+            self._system.step()
+        self._last_step = start, force, self._torque
+
+    def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """See :meth:`World.links`."""
+        k = len(self._frames)
+        pos, quat, linvel, angvel = np.zeros((k, 3)), np.zeros((k, 4)), np.zeros((k, 3)), np.zeros((k, 3))
+        for i, (body, inertia, frame_pos, frame_quat) in enumerate(self._frames):
+            pose = body.entity_pose
+            turn = pose.q.astype(np.float64)
+            arm = rotate(turn, frame_pos)
+            pos[i] = pose.p + arm
+            quat[i] = multiply(turn, frame_quat)
+            if inertia is not None:
+                angvel[i] = body.angular_velocity
+                linvel[i] = body.linear_velocity + cross(angvel[i], arm - rotate(turn, inertia.com))
+        return pos, quat, linvel, angvel
+
+    def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See :meth:`World.contacts`."""
+        tips = len(self._mechanism.robot.fingertips)
+        tip_force, tip_touch, table_force = np.zeros((tips, 3)), np.zeros(tips, dtype=bool), np.zeros(3)
+        surfaces, points, normal_forces = self._contact_points()
+        if surfaces:
+            friction = _friction(
+                points - self._center_of_mass(),
+                normal_forces,
+                np.array([self._pair_friction[surface.role] for surface in surfaces]),
+                *self._missing_wrench(points, normal_forces),
+            )
+            for surface, force in zip(surfaces, normal_forces + friction, strict=True):
+                if surface.role == "table":
+                    table_force += force
+                elif surface.tip is not None:
+                    tip_force[surface.tip] += force
+                    tip_touch[surface.tip] = True
+        return tip_force, tip_touch, table_force
+
+    def health(self) -> tuple[bool, bool]:
+        """See :meth:`World.health`. PhysX allocates contacts as it needs them: none is ever dropped."""
+        pose = self._object.entity.pose
+        return not all(np.isfinite(x).all() for x in (pose.p, pose.q, self._object.linear_velocity, *self._joints.read())), False
+
+    def set_object_mass(self, mass: float) -> None:
+        """See :meth:`World.set_object_mass`."""
+        self._object.mass = self._mass = mass
+        self._object.inertia = self._moments = self._inertia.moments * (mass / self._inertia.mass)
+
+    def set_friction(self, friction: np.ndarray) -> None:
+        """See :meth:`World.set_friction`."""
+        self._pair_friction = dict(zip(("tip", "link", "table"), (float(mu) for mu in friction), strict=True))
+        for role, mu in self._pair_friction.items():
+            self._materials[role].static_friction = self._materials[role].dynamic_friction = 2.0 * mu
+        for shape, surface in self._surfaces.items():
+            mu = self._pair_friction[surface.role]
+            shape.min_patch_radius = self._torsional / mu if mu > 0 else 0.0
+
+    def set_object_gravity(self, fraction: float) -> None:
+        """See :meth:`World.set_object_gravity`."""
+        self._fraction = fraction
+
+    def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
+        """See :meth:`World.set_object_wrench`."""
+        self._force, self._torque = force, torque
+
+    # Building ----------------------------------------------------------------------------------------------------------------------------
+
+    def _add_table(self, scene: SceneSpec) -> None:
+        table = self._sapien.physx.PhysxRigidStaticComponent()
+        self._attach(table, Shape(geometry=Geometry(kind="box", size=scene.table.half_size)), _Surface("table"), [_TABLE, _OBJECT, 0, 0])
+        self._add(table, "table", self._sapien.Pose([*scene.table.center, -scene.table.half_size[2]]))
+
+    def _add_object(self, pieces: Sequence[Shape]) -> Any:
+        body = self._sapien.physx.PhysxRigidDynamicComponent()
+        for piece in pieces:
+            self._attach(body, piece, None, [_OBJECT, 0, 0, 0])
+        self._set_inertia(body, self._inertia)
+        body.disable_gravity = True
+        self._add(body, "object", self._sapien.Pose())
+        return body
+
+    def _add_robot(self) -> list[Any]:
+        sapien, robot = self._sapien, self._mechanism.robot
+        self_bits = _self_collision_bits(self._mechanism)
+        links: list[Any] = []
+        for body in self._mechanism.bodies:
+            link = sapien.physx.PhysxArticulationLinkComponent(links[body.parent] if body.parent >= 0 else None)
+            for part in body.shapes:
+                tip = self._mechanism.tip_of.get(part.link)
+                kind, affinity = self_bits.get(part.link, (0, 0))
+                near_table = 0 if part.link in robot.table_exclude else _TABLE
+                surface = _Surface("link" if tip is None else "tip", tip)
+                self._attach(link, part.shape, surface, [kind, affinity | _OBJECT | near_table, 0, 0])
+            if body.inertia is not None:
+                self._set_inertia(link, body.inertia)
+            link.disable_gravity = robot.gravity_compensated
+            if body.joint is None:
+                link.joint.type = "fixed"
+            else:
+                T_joint_axis = np.eye(4)
+                T_joint_axis[:3, :3] = _x_to(body.joint.axis)
+                link.joint.name = body.joint.name
+                link.joint.type = "prismatic" if body.joint.type == "prismatic" else "revolute_unwrapped"
+                link.joint.pose_in_parent = self._pose(body.T_parent_body @ T_joint_axis)
+                link.joint.pose_in_child = self._pose(T_joint_axis)
+                limited = np.isfinite(body.joint.lower) and np.isfinite(body.joint.upper)
+                link.joint.limit = [[body.joint.lower, body.joint.upper] if limited else [-np.inf, np.inf]]
+            links.append(link)
+        base = sapien.Pose(robot.base_pos, robot.base_quat)
+        for link, body in zip(links, self._mechanism.bodies, strict=True):
+            self._add(link, body.name, base)  # the pose of the root decides; joints place the others
+        return links
+
+    def _attach(self, body: Any, shape: Shape, surface: _Surface | None, groups: list[int]) -> None:
+        physx, geometry = self._sapien.physx, shape.geometry
+        material = self._materials[surface.role if surface else "object"]
+        T = shape.T_body_shape
+        if geometry.kind == "box":
+            made = physx.PhysxCollisionShapeBox(half_size=geometry.size, material=material)
+        elif geometry.kind == "sphere":
+            made = physx.PhysxCollisionShapeSphere(radius=geometry.size[0], material=material)
+        elif geometry.kind == "hull":
+            made = physx.PhysxCollisionShapeConvexMesh(vertices=geometry.vertices, scale=np.ones(3), material=material)
+        else:
+            kind = physx.PhysxCollisionShapeCapsule if geometry.kind == "capsule" else physx.PhysxCollisionShapeCylinder
+            made = kind(radius=geometry.size[0], half_length=geometry.size[1], material=material)
+            T = T.copy()
+            T[:3, :3] = T[:3, :3] @ _x_to(np.array([0.0, 0.0, 1.0]))  # PhysX has them along x
+        made.local_pose = self._pose(T)
+        made.set_collision_groups(groups)
+        body.attach(made)
+        if surface is not None:
+            self._surfaces[made] = surface
+
+    def _set_inertia(self, body: Any, inertia: Inertia) -> None:
+        body.mass = inertia.mass
+        body.cmass_local_pose = self._sapien.Pose(inertia.com, inertia.quat)
+        body.inertia = inertia.moments
+        body.linear_damping = body.angular_damping = 0.0
+        body.max_linear_velocity = body.max_angular_velocity = _NO_LIMIT
+
+    def _add(self, body: Any, name: str, pose: Any) -> None:
+        entity = self._sapien.Entity()
+        entity.name = name
+        entity.add_component(body)
+        entity.pose = pose
+        self._scene.add_entity(entity)
+
+    def _pose(self, T: np.ndarray) -> Any:
+        return self._sapien.Pose(T[:3, 3], matrix_to_quat(T[:3, :3]))
+
+    # Contacts ----------------------------------------------------------------------------------------------------------------------------
+
+    def _contact_points(self) -> tuple[list[_Surface], np.ndarray, np.ndarray]:
+        """What presses on the object in the last step: surfaces, points [n, 3], normal forces on the object [n, 3]."""
+        surfaces, points, forces = [], [], []
+        for contact in self._system.get_contacts() if self._last_step else ():
+            first, second = contact.bodies
+            if self._object not in (first, second):
+                continue
+            sign = 1.0 if first == self._object else -1.0  # an impulse acts on the first body
+            surface = self._surfaces[contact.shapes[1 if first == self._object else 0]]
+            for point in contact.points:
+                if point.impulse.any():
+                    surfaces.append(surface)
+                    points.append(point.position)
+                    forces.append(sign * point.impulse / self._dt)
+        return surfaces, np.array(points, dtype=np.float64), np.array(forces, dtype=np.float64)
+
+    def _missing_wrench(self, points: np.ndarray, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Force and torque about the centre of mass that the object's change of momentum shows beyond the given contact forces."""
+        start, force, torque = self._last_step
+        torque = torque - cross(start.angvel, self._angular_momentum(start.angvel, start.principal))  # gyroscopic
+        gained = self._mass * (self._object.linear_velocity - start.linvel) / self._dt
+        turned = self._angular_momentum(self._object.angular_velocity - start.angvel, start.principal) / self._dt
+        return gained - force - forces.sum(axis=0), turned - torque - np.cross(points - self._center_of_mass(), forces).sum(axis=0)
+
+    def _center_of_mass(self) -> np.ndarray:
+        pose = self._object.entity.pose
+        return pose.p + rotate(pose.q, self._inertia.com)
+
+    def _angular_momentum(self, omega: np.ndarray, principal: np.ndarray) -> np.ndarray:
+        return rotate(principal, self._moments * rotate(conjugate(principal), omega))
+
+
+class SapienBackend(PoolBackend):
+    """N worlds of PhysX; the keyword ``settings`` takes :class:`SapienSettings`."""
+
+    name = "sapien"
+    capabilities = frozenset({"object_mass", "friction", "object_gravity", "object_wrench", "overflow"})
+    world_class = SapienWorld
+
+    @classmethod
+    def engine_version(cls) -> str:
+        """See :meth:`Backend.engine_version`."""
+        _engine()
+        return version("sapien")
+
+
+class _Motion(NamedTuple):
+    """Of the object at the start of a step."""
+
+    linvel: np.ndarray
+    """[3] velocity of the centre of mass."""
+    angvel: np.ndarray
+    """[3]"""
+    principal: np.ndarray
+    """[4] orientation of the principal axes in the world."""
+
+
+class _Surface(NamedTuple):
+    """What a shape is to the object."""
+
+    role: Literal["tip", "link", "table"]
+    tip: int | None = None
+    """Index of its fingertip."""
+
+
+def _friction(arms: np.ndarray, normal_forces: np.ndarray, coefficients: np.ndarray, force: np.ndarray, torque: np.ndarray) -> np.ndarray:
+    """Friction forces [n, 3] that explain a force and torque [3] on a body, given its contacts.
+
+    Of all tangential forces that add up to the wrench (in the sense of least squares) these have the smallest sum of (f / (mu N))^2: each
+    contact carries what it can. When a single surface touches the object, the sum is what it really is.
+
+    Args:
+        arms: [n, 3] contact points from the centre of mass [m].
+        normal_forces: [n, 3] N.
+        coefficients: [n] friction coefficients mu.
+        force: [3] N.
+        torque: [3] N m, about the centre of mass.
+    """
+    limits = np.linalg.norm(normal_forces, axis=1)
+    normals = normal_forces / limits[:, None]
+    capacity = limits * coefficients
+    side = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
+    side /= np.linalg.norm(side, axis=1)[:, None]
+    tangents = np.stack([side, np.cross(normals, side)], axis=1)  # [n, 2, 3]
+    columns = np.concatenate([tangents, np.cross(arms[:, None, :], tangents) / _ARM], axis=2) * capacity[:, None, None]
+    shares, *_ = np.linalg.lstsq(columns.reshape(-1, 6).T, np.concatenate([force, torque / _ARM]), rcond=1e-6)
+    return np.einsum("nk,nkx->nx", shares.reshape(-1, 2) * capacity[:, None], tangents)
+
+
+_ARM = 0.05
+"""Length [m] that makes torques and forces comparable."""
+
+
+# Joints ----------------------------------------------------------------------------------------------------------------------------------
+
+
+class _Joints:
+    """Drives, dry friction and mimic couplings of the articulation. PhysX keeps the joints in an order of its own."""
+
+    def __init__(self, links: Sequence[Any], robot: Mechanism, dt: float) -> None:
+        spec = robot.robot
+        self._articulation = articulation = links[0].articulation
+        active = [joint.name for joint in articulation.active_joints]
+        joints = {joint.name: joint for joint in articulation.active_joints}
+        self._driven = np.array([active.index(name) for name in spec.joint_names])
+        self._mimic = np.array([active.index(mimic.joint) for mimic in spec.mimics], dtype=int)
+        self._source = np.array([spec.joint_names.index(mimic.source) for mimic in spec.mimics], dtype=int)
+        self._multiplier = np.array([mimic.multiplier for mimic in spec.mimics])
+        self._offset = np.array([mimic.offset for mimic in spec.mimics])
+        self._drives = [joints[name] for name in spec.joint_names]
+        for joint in articulation.active_joints:
+            joint.set_friction(0.0)
+        for joint, described in zip(self._drives, spec.joints, strict=True):
+            drive = described.drive
+            joint.set_drive_properties(drive.kp, drive.kd, drive.effort, "force")
+            joint.set_armature(np.array([[drive.armature]]))
+        for mimic in spec.mimics:
+            _couple(articulation, joints, mimic)
+
+        self.target = spec.home
+        """[J] drive targets."""
+        self._dt = dt
+        self._kp, self._kd, self._effort, self._armature, self._loss = (
+            np.array([getattr(joint.drive, field) for joint in spec.joints])
+            for field in ("kp", "kd", "effort", "armature", "friction_loss")
+        )
+        if self._loss.any():
+            from xreset.robots.dynamics import mass_matrix
+
+            self._felt = 1.0 / np.diag(np.linalg.inv(mass_matrix(spec, spec.home) + np.diag(self._armature)))
+
+    def reset(self, position: np.ndarray, velocity: np.ndarray, target: np.ndarray) -> None:
+        """Set positions, velocities and targets [J] of the actuated joints; mimic joints follow."""
+        articulation = self._articulation
+        articulation.qpos = self._all(position, self._offset)
+        articulation.qvel = self._all(velocity, np.zeros_like(self._offset))
+        articulation.qf = np.zeros(len(self._driven) + len(self._mimic))
+        self.set_targets(target)
+
+    def read(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities [J] of the actuated joints."""
+        position, velocity = self._articulation.qpos, self._articulation.qvel
+        return position[self._driven].astype(np.float64), velocity[self._driven].astype(np.float64)
+
+    def set_targets(self, targets: np.ndarray) -> None:
+        """Set the drive targets [J]."""
+        self.target = targets
+        for joint, target in zip(self._drives, targets, strict=True):
+            joint.set_drive_target(target)
+
+    def brake(self) -> None:
+        """Apply dry friction for one step: PhysX's joint friction is no torque, so it is a torque here.
+
+        It is what would bring the joint to rest within the step, as far as the friction loss allows; contacts are not foreseen.
+        """
+        if not self._loss.any():
+            return
+        position, velocity = self.read()
+        drive = np.clip(self._kp * (self.target - position) - self._kd * velocity, -self._effort, self._effort)
+        torque = np.zeros(len(self._driven) + len(self._mimic))
+        torque[self._driven] = np.clip(-self._felt * velocity / self._dt - drive, -self._loss, self._loss)
+        self._articulation.qf = torque
+
+    def _all(self, actuated: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        values = np.zeros(len(self._driven) + len(self._mimic))
+        values[self._driven] = actuated
+        values[self._mimic] = self._multiplier * actuated[self._source] + offset
+        return values
+
+
+_TENDON_STIFFNESS, _TENDON_DAMPING = 1e5, 1e2
+
+
+def _couple(articulation: Any, joints: Mapping[str, Any], mimic: MimicSpec) -> None:
+    """Tie a mimic joint to its source: a fixed tendon keeps q_mimic - multiplier q_source = offset and acts on both.
+
+    Raises:
+        RobotError: the two joints neither share their parent link nor follow one another, so PhysX has no tendon for them.
+    """
+    follower, leader = joints[mimic.joint], joints[mimic.source]
+    if follower.parent_link == leader.parent_link or follower.parent_link == leader.child_link:
+        chain, rates = [leader.parent_link, leader.child_link, follower.child_link], [0.0, -mimic.multiplier, 1.0]
+    elif leader.parent_link == follower.child_link:
+        chain, rates = [follower.parent_link, follower.child_link, leader.child_link], [0.0, 1.0, -mimic.multiplier]
+    else:
+        raise RobotError(
+            f"the joint {mimic.joint!r} mimics {mimic.source!r}, but they neither share a parent link nor follow one another: "
+            "the backend 'sapien' cannot couple them. Use another backend."
+        )
+    articulation.create_fixed_tendon(chain, rates, rates, rest_length=mimic.offset, stiffness=_TENDON_STIFFNESS, damping=_TENDON_DAMPING)
+
+
+# Which shapes collide --------------------------------------------------------------------------------------------------------------------
+# Two shapes collide if a bit of one's first group is in the other's second group.
+
+_OBJECT, _TABLE, _FIRST_SELF_BIT, _BITS = 1, 2, 2, 32
+
+
+def _self_collision_bits(robot: Mechanism) -> dict[str, tuple[int, int]]:
+    """Link -> first and second group, such that exactly the links that may collide with each other do.
+
+    A bit says "this link collides with those": one link has it in its first group, its partners in their second group. The link with most
+    partners left takes the next bit, until every pair is covered.
+
+    Raises:
+        XResetError: the 30 bits do not suffice.
+    """
+    links = robot.robot.self_collision_links
+    partners = {a: {b for b in links if robot.may_collide(a, b)} for a in links}
+    bits = {link: [0, 0] for link in links}
+    for bit in range(_FIRST_SELF_BIT, _BITS):
+        hub = max(partners, key=lambda link: len(partners[link]), default=None)
+        if hub is None or not partners[hub]:
+            return {link: (kind, affinity) for link, (kind, affinity) in bits.items()}
+        bits[hub][0] |= 1 << bit
+        for partner in partners.pop(hub):
+            bits[partner][1] |= 1 << bit
+            partners[partner].discard(hub)
+    raise XResetError(
+        f"robot {robot.robot.name!r}: {len(links)} links collide with one another in more ways than PhysX's "
+        f"{_BITS - _FIRST_SELF_BIT} collision bits can say. Shorten self_collision_links (31 links always fit)."
+    )
+
+
+# SAPIEN's habits -----------------------------------------------------------------------------------------------------------------------
+
+_NO_LIMIT = 1e3
+"""Speed limit of bodies [m/s, rad/s]: PhysX has lower ones of its own."""
+
+
+def _x_to(axis: np.ndarray) -> np.ndarray:
+    """[3, 3] a rotation that turns x into a unit vector: joints, capsules and cylinders lie along x in PhysX."""
+    other = np.eye(3)[np.abs(axis).argmin()]
+    y = np.cross(axis, other)
+    y /= np.linalg.norm(y)
+    return np.stack([axis, y, np.cross(axis, y)], axis=1)
+
+
+def _configure(physx: Any, settings: SapienSettings) -> None:
+    """Set the process-wide configuration that systems, bodies and shapes take when they are made."""
+    physx.set_scene_config(
+        gravity=np.array([0.0, 0.0, -GRAVITY]),
+        enable_tgs=True,
+        enable_pcm=True,
+        enable_enhanced_determinism=True,  # or a world would depend on what was in it before
+        enable_friction_every_iteration=True,
+        cpu_workers=0,
+    )
+    physx.set_body_config(
+        solver_position_iterations=settings.position_iterations,
+        solver_velocity_iterations=settings.velocity_iterations,
+        sleep_threshold=0.0,
+    )
+    physx.set_shape_config(contact_offset=settings.contact_offset, rest_offset=0.0)
+
+
+def _engine() -> Any:
+    """The module ``sapien``; ``BackendUnavailableError`` if it cannot be imported."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about Vulkan, which nothing here renders with
+            import sapien
+            import sapien.physx
+    except ImportError as error:
+        raise unavailable("sapien", "sapien", error) from error
+    return sapien

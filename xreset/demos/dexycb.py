@@ -5,8 +5,8 @@
                                              SERIAL/labels_000000.npz   joint_3d: hand joints, in that camera's frame
     ROOT/calibration/extrinsics_ID/extrinsics.yml                  camera poses and the AprilTag's pose in the world frame
 
-The world frame is the master camera's; the table frame is the AprilTag's. Object quaternions in ``pose.npz`` are (x, y, z, w). Frames without a
-hand have ``pose_m`` = 0 and joints = -1.
+The world frame is the master camera's; the table frame is the AprilTag's. Object quaternions in ``pose.npz`` are (x, y, z, w). Frames
+without a hand have ``pose_m`` = 0 and joints = -1.
 """
 
 from __future__ import annotations
@@ -149,8 +149,8 @@ def _joints(sequence: _Sequence, frame: int, extrinsics: Mapping[str, np.ndarray
             " calibration folder does not belong to these sequences. Download DexYCB's calibration archive again."
         )
     raise DemoError(
-        f"sequence {sequence.name}: no camera ({', '.join(calibrated)}) has labels_{frame:06d}.npz, but meta.yml says {sequence.num_frames} frames."
-        " Unpack at least one camera's folder of this sequence completely."
+        f"sequence {sequence.name}: no camera ({', '.join(calibrated)}) has labels_{frame:06d}.npz, but meta.yml says"
+        f" {sequence.num_frames} frames. Unpack at least one camera's folder of this sequence completely."
     )
 
 
@@ -207,7 +207,7 @@ def _yaml(path: Path) -> dict[str, Any]:
             f"there is no {path}; the DexYCB folder is incomplete. Unpack its calibration archive beside the subjects' folders."
         )
     try:
-        data = yaml.load(path.read_text(), Loader=_Loader)  # noqa: S506 (a safe loader)
+        data = yaml.load(path.read_text(), Loader=_Loader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise DemoError(f"{path} is not valid YAML: {error}") from error
     if not isinstance(data, dict):

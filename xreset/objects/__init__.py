@@ -1,14 +1,17 @@
 """Objects: parametric stand-ins for the YCB objects, import of real meshes, surface points.
 
-from xreset.objects import load_object, surface_points
-can = load_object("soup")                       # a stand-in
-can = load_object("soup", Path("ycb_models"))   # the real mesh
-cloud = surface_points(can, 64)
+.. code-block:: python
+
+    from xreset.objects import load_object, surface_points
+    can = load_object("soup")                       # a stand-in
+    can = load_object("soup", Path("ycb_models"))   # the real mesh
+    cloud = surface_points(can, 64)
 """
 
 from xreset.objects.catalogue import canonical_name, load_object, load_objects, object_names
 from xreset.objects.geometry import shape_mesh
-from xreset.objects.sampling import bounding_box, bounding_radius, keypoints, rest_height, surface_points
+from xreset.objects.rest import rest_height, resting_orientation
+from xreset.objects.sampling import bounding_box, bounding_radius, keypoints, surface_points
 
 __all__ = [
     "bounding_box",
@@ -19,6 +22,7 @@ __all__ = [
     "load_objects",
     "object_names",
     "rest_height",
+    "resting_orientation",
     "shape_mesh",
     "surface_points",
 ]

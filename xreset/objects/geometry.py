@@ -119,3 +119,11 @@ def _translation(center: Sequence[float]) -> np.ndarray:
     T = np.eye(4)
     T[:3, 3] = center
     return T
+
+
+def half_spaces(shape: Shape) -> np.ndarray:
+    """[P, 4] the planes of a convex shape, (outward unit normal, offset): a point x is inside where normal . x + offset <= 0 for all."""
+    from scipy.spatial import ConvexHull
+
+    vertices = np.asarray(shape_mesh(shape).vertices, dtype=float)
+    return np.unique(ConvexHull(vertices).equations.round(9), axis=0)  # coplanar triangles share a plane

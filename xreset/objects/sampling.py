@@ -85,20 +85,3 @@ def keypoints(obj: ObjectSpec) -> np.ndarray:
 def bounding_radius(obj: ObjectSpec) -> float:
     """Radius of the sphere about the mesh frame's origin that encloses the object [m]."""
     return float(np.linalg.norm(obj.vertices, axis=1).max())
-
-
-def rest_height(obj: ObjectSpec, quat: np.ndarray) -> np.ndarray | float:
-    """Height of the mesh frame's origin at which the lowest vertex touches z = 0 [m].
-
-    Args:
-        obj: the object.
-        quat: [..., 4] orientations (w, x, y, z).
-
-    Returns:
-        [...] heights; a float for one orientation.
-    """
-    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=float), -1, 0)
-    norm = w * w + x * x + y * y + z * z
-    up = np.stack((2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z), axis=-1) / norm[..., None]  # R's last row
-    height = -(up @ obj.vertices.T).min(axis=-1)
-    return float(height) if np.ndim(height) == 0 else height

@@ -1,0 +1,137 @@
+"""How hand and object move in a synthetic demonstration: random timing, approach, lift and goal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from xreset.demos import hand
+from xreset.demos.grasp import Grasp, Solid
+
+LIFT = (0.25, 0.33)
+"""Height that objects are lifted [m]."""
+
+_TRIES = 12
+_CLEAR = 0.001  # [m]: a fingertip in contact is at 2 mm, give or take the fit
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """When things happen, in frames."""
+
+    frames: int
+    """T, all of them."""
+    reach: int
+    """The hand has arrived."""
+    close: int
+    """The fingers are on the object."""
+    lift: int
+    """The object begins to move."""
+    end: int
+    """The object is at the goal."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandPath:
+    """A hand's motion up to the grasp, [T] frames; the grasp holds to the end."""
+
+    wrist_pos: np.ndarray
+    """[T, 3]"""
+    wrist_rot: Rotation
+    """T orientations."""
+    angles: np.ndarray
+    """[T, 17] joint angles."""
+    gap: float
+    """Least distance of a keypoint to object and table until the lift [m]."""
+
+
+def random_timing(fps: float, rng: np.random.Generator) -> Timing:
+    """A demonstration of about 2.4 s whose object leaves the table after about 1.15 s."""
+    seconds = np.cumsum(
+        [rng.uniform(0.75, 0.95), rng.uniform(0.15, 0.25), rng.uniform(0.05, 0.1), rng.uniform(0.8, 1.0), rng.uniform(0.25, 0.45)]
+    )
+    reach, close, lift, end, last = (round(float(s) * fps) for s in seconds)
+    return Timing(frames=last + 1, reach=reach, close=close, lift=lift, end=end)
+
+
+def object_path(pos: np.ndarray, rest: Rotation, timing: Timing, rng: np.random.Generator) -> tuple[np.ndarray, Rotation]:
+    """Object position [T, 3] and T orientations: at rest, lifted, turned, at the goal.
+
+    Args:
+        pos: [3] where it rests.
+        rest: how it rests.
+        timing: when it moves.
+        rng: chooses the goal.
+    """
+    goal = pos + np.array([rng.uniform(-0.06, 0.06), rng.uniform(-0.14, 0.0), rng.uniform(*LIFT)])
+    heading = rng.uniform(0, 2 * np.pi)
+    tilt = np.radians(rng.uniform(10.0, 40.0)) * np.array([np.cos(heading), np.sin(heading), 0.0])
+    turn = Rotation.from_rotvec(tilt) * Rotation.from_euler("z", np.radians(rng.uniform(-45.0, 45.0)))
+    frame = np.arange(timing.frames)
+    rise = _minimum_jerk(frame, timing.lift, timing.end)
+    late = _minimum_jerk(frame, timing.lift + 0.2 * (timing.end - timing.lift), timing.end)  # turns when it is clear of the table
+    object_rot = Rotation.from_rotvec(late[:, None] * turn.as_rotvec()) * rest
+    return pos + rise[:, None] * (goal - pos), object_rot
+
+
+def clear_approach(solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, side: str, rng: np.random.Generator) -> HandPath:
+    """The first of some random approaches in which no keypoint comes too near to object or table, or the best of them.
+
+    Args:
+        solid: the object where it rests.
+        pos: [3] its position.
+        grasp: where the hand ends.
+        timing: when it moves.
+        side: right or left hand.
+        rng: chooses start and path.
+    """
+    best: HandPath | None = None
+    for _ in range(_TRIES):
+        path = _approach(solid, pos, grasp, timing, side, rng)
+        if best is None or path.gap > best.gap:
+            best = path
+        if path.gap > _CLEAR:
+            break
+    assert best is not None
+    return best
+
+
+def place_hand(pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: str) -> np.ndarray:
+    """[T, 21, 3] keypoints of a hand for wrist positions [T, 3], T wrist orientations and joint angles [T, 17]."""
+    return np.einsum("nij,nkj->nki", rotation.as_matrix(), hand.keypoints(angles, side)) + pos[:, None]
+
+
+def _approach(solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, side: str, rng: np.random.Generator) -> HandPath:
+    """To a place before the object while the hand opens, forward, close; each a minimum-jerk motion, overlapping."""
+    frame = np.arange(timing.frames)
+    mirror = 1.0 if side == "right" else -1.0
+    start = np.array([pos[0] - mirror * rng.uniform(-0.05, 0.20), rng.uniform(0.60, 0.80), grasp.wrist_pos[2] + rng.uniform(0.02, 0.18)])
+    start_rot = Rotation.from_rotvec(rng.normal(0.0, 0.2, 3)) * grasp.wrist_rot
+    fingers = grasp.wrist_rot.apply([-1.0, 0.0, 0.0] if side == "right" else [1.0, 0.0, 0.0])
+    palm = grasp.wrist_rot.apply([0.0, -1.0, 0.0])
+    inward = fingers + 0.6 * palm
+    before = grasp.wrist_pos - rng.uniform(0.07, 0.10) * inward / np.linalg.norm(inward)
+    before[2] = max(before[2], grasp.wrist_pos[2])
+
+    coming = _minimum_jerk(frame, 0, 0.75 * timing.reach)[:, None]
+    entering = _minimum_jerk(frame, 0.5 * timing.reach, timing.close)[:, None]
+    wrist_pos = start + coming * (before - start) + entering * (grasp.wrist_pos - before)
+    turning = _minimum_jerk(frame, 0, 0.85 * timing.reach)[:, None]
+    wrist_rot = Rotation.from_rotvec((1 - turning) * (start_rot * grasp.wrist_rot.inv()).as_rotvec()) * grasp.wrist_rot
+
+    opened = grasp.angles - np.array([0.0, 0.4, 0.2] * 4 + [-0.15, -0.1, 0.0, 0.3, 0.3])
+    opened = np.clip(opened, hand.LOWER, hand.UPPER)
+    opening = _minimum_jerk(frame, 0.1 * timing.reach, 0.65 * timing.reach)[:, None]
+    closing = _minimum_jerk(frame, 0.8 * timing.reach, timing.close)[:, None]
+    angles = hand.RELAXED + opening * (opened - hand.RELAXED) + closing * (grasp.angles - opened)
+    points = place_hand(wrist_pos, wrist_rot, angles, side)[: timing.lift]
+    gap = min(solid.distance(points).min(), points[..., 2].min())
+    return HandPath(wrist_pos=wrist_pos, wrist_rot=wrist_rot, angles=angles, gap=float(gap))
+
+
+def _minimum_jerk(frame: np.ndarray, start: float, end: float) -> np.ndarray:
+    """0 until ``start``, 1 from ``end``, and between them the smoothest path of human reaching (Flash and Hogan 1985)."""
+    s = np.clip((frame - start) / (end - start), 0.0, 1.0)
+    return s**3 * (10 + s * (6 * s - 15))

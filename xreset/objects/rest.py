@@ -1,0 +1,50 @@
+"""How an object rests on a table."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xreset.spec import ObjectSpec
+
+
+def rest_height(obj: ObjectSpec, quat: np.ndarray) -> np.ndarray | float:
+    """Height of the mesh frame's origin at which the lowest vertex touches z = 0 [m].
+
+    Args:
+        obj: the object.
+        quat: [..., 4] orientations (w, x, y, z).
+
+    Returns:
+        [...] heights; a float for one orientation.
+    """
+    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=float), -1, 0)
+    norm = w * w + x * x + y * y + z * z
+    up = np.stack((2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z), axis=-1) / norm[..., None]  # R's last row
+    height = -(up @ obj.vertices.T).min(axis=-1)
+    return float(height) if np.ndim(height) == 0 else height
+
+
+def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
+    """[4] the stable pose on a plane that comes nearest to the mesh direction ``up`` [3] pointing up.
+
+    An object rests on a face of its convex hull if its centre of mass projects into that face. The heading is that of the least turn from the
+    mesh frame to the pose if ``up`` is z.
+    """
+    from scipy.spatial import ConvexHull
+    from scipy.spatial.transform import Rotation
+
+    convex = ConvexHull(obj.vertices)
+    corners, normals = obj.vertices[convex.simplices], convex.equations[:, :3]
+    distance = normals @ obj.com + convex.equations[:, 3]  # of the centre of mass, negative as it is inside
+    foot = obj.com - distance[:, None] * normals
+    turn = np.sign(np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), normals))
+    stable = np.ones(len(corners), dtype=bool)
+    for i in range(3):
+        edge, to_foot = corners[:, (i + 1) % 3] - corners[:, i], foot - corners[:, i]
+        stable &= turn * np.einsum("ij,ij->i", np.cross(edge, to_foot), normals) >= -1e-12
+    top = -normals[stable][np.argmin(normals[stable] @ up)]
+    axis = np.cross(top, (0.0, 0.0, 1.0))
+    sine = np.linalg.norm(axis)
+    if sine < 1e-12:  # no turn, or half a turn about any horizontal axis
+        return np.array([1.0, 0.0, 0.0, 0.0]) if top[2] > 0 else np.array([0.0, 1.0, 0.0, 0.0])
+    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, top[2])).as_quat(canonical=True, scalar_first=True)

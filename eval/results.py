@@ -12,8 +12,10 @@ from xreset.errors import FileFormatError
 from xreset.eval.rollout import Episode, Rollouts, Trace
 from xreset.eval.stats import bootstrap_ci95
 from xreset.files import Field, read_json, read_npz, write_json, write_npz
+from xreset.typed import from_dict
 
 SCHEMA = "xreset-eval/1"
+EPISODES_SCHEMA = "xreset-episodes/1"
 TRACE_SCHEMA = "xreset-trace/1"
 
 _TRACE_FIELDS = {
@@ -68,7 +70,7 @@ def summarize(
 def write_results(folder: Path, summary: dict[str, Any], rollouts: Rollouts, joint_names: tuple[str, ...]) -> Path:
     """Write ``BACKEND.json``, ``BACKEND.episodes.json`` and ``BACKEND.trace.npz``; returns the first."""
     name = summary["backend"]
-    write_json(folder / f"{name}.episodes.json", {"schema": "xreset-episodes/1", "episodes": [asdict(e) for e in rollouts.episodes]})
+    write_json(folder / f"{name}.episodes.json", {"schema": EPISODES_SCHEMA, "episodes": [asdict(e) for e in rollouts.episodes]})
     traces = rollouts.traces
     write_npz(
         folder / f"{name}.trace.npz",
@@ -91,8 +93,17 @@ def write_results(folder: Path, summary: dict[str, Any], rollouts: Rollouts, joi
 
 def read_results(folder: Path) -> list[dict[str, Any]]:
     """Every engine's summary in an ``eval`` folder, in order of name."""
-    files = sorted(f for f in folder.glob("*.json") if not f.name.endswith(".episodes.json"))
-    return [read_json(file, SCHEMA) for file in files]
+    files = [f for f in folder.glob("*.json") if not f.name.endswith(".episodes.json")]
+    return [read_json(file, SCHEMA) for file in sorted(files, key=lambda f: f.stem)]
+
+
+def read_episodes(folder: Path, backend: str) -> tuple[Episode, ...]:
+    """The episodes of one engine."""
+    path = folder / f"{backend}.episodes.json"
+    episodes = read_json(path, EPISODES_SCHEMA).get("episodes")
+    if not isinstance(episodes, list):
+        raise FileFormatError(f"{path} has no list 'episodes'. Evaluate again.")
+    return tuple(from_dict(Episode, episode, f"{path}: episodes[{i}]") for i, episode in enumerate(episodes))
 
 
 def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tuple[Trace, ...]:

@@ -1,4 +1,4 @@
-"""The result matrix: engines side by side."""
+"""The result matrix for a terminal: engines side by side."""
 
 from __future__ import annotations
 
@@ -8,51 +8,42 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.table import Table
 
-COLUMNS = (
-    "engine",
-    "version",
-    "task progress [95 %]",
-    "approach",
-    "grasp",
-    "reorient",
-    "reorientation progress",
-    "not finite",
-    "overflow",
-    "steps/s",
-)
-
 
 def rows(summaries: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
-    """One row of text per engine, in the order of :data:`COLUMNS`."""
-    out = []
-    for s in summaries:
-        progress, health = s["task_progress"], s["health"]
-        low, high = progress["ci95"]
-        out.append(
-            (
-                s["backend"],
-                s["backend_version"],
-                f"{progress['mean']:.1%} [{low:.1%}, {high:.1%}]",
-                f"{s['approach_rate']:.0%}",
-                f"{s['grasp_rate']:.0%}",
-                f"{s['reorient_rate']:.0%}",
-                f"{s['reorientation_progress']:.1%}",
-                str(health["nonfinite"]),
-                str(health["overflow"]),
-                f"{s['control_steps_per_second']:,.0f}",
-            )
-        )
-    return out
+    """One row of text per quantity: its name, then its value in each engine."""
+
+    def health(name: str) -> list[str]:
+        return [str(s["health"][name]) for s in summaries]
+
+    def rate(name: str) -> list[str]:
+        return [f"{s[name]:.0%}" for s in summaries]
+
+    intervals = [s["task_progress"]["ci95"] for s in summaries]
+    return [
+        ("version", *(s["backend_version"] for s in summaries)),
+        ("task progress", *(f"{s['task_progress']['mean']:.1%}" for s in summaries)),
+        ("  95 % interval", *(f"{100 * low:.0f}-{100 * high:.0f}%" for low, high in intervals)),
+        ("approach", *rate("approach_rate")),
+        ("grasp", *rate("grasp_rate")),
+        ("reorient", *rate("reorient_rate")),
+        ("reorientation progress", *(f"{s['reorientation_progress']:.1%}" for s in summaries)),
+        ("not finite", *health("nonfinite")),
+        ("overflow", *health("overflow")),
+        ("left the scene", *health("out_of_bounds")),
+        ("control steps/s", *(f"{s['control_steps_per_second']:,.0f}" for s in summaries)),
+    ]
 
 
 def rich_table(summaries: Sequence[dict[str, Any]]) -> Table:
-    """The matrix for a terminal."""
+    """The matrix: one column per engine; four of them fit into 80 characters."""
     from rich.table import Table
 
     first = summaries[0]
     count = f"{first['episodes']} episodes of {len(first['per_demo'])} demonstrations"
-    title = f"{first['policy']} on {first['robot']}: {count}, seed {first['seed']}"
-    table = Table(*COLUMNS, title=title)
+    table = Table(title=f"{first['policy']} on {first['robot']}: {count}, seed {first['seed']}", title_justify="left")
+    table.add_column("", no_wrap=True)
+    for s in summaries:
+        table.add_column(s["backend"], justify="right", no_wrap=True)
     for row in rows(summaries):
-        table.add_row(*row)
+        table.add_row(*row, style="bold" if row[0] == "task progress" else None)
     return table

@@ -1,0 +1,128 @@
+"""Short clips of one episode, the same in every engine, drawn without any engine."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xreset.errors import XResetError
+from xreset.eval.rollout import Episode, Trace
+
+if TYPE_CHECKING:
+    from xreset.render import Camera
+    from xreset.spec import ObjectSpec, RobotSpec
+
+SIZE = (400, 300)
+"""Width and height [pixels]; even, as video encoders ask."""
+FRAMES_PER_SECOND = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clip:
+    """One episode in one engine, as a film at the episode's own speed."""
+
+    engine: str
+    episode: Episode
+    """Its result."""
+    frames: np.ndarray
+    """[T, H, W, 3] uint8"""
+    fps: float
+    """Frames per second."""
+    finite: bool
+    """False where the state stopped being finite: the film stands still from there on."""
+
+
+def choose_sequence(episodes: dict[str, tuple[Episode, ...]], traces: dict[str, tuple[Trace, ...]]) -> int | None:
+    """The recorded demonstration that went best over all engines, None if no demonstration was recorded in every engine.
+
+    Best is the mean task progress of the recorded episodes, then their mean reorientation progress, then the lower index.
+    """
+    common = set.intersection(*({t.sequence for t in found} for found in traces.values())) if traces else set()
+
+    def quality(sequence: int) -> tuple[float, float, int]:
+        shown = [recorded_episode(episodes[engine], sequence) for engine in traces]
+        progress, reorientation = (float(np.mean([getattr(e, n) for e in shown])) for n in ("task_progress", "reorientation_progress"))
+        return progress, reorientation, -sequence
+
+    return max(common, key=quality, default=None)
+
+
+def recorded_episode(episodes: tuple[Episode, ...], sequence: int) -> Episode:
+    """The episode of a demonstration that its trace shows: the first repetition."""
+    return min((e for e in episodes if e.sequence == sequence), key=lambda e: e.repetition)
+
+
+def camera_for(traces: list[Trace]) -> Camera:
+    """A camera that shows the table between the object's start and its goal, and the hand above them."""
+    from xreset.render import Camera
+
+    start, goal = traces[0].object_pos[0].astype(float), traces[0].goal_pos.astype(float)
+    center = (start + goal) / 2 + (0.0, 0.0, 0.06)
+    default = Camera()
+    away = np.subtract(default.eye, default.target)
+    distance = np.clip(0.75 + 1.2 * np.linalg.norm(goal - start), 0.85, 1.3)
+    eye = center + away / np.linalg.norm(away) * distance
+    return Camera(eye=tuple(eye.tolist()), target=tuple(center.tolist()), fov=default.fov)
+
+
+def draw_clip(engine: str, episode: Episode, trace: Trace, robot: RobotSpec, obj: ObjectSpec, camera: Camera) -> Clip:
+    """Draw a trace with the goal as a translucent object.
+
+    Args:
+        engine: name of the engine.
+        episode: its result.
+        trace: states of the episode; what comes after a state that is not finite is drawn as the last finite one.
+        robot: the robot that the trace is of.
+        obj: the object that the trace is of.
+        camera: where from.
+    """
+    from xreset.render import Renderer, pose_matrix
+    from xreset.spec import SceneSpec
+
+    interval = float(trace.time[1] - trace.time[0]) if len(trace.time) > 1 else 1.0 / FRAMES_PER_SECOND
+    every = max(1, round(1.0 / (FRAMES_PER_SECOND * interval)))
+    rows = np.arange(0, len(trace.time), every)
+    sound = np.isfinite(np.concatenate((trace.joint_pos, trace.object_pos, trace.object_quat), axis=1)).all(axis=1)
+    last = len(sound) - 1 if sound.all() else max(int(np.argmin(sound)) - 1, 0)
+    renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=SIZE, camera=camera)
+    goal = pose_matrix(trace.goal_pos, trace.goal_quat)
+    pictures: dict[int, np.ndarray] = {}
+    for row in np.unique(np.minimum(rows, last)).tolist():
+        pose = pose_matrix(trace.object_pos[row], trace.object_quat[row])
+        pictures[row] = renderer.draw(trace.joint_pos[row], pose, goal_pose=goal)
+    frames = np.stack([pictures[row] for row in np.minimum(rows, last).tolist()])
+    return Clip(engine=engine, episode=episode, frames=frames, fps=1.0 / (every * interval), finite=bool(sound.all()))
+
+
+def encode_mp4(frames: np.ndarray, fps: float) -> bytes:
+    """H.264 in an mp4 file that every browser plays.
+
+    Args:
+        frames: [T, H, W, 3] uint8 with even H and W.
+        fps: frames per second.
+
+    Raises:
+        XResetError: the encoder is not installed or fails.
+    """
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise XResetError(f"imageio-ffmpeg cannot be imported ({error}). Install it with: pip install 'xreset[eval]'") from error
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "clip.mp4"
+        settings = ["-crf", "24", "-preset", "veryfast", "-movflags", "+faststart", "-threads", "1", "-bitexact"]
+        writer = imageio_ffmpeg.write_frames(
+            str(path), frames.shape[2:0:-1], fps=fps, codec="libx264", macro_block_size=2, quality=None, output_params=settings
+        )
+        try:
+            writer.send(None)
+            for frame in frames:
+                writer.send(np.ascontiguousarray(frame))
+            writer.close()
+            return path.read_bytes()
+        except (OSError, RuntimeError) as error:
+            raise XResetError(f"the clips cannot be encoded: {error}") from error

@@ -1,0 +1,135 @@
+"""What a report is made of, read from a run folder or from a folder of results."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from xreset.errors import RunError
+from xreset.eval.results import read_episodes, read_results
+from xreset.eval.rollout import Episode
+from xreset.files import read_json
+from xreset.learning.run import SCHEMA as RUN_SCHEMA
+from xreset.learning.run import RunInfo, read_run
+
+CURVES = {
+    "episode/return": "episode return",
+    "task/grasped": "worlds with a grasp",
+    "task/success": "worlds at the goal",
+}
+"""TensorBoard tag -> what it shows."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """A scalar over the iterations of a training."""
+
+    label: str
+    iteration: np.ndarray
+    """[T] rising"""
+    value: np.ndarray
+    """[T]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportData:
+    """Results of one policy in several engines, and how it was trained."""
+
+    name: str
+    """Name of the run or folder."""
+    results: Path
+    """Folder of the results."""
+    summaries: tuple[dict[str, Any], ...]
+    """``BACKEND.json`` of every engine, in order of name."""
+    episodes: dict[str, tuple[Episode, ...]]
+    """Engine -> its episodes."""
+    run: RunInfo | None
+    """The training; None for baselines."""
+    trained_with: str | None
+    """Version of xreset that the policy was trained with."""
+    curves: tuple[Curve, ...]
+    notes: tuple[str, ...]
+    """What the reader must know before comparing engines, or what is missing."""
+
+    @property
+    def engines(self) -> tuple[str, ...]:
+        """Names of the engines."""
+        return tuple(s["backend"] for s in self.summaries)
+
+
+def collect(folder: Path) -> ReportData:
+    """Read everything.
+
+    Args:
+        folder: a run folder, or a folder that holds ``BACKEND.json`` files, itself or in ``eval/``.
+
+    Raises:
+        RunError: the folder does not exist or holds no results.
+        FileFormatError: a file is damaged or of another version.
+    """
+    if not folder.is_dir():
+        raise RunError(f"there is no folder {folder}. Give a run folder, or a folder that xreset eval wrote results into.")
+    is_run = (folder / "run.json").is_file()
+    results = folder / "eval" if (folder / "eval").is_dir() or is_run else folder
+    summaries = tuple(read_results(results))
+    if not summaries:
+        policy = str(folder) if is_run else "POLICY"
+        raise RunError(
+            f"{results} holds no evaluation results. Make them first: xreset eval {policy} --backend mujoco --demos DEMOS"
+            + ("" if is_run else f" --out {results}")
+        )
+    curves, note = read_curves(folder)
+    return ReportData(
+        name=(folder.resolve().parent if folder.resolve().name == "eval" else folder.resolve()).name,
+        results=results,
+        summaries=summaries,
+        episodes={s["backend"]: read_episodes(results, s["backend"]) for s in summaries},
+        run=read_run(folder) if is_run else None,
+        trained_with=str(read_json(folder / "run.json", RUN_SCHEMA).get("xreset")) if is_run else None,
+        curves=curves,
+        notes=(*differences(summaries), *([note] if note else [])),
+    )
+
+
+def differences(summaries: tuple[dict[str, Any], ...]) -> list[str]:
+    """What makes engines' results incomparable: sentences, none if all were evaluated alike."""
+    notes = []
+    for what, get in (
+        ("policy", lambda s: s["policy"]),
+        ("robot", lambda s: s["robot"]),
+        ("policy file", lambda s: s["inputs"].get("policy", "")[:12]),
+        ("demonstrations", lambda s: s["inputs"].get("demos", "")[:12]),
+        ("object meshes", lambda s: s["objects_folder"] or "stand-ins"),
+        ("number of episodes", lambda s: s["episodes"]),
+        ("seed", lambda s: s["seed"]),
+    ):
+        values = {s["backend"]: get(s) for s in summaries}
+        if len(set(values.values())) > 1:
+            listing = ", ".join(f"{engine}: {value}" for engine, value in values.items())
+            notes.append(f"These results are not comparable: the {what} differs ({listing}). Evaluate all engines in one command.")
+    return notes
+
+
+def read_curves(folder: Path) -> tuple[tuple[Curve, ...], str | None]:
+    """Learning curves from TensorBoard's event files in a folder, and a note if they are there but cannot be read."""
+    if not any(folder.glob("events.out.tfevents.*")):
+        return (), None
+    try:
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    except ImportError as error:
+        return (), f"Learning curves need TensorBoard, which cannot be imported ({error}). Install it with: pip install 'xreset[train]'"
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+    known = set(events.Tags()["scalars"])
+    curves = []
+    for tag, label in CURVES.items():
+        if tag in known:
+            latest = {
+                e.step: e.value for e in events.Scalars(tag)
+            }  # a resumed run repeats the steps after its checkpoint: the later ones count
+            steps = sorted(latest)
+            curves.append(Curve(label=label, iteration=np.array(steps), value=np.array([latest[step] for step in steps])))
+    return tuple(curves), None

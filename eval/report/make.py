@@ -1,0 +1,91 @@
+"""From a run folder to the page and the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from xreset.errors import XResetError
+from xreset.eval.report.clips import Clip, camera_for, choose_sequence, draw_clip, recorded_episode
+from xreset.eval.report.data import ReportData, collect
+from xreset.eval.report.page import headline, page
+from xreset.eval.report.plots import short_name, write_overview
+from xreset.eval.results import read_traces
+from xreset.files import atomic_write
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What was made."""
+
+    html: Path
+    overview: Path
+    summaries: tuple[dict[str, Any], ...]
+    """``BACKEND.json`` of every engine."""
+    headline: str
+    """The result in one or two sentences."""
+    notes: tuple[str, ...]
+    """What is missing or not comparable."""
+
+
+def make_report(
+    folder: Path,
+    out: Path | None = None,
+    *,
+    robot: str | None = None,
+    objects: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Report:
+    """Write ``index.html`` and ``overview.png``.
+
+    Args:
+        folder: a run folder, or a folder of results.
+        out: where to; default: ``report`` in the folder.
+        robot: name or folder of the robot, for the clips; default: as the run and the results name it.
+        objects: folder of meshes, for the clips; default: as the results name it.
+        progress: called with (clips drawn, clips in all).
+
+    Raises:
+        RunError: there are no results.
+        FileFormatError: a file of the results is damaged.
+        XResetError: the page cannot be written, or a package for plots is missing.
+    """
+    out = folder / "report" if out is None else out
+    data = collect(folder)
+    try:
+        clips = _draw_clips(data, robot, objects, progress)
+    except XResetError as error:  # numbers are worth a page without films; the page says why
+        clips, data = [], replace(data, notes=(*data.notes, f"There are no clips: {error}"))
+    html, overview = out / "index.html", out / "overview.png"
+    content = page(data, clips)
+    first = data.summaries[0]
+    shown = clips[0].episode if clips else None
+    caption = f"{short_name(shown.object)}: last frame of the same episode in each engine" if shown else ""
+    write_overview(overview, f"{first['policy']} on {first['robot']}", data.summaries, clips, caption)
+    with atomic_write(html) as file:
+        file.write(content.encode())
+    return Report(html=html, overview=overview, summaries=data.summaries, headline=headline(data), notes=data.notes)
+
+
+def _draw_clips(data: ReportData, robot: str | None, objects: Path | None, progress: Callable[[int, int], None]) -> list[Clip]:
+    from xreset import robots
+    from xreset.objects import load_object
+
+    first = data.summaries[0]
+    spec = robots.load(robot or (data.run.robot if data.run is not None else first["robot"]))
+    recorded = {engine: read_traces(data.results, engine, spec.joint_names) for engine in data.engines}
+    sequence = choose_sequence(data.episodes, recorded)
+    if sequence is None:
+        raise XResetError("no demonstration was recorded in every engine. Evaluate all engines in one command.")
+    traces = {engine: next(t for t in found if t.sequence == sequence) for engine, found in recorded.items()}
+    meshes = objects or (Path(first["objects_folder"]) if first["objects_folder"] else None)
+    obj = load_object(next(iter(traces.values())).object, meshes)
+    camera = camera_for(list(traces.values()))
+    clips = []
+    for number, (engine, trace) in enumerate(traces.items()):
+        progress(number, len(traces))
+        clips.append(draw_clip(engine, recorded_episode(data.episodes[engine], sequence), trace, spec, obj, camera))
+    progress(len(traces), len(traces))
+    return clips

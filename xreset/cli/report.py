@@ -1,0 +1,41 @@
+"""``xreset report``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def report(
+    run: Annotated[Path, tyro.conf.Positional], *, out: Path | None = None, robot: str | None = None, objects: Path | None = None
+) -> None:
+    """Make a self-contained HTML page of a run's evaluations, and one picture.
+
+    Args:
+        run: Run folder, or a folder of results (of a baseline, for example).
+        out: Folder for index.html and overview.png; default: report/ in the run folder.
+        robot: Name or folder of the robot, for the clips; default: as the results name it.
+        objects: Folder of real meshes, for the clips; default: as the results name it.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from xreset.eval.report import make_report
+    from xreset.eval.table import rich_table
+
+    console = Console()
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("drawing clips", total=None)
+        made = make_report(
+            run, out, robot=robot, objects=objects, progress=lambda done, total: bar.update(task, completed=done, total=total)
+        )
+    console.print(rich_table(made.summaries))
+    console.print(made.headline)
+    for note in made.notes:
+        console.print(f"note: {note}", style="yellow", markup=False)
+    console.print(f"page:    {made.html}\npicture: {made.overview}", markup=False, soft_wrap=True)
+
+
+COMMAND = report

@@ -368,16 +368,17 @@ class _Shadow:
         self.span = float((flat.max(axis=0) - self.low)[:2].max()) + 1e-6
         self.depth = float(flat[:, 2].max() - self.low[2]) + 1e-6
         self.scale = (_SHADOW_SIZE - 2) / self.span
-        _, self.map = _rasterize(
+        face, height = _rasterize(
             (local[..., :2] - self.low[:2]) * self.scale + 1, (local[..., 2] - self.low[2]) / self.depth, (_SHADOW_SIZE, _SHADOW_SIZE)
         )
+        self.map = np.where(face < 0, -math.inf, height)
 
     def lit(self, points: np.ndarray) -> np.ndarray:
         """[...] share of light, 0..1, at world points [..., 3]: the mean of four neighbouring texels."""
         local = (points - (self.low @ self.R).astype(points.dtype)) @ self.R.T.astype(points.dtype)
         height = (local[..., 2] + _SHADOW_BIAS) / self.depth
         total = np.zeros(points.shape[:-1], dtype=points.dtype)
-        for dx, dy in ((0.25, 0.25), (0.25, 1.75), (1.75, 0.25), (1.75, 1.75)):
+        for dx, dy in ((0.5, 0.5), (0.5, 1.5), (1.5, 0.5), (1.5, 1.5)):
             x = (local[..., 0] * self.scale + dx).astype(np.int32).clip(0, _SHADOW_SIZE - 1)
             y = (local[..., 1] * self.scale + dy).astype(np.int32).clip(0, _SHADOW_SIZE - 1)
             total += height >= self.map[y, x]

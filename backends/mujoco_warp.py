@@ -96,7 +96,7 @@ class MujocoWarpBackend(Backend):
         at = max(scenes.values(), key=lambda s: s.model.nC)  # the mass matrix with the fullest structure has room for every object's
         at.model.opt.iterations = solver_iterations
         self._at = at
-        with wp.ScopedDevice(self._warp_device):
+        with self._on_stream():
             differing = _differing_fields([s.model for s in scenes.values()])
             self._model = mjw.put_model(at.model, batch_sizes=dict.fromkeys((*_SET_PER_WORLD, *differing), num_worlds))
             self._model.opt.warn_overflow = 0  # overflows are counted, see health(); printing them from the GPU would flood the terminal
@@ -304,12 +304,14 @@ class MujocoWarpBackend(Backend):
         self._graphs: dict[str, Any] | None = {}
         for sequence in self._sequences.values():
             sequence()
-        if self._warp_device.is_cuda:
-            for name, sequence in self._sequences.items():
-                with wp.ScopedCapture(device=self._warp_device) as capture:
-                    sequence()
-                self._graphs[name] = capture.graph
         wp.synchronize_device(self._warp_device)
+        if self._warp_device.is_cuda:
+            with wp.ScopedStream(wp.Stream(self._warp_device)):  # torch's default stream cannot be captured
+                for name, sequence in self._sequences.items():
+                    with wp.ScopedCapture() as capture:
+                        sequence()
+                    self._graphs[name] = capture.graph
+            wp.synchronize_device(self._warp_device)
 
     def _set_initial_state(self) -> None:
         states = [initial_state(self.scene, i) for i in range(len(self.scene.objects))]

@@ -47,13 +47,15 @@ def conformance(
     spec = None if robot is None else robots.load(robot)
     records = []
     for name in dict.fromkeys(backend) or _usable(console):
-        console.print(f"[bold]{name}[/] on {device}: status, check, and what came nearest to its tolerance")
-        results = run(_maker(name, device), robot=spec, only=check or None, report=lambda r: _print(console, r, verbose))
+        status = backend_status(name)
+        used = device if device.split(":")[0] in status.device else "cpu"
+        console.print(f"[bold]{name}[/] on {used}: status, check, and what came nearest to its tolerance")
+        results = run(_maker(name, used), robot=spec, only=check or None, report=lambda r: _print(console, r, verbose))
         records.append(
             {
                 "backend": name,
-                "backend_version": backend_status(name).version,
-                "device": device,
+                "backend_version": status.version,
+                "device": used,
                 "checks": [result.as_dict() for result in results],
             }
         )

@@ -11,12 +11,13 @@ import numpy as np
 import torch
 
 from tests.toy_bank import SOUP, SPAM
+from tests.toy_results import toy_rollouts, toy_summary
 from xreset.backends.base import Contacts, Health, Links, State
 from xreset.env import Reading
 from xreset.errors import FileFormatError
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig, keypoint_distance
-from xreset.eval.results import read_results, read_traces, summarize, write_results
-from xreset.eval.rollout import Episode, Rollouts, Trace
+from xreset.eval.results import read_results, read_traces, write_results
+from xreset.eval.rollout import Episode
 from xreset.eval.stats import bootstrap_ci95
 from xreset.rotations import quat_from_axis_angle
 
@@ -195,38 +196,6 @@ class BootstrapTest(unittest.TestCase):
         self.assertTrue(0 <= alone[0] < 0.5 < alone[1] <= 1)
 
 
-def make_rollouts() -> Rollouts:
-    def made(sequence: int, repetition: int, **changes) -> Episode:
-        nothing = dict.fromkeys(("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow"), False)
-        base = nothing | {"reorientation_progress": 0.0, "task_progress": 0.0}
-        return Episode(
-            sequence=sequence, sequence_name=f"demo_{sequence}", object=(SOUP, SPAM)[sequence], repetition=repetition, **(base | changes)
-        )
-
-    def trace(sequence: int) -> Trace:
-        t, rng = 5, np.random.default_rng(sequence)
-        quat = np.tile([1.0, 0, 0, 0], (t, 1))
-        return Trace(
-            sequence=sequence, object=(SOUP, SPAM)[sequence], goal_pos=rng.random(3), goal_quat=quat[0], time=np.arange(t) * 0.05,
-            joint_pos=rng.random((t, 3)), object_pos=rng.random((t, 3)), object_quat=quat,
-        )  # fmt: skip
-
-    episodes = (
-        made(0, 0, approach=True, grasp=True, reorient=True, reorient_once=True, reorientation_progress=0.9, task_progress=1.0),
-        made(0, 1, approach=True, reorientation_progress=0.1, task_progress=0.33, overflow=True),
-        made(1, 0, approach=True, grasp=True, reorientation_progress=0.5, task_progress=0.66, out_of_bounds=True),
-        made(1, 1, nonfinite=True),
-    )
-    return Rollouts(episodes=episodes, traces=(trace(0), trace(1)), control_steps_per_second=1234.56)
-
-
-def make_summary(backend: str = "mujoco", rollouts: Rollouts | None = None) -> dict:
-    return summarize(
-        rollouts or make_rollouts(), backend=backend, backend_version="4.0.0", robot="toy", policy="zero", seed=3, repetitions=2,
-        inputs={"demos": "ab"}, objects_folder=None,
-    )  # fmt: skip
-
-
 class ResultsTest(unittest.TestCase):
     JOINTS = ("a", "b", "c")
 
@@ -236,7 +205,7 @@ class ResultsTest(unittest.TestCase):
         self.folder = Path(folder.name)
 
     def test_summary(self):
-        s = make_summary()
+        s = toy_summary()
         self.assertEqual(s["schema"], "xreset-eval/1")
         self.assertEqual((s["backend"], s["robot"], s["policy"], s["seed"], s["episodes"]), ("mujoco", "toy", "zero", 3, 4))
         self.assertEqual(s["objects"], [SOUP, SPAM])
@@ -252,11 +221,11 @@ class ResultsTest(unittest.TestCase):
         self.assertEqual((s["per_demo"][1]["grasp_rate"], s["per_demo"][1]["object"], s["per_demo"][1]["episodes"]), (0.5, SPAM, 2))
 
     def test_files(self):
-        rollouts = make_rollouts()
+        rollouts = toy_rollouts()
         for name in ("sapien", "mujoco"):
-            write_results(self.folder, make_summary(name, rollouts), rollouts, self.JOINTS)
+            write_results(self.folder, toy_summary(name, rollouts), rollouts, self.JOINTS)
         self.assertEqual([s["backend"] for s in read_results(self.folder)], ["mujoco", "sapien"])
-        self.assertEqual(read_results(self.folder)[0], make_summary("mujoco"))
+        self.assertEqual(read_results(self.folder)[0], toy_summary("mujoco"))
         traces = read_traces(self.folder, "mujoco", self.JOINTS)
         for found, made in zip(traces, rollouts.traces, strict=True):
             for name, value in vars(made).items():
@@ -267,14 +236,14 @@ class ResultsTest(unittest.TestCase):
     def test_writing_twice_gives_the_same_bytes(self):
         contents = []
         for name in ("one", "two"):
-            write_results(self.folder / name, make_summary(), make_rollouts(), self.JOINTS)
+            write_results(self.folder / name, toy_summary(), toy_rollouts(), self.JOINTS)
             contents.append([f.read_bytes() for f in sorted((self.folder / name).iterdir())])
         self.assertEqual(len(contents[0]), 3)
         self.assertEqual(contents[0], contents[1])
 
     def test_refusals(self):
-        rollouts = make_rollouts()
-        write_results(self.folder, make_summary(), rollouts, self.JOINTS)
+        rollouts = toy_rollouts()
+        write_results(self.folder, toy_summary(), rollouts, self.JOINTS)
         with self.assertRaisesRegex(FileFormatError, "joints a, b, c.*robot has a, c, b"):
             read_traces(self.folder, "mujoco", ("a", "c", "b"))
         trace = self.folder / "mujoco.trace.npz"
@@ -286,11 +255,11 @@ class ResultsTest(unittest.TestCase):
             read_results(self.folder)
 
     def test_a_result_that_is_not_a_number_is_not_written(self):
-        rollouts = make_rollouts()
+        rollouts = toy_rollouts()
         bad = replace(rollouts.episodes[0], reorientation_progress=math.nan)
         with self.assertRaises(ValueError):
             write_results(
-                self.folder, make_summary(rollouts=replace(rollouts, episodes=(bad,))), replace(rollouts, episodes=(bad,)), self.JOINTS
+                self.folder, toy_summary(rollouts=replace(rollouts, episodes=(bad,))), replace(rollouts, episodes=(bad,)), self.JOINTS
             )
         self.assertEqual(list(self.folder.iterdir()), [])
 

@@ -1,0 +1,367 @@
+"""The report: what it reads, which episode it shows, and a page that needs nothing else."""
+
+import io
+import re
+import tempfile
+import unittest
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+
+from tests.toy_bank import SOUP, SPAM
+from tests.toy_results import toy_rollouts, toy_summary
+from tests.toy_robot import toy_hand_arm
+from xreset import robots
+from xreset.cli import main
+from xreset.errors import FileFormatError, RunError
+from xreset.eval.report import make_report, plots
+from xreset.eval.report.clips import Clip, camera_for, choose_sequence, draw_clip, encode_mp4, recorded_episode
+from xreset.eval.report.data import Curve, collect, differences, read_curves
+from xreset.eval.report.page import headline, page
+from xreset.eval.results import write_results
+from xreset.eval.table import rich_table
+from xreset.learning.config import TrainConfig
+from xreset.learning.run import RunInfo, write_run
+from xreset.objects import load_object
+
+ENGINES = ("mujoco", "mujoco-warp", "pybullet", "sapien")
+VOID = {"meta", "br", "link", "img", "input", "hr"}
+
+
+class InFolder(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name) / "soup"
+
+    def write(self, engines=ENGINES, folder: str = "eval", rollouts=None, joints=("a", "b", "c"), **changes):
+        rollouts = rollouts or toy_rollouts()
+        for engine in engines:
+            write_results(self.folder / folder, toy_summary(engine, rollouts, **changes), rollouts, joints)
+
+    def write_run(self, **changes):
+        info = {
+            "robot": "openarm", "resets": "resets.npz", "resets_hash": "ef", "objects": None, "backend": "mujoco-warp",
+            "backend_version": "4.0.0", "device": "cuda", "num_envs": 4096, "seed": 7,
+            "config": TrainConfig(iterations=500), "contract": {},
+        }  # fmt: skip
+        write_run(self.folder, RunInfo(**(info | changes)))
+
+
+class Outline(HTMLParser):
+    """What a test wants to know of a page."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-3:]}"
+        self.open.pop()
+
+    def handle_data(self, data):
+        if not self.open or self.open[-1] not in ("style", "script"):
+            self.text += data
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+class CollectTest(InFolder):
+    def test_a_run_a_baseline_and_a_bare_folder(self):
+        self.write()
+        self.assertIsNone(collect(self.folder).run)
+        self.assertEqual(collect(self.folder / "eval").engines, ENGINES)
+        self.assertEqual(collect(self.folder / "eval").name, "soup")
+        self.write_run()
+        data = collect(self.folder)
+        self.assertEqual((data.name, data.run.num_envs, data.engines, data.notes), ("soup", 4096, ENGINES, ()))
+        self.assertEqual(data.episodes["sapien"], toy_rollouts().episodes)
+
+    def test_nothing_to_report(self):
+        with self.assertRaisesRegex(RunError, "there is no folder"):
+            collect(self.folder)
+        self.folder.mkdir()
+        with self.assertRaisesRegex(RunError, "(?s)no evaluation results.*xreset eval POLICY.*--out"):
+            collect(self.folder)
+        self.write_run()
+        with self.assertRaisesRegex(RunError, f"(?s)no evaluation results.*xreset eval {self.folder} --backend"):
+            collect(self.folder)
+
+    def test_damaged_results(self):
+        self.write()
+        file = self.folder / "eval" / "sapien.episodes.json"
+        file.write_text(file.read_text()[:100])
+        with self.assertRaisesRegex(FileFormatError, "sapien.episodes.json is not valid JSON"):
+            collect(self.folder)
+
+    def test_engines_that_were_not_evaluated_alike_are_pointed_out(self):
+        alike = (toy_summary("mujoco"), toy_summary("sapien"))
+        self.assertEqual(differences(alike), [])
+        for what, change in (("seed", {"seed": 4}), ("policy", {"policy": "ik"}), ("demonstrations", {"inputs": {"demos": "cd"}})):
+            notes = differences((toy_summary("mujoco"), toy_summary("sapien", **change)))
+            self.assertEqual(len(notes), 1)
+            self.assertRegex(notes[0], f"not comparable: the {what} differs .mujoco: .*sapien: ")
+
+    def test_learning_curves(self):
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.assertEqual(read_curves(self.folder), ((), None))
+        for values in ({1: 0.1, 2: 0.2, 3: 0.9}, {3: 0.3, 4: 0.4}):  # the second continues after iteration 2
+            writer = SummaryWriter(log_dir=str(self.folder))
+            for step, value in values.items():
+                writer.add_scalar("task/grasped", value, step)
+                writer.add_scalar("loss/other", value, step)
+            writer.close()
+        (curve,), note = read_curves(self.folder)
+        self.assertIsNone(note)
+        self.assertEqual((curve.label, curve.iteration.tolist()), ("worlds with a grasp", [1, 2, 3, 4]))
+        np.testing.assert_allclose(curve.value, [0.1, 0.2, 0.3, 0.4], rtol=1e-6)
+
+
+class ClipTest(InFolder):
+    ROLLOUTS = toy_rollouts()
+
+    def test_the_episode_that_went_best_over_all_engines_is_shown(self):
+        traces = dict.fromkeys(ENGINES, self.ROLLOUTS.traces)
+        episodes = dict.fromkeys(ENGINES, self.ROLLOUTS.episodes)
+        self.assertEqual(choose_sequence(episodes, traces), 0)
+        worse = tuple(replace(e, task_progress=0.0) if e.sequence == 0 else e for e in self.ROLLOUTS.episodes)
+        self.assertEqual(choose_sequence(episodes | {"sapien": worse, "pybullet": worse}, traces), 1)
+        self.assertEqual(choose_sequence(episodes, traces | {"sapien": self.ROLLOUTS.traces[1:]}), 1, "recorded in every engine")
+        self.assertIsNone(choose_sequence(episodes, {"mujoco": self.ROLLOUTS.traces[:1], "sapien": self.ROLLOUTS.traces[1:]}))
+        self.assertIsNone(choose_sequence({}, {}))
+
+    def test_the_recorded_episode_is_the_first_repetition(self):
+        self.assertEqual(recorded_episode(self.ROLLOUTS.episodes[::-1], 1), self.ROLLOUTS.episodes[2])
+
+    def draw(self, **changes) -> Clip:
+        self.folder.mkdir(exist_ok=True)
+        robot = toy_hand_arm(self.folder)
+        trace = toy_rollouts(robot.home).traces[0]
+        trace = replace(trace, **{k: np.array(change(getattr(trace, k).copy())) for k, change in changes.items()})
+        return draw_clip("mujoco", self.ROLLOUTS.episodes[0], trace, robot, load_object(SOUP), camera_for([trace]))
+
+    def test_a_clip_shows_the_object_on_its_way_at_the_right_speed(self):
+        clip = self.draw()
+        self.assertEqual(clip.frames.shape, (3, 300, 400, 3))  # 5 states of 0.05 s, every second one
+        self.assertAlmostEqual(clip.fps, 10.0)
+        self.assertTrue(clip.finite)
+        orange = [np.argwhere((f[..., 0] > 180) & (f[..., 2] < 100)).mean(axis=0)[0] for f in clip.frames[:2].astype(int)]
+        self.assertLess(orange[1], orange[0] - 3, "the object rises in the picture")
+
+    def test_a_clip_stands_still_once_a_state_is_not_finite(self):
+        def broken(pos: np.ndarray) -> np.ndarray:
+            pos[3:] = np.nan
+            return pos
+
+        clip = self.draw(object_pos=broken)
+        self.assertFalse(clip.finite)
+        self.assertEqual(len(clip.frames), 3)
+        whole = self.draw()
+        np.testing.assert_array_equal(clip.frames[:2], whole.frames[:2])
+        self.assertFalse(np.array_equal(clip.frames[2], whole.frames[2]))
+
+    def test_the_film_holds_every_frame(self):
+        import imageio_ffmpeg
+
+        colors = np.array([[200, 40, 40], [40, 200, 40], [40, 40, 200], [220, 220, 40]], dtype=np.uint8)
+        frames = np.broadcast_to(colors[:, None, None], (4, 48, 64, 3))
+        file = self.folder.with_suffix(".mp4")
+        file.write_bytes(encode_mp4(frames, 10.0))
+        reader = imageio_ffmpeg.read_frames(str(file))
+        meta = next(reader)
+        self.assertEqual((meta["size"], meta["fps"], meta["codec"]), ((64, 48), 10.0, "h264"))
+        self.assertIn("yuv420p", meta["pix_fmt"])  # what browsers play
+        found = np.stack([np.frombuffer(frame, np.uint8).reshape(48, 64, 3).mean(axis=(0, 1)) for frame in reader])
+        np.testing.assert_allclose(found, colors, atol=12)
+
+
+class PlotTest(unittest.TestCase):
+    def test_progress_by_object_weighs_demonstrations_by_their_episodes(self):
+        rows = [
+            {"object": SOUP, "task_progress": 1.0, "episodes": 3},
+            {"object": SOUP, "task_progress": 0.0, "episodes": 1},
+            {"object": SPAM, "task_progress": 0.5, "episodes": 2},
+        ]
+        self.assertEqual(plots.object_progress({"per_demo": rows}), {SOUP: 0.75, SPAM: 0.5})
+
+    def test_bars_are_as_long_as_the_results(self):
+        from matplotlib.figure import Figure
+
+        low, high = (toy_summary(name) | {"task_progress": {"mean": m, "ci95": [m - 0.1, m + 0.1]}} for name, m in (("a", 0.2), ("b", 0.7)))
+        axes = Figure().subplots()
+        plots.draw_progress(axes, [low, high])
+        np.testing.assert_allclose([bar.get_width() for bar in axes.patches], [20.0, 70.0])
+        self.assertEqual([label.get_text() for label in axes.get_yticklabels()], ["a", "b"])
+        axes = Figure().subplots()
+        plots.draw_stages(axes, [low])
+        np.testing.assert_allclose([bar.get_height() for bar in axes.patches], [75.0, 50.0, 25.0])
+
+    def test_drawings_take_the_pages_colour_and_size(self):
+        drawing = plots.figure_progress([toy_summary()], "salt")
+        self.assertTrue(drawing.startswith("<svg") and drawing.endswith("</svg>"))
+        opening = drawing[: drawing.index(">")]
+        self.assertIn("viewBox", opening)
+        self.assertNotRegex(opening, r"\b(width|height)=")
+        self.assertIn("currentColor", drawing)
+        self.assertNotIn("#010203", drawing)
+        self.assertEqual(drawing, plots.figure_progress([toy_summary()], "salt"))
+
+    def test_more_engines_than_colours(self):
+        many = [toy_summary(f"engine-{i}") for i in range(10)]
+        self.assertIn("engine-9", plots.figure_stages(many, "s"))
+
+
+class PageTest(InFolder):
+    @classmethod
+    def setUpClass(cls):
+        frames = np.zeros((2, 48, 64, 3), dtype=np.uint8)
+        episode = toy_rollouts().episodes[0]
+        cls.clips = [Clip(engine=name, episode=episode, frames=frames, fps=10.0, finite=name != "sapien") for name in ENGINES]
+
+    def data(self, **changes):
+        self.write()
+        self.write_run()
+        curves = (Curve(label="episode return", iteration=np.array([1, 50]), value=np.array([0.5, 2.0])),)
+        return replace(collect(self.folder), curves=curves, **changes)
+
+    def test_needs_nothing_from_outside(self):
+        text = page(self.data(), self.clips)
+        outline = Outline(text)
+        for tag, attributes in outline.tags:
+            for name in ("src", "href", "xlink:href", "poster", "srcset", "action", "data"):
+                value = attributes.get(name)
+                if value is not None:
+                    self.assertRegex(value, "^(data:|#)", f"<{tag} {name}>")
+        styles = "".join(a.get("style") or "" for _, a in outline.tags) + text[text.index("<style>") : text.index("</style>")]
+        self.assertNotIn("@import", styles)
+        for target in re.findall(r"url\(([^)]*)\)", styles):
+            self.assertTrue(target.startswith("#"), target)
+        policy = next(a["content"] for a in outline.of("meta") if a.get("http-equiv") == "Content-Security-Policy")
+        self.assertIn("default-src 'none'", policy)
+
+    def test_is_well_formed_and_its_identifiers_are_unique(self):
+        outline = Outline(page(self.data(), self.clips))
+        self.assertEqual(outline.open, [])
+        names = [a["id"] for _, a in outline.tags if "id" in a]
+        self.assertEqual(len(names), len(set(names)))
+        targets = {a["xlink:href"][1:] for _, a in outline.tags if "xlink:href" in a}
+        self.assertLessEqual(targets, set(names))
+
+    def test_says_in_words_what_it_shows(self):
+        outline = Outline(page(self.data(), self.clips))
+        self.assertEqual(len(outline.of("video")), 4)
+        for tag in ("video", "svg"):
+            for attributes in outline.of(tag):
+                self.assertGreater(len(attributes.get("aria-label") or ""), 20, tag)
+        self.assertIn("object at its goal", outline.of("video")[0]["aria-label"])
+        self.assertIn("stopped being finite", outline.of("video")[3]["aria-label"])
+        charts = " ".join(a["aria-label"] for a in outline.of("svg"))
+        self.assertIn("mujoco-warp approach 75%, grasp 50%, reorient 25%", charts)
+        self.assertEqual(outline.of("html")[0]["lang"], "en")
+        self.assertEqual(len(outline.of("caption")), 2)
+
+    def test_states_the_results_and_their_origin(self):
+        text = Outline(page(self.data(), self.clips)).text
+        for expected in (
+            "zero on toy", "mujoco-warp 4.0.0 on cuda, 4,096 worlds", "50 of 500 iterations, seed 7", "49.8%", "33.0 to 66.5%", "37.5%",
+            "tomato soup can", "demo_1", "4 in each engine: 2 demonstrations, 2 starts each", "trained here",
+        ):  # fmt: skip
+            self.assertIn(expected, text)
+
+    def test_faults_of_an_engine_stand_out(self):
+        self.assertEqual(page(self.data(), []).count('<td class="bad">1</td>'), 2 * 4)
+
+    def test_without_clips_curves_and_run(self):
+        self.write(engines=("pybullet",))
+        outline = Outline(page(collect(self.folder), []))
+        self.assertEqual((len(outline.of("video")), outline.open), (0, []))
+        self.assertNotIn("Training", outline.text)
+
+    def test_names_cannot_inject_anything(self):
+        hostile = '<script>alert("x")</script>'
+        text = page(self.data(name=hostile, notes=(hostile,)), self.clips)
+        self.assertNotIn("<script>alert", text)
+        self.write(policy=hostile)
+        text = page(collect(self.folder), [])
+        self.assertNotIn("<script>alert", text)
+        self.assertIn(hostile, Outline(text).text)
+
+    def test_the_headline_names_best_and_worst(self):
+        data = self.data()
+        made = [s | {"task_progress": {"mean": m, "ci95": [m, m]}} for s, m in zip(data.summaries, (0.4, 0.9, 0.1, 0.5), strict=True)]
+        text = headline(replace(data, summaries=tuple(made)))
+        self.assertIn("90% in mujoco-warp and 10% in pybullet, the best and the worst of 4 engines", text)
+        self.assertIn("trained in mujoco-warp", text)
+        self.assertIn("25%", text)
+        self.assertNotIn("worst", headline(replace(data, summaries=tuple(made[:1]))))
+
+    def test_the_same_results_give_the_same_page(self):
+        self.assertEqual(page(self.data(), self.clips), page(self.data(), self.clips))
+
+
+class CommandTest(InFolder):
+    def run_command(self, *arguments: str) -> tuple[int, str]:
+        out = io.StringIO()
+        with redirect_stdout(out), redirect_stderr(out):
+            try:
+                main(["report", *arguments])
+            except SystemExit as end:
+                return int(end.code or 0), out.getvalue()
+        return 0, out.getvalue()
+
+    def test_from_results_to_page_and_picture(self):
+        robot = robots.load("openarm")
+        self.write(("mujoco", "sapien"), rollouts=toy_rollouts(robot.home), joints=robot.joint_names, robot="openarm")
+        code, printed = self.run_command(str(self.folder))
+        self.assertEqual(code, 0, printed)
+        for word in ("mujoco", "sapien", "49.8%", "index.html", "overview.png"):
+            self.assertIn(word, printed)
+        self.assertNotIn("note:", printed)
+        html = (self.folder / "report" / "index.html").read_text()
+        self.assertEqual(html.count("<video"), 2)
+        picture = (self.folder / "report" / "overview.png").read_bytes()
+        self.assertEqual(picture[:8], b"\x89PNG\r\n\x1a\n")
+        width, height = (int.from_bytes(picture[i : i + 4], "big") for i in (16, 20))
+        self.assertTrue(800 < width < 3000 and 400 < height < 3000)
+
+    def test_numbers_are_reported_even_where_no_clip_can_be_drawn(self):
+        self.write(("mujoco",), robot="a-robot-that-is-not-installed")
+        made = make_report(self.folder, self.folder / "elsewhere")
+        self.assertRegex(" ".join(made.notes), "no clips: there is no robot 'a-robot-that-is-not-installed'")
+        self.assertEqual(made.html, self.folder / "elsewhere" / "index.html")
+        self.assertIn("There are no clips", made.html.read_text())
+        self.assertTrue(made.overview.is_file())
+
+    def test_mistakes_are_one_line(self):
+        code, printed = self.run_command(str(self.folder))
+        self.assertEqual(code, 1)
+        self.assertRegex(printed.strip(), "^xreset report: there is no folder [^\n]*$")
+
+    def test_the_table_fits_into_eighty_characters(self):
+        from rich.console import Console
+
+        out = io.StringIO()
+        Console(file=out, width=80).print(rich_table([toy_summary(name) for name in ENGINES]))
+        for expected in (*ENGINES, "4 episodes of 2 demonstrations", "reorientation progress", "33-66%"):
+            self.assertIn(expected, out.getvalue())
+
+
+if __name__ == "__main__":
+    unittest.main()

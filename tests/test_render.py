@@ -1,0 +1,212 @@
+import tempfile
+import unittest
+import zlib
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+
+from xreset import render
+from xreset.errors import RobotError
+from xreset.kinematics import Kinematics
+from xreset.render import Camera, Frames, Points, Renderer, link_colors, pose_matrix, write_png
+from xreset.robots import load
+from xreset.spec import Geometry, ObjectSpec, SceneSpec, Shape
+
+
+def cube(half: float) -> ObjectSpec:
+    mesh = trimesh.creation.box([2 * half] * 3)
+    return ObjectSpec(
+        name="cube",
+        pieces=(Shape(geometry=Geometry(kind="box", size=(half,) * 3)),),
+        mass=0.2,
+        com=np.zeros(3),
+        inertia=np.eye(3) * 1e-4,
+        vertices=np.asarray(mesh.vertices),
+        faces=np.asarray(mesh.faces),
+    )
+
+
+def at(x: float, y: float, z: float) -> np.ndarray:
+    return pose_matrix(np.array([x, y, z]), np.array([1.0, 0, 0, 0]))
+
+
+def pixel(camera: Camera, size: tuple[int, int], point) -> np.ndarray:
+    """Where a world point appears, by the textbook: written apart from the module that is tested."""
+    eye, target = np.array(camera.eye), np.array(camera.target)
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    away = np.array(point) - eye
+    scale = size[1] / 2 / np.tan(camera.fov / 2) / (away @ forward)
+    return np.array([size[0] / 2 + scale * (away @ right), size[1] / 2 - scale * (away @ up)])
+
+
+class Rasterizer(unittest.TestCase):
+    def test_two_triangles_tile_a_rectangle(self):
+        corners = np.array([[2.0, 2], [2, 9], [12, 9], [12, 2]])  # counter-clockwise to the viewer, y down
+        pixels = corners[np.array([[0, 1, 2], [0, 2, 3]])]
+        face, near = render._rasterize(pixels, np.full((2, 3), 0.5), (16, 12))
+        expected = np.zeros((12, 16), dtype=bool)
+        expected[2:9, 2:12] = True
+        np.testing.assert_array_equal(face >= 0, expected)
+        self.assertEqual(set(face[expected]), {0, 1})
+        np.testing.assert_allclose(near[expected], 0.5, atol=1e-8)
+
+    def test_the_nearest_wins_pixel_by_pixel(self):
+        triangle = np.array([[-40.0, -40], [-40, 80], [80, -40]])
+        near = np.array([[0.5, 0.5, 0.5], [0.2, 0.2, 0.8]])  # the second rises to the right and cuts the first
+        face, _ = render._rasterize(np.stack((triangle, triangle)), near, (16, 12))
+        x = np.arange(16) + 0.5
+        np.testing.assert_array_equal(face, np.broadcast_to(np.where(0.2 + 0.6 * (x + 40) / 120 > 0.5, 1, 0), (12, 16)))
+
+    def test_faces_that_look_away_are_left_out(self):
+        triangle = np.array([[[2.0, 2], [12, 2], [2, 9]]])
+        face, _ = render._rasterize(triangle, np.full((1, 3), 0.5), (16, 12))
+        self.assertFalse((face >= 0).any())
+
+
+class Pictures(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.robot = load("openarm")
+        cls.size = (240, 180)
+        cls.renderer = Renderer(SceneSpec(robot=cls.robot, objects=(cube(0.04), cube(0.08))), size=cls.size)
+        cls.camera = Camera()
+        cls.home = cls.robot.home
+
+    def changed(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.abs(a.astype(int) - b).max(axis=-1) > 12
+
+    def test_object_appears_where_it_is(self):
+        empty = self.renderer.draw(self.home)
+        for position in ((0.4, 0.1, 0.3), (0.6, 0.2, 0.5)):  # in the air: its shadow falls elsewhere
+            picture = self.renderer.draw(self.home, at(*position))
+            orange = (picture[..., 0] > picture[..., 2] + 60) & self.changed(picture, empty)
+            y, x = np.nonzero(orange)
+            expected = pixel(self.camera, self.size, position)
+            np.testing.assert_allclose((x.min() / 2 + x.max() / 2 + 0.5, y.min() / 2 + y.max() / 2 + 0.5), expected, atol=2.0)
+
+    def test_object_index_picks_the_object(self):
+        empty = self.renderer.draw(self.home)
+        small, large = (self.changed(self.renderer.draw(self.home, at(0.4, 0.1, 0.4), object_index=i), empty).sum() for i in (0, 1))
+        self.assertGreater(large, 2.5 * small)
+
+    def test_the_robot_moves_with_its_joints(self):
+        q = self.home.copy()
+        q[0] += 0.5
+        self.assertGreater(self.changed(self.renderer.draw(self.home), self.renderer.draw(q)).sum(), 100)
+
+    def test_a_near_object_hides_a_far_one_and_never_the_reverse(self):
+        eye, target = np.array(self.camera.eye), np.array(self.camera.target)
+        front = at(*(eye + 0.35 * (target - eye)))  # on the axis of view, before everything
+        centre = (self.size[1] // 2, self.size[0] // 2)
+        picture = self.renderer.draw(self.home, front)
+        self.assertGreater(int(picture[centre][0]), int(picture[centre][2]) + 40)  # orange
+        behind = at(*(eye + 3.0 * (target - eye)))
+        np.testing.assert_array_equal(self.renderer.draw(self.home, behind)[centre], self.renderer.draw(self.home)[centre])
+
+    def test_shadow_falls_on_the_table_away_from_the_light(self):
+        above = np.array([0.35, 0.1, 0.25])
+        ground = above - render._LIGHT * above[2] / render._LIGHT[2]
+        x, y = pixel(self.camera, self.size, ground).astype(int)
+        lit, dark = self.renderer.draw(self.home)[y, x], self.renderer.draw(self.home, at(*above))[y, x]
+        self.assertLess(int(dark.max()), 0.75 * int(lit.max()))
+
+    def test_the_table_is_lit_where_nothing_stands_in_the_light(self):
+        x, y = pixel(self.camera, self.size, (0.95, 0.25, 0.0)).astype(int)
+        self.assertGreater(int(self.renderer.draw(self.home)[y, x].min()), 150)
+
+    def test_goal_is_translucent(self):
+        empty, T = self.renderer.draw(self.home), at(0.4, 0.1, 0.3)
+        x, y = pixel(self.camera, self.size, T[:3, 3]).astype(int)
+        goal, solid = self.renderer.draw(self.home, goal_pose=T)[y, x], self.renderer.draw(self.home, T)[y, x]
+        self.assertGreater(int(goal[1]), int(goal[0]))  # green
+        self.assertLess(np.abs(goal.astype(int) - empty[y, x]).sum(), np.abs(solid.astype(int) - empty[y, x]).sum())
+
+    def test_points_are_drawn_over_everything_and_missing_ones_left_out(self):
+        color = (1.0, 0.0, 1.0)
+        inside = np.array([0.4, 0.1, 0.3])
+        points = Points(pos=np.stack((inside, np.full(3, np.nan))), color=color, radius=0.012)
+        picture = self.renderer.draw(self.home, at(*inside), points=[points])
+        y, x = np.nonzero((picture == (255, 0, 255)).all(axis=-1))
+        np.testing.assert_allclose((x.mean() + 0.5, y.mean() + 0.5), pixel(self.camera, self.size, inside), atol=1.0)
+
+    def test_frames_show_the_links_axes(self):
+        frames = self.renderer.link_frames(self.home, ["palm"], length=0.1)
+        T = Kinematics(self.robot).link_poses(torch.tensor(self.home), ["palm"])[0].numpy()
+        np.testing.assert_allclose(frames.poses[0], T)
+        picture = self.renderer.draw(self.home, frames=[frames]).astype(int)
+        for axis in range(3):
+            x, y = pixel(self.camera, self.size, T[:3, 3] + 0.08 * T[:3, axis]).astype(int)
+            self.assertEqual(picture[y, x].argmax(), axis)
+            self.assertGreater(picture[y, x].max() - picture[y, x].min(), 100)
+        with self.assertRaises(RobotError):
+            self.renderer.link_frames(self.home, ["no_such_link"])
+
+    def test_overlays_outside_the_picture_or_behind_the_camera_do_no_harm(self):
+        far = Points(pos=np.array([[50.0, 0, 0], [1.3, -1.5, 0.9], [1.28, -0.5, 0.9]]))
+        frames = Frames(poses=np.stack((at(50, 0, 0), at(1.3, -1.5, 0.9))))
+        np.testing.assert_array_equal(self.renderer.draw(self.home, points=[far], frames=[frames]), self.renderer.draw(self.home))
+
+    def test_smooth_is_the_same_picture(self):
+        smooth = Renderer(self.renderer.scene, size=self.size, smooth=True)
+        a, b = (r.draw(self.home, at(0.4, 0.1, 0.04)).astype(float) for r in (self.renderer, smooth))
+        self.assertEqual(a.shape, (180, 240, 3))
+        self.assertEqual(a.shape, b.shape)
+        self.assertLess(np.abs(a - b).mean(), 3.0)
+
+    def test_same_state_same_picture(self):
+        T = at(0.4, 0.1, 0.04)
+        np.testing.assert_array_equal(self.renderer.draw(self.home, T), self.renderer.draw(self.home, T))
+
+    def test_parts_are_told_apart_by_color(self):
+        for name in ("openarm", "ur7e-sharpa"):
+            robot = load(name)
+            colors = dict(zip(Kinematics(robot).link_names, link_colors(robot), strict=True))
+            self.assertEqual(colors[robot.hand_root], render.PALM_COLOR)
+            self.assertEqual({colors[link] for tip in robot.fingertips for link in tip.contact_links}, {render.TIP_COLOR})
+            self.assertEqual(colors[Kinematics(robot).link_names[0]], render.ARM_COLOR)
+        self.assertEqual(colors["right_index_MP"], render.HAND_COLOR)
+
+
+class Meshes(unittest.TestCase):
+    def test_normals_are_round_on_round_shapes_and_flat_on_boxes(self):
+        T = pose_matrix(np.array([0.1, 0.2, 0.3]), np.array([0.5, 0.5, -0.5, 0.5]))
+        box = render._shape_mesh(Geometry(kind="box", size=(0.1, 0.2, 0.3)), T)
+        corners = box.vertices[box.faces]
+        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+        np.testing.assert_allclose(box.normals, np.broadcast_to(flat[:, None], box.normals.shape), atol=1e-9)
+        sphere = render._shape_mesh(Geometry(kind="sphere", size=(0.2,)), T)
+        outward = (sphere.vertices[sphere.faces] - T[:3, 3]) / 0.2
+        np.testing.assert_allclose((sphere.normals * outward).sum(-1), 1.0, atol=0.01)
+
+    def test_capsules_and_cylinders_are_centred(self):
+        for kind, top in (("capsule", 0.15), ("cylinder", 0.1)):
+            mesh = render._shape_mesh(Geometry(kind=kind, size=(0.05, 0.1)), np.eye(4))
+            np.testing.assert_allclose((mesh.vertices[:, 2].min(), mesh.vertices[:, 2].max()), (-top, top), atol=1e-6)
+
+
+class Png(unittest.TestCase):
+    def test_written_picture_reads_back(self):
+        picture = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "a.png"
+            write_png(path, picture)
+            data = path.read_bytes()
+        self.assertEqual(data[:8], b"\x89PNG\r\n\x1a\n")
+        self.assertEqual(data[16:24], (5).to_bytes(4, "big") + (7).to_bytes(4, "big"))
+        start = data.index(b"IDAT")
+        length = int.from_bytes(data[start - 4 : start], "big")
+        body = data[start : start + 4 + length]
+        self.assertEqual(zlib.crc32(body), int.from_bytes(data[start + 4 + length : start + 8 + length], "big"))
+        rows = np.frombuffer(zlib.decompress(body[4:]), np.uint8).reshape(7, 16)
+        self.assertFalse(rows[:, 0].any())
+        np.testing.assert_array_equal(rows[:, 1:].reshape(7, 5, 3), picture)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,277 @@
+import io
+import shutil
+import tempfile
+import unittest
+from contextlib import redirect_stdout
+from importlib.metadata import EntryPoint
+from importlib.util import find_spec
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+
+from xreset.cli import main
+from xreset.errors import RobotError
+from xreset.kinematics import Kinematics
+from xreset.robots import load, registry, robot_names
+from xreset.robots.check import check_description
+from xreset.robots.dynamics import damping_ratio, mass_matrix
+from xreset.robots.openarm import build as openarm
+from xreset.robots.ur7e_sharpa import build as ur7e_sharpa
+from xreset.urdf import load_urdf
+
+BUILT_IN = {"ur7e-sharpa": ur7e_sharpa, "openarm": openarm}
+
+
+class BuiltIn(unittest.TestCase):
+    def test_committed_urdf_is_what_build_writes(self):
+        for name, build in BUILT_IN.items():
+            with self.subTest(name):
+                self.assertEqual(build.URDF.read_text(), build.text())
+
+    def test_urdf_read_back_is_the_tree_that_was_written(self):
+        for name, build in BUILT_IN.items():
+            written, _ = build.tree()
+            read = load_urdf(build.URDF)
+            self.assertEqual(sorted(read.link_names), sorted(written.link_names), name)
+            for joint in written.joints:
+                again = read.joint(joint.name)
+                np.testing.assert_allclose(again.T_parent_joint, joint.T_parent_joint, atol=1e-5, err_msg=joint.name)
+                if joint.type != "fixed":
+                    np.testing.assert_allclose(again.axis, joint.axis, atol=1e-9)
+                    np.testing.assert_allclose((again.lower, again.upper), (joint.lower, joint.upper), atol=1e-8)
+            for link in written.links:
+                again = read.link(link.name)
+                np.testing.assert_allclose(again.inertia, link.inertia, atol=1e-9, err_msg=link.name)
+                self.assertEqual(len(again.collisions), len(link.collisions))
+                for shape, other in zip(again.collisions, link.collisions, strict=True):
+                    self.assertEqual(shape.geometry.kind, other.geometry.kind)
+                    np.testing.assert_allclose(shape.geometry.size, other.geometry.size, atol=1e-9)
+                    np.testing.assert_allclose(shape.T_body_shape, other.T_body_shape, atol=1e-7)
+
+    def test_degrees_of_freedom(self):
+        counts = {name: (len(load(name).arm_indices), len(load(name).hand_indices)) for name in BUILT_IN}
+        self.assertEqual(counts, {"ur7e-sharpa": (6, 22), "openarm": (7, 1)})
+
+    def test_efforts_in_the_description_are_those_of_the_urdf(self):
+        for name, build in BUILT_IN.items():
+            _, effort = build.tree()
+            self.assertEqual({joint.name: joint.drive.effort for joint in load(name).joints}, effort)
+
+    def test_check_finds_nothing(self):
+        for name in BUILT_IN:
+            _, findings = check_description(name)
+            self.assertEqual([finding for finding in findings if finding.level in ("warning", "error")], [], name)
+
+    def test_sharpa_is_a_right_hand_held_palm_down(self):
+        robot = load("ur7e-sharpa")
+        palm, *tips = Kinematics(robot).link_poses(torch.tensor(robot.home), robot.tracked_links).numpy()
+        thumb, fingers = tips[0][:3, 3], np.array([tip[:3, 3] for tip in tips[1:]])
+        self.assertLess(palm[2, 2], -0.8)  # the palm looks down
+        self.assertLess(palm[1, 0], -0.8)  # fingers away from the person, who stands at +y
+        self.assertTrue((thumb[0] > fingers[:, 0]).all())  # seen by that person, a right hand's thumb is on the left: +x
+        self.assertTrue((np.diff(fingers[:, 0]) < 0).all())  # index, middle, ring, pinky
+
+    def test_sharpa_thumb_meets_the_index_finger(self):
+        robot = load("ur7e-sharpa")
+        kinematics = Kinematics(robot)
+        generator = torch.Generator().manual_seed(0)
+        lower, upper = kinematics.lower, kinematics.upper
+        q = lower + (upper - lower) * torch.rand(20000, len(lower), generator=generator, dtype=torch.float64)
+        thumb, index = kinematics.points(q, ["thumb_tip", "index_tip"]).unbind(-2)
+        self.assertLess(float((thumb - index).norm(dim=-1).min()), 0.02)
+
+    def test_flexion_bends_towards_the_palm(self):
+        robot = load("ur7e-sharpa")
+        kinematics = Kinematics(robot)
+        palm = kinematics.link_poses(torch.tensor(robot.home), ["palm"])[0, :3, 2]
+        for finger in ("index", "middle", "ring", "pinky"):
+            jacobian = kinematics.jacobian(torch.tensor(robot.home), [f"{finger}_tip"])
+            for joint in ("MCP_FE", "PIP", "DIP"):
+                column = jacobian.linear[0, :, robot.joint_names.index(f"right_{finger}_{joint}")]
+                self.assertGreater(float(column @ palm), 0, f"{finger} {joint}")
+
+    def test_openarm_jaws_close_on_each_other(self):
+        robot = load("openarm")
+        kinematics = Kinematics(robot)
+        for opening, gap in ((0.0, 0.001), (0.044, 0.089)):
+            q = torch.tensor(robot.home)
+            q[-1] = opening
+            thumb, index = kinematics.link_poses(q, ["thumb_tip", "index_tip"]).numpy()
+            apart = index[:3, 3] - thumb[:3, 3]
+            np.testing.assert_allclose(apart @ thumb[:3, 2], gap, atol=1e-6)  # z looks out of the pad, at the other jaw
+            np.testing.assert_allclose(thumb[:3, 2], -index[:3, 2], atol=1e-9)
+
+    def test_rotors_are_in_the_hand_links(self):
+        tree = load_urdf(ur7e_sharpa.URDF)
+        for joint in tree.joints:
+            if joint.name.startswith("right_") and joint.type == "revolute":
+                self.assertGreaterEqual(np.linalg.eigvalsh(tree.link(joint.child).inertia)[0], 0.002)
+
+    def test_damping_is_what_the_descriptions_say(self):
+        for name in BUILT_IN:
+            robot = load(name)
+            ratio = damping_ratio(robot, robot.home)
+            np.testing.assert_allclose(ratio[robot.hand_indices], 0.9, atol=0.01, err_msg=name)  # 1.8 sqrt(kp I)
+            self.assertGreater(ratio[robot.arm_indices].min(), 0.95, name)
+
+    def test_home_is_well_inside_the_limits(self):
+        for name in BUILT_IN:
+            robot = load(name)
+            kinematics = Kinematics(robot)
+            spread = np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints])
+            margin = np.minimum(robot.home - kinematics.lower.numpy(), kinematics.upper.numpy() - robot.home)
+            self.assertGreater((margin / spread).min(), 1.2, name)
+
+
+class Dynamics(unittest.TestCase):
+    def test_mass_matrix_gives_the_kinetic_energy(self):
+        robot = load("openarm")
+        kinematics = Kinematics(robot)
+        rng = np.random.default_rng(0)
+        q, v, h = robot.home, rng.normal(size=8) * 0.5, 1e-6
+        before, after = (kinematics.link_poses(torch.tensor(q + s * h * v)).numpy() for s in (-1, 1))
+        energy = 0.0
+        for name, a, b in zip(kinematics.link_names, before, after, strict=True):
+            link = kinematics.tree.link(name)
+            velocity = (b[:3, 3] + b[:3, :3] @ link.com - a[:3, 3] - a[:3, :3] @ link.com) / (2 * h)
+            W = (b[:3, :3] - a[:3, :3]) / (2 * h) @ a[:3, :3].T
+            omega = np.array([W[2, 1], W[0, 2], W[1, 0]])
+            energy += link.mass * velocity @ velocity / 2 + omega @ a[:3, :3] @ link.inertia @ a[:3, :3].T @ omega / 2
+        np.testing.assert_allclose(v @ mass_matrix(robot, q) @ v / 2, energy, rtol=1e-4)
+
+    @unittest.skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
+    def test_a_step_settles_without_overshoot(self):
+        from xreset.backends import make_backend
+        from xreset.robots.check import _probe
+        from xreset.spec import SceneSpec
+
+        robot = load("openarm")
+        joints = len(robot.joints)
+        target = torch.tensor(robot.home, dtype=torch.float32).repeat(joints, 1)
+        step = torch.tensor([0.05 if joint.group == "arm" else -0.01 for joint in robot.joints])
+        target += torch.diag(step)
+        with make_backend("mujoco", SceneSpec(robot=robot, objects=(_probe(),)), joints) as engine:
+            engine.set_joint_targets(target)
+            moved = []
+            for _ in range(40):
+                engine.step()
+                moved.append(((engine.state().joint_pos - torch.tensor(robot.home)) / step).diagonal().clone())
+        moved = torch.stack(moved)
+        self.assertLess(float(moved.max()), 1.02)
+        self.assertGreater(float(moved[-1].min()), 0.98)
+
+
+class Registry(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name) / "robot"
+        self.folder.mkdir()
+        for name in ("robot.toml", "robot.urdf"):
+            shutil.copy(openarm.URDF.parent / name, self.folder)
+
+    def edit(self, file: str, old: str, new: str) -> None:
+        path = self.folder / file
+        text = path.read_text()
+        self.assertIn(old, text)
+        path.write_text(text.replace(old, new))
+
+    def errors(self, level: str = "error") -> str:
+        return "\n".join(f"{f.topic}: {f.message}" for f in check_description(self.folder)[1] if f.level == level)
+
+    def test_names_and_folders(self):
+        self.assertLessEqual(set(BUILT_IN), set(robot_names()))
+        self.assertEqual(load(self.folder).home.tolist(), load("openarm").home.tolist())
+        with self.assertRaisesRegex(RobotError, "ur7e-sharpa"):
+            load("no-such-robot")
+
+    def test_a_broken_plugin_harms_nobody(self):
+        entries = [
+            EntryPoint("broken", "xreset_no_such_package.robot", registry.GROUP),
+            EntryPoint("openarm", "xreset.robots.openarm", registry.GROUP),
+        ]
+        with mock.patch.object(registry, "entry_points", lambda group: entries):
+            self.assertEqual(robot_names(), ["broken", "openarm"])
+            self.assertEqual(load("openarm").name, "openarm")
+            with self.assertRaisesRegex(RobotError, "'broken'.*xreset_no_such_package"):
+                load("broken")
+            output = io.StringIO()
+            with redirect_stdout(output):
+                main(["robots", "list"])
+        self.assertIn("openarm", output.getvalue())
+        self.assertIn("broken", output.getvalue())
+
+    def test_every_mistake_in_a_description_is_listed(self):
+        self.edit("robot.toml", 'palm = "palm"', 'plam = "palm"')
+        self.edit("robot.toml", "home = 0.38, kp = 400.0", 'home = "0.38", kp = true')
+        self.edit("robot.toml", 'keypoint = "index4"', 'keypoint = "index5"')
+        self.edit("robot.toml", "pos = [0.45, 0.60, 0.55]", "pos = [0.45, 0.60]")
+        with self.assertRaises(RobotError) as caught:
+            load(self.folder)
+        for part in ("'plam'", "has no 'palm'", "joints[0] has home", "joints[0] has kp", "index5", "base has pos", "6 places"):
+            self.assertIn(part, str(caught.exception))
+
+    def test_contradictions(self):
+        self.edit("robot.toml", 'name = "thumb", link', 'name = "index", link')
+        self.edit("robot.toml", 'source = "finger_joint1"', 'source = "finger_joint9"')
+        self.edit("robot.toml", "quat = [0.38268343,", "quat = [0.5,")
+        with self.assertRaises(RobotError) as caught:
+            load(self.folder)
+        for part in ("index occur more than once", "finger_joint9", "must be 'thumb'", "expected 1"):
+            self.assertIn(part, str(caught.exception))
+
+    def test_not_toml_wrong_schema_no_file(self):
+        for text, message in (("schema = ", "not valid TOML"), ('schema = "other/1"', "other/1")):
+            (self.folder / "robot.toml").write_text(text)
+            with self.assertRaisesRegex(RobotError, message):
+                load(self.folder)
+        (self.folder / "robot.toml").unlink()
+        with self.assertRaisesRegex(RobotError, "no readable robot.toml"):
+            load(self.folder)
+
+    def test_check_tells_all_that_only_the_urdf_knows(self):
+        self.edit("robot.toml", 'name = "joint7"', 'name = "joint9"')
+        self.edit("robot.toml", "home = 1.50", "home = 2.60")
+        self.edit("robot.toml", 'wrist = "link7"', 'wrist = "link77"')
+        self.edit("robot.toml", "mimics = [{", "mimics = [{ multiplier = 2.0,")
+        self.edit("robot.urdf", 'ixx="0.000143"', 'ixx="0.00143"')
+        found = self.errors()
+        for part in ("'joint9' is not in the URDF", "'joint7' moves", "'joint4' is at home at 2.6", "'link77'", "finger_joint2", "'link6'"):
+            self.assertIn(part, found)
+
+    def test_check_finds_an_indefinite_inertia_and_a_missing_mass(self):
+        self.edit("robot.urdf", 'ixx="0.000143"', 'ixx="-0.000143"')
+        self.edit("robot.urdf", '<mass value="0.550659" />', '<mass value="0" />')
+        self.assertRegex(self.errors(), r"'link5' moves but has the mass 0[\s\S]*'link6' has the principal moments -")
+
+    def test_check_finds_every_missing_mesh(self):
+        self.edit("robot.urdf", '<box size="0.05 0.14 0.04" />', '<mesh filename="package://a/body.stl" />')
+        self.edit("robot.urdf", '<cylinder radius="0.05" length="0.055" />', '<mesh filename="base.stl" />')
+        self.assertRegex(self.errors(), r"base\.stl[\s\S]*body\.stl")
+
+    def test_check_finds_home_in_the_table_and_in_itself(self):
+        self.edit("robot.toml", "pos = [0.45, 0.60, 0.55]", "pos = [0.45, 0.60, 0.10]")
+        self.edit("robot.toml", '["link5", "link7"],', "")
+        self.assertRegex(self.errors(), r"below it|lowest at -")
+        self.assertIn("link5 and link7 overlap at home", self.errors())
+
+    def test_check_warns_of_drives_that_swing_or_are_too_fast(self):
+        self.edit("robot.toml", "kd = 28.3", "kd = 1.0")
+        self.edit("robot.toml", "kd = 55.3", "kd = 500.0")
+        self.assertRegex(self.errors("warning"), r"'joint1' has the damping ratio 0\.\d+ at home and will swing")
+        self.assertRegex(self.errors("warning"), r"'finger_joint1': kd = 500")
+
+    def test_command_fails_on_errors_only(self):
+        with redirect_stdout(io.StringIO()):
+            main(["robots", "check", str(self.folder), "--no-engines"])
+        self.edit("robot.toml", 'palm = "palm"', 'palm = "plam"')
+        with redirect_stdout(io.StringIO()) as output, self.assertRaises(SystemExit) as caught:
+            main(["robots", "check", str(self.folder), "--no-engines"])
+        self.assertEqual(caught.exception.code, 1)
+        self.assertIn("'plam'", output.getvalue())
+
+
+if __name__ == "__main__":
+    unittest.main()

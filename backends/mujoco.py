@@ -34,12 +34,13 @@ class MujocoWorld(World):
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world must be seen, not silently put back
         self._data = mujoco.MjData(self._model)
         self._stepped = False
+        self._overflows_before = 0
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """See :meth:`World.set_state`."""
         at, data = self._at, self._data
         mujoco.mj_resetData(self._model, data)
-        self._stepped = False
+        self._stepped, self._overflows_before = False, 0
         q, v = data.qpos, data.qvel
         q[at.joint_qpos] = state["joint_pos"]
         v[at.joint_dof] = state["joint_vel"]
@@ -73,8 +74,7 @@ class MujocoWorld(World):
 
     def step(self, n: int) -> None:
         """See :meth:`World.step`."""
-        for warning in self._data.warning:
-            warning.number = 0
+        self._overflows_before = self._overflows()
         mujoco.mj_step(self._model, self._data, n)
         self._stepped = True
         self._update_kinematics()
@@ -120,8 +120,7 @@ class MujocoWorld(World):
         """See :meth:`World.health`."""
         data = self._data
         finite = np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()
-        full = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
-        return not finite, any(data.warning[int(kind)].number for kind in full)
+        return not finite, self._overflows() > self._overflows_before
 
     def set_object_mass(self, mass: float) -> None:
         """See :meth:`World.set_object_mass`."""
@@ -147,6 +146,11 @@ class MujocoWorld(World):
         """See :meth:`World.set_object_wrench`."""
         wrench = self._data.xfrc_applied[self._at.object_body]
         wrench[:3], wrench[3:] = force, torque
+
+    def _overflows(self) -> int:
+        """How often contacts or constraints have found no room so far."""
+        kinds = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
+        return sum(int(self._data.warning[int(kind)].number) for kind in kinds)
 
     def _update_kinematics(self) -> None:
         """Bring link poses and velocities up to date with qpos and qvel; contact forces stay those of the last step."""

@@ -67,7 +67,7 @@ class MujocoWarpBackend(Backend):
         contacts_per_world: int = 64,
         convex_contacts_per_world: int = 32,
         constraints_per_world: int = 220,
-        solver_iterations: int = 50,
+        solver_iterations: int = 30,
     ) -> None:
         """Build the worlds, compile the kernels and capture the CUDA graphs.
 

@@ -195,8 +195,8 @@ class _Recorder:
                 Trace(
                     sequence=int(env.sequence[world]),
                     object=names[int(env.backend.object_index[world])],
-                    goal_pos=env.goal_pos[world].cpu().numpy(),
-                    goal_quat=env.goal_quat[world].cpu().numpy(),
+                    goal_pos=env.goal_pos[world].cpu().numpy().copy(),  # the environment writes the next round's goals in place
+                    goal_quat=env.goal_quat[world].cpu().numpy().copy(),
                     time=np.array(self._time),
                     joint_pos=joint_pos,
                     object_pos=object_pos,

@@ -125,7 +125,7 @@ class ManipulationEnv:
         """
         reading, reward, failed, time_out = self._advance(action)
         done = failed | time_out
-        log = self._log(reward, done)
+        log = self._log(reward, done, sound=~reading.health.nonfinite)
         finished = done.nonzero().squeeze(-1)
         if len(finished):
             self.reset(finished)
@@ -275,9 +275,12 @@ class ManipulationEnv:
         }
         self._observations = TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
-    def _log(self, reward: Reward, done: Tensor) -> dict[str, Tensor]:
-        """Means over worlds of this step, by name; scalars on the device, so that nothing waits for them."""
-        log = {f"reward/{name}": value.mean() for name, value in reward.terms.items()}
+    def _log(self, reward: Reward, done: Tensor, sound: Tensor) -> dict[str, Tensor]:
+        """Means over worlds of this step, by name; scalars on the device, so that nothing waits for them.
+
+        Reward terms are means over the worlds that are ``sound`` [N]: the others' say nothing, and are counted.
+        """
+        log = {f"reward/{name}": _mean_where(value, sound) for name, value in reward.terms.items()}
         log |= {
             "task/grasped": reward.grasped.float().mean(),
             "task/success": reward.success.float().mean(),
@@ -307,8 +310,8 @@ def rest_state(joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor) -> St
 
 
 def _mean_where(values: Tensor, mask: Tensor) -> Tensor:
-    """[] mean of a bool tensor over the worlds of a mask; 0 if there are none."""
-    return (values & mask).sum() / mask.sum().clamp_min(1)
+    """[] mean of numbers or bools [N] over the worlds of a mask; 0 if there are none."""
+    return torch.where(mask, values, 0).sum() / mask.sum().clamp_min(1)
 
 
 __all__ = ["ManipulationEnv", "Reading", "make_scene", "rest_state"]

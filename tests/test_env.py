@@ -1,0 +1,351 @@
+"""The environment and the rollouts on the MuJoCo C engine: episodes begin and end as they should, world by world."""
+
+import tempfile
+import unittest
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+import numpy as np
+import torch
+
+from tests.toy_bank import SOUP, SPAM, toy_bank
+from tests.toy_robot import toy_hand_arm
+from xreset.env import ManipulationEnv, make_scene
+from xreset.objects import load_objects
+from xreset.policy import RandomPolicy, ZeroPolicy
+from xreset.task.config import ActionConfig, NoiseConfig, ObservationConfig, ResetConfig, TaskConfig, TerminationConfig, evaluation_task
+from xreset.task.observations import layout
+from xreset.task.resets import ResetDistribution
+
+try:
+    from xreset.backends.mujoco import MujocoBackend
+except ImportError as error:
+    raise unittest.SkipTest(str(error)) from error
+
+N = 3
+TASK = TaskConfig(termination=TerminationConfig(episode_seconds=0.5), observation=ObservationConfig(cloud_points=16), distance_points=64)
+QUIET = replace(
+    TASK,
+    observation=replace(TASK.observation, noise=NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)),
+)
+
+
+class BreakableBackend(MujocoBackend):
+    """An engine some of whose worlds are not finite until they are set again."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.broken = torch.zeros(self.num_worlds, dtype=torch.bool)
+
+    def set_state(self, state, worlds=None):
+        self.broken[slice(None) if worlds is None else worlds] = False
+        super().set_state(state, worlds)
+
+    def state(self):
+        state = super().state()
+        pos = state.object_pos.clone()
+        pos[self.broken] = torch.nan
+        return replace(state, object_pos=pos, joint_pos=torch.where(self.broken[:, None], torch.nan, state.joint_pos))
+
+    def health(self):
+        health = super().health()
+        return replace(health, nonfinite=health.nonfinite | self.broken)
+
+
+class WithEnv(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        folder = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(folder.cleanup)
+        cls.robot = toy_hand_arm(Path(folder.name))
+        cls.objects = load_objects((SOUP, SPAM))
+        cls.bank = toy_bank(cls.robot)
+
+    def make(self, task: TaskConfig = TASK, seed: int = 0, kind: type[MujocoBackend] = MujocoBackend) -> ManipulationEnv:
+        backend = kind(make_scene(self.robot, self.objects, task), N, object_index=torch.tensor([0, 1, 0]), workers=0)
+        self.addCleanup(backend.close)
+        return ManipulationEnv(backend, task, ResetDistribution(self.bank, self.robot, (SOUP, SPAM), task.reset), seed=seed)
+
+    def actions(self, steps: int, seed: int = 0) -> torch.Tensor:
+        return 2 * torch.rand(steps, N, 7, generator=torch.Generator().manual_seed(seed)) - 1
+
+
+class StepTest(WithEnv):
+    def test_observations_have_the_width_of_their_layout(self):
+        env = self.make()
+        widths = layout(7, 2, TASK.observation)
+        for observations in (env.get_observations(), env.step(self.actions(1)[0])[0]):
+            self.assertEqual(tuple(observations["policy"].shape), (N, sum(widths["policy"].values())))
+            self.assertEqual(tuple(observations["proprio"].shape), (N, sum(widths["proprio"].values())))
+            self.assertEqual(tuple(observations["perception"].shape), (N, 5, 16, 3))
+            self.assertEqual(tuple(observations["privileged"].shape), (N, 15))
+            for group in set(observations.keys()):
+                self.assertEqual(observations[group].dtype, torch.float32)
+                self.assertTrue(bool(observations[group].isfinite().all()), group)
+
+    def test_observations_state_the_world(self):
+        env = self.make(QUIET)
+        for action in self.actions(5):
+            observations, *_ = env.step(action)
+        state = env.backend.state()
+        policy = observations["policy"]
+        torch.testing.assert_close(policy[:, :3], state.object_pos)
+        torch.testing.assert_close(policy[:, 7:10], env.goal_pos)
+        torch.testing.assert_close(policy[:, 14], env.gravity_fraction)
+        torch.testing.assert_close(policy[:, 15:], self.actions(5)[-1])
+        middle, half = (env.actions.upper + env.actions.lower) / 2, (env.actions.upper - env.actions.lower) / 2
+        torch.testing.assert_close(observations["proprio"][:, :7], (state.joint_pos - middle) / half)
+        cloud = observations["perception"][:, -1]
+        size = torch.tensor([np.linalg.norm(o.vertices, axis=1).max() for o in self.objects], dtype=torch.float32)[env.backend.object_index]
+        self.assertTrue(bool(((cloud - state.object_pos[:, None]).norm(dim=-1).amax(dim=-1) <= size + 1e-5).all()))
+
+    def test_actions_reach_the_drives(self):
+        env = self.make()
+        before = env.joint_target.clone()
+        action = torch.zeros(N, 7)
+        action[1, 1], action[2, 3] = 1.0, 2.0
+        env.step(action)
+        target = env.backend.state().joint_target
+        torch.testing.assert_close(target, env.joint_target)
+        torch.testing.assert_close(target[1, 1], before[1, 1] + TASK.action.arm_step)
+        torch.testing.assert_close(target[0, :3], before[0, :3])
+        torch.testing.assert_close(target[2, 3], env.actions.upper[3])
+
+    def test_the_reach_reward_never_falls_within_an_episode(self):
+        env = self.make(replace(QUIET, action=ActionConfig(arm_step=0.3, arm_lead=1.0)))
+        reach, distance = [], []
+        for step in range(20):
+            reading, reward = env.advance(torch.full((N, 7), 1.0 if step % 10 < 5 else -1.0))
+            reach.append(reward.terms["reach"].clone())
+            distance.append(reading.tip_distance.mean(dim=-1))
+        reach, distance = torch.stack(reach), torch.stack(distance)
+        self.assertTrue(bool((reach.diff(dim=0) >= 0).all()))
+        self.assertTrue(bool((distance.diff(dim=0) > 1e-3).any()), "the hand moved away at times")
+        expected = 1 - torch.tanh(distance.cummin(dim=0).values / TASK.reward.reach_width)
+        self.assertTrue(bool((reach >= expected - 1e-6).all()), "at least the best of the steps; the start may have been better")
+
+    def test_the_same_seed_gives_the_same_episodes(self):
+        runs = [self.make(seed=seed) for seed in (3, 3, 4)]
+        for action in self.actions(40):  # past the time limit: resets are drawn too
+            results = [env.step(action) for env in runs]
+        for group in set(results[0][0].keys()):
+            self.assertTrue(torch.equal(results[0][0][group], results[1][0][group]), group)
+        self.assertTrue(torch.equal(results[0][1], results[1][1]))
+        self.assertFalse(torch.equal(results[0][0]["policy"], results[2][0]["policy"]))
+
+    def test_random_numbers_continue_where_a_checkpoint_left_them(self):
+        one, two = self.make(seed=1), self.make(seed=2)
+        two.set_rng_state(one.rng_state())
+        one.reset()
+        two.reset()
+        self.assertTrue(torch.equal(one.get_observations()["policy"], two.get_observations()["policy"]))
+
+
+class ResetTest(WithEnv):
+    def test_only_the_finished_world_begins_anew(self):
+        env, other = self.make(QUIET), self.make(QUIET)
+        for action in self.actions(8):
+            env.step(action)
+            other.step(action)
+        env.episode_length_buf[1] = env.max_episode_length - 1
+        action, last_cloud = self.actions(1, seed=5)[0], env.get_observations()["perception"].clone()
+        observations, _, done, extras = env.step(action)
+        expected, *_ = other.step(action)
+        self.assertEqual(done.tolist(), [0, 1, 0])
+        self.assertEqual(extras["time_outs"].tolist(), [0.0, 1.0, 0.0])
+        self.assertEqual(env.episode_length_buf.tolist(), [9, 0, 9])
+        for name, value in vars(env.backend.state()).items():
+            self.assertTrue(torch.equal(value[[0, 2]], getattr(other.backend.state(), name)[[0, 2]]), name)
+        for group in set(observations.keys()):
+            self.assertTrue(torch.equal(observations[group][[0, 2]], expected[group][[0, 2]]), group)
+        cloud = observations["perception"]
+        torch.testing.assert_close(cloud[[0, 2], :-1], last_cloud[[0, 2], 1:])
+        torch.testing.assert_close(cloud[1], cloud[1, :1].expand_as(cloud[1]), msg="the new episode's history is its first frame")
+        self.assertEqual(float(observations["policy"][1, 15:].abs().max()), 0.0, "no previous action")
+        self.assertEqual(float(observations["privileged"][1, -1]), 0.0, "no previous reward")
+        self.assertTrue(torch.equal(env.joint_target[1], env.backend.state().joint_pos[1]), "the drives hold the new joint positions")
+
+    def test_every_world_times_out_in_the_end(self):
+        env = self.make()
+        for step in range(env.max_episode_length):
+            _, _, done, extras = env.step(torch.zeros(N, 7))
+            self.assertEqual(bool(done.any()), step == env.max_episode_length - 1)
+        self.assertEqual((done.tolist(), extras["time_outs"].tolist()), ([1] * N, [1.0] * N))
+
+    def test_starts_come_from_the_distribution(self):
+        env = self.make(replace(TASK, reset=ResetConfig(demo_probability=1.0)))
+        state = env.backend.state()
+        self.assertTrue(bool(env.from_bank.all()))
+        numbers = ((state.object_pos[:, 0] - 0.6) * 100).round().int().tolist()
+        self.assertEqual([self.bank.object_name[i] for i in numbers], [SOUP, SPAM, SOUP])
+        torch.testing.assert_close(state.joint_pos, torch.as_tensor(self.bank.joint_pos)[numbers])
+        self.assertEqual(env.sequence.tolist(), self.bank.sequence_index[numbers].tolist())
+        torch.testing.assert_close(env.goal_pos, torch.as_tensor(self.bank.goal_pos)[env.sequence])
+        self.assertEqual(float(state.object_linvel.abs().max()), 0.0)
+
+    def test_mass_friction_and_gravity_are_drawn_anew_for_the_worlds_that_begin(self):
+        env = self.make()
+        with (
+            mock.patch.object(env.backend, "set_object_mass") as mass,
+            mock.patch.object(env.backend, "set_friction") as friction,
+            mock.patch.object(env.backend, "set_object_gravity") as gravity,
+        ):
+            env.reset(torch.tensor([2, 0]))
+        for call in (mass, friction, gravity):
+            self.assertEqual(call.call_args.args[1].tolist(), [2, 0])
+        scale = mass.call_args.args[0] / self.objects[0].mass
+        self.assertTrue(bool(((scale >= 0.7) & (scale <= 1.3)).all()) and float(scale[0]) != float(scale[1]))
+        self.assertEqual(tuple(friction.call_args.args[0].shape), (2, 3))
+        self.assertTrue(torch.equal(gravity.call_args.args[0], env.gravity_fraction[[2, 0]]))
+
+
+class FailureTest(WithEnv):
+    def test_an_object_that_leaves_the_scene_ends_the_episode_at_a_price(self):
+        env = self.make()
+        state = env.backend.state()
+        pos = state.object_pos.clone()
+        pos[0, :2] = torch.tensor([3.0, 0.3])
+        env.backend.set_state(replace(state, object_pos=pos))
+        _, reward, done, extras = env.step(torch.zeros(N, 7))
+        self.assertEqual((done.tolist(), extras["time_outs"].tolist()), ([1, 0, 0], [0.0] * N))
+        self.assertAlmostEqual(float(reward[0]), -5.0, delta=0.02)
+        self.assertGreater(float(reward[1:].min()), -0.02)
+        self.assertLess(float(env.backend.state().object_pos[0, 0]), 1.0, "a new episode has begun")
+
+    def test_leaving_at_the_time_limit_is_a_failure_not_a_time_out(self):
+        env = self.make()
+        env.episode_length_buf[:] = env.max_episode_length - 1
+        state = env.backend.state()
+        pos = state.object_pos.clone()
+        pos[0, 2] = 2.0
+        env.backend.set_state(replace(state, object_pos=pos))
+        _, _, done, extras = env.step(torch.zeros(N, 7))
+        self.assertEqual((done.tolist(), extras["time_outs"].tolist()), ([1] * N, [0.0, 1.0, 1.0]))
+
+    def test_a_world_that_is_not_finite_ends_teaches_nothing_and_is_counted(self):
+        env = self.make(kind=BreakableBackend)
+        env.step(self.actions(1)[0])
+        env.backend.broken[1] = True
+        observations, reward, done, extras = env.step(self.actions(1)[0])
+        self.assertEqual((done.tolist(), extras["time_outs"].tolist()), ([0, 1, 0], [0.0, 1.0, 0.0]))
+        self.assertEqual(float(reward[1]), 0.0)
+        self.assertTrue(bool(reward.isfinite().all()))
+        self.assertEqual(int(env.nonfinite_count), 1)
+        for group in set(observations.keys()):
+            self.assertTrue(bool(observations[group].isfinite().all()), group)
+        _, reward, done, extras = env.step(self.actions(1)[0])
+        self.assertEqual((int(env.nonfinite_count), done.tolist()), (1, [0] * N))
+        self.assertEqual(float(extras["log"]["health/nonfinite_total"]), 1.0)
+        self.assertNotEqual(float(reward[1]), 0.0)
+
+    def test_the_log_of_a_step_with_a_broken_world_is_finite(self):
+        env = self.make(kind=BreakableBackend)
+        env.backend.broken[1] = True
+        *_, extras = env.step(self.actions(1)[0])
+        for name, value in extras["log"].items():
+            self.assertTrue(bool(torch.as_tensor(value).isfinite()), name)
+
+    def test_a_world_that_really_breaks_down(self):
+        env = self.make()
+        force = torch.zeros(N, 3)
+        force[1, 2] = torch.nan
+        env.backend.set_object_wrench(force, torch.zeros(N, 3))
+        _, reward, done, _ = env.step(torch.zeros(N, 7))
+        env.backend.set_object_wrench(torch.zeros(N, 3), torch.zeros(N, 3))
+        self.assertEqual((done.tolist(), int(env.nonfinite_count), float(reward[1])), ([0, 1, 0], 1, 0.0))
+        for _ in range(3):
+            observations, reward, *_ = env.step(torch.zeros(N, 7))
+        self.assertTrue(bool(observations["policy"].isfinite().all()) and bool(reward.isfinite().all()))
+        self.assertEqual(int(env.nonfinite_count), 1)
+
+
+class RolloutTest(WithEnv):
+    TASK = evaluation_task(TASK)
+
+    def roll_out(self, policy, num_envs: int, backend: type[MujocoBackend] = MujocoBackend, **options):
+        from xreset.eval import rollout
+
+        def make(name, scene, num_worlds, **kwargs):
+            return backend(scene, num_worlds, workers=0, **kwargs)
+
+        arguments = {"repetitions": 2, "seed": 0} | options
+        with mock.patch.object(rollout, "make_backend", make):
+            return rollout.roll_out(policy, "mujoco", self.robot, self.objects, self.bank, self.TASK, num_envs=num_envs, **arguments)
+
+    def test_every_demonstration_is_played_as_often_as_asked(self):
+        found = self.roll_out(ZeroPolicy(7), 4)
+        self.assertEqual([(e.sequence, e.repetition) for e in found.episodes], [(s, r) for s in range(3) for r in range(2)])
+        self.assertEqual([e.object for e in found.episodes], [SOUP, SOUP, SPAM, SPAM, SOUP, SOUP])
+        self.assertEqual(found.episodes[2].sequence_name, "demo_b")
+        self.assertEqual([(t.sequence, t.object) for t in found.traces], [(0, SOUP), (1, SPAM)])
+        trace = found.traces[0]
+        self.assertEqual((trace.joint_pos.shape, trace.object_pos.shape), ((11, 7), (11, 3)))
+        np.testing.assert_allclose(np.diff(trace.time), 0.05)
+        np.testing.assert_allclose(trace.goal_pos, self.bank.goal_pos[0])
+        self.assertGreater(found.control_steps_per_second, 0)
+
+    def test_the_number_of_worlds_changes_nothing(self):
+        one, many = (self.roll_out(ZeroPolicy(7), n) for n in (1, 6))
+        self.assertEqual(one.episodes, many.episodes)
+        for a, b in zip(one.traces, many.traces, strict=True):
+            np.testing.assert_array_equal(a.object_pos, b.object_pos)
+            np.testing.assert_array_equal(a.joint_pos, b.joint_pos)
+
+    def test_starts_differ_by_repetition_and_seed_only(self):
+        def starts(**options) -> np.ndarray:
+            found = self.roll_out(RandomPolicy(7, 0), 6, **options)
+            return np.stack([t.object_pos[0] for t in found.traces])
+
+        np.testing.assert_array_equal(starts(), starts(repetitions=3))
+        self.assertGreater(np.abs(starts() - starts(seed=1)).max(), 1e-3)
+        away = np.abs(starts()[:, :2] - self.bank.start_pos[:2, :2])
+        self.assertTrue(0 < away.max() <= 0.02)
+
+    def test_a_world_that_breaks_down_is_reported_and_the_others_go_on(self):
+        class BreaksOnce(BreakableBackend):
+            steps = 0
+
+            def step(self, substeps=None):
+                super().step(substeps)
+                BreaksOnce.steps += 1
+                if BreaksOnce.steps == 10:
+                    self.broken[0] = True
+
+        found = self.roll_out(ZeroPolicy(7), 6, BreaksOnce)
+        self.assertEqual([e.nonfinite for e in found.episodes], [True] + [False] * 5)
+        self.assertTrue(all(np.isfinite(e.task_progress) for e in found.episodes))
+
+
+class KinematicRetargetingTest(WithEnv):
+    def test_plays_the_trajectory_at_its_own_speed_after_moving_there(self):
+        from xreset.eval.baselines import KinematicRetargeting
+
+        task = evaluation_task(replace(TASK, action=ActionConfig(arm_lead=10.0), reset=ResetConfig(home_noise=False)))
+        env = self.make(task)
+        lengths = [7, 5, 6]
+        rng = np.random.default_rng(0)
+        low, high = env.actions.lower.numpy(), env.actions.upper.numpy()
+        paths = [low + (high - low) * (0.5 + 0.02 * np.cumsum(rng.random((n, 7)), axis=0)) for n in lengths]
+        for path in paths:
+            path[:, :3] = 0.01 * path[:, :3] + 0.01  # the arm can follow
+        retargeted = SimpleNamespace(joint_pos=np.concatenate(paths), frame_offsets=np.cumsum([0, *lengths]), fps=30.0)
+        policy = KinematicRetargeting(retargeted, lead_in=0.1)  # 6 control steps
+        policy.begin(env)
+        targets = []
+        for _ in range(env.max_episode_length):
+            env.advance(policy.act(env.get_observations()))
+            targets.append(env.joint_target.numpy().copy())
+        for world in range(N):
+            path = paths[int(env.sequence[world])]
+            at = np.arange(len(path)) * 2 + 6  # 30 Hz frames at 60 Hz control
+            for frame, step in enumerate(at):
+                np.testing.assert_allclose(targets[step][world], path[frame], atol=1e-4)
+            np.testing.assert_allclose(targets[-1][world], path[-1], atol=1e-4, err_msg="it holds the last frame")
+            half = 0.5 * (0.01 + path[0])
+            np.testing.assert_allclose(targets[2][world], half, atol=1e-4, err_msg="half-way to the first frame after half the lead-in")
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -57,16 +57,16 @@ class HandConfig:
     """Distance between contact link and contact point that costs nothing [m]."""
     contact_knee: float = 0.002
     """Excess over the margin below which the contact cost is quadratic [m]."""
-    clearance_weight: float = 500.0
+    clearance_weight: float = 2000.0
     """Depth of the hand in the object, the table and itself, beyond what is allowed."""
-    object_depth: float = 0.001
-    """Depth of the hand in the object that is allowed: it touches [m]."""
+    object_clearance: float = 0.0005
+    """Distance that the hand keeps from the object [m]. Deeper grasps are pushed apart in physics: at -0.001 a third fewer are accepted."""
     self_depth: float = 0.002
     """Depth of the hand's links in one another that is allowed [m]."""
     smoothness_weight: float = 2.0
     """Change of joints and root between neighbouring frames."""
-    length_scale: float = 0.05
-    """Length that counts as much as one radian [m]: about a finger bone's length."""
+    length_scale: float = 0.10
+    """Length that counts as much as one radian [m]: about a finger's length."""
     iterations: int = 40
     """Most Levenberg-Marquardt steps."""
     tolerance: float = 1e-3
@@ -430,7 +430,7 @@ def _clearances(model: HandModel, targets: HandTargets, config: HandConfig, bodi
         low, high = torch.as_tensor(surface.low) - reach, torch.as_tensor(surface.high) + reach
         row, ball = (((local > low) & (local < high)).all(-1) & annotated[rows][:, None]).nonzero(as_tuple=True)
         distance, slope = surface.signed_distance(local[row, ball])
-        distance = distance - balls.radii[ball] + config.object_depth
+        distance = distance - balls.radii[ball] - config.object_clearance
         near = distance < 0
         row, ball = row[near], ball[near]
         direction = (T[row] @ slope[near][..., None])[..., 0]

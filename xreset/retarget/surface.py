@@ -32,7 +32,7 @@ class Surface:
 
         mesh = trimesh.Trimesh(obj.vertices, obj.faces, process=False)
         self._triangles = np.asarray(mesh.triangles)
-        self.low, self.high = (np.asarray(corner) for corner in mesh.bounds)
+        self.low, self.high = (np.array(corner) for corner in mesh.bounds)
         """[3] corners of the bounding box."""
         self._origin = self.low - _GRID_MARGIN
         counts = np.ceil((self.high - self.low + 2 * _GRID_MARGIN) / _GRID_SPACING).astype(int) + 1

@@ -28,9 +28,9 @@ from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import (
     Inertia,
     Mechanism,
+    TrackedFrames,
     conjugate,
     cross,
-    matrix_to_quat,
     mechanism,
     multiply,
     nearer,
@@ -38,7 +38,7 @@ from xreset.backends.rigid import (
     rotate,
 )
 from xreset.errors import XResetError
-from xreset.spec import GRAVITY, Geometry, ObjectSpec, SceneSpec, Shape
+from xreset.spec import GRAVITY, Geometry, SceneSpec, Shape
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +52,8 @@ class PybulletSettings:
     friction_cone: bool = True
     """Whether friction is limited by a cone instead of a pyramid. Without it objects slide 30 % less far along the pyramid's diagonals, and
     Bullet leaves out torsional friction altogether. Grasps hold equally well with either."""
+    mass_matrix_steps: int = 8
+    """Bullet steps between two updates of the mass matrix that emulated armature and mimic couplings need."""
     explicit_limit: float = 0.5
     """A drive is applied as a plain PD torque while (dt kd + dt^2 kp) / inertia is below this (2 is the limit of stability); beyond it
     is made implicit, which is stable but softens the drive in contact."""
@@ -86,22 +88,17 @@ class PybulletWorld(World):
         self._mechanism = robot = mechanism(scene.robot)
         thing = scene.objects[object_index]
         self._inertia = object_inertia(thing)
-        self._robot_parts, self._object_parts = _robot_parts(robot), _object_parts(thing)
-        table = Shape(geometry=Geometry(kind="box", size=scene.table.half_size))
-        table_parts = [_Part(body=0, link="table", shapes=(table,))]
         with tempfile.TemporaryDirectory(prefix="xreset-") as folder:
-            self._robot = self._load(_robot_urdf(robot, self._robot_parts, Path(folder)), scene.robot.base_pos, scene.robot.base_quat)
-            self._object = self._load(_rigid_urdf(self._object_parts, self._inertia, Path(folder)), (0.0, 0.0, _FAR), fixed=False)
-            self._table = self._load(_rigid_urdf(table_parts, _WEIGHTLESS, Path(folder)), (*scene.table.center, -scene.table.half_size[2]))
-        for body, parts in ((self._robot, self._robot_parts), (self._object, self._object_parts), (self._table, table_parts)):
-            self._remove_defaults(body, parts)
-        self._set_collision_pairs(scene)
+            self._robot = self._load_robot(robot, Path(folder))
+            self._object = self._load_rigid(_groups(thing.pieces), self._inertia, (0.0, 0.0, _FAR), Path(folder))
+            table = Shape(geometry=Geometry(kind="box", size=scene.table.half_size))
+            self._table = self._load_rigid([(table,)], None, (*scene.table.center, -scene.table.half_size[2]), Path(folder))
+        for model in (self._robot, self._object, self._table):
+            self._remove_defaults(model)
+        self._set_collision_pairs()
 
-        self._drives = _Drives(p, self._client, self._robot, robot, dt, settings.explicit_limit)
-        self._base = (np.array(scene.robot.base_pos), np.array(scene.robot.base_quat))
-        self._frames = [
-            (body - 1, T[:3, 3], matrix_to_quat(T[:3, :3])) for body, T in (robot.frames[link] for link in scene.robot.tracked_links)
-        ]
+        self._drives = _Drives(p, self._client, self._robot.body, robot, dt, settings)
+        self._frames = TrackedFrames(robot)
         self._mass, self._fraction = self._inertia.mass, 1.0
         self._force, self._torque = np.zeros(3), np.zeros(3)
         self._torsional = scene.friction.torsional
@@ -119,17 +116,17 @@ class PybulletWorld(World):
         self._quat = np.array(state["object_quat"])
         arm = rotate(self._quat, self._inertia.com)
         turn = multiply(self._quat, self._inertia.quat)
-        p.resetBasePositionAndOrientation(self._object, state["object_pos"] + arm, _xyzw(turn), physicsClientId=client)
+        p.resetBasePositionAndOrientation(self._object.body, state["object_pos"] + arm, _xyzw(turn), physicsClientId=client)
         omega = state["object_angvel"]
-        p.resetBaseVelocity(self._object, state["object_linvel"] + cross(omega, arm), omega, physicsClientId=client)
+        p.resetBaseVelocity(self._object.body, state["object_linvel"] + cross(omega, arm), omega, physicsClientId=client)
         self._force, self._torque = np.zeros(3), np.zeros(3)
         self._fresh = True
 
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
         p, client = self._p, self._client
-        com, turn = p.getBasePositionAndOrientation(self._object, physicsClientId=client)
-        linear, angular = (np.array(v) for v in p.getBaseVelocity(self._object, physicsClientId=client))
+        com, turn = p.getBasePositionAndOrientation(self._object.body, physicsClientId=client)
+        linear, angular = (np.array(v) for v in p.getBaseVelocity(self._object.body, physicsClientId=client))
         self._quat = nearer(multiply(_wxyz(turn), conjugate(self._inertia.quat)), self._quat)
         arm = rotate(self._quat, self._inertia.com)
         position, velocity = self._drives.read()
@@ -153,33 +150,22 @@ class PybulletWorld(World):
         weight = np.array([0.0, 0.0, self._mass * (-GRAVITY * self._fraction - self._world_gravity)])
         force = weight + self._force
         turned = bool(self._torque.any())
-        for i in range(n * self._internal_steps):
-            self._drives.apply(renew=i % self._internal_steps == 0)
-            com, _ = p.getBasePositionAndOrientation(self._object, physicsClientId=client)
-            p.applyExternalForce(self._object, -1, force, com, p.WORLD_FRAME, physicsClientId=client)
+        for _ in range(n * self._internal_steps):
+            self._drives.apply()
+            com, _ = p.getBasePositionAndOrientation(self._object.body, physicsClientId=client)
+            p.applyExternalForce(self._object.body, -1, force, com, p.WORLD_FRAME, physicsClientId=client)
             if turned:
-                p.applyExternalTorque(self._object, -1, self._torque, p.WORLD_FRAME, physicsClientId=client)
+                p.applyExternalTorque(self._object.body, -1, self._torque, p.WORLD_FRAME, physicsClientId=client)
             p.stepSimulation(physicsClientId=client)
         self._fresh = False
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.links`."""
-        k = len(self._frames)
-        pos, quat, linvel, angvel = np.zeros((k, 3)), np.zeros((k, 4)), np.zeros((k, 3)), np.zeros((k, 3))
-        for i, (link, frame_pos, frame_quat) in enumerate(self._frames):
-            com = velocity = omega = np.zeros(3)
-            origin, turn = self._base
-            if link >= 0:
-                state = self._p.getLinkState(
-                    self._robot, link, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=self._client
-                )
-                com, origin, velocity, omega = (np.array(state[j]) for j in (0, 4, 6, 7))
-                turn = _wxyz(state[5])
-            pos[i] = origin + rotate(turn, frame_pos)
-            quat[i] = multiply(turn, frame_quat)
-            linvel[i] = velocity + cross(omega, pos[i] - com)
-            angvel[i] = omega
-        return pos, quat, linvel, angvel
+        states = self._p.getLinkStates(
+            self._robot.body, self._frames.bodies, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=self._client
+        )
+        pos, xyzw, velocity, omega = (np.array([state[i] for state in states]) for i in (4, 5, 6, 7))
+        return self._frames.locate(pos, xyzw[:, [3, 0, 1, 2]], velocity, omega)
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.contacts`: of the last internal step."""
@@ -188,37 +174,33 @@ class PybulletWorld(World):
         if self._fresh:
             return tip_force, tip_touch, table_force
         p, client = self._p, self._client
-        for contact in p.getContactPoints(self._object, self._robot, physicsClientId=client):
-            tip = self._robot_parts[contact[4] + 1].tip
+        for contact in p.getContactPoints(self._object.body, self._robot.body, physicsClientId=client):
+            tip = self._robot.parts[contact[4]].tip
             if tip is not None and contact[9] > 0:
                 tip_force[tip] += _force_on_first(contact)
                 tip_touch[tip] = True
-        for contact in p.getContactPoints(self._object, self._table, physicsClientId=client):
+        for contact in p.getContactPoints(self._object.body, self._table.body, physicsClientId=client):
             table_force += _force_on_first(contact)
         return tip_force, tip_touch, table_force
 
     def health(self) -> tuple[bool, bool]:
         """See :meth:`World.health`. Bullet allocates contacts as it needs them: none is ever dropped."""
-        values = [*self._p.getBasePositionAndOrientation(self._object, physicsClientId=self._client)[0]]
+        values = [*self._p.getBasePositionAndOrientation(self._object.body, physicsClientId=self._client)[0]]
         return not bool(np.isfinite(values).all() and all(np.isfinite(x).all() for x in self._drives.read())), False
 
     def set_object_mass(self, mass: float) -> None:
         """See :meth:`World.set_object_mass`."""
         self._mass = mass
         moments = self._inertia.moments * (mass / self._inertia.mass)
-        self._p.changeDynamics(self._object, -1, mass=mass, physicsClientId=self._client)  # also invents an inertia
-        self._p.changeDynamics(self._object, -1, localInertiaDiagonal=moments, physicsClientId=self._client)
+        self._p.changeDynamics(self._object.body, -1, mass=mass, physicsClientId=self._client)  # also invents an inertia
+        self._p.changeDynamics(self._object.body, -1, localInertiaDiagonal=moments, physicsClientId=self._client)
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
-        p, client = self._p, self._client
-        tip, link, table = friction
-        for i in range(len(self._object_parts)):
-            p.changeDynamics(self._object, i - 1, lateralFriction=1.0, spinningFriction=0.0, physicsClientId=client)
-        p.changeDynamics(self._table, -1, lateralFriction=table, spinningFriction=self._torsional, physicsClientId=client)
-        for i, part in enumerate(self._robot_parts):
-            mu = link if part.tip is None else tip
-            p.changeDynamics(self._robot, i - 1, lateralFriction=mu, spinningFriction=self._torsional, physicsClientId=client)
+        tip, link, table = (float(mu) for mu in friction)
+        self._set_surface(self._object, {None: 1.0}, torsional=0.0)
+        self._set_surface(self._table, {None: table}, torsional=self._torsional)
+        self._set_surface(self._robot, {None: link} | dict.fromkeys(range(len(self._mechanism.robot.fingertips)), tip), self._torsional)
 
     def set_object_gravity(self, fraction: float) -> None:
         """See :meth:`World.set_object_gravity`."""
@@ -234,9 +216,23 @@ class PybulletWorld(World):
             self._p.disconnect(physicsClientId=self._client)
             self._client = -1
 
-    def _load(
-        self, urdf: Path, pos: tuple[float, float, float], quat: Sequence[float] = (1.0, 0.0, 0.0, 0.0), *, fixed: bool = True
-    ) -> int:
+    # Building ----------------------------------------------------------------------------------------------------------------------------
+
+    def _load_robot(self, robot: Mechanism, folder: Path) -> _Model:
+        parts = _robot_parts(robot)
+        spec = robot.robot
+        body = self._load(_robot_urdf(robot, parts, folder), pos=spec.base_pos, quat=spec.base_quat, fixed=True)
+        return _Model(body, 0, parts)
+
+    def _load_rigid(
+        self, groups: list[tuple[Shape, ...]], inertia: Inertia | None, pos: tuple[float, float, float], folder: Path
+    ) -> _Model:
+        """Load a single body; fixed if it has no inertia."""
+        parts = [_Part(body=0, link="", shapes=group) for group in groups]
+        urdf = _rigid_urdf(parts, inertia or _WEIGHTLESS, folder)
+        return _Model(self._load(urdf, pos=pos, quat=(1.0, 0.0, 0.0, 0.0), fixed=inertia is None), -1, parts)
+
+    def _load(self, urdf: Path, *, pos: Sequence[float], quat: Sequence[float], fixed: bool) -> int:
         p = self._p
         return p.loadURDF(
             str(urdf),
@@ -251,30 +247,36 @@ class PybulletWorld(World):
             physicsClientId=self._client,
         )
 
-    def _remove_defaults(self, body: int, parts: Sequence[_Part]) -> None:
+    def _remove_defaults(self, model: _Model) -> None:
         """Take away the damping, sleep and margins that Bullet gives every link."""
         p, client = self._p, self._client
-        for i, part in enumerate(parts):
-            p.changeDynamics(body, i - 1, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, physicsClientId=client)
-            p.changeDynamics(body, i - 1, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client)
+        for link, part in model.links:
+            p.changeDynamics(model.body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, physicsClientId=client)
+            p.changeDynamics(model.body, link, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client)
             if part.is_hull:
-                p.changeDynamics(body, i - 1, collisionMargin=0.0, physicsClientId=client)
+                p.changeDynamics(model.body, link, collisionMargin=0.0, physicsClientId=client)
 
-    def _set_collision_pairs(self, scene: SceneSpec) -> None:
-        def allow(a: int, b: int, link_a: int, link_b: int, yes: bool) -> None:
-            self._p.setCollisionFilterPair(a, b, link_a - 1, link_b - 1, int(yes), physicsClientId=self._client)
+    def _set_surface(self, model: _Model, lateral: Mapping[int | None, float], torsional: float) -> None:
+        """Set friction by the fingertip that a part belongs to."""
+        for link, part in model.links:
+            mu = lateral[part.tip]
+            self._p.changeDynamics(model.body, link, lateralFriction=mu, spinningFriction=torsional, physicsClientId=self._client)
 
-        pieces = range(len(self._object_parts))
-        for k in pieces:
-            allow(self._object, self._table, k, 0, True)
-            for other in range(k):
-                allow(self._object, self._object, k, other, False)
-        for i, part in enumerate(self._robot_parts):
-            allow(self._robot, self._table, i, 0, part.link not in scene.robot.table_exclude)
-            for k in pieces:
-                allow(self._robot, self._object, i, k, True)
-            for j, other in enumerate(self._robot_parts[:i]):
-                allow(self._robot, self._robot, i, j, self._mechanism.may_collide(part.link, other.link))
+    def _set_collision_pairs(self) -> None:
+        def allow(a: _Model, link_a: int, b: _Model, link_b: int, yes: bool) -> None:
+            self._p.setCollisionFilterPair(a.body, b.body, link_a, link_b, int(yes), physicsClientId=self._client)
+
+        robot = self._mechanism
+        for piece, _ in self._object.links:
+            allow(self._object, piece, self._table, -1, True)
+            for other in range(-1, piece):
+                allow(self._object, piece, self._object, other, False)
+        for link, part in self._robot.links:
+            allow(self._robot, link, self._table, -1, part.link not in robot.robot.table_exclude)
+            for piece, _ in self._object.links:
+                allow(self._robot, link, self._object, piece, True)
+            for other, other_part in self._robot.links[:link]:
+                allow(self._robot, link, self._robot, other, robot.may_collide(part.link, other_part.link))
 
 
 class PybulletBackend(PoolBackend):
@@ -307,10 +309,11 @@ class _Drives:
     that is stable when explicit) get the PD torque as it is.
     """
 
-    def __init__(self, engine: Any, client: int, body: int, robot: Mechanism, dt: float, explicit_limit: float) -> None:
+    def __init__(self, engine: Any, client: int, body: int, robot: Mechanism, dt: float, settings: PybulletSettings) -> None:
         self._p, self._client, self._body, self._dt = engine, client, body, dt
+        self._mass_matrix_age, self._mass_matrix_steps = 0, settings.mass_matrix_steps
         spec, names = robot.robot, robot.joint_names
-        self._links = list(range(len(names)))
+        self._links = list(range(1, len(names) + 1))  # link 0 is the base
         self.driven = np.array([names.index(name) for name in spec.joint_names])
         """[J] position of each actuated joint among the moving ones."""
         self.target = spec.home
@@ -327,7 +330,7 @@ class _Drives:
         self.reset(spec.home, np.zeros(len(drives)), spec.home)
         M = self._mass_matrix(spec.home)
         inertia = 1.0 / np.diag(np.linalg.inv(M))
-        stiff = dt * self._kd + dt**2 * self._kp > explicit_limit * inertia[self.driven]
+        stiff = dt * self._kd + dt**2 * self._kp > settings.explicit_limit * inertia[self.driven]
         self._implicit = stiff | (self._armature > 0)
         self._loss = np.where(self._implicit, loss, 0.0)
         self._J = np.zeros((len(self._mimic), len(names)))
@@ -352,14 +355,15 @@ class _Drives:
             self._body, self._links, [[x] for x in q], targetVelocities=[[x] for x in v], physicsClientId=self._client
         )
         self.target = target
+        self._mass_matrix_age = 0
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities [D] of all moving joints."""
         states = self._p.getJointStates(self._body, self._links, physicsClientId=self._client)
         return np.array([state[0] for state in states]), np.array([state[1] for state in states])
 
-    def apply(self, *, renew: bool) -> None:
-        """Apply the torques of one Bullet step; ``renew`` updates the mass matrix."""
+    def apply(self) -> None:
+        """Apply the torques of one Bullet step."""
         q, v = self.read()
         dt, driven = self._dt, self.driven
         wanted = self._kp * (self.target - q[driven]) - self._kd * v[driven]
@@ -371,8 +375,9 @@ class _Drives:
                 rate = self._J @ v
                 tau -= self._J.T @ (self._stiffness * (lag + dt * rate) + self._damping * rate)
             saturated = np.abs(wanted) > self._effort
-            if renew or not np.array_equal(saturated, self._saturated):
+            if self._mass_matrix_age == 0 or not np.array_equal(saturated, self._saturated):
                 self._factorise(q, saturated)
+            self._mass_matrix_age = (self._mass_matrix_age + 1) % self._mass_matrix_steps
             bias = self._p.calculateInverseDynamics(self._body, list(q), list(v), [0.0] * len(q), physicsClientId=self._client)
             net = tau - bias
             if self._loss.any():
@@ -417,7 +422,7 @@ class _Part:
     body: int
     """Index of the body that it is (part of)."""
     link: str
-    """URDF link whose shapes it has; for an object its name."""
+    """URDF link whose shapes it has; empty for objects and the table."""
     shapes: tuple[Shape, ...]
     tip: int | None = None
     """Index of the fingertip that it is part of."""
@@ -428,6 +433,22 @@ class _Part:
         return any(shape.geometry.kind == "hull" for shape in self.shapes)
 
 
+@dataclass(frozen=True)
+class _Model:
+    """A loaded URDF."""
+
+    body: int
+    """Bullet's number of it."""
+    first: int
+    """Bullet's number of its first part: -1 where that is the root of the URDF."""
+    parts: list[_Part]
+
+    @property
+    def links(self) -> list[tuple[int, _Part]]:
+        """Bullet's link number and description of every part."""
+        return list(enumerate(self.parts, start=self.first))
+
+
 def _groups(shapes: Sequence[Shape]) -> list[tuple[Shape, ...]]:
     """Shapes that may share a Bullet link: the primitives together, every hull alone, for only then can its margin be removed."""
     hulls = [(shape,) for shape in shapes if shape.geometry.kind == "hull"]
@@ -436,7 +457,7 @@ def _groups(shapes: Sequence[Shape]) -> list[tuple[Shape, ...]]:
 
 
 def _robot_parts(robot: Mechanism) -> list[_Part]:
-    """The base and the moving bodies, then the fixed pieces: so Bullet's link i is body i + 1 and moving joint i."""
+    """The base and the moving bodies, then the fixed pieces: so Bullet's link i is body i."""
     moving, fixed = [], []
     for i, body in enumerate(robot.bodies):
         for link in dict.fromkeys((body.name, *(s.link for s in body.shapes))):
@@ -450,10 +471,6 @@ def _robot_parts(robot: Mechanism) -> list[_Part]:
     return moving + fixed
 
 
-def _object_parts(spec: ObjectSpec) -> list[_Part]:
-    return [_Part(body=0, link=spec.name, shapes=group) for group in _groups(spec.pieces)]
-
-
 _FAR = 100.0
 """A height [m] where nothing touches the object."""
 
@@ -462,35 +479,35 @@ _WEIGHTLESS = Inertia(mass=1e-9, com=np.zeros(3), quat=np.array([1.0, 0, 0, 0]),
 
 
 def _robot_urdf(robot: Mechanism, parts: Sequence[_Part], folder: Path) -> Path:
-    text = []
+    text = [_link_text("root", _WEIGHTLESS, (), folder)]  # Bullet does not count the root as a link, and tells less about it
     for i, part in enumerate(parts):
         body = robot.bodies[part.body]
-        text.append(_link_text(i, (body.inertia if i == part.body else None) or _WEIGHTLESS, part.shapes, folder))
-        if i != part.body:
-            text.append(_fixed_joint_text(i, part.body))
-        elif body.joint is not None:
-            joint = body.joint
-            limited = np.isfinite(joint.lower) and np.isfinite(joint.upper)
-            kind = "prismatic" if joint.type == "prismatic" else "revolute" if limited else "continuous"
-            lower, upper = (joint.lower, joint.upper) if limited else (0.0, -1.0)
-            text.append(
-                f'<joint name="joint{i}" type="{kind}"><parent link="link{body.parent}"/><child link="link{i}"/>'
-                f'{_origin(body.T_parent_body)}<axis xyz="{_numbers(joint.axis)}"/>'
-                f'<limit lower="{lower!r}" upper="{upper!r}" effort="0" velocity="0"/></joint>'
-            )
+        text.append(_link_text(f"link{i}", (body.inertia if i == part.body else None) or _WEIGHTLESS, part.shapes, folder))
+        if i == 0 or i != part.body:
+            text.append(_fixed_joint_text(i, f"link{part.body}" if i else "root"))
+            continue
+        joint = body.joint
+        limited = np.isfinite(joint.lower) and np.isfinite(joint.upper)
+        kind = "prismatic" if joint.type == "prismatic" else "revolute" if limited else "continuous"
+        lower, upper = (joint.lower, joint.upper) if limited else (0.0, -1.0)
+        text.append(
+            f'<joint name="joint{i}" type="{kind}"><parent link="link{body.parent}"/><child link="link{i}"/>'
+            f'{_origin(body.T_parent_body)}<axis xyz="{_numbers(joint.axis)}"/>'
+            f'<limit lower="{lower!r}" upper="{upper!r}" effort="0" velocity="0"/></joint>'
+        )
     return _write(folder / "robot.urdf", text)
 
 
 def _rigid_urdf(parts: Sequence[_Part], inertia: Inertia, folder: Path) -> Path:
     text = []
     for i, part in enumerate(parts):
-        text.append(_link_text(i, _WEIGHTLESS if i else inertia, part.shapes, folder))
-        text.append(_fixed_joint_text(i, 0) if i else "")
+        text.append(_link_text(f"link{i}", _WEIGHTLESS if i else inertia, part.shapes, folder))
+        text.append(_fixed_joint_text(i, "link0") if i else "")
     return _write(folder / "rigid.urdf", text)
 
 
-def _fixed_joint_text(link: int, parent: int) -> str:
-    return f'<joint name="joint{link}" type="fixed"><parent link="link{parent}"/><child link="link{link}"/></joint>'
+def _fixed_joint_text(link: int, parent: str) -> str:
+    return f'<joint name="joint{link}" type="fixed"><parent link="{parent}"/><child link="link{link}"/></joint>'
 
 
 def _write(path: Path, text: Sequence[str]) -> Path:
@@ -498,16 +515,16 @@ def _write(path: Path, text: Sequence[str]) -> Path:
     return path
 
 
-def _link_text(index: int, inertia: Inertia, shapes: Sequence[Shape], folder: Path) -> str:
+def _link_text(name: str, inertia: Inertia, shapes: Sequence[Shape], folder: Path) -> str:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = _matrix(inertia.quat), inertia.com
     x, y, z = (float(m) for m in inertia.moments)
     text = [
-        f'<link name="link{index}"><inertial>{_origin(T)}<mass value="{inertia.mass!r}"/>'
+        f'<link name="{name}"><inertial>{_origin(T)}<mass value="{inertia.mass!r}"/>'
         f'<inertia ixx="{x!r}" iyy="{y!r}" izz="{z!r}" ixy="0" ixz="0" iyz="0"/></inertial>'
     ]
     for i, shape in enumerate(shapes):
-        geometry = _geometry_text(shape, folder / f"{index}_{i}.obj")
+        geometry = _geometry_text(shape, folder / f"{name}_{i}.obj")
         text.append(f"<collision>{_origin(shape.T_body_shape)}<geometry>{geometry}</geometry></collision>")
     return "".join([*text, "</link>"])
 

@@ -1,7 +1,7 @@
 """A robot as moving rigid bodies: what the backends build that must know masses and frames themselves.
 
 Links that are fixed to one another are fused into one body with their common mass, centre of mass and inertia; :class:`Mechanism` says
-where every link has gone. Also the few numpy operations on single quaternions (w, x, y, z) that a backend needs every step.
+where every link has gone. Also numpy operations on a few quaternions (w, x, y, z), which backends need every step.
 """
 
 from __future__ import annotations
@@ -129,6 +129,33 @@ def mechanism(robot: RobotSpec) -> Mechanism:
     return Mechanism(robot=robot, bodies=bodies, frames=frames)
 
 
+class TrackedFrames:
+    """The tracked links of a robot as frames on its bodies."""
+
+    def __init__(self, robot: Mechanism) -> None:
+        places = [robot.frames[link] for link in robot.robot.tracked_links]
+        self.bodies = [body for body, _ in places]
+        """[K] index of the body of each tracked link."""
+        inertias = [robot.bodies[body].inertia for body in self.bodies]
+        self._com = np.array([np.zeros(3) if inertia is None else inertia.com for inertia in inertias])
+        self._pos = np.array([T[:3, 3] for _, T in places])
+        self._quat = np.array([matrix_to_quat(T[:3, :3]) for _, T in places])
+
+    def locate(
+        self, pos: np.ndarray, quat: np.ndarray, com_velocity: np.ndarray, angvel: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Position, orientation, velocity and angular velocity of the tracked links.
+
+        Args:
+            pos: [K, 3] position of their bodies' frames.
+            quat: [K, 4] orientation of their bodies' frames.
+            com_velocity: [K, 3] velocity of their bodies' centres of mass.
+            angvel: [K, 3] angular velocity of their bodies.
+        """
+        arm = rotate(quat, self._pos)
+        return pos + arm, multiply(quat, self._quat), com_velocity + cross(angvel, arm - rotate(quat, self._com)), angvel
+
+
 def object_inertia(spec: ObjectSpec) -> Inertia:
     """Mass properties of an object; ``ObjectError`` if no body can have them."""
     return principal(spec.mass, spec.com, spec.inertia, ObjectError, f"the object {spec.name!r}")
@@ -179,14 +206,14 @@ def _fused_inertia(robot: RobotSpec, links: list[Link], frames: dict[str, tuple[
     return principal(mass, com, inertia, RobotError, f"robot {robot.name!r}: the link {links[0].name!r}")
 
 
-# Single quaternions ----------------------------------------------------------------------------------------------------------------------
-# Written out in scalars: numpy's own calls cost more than the arithmetic on arrays this small.
+# Few quaternions -------------------------------------------------------------------------------------------------------------------------
+# For one or a handful of vectors [3] or [n, 3], where numpy's and scipy's own functions cost more than the arithmetic.
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[4] Hamilton product: rotation b first, then a."""
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
+    """[..., 4] Hamilton product: rotation b first, then a."""
+    aw, ax, ay, az = a.T
+    bw, bx, by, bz = b.T
     return np.array(
         (
             aw * bw - ax * bx - ay * by - az * bz,
@@ -194,26 +221,29 @@ def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
             aw * by - ax * bz + ay * bw + az * bx,
             aw * bz + ax * by - ay * bx + az * bw,
         )
-    )
+    ).T
 
 
 def conjugate(q: np.ndarray) -> np.ndarray:
-    """[4] inverse of a unit quaternion."""
-    return np.array((q[0], -q[1], -q[2], -q[3]))
+    """[..., 4] inverse of a unit quaternion."""
+    return q * _CONJUGATE
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[3] vector product."""
-    ax, ay, az = a
-    bx, by, bz = b
-    return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
+    """[..., 3] vector product."""
+    ax, ay, az = a.T
+    bx, by, bz = b.T
+    return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)).T
 
 
 def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """[3] vector v turned by the unit quaternion q."""
-    u = np.asarray(q[1:])
+    """[..., 3] vector v turned by the unit quaternion q."""
+    u = q[..., 1:]
     t = 2.0 * cross(u, v)
-    return v + q[0] * t + cross(u, t)
+    return v + q[..., :1] * t + cross(u, t)
+
+
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def matrix_to_quat(R: np.ndarray) -> np.ndarray:

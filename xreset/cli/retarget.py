@@ -9,7 +9,13 @@ import tyro
 
 
 def retarget(
-    demos: Annotated[Path, tyro.conf.Positional], *, robot: str, out: Path, objects: Path | None = None, max_per_object: int | None = None
+    demos: Annotated[Path, tyro.conf.Positional],
+    *,
+    robot: str,
+    out: Path,
+    objects: Path | None = None,
+    max_per_object: int | None = None,
+    picture: Path | None = None,
 ) -> None:
     """Turn human demonstrations into robot trajectories.
 
@@ -19,6 +25,7 @@ def retarget(
         out: File to write.
         objects: Folder of real meshes; default: the built-in stand-ins.
         max_per_object: Only the first so many sequences of each object.
+        picture: PNG to write: one grasp per object, the human keypoints over it.
     """
     from dataclasses import asdict
 
@@ -50,6 +57,12 @@ def retarget(
         config={"retarget": asdict(config), "robot": robot, "max_per_object": max_per_object},
         inputs={"demos": file_hash(demos), "robot": spec.fingerprint} | {f"object {s.name}": s.source for s in specs.values()},
     )
+
+    if picture is not None:
+        from xreset.render import write_png
+        from xreset.retarget.picture import grasp_sheet
+
+        write_png(picture, grasp_sheet(result, pipeline.rest_on_table(chosen, list(specs.values())), spec, list(specs.values())))
 
     table = Table(
         "object", "sequences", "frames", "annotated", "valid", "fingertips [mm]", "invalid because of", title=f"retargeted to {spec.name}"

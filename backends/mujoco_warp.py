@@ -85,10 +85,8 @@ class MujocoWarpBackend(Backend):
         Raises:
             BackendUnavailableError: there is no such device.
         """
-        super().__init__(scene, num_worlds, object_index=object_index, device=device)
+        super().__init__(scene, num_worlds, object_index=object_index, device=_existing_device(device))
         wp.init()
-        self.device = _existing_device(self.device)
-        self.object_index = self.object_index.to(self.device)
         self._warp_device = wp.device_from_torch(self.device)
         self._streams: dict[int, Any] = {}
         held = self.object_index.unique().tolist()
@@ -101,7 +99,11 @@ class MujocoWarpBackend(Backend):
             self._model = mjw.put_model(at.model, batch_sizes=dict.fromkeys((*_SET_PER_WORLD, *differing), num_worlds))
             self._model.opt.warn_overflow = 0  # overflows are counted, see health(); printing them from the GPU would flood the terminal
             self._data = mjw.make_data(
-                at.model, nworld=num_worlds, nconmax=contacts_per_world, nccdmax=convex_contacts_per_world, njmax=constraints_per_world
+                at.model,
+                nworld=num_worlds,
+                nconmax=contacts_per_world,
+                nccdmax=min(convex_contacts_per_world, contacts_per_world),
+                njmax=constraints_per_world,
             )
             self._fill_batched({i: s.model for i, s in scenes.items()}, {i: s.parked for i, s in scenes.items()}, differing)
             self._allocate()
@@ -403,10 +405,11 @@ class MujocoWarpBackend(Backend):
             raise XResetError(f"the backend {self.name!r} is closed. Build a new one.")
 
 
-def _existing_device(device: torch.device) -> torch.device:
+def _existing_device(name: str) -> str:
     """The device with its index; ``BackendUnavailableError`` if it is not there."""
+    device = torch.device(name)
     if device.type == "cpu":
-        return device
+        return name
     if device.type != "cuda":
         raise BackendUnavailableError(f"the backend 'mujoco-warp' runs on devices 'cuda' and 'cpu', found {str(device)!r}.")
     if "cuda" not in MujocoWarpBackend.devices():
@@ -416,7 +419,7 @@ def _existing_device(device: torch.device) -> torch.device:
     index = torch.cuda.current_device() if device.index is None else device.index
     if index >= torch.cuda.device_count():
         raise BackendUnavailableError(f"there is no device 'cuda:{index}'; there are {torch.cuda.device_count()} CUDA devices.")
-    return torch.device("cuda", index)
+    return f"cuda:{index}"
 
 
 def _differing_fields(models: list[Any]) -> list[str]:

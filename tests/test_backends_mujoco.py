@@ -1,0 +1,296 @@
+"""The MuJoCo model of a scene, and what the two MuJoCo backends do beyond the conformance suite."""
+
+from __future__ import annotations
+
+import tempfile
+import unittest
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import mujoco
+import numpy as np
+import torch
+
+from tests.toy_robot import toy_hand_arm
+from xreset.backends.base import Backend
+from xreset.backends.conformance.contact_checks import _grasp
+from xreset.backends.conformance.harness import Bench, snapshot
+from xreset.backends.conformance.scene import gripper, objects, scene
+from xreset.backends.mjcf import OBJECT, OTHER_LINK, TABLE, SceneModel, compile_scene
+from xreset.backends.mujoco import MujocoBackend
+from xreset.backends.mujoco_warp import MujocoWarpBackend, _differing_fields
+from xreset.errors import BackendUnavailableError, ObjectError, RobotError, XResetError
+from xreset.spec import FingertipSpec
+from xreset.urdf import robot_tree
+
+
+def colliding_geoms(model: mujoco.MjModel) -> set[frozenset[str]]:
+    """Pairs of geoms that the engine lets touch: all are made into large spheres that overlap, and it says what touches what."""
+    model.geom_type[:] = mujoco.mjtGeom.mjGEOM_SPHERE
+    model.geom_size[:, 0] = model.geom_rbound[:] = model.geom_aabb[:, 3:] = 10.0
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    return {frozenset(names[i] for i in pair) for pair in data.contact.geom}
+
+
+class Model(unittest.TestCase):
+    at: SceneModel
+
+    @classmethod
+    def setUpClass(cls):
+        cls.scene = scene()
+        cls.at = compile_scene(cls.scene, 0)
+
+    def test_fused_bodies_keep_the_mass_and_the_inertia(self):
+        model = self.at.model
+        tree = robot_tree(self.scene.robot)
+        moving = sum(link.mass for link in tree.links if link.name != tree.root)
+        self.assertAlmostEqual(float(model.body_mass[1:-1].sum()), moving)
+        # wrist and palm are one body: the mass matrix of the joint that turns it must see both, about the joint's axis
+        wrist, palm = tree.link("wrist"), tree.link("palm")
+        mount = tree.joint("palm_mount").T_parent_joint
+        body = model.body("robot/wrist")
+        com = (wrist.mass * wrist.com + palm.mass * (mount[:3, :3] @ palm.com + mount[:3, 3])) / (wrist.mass + palm.mass)
+        np.testing.assert_allclose(body.ipos, com, atol=1e-12)
+
+    def test_actuators_are_drives_in_joint_order(self):
+        model, robot = self.at.model, self.scene.robot
+        for i, joint in enumerate(robot.joints):
+            self.assertEqual(model.actuator(i).name, joint.name)
+            self.assertEqual(model.actuator(i).gainprm[0], joint.drive.kp)
+            np.testing.assert_array_equal(model.actuator(i).biasprm[:3], (0.0, -joint.drive.kp, -joint.drive.kd))
+            np.testing.assert_array_equal(model.actuator(i).forcerange, (-joint.drive.effort, joint.drive.effort))
+            self.assertEqual(model.dof_armature[self.at.joint_dof[i]], joint.drive.armature)
+            self.assertEqual(model.jnt_qposadr[model.joint(joint.name).id], self.at.joint_qpos[i])
+
+    def test_gravity_compensation_takes_the_weight_of_the_robot_only(self):
+        model, data = self.at.model, mujoco.MjData(self.at.model)
+        data.qpos[self.at.joint_qpos] = (0.1, 0.4, 0.2, -0.5, 0.03)
+        data.qpos[self.at.object_qpos + 2] = 2.0
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(data.qacc[self.at.object_dof : self.at.object_dof + 3], (0, 0, -9.81), atol=1e-9)
+        weightless = data.qfrc_bias - data.qfrc_passive
+        np.testing.assert_allclose(weightless[self.at.joint_dof], 0.0, atol=1e-9)
+        heavy = replace(self.scene, robot=replace(self.scene.robot, gravity_compensated=False))
+        model = compile_scene(heavy, 0).model
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        self.assertGreater(np.abs((data.qfrc_bias - data.qfrc_passive)[self.at.joint_dof]).max(), 1.0)
+
+    def test_what_may_collide(self):
+        pairs = colliding_geoms(compile_scene(self.scene, 0).model)
+        base, column, wrist, jaw_a, pad_b = (
+            f"robot/{body}/0" for body in ("base", "column", "wrist", "jaw_a", "finger_b")
+        )  # the pad is fixed to finger_b
+        thing = "object/box/0"
+        expected = {frozenset((thing, other)) for other in ("table", base, column, wrist, jaw_a, pad_b)}
+        expected |= {frozenset(("table", link)) for link in (column, wrist, jaw_a, pad_b)}  # the base is excluded
+        expected |= {frozenset((jaw_a, pad_b)), frozenset((column, pad_b))}  # jaw_a and column are excluded, the wrist not listed
+        self.assertEqual(pairs, expected)
+
+    def test_links_of_one_body_are_told_apart(self):
+        # finger_b has no shape; its pad may collide with jaw_a, a second fixed link of the same body may not
+        with tempfile.TemporaryDirectory() as folder:
+            text = gripper().urdf.read_text()
+            box = '<collision><geometry><box size="0.01 0.01 0.01"/></geometry></collision>'
+            text = text.replace('<link name="tip_b"/>', f'<link name="tip_b">{box}</link>')
+            urdf = Path(folder) / "robot.urdf"
+            urdf.write_text(text)
+            robot = replace(
+                gripper(),
+                urdf=urdf,
+                self_collision_links=("jaw_a", "pad_b", "tip_b"),
+                collision_exclude=(("jaw_a", "tip_b"),),
+            )
+            pairs = colliding_geoms(compile_scene(replace(self.scene, robot=robot), 0).model)
+        own = {pair for pair in pairs if all(name.startswith("robot/") for name in pair)}
+        self.assertEqual(own, {frozenset(("robot/jaw_a/0", "robot/finger_b/0"))})
+
+    def test_neighbours_of_a_base_that_stands_still_never_collide(self):
+        robot = replace(self.scene.robot, self_collision_links=("base", "column", "wrist"), collision_exclude=())
+        pairs = colliding_geoms(compile_scene(replace(self.scene, robot=robot), 0).model)
+        own = {pair for pair in pairs if all(name.startswith("robot/") for name in pair)}
+        self.assertEqual(own, {frozenset(("robot/base/0", "robot/wrist/0")), frozenset(("robot/column/0", "robot/wrist/0"))})
+
+    def test_roles(self):
+        names = [self.at.model.geom(i).name for i in range(self.at.model.ngeom)]
+        role = dict(zip(names, self.at.geom_role.tolist(), strict=True))
+        self.assertEqual(role["table"], TABLE)
+        self.assertEqual(role["robot/jaw_a/0"], 0)
+        self.assertEqual(role["robot/finger_b/0"], 1)
+        self.assertEqual(role["robot/wrist/0"], OTHER_LINK)
+        self.assertEqual(role["object/box/0"], OBJECT)
+
+    def test_slots_hold_any_of_the_objects(self):
+        models = [compile_scene(self.scene, i, slots_for=range(3)) for i in range(3)]
+        kinds = [m.model.geom_type.tolist() for m in models]
+        self.assertEqual(kinds[0], kinds[1])
+        self.assertEqual(kinds[0], kinds[2])
+        self.assertEqual([int(m.parked.sum()) for m in models], [3, 3, 2])  # of one box, one cylinder and two hulls
+        for field in ("mesh_vert", "mesh_graph", "geom_contype", "geom_bodyid", "geom_condim", "dof_parentid"):
+            for other in models[1:]:
+                np.testing.assert_array_equal(getattr(models[0].model, field), getattr(other.model, field), field)
+        differing = _differing_fields([m.model for m in models])
+        for field in ("geom_size", "geom_pos", "geom_aabb", "geom_rbound", "body_mass", "body_ipos", "body_iquat", "body_inertia",
+                      "body_invweight0", "dof_invweight0", "geom_dataid"):  # fmt: skip
+            self.assertIn(field, differing)
+
+    def test_bad_objects_and_robots(self):
+        brick = objects()[0]
+        for bad, message in (
+            (replace(brick, pieces=()), "no collision piece"),
+            (replace(brick, mass=0.0), "mass"),
+            (replace(brick, inertia=np.diag((1e-4, 1e-4, 3e-4))), "moments of inertia"),
+        ):
+            with self.assertRaisesRegex(ObjectError, message):
+                compile_scene(replace(self.scene, objects=(bad,)), 0)
+        robot = self.scene.robot
+        tip = FingertipSpec(name="thumb", link="nowhere", contact_links=("jaw_a",), keypoint="thumb4")
+        with self.assertRaisesRegex(RobotError, "nowhere"):
+            compile_scene(replace(self.scene, robot=replace(robot, fingertips=(tip,))), 0)
+        with self.assertRaisesRegex(RobotError, "jaw_b_slide"):
+            compile_scene(replace(self.scene, robot=replace(robot, mimics=())), 0)
+
+    def test_another_robot(self):
+        with tempfile.TemporaryDirectory() as folder:
+            at = compile_scene(replace(self.scene, robot=toy_hand_arm(Path(folder))), 1)
+        self.assertEqual(len(at.joint_qpos), 7)
+        self.assertEqual(at.model.body("robot/fore").id, at.link_body[0])  # the palm is fixed to the forearm
+
+
+class BothBackends(unittest.TestCase):
+    """MuJoCo C is the reference for MuJoCo-Warp. The worlds are built once: compiling kernels takes about a minute."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.scene = scene()
+        index = torch.tensor([0, 1, 2, 0])
+        cls.warp = MujocoWarpBackend(cls.scene, 4, object_index=index)
+        cls.c = MujocoBackend(cls.scene, 4, object_index=index, workers=0)
+        cls.bench = Bench(lambda *_, **__: cls.c, cls.scene)
+
+    @classmethod
+    def tearDownClass(cls):
+        cls.warp.close()
+        cls.c.close()
+
+    def both(self) -> tuple[Backend, Backend]:
+        return self.warp, self.c
+
+    def test_start(self):
+        home = torch.as_tensor(self.scene.robot.home, dtype=torch.float32)
+        for backend in (MujocoBackend(self.scene, 1, workers=0), MujocoWarpBackend(self.scene, 1)):
+            state = backend.state()
+            torch.testing.assert_close(state.joint_pos[0], home)
+            torch.testing.assert_close(state.joint_target[0], home)
+            torch.testing.assert_close(state.object_pos[0], torch.tensor([0.57, 0.30, 0.029]))
+
+    def test_same_motion(self):
+        """Closing jaws, a swinging arm and objects at rest, for half a second."""
+        start = self.bench.start()
+        target = start.joint_pos + torch.tensor([0.05, 0.3, 0.2, -0.3, -0.02])
+        for backend in self.both():
+            backend.set_state(start)
+            backend.set_joint_targets(target)
+            for _ in range(30):
+                backend.step()
+        a, b = snapshot(self.warp.state()), snapshot(self.c.state())
+        torch.testing.assert_close(a.joint_pos, b.joint_pos, atol=1e-5, rtol=0.0)
+        torch.testing.assert_close(a.object_pos, b.object_pos, atol=1e-4, rtol=0.0)
+        torch.testing.assert_close(self.warp.links().linvel, self.c.links().linvel, atol=1e-4, rtol=0.0)
+        torch.testing.assert_close(self.warp.contacts().table_force, self.c.contacts().table_force, atol=0.05, rtol=0.0)
+
+    def test_a_grasp_holds_for_two_seconds(self):
+        """Grasps have changed between versions of MuJoCo-Warp."""
+        state, _ = _grasp(self.bench)
+        for backend in self.both():
+            with self.subTest(backend=backend.name):
+                backend.set_state(state)
+                for _ in range(120):
+                    backend.step()
+                fallen = (state.object_pos - backend.state().object_pos)[[0, 3], 2]
+                self.assertLess(float(fallen.abs().max()), 5e-3)
+                self.assertTrue(bool(backend.contacts().tip_touch[[0, 3]].all()))
+                self.assertFalse(bool(backend.health().nonfinite.any()))
+
+    def test_held_forces_agree(self):
+        state, _ = _grasp(self.bench)
+        for backend in self.both():
+            backend.set_state(state)
+            backend.step(60)
+        a, b = self.warp.contacts(), self.c.contacts()
+        torch.testing.assert_close(a.tip_force[[0, 3]], b.tip_force[[0, 3]], atol=0.02, rtol=0.0)
+        torch.testing.assert_close(a.tip_touch, b.tip_touch)
+
+    def test_bad_shapes_are_named(self):
+        state = self.bench.start()
+        for backend in self.both():
+            with self.assertRaisesRegex(ValueError, r"joint_pos.*\(3, 5\).*\(4, 5\)"):
+                backend.set_state(replace(state, joint_pos=state.joint_pos[:3]))
+            with self.assertRaisesRegex(ValueError, "joint_target"):
+                backend.set_joint_targets(state.joint_pos[:, :2])
+            with self.assertRaisesRegex(ValueError, "substeps"):
+                backend.step(0)
+            with self.assertRaises(ValueError):
+                backend.set_object_mass(torch.ones(3))
+            with self.assertRaises(ValueError):
+                backend.set_friction(torch.ones(4, 2))
+
+    def test_setting_no_world_does_nothing(self):
+        for backend in self.both():
+            backend.set_state(self.bench.start())
+            before = snapshot(backend.state())
+            backend.set_state(self.bench.start()[[]], torch.tensor([], dtype=torch.long))
+            torch.testing.assert_close(backend.state().object_pos, before.object_pos)
+
+
+class Limits(unittest.TestCase):
+    def test_warp_counts_contacts_that_found_no_room(self):
+        backend = MujocoWarpBackend(scene(), 4, object_index=torch.zeros(4, dtype=torch.long), contacts_per_world=1)
+        backend.step(8)
+        self.assertTrue(bool(backend.health().overflow.all()))  # the pool is everyone's
+        state = snapshot(backend.state())
+        state = replace(state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 1.0]))  # no contacts
+        backend.set_state(state[[2]], torch.tensor([2]))
+        self.assertEqual(backend.health().overflow.tolist(), [True, True, False, True])
+        backend.set_state(state)
+        backend.step(1)
+        self.assertFalse(bool(backend.health().overflow.any()))
+
+    def test_c_reports_the_engine_s_warnings_of_a_full_buffer(self):
+        backend = MujocoBackend(scene(), 1, workers=0)
+        step = mujoco.mj_step
+
+        def full(model, data, n):
+            step(model, data, n)
+            data.warning[int(mujoco.mjtWarning.mjWARN_CNSTRFULL)].number += 1
+
+        with mock.patch.object(mujoco, "mj_step", full):
+            backend.step(1)
+        self.assertTrue(bool(backend.health().overflow[0]))
+        backend.step(1)
+        self.assertTrue(bool(backend.health().overflow[0]), "it stays until the state is set")
+        backend.set_state(snapshot(backend.state()))
+        backend.step(1)
+        self.assertFalse(bool(backend.health().overflow[0]))
+
+    def test_closed(self):
+        backend = MujocoWarpBackend(scene(), 1)
+        backend.close()
+        backend.close()
+        for call in (backend.state, backend.step, backend.links, backend.contacts, backend.health):
+            with self.assertRaisesRegex(XResetError, "closed"):
+                call()
+
+    @unittest.skipIf(torch.cuda.is_available(), "there is a CUDA device")
+    def test_no_such_device(self):
+        self.assertEqual(MujocoWarpBackend.devices(), ["cpu"])
+        with self.assertRaisesRegex(BackendUnavailableError, "cpu"):
+            MujocoWarpBackend(scene(), 1, device="cuda")
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -27,8 +27,7 @@ def rest_height(obj: ObjectSpec, quat: np.ndarray) -> np.ndarray | float:
 def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
     """[4] the stable pose on a plane that comes nearest to the mesh direction ``up`` [3] pointing up.
 
-    An object rests on a face of its convex hull if its centre of mass projects into that face. The heading is that of the least turn from the
-    mesh frame to the pose if ``up`` is z.
+    An object rests on a face of its convex hull if its centre of mass projects into that face.
     """
     from scipy.spatial import ConvexHull
     from scipy.spatial.transform import Rotation

@@ -6,7 +6,7 @@ import numpy as np
 
 from xreset.spec import ObjectSpec
 
-_CANDIDATES_PER_POINT = 12
+_CANDIDATES_PER_POINT = 8
 _PROBE = 2e-4  # how far outside the surface a sample is tested [m]: above rounding, below any feature
 
 

@@ -1,0 +1,126 @@
+"""``xreset demos``: import, synth, info."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from xreset.demos import Demos
+
+Side = Literal["right", "left", "both"]
+
+
+def import_(
+    dataset: Annotated[Literal["dexycb"], tyro.conf.Positional],
+    folder: Annotated[Path, tyro.conf.Positional],
+    *,
+    out: Path,
+    objects: tuple[str, ...] = (),
+    side: Side = "both",
+) -> None:
+    """Read a data set in its own layout and write an archive of demonstrations.
+
+    Args:
+        dataset: The data set. dexycb: the folder that holds the subjects' folders and `calibration`.
+        folder: Where it is.
+        out: Archive to write.
+        objects: Only sequences that grasp one of these objects; default: all.
+        side: Only sequences of this hand.
+    """
+    from xreset.demos import read_dexycb, write_demos
+
+    with _progress(f"reading {dataset}") as progress:
+        demos = read_dexycb(folder, objects=objects or None, sides=_sides(side), progress=progress)
+    write_demos(out, demos, config={"dataset": dataset, "objects": list(objects), "side": side})
+    _print_summary(demos, out)
+
+
+def synth(
+    *,
+    out: Path,
+    objects: tuple[str, ...] = (),
+    per_object: int = 4,
+    seed: int = 0,
+    fps: float = 30.0,
+    side: Side = "right",
+) -> None:
+    """Make synthetic demonstrations of the built-in objects: reach, grasp, lift, turn.
+
+    Args:
+        out: Archive to write.
+        objects: Objects to grasp; default: all nine.
+        per_object: Sequences of each object (and hand).
+        seed: The same seed gives the same file.
+        fps: Frames per second.
+        side: Hand.
+    """
+    from xreset.demos import concatenate, synthesize, write_demos
+
+    with _progress("making demonstrations") as progress:
+        demos = concatenate([synthesize(objects or None, per_object, seed, fps=fps, side=hand, progress=progress) for hand in _sides(side)])
+    config = {"objects": list(objects), "per_object": per_object, "seed": seed, "fps": fps, "side": side}
+    write_demos(out, demos, config=config)
+    _print_summary(demos, out)
+
+
+def info(file: Annotated[Path, tyro.conf.Positional]) -> None:
+    """Say what an archive of demonstrations contains, object by object.
+
+    Args:
+        file: The archive.
+    """
+    from xreset.demos import read_demos
+
+    _print_summary(read_demos(file), file)
+
+
+def _sides(side: Side) -> tuple[Literal["right", "left"], ...]:
+    return ("right", "left") if side == "both" else (side,)
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total, name: bar.update(task, completed=done, total=total, description=f"{what}: {name}")
+
+
+def _print_summary(demos: Demos, path: Path) -> None:
+    from math import degrees
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from xreset.demos.info import summarize
+
+    columns = ("sequences", "right / left", "frames", "with hand", "lift, cm", "goal, cm", "goal, deg")
+    table = Table("object", caption="lift, goal: medians, from the start pose")
+    for column in columns:
+        table.add_column(column, justify="right")
+    for row in summarize(demos):
+        table.add_row(
+            row.object_name,
+            str(row.sequences),
+            f"{row.right} / {row.sequences - row.right}",
+            str(row.frames),
+            f"{row.hand_frames / row.frames:.0%}",
+            f"{100 * row.lift:.1f}",
+            f"{100 * row.goal_distance:.1f}",
+            f"{degrees(row.goal_angle):.0f}",
+        )
+    console = Console()
+    console.print(table)
+    console.print(
+        f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second", soft_wrap=True, highlight=False
+    )
+
+
+COMMAND = {"import": import_, "synth": synth, "info": info}

@@ -173,14 +173,18 @@ class PybulletWorld(World):
         tip_force, tip_touch, table_force = np.zeros((tips, 3)), np.zeros(tips, dtype=bool), np.zeros(3)
         if self._fresh:
             return tip_force, tip_touch, table_force
-        p, client = self._p, self._client
-        for contact in p.getContactPoints(self._object.body, self._robot.body, physicsClientId=client):
-            tip = self._robot.parts[contact[4]].tip
-            if tip is not None and contact[9] > 0:
-                tip_force[tip] += _force_on_first(contact)
+        for contact in self._p.getContactPoints(physicsClientId=self._client):
+            # Bullet's own order of the two bodies: when asked for a body, PyBullet swaps them and the normal, but not the friction.
+            bodies, links = contact[1:3], contact[3:5]
+            if self._object.body not in bodies:
+                continue
+            other = 1 if bodies[0] == self._object.body else 0
+            force = _force_on_first(contact) if other == 1 else -_force_on_first(contact)
+            if bodies[other] == self._table.body:
+                table_force += force
+            elif (tip := self._robot.parts[links[other]].tip) is not None and contact[9] > 0:
+                tip_force[tip] += force
                 tip_touch[tip] = True
-        for contact in p.getContactPoints(self._object.body, self._table.body, physicsClientId=client):
-            table_force += _force_on_first(contact)
         return tip_force, tip_touch, table_force
 
     def health(self) -> tuple[bool, bool]:
@@ -570,7 +574,7 @@ def _wxyz(q: Sequence[float]) -> np.ndarray:
 
 
 def _force_on_first(contact: Sequence[Any]) -> np.ndarray:
-    """[3] force of a contact point on the body that was asked for first."""
+    """[3] force of a contact point on the first of its two bodies."""
     normal, force, side, along, other_side, other = contact[7], contact[9], contact[10], contact[11], contact[12], contact[13]
     return force * np.array(normal) + side * np.array(along) + other_side * np.array(other)
 

@@ -359,8 +359,8 @@ def _friction(arms: np.ndarray, normal_forces: np.ndarray, coefficients: np.ndar
     return (shares[:, None] * capacity * tangents).reshape(2, -1, 3).sum(axis=0)
 
 
-_ARM = 0.05
-"""Length [m] that makes torques and forces comparable."""
+_ARM = 1.0
+"""Length [m] that makes torques and forces comparable: long beside an object, so that forces are explained first."""
 
 
 # Joints ----------------------------------------------------------------------------------------------------------------------------------

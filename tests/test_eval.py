@@ -135,6 +135,15 @@ class MetricsTest(unittest.TestCase):
         self.assertAlmostEqual(float(m.reorientation_progress), 0.25, places=5)
         self.assertEqual((bool(m.nonfinite), bool(m.out_of_bounds)), (True, False))
 
+    def test_an_episode_has_one_end(self):
+        """What happens to a world after its end is not counted, nor is where a broken world seems to be."""
+        broken = reading(torch.full((3,), math.inf), nonfinite=True)
+        for lost_at in (0, 1):
+            m = episode(broken, reading(), lost_at=lost_at)
+            self.assertEqual((bool(m.nonfinite), bool(m.out_of_bounds)), (True, False))
+        m = episode(reading(), reading(nonfinite=True, overflow=True), lost_at=0)
+        self.assertEqual((bool(m.nonfinite), bool(m.overflow), bool(m.out_of_bounds)), (False, False, True))
+
     def test_overflow_is_counted_but_ends_nothing(self):
         m = episode(reading(overflow=True), reading(GOAL))
         self.assertTrue(bool(m.overflow))

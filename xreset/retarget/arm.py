@@ -218,7 +218,8 @@ def measure(model: ArmModel, targets: ArmTargets, joints: Tensor) -> Measures:
     poses = model.kinematics.link_poses(model.full(joints, targets.hand_joints).flatten(0, 1))
     root = poses[:, model.kinematics.link_index(model.robot.hand_root)]
     quat = matrix_to_quat(root[:, :3, :3])
-    heights = [height_above_table(_place(root, model.hand_support(targets.hand_joints).flatten(0, 1)), model.hand_radii, model.table)]
+    heights = [torch.full((len(poses), 1), torch.inf, dtype=poses.dtype)]  # what a robot without shapes would keep
+    heights += [height_above_table(_place(root, model.hand_support(targets.hand_joints).flatten(0, 1)), model.hand_radii, model.table)]
     for carrier, points, radii in model.arm_support:
         link = poses[:, model.kinematics.link_index(model.carriers[carrier])]
         heights.append(height_above_table(_place(link, points), radii, model.table))
@@ -345,7 +346,8 @@ def _system(model: ArmModel, frame: _Frame, q: Tensor, config: ArmConfig, collis
         scale = config.smoothness_weight**0.5
         residuals.append(scale * (q - frame.previous))
         jacobians.append(scale * torch.eye(q.shape[1], dtype=q.dtype).expand(len(q), -1, -1))
-    for carrier, points, radii in [(0, frame.support, model.hand_radii), *model.arm_support]:
+    hand = [(0, frame.support, model.hand_radii)] if len(model.hand_radii) else []
+    for carrier, points, radii in hand + model.arm_support:
         arms = points @ carriers.rot[:, carrier].mT
         heights = height_above_table(arms + carriers.pos[:, None, carrier], radii, model.table)
         lowest = heights.argmin(dim=1)

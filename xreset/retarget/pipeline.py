@@ -14,7 +14,8 @@ from xreset.demos.archive import Demos
 from xreset.errors import DemoError
 from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
 from xreset.retarget.file import SCHEMA, Retargeted, read_retargeted, write_retargeted
-from xreset.retarget.hand import HandConfig, HandModel, HandTargets, retarget_hand
+from xreset.retarget.hand import HandConfig, HandTargets, retarget_hand
+from xreset.retarget.hand_model import HandModel
 from xreset.retarget.surface import Surface, keypoint_contacts
 from xreset.retarget.validity import REASONS, Thresholds, classify
 from xreset.rotations import matrix_to_quat

@@ -62,8 +62,8 @@ def global_alignment(x: Tensor, J: Tensor, target: Tensor, weight: Tensor) -> Re
 def contact(x: Tensor, J: Tensor, contact_point: Tensor, weight: Tensor, margin: float, knee: float) -> Residual:
     """The paper's contact term, w [|c - x| - margin]_+, as iteratively reweighted least squares.
 
-    The square of r = s e, with e = [|c - x| - margin]_+ and s^2 = w / max(e, knee) held constant, has the value and the gradient
-    direction of the L1 cost where e > knee, and is quadratic below, where the L1 cost has no second derivative.
+    The square of r = s e, with e = [|c - x| - margin]_+ and s^2 = w / (2 max(e, knee)) held constant, has the gradient of that cost where
+    e > knee; below it is quadratic, because there the L1 cost has no second derivative.
 
     Args:
         x: [B, P, 3] robot contact points.
@@ -76,19 +76,18 @@ def contact(x: Tensor, J: Tensor, contact_point: Tensor, weight: Tensor, margin:
     gap = x - contact_point
     distance = gap.norm(dim=-1).clamp_min(_TINY)
     excess = (distance - margin).clamp_min(0.0)
-    scale = (weight / excess.clamp_min(knee)).sqrt() * (excess > 0)
+    scale = (weight / (2.0 * excess.clamp_min(knee))).sqrt() * (excess > 0)
     direction = gap / distance[..., None]
     return Residual(scale * excess, scale[..., None] * (direction[..., None, :] @ J)[..., 0, :])
 
 
 def contact_cost(x: Tensor, contact_point: Tensor, weight: Tensor, margin: float, knee: float) -> Tensor:
-    """[B] the cost that :func:`contact` linearises, as a sum over contacts of Huber's function.
+    """[B] the cost whose gradient :func:`contact` has, as a sum over contacts of Huber's function.
 
-    w (e^2 / knee) below the knee and w (2 e - knee) above: continuous, with the derivative of the reweighted squares. (Twice the paper's
-    L1 cost at large e; the factor is in the weight.)
+    It is w e^2 / (2 knee) below the knee and w (e - knee / 2) above: the paper's L1 cost with its corner rounded.
     """
     excess = ((x - contact_point).norm(dim=-1) - margin).clamp_min(0.0)
-    return (weight * torch.where(excess < knee, excess**2 / knee, 2.0 * excess - knee)).sum(-1)
+    return (weight * torch.where(excess < knee, excess**2 / (2.0 * knee), excess - knee / 2.0)).sum(-1)
 
 
 def clearance(distance: Tensor, J: Tensor, frame: Tensor, frames: int, weight: float, least: float) -> Residual:

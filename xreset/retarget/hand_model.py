@@ -1,0 +1,139 @@
+"""A hand as retargeting sees it: a floating tree, the links that follow human keypoints, and the balls that keep it out of things.
+
+Shape letters: B frames, P mapped keypoints, C pairs of keypoints, J hand joints, n = J + 6 variables, L links, Q balls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xreset.errors import RobotError
+from xreset.kinematics import Kinematics
+from xreset.retarget.balls import hand_balls
+from xreset.retarget.collision import SelfCollision
+from xreset.rotations import quat_to_matrix
+from xreset.spec import FINGERS, KEYPOINTS, RobotSpec, TableSpec
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Links of the hand and how they move with the variables."""
+
+    pos: Tensor
+    """[B, L, 3]"""
+    rot: Tensor
+    """[B, L, 3, 3]"""
+    linear: Tensor
+    """[B, L, 3, n] derivative of the position."""
+    angular: Tensor
+    """[B, L, 3, n] angular velocity per variable."""
+
+
+class HandModel:
+    """A robot's hand as a floating tree, and which of its links follow which human keypoints."""
+
+    def __init__(self, robot: RobotSpec, table: TableSpec | None = None) -> None:
+        """Raises ``RobotError`` where the description does not allow retargeting: the message says which entry is wrong."""
+        self.robot = robot
+        self.kinematics = Kinematics(robot, root=robot.hand_root)
+        if not np.array_equal(self.kinematics.joint_indices, robot.hand_indices):
+            below, group = self.kinematics.joint_names, [robot.joint_names[i] for i in robot.hand_indices]
+            raise RobotError(
+                f"robot {robot.name!r}: the joints below the hand root {robot.hand_root!r} are {', '.join(below)}, but the hand group is "
+                f"{', '.join(group)}. Choose the last link that the arm moves as hand_root."
+            )
+        self.names: tuple[str, ...] = tuple(spec.keypoint for spec in robot.keypoints)
+        """Human keypoint of each mapped keypoint (length P)."""
+        self.links: tuple[str, ...] = tuple(spec.link for spec in robot.keypoints)
+        """Link of each mapped keypoint."""
+        for name, link in zip(self.names, self.links, strict=True):
+            if name not in KEYPOINTS:
+                raise RobotError(f"robot {robot.name!r}: there is no human keypoint {name!r}; there are {', '.join(KEYPOINTS)}.")
+            self.kinematics.link_index(link)
+        if len(set(self.links)) < 3:
+            raise RobotError(
+                f"robot {robot.name!r}: {len(set(self.links))} links follow keypoints, expected 3 or more (wrist, thumb, finger)."
+            )
+        self.keypoint_indices = np.array([KEYPOINTS.index(name) for name in self.names])
+        """[P] indices into the 21 human keypoints."""
+        tips = {tip.keypoint for tip in robot.fingertips}
+        self.is_tip = np.array([name in tips for name in self.names])
+        """[P] whether a fingertip follows the keypoint."""
+        self.pairs = torch.tensor(keypoint_pairs(self.names, self.links))
+        """[C, 2] pairs of mapped keypoints whose difference is matched."""
+        self.home = torch.as_tensor(robot.home[robot.hand_indices])
+        """[J] home configuration of the hand."""
+
+        collision = SelfCollision(robot, self.kinematics, only=robot.self_collision_links)
+        self.balls = hand_balls(robot, self.kinematics, collision)
+        """What keeps the hand out of the object, the table and itself."""
+        self.table = table or TableSpec()
+        self._bodies = tuple(dict.fromkeys((*self.links, *self.balls.links)))
+        self._keypoint_bodies = [self._bodies.index(link) for link in self.links]
+        self.ball_links = torch.tensor([self._bodies.index(link) for link in self.balls.links], dtype=torch.long)
+        """[Q] index of each ball's link among the bodies."""
+
+    def keypoints(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Tensor:
+        """[..., P, 3] positions of the keypoint links."""
+        return self.kinematics.points(joints, self.links, base=_pose(root_pos, root_quat))
+
+    def bodies(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Bodies:
+        """Links of the hand at joints [B, J] and root poses, and their Jacobians by the variables.
+
+        Variables: joints, then translation of the root, then rotation of the root about its origin (both along the world's axes).
+        """
+        links = self.kinematics.jacobian(joints, self._bodies, base=_pose(root_pos, root_quat))
+        identity = torch.eye(3, dtype=links.pos.dtype).expand(*links.pos.shape[:-1], 3, 3)
+        turn = torch.linalg.cross(identity, (links.pos - root_pos[:, None])[..., None, :])  # row i: e_i x r
+        return Bodies(
+            pos=links.pos,
+            rot=links.rot,
+            linear=torch.cat((links.linear, identity, turn.mT), dim=-1),
+            angular=torch.cat((links.angular, torch.zeros_like(identity), identity), dim=-1),
+        )
+
+    def keypoints_of(self, bodies: Bodies) -> tuple[Tensor, Tensor]:
+        """Keypoints [B, P, 3] and their Jacobian [B, P, 3, n]."""
+        return bodies.pos[:, self._keypoint_bodies], bodies.linear[:, self._keypoint_bodies]
+
+    def ball_slope(self, bodies: Bodies, frame: Tensor, ball: Tensor, centers: Tensor, direction: Tensor) -> Tensor:
+        """[A, n] how the centre of a ball moves along a direction: n . (v + w x r) = n . v + (r x n) . w.
+
+        Args:
+            bodies: the hand.
+            frame: [A]
+            ball: [A]
+            centers: [B, Q, 3] of all balls.
+            direction: [A, 3] unit vectors n.
+        """
+        link = self.ball_links[ball]
+        lever = torch.linalg.cross(centers[frame, ball] - bodies.pos[frame, link], direction)
+        along = direction[:, None] @ bodies.linear[frame, link] + lever[:, None] @ bodies.angular[frame, link]
+        return along[:, 0]
+
+
+def keypoint_pairs(names: Sequence[str], links: Sequence[str]) -> list[tuple[int, int]]:
+    """Pairs of mapped keypoints: along each finger from the wrist, between neighbouring knuckles, and from the thumb's tip to the others.
+
+    Works for any subset of the 21 keypoints; pairs on one and the same link say nothing and are left out.
+    """
+    wrist = [i for i, name in enumerate(names) if name == "wrist"]
+    fingers = [sorted((i for i, name in enumerate(names) if name.startswith(finger)), key=lambda i: names[i]) for finger in FINGERS]
+    pairs = [pair for finger in fingers for pair in pairwise(wrist + finger)]
+    thumb, others = fingers[0], [finger for finger in fingers[1:] if finger]
+    for left, right in pairwise(others):
+        pairs += [(left[0], right[0]), (left[-1], right[-1])]
+    pairs += [(thumb[-1], finger[-1]) for finger in others if thumb]
+    return [(a, b) for a, b in dict.fromkeys(pairs) if links[a] != links[b]]
+
+
+def _pose(pos: Tensor, quat: Tensor) -> Tensor:
+    T = pos.new_zeros(*pos.shape[:-1], 4, 4)
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = quat_to_matrix(quat), pos, 1.0
+    return T

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig, rsl_rl_config
 from xreset.learning.export import export_onnx
-from xreset.learning.model import PointNetLstmModel
+from xreset.learning.model import PointNetLstmModel, embed_sequences
 from xreset.learning.ppo import SequencePpo, SequenceStorage
 from xreset.policy import OnnxPolicy
 from xreset.task.config import ObservationConfig, TaskConfig
@@ -35,23 +35,45 @@ def make_model(kind: str = "actor") -> PointNetLstmModel:
     return PointNetLstmModel(observations(N), GROUPS, kind, A if kind == "actor" else 1, distribution_cfg=gaussian, **SMALL)
 
 
+def with_real_history(obs: TensorDict, first: torch.Tensor) -> TensorDict:
+    """Observations [T, N] whose cloud histories are as an environment makes them: shifted by one per step, copies after a reset."""
+    cloud = obs["perception"].clone()
+    for t in range(len(cloud)):
+        newest = cloud[t, :, -1:]
+        if t:
+            cloud[t] = torch.cat((cloud[t - 1, :, 1:], newest), dim=1)
+        cloud[t] = torch.where(first[t][:, None, None, None], newest.expand_as(cloud[t]), cloud[t])
+    obs["perception"] = cloud
+    return obs
+
+
 class ModelTest(unittest.TestCase):
+    def test_shared_frames_are_embedded_as_if_each_were_alone(self):
+        model = make_model()
+        first = torch.rand(T, N, generator=torch.Generator().manual_seed(1)) < 0.3
+        first[0, 0], first[0, 1] = True, False
+        cloud = with_real_history(observations(T, N), first)["perception"]
+        for begin in (0, 3):
+            piece, starts = cloud[begin : begin + L], first[begin : begin + L]
+            torch.testing.assert_close(embed_sequences(model.trunk.pointnet, piece, starts), model.trunk.pointnet(piece))
+
     def test_update_sees_what_the_rollout_saw(self):
         """Step by step with resets at episode ends gives the same outputs as one sequence with masks."""
-        model, obs = make_model(), observations(T, N)
         dones = torch.zeros(T, N, dtype=torch.bool)
         dones[2, 0] = dones[5, 2] = True
+        first = torch.zeros_like(dones)
+        first[1:] = dones[:-1]
+        model, obs = make_model(), with_real_history(observations(T, N), first)
         stepwise = []
         for t in range(T):
             stepwise.append(model(obs[t]))
             model.reset(dones[t])
-        first = torch.zeros_like(dones)
-        first[1:] = dones[:-1]
         zero = torch.zeros(1, N, SMALL["lstm_dim"])
         together = model(obs, masks=first, hidden_state=(zero, zero))
         torch.testing.assert_close(together, torch.stack(stepwise))
-        unmasked = model(obs, masks=torch.zeros_like(first), hidden_state=(zero, zero))
-        self.assertGreater(float((unmasked - together).detach()[3:, 0].abs().max()), 1e-4)
+        carried = model(obs, masks=first, hidden_state=(zero + 1, zero + 1))
+        self.assertGreater(float((carried - together).detach()[:3, 0].abs().max()), 1e-4)
+        torch.testing.assert_close(carried[3:, 0], together[3:, 0])
 
     def test_gradients_do_not_cross_an_episode_end(self):
         model, obs = make_model(), observations(T, N)
@@ -118,7 +140,8 @@ class StorageTest(unittest.TestCase):
         torch.manual_seed(0)
         alg = SequencePpo.construct_algorithm(observations(64), Bandit(), cfg, "cpu")
         obs = observations(64)
-        before = float((alg.actor(obs) - 0.5).abs().mean())
+        obs["perception"] = obs["perception"][:, -1:].expand(-1, 5, -1, -1)  # a scene in which nothing moves
+        before = float((alg.actor(obs) - 0.5).detach().abs().mean())
         alg.actor.reset()
         for _ in range(40):
             with torch.no_grad():

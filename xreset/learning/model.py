@@ -34,6 +34,22 @@ class PointNet(nn.Module):
         return self.mlp(cloud).amax(dim=-2)
 
 
+def embed_sequences(pointnet: PointNet, cloud: Tensor, first: Tensor) -> Tensor:
+    """[L, N, H, embedding] embeddings of cloud histories [L, N, H, P, 3], every distinct frame embedded once.
+
+    Step t's history is step t-1's, shifted by one, with the newest frame at the end; where an episode begins (``first`` [L, N]) it is H
+    copies of the newest. So L steps hold H - 1 + L distinct frames and not L * H: with the paper's 4 and 5, 8 and not 20.
+    """
+    steps, _, history = cloud.shape[:3]
+    frames = torch.cat((cloud[0, :, :-1].transpose(0, 1), cloud[:, :, -1]))  # [H - 1 + L, N, P, 3]
+    embedded = pointnet(frames)
+    step = torch.arange(steps, device=cloud.device)
+    begin = torch.where(first, step[:, None], -history).cummax(dim=0).values  # [L, N] step of this episode's beginning, if it is in here
+    shifted = step[:, None, None] + torch.arange(1 - history, 1, device=cloud.device)  # [L, 1, H] step whose newest frame it was
+    source = torch.maximum(shifted, begin[..., None]) + history - 1
+    return embedded.transpose(0, 1)[torch.arange(cloud.shape[1], device=cloud.device)[:, None], source]
+
+
 class Trunk(nn.Module):
     """From observations to the MLP's input: what training and the exported policy share."""
 
@@ -47,13 +63,13 @@ class Trunk(nn.Module):
         self.lstm = nn.LSTM(flat_dim + history * pointnet_dims[-1], lstm_dim)
         self.norm = nn.LayerNorm(lstm_dim)
 
-    def embed(self, flat: Tensor, cloud: Tensor) -> Tensor:
-        """Flat [..., D] and clouds [..., H, P, 3] -> [..., D + H * embedding]."""
-        return torch.cat((self.normalizer(flat), self.pointnet(cloud).flatten(-2)), dim=-1)
+    def join(self, flat: Tensor, embeddings: Tensor) -> Tensor:
+        """Flat [..., D] and embeddings [..., H, embedding] -> [..., D + H * embedding], the LSTM's input."""
+        return torch.cat((self.normalizer(flat), embeddings.flatten(-2)), dim=-1)
 
     def forward(self, flat: Tensor, cloud: Tensor, state: LstmState) -> tuple[Tensor, LstmState]:
         """One step for N worlds: [N, D], [N, H, P, 3], LSTM state of [1, N, lstm] each -> [N, lstm], new state."""
-        out, state = self.lstm(self.embed(flat, cloud)[None], state)
+        out, state = self.lstm(self.join(flat, self.pointnet(cloud))[None], state)
         return self.norm(out[0]), state
 
 
@@ -98,7 +114,7 @@ class PointNetLstmModel(MLPModel):
             latent, self.state = self.trunk(flat, cloud, self.state)
             return latent
         assert isinstance(hidden_state, tuple), "an update needs the LSTM state that each sequence began with"
-        embedded = self.trunk.embed(flat, cloud)
+        embedded = self.trunk.join(flat, embed_sequences(self.trunk.pointnet, cloud, masks))
         h, c = hidden_state
         out = []
         for step, first in zip(embedded, masks, strict=True):

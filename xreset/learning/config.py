@@ -46,6 +46,9 @@ class PpoConfig:
     value_loss: float = 1.0
     """Weight of the value loss. Not in the paper."""
     grad_norm: float = 1.0
+    precision: Literal["float32", "tf32", "bfloat16"] = "tf32"
+    """Arithmetic of matrix products on a GPU. ``bfloat16``: the point-cloud encoder in bfloat16, all else in TF32. The CPU and the
+    exported policy use float32. Not in the paper."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +77,7 @@ def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
         "obs_normalization": m.normalize_observations,
         "pointnet_dims": list(m.pointnet),
         "lstm_dim": m.lstm,
+        "bfloat16_clouds": p.precision == "bfloat16",
     }
     gaussian = {"class_name": "GaussianDistribution", "init_std": m.initial_std, "std_type": "log", "learn_std": True}
     return {

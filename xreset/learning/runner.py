@@ -29,6 +29,7 @@ class TrainingRunner(OnPolicyRunner):
         """Build algorithm and models; rsl-rl's own logging stays off."""
         self.folder = folder
         self.train_config = config
+        torch.set_float32_matmul_precision("highest" if config.ppo.precision == "float32" else "high")
         super().__init__(env, rsl_rl_config(config, env.num_envs), log_dir=None, device=str(env.device))  # pyright: ignore[reportArgumentType]
         self.iteration = 0
         self.env_steps = 0

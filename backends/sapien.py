@@ -60,19 +60,19 @@ class SapienWorld(World):
 
     def __init__(self, scene: SceneSpec, object_index: int, *, settings: SapienSettings = _DEFAULTS) -> None:
         self._sapien = sapien = _engine()
+        self._settings, self._dt = settings, scene.timestep
         _configure(sapien.physx, settings)
-        self._system = sapien.physx.PhysxCpuSystem()
-        self._system.timestep = self._dt = scene.timestep
-        self._scene = sapien.Scene([self._system])
-
         self._mechanism = robot = mechanism(scene.robot)
         self._inertia = object_inertia(scene.objects[object_index])
         self._torsional = scene.friction.torsional
         self._materials = {role: sapien.physx.PhysxMaterial(0.0, 0.0, 0.0) for role in ("tip", "link", "table", "object")}
         self._surfaces: dict[Any, _Surface] = {}
+        self._entities: list[Any] = []
         self._add_table(scene)
         self._bodies = self._add_robot()
         self._object = self._add_object(scene.objects[object_index].pieces)
+        self._scene = self._system = None
+        self._renew_scene()
         self._joints = _Joints(self._bodies, robot, scene.timestep)
         self._frames = TrackedFrames(robot)
         self._mass, self._moments, self._fraction = self._inertia.mass, self._inertia.moments, 1.0
@@ -83,6 +83,7 @@ class SapienWorld(World):
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """See :meth:`World.set_state`."""
+        self._renew_scene()
         self._joints.reset(state["joint_pos"], state["joint_vel"], state["joint_target"])
         self._quat = np.array(state["object_quat"])
         self._object.entity.pose = self._sapien.Pose(state["object_pos"], self._quat)
@@ -262,7 +263,18 @@ class SapienWorld(World):
         entity.name = name
         entity.add_component(body)
         entity.pose = pose
-        self._scene.add_entity(entity)
+        self._entities.append(entity)
+
+    def _renew_scene(self) -> None:
+        """Move everything to a new scene: the only way to make PhysX forget the order in which pairs came into contact."""
+        for entity in self._entities if self._scene else ():
+            self._scene.remove_entity(entity)
+        _configure(self._sapien.physx, self._settings)
+        self._system = self._sapien.physx.PhysxCpuSystem()
+        self._system.timestep = self._dt
+        self._scene = self._sapien.Scene([self._system])
+        for entity in self._entities:
+            self._scene.add_entity(entity)
 
     def _pose(self, T: np.ndarray) -> Any:
         return self._sapien.Pose(T[:3, 3], matrix_to_quat(T[:3, :3]))

@@ -110,6 +110,15 @@ class CollectTest(InFolder):
         with self.assertRaisesRegex(FileFormatError, "sapien.episodes.json is not valid JSON"):
             collect(self.folder)
 
+    def test_results_outlive_the_description_of_their_training(self):
+        self.write()
+        self.write_run()
+        file = self.folder / "run.json"
+        file.write_text(file.read_text().replace('"iterations"', '"cycles"'))
+        data = collect(self.folder)
+        self.assertIsNone(data.run)
+        self.assertRegex(data.notes[0], "training is not described here: .*unknown: cycles; missing: iterations")
+
     def test_engines_that_were_not_evaluated_alike_are_pointed_out(self):
         alike = (toy_summary("mujoco"), toy_summary("sapien"))
         self.assertEqual(differences(alike), [])
@@ -311,6 +320,7 @@ class PageTest(InFolder):
         self.assertIn("trained in mujoco-warp", text)
         self.assertIn("25%", text)
         self.assertNotIn("worst", headline(replace(data, summaries=tuple(made[:1]))))
+        self.assertIn("40% in each of the 4 engines", headline(replace(data, summaries=tuple(made[0] | {"backend": n} for n in ENGINES))))
 
     def test_the_same_results_give_the_same_page(self):
         self.assertEqual(page(self.data(), self.clips), page(self.data(), self.clips))

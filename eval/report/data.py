@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from xreset.errors import RunError
+from xreset.errors import FileFormatError, RunError
 from xreset.eval.results import read_episodes, read_results
 from xreset.eval.rollout import Episode
 from xreset.files import read_json
@@ -47,7 +47,7 @@ class ReportData:
     episodes: dict[str, tuple[Episode, ...]]
     """Engine -> its episodes."""
     run: RunInfo | None
-    """The training; None for baselines."""
+    """The training; None for baselines, and where ``run.json`` cannot be read."""
     trained_with: str | None
     """Version of xreset that the policy was trained with."""
     curves: tuple[Curve, ...]
@@ -82,15 +82,22 @@ def collect(folder: Path) -> ReportData:
             + ("" if is_run else f" --out {results}")
         )
     curves, note = read_curves(folder)
+    notes = [*differences(summaries), *([note] if note else [])]
+    run, trained_with = None, None
+    if is_run:
+        try:
+            run, trained_with = read_run(folder), str(read_json(folder / "run.json", RUN_SCHEMA).get("xreset"))
+        except FileFormatError as error:  # results outlive a change of the training's configuration
+            notes.append(f"The training is not described here: {error}")
     return ReportData(
         name=(folder.resolve().parent if folder.resolve().name == "eval" else folder.resolve()).name,
         results=results,
         summaries=summaries,
         episodes={s["backend"]: read_episodes(results, s["backend"]) for s in summaries},
-        run=read_run(folder) if is_run else None,
-        trained_with=str(read_json(folder / "run.json", RUN_SCHEMA).get("xreset")) if is_run else None,
+        run=run,
+        trained_with=trained_with,
         curves=curves,
-        notes=(*differences(summaries), *([note] if note else [])),
+        notes=tuple(notes),
     )
 
 

@@ -102,10 +102,14 @@ def headline(data: ReportData) -> str:
     """The result in one or two sentences."""
     ranked = sorted(data.summaries, key=lambda s: -s["task_progress"]["mean"])
     best, worst = ranked[0], ranked[-1]
-    text = f"Task progress is {best['task_progress']['mean']:.0%} in {best['backend']}"
-    if len(ranked) > 1:
-        text += f" and {worst['task_progress']['mean']:.0%} in {worst['backend']}, "
-        text += "the best and the worst of " + f"{len(ranked)} engines" if len(ranked) > 2 else "the two engines"
+    high, low = (_percent(x["task_progress"]["mean"]) for x in (best, worst))
+    if len(ranked) == 1:
+        text = f"Task progress is {high} in {best['backend']}"
+    elif high == low:
+        text = f"Task progress is {high} in each of the {len(ranked)} engines"
+    else:
+        number = f"{len(ranked)} engines" if len(ranked) > 2 else "the two engines"
+        text = f"Task progress is {high} in {best['backend']} and {low} in {worst['backend']}, the best and the worst of {number}"
     text += f". The object is grasped in {_between([s['grasp_rate'] for s in ranked])} of the episodes and at its goal at the end of "
     text += f"{_between([s['reorient_rate'] for s in ranked])}."
     trained = data.run and next((s for s in ranked if s["backend"] == data.run.backend), None)

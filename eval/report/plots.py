@@ -67,7 +67,8 @@ def draw_stages(ax: Axes, summaries: Summaries) -> None:
     width = 0.8 / len(summaries)
     for i, s in enumerate(summaries):
         at = np.arange(len(STAGES)) - 0.4 + width * (i + 0.5)
-        ax.bar(at, [100 * s[key] for key, _ in STAGES], width=0.9 * width, color=COLORS[i % len(COLORS)], label=s["backend"])
+        bars = ax.bar(at, [100 * s[key] for key, _ in STAGES], width=0.9 * width, color=COLORS[i % len(COLORS)], label=s["backend"])
+        ax.bar_label(bars, fmt="%.0f", fontsize="small", padding=1)
     ax.set_xticks(range(len(STAGES)), [label for _, label in STAGES])
     _percent(ax, "y")
     ax.set_ylabel("episodes that reach the stage")

@@ -3,6 +3,10 @@
 Letters as in :mod:`xreset.backends.base`; Q mimic joints. Quaternions are stored (w, x, y, z) in a ``wp.quat``, as MuJoCo does.
 """
 
+# Warp compiles these functions from their source; to a type checker of Python they make no sense.
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+# pyright: reportGeneralTypeIssues=false, reportAssignmentType=false
+
 from __future__ import annotations
 
 import warp as wp

@@ -38,7 +38,7 @@ def free_fall(bench: Bench) -> list[Measure]:
 
     h = bench.scene.timestep
     t = _STEPS * h
-    errors = dict.fromkeys(("pos, horizontal", "pos, vertical", "linvel", "orientation", "angvel"), 0.0)
+    errors: dict[str, float] = dict.fromkeys(("pos, horizontal", "pos, vertical", "linvel", "orientation", "angvel"), 0.0)
     for i, thing in enumerate(bench.objects):
         turn, omega = _spin(thing, quat, angvel, t)
         arm = Rotation.from_quat(quat, scalar_first=True).apply(thing.com)

@@ -87,7 +87,7 @@ def draw_clip(engine: str, episode: Episode, trace: Trace, robot: RobotSpec, obj
     every = max(1, round(1.0 / (FRAMES_PER_SECOND * interval)))
     rows = np.arange(0, len(trace.time), every)
     sound = np.isfinite(np.concatenate((trace.joint_pos, trace.object_pos, trace.object_quat), axis=1)).all(axis=1)
-    last = len(sound) - 1 if sound.all() else max(int(np.argmin(sound)) - 1, 0)
+    last = len(trace.time) - 1 if sound.all() else max(int(np.argmin(sound)) - 1, 0)
     renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=SIZE, camera=camera)
     goal = pose_matrix(trace.goal_pos, trace.goal_quat)
     pictures: dict[int, np.ndarray] = {}
@@ -115,8 +115,14 @@ def encode_mp4(frames: np.ndarray, fps: float) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "clip.mp4"
         settings = ["-crf", "24", "-preset", "veryfast", "-movflags", "+faststart", "-threads", "1", "-bitexact"]
-        writer = imageio_ffmpeg.write_frames(
-            str(path), frames.shape[2:0:-1], fps=fps, codec="libx264", macro_block_size=2, quality=None, output_params=settings
+        writer = imageio_ffmpeg.write_frames(  # its annotations are narrower than what it takes
+            str(path),
+            frames.shape[2:0:-1],
+            fps=fps,  # pyright: ignore[reportArgumentType]
+            codec="libx264",
+            macro_block_size=2,
+            quality=None,  # pyright: ignore[reportArgumentType]
+            output_params=settings,
         )
         try:
             writer.send(None)

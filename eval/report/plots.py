@@ -171,16 +171,16 @@ def write_overview(path: Path, title: str, summaries: Summaries, clips: Sequence
     with _matplotlib({"font.size": 10}) as figure_class:
         figure = figure_class(figsize=(width, plot_height + picture_height + 0.4), layout="constrained", facecolor="white")
         figure.suptitle(title, fontsize="large", fontweight="bold")
+        heights = (plot_height, picture_height) if clips else (plot_height,)
+        parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
         if clips:
-            plots, pictures = figure.subfigures(2, 1, height_ratios=(plot_height, picture_height))
+            pictures = parts[1]
             for ax, clip in zip(pictures.subplots(1, len(clips), squeeze=False)[0], clips, strict=True):
                 ax.imshow(clip.frames[-1])
                 ax.set_title(clip.engine, fontsize="medium", color=COLORS[_index(summaries, clip.engine)], fontweight="bold")
                 ax.set_axis_off()
             pictures.supxlabel(caption, fontsize="small")
-        else:
-            plots = figure.subfigures()
-        left, right = plots.subplots(1, 2)
+        left, right = parts[0].subplots(1, 2)
         draw_progress(left, summaries)
         draw_stages(right, summaries)
         buffer = io.BytesIO()
@@ -218,5 +218,5 @@ def _matplotlib(style: dict[str, Any]):
         "axes.axisbelow": True,
     }
     base |= dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), _INK)
-    with matplotlib.rc_context(base | style):
+    with matplotlib.rc_context(base | style):  # pyright: ignore[reportArgumentType]
         yield Figure

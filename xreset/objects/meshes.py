@@ -13,7 +13,7 @@ import numpy as np
 from xreset.errors import ObjectError
 from xreset.files import file_hash
 from xreset.objects.decompose import cached_pieces
-from xreset.objects.geometry import mass_properties
+from xreset.objects.geometry import hull, mass_properties, shape_mesh
 from xreset.objects.ycb import MASSES
 from xreset.spec import ObjectSpec
 
@@ -84,8 +84,8 @@ def import_with_notes(path: str | Path, name: str, *, mass: float | None = None)
     mesh = _load(path)
     notes = []
     solid = mesh
-    if not mesh.is_watertight or mesh.volume <= 0:
-        solid = mesh.convex_hull
+    if not mesh.is_volume:
+        solid = shape_mesh(hull(mesh.vertices))
         notes.append("the mesh is not closed: volume, centre of mass and inertia are those of its convex hull")
     if mass is None:
         mass = MASSES.get(name)
@@ -116,7 +116,7 @@ def _load(path: Path) -> trimesh.Trimesh:
     if not path.is_file():
         raise ObjectError(f"there is no mesh at {path}.")
     try:
-        mesh = trimesh.load(path, force="mesh", skip_materials=True)
+        mesh = trimesh.load(path, force="mesh", skip_materials=True, process=False)  # processing would drop damaged vertices silently
     except Exception as error:  # trimesh raises whatever its parsers meet
         raise ObjectError(f"{path} cannot be read as a mesh: {error}") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not len(mesh.vertices):
@@ -126,6 +126,8 @@ def _load(path: Path) -> trimesh.Trimesh:
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # texture seams are no holes
     mesh.update_faces(mesh.nondegenerate_faces())
     mesh.remove_unreferenced_vertices()
+    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0:
+        mesh.invert()  # inside out
     if not len(mesh.faces) or mesh.extents.min() < 1e-5:
         raise ObjectError(f"{path} is flat: {_size(mesh)}; a solid object is needed.")
     if mesh.extents.max() > _LARGEST:

@@ -1,0 +1,330 @@
+"""Objects: stand-ins, sampling, rest, and the import of meshes."""
+
+import importlib.util
+import os
+import tempfile
+import unittest
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial.transform import Rotation
+
+from tests.data import data_dir
+from xreset.errors import ObjectError
+from xreset.objects import (
+    bounding_box,
+    bounding_radius,
+    canonical_name,
+    keypoints,
+    load_object,
+    load_objects,
+    object_names,
+    rest_height,
+    resting_orientation,
+    shape_mesh,
+    surface_points,
+)
+from xreset.objects.decompose import limited_hull
+from xreset.objects.geometry import half_spaces, hull
+from xreset.objects.meshes import DEFAULT_DENSITY, import_with_notes, mesh_files
+from xreset.objects.sampling import sample_surface, winding_number
+
+Z = np.array([0.0, 0.0, 1.0])
+
+
+def distance_to_pieces(points, obj):
+    """Signed distance to the union of convex pieces (a lower bound outside)."""
+    planes = [half_spaces(piece) for piece in obj.pieces]
+    return np.min([(points @ plane[:, :3].T + plane[:, 3]).max(axis=1) for plane in planes], axis=0)
+
+
+class Names(unittest.TestCase):
+    def test_the_papers_nine_objects(self):
+        papers = ("cheez-its", "soup", "mustard", "tuna", "spam", "banana", "pitcher", "powerdrill", "scissors")
+        self.assertEqual(tuple(canonical_name(name) for name in papers), object_names())
+
+    def test_other_spellings(self):
+        for name in ("035_power_drill", "power_drill", "Power Drill"):
+            self.assertEqual(canonical_name(name), "035_power_drill")
+
+    def test_unknown_object_lists_what_exists(self):
+        with self.assertRaisesRegex(ObjectError, r"'teapot'.*003_cracker_box \(cheez-its\).*037_scissors"):
+            load_object("teapot")
+
+
+class StandIns(unittest.TestCase):
+    def test_physical(self):
+        for obj in load_objects(object_names()):
+            with self.subTest(obj.name):
+                low, high = bounding_box(obj)
+                self.assertTrue(((obj.com > low) & (obj.com < high)).all())
+                moments = np.linalg.eigvalsh(obj.inertia)
+                self.assertGreater(moments[0], 0)
+                self.assertGreater(moments[0] + moments[1], moments[2])  # true of every rigid body
+                self.assertLessEqual(len(obj.pieces), 8)
+                for piece in obj.pieces:
+                    if piece.geometry.vertices is not None:
+                        self.assertLessEqual(len(piece.geometry.vertices), 64)
+
+    def test_inertia_of_the_box_is_the_textbooks(self):
+        obj = load_object("cheez-its")
+        a, b, c = 2 * np.array(obj.pieces[0].geometry.size)
+        expected = obj.mass / 12 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b])
+        np.testing.assert_allclose(obj.inertia, expected, rtol=1e-9, atol=1e-12)
+
+    def test_inertia_of_the_can_is_the_textbooks(self):
+        obj = load_object("soup")
+        radius, half = obj.pieces[0].geometry.size
+        across = obj.mass * (3 * radius**2 + 4 * half**2) / 12
+        expected = [across, across, obj.mass * radius**2 / 2]
+        np.testing.assert_allclose(np.diag(obj.inertia), expected, rtol=0.01)  # the mesh is a prism
+
+    def test_close_to_the_real_meshes(self):
+        folder = data_dir() / "ycb"
+        for name in object_names():
+            with self.subTest(name):
+                real = trimesh.load(folder / f"{name}.obj", process=False)
+                obj = load_object(name)
+                np.testing.assert_allclose(np.array(bounding_box(obj)), real.bounds, atol=0.005)
+                points, normals = sample_surface(obj, 6000)
+                points = points[winding_number(points + 2e-4 * normals, obj.vertices, obj.faces) < 0.5]
+                real_points, _ = trimesh.sample.sample_surface(real, 12000, seed=0)
+                self.assertLess(cKDTree(real_points).query(points)[0].mean(), 0.0035)
+                self.assertLess(cKDTree(points).query(real_points)[0].mean(), 0.004)
+                self.assertLess(np.linalg.norm(obj.com - real.center_mass), 0.005)
+
+
+class Geometry(unittest.TestCase):
+    def test_hull_faces_point_outward(self):
+        points = np.random.default_rng(0).normal(size=(40, 3))
+        mesh = shape_mesh(hull(points))
+        self.assertTrue(mesh.is_volume)
+        self.assertAlmostEqual(mesh.volume, trimesh.Trimesh(points).convex_hull.volume, places=9)
+
+    def test_hull_of_flat_points(self):
+        with self.assertRaisesRegex(ObjectError, "span no volume"):
+            hull(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]))
+
+    def test_winding_number_counts_overlaps(self):
+        a, b = trimesh.creation.box((2, 2, 2)), trimesh.creation.box((2, 2, 2))
+        b.apply_translation((1, 0, 0))
+        both = trimesh.util.concatenate([a, b])
+        points = np.array([[-0.5, 0.1, 0.2], [0.5, 0.1, 0.2], [2.5, 0.1, 0.2]])
+        np.testing.assert_allclose(winding_number(points, both.vertices, both.faces), [1, 2, 0], atol=1e-9)
+
+    def test_limited_hull_keeps_the_shape(self):
+        sphere = trimesh.creation.icosphere(4, 0.05)
+        mesh = shape_mesh(limited_hull(sphere.vertices, 64))
+        self.assertEqual(len(mesh.vertices), 64)
+        self.assertGreater(mesh.volume / sphere.volume, 0.9)
+        self.assertTrue(mesh.is_volume)
+
+
+class Sampling(unittest.TestCase):
+    def test_on_the_outer_surface(self):
+        for obj in load_objects(["scissors", "mustard", "powerdrill"]):  # whose pieces overlap
+            points = surface_points(obj, 64)
+            self.assertEqual(points.shape, (64, 3))
+            np.testing.assert_allclose(distance_to_pieces(points, obj), 0, atol=1e-4)
+
+    def test_deterministic_and_seeded(self):
+        obj = load_object("banana")
+        np.testing.assert_array_equal(surface_points(obj), surface_points(obj))
+        self.assertFalse(np.array_equal(surface_points(obj), surface_points(obj, seed=1)))
+
+    def test_well_spread(self):
+        obj = load_object("soup")
+        points = surface_points(obj, 64)
+        nearest = cKDTree(points).query(points, k=2)[0][:, 1]
+        everywhere, _ = sample_surface(obj, 4000, seed=5)
+        self.assertGreater(nearest.min(), 0.008)
+        self.assertLess(cKDTree(points).query(everywhere)[0].max(), 0.02)
+
+    def test_keypoints_see_every_rotation(self):
+        for obj in load_objects(object_names()):
+            points = keypoints(obj)
+            self.assertGreater(abs(np.linalg.det(points[1:] - points[0])), 1e-6)  # not coplanar
+            low, high = bounding_box(obj)
+            self.assertTrue((np.isclose(points, low) | np.isclose(points, high)).all())
+        box = keypoints(load_object("cheez-its"))
+        for axis in np.eye(3):
+            moved = Rotation.from_rotvec(np.pi * axis).apply(box - box.mean(axis=0)) + box.mean(axis=0)
+            self.assertGreater(np.linalg.norm(moved - box, axis=1).max(), 0.05)
+
+    def test_bounding_radius(self):
+        obj = load_object("tuna")
+        self.assertAlmostEqual(bounding_radius(obj), np.linalg.norm(obj.vertices, axis=1).max())
+
+
+class Rest(unittest.TestCase):
+    def test_height(self):
+        obj = load_object("cheez-its")
+        quats = np.array([[1, 0, 0, 0], [0.5**0.5, 0, 0.5**0.5, 0], [0, 1, 0, 0]])
+        low, high = bounding_box(obj)
+        np.testing.assert_allclose(rest_height(obj, quats), [-low[2], high[0], high[2]], atol=1e-12)
+        self.assertIsInstance(rest_height(obj, quats[0]), float)
+
+    def test_stable_pose_stands_over_its_base(self):
+        for name in object_names():
+            obj = load_object(name)
+            rotation = Rotation.from_quat(resting_orientation(obj, Z), scalar_first=True)
+            self.assertGreater(rotation.apply(Z)[2], np.cos(np.radians(5)))
+            vertices = rotation.apply(obj.vertices)
+            base = vertices[vertices[:, 2] < vertices[:, 2].min() + 1e-5, :2]
+            center = rotation.apply(obj.com)[:2]
+            edges = ConvexHull(base).equations
+            self.assertLess((edges[:, :2] @ center + edges[:, 2]).max(), 1e-6, name)
+
+    def test_nearest_stable_pose(self):
+        box = load_object("cheez-its")
+        rotation = Rotation.from_quat(resting_orientation(box, np.array([0.9, 0.1, 0.4])), scalar_first=True)
+        np.testing.assert_allclose(rotation.apply([1, 0, 0]), Z, atol=1e-9)
+        upside_down = Rotation.from_quat(resting_orientation(box, -Z), scalar_first=True)
+        np.testing.assert_allclose(upside_down.apply(Z), -Z, atol=1e-9)
+
+
+class MeshImport(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name)
+        patch = mock.patch.dict(os.environ, {"XRESET_CACHE": str(self.folder / "cache")})
+        patch.start()
+        self.addCleanup(patch.stop)
+
+    def write(self, mesh, name="thing"):
+        path = self.folder / f"{name}.obj"
+        mesh.export(path)
+        return path
+
+    def bracket(self):
+        """An L of two bars, closed and concave."""
+        outline = [(0, 0), (0.1, 0), (0.1, 0.03), (0.03, 0.03), (0.03, 0.1), (0, 0.1)]
+        n = len(outline)
+        vertices = [(x, y, z) for z in (0.0, 0.02) for x, y in outline]
+        cap = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)]
+        faces = [(c, b, a) for a, b, c in cap] + [(a + n, b + n, c + n) for a, b, c in cap]
+        for i in range(n):
+            j = (i + 1) % n
+            faces += [(i, j, j + n), (i, j + n, i + n)]
+        return trimesh.Trimesh(vertices, faces)
+
+    def test_convex_mesh_is_one_hull_with_mass_by_density(self):
+        path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)))
+        result = import_with_notes(path, "thing")
+        self.assertEqual(len(result.obj.pieces), 1)
+        self.assertAlmostEqual(result.obj.mass, DEFAULT_DENSITY * 0.1 * 0.06 * 0.04)
+        np.testing.assert_allclose(np.diag(result.obj.inertia), result.obj.mass / 12 * np.array([0.0052, 0.0116, 0.0136]), rtol=1e-6)
+        self.assertIn("mass is not known", result.notes[0])
+        self.assertEqual(import_with_notes(path, "thing", mass=0.2).obj.mass, 0.2)
+
+    def test_published_mass_by_name(self):
+        path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)), "025_mug")
+        result = import_with_notes(path, "025_mug")
+        self.assertEqual(result.obj.mass, 0.118)
+        self.assertEqual(result.notes, ())
+
+    @unittest.skipUnless(importlib.util.find_spec("coacd"), "CoACD is not installed")
+    def test_concave_mesh_is_cut_and_cached(self):
+        path = self.write(self.bracket())
+        first = import_with_notes(path, "bracket", mass=0.1)
+        self.assertFalse(first.cached)
+        self.assertGreaterEqual(len(first.obj.pieces), 2)
+        volume = sum(shape_mesh(piece).volume for piece in first.obj.pieces)
+        self.assertAlmostEqual(volume / (0.0051 * 0.02), 1.0, delta=0.05)
+        np.testing.assert_allclose(first.obj.com[:2], (0.003 * 0.05 + 0.0021 * 0.015) / 0.0051, atol=1e-6)  # two rectangles
+        self.assertGreater(distance_to_pieces(np.array([[0.07, 0.07, 0.01]]), first.obj)[0], 0.02)  # the notch stays open
+        second = import_with_notes(path, "bracket", mass=0.1)
+        self.assertTrue(second.cached)
+        for a, b in zip(first.obj.pieces, second.obj.pieces, strict=True):
+            np.testing.assert_allclose(shape_mesh(a).bounds, shape_mesh(b).bounds, atol=1e-12)
+
+        (file,) = (self.folder / "cache" / "objects").glob("*.npz")
+        file.write_bytes(file.read_bytes()[:100])
+        self.assertFalse(import_with_notes(path, "bracket", mass=0.1).cached)  # a damaged cache is made again
+        self.assertTrue(import_with_notes(path, "bracket", mass=0.1).cached)
+
+    def test_without_coacd_the_error_names_the_remedy(self):
+        path = self.write(self.bracket())
+        with mock.patch.dict("sys.modules", {"coacd": None}), self.assertRaisesRegex(ObjectError, r"pip install 'xreset\[objects\]'"):
+            import_with_notes(path, "bracket")
+
+    def test_an_unwritable_cache_does_no_harm(self):
+        (self.folder / "file").write_text("")
+        with mock.patch.dict(os.environ, {"XRESET_CACHE": str(self.folder / "file")}):
+            result = import_with_notes(self.write(trimesh.creation.box((0.1, 0.1, 0.1))), "thing")
+        self.assertEqual(len(result.obj.pieces), 1)
+
+    def test_open_mesh_uses_its_hull_and_says_so(self):
+        box = trimesh.creation.box((0.1, 0.1, 0.1)).subdivide().subdivide()
+        path = self.write(trimesh.Trimesh(box.vertices, box.faces[:-1]))
+        result = import_with_notes(path, "thing", mass=1.0)
+        self.assertIn("not closed", result.notes[0])
+        np.testing.assert_allclose(np.diag(result.obj.inertia), 0.01 / 6, rtol=1e-6)
+
+    def test_mesh_inside_out(self):
+        box = trimesh.creation.box((0.1, 0.1, 0.1))
+        result = import_with_notes(self.write(trimesh.Trimesh(box.vertices, box.faces[:, ::-1])), "thing", mass=1.0)
+        self.assertEqual(result.notes, ())
+        corners = result.obj.vertices[result.obj.faces]
+        self.assertGreater(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])), 0)
+
+    def test_bad_meshes(self):
+        box = trimesh.creation.box((0.1, 0.1, 0.1))
+        nan = box.copy().export(file_type="obj").replace("v ", "v nan ", 1)
+        cases = {
+            "empty": ("", "no triangles|cannot be read"),
+            "garbage": ("v 0 0\nf 1 2 3\n", "no triangles|cannot be read"),
+            "nan": (nan, "finite|cannot be read"),
+            "flat": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "flat"),
+            "millimetres": (box.copy().apply_scale(1000).export(file_type="obj"), "millimetres"),
+        }
+        for name, (text, message) in cases.items():
+            with self.subTest(name):
+                path = self.folder / f"{name}.obj"
+                path.write_text(text)
+                with self.assertRaisesRegex(ObjectError, message):
+                    import_with_notes(path, name)
+
+    def test_layouts(self):
+        mesh = trimesh.creation.box((0.1, 0.1, 0.1))
+        self.write(mesh, "011_banana")
+        for name, files in {"025_mug": ("textured.obj", "textured_simple.obj"), "024_bowl": ("textured.obj",)}.items():
+            (self.folder / name).mkdir()
+            for file in files:
+                mesh.export(self.folder / name / file)
+        found = {name: path.name for name, path in mesh_files(self.folder).items()}
+        self.assertEqual(found, {"011_banana": "011_banana.obj", "024_bowl": "textured.obj", "025_mug": "textured_simple.obj"})
+        with self.assertLogs("xreset.objects.meshes", "WARNING") as log:
+            self.assertEqual(load_object("banana", self.folder).mass, 0.066)
+        self.assertIn("hollow", log.output[0])  # 66 g in a litre
+        with self.assertRaisesRegex(ObjectError, r"'soup'.*011_banana.*looked for meshes in"):
+            load_object("soup", self.folder)
+        with self.assertRaisesRegex(ObjectError, "no folder"):
+            load_object("soup", self.folder / "nowhere")
+
+    def test_real_cans_stay_whole(self):
+        folder = data_dir() / "ycb"
+        for name in ("soup", "tuna", "spam"):
+            obj = load_object(name, folder)
+            self.assertEqual(len(obj.pieces), 1, name)
+            outside = distance_to_pieces(obj.vertices, obj)
+            self.assertLess(outside.max(), 0.002)  # 64 vertices are enough
+            self.assertLess(np.linalg.norm(load_object(name).com - obj.com), 0.003)
+
+
+class SpecIsFrozen(unittest.TestCase):
+    def test_the_cached_stand_in_is_shared_but_cannot_be_reassigned(self):
+        obj = load_object("soup")
+        with self.assertRaises(AttributeError):
+            obj.mass = 1.0  # type: ignore[misc]
+        self.assertEqual(replace(obj, mass=1.0).mass, 1.0)
+        self.assertEqual(load_object("soup").mass, 0.349)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -20,7 +20,7 @@ _CANDIDATES = 6
 _GRID_SPACING = 0.004
 """Of the grid of signed distances [m]."""
 _GRID_MARGIN = 0.032
-"""Width of the grid around the object's bounding box [m]; points farther away are told a distance of at least about this."""
+"""Width of the grid around the object's bounding box [m]."""
 
 
 class Surface:
@@ -70,11 +70,13 @@ class Surface:
     def signed_distance(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance [N] and its gradient [N, 3] at points [N, 3]: trilinear interpolation of the grid.
 
-        Points beyond the grid get the value of the nearest point in it, and no gradient across its border.
+        Beyond the grid, the distance to the grid is added to the value of the nearest point in it.
         """
         counts = torch.tensor(self.distance.shape)
-        x = (points - torch.as_tensor(self._origin)) / _GRID_SPACING
-        x = torch.minimum(x.clamp_min(0.0), counts - 1.0001)
+        unclamped = (points - torch.as_tensor(self._origin)) / _GRID_SPACING
+        x = torch.minimum(unclamped.clamp_min(0.0), counts - 1.0001)
+        beyond = unclamped - x
+        excess = beyond.norm(dim=-1)
         cell = x.floor().long()
         f = x - cell
         corner = [cell[:, 0, None] + torch.tensor([0, 0, 0, 0, 1, 1, 1, 1]), cell[:, 1, None] + torch.tensor([0, 0, 1, 1, 0, 0, 1, 1])]
@@ -89,7 +91,8 @@ class Surface:
         gradient = torch.stack(
             (slope_x[:, 0] + fz * (slope_x[:, 1] - slope_x[:, 0]), slope_y[:, 0] + fz * (slope_y[:, 1] - slope_y[:, 0]), slope_z), dim=-1
         )
-        return along_y[:, 0] + fz * slope_z, gradient / _GRID_SPACING
+        gradient = torch.where(beyond == 0, gradient / _GRID_SPACING, beyond / excess[:, None].clamp_min(1e-12))
+        return along_y[:, 0] + fz * slope_z + excess * _GRID_SPACING, gradient
 
     def _at_nodes(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
         index = np.clip(np.rint((points - self._origin) / _GRID_SPACING).astype(int), 0, np.array(values.shape) - 1)

@@ -102,7 +102,8 @@ def _print_summary(demos: Demos, path: Path) -> None:
     from xreset.demos.info import summarize
 
     columns = ("sequences", "right / left", "frames", "with hand", "lift, cm", "goal, cm", "goal, deg")
-    table = Table("object", caption="lift, goal: medians, from the start pose")
+    table = Table(caption="lift, goal: medians, from the start pose")
+    table.add_column("object", no_wrap=True)
     for column in columns:
         table.add_column(column, justify="right")
     for row in summarize(demos):

@@ -57,9 +57,11 @@ def import_(folder: Annotated[Path, tyro.conf.Positional]) -> None:
 def _table(*more: str) -> Table:
     from rich.table import Table
 
-    table = Table("object", "also known as")
-    for column in ("mass, kg", "size, mm", "pieces", "largest piece"):
-        table.add_column(column, justify="right")
+    table = Table()
+    for column in ("object", "alias"):
+        table.add_column(column, no_wrap=True)
+    for column in ("kg", "size, mm", "pieces"):
+        table.add_column(column, justify="right", no_wrap=True)
     table.add_column("source")
     for column in more:
         table.add_column(column, justify="right")
@@ -71,14 +73,13 @@ def _cells(obj: ObjectSpec) -> tuple[str, ...]:
     from xreset.objects.catalogue import ALIASES
 
     low, high = bounding_box(obj)
-    hulls = [len(piece.geometry.vertices) for piece in obj.pieces if piece.geometry.vertices is not None]
+    kinds = {piece.geometry.kind for piece in obj.pieces}
     return (
         obj.name,
         next((alias for alias, name in ALIASES.items() if name == obj.name), ""),
         f"{obj.mass:.3f}",
-        " x ".join(f"{1000 * length:.0f}" for length in high - low),
-        str(len(obj.pieces)),
-        f"{max(hulls)} vertices" if hulls else obj.pieces[0].geometry.kind,
+        "x".join(f"{1000 * length:.0f}" for length in high - low),
+        f"{len(obj.pieces)} {' + '.join(sorted(kinds))}",
         obj.source if obj.source == "stand-in" else f"mesh {obj.source[:8]}",
     )
 

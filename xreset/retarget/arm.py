@@ -57,7 +57,10 @@ class ArmConfig:
     restarts: int = 32
     """Random starts of the first frame (the first of them is the home configuration)."""
     branches: int = 4
-    """Distinct solutions of the first frame that are followed."""
+    """Distinct solutions of the first frame that are followed; the one that home leads to is always among them."""
+    detour_cost: float = 1.0
+    """Valid frames that a path is worth less for each rad^2 of its mean squared distance from home. A policy starts at home: states in
+    another branch of the arm's solutions are of no use to it, because the way there leads through half a turn of the shoulder."""
     first_iterations: int = 60
     """Most steps for the first frame."""
     iterations: int = 12
@@ -198,7 +201,7 @@ def track(
     valid = (classify(measure(model, many, paths), thresholds) == 0).sum(1)
     home = torch.as_tensor(model.robot.home[model.robot.arm_indices])
     detour = (paths - home).square().sum(-1).mean(1)
-    score = valid - detour / (1.0 + detour)  # equally valid paths: the one that stays nearest to home
+    score = valid - config.detour_cost * detour
     joints = paths[torch.arange(sequences) * branches + score.view(sequences, branches).argmax(dim=1)]
 
     reason = classify(measure(model, targets, joints), thresholds)
@@ -259,7 +262,7 @@ def _frame(targets: ArmTargets, support: Tensor, t: int, previous: Tensor | None
 
 
 def _first_frames(model: ArmModel, targets: ArmTargets, support: Tensor, config: ArmConfig) -> Tensor:
-    """[S, K, n] the K best distinct solutions of the first frame."""
+    """[S, K, n] distinct solutions of the first frame: the one that home leads to, then the best others."""
     sequences, restarts = len(targets.annotated), config.restarts
     home = torch.as_tensor(model.robot.home[model.robot.arm_indices])
     generator = torch.Generator().manual_seed(config.seed)
@@ -275,7 +278,7 @@ def _first_frames(model: ArmModel, targets: ArmTargets, support: Tensor, config:
     order = (cost + _HOME_BIAS * (solved - home).square().sum(-1)).argsort(dim=1)
     chosen = torch.empty(sequences, min(config.branches, restarts), len(home), dtype=home.dtype)
     for s in range(sequences):
-        kept: list[Tensor] = []
+        kept = [solved[s, 0]]  # the one that home leads to
         for i in order[s]:
             candidate = solved[s, i]
             if all((candidate - other).abs().max() > _DISTINCT for other in kept):

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 class ActionConfig:
     """How a policy's output in [-1, 1] becomes joint targets (Table VIII: relative arm commands, absolute hand targets)."""
 
-    arm_step: float = 0.05
-    """Largest change of an arm joint's target per control step [rad]: 3 rad/s at 60 Hz, the UR7e's own limit. Not in the paper."""
+    arm_step: float = 0.03
+    """Largest change of an arm joint's target per control step [rad]: 1.8 rad/s at 60 Hz. Not in the paper."""
     arm_lead: float = 0.15
     """Farthest that an arm target may run ahead of the joint [rad], so that a blocked arm does not wind up. Not in the paper."""
     hand_smoothing: float = 1.0

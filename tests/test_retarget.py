@@ -15,6 +15,7 @@ from xreset import robots
 from xreset.demos import demo_objects, read_demos, synthesize, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError
 from xreset.kinematics import Kinematics
+from xreset.objects.geometry import box, surface_of
 from xreset.retarget import hand as hand_module
 from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, measure, track
 from xreset.retarget.balls import inscribed_balls
@@ -32,21 +33,11 @@ from xreset.spec import KEYPOINTS, Geometry, ObjectSpec, TableSpec
 FLOAT = torch.float64
 
 
-def box_object(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]], name: str = "block") -> ObjectSpec:
+def box_object(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> ObjectSpec:
     """An object made of boxes (centre, size)."""
-    import trimesh
-
-    parts = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(center)) for center, size in boxes]
-    mesh = trimesh.util.concatenate(parts)
-    return ObjectSpec(
-        name=name,
-        pieces=(),
-        mass=1.0,
-        com=np.zeros(3),
-        inertia=np.eye(3),
-        vertices=np.array(mesh.vertices),
-        faces=np.array(mesh.faces),
-    )
+    pieces = tuple(box(center, size) for center, size in boxes)
+    vertices, faces = surface_of(pieces)
+    return ObjectSpec(name="block", pieces=pieces, mass=1.0, com=np.zeros(3), inertia=np.eye(3), vertices=vertices, faces=faces)
 
 
 FAR_OBJECT = Surface(box_object(((0, 0, 0), (0.1, 0.1, 0.1))))

@@ -107,7 +107,7 @@ def retarget(
     progress(len(todo), len(todo))
 
     links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
-    contact = touches.any(axis=1)
+    contact = np.asarray(touches.any(axis=1))
     return Retargeted(
         robot=robot.name,
         robot_fingerprint=robot.fingerprint,

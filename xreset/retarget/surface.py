@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from xreset.objects.geometry import surface_of
 from xreset.spec import ObjectSpec
 
 _SAMPLE_SPACING = 0.003
@@ -24,15 +25,20 @@ _GRID_MARGIN = 0.032
 
 
 class Surface:
-    """An object's outer surface, prepared for nearest points and signed distances. Points are in the object's mesh frame."""
+    """An object's outer surface, prepared for nearest points and signed distances. Points are in the object's mesh frame.
+
+    It is the surface of the union of the collision pieces: what the robot will touch in physics. An imported mesh's pieces may stand out
+    of the mesh by some millimetres, enough for a grasp that fits the mesh to be pushed apart.
+    """
 
     def __init__(self, obj: ObjectSpec) -> None:
         """Sample the surface and fill the grid; takes some 0.1 s to 1 s."""
         import trimesh
 
-        mesh = trimesh.Trimesh(obj.vertices, obj.faces, process=False)
+        mesh = trimesh.Trimesh(*surface_of(obj.pieces), process=False)
         self._triangles = np.asarray(mesh.triangles)
-        self.low, self.high = (np.array(corner) for corner in mesh.bounds)
+        corners = self._triangles.reshape(-1, 3)
+        self.low, self.high = corners.min(axis=0), corners.max(axis=0)
         """[3] corners of the bounding box."""
         self._origin = self.low - _GRID_MARGIN
         counts = np.ceil((self.high - self.low + 2 * _GRID_MARGIN) / _GRID_SPACING).astype(int) + 1
@@ -40,9 +46,9 @@ class Surface:
         inside = solid_nodes(self._triangles, axes)
 
         count = int(np.clip(mesh.area / _SAMPLE_SPACING**2, 2_000, 40_000))
-        samples, owners = trimesh.sample.sample_surface(mesh, count, seed=0)
-        samples = np.concatenate((samples, self._triangles.mean(axis=1)))  # so that no small triangle goes without a sample
-        owners = np.concatenate((owners, np.arange(len(self._triangles))))
+        drawn = trimesh.sample.sample_surface(mesh, count, seed=0)
+        samples = np.concatenate((drawn[0], self._triangles.mean(axis=1)))  # so that no small triangle goes without a sample
+        owners = np.concatenate((drawn[1], np.arange(len(self._triangles))))
         outward = _GRID_SPACING * np.asarray(mesh.face_normals)[owners]
         buried = self._at_nodes(inside, samples + outward) & self._at_nodes(inside, samples - outward)  # where the parts of a mesh overlap
         self._owners, self._tree = owners[~buried], cKDTree(samples[~buried])

@@ -46,17 +46,14 @@ class PybulletSettings:
     """Bullet's dials."""
 
     internal_steps: int = 2
-    """Bullet steps per physics step: drives are explicit and contacts are solved once per step, so both gain from 480 Hz."""
+    """Bullet steps per physics step. Objects creep in a grasp by 2 mm in 2 s with 2, by 4 mm with 1, which is 1.6 times as fast."""
     solver_iterations: int = 50
     """Sweeps of the contact solver."""
     friction_cone: bool = True
     """Whether friction is limited by a cone instead of a pyramid. Without it objects slide 30 % less far along the pyramid's diagonals, and
     Bullet leaves out torsional friction altogether. Grasps hold equally well with either."""
     mass_matrix_steps: int = 8
-    """Bullet steps between two updates of the mass matrix that emulated armature and mimic couplings need."""
-    explicit_limit: float = 0.5
-    """A drive is applied as a plain PD torque while (dt kd + dt^2 kp) / inertia is below this (2 is the limit of stability); beyond it
-    is made implicit, which is stable but softens the drive in contact."""
+    """Bullet steps between two updates of the mass matrix that the drives need."""
 
 
 _DEFAULTS = PybulletSettings()
@@ -308,9 +305,10 @@ class _Drives:
     PD torque and B = diag(A + dt kd). Bullet integrates a = M^-1 (tau' - c), so it does the same when given tau' = tau - B a. Mimic joints
     are coupled by a stiff spring and damper, which add J^T (dt^2 k + dt b) J to B.
 
-    This is exact in free motion. In contact the true acceleration is another than a, and tau' is off by B times the difference: small
-    where B is small beside M, as in an arm, but enough to lose a grasp in a hand. So drives that need none of it (no armature, and damping
-    that is stable when explicit) get the PD torque as it is.
+    In contact that alone is wrong: a held joint does not move with a, and would lack the torque B a. So the torque r of contacts and limits
+    in the last step, seen as r = M dv / dt - (tau' - c), is expected again: a = (M + B)^-1 (tau - c + r). A held joint then gets the whole
+    of tau, and an impact delivers the momentum of M + B, both after about 1 + B / M steps. That is one or two for ordinary drives; it is
+    far too many where B dwarfs M, as with armature on the light links of a hand.
     """
 
     def __init__(self, engine: Any, client: int, body: int, robot: Mechanism, dt: float, settings: PybulletSettings) -> None:
@@ -327,30 +325,25 @@ class _Drives:
         self._multiplier = np.array([mimic.multiplier for mimic in spec.mimics])
         self._offset = np.array([mimic.offset for mimic in spec.mimics])
         drives = [joint.drive for joint in spec.joints]
-        self._kp, self._kd, self._effort, self._armature, loss = (
+        self._kp, self._kd, self._effort, self._armature, self._loss = (
             np.array([getattr(drive, field) for drive in drives]) for field in ("kp", "kd", "effort", "armature", "friction_loss")
         )
 
         self.reset(spec.home, np.zeros(len(drives)), spec.home)
         M = self._mass_matrix(spec.home)
-        inertia = 1.0 / np.diag(np.linalg.inv(M))
-        stiff = dt * self._kd + dt**2 * self._kp > settings.explicit_limit * inertia[self.driven]
-        self._implicit = stiff | (self._armature > 0)
-        self._loss = np.where(self._implicit, loss, 0.0)
         self._J = np.zeros((len(self._mimic), len(names)))
         """Rate of each mimic joint's lag behind its source, by joint."""
         rows = np.arange(len(self._mimic))
         self._J[rows, self._mimic] = -1.0
         self._J[rows, self.driven[self._source]] = self._multiplier
-        self._stiffness = _COUPLING * inertia[self._mimic] / dt**2
-        self._damping = 2.0 * np.sqrt(_COUPLING) * inertia[self._mimic] / dt
+        inertia = 1.0 / np.diag(np.linalg.inv(M))[self._mimic]
+        self._stiffness, self._damping = inertia / dt**2, 2.0 * inertia / dt  # critically damped, as stiff as one step can feel
         self._coupling = self._J.T @ ((dt**2 * self._stiffness + dt * self._damping)[:, None] * self._J)
-        self._plain = not (self._implicit.any() or len(self._mimic))
-        self._inverse, self._added, self._saturated = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0, dtype=bool)
+        self._M, self._added, self._inverse = M, np.zeros_like(M), np.zeros_like(M)
+        self._saturated = np.zeros(0, dtype=bool)
 
-        friction = np.zeros(len(names))  # Bullet's velocity motor towards 0 with a limited force is dry friction
-        friction[self.driven] = np.where(self._implicit, 0.0, loss)
-        engine.setJointMotorControlArray(body, self._links, engine.VELOCITY_CONTROL, forces=friction, physicsClientId=client)
+        # Bullet's joints start with a motor that brakes them.
+        engine.setJointMotorControlArray(body, self._links, engine.VELOCITY_CONTROL, forces=np.zeros(len(names)), physicsClientId=client)
 
     def reset(self, position: np.ndarray, velocity: np.ndarray, target: np.ndarray) -> None:
         """Set positions, velocities and targets [J] of the actuated joints; mimic joints follow."""
@@ -360,6 +353,7 @@ class _Drives:
         )
         self.target = target
         self._mass_matrix_age = 0
+        self._last_step: tuple[np.ndarray, np.ndarray] | None = None
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities [D] of all moving joints."""
@@ -373,24 +367,26 @@ class _Drives:
         wanted = self._kp * (self.target - q[driven]) - self._kd * v[driven]
         tau = np.zeros(len(q))
         tau[driven] = np.clip(wanted, -self._effort, self._effort)
-        if not self._plain:
-            if len(self._mimic):
-                lag = self._multiplier * q[driven[self._source]] + self._offset - q[self._mimic]
-                rate = self._J @ v
-                tau -= self._J.T @ (self._stiffness * (lag + dt * rate) + self._damping * rate)
-            saturated = np.abs(wanted) > self._effort
-            if self._mass_matrix_age == 0 or not np.array_equal(saturated, self._saturated):
-                self._factorise(q, saturated)
-            self._mass_matrix_age = (self._mass_matrix_age + 1) % self._mass_matrix_steps
-            bias = self._p.calculateInverseDynamics(self._body, list(q), list(v), [0.0] * len(q), physicsClientId=self._client)
-            net = tau - bias
-            if self._loss.any():
-                compliance = np.diag(self._inverse)[driven]
-                stopping = -(v / dt + self._inverse @ net)[driven] / compliance
-                brake = np.clip(stopping, -self._loss, self._loss)
-                tau[driven] += brake
-                net[driven] += brake
-            tau -= self._added @ (self._inverse @ net)
+        if len(self._mimic):
+            lag = self._multiplier * q[driven[self._source]] + self._offset - q[self._mimic]
+            rate = self._J @ v
+            tau -= self._J.T @ (self._stiffness * (lag + dt * rate) + self._damping * rate)
+        bias = np.array(self._p.calculateInverseDynamics(self._body, list(q), list(v), [0.0] * len(q), physicsClientId=self._client))
+        net = tau - bias
+        if self._last_step is not None:
+            last_velocity, last_net = self._last_step
+            net += self._M @ (v - last_velocity) / dt - last_net
+        saturated = np.abs(wanted) > self._effort
+        if self._mass_matrix_age == 0 or not np.array_equal(saturated, self._saturated):
+            self._factorise(q, saturated)
+        self._mass_matrix_age = (self._mass_matrix_age + 1) % self._mass_matrix_steps
+        if self._loss.any():
+            stopping = -(v / dt + self._inverse @ net)[driven] / np.diag(self._inverse)[driven]
+            brake = np.clip(stopping, -self._loss, self._loss)
+            tau[driven] += brake
+            net[driven] += brake
+        tau -= self._added @ (self._inverse @ net)
+        self._last_step = v, tau - bias
         self._p.setJointMotorControlArray(self._body, self._links, self._p.TORQUE_CONTROL, forces=tau, physicsClientId=self._client)
 
     def _all(self, actuated: np.ndarray, offset: np.ndarray) -> np.ndarray:
@@ -405,14 +401,11 @@ class _Drives:
     def _factorise(self, q: np.ndarray, saturated: np.ndarray) -> None:
         """Invert M + B; a drive at its effort limit has no damping left to be implicit in."""
         added = np.zeros(len(q))
-        added[self.driven] = np.where(self._implicit, self._armature + np.where(saturated, 0.0, self._dt * self._kd), 0.0)
+        added[self.driven] = self._armature + np.where(saturated, 0.0, self._dt * self._kd)
         self._added = self._coupling + np.diag(added)
-        self._inverse = np.linalg.inv(self._mass_matrix(q) + self._added)
+        self._M = self._mass_matrix(q)
+        self._inverse = np.linalg.inv(self._M + self._added)
         self._saturated = saturated
-
-
-_COUPLING = 1.0
-"""Natural frequency of a mimic joint's coupling, squared, in units of 1 / dt^2; its damping is critical."""
 
 
 # Models ----------------------------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,76 @@
+"""The PhysX backend."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import unittest
+from dataclasses import replace
+from unittest import mock
+
+import numpy as np
+
+from tests.engine_checks import EngineChecks
+from xreset.backends.conformance.scene import gripper, scene
+from xreset.backends.rigid import mechanism
+from xreset.backends.sapien import SapienBackend, _friction, _self_collision_bits
+from xreset.errors import BackendUnavailableError, RobotError
+from xreset.spec import MimicSpec
+
+
+class SapienTest(EngineChecks, unittest.TestCase):
+    backend_class = SapienBackend
+
+    def test_a_missing_engine_says_how_to_get_it(self):
+        with mock.patch.dict(sys.modules, {"sapien": None}), self.assertRaisesRegex(BackendUnavailableError, r"xreset\[sapien\]"):
+            SapienBackend.engine_version()
+
+    def test_a_mimic_joint_far_from_its_source_is_refused(self):
+        robot = gripper()
+        far = replace(
+            robot,
+            joints=tuple(j for j in robot.joints if j.name != "finger_b_bend"),
+            mimics=(*robot.mimics, MimicSpec(joint="finger_b_bend", source="swing")),
+        )
+        with self.assertRaisesRegex(RobotError, "'finger_b_bend' mimics 'swing'"):
+            SapienBackend(scene(far), 1)
+
+
+class CollisionBitsTest(unittest.TestCase):
+    def test_exactly_the_pairs_of_the_rule(self):
+        robot = replace(
+            gripper(), self_collision_links=("base", "column", "wrist", "jaw_a", "pad_b"), collision_exclude=(("base", "jaw_a"),)
+        )
+        mech = mechanism(robot)
+        bits = _self_collision_bits(mech)
+        hits = {
+            frozenset((a, b))
+            for a, b in itertools.combinations(robot.self_collision_links, 2)
+            if bits[a][0] & bits[b][1] or bits[a][1] & bits[b][0]
+        }
+        # base and column are neighbours, wrist and jaw_a too; between wrist and pad_b lies jaw_b.
+        expected = {("base", "wrist"), ("base", "pad_b"), ("column", "wrist"), ("column", "jaw_a"), ("column", "pad_b"),
+                    ("wrist", "pad_b"), ("jaw_a", "pad_b")}  # fmt: skip
+        self.assertEqual(hits, {frozenset(pair) for pair in expected})
+
+
+class FrictionTest(unittest.TestCase):
+    def test_forces_of_known_contacts_are_found(self):
+        rng = np.random.default_rng(0)
+        arms = rng.normal(size=(3, 3)) * 0.03
+        normals = rng.normal(size=(3, 3))
+        tangential = np.cross(normals, rng.normal(size=(3, 3)))
+        force, torque = tangential.sum(0), np.cross(arms, tangential).sum(0)
+        found = _friction(arms, normals, np.full(3, 0.8), force, torque)
+        np.testing.assert_allclose(found, tangential, atol=1e-6)  # three contacts: six unknowns, six equations
+
+    def test_a_stronger_contact_carries_more(self):
+        arms = np.zeros((2, 3))
+        normals = np.array([[-9.0, 0, 0], [3.0, 0, 0]])
+        found = _friction(arms, normals, np.full(2, 0.5), np.array([0, 0, 2.0]), np.zeros(3))
+        np.testing.assert_allclose(found.sum(0), [0, 0, 2.0], atol=0.02)
+        self.assertGreater(found[0, 2], found[1, 2])
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -101,16 +101,16 @@ def _print_summary(demos: Demos, path: Path) -> None:
 
     from xreset.demos.info import summarize
 
-    columns = ("sequences", "right / left", "frames", "with hand", "lift, cm", "goal, cm", "goal, deg")
-    table = Table(caption="lift, goal: medians, from the start pose")
+    columns = ("right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg")
+    table = Table(caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start pose")
     table.add_column("object", no_wrap=True)
     for column in columns:
         table.add_column(column, justify="right")
     for row in summarize(demos):
         table.add_row(
             row.object_name,
-            str(row.sequences),
-            f"{row.right} / {row.sequences - row.right}",
+            str(row.right),
+            str(row.sequences - row.right),
             str(row.frames),
             f"{row.hand_frames / row.frames:.0%}",
             f"{100 * row.lift:.1f}",

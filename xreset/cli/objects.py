@@ -62,7 +62,7 @@ def _table(*more: str) -> Table:
         table.add_column(column, no_wrap=True)
     for column in ("kg", "size, mm", "pieces"):
         table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("source")
+    table.add_column("source", overflow="fold")
     for column in more:
         table.add_column(column, justify="right")
     return table

@@ -29,7 +29,7 @@ def levelled(demos: Demos) -> Demos:
     if missing:
         raise DemoError(f"T_level_from_table is given for {', '.join(index)}, but not for {', '.join(missing)}.")
     T = demos.T_level_from_table[[index[name] for name in demos.subject.tolist()]][demos.sequence_of_frame]
-    turn = Rotation.from_matrix(T[:, :3, :3])
+    turn = Rotation.from_matrix(T[:, :3, :3]).as_quat()
 
     def moved(points: np.ndarray) -> np.ndarray:
         return (np.einsum("fij,f...j->f...i", T[:, :3, :3], points) + T[:, :3, 3].reshape(-1, *[1] * (points.ndim - 2), 3)).astype(
@@ -38,7 +38,7 @@ def levelled(demos: Demos) -> Demos:
 
     def turned(quats: np.ndarray, known: np.ndarray) -> np.ndarray:
         out = quats.copy()
-        out[known] = (turn[known] * Rotation.from_quat(quats[known], scalar_first=True)).as_quat(scalar_first=True)
+        out[known] = (Rotation.from_quat(turn[known]) * Rotation.from_quat(quats[known], scalar_first=True)).as_quat(scalar_first=True)
         return out
 
     return replace(

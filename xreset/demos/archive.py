@@ -197,7 +197,8 @@ def read_demos(path: str | Path) -> Demos:
     """
     arrays = read_npz(path, SCHEMA_NAME, SCHEMA, what="an archive of demonstrations", check=_problem)
     values: dict[str, Any] = {field.name: arrays.get(field.name) for field in fields(Demos)}
-    return Demos(**(values | {"fps": float(arrays["fps"])}))
+    values["fps"] = float(arrays["fps"])
+    return Demos(**values)
 
 
 def write_demos(

@@ -198,7 +198,11 @@ class _Loader(yaml.SafeLoader):
     """Plain YAML and ``!!python/tuple``, which DexYCB's calibration uses; every other tag is refused."""
 
 
-_Loader.add_constructor("tag:yaml.org,2002:python/tuple", lambda loader, node: tuple(loader.construct_sequence(node)))
+def _tuple(loader: yaml.SafeLoader, node: Any) -> tuple[Any, ...]:
+    return tuple(loader.construct_sequence(node))
+
+
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _tuple)
 
 
 def _yaml(path: Path) -> dict[str, Any]:

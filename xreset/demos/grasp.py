@@ -28,6 +28,8 @@ MAX_OPENING = 0.095
 
 _STACK = np.array([-0.004, -0.026, -0.043, -0.059])  # index to little along the knuckles, the thumb at 0 [m]
 _FINGER_ROOM = 0.022  # free space that a finger needs beside the object [m]
+_LEANS = (0.6, 1.0)  # first guesses: how far the back of the hand leans to the fingers' side [rad]
+_CURL = np.array([0.0, 0.25, 0.25] * 4 + [0.0] * 5)  # of a grasping hand, beyond a relaxed one
 _GRID = 0.012  # spacing of the centres that are tried [m]
 _SIDE_TILTS = (0.6, 0.4, 0.15)  # how steeply a hand comes down from the side [rad]: the first is the most natural
 _TILT_COST = 2.0  # of being less steep [1/rad]
@@ -137,7 +139,7 @@ def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str = "right") -> li
 def _centers(low: np.ndarray, high: np.ndarray, closing: np.ndarray, across: np.ndarray, from_above: bool) -> np.ndarray:
     """[n, 3] a grid of points that the thumb and the fingers may close upon."""
     middle, half = (low + high) / 2, (high - low) / 2
-    reach_c, reach_a = np.abs(closing) @ half, np.abs(across) @ half
+    reach_c, reach_a = float(np.abs(closing) @ half), float(np.abs(across) @ half)
     along_c = np.arange(-reach_c, reach_c + 1e-9, _GRID)
     along_a = np.arange(-reach_a, reach_a + 1e-9, _GRID)
     if from_above:
@@ -213,67 +215,68 @@ def _depth(solid: Solid, points: np.ndarray, approach: np.ndarray) -> np.ndarray
 
 def fit_hand(solid: Solid, contacts: Contacts, side: str = "right") -> Grasp:
     """The hand whose fingertips are on their contacts, without a bone inside object or table."""
+    fits = [_fit_from(solid, contacts, lean, side) for lean in _LEANS]
+    return min(fits, key=lambda fit: fit[1])[0]
+
+
+def _fit_from(solid: Solid, contacts: Contacts, lean: float, side: str) -> tuple[Grasp, float]:
+    """The best hand near a first guess whose back leans to the fingers' side by ``lean``, and its cost."""
     touching = np.flatnonzero(np.isfinite(contacts.points[:, 0]))
     targets = contacts.points[touching]
     tips = np.array(TIPS)[touching]
-    lower = np.concatenate((np.full(6, -np.inf), hand.LOWER))
-    upper = np.concatenate((np.full(6, np.inf), hand.UPPER))
-    best: Grasp | None = None
-    best_cost = np.inf
-    for lean in (0.6, 1.0):  # how far the back of the hand leans to the fingers' side [rad]
-        axes = _hand_over(contacts, lean, side)
-        start = np.concatenate((np.zeros(6), hand.RELAXED + np.array([0.0, 0.25, 0.25] * 4 + [0.0] * 5)))
-        pose = Rotation.from_matrix(axes)
-        # Begin with the mean fingertip where the mean contact is.
-        start[:3] = targets.mean(axis=0) - pose.apply(hand.keypoints(start[6:], side)[tips]).mean(axis=0)
+    pose = Rotation.from_matrix(_hand_over(contacts, lean, side))
+    posture = hand.RELAXED + _CURL
+    # Begin with the mean fingertip where the mean contact is.
+    wrist = targets.mean(axis=0) - pose.apply(hand.keypoints(posture, side)[tips]).mean(axis=0)
 
-        def residuals(x: np.ndarray, pose: Rotation = pose, start: np.ndarray = start) -> np.ndarray:
-            """[n, R] for n parameter vectors [n, 23]: wrist position, rotation away from ``pose``, joint angles."""
-            points = _place(hand.keypoints(x[:, 6:], side), x[:, :3], pose * Rotation.from_rotvec(x[:, 3:6]))
-            flesh, radius = _flesh(points)
-            inside = np.maximum(radius - solid.distance(flesh), 0.0)
-            sunk = np.maximum(radius + 0.002 - flesh[..., 2], 0.0)
-            return np.concatenate(
-                (
-                    ((points[:, tips] - targets) / 0.002).reshape(len(x), -1),
-                    inside / 0.003,
-                    sunk / 0.003,
-                    x[:, 3:6] / 0.2,
-                    (x[:, 6:] - start[6:]) / 0.7,
-                ),
-                axis=1,
-            )
+    def points_of(x: np.ndarray) -> np.ndarray:
+        """[n, 21, 3] for parameters [n, 23]: wrist position, rotation away from ``pose``, joint angles."""
+        matrix = (pose * Rotation.from_rotvec(x[:, 3:6])).as_matrix()
+        return np.einsum("nij,nkj->nki", matrix, hand.keypoints(x[:, 6:], side)) + x[:, None, :3]
 
-        def jacobian(x: np.ndarray, residuals=residuals) -> np.ndarray:
-            step = 1e-6
-            shifted = residuals(np.concatenate((x + step * np.eye(len(x)), x - step * np.eye(len(x)))))
-            return ((shifted[: len(x)] - shifted[len(x) :]) / (2 * step)).T
+    def residuals(x: np.ndarray) -> np.ndarray:
+        """[n, R], each in units of what is tolerable."""
+        points = points_of(x)
+        flesh, radius = _flesh(points)
+        return np.concatenate(
+            (
+                ((points[:, tips] - targets) / 0.002).reshape(len(x), -1),
+                np.maximum(radius - solid.distance(flesh), 0.0) / 0.003,
+                np.maximum(radius + 0.002 - flesh[..., 2], 0.0) / 0.003,
+                x[:, 3:6] / 0.2,
+                (x[:, 6:] - posture) / 0.7,
+            ),
+            axis=1,
+        )
 
-        fit = least_squares(lambda x, r=residuals: r(x[None])[0], start, jac=jacobian, bounds=(lower, upper), max_nfev=60)
-        if fit.cost < best_cost:
-            best_cost = fit.cost
-            rotation = pose * Rotation.from_rotvec(fit.x[3:6])
-            points = _place(hand.keypoints(fit.x[None, 6:], side), fit.x[None, :3], rotation)
-            flesh, _ = _flesh(points)
-            best = Grasp(
-                wrist_pos=fit.x[:3],
-                wrist_rot=rotation,
-                angles=fit.x[6:],
-                tip_error=float(np.linalg.norm(points[0, tips] - targets, axis=1).max()),
-                penetration=float(max(0.0, -solid.distance(flesh).min(), -flesh[..., 2].min())),
-            )
-    assert best is not None
-    return best
+    def jacobian(x: np.ndarray) -> np.ndarray:  # central differences, all at once
+        steps = 1e-6 * np.eye(len(x))
+        ahead, behind = np.split(residuals(np.concatenate((x + steps, x - steps))), 2)
+        return ((ahead - behind) / 2e-6).T
+
+    bounds = (np.concatenate((np.full(6, -np.inf), hand.LOWER)), np.concatenate((np.full(6, np.inf), hand.UPPER)))
+    fit = least_squares(
+        lambda x: residuals(x[None])[0],
+        np.concatenate((wrist, np.zeros(3), posture)),
+        jac=jacobian,  # pyright: ignore[reportArgumentType]
+        bounds=bounds,
+        max_nfev=60,
+    )
+    points = points_of(fit.x[None])
+    flesh, _ = _flesh(points)
+    grasp = Grasp(
+        wrist_pos=fit.x[:3],
+        wrist_rot=pose * Rotation.from_rotvec(fit.x[3:6]),
+        angles=fit.x[6:],
+        tip_error=float(np.linalg.norm(points[0, tips] - targets, axis=1).max()),
+        penetration=float(max(0.0, -solid.distance(flesh).min(), -flesh[..., 2].min())),
+    )
+    return grasp, float(fit.cost)
 
 
 def _hand_over(contacts: Contacts, lean: float, side: str) -> np.ndarray:
     a, c = contacts.approach, contacts.closing
     return hand.hand_axes(np.cos(lean) * a - np.sin(lean) * c, np.sin(lean) * a + np.cos(lean) * c, side)
-
-
-def _place(points: np.ndarray, pos: np.ndarray, rotation: Rotation) -> np.ndarray:
-    matrix = np.broadcast_to(rotation.as_matrix(), (len(points), 3, 3))
-    return np.einsum("nij,nkj->nki", matrix, points) + pos[:, None]
 
 
 _PARENTS = np.array([0 if k % 4 == 1 else k - 1 for k in range(1, 21)])

@@ -86,7 +86,7 @@ def synthesize(
 
 
 def _sequence(obj: ObjectSpec, starts: Sequence[_Start], name: str, side: str, fps: float, rng: np.random.Generator) -> Demos:
-    start = starts[rng.integers(len(starts))]
+    start = starts[int(rng.integers(len(starts)))]
     timing = random_timing(fps, rng)
     best: tuple[Rotation, np.ndarray, Grasp, HandPath] | None = None
     for _ in range(_GRASP_TRIES):

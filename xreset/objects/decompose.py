@@ -140,6 +140,6 @@ def _depth(mesh: trimesh.Trimesh) -> float:
     import trimesh
     from scipy.spatial import cKDTree
 
-    hull_points, _ = trimesh.sample.sample_surface(mesh.convex_hull, 2000, seed=0)
-    own_points, _ = trimesh.sample.sample_surface(mesh, 40000, seed=0)
+    hull_points = trimesh.sample.sample_surface(mesh.convex_hull, 2000, seed=0)[0]
+    own_points = trimesh.sample.sample_surface(mesh, 40000, seed=0)[0]
     return float(cKDTree(own_points).query(hull_points)[0].max() / np.linalg.norm(mesh.extents))

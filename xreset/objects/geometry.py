@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from xreset.errors import ObjectError
 from xreset.spec import Geometry, Shape
@@ -20,12 +21,12 @@ CYLINDER_SECTIONS = 48
 """Sides of the prism that stands for a cylinder in a surface mesh."""
 
 
-def box(center: Sequence[float], size: Sequence[float]) -> Shape:
+def box(center: ArrayLike, size: Sequence[float]) -> Shape:
     """An axis-aligned box of edge lengths ``size``."""
     return Shape(geometry=Geometry(kind="box", size=tuple(float(s) / 2 for s in size)), T_body_shape=_translation(center))
 
 
-def cylinder(center: Sequence[float], radius: float, height: float) -> Shape:
+def cylinder(center: ArrayLike, radius: float, height: float) -> Shape:
     """A cylinder along z."""
     return Shape(geometry=Geometry(kind="cylinder", size=(float(radius), float(height) / 2)), T_body_shape=_translation(center))
 
@@ -58,9 +59,7 @@ def loft(sections: Iterable[np.ndarray]) -> Shape:
     return hull(np.concatenate(list(sections)))
 
 
-def section(
-    center: Sequence[float], half_u: Sequence[float], half_v: Sequence[float], *, power: float = 2.0, count: int = 16
-) -> np.ndarray:
+def section(center: ArrayLike, half_u: ArrayLike, half_v: ArrayLike, *, power: float = 2.0, count: int = 16) -> np.ndarray:
     """[count, 3] points of a superellipse |u|^power + |v|^power = 1 with half axes ``half_u`` and ``half_v`` (vectors).
 
     A power of 2 is an ellipse; larger ones approach a rectangle.
@@ -68,7 +67,8 @@ def section(
     angle = (np.arange(count) + 0.5) * 2 * np.pi / count
     c, s = np.cos(angle), np.sin(angle)
     radius = (np.abs(c) ** power + np.abs(s) ** power) ** (-1 / power)
-    return np.asarray(center) + np.outer(radius * c, half_u) + np.outer(radius * s, half_v)
+    center, half_u, half_v = (np.asarray(vector, dtype=float) for vector in (center, half_u, half_v))
+    return center + np.outer(radius * c, half_u) + np.outer(radius * s, half_v)
 
 
 def prism(outline: Sequence[tuple[float, float]], bottom: float, top: float) -> Shape:
@@ -115,7 +115,7 @@ def mass_properties(vertices: np.ndarray, faces: np.ndarray, mass: float) -> tup
     return np.asarray(solid.center_mass), np.asarray(solid.inertia) * (mass / solid.mass)
 
 
-def _translation(center: Sequence[float]) -> np.ndarray:
+def _translation(center: ArrayLike) -> np.ndarray:
     T = np.eye(4)
     T[:3, 3] = center
     return T

@@ -63,6 +63,9 @@ class PybulletWorld(World):
     """One world of Bullet, in a client of its own."""
 
     def __init__(self, scene: SceneSpec, object_index: int, *, settings: PybulletSettings = _DEFAULTS) -> None:
+        self._mechanism = robot = mechanism(scene.robot)
+        thing = scene.objects[object_index]
+        self._inertia = object_inertia(thing)
         self._p = p = _engine()
         self._client = p.connect(p.DIRECT)
         if self._client < 0:
@@ -82,9 +85,6 @@ class PybulletWorld(World):
         self._world_gravity = 0.0 if scene.robot.gravity_compensated else -GRAVITY
         p.setGravity(0, 0, self._world_gravity, physicsClientId=self._client)
 
-        self._mechanism = robot = mechanism(scene.robot)
-        thing = scene.objects[object_index]
-        self._inertia = object_inertia(thing)
         with tempfile.TemporaryDirectory(prefix="xreset-") as folder:
             self._robot = self._load_robot(robot, Path(folder))
             self._object = self._load_rigid(_groups(thing.pieces), self._inertia, (0.0, 0.0, _FAR), Path(folder))
@@ -528,7 +528,7 @@ def _link_text(name: str, inertia: Inertia, shapes: Sequence[Shape], folder: Pat
 
 def _geometry_text(shape: Shape, mesh: Path) -> str:
     geometry = shape.geometry
-    if geometry.kind == "hull":
+    if geometry.vertices is not None and geometry.faces is not None:
         lines = [f"v {_numbers(v)}" for v in geometry.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in geometry.faces]
         mesh.write_text("\n".join(lines) + "\n")
         return f'<mesh filename="{mesh.name}"/>'

@@ -71,7 +71,8 @@ class SapienWorld(World):
         self._add_table(scene)
         self._bodies = self._add_robot()
         self._object = self._add_object(scene.objects[object_index].pieces)
-        self._scene = self._system = None
+        self._scene: Any = None
+        self._system: Any = None
         self._renew_scene()
         self._joints = _Joints(self._bodies, robot, scene.timestep)
         self._frames = TrackedFrames(robot)
@@ -139,15 +140,14 @@ class SapienWorld(World):
         """See :meth:`World.contacts`."""
         tips = len(self._mechanism.robot.fingertips)
         tip_force, tip_touch, table_force = np.zeros((tips, 3)), np.zeros(tips, dtype=bool), np.zeros(3)
+        if self._last_step is None:
+            return tip_force, tip_touch, table_force
         surfaces, points, normal_forces = self._contact_points()
         if surfaces:
-            friction = _friction(
-                points - self._center_of_mass(),
-                normal_forces,
-                np.array([self._pair_friction[surface.role] for surface in surfaces]),
-                *self._missing_wrench(points, normal_forces),
-            )
-            for surface, force in zip(surfaces, normal_forces + friction, strict=True):
+            arms = points - self._center_of_mass()
+            limits = np.array([self._pair_friction[surface.role] for surface in surfaces])
+            missing = self._missing_wrench(*self._last_step, arms, normal_forces)
+            for surface, force in zip(surfaces, normal_forces + _friction(arms, normal_forces, limits, *missing), strict=True):
                 if surface.role == "table":
                     table_force += force
                 elif surface.tip is not None:
@@ -282,9 +282,9 @@ class SapienWorld(World):
     # Contacts ----------------------------------------------------------------------------------------------------------------------------
 
     def _contact_points(self) -> tuple[list[_Surface], np.ndarray, np.ndarray]:
-        """What presses on the object in the last step: surfaces, points [n, 3], normal forces on the object [n, 3]."""
+        """What pressed on the object in the last step: surfaces, points [n, 3], normal forces on the object [n, 3]."""
         surfaces, points, forces = [], [], []
-        for contact in self._system.get_contacts() if self._last_step else ():
+        for contact in self._system.get_contacts():
             first, second = contact.bodies
             if self._object not in (first, second):
                 continue
@@ -297,13 +297,14 @@ class SapienWorld(World):
                     forces.append(sign * point.impulse / self._dt)
         return surfaces, np.array(points, dtype=np.float64), np.array(forces, dtype=np.float64)
 
-    def _missing_wrench(self, points: np.ndarray, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Force and torque about the centre of mass that the object's change of momentum shows beyond the given contact forces."""
-        start, force, torque = self._last_step
-        torque = torque - cross(start.angvel, self._angular_momentum(start.angvel, start.principal))  # gyroscopic
+    def _missing_wrench(
+        self, start: _Motion, force: np.ndarray, torque: np.ndarray, arms: np.ndarray, contact_forces: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Force and torque [3] about the centre of mass that the object's change of momentum shows beyond the forces given."""
         gained = self._mass * (self._object.linear_velocity - start.linvel) / self._dt
         turned = self._angular_momentum(self._object.angular_velocity - start.angvel, start.principal) / self._dt
-        return gained - force - forces.sum(axis=0), turned - torque - cross(points - self._center_of_mass(), forces).sum(axis=0)
+        gyroscopic = cross(start.angvel, self._angular_momentum(start.angvel, start.principal))
+        return gained - force - contact_forces.sum(axis=0), turned + gyroscopic - torque - cross(arms, contact_forces).sum(axis=0)
 
     def _center_of_mass(self) -> np.ndarray:
         pose = self._object.entity.pose

@@ -18,7 +18,7 @@ from xreset.kinematics import Kinematics
 from xreset.objects.geometry import box, surface_of
 from xreset.retarget import hand as hand_module
 from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, measure, track
-from xreset.retarget.balls import inscribed_balls
+from xreset.retarget.balls import inscribed_balls, sharp_points
 from xreset.retarget.chain import solve_chain
 from xreset.retarget.collision import SelfCollision, height_above_table, support_points
 from xreset.retarget.file import Retargeted, read_retargeted, write_retargeted
@@ -146,6 +146,16 @@ class CollisionTest(unittest.TestCase):
                 else:
                     np.testing.assert_allclose(np.abs(centers).max(axis=0), np.abs(points).max(axis=0))
                     self.assertEqual(radius, ball)
+
+    def test_sharp_points_lie_on_edges_and_round_shapes_have_none(self):
+        size = np.array(self.SHAPES[0].size)
+        points = sharp_points(self.SHAPES[0], 0.01)
+        at_side = np.isclose(np.abs(points), size)
+        self.assertTrue((at_side.sum(axis=1) >= 2).all())
+        self.assertEqual((at_side.sum(axis=1) == 3).sum(), 8)
+        lonely = np.linalg.norm(points[:, None] - points, axis=-1) + np.eye(len(points))
+        self.assertLessEqual(lonely.min(axis=1).max(), 0.01 + 1e-12)
+        self.assertEqual(len(sharp_points(self.SHAPES[1], 0.01)) + len(sharp_points(self.SHAPES[2], 0.01)), 0)
 
     def test_height_counts_only_above_the_table(self):
         table = TableSpec(center=(0.0, 0.0), half_size=(0.5, 0.5, 0.02))

@@ -1,1 +1,9 @@
-"""Retargeting: human hand motion to robot joint trajectories."""
+"""Retargeting: human hand motion to robot joint trajectories.
+
+from xreset.retarget.pipeline import retarget, write_retargeted
+trajectories = retarget(demos, robot, objects)      # hand, then arm, then validity of every frame
+trajectories.joint_pos[trajectories.valid]          # robot states that may become resets
+
+Modules: ``pipeline`` (the whole), ``hand`` with ``hand_model``, ``terms``, ``balls`` and ``chain``, ``arm`` with ``collision``,
+``surface`` (the object), ``validity``, ``file``, ``picture``.
+"""

@@ -1,7 +1,7 @@
 """A hand as balls: what keeps it out of the object, the table and itself while it is being retargeted.
 
-Balls make distances and their derivatives cheap over whole trajectories. They are exact for capsules and spheres and inscribed in other
-shapes; what they miss is for the exact collision checks that follow (coal, then physics).
+Balls make distances and their derivatives cheap over whole trajectories. They are exact for capsules and spheres, and inscribed in other
+shapes, whose edges and corners balls of radius 0 stand for; what they miss is for the exact checks that follow (coal, then physics).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Balls:
     radii: Tensor
     """[Q]"""
     pairs: Tensor
-    """[R, 2] balls that must not overlap each other."""
+    """[R, 2] balls, of a radius above 0, that must not overlap each other."""
 
 
 def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> Balls:
@@ -42,21 +42,23 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
     """
     links: list[str] = []
     centers: list[np.ndarray] = []
-    radii: list[float] = []
+    radii: list[np.ndarray] = []
     for name in hand.link_names:
         for shape in hand.tree.link(name).collisions:
-            points, radius = inscribed_balls(shape.geometry)
+            inner, radius = inscribed_balls(shape.geometry)
+            points = np.concatenate((inner, sharp_points(shape.geometry, radius)))
             centers.append(points @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3])
             links += [name] * len(points)
-            radii += [radius] * len(points)
-    index = np.array([hand.link_index(name) for name in links])
+            radii.append(np.where(np.arange(len(points)) < len(inner), radius, 0.0))
+    radius = np.concatenate(radii) if radii else np.zeros(0)
+    index = np.where(radius > 0, np.array([hand.link_index(name) for name in links], dtype=np.int64), -1)
     pairs = [
         np.stack(np.meshgrid(np.flatnonzero(index == a), np.flatnonzero(index == b)), -1).reshape(-1, 2) for a, b in collision.link_pairs
     ]
     return Balls(
         links=tuple(links),
         centers=torch.as_tensor(np.concatenate(centers) if centers else np.zeros((0, 3))),
-        radii=torch.as_tensor(np.array(radii)),
+        radii=torch.as_tensor(radius),
         pairs=torch.as_tensor(np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int64)),
     )
 
@@ -85,6 +87,23 @@ def inscribed_balls(geometry: Geometry) -> tuple[np.ndarray, float]:
         center, sides = (low + high) / 2, (high - low) / 2 * (ConvexHull(points).volume / np.prod(high - low)) ** (1 / 3)
     radius = float(sides.min())
     return center + _grid(tuple(sides - radius), radius), radius
+
+
+def sharp_points(geometry: Geometry, spacing: float) -> np.ndarray:
+    """[n, 3] points where a shape stands out of balls in it: a box's edges, a cylinder's rims, a hull's vertices; none for round shapes."""
+    points, radius = support_points(geometry)
+    if radius > 0:
+        return np.zeros((0, 3))
+    if geometry.kind != "box":
+        return points
+    edges = []
+    for axis, half in enumerate(geometry.size):
+        along = np.linspace(-half, half, int(np.ceil(2 * half / spacing)) + 1)
+        for corner in points[points[:, axis] > 0]:
+            edge = np.repeat(corner[None], len(along), axis=0)
+            edge[:, axis] = along
+            edges.append(edge)
+    return np.unique(np.concatenate(edges), axis=0)
 
 
 def _grid(half: tuple[float, ...], radius: float) -> np.ndarray:

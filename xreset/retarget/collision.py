@@ -140,8 +140,10 @@ class SelfCollision:
         self._T_link_shape = np.array(local).reshape(-1, 4, 4)
         self._center, self._radius = np.array(centers).reshape(-1, 3), np.array(radii)
 
-        owners = [kinematics.link_names[index] for index in self._link]
-        pairs = [(i, j) for i, j in combinations(range(len(owners)), 2) if _may_collide(robot, tree, owners[i], owners[j], moved_by_arm)]
+        names = kinematics.link_names
+        linked = combinations(dict.fromkeys(self._link), 2)
+        count = {(a, b) for a, b in linked if _may_collide(robot, tree, names[a], names[b], moved_by_arm)}
+        pairs = [(i, j) for i, j in combinations(range(len(self._link)), 2) if (self._link[i], self._link[j]) in count]
         self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
         home = kinematics.link_poses(kinematics.clamp(kinematics.lower.new_tensor(robot.home[kinematics.joint_indices])))[None].numpy()
         overlapping = self.near(home, 0.0)

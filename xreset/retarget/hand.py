@@ -62,13 +62,17 @@ class HandConfig:
     self_depth: float = 0.002
     """Depth of the hand's links in one another that is allowed [m]."""
     smoothness_weight: float = 2.0
-    """Change of joints and root between neighbouring frames."""
+    """Change of joints and root between neighbouring frames. Positive: it alone holds what no keypoint determines."""
     length_scale: float = 0.10
     """Length that counts as much as one radian [m]: about a finger's length."""
     iterations: int = 40
     """Most Levenberg-Marquardt steps."""
     tolerance: float = 1e-3
     """A sequence is done when a step lowers its cost by less than this fraction."""
+
+    def __post_init__(self) -> None:
+        if not (self.smoothness_weight > 0 and self.length_scale > 0):
+            raise ValueError(f"smoothness_weight ({self.smoothness_weight}) and length_scale ({self.length_scale}) must be positive")
 
 
 @dataclass(frozen=True, kw_only=True)

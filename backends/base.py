@@ -90,7 +90,7 @@ class Backend(ABC):
     Contracts that the conformance suite checks:
 
     - After :meth:`set_state`, :meth:`state` and :meth:`links` report it at once, without a step.
-    - Tensors that a getter returns are snapshots or views that are valid until the next call that changes the worlds; treat them as read-only.
+    - Tensors that a getter returns are snapshots, or views that are valid until the next call that changes the worlds; they are read-only.
     - A joint target stays until it is replaced. Drives, joint limits, dry friction and armature are as the robot spec says.
     - Mimic joints follow their source, and are set with it.
     - Worlds never influence one another.
@@ -167,7 +167,7 @@ class Backend(ABC):
     def health(self) -> Health:
         """What went wrong since each world's state was last set."""
 
-    # Physical parameters: each stays through set_state -----------------------------------------------------------------------------
+    # Physical parameters: each stays through set_state, except the wrench ----------------------------------------------------------
 
     @abstractmethod
     def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
@@ -186,10 +186,14 @@ class Backend(ABC):
 
     @abstractmethod
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
-        """Set an external force [N, 3] N at the object's centre of mass and a torque [N, 3] N m, world frame; stays until replaced."""
+        """Set an external force [N, 3] N at the object's centre of mass and a torque [N, 3] N m, world frame.
+
+        It stays until it is replaced, or the world's state is set.
+        """
 
     # The end ---------------------------------------------------------------------------------------------------------------------
 
+    @abstractmethod
     def close(self) -> None:
         """Free what the worlds hold. Calling it twice does no harm."""
 

@@ -28,12 +28,12 @@ class PointNet(nn.Module):
         for i, (width_in, width_out) in enumerate(zip([3, *dims[:-1]], dims, strict=True)):
             layers += [act()] * (i > 0) + [nn.Linear(width_in, width_out)]
         self.mlp = nn.Sequential(*layers)
-        self.bfloat16 = False
+        self.use_bfloat16 = False
         """Whether to compute in bfloat16 where the clouds are on a GPU; the result is float32 all the same."""
 
     def forward(self, cloud: Tensor) -> Tensor:
         """[..., P, 3] -> [..., dims[-1]]."""
-        if not (self.bfloat16 and cloud.is_cuda):
+        if not (self.use_bfloat16 and cloud.is_cuda):
             return self.mlp(cloud).amax(dim=-2)
         with torch.autocast("cuda", dtype=torch.bfloat16):
             return self.mlp(cloud).amax(dim=-2).float()
@@ -107,7 +107,7 @@ class PointNetLstmModel(MLPModel):
         super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims, activation, False, distribution_cfg)
         normalizer = EmpiricalNormalization(self.obs_dim) if obs_normalization else nn.Identity()
         self.trunk = Trunk(self.obs_dim, obs[self.cloud_group].shape[1], list(pointnet_dims), lstm_dim, activation, normalizer)
-        self.trunk.pointnet.bfloat16 = bfloat16_clouds
+        self.trunk.pointnet.use_bfloat16 = bfloat16_clouds
         self.state: LstmState | None = None
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None) -> Tensor:
@@ -175,7 +175,7 @@ class ExportedPolicy(nn.Module):
         """Copy the parts of a trained model; the copy is on the CPU and in evaluation mode."""
         super().__init__()
         self.trunk = copy.deepcopy(model.trunk)
-        self.trunk.pointnet.bfloat16 = False
+        self.trunk.pointnet.use_bfloat16 = False
         self.mlp = copy.deepcopy(model.mlp)
         self.output = model.distribution.as_deterministic_output_module() if model.distribution is not None else nn.Identity()
         self.flat_dim, self.lstm_dim = model.obs_dim, model._latent_dim

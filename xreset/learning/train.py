@@ -86,7 +86,7 @@ def train(out: Path, info: RunInfo, *, resume: bool = False) -> None:
     rank, device = int(os.environ.get("RANK", "0")), info.device
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
-    if device.startswith("cuda"):
+    if device.startswith("cuda:"):
         torch.cuda.set_device(device)
     inputs = load_inputs(info.robot, info.resets, info.objects)
     if file_hash(info.resets) != info.resets_hash:

@@ -124,11 +124,11 @@ def make_bank(
             tried = 0
             for items, fresh in plan:
                 rows = frames[left[items]]
-                tensors = [
+                joint_pos, object_pos, object_quat = (
                     torch.as_tensor(array[rows], dtype=torch.float32, device=backend.device)
                     for array in (retargeted.joint_pos, retargeted.object_pos, retargeted.object_quat_wxyz)
-                ]
-                found = try_states(backend, *tensors, config).cpu().numpy()
+                )
+                found = try_states(backend, joint_pos, object_pos, object_quat, config).cpu().numpy()
                 reason[left[items[fresh]]] = found[fresh]
                 tried += int(fresh.sum())
                 progress(number * len(frames) + tried, len(backends) * len(frames))

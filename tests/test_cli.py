@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import os
 import subprocess
 import sys
 import unittest
@@ -72,6 +73,12 @@ class UsageTest(unittest.TestCase):
         code, _, err = run("conformance", "--backend", "bulet")
         self.assertEqual(code, 1)
         self.assertRegex(err, "no backend 'bulet'; there are .*pybullet")
+
+    def test_a_missing_engine_is_named_with_the_command_that_mends_it(self):
+        code = "import sys; sys.modules['pybullet'] = None; from xreset.cli import main; main(['backends'])"
+        wide = os.environ | {"COLUMNS": "300"}
+        out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=wide).stdout
+        self.assertRegex(out, r"pybullet .* no: .*pip install 'xreset\[pybullet\]'")
 
     def test_a_policy_that_does_not_exist(self):
         code, _, err = run("eval", "nonsense", "--demos", "x.npz")

@@ -53,7 +53,7 @@ def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]
         "objects": list(objects),
         "observation_layout": layout(len(robot.joints), len(robot.fingertips), task.observation),
         "control_dt": task.timestep * task.substeps,
-        "task": asdict(task),
+        "task": json.loads(json.dumps(asdict(task))),  # as it will be read back: lists for tuples
     }
 
 

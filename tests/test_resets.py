@@ -1,0 +1,141 @@
+"""The physics filter on the MuJoCo C engine: what stays put is kept, what moves is rejected, with its reason."""
+
+import unittest
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from xreset import robots
+from xreset.backends.base import Health
+from xreset.errors import DemoError
+from xreset.objects import load_objects, rest_height
+from xreset.resets.filter import REASONS, FilterConfig, acceptance_table, make_bank, try_states
+from xreset.retarget.pipeline import Retargeted
+from xreset.spec import SceneSpec
+
+try:
+    from xreset.backends.mujoco import MujocoBackend
+except ImportError as error:
+    raise unittest.SkipTest(str(error)) from error
+
+SOUP, SPAM = "005_tomato_soup_can", "010_potted_meat_can"
+UPRIGHT = np.array([1.0, 0, 0, 0])
+
+
+class FilterTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.robot = robots.load("openarm")
+        cls.objects = load_objects([SOUP, SPAM])
+        cls.height = float(rest_height(cls.objects[0], UPRIGHT))
+
+    def try_one(self, pos, joint_pos=None, backend_class=MujocoBackend, config=None):
+        """The reason (None: accepted) of one state with the soup can at ``pos``."""
+        scene = SceneSpec(robot=self.robot, objects=self.objects[:1])
+        joint_pos = self.robot.home if joint_pos is None else joint_pos
+        rows = [torch.as_tensor(np.asarray(v)[None], dtype=torch.float32) for v in (joint_pos, pos, UPRIGHT)]
+        with backend_class(scene, 1, workers=0) as backend:
+            reason = int(try_states(backend, *rows, config or FilterConfig()))
+        return None if reason < 0 else REASONS[reason]
+
+    def test_an_object_at_rest_is_accepted(self):
+        self.assertIsNone(self.try_one([0.5, 0.3, self.height]))
+
+    def test_an_object_in_the_air_is_accepted_because_gravity_is_off(self):
+        self.assertIsNone(self.try_one([0.5, 0.3, self.height + 0.2]))
+
+    def test_an_object_inside_the_table_is_rejected(self):
+        self.assertEqual(self.try_one([0.5, 0.3, self.height - 0.02]), "object linear velocity")
+
+    def test_an_object_beside_the_table_is_out_of_bounds(self):
+        self.assertEqual(self.try_one([2.0, 0.3, 0.3]), "out of bounds")
+
+    def test_thresholds_count(self):
+        pos = [0.5, 0.3, self.height - 0.02]
+        self.assertIsNone(self.try_one(pos, config=FilterConfig(linear_velocity=1e3, angular_velocity=1e3, joint_velocity=1e3)))
+
+    def test_broken_and_overflowing_worlds_are_rejected(self):
+        for field, reason in (("nonfinite", "not finite"), ("overflow", "overflow")):
+
+            class Broken(MujocoBackend):
+                def health(self, field=field) -> Health:
+                    return replace(super().health(), **{field: torch.ones(self.num_worlds, dtype=torch.bool)})
+
+            self.assertEqual(self.try_one([0.5, 0.3, self.height], backend_class=Broken), reason)
+
+    def retargeted(self, **changes) -> Retargeted:
+        """Two demonstrations of three frames: soup (at rest, inside the table, at rest) and spam (not valid, at rest, at rest)."""
+        spam_height = float(rest_height(self.objects[1], UPRIGHT))
+        heights = [self.height, self.height - 0.02, self.height, spam_height, spam_height, spam_height]
+        pos = np.array([[0.45 + 0.02 * i, 0.3, z] for i, z in enumerate(heights)])
+        quat = np.tile(UPRIGHT, (6, 1))
+        reason = np.array([0, 0, 0, 1, 0, 0])
+        values = {
+            "robot": self.robot.name,
+            "robot_fingerprint": self.robot.fingerprint,
+            "sequence_name": np.array(["a", "b"]),
+            "object_name": np.array([SOUP, SPAM]),
+            "hand_side": np.array(["right", "right"]),
+            "frame_offsets": np.array([0, 3, 6]),
+            "fps": 30.0,
+            "joint_names": self.robot.joint_names,
+            "joint_pos": np.tile(self.robot.home, (6, 1)),
+            "palm_pos": np.zeros((6, 3)),
+            "palm_quat_wxyz": quat,
+            "fingertip_names": self.robot.fingertip_names,
+            "fingertip_pos": np.zeros((6, 2, 3)),
+            "object_pos": pos,
+            "object_quat_wxyz": quat,
+            "goal_pos": pos[[2, 5]],
+            "goal_quat_wxyz": quat[[2, 5]],
+            "annotated": np.ones(6, dtype=bool),
+            "valid": reason == 0,
+            "reason": reason,
+            "reason_names": ("valid", "not annotated"),
+            "contact": np.zeros(6, dtype=bool),
+            "first_contact": np.array([2, -1]),
+            "hand_error": np.zeros(6),
+            "wrist_error": np.zeros(6),
+        }
+        return Retargeted(**(values | changes))
+
+    def test_the_bank_holds_what_was_accepted_and_why_the_rest_was_not(self):
+        calls = []
+        bank = make_bank(
+            self.retargeted(), self.robot, self.objects, ["mujoco"], num_envs=2, progress=lambda done, total: calls.append((done, total))
+        )
+        self.assertEqual(list(zip(bank.sequence_index.tolist(), bank.frame_index.tolist())), [(0, 0), (0, 2), (1, 1), (1, 2)])
+        self.assertEqual(bank.post_contact.tolist(), [False, True, False, False])  # -1: the hand never touches the object
+        self.assertEqual(bank.object_name.tolist(), [SOUP, SOUP, SPAM, SPAM])
+        self.assertEqual([REASONS[r] for r in bank.rejected_reason], ["object linear velocity"])
+        self.assertEqual((bank.rejected_sequence_index.tolist(), bank.rejected_frame_index.tolist()), ([0], [1]))
+        np.testing.assert_allclose(bank.start_pos[1], self.retargeted().object_pos[3], atol=1e-6)  # frame 0 counts although it is not valid
+        np.testing.assert_allclose(bank.goal_pos, self.retargeted().goal_pos, atol=1e-6)
+        self.assertEqual(calls[-1], (5, 5))
+
+    def test_number_of_worlds_changes_nothing(self):
+        few, many = (make_bank(self.retargeted(), self.robot, self.objects, ["mujoco"], num_envs=n) for n in (1, 8))
+        np.testing.assert_array_equal(few.frame_index, many.frame_index)
+        np.testing.assert_array_equal(few.rejected_reason, many.rejected_reason)
+
+    def test_the_table_counts_by_object_and_phase(self):
+        bank = make_bank(self.retargeted(), self.robot, self.objects, ["mujoco"], num_envs=4)
+        self.assertEqual(
+            acceptance_table(bank),
+            [
+                (SOUP, "pre-contact", 1, 2, {"object linear velocity": 1}),
+                (SOUP, "post-contact", 1, 1, {}),
+                (SPAM, "pre-contact", 2, 2, {}),
+                (SPAM, "post-contact", 0, 0, {}),
+            ],
+        )
+
+    def test_nothing_valid_is_an_error(self):
+        none = self.retargeted(valid=np.zeros(6, dtype=bool), reason=np.ones(6, dtype=int))
+        with self.assertRaisesRegex(DemoError, "no frame of the retargeted trajectories is valid"):
+            make_bank(none, self.robot, self.objects, ["mujoco"])
+
+
+if __name__ == "__main__":
+    unittest.main()

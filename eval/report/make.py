@@ -62,7 +62,7 @@ def make_report(
     content = page(data, clips)
     first = data.summaries[0]
     shown = clips[0].episode if clips else None
-    caption = f"{short_name(shown.object)}: last frame of the same episode in each engine" if shown else ""
+    caption = f"{short_name(shown.object)}: middle and end of the same episode in each engine" if shown else ""
     write_overview(overview, f"{first['policy']} on {first['robot']}", data.summaries, clips, caption)
     with atomic_write(html) as file:
         file.write(content.encode())

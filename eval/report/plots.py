@@ -163,10 +163,10 @@ def figure_curves(curves: Sequence[Curve], salt: str) -> str:
 
 
 def write_overview(path: Path, title: str, summaries: Summaries, clips: Sequence[Clip], caption: str) -> None:
-    """One picture: task progress and stages of every engine, and the last frame of each clip."""
+    """One picture: task progress and stages of every engine, and two frames of each clip, from the middle and the end."""
     columns = max(len(clips), 2)
     width = max(2.9 * columns, 9.0)
-    picture_height = width / columns * 0.75 + 0.45 if clips else 0.0
+    picture_height = 2 * width / columns * 0.75 + 0.45 if clips else 0.0
     plot_height = 1.6 + 0.36 * len(summaries)
     with _matplotlib({"font.size": 10}) as figure_class:
         figure = figure_class(figsize=(width, plot_height + picture_height + 0.4), layout="constrained", facecolor="white")
@@ -175,9 +175,12 @@ def write_overview(path: Path, title: str, summaries: Summaries, clips: Sequence
         parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
         if clips:
             pictures = parts[1]
-            for ax, clip in zip(pictures.subplots(1, len(clips), squeeze=False)[0], clips, strict=True):
-                ax.imshow(clip.frames[-1])
-                ax.set_title(clip.engine, fontsize="medium", color=COLORS[_index(summaries, clip.engine)], fontweight="bold")
+            grid = pictures.subplots(2, len(clips), squeeze=False)
+            for (middle, end), clip in zip(grid.T, clips, strict=True):
+                middle.imshow(clip.frames[len(clip.frames) // 2])
+                end.imshow(clip.frames[-1])
+                middle.set_title(clip.engine, fontsize="medium", color=COLORS[_index(summaries, clip.engine)], fontweight="bold")
+            for ax in grid.flat:
                 ax.set_axis_off()
             pictures.supxlabel(caption, fontsize="small")
         left, right = parts[0].subplots(1, 2)

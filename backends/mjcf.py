@@ -91,6 +91,8 @@ class SceneModel:
     """[G] what a geom is: index of the fingertip it belongs to, or TABLE, OTHER_LINK, OBJECT."""
     parked: np.ndarray
     """[G] bool: an object's shape slot that this object does not use."""
+    sensed_tip: np.ndarray
+    """[S] fingertip of each geom that has a contact sensor; empty without sensors (see :func:`compile_scene`)."""
 
     @property
     def friction_column(self) -> np.ndarray:
@@ -101,7 +103,7 @@ class SceneModel:
         return np.select([self.geom_role >= 0, self.geom_role == OTHER_LINK, self.geom_role == TABLE], [0, 1, 2], default=3)
 
 
-def compile_scene(scene: SceneSpec, object_index: int, *, slots_for: Sequence[int] = ()) -> SceneModel:
+def compile_scene(scene: SceneSpec, object_index: int, *, slots_for: Sequence[int] = (), sensors: bool = False) -> SceneModel:
     """The model of a scene that holds ``scene.objects[object_index]``.
 
     Args:
@@ -109,6 +111,9 @@ def compile_scene(scene: SceneSpec, object_index: int, *, slots_for: Sequence[in
         object_index: the object in it.
         slots_for: also make room for the shapes of these objects: the models of one scene with the same ``slots_for`` agree in the
             type and number of all geoms and in all meshes, so one engine model can hold any of the objects. Slots without use are parked.
+        sensors: let the engine itself compute what a backend reports. ``sensordata`` then holds, one behind the other, of the tracked
+            links the positions [K, 3], orientations [K, 4], velocities [K, 3] and angular velocities [K, 3]; then the force of the
+            object on the table [3] and on each fingertip geom [S, 3].
 
     Raises:
         RobotError: the robot cannot be simulated.
@@ -129,13 +134,14 @@ def compile_scene(scene: SceneSpec, object_index: int, *, slots_for: Sequence[in
     roles["table"] = TABLE
     parked = _add_object(spec, scene, object_index, slots_for)
     _add_drives(spec, scene)
+    sensed = _add_sensors(spec, robot, roles) if sensors else []
     try:
         model = spec.compile()
     except ValueError as error:
         thing = scene.objects[object_index].name
         raise XResetError(f"MuJoCo refuses the robot {scene.robot.name!r} with the object {thing!r}: {error}") from error
     model.body_gravcomp[model.body("object").id] = 0.0
-    return _locate(robot, model, roles, parked)
+    return _locate(robot, model, roles, parked, sensed)
 
 
 # Options -------------------------------------------------------------------------------------------------------------------------------
@@ -356,10 +362,39 @@ def _pose(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
 
 
+# Sensors -------------------------------------------------------------------------------------------------------------------------------
+
+_NET_FORCE = (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1)  # intprm of a contact sensor: what, reduced to the net force, once
+
+
+def _add_sensors(spec: mujoco.MjSpec, robot: Mechanism, roles: dict[str, int]) -> list[int]:
+    """Add what :func:`compile_scene` says; returns the fingertip of each geom sensed."""
+    sites = []
+    for i, link in enumerate(robot.robot.tracked_links):
+        body, T = robot.frames[link]
+        pos, quat = _pose(T)
+        sites.append(spec.body(_body_name(robot.bodies[body])).add_site(name=f"link/{i}", pos=pos, quat=quat).name)
+    kind, site = mujoco.mjtSensor, mujoco.mjtObj.mjOBJ_SITE
+    for quantity in (kind.mjSENS_FRAMEPOS, kind.mjSENS_FRAMEQUAT, kind.mjSENS_FRAMELINVEL, kind.mjSENS_FRAMEANGVEL):
+        for name in sites:
+            spec.add_sensor(type=quantity, objtype=site, objname=name)
+    tips = {geom: role for geom, role in roles.items() if role >= 0}
+    for geom in ("table", *tips):
+        spec.add_sensor(
+            type=kind.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname="object",
+            reftype=mujoco.mjtObj.mjOBJ_GEOM,
+            refname=geom,
+            intprm=_NET_FORCE,
+        )
+    return list(tips.values())
+
+
 # Where everything is -------------------------------------------------------------------------------------------------------------------
 
 
-def _locate(robot: Mechanism, model: mujoco.MjModel, roles: dict[str, int], parked: set[str]) -> SceneModel:
+def _locate(robot: Mechanism, model: mujoco.MjModel, roles: dict[str, int], parked: set[str], sensed: list[int]) -> SceneModel:
     joints, mimics = robot.robot.joint_names, robot.robot.mimics
     names = [model.geom(i).name for i in range(model.ngeom)]
     frames = [robot.frames[link] for link in robot.robot.tracked_links]
@@ -387,4 +422,5 @@ def _locate(robot: Mechanism, model: mujoco.MjModel, roles: dict[str, int], park
         object_dof=dof["object"],
         geom_role=np.array([roles.get(name, OBJECT) for name in names], dtype=np.int64),
         parked=np.array([name in parked for name in names]),
+        sensed_tip=np.array(sensed, dtype=np.int64),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
@@ -19,7 +20,10 @@ try:
 except ImportError as error:
     raise unavailable("mujoco", "mujoco", error) from error
 
-from xreset.backends.mjcf import MIN_FRICTION, OBJECT, TABLE, SceneModel, compile_scene
+from xreset.backends.mjcf import MIN_FRICTION, SceneModel, compile_scene
+
+_FULL = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
+"""The engine's warnings that contacts or constraints have found no room."""
 
 
 class MujocoWorld(World):
@@ -33,8 +37,24 @@ class MujocoWorld(World):
         self._model = copy(self._at.model)  # each world has parameters of its own
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world must be seen, not silently put back
         self._data = mujoco.MjData(self._model)
+        self._option = self._model.opt
+        self._silent = self._option.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR
+        self._sensing = self._option.disableflags
+        self._option.disableflags = self._silent  # sensors are read once per step(), not computed in each physics step
         self._stepped = False
         self._overflows_before = 0
+
+        # Views of the engine's own memory, which stays where it is: making one costs as much as reading it.
+        data, links = self._data, len(self._at.link_body)
+        self._ctrl, self._qpos, self._qvel = data.ctrl, data.qpos, data.qvel
+        self._wrench = data.xfrc_applied[self._at.object_body]
+        sizes = np.cumsum((3 * links, 4 * links, 3 * links, 3 * links, 3))
+        pos, quat, linvel, angvel, self._table_force, tip_forces = np.split(data.sensordata, sizes)
+        self._links = pos.reshape(-1, 3), quat.reshape(-1, 4), linvel.reshape(-1, 3), angvel.reshape(-1, 3)
+        self._geom_forces = tip_forces.reshape(-1, 3)
+        self._sum_by_tip = -(self._at.sensed_tip == np.arange(links - 1)[:, None]).astype(np.float64)  # minus: of the tip on the object
+        self._full = [data.warning[int(kind)] for kind in _FULL]
+        self._ones = np.ones(len(data.qpos)), np.ones(len(data.qvel))
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """See :meth:`World.set_state`."""
@@ -56,12 +76,12 @@ class MujocoWorld(World):
 
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
-        at, q, v = self._at, self._data.qpos, self._data.qvel
+        at, q, v = self._at, self._qpos, self._qvel
         quat = q[at.object_qpos + 3 : at.object_qpos + 7].copy()
         return {
             "joint_pos": q[at.joint_qpos],
             "joint_vel": v[at.joint_dof],
-            "joint_target": self._data.ctrl.copy(),
+            "joint_target": self._ctrl.copy(),
             "object_pos": q[at.object_qpos : at.object_qpos + 3].copy(),
             "object_quat": quat,
             "object_linvel": v[at.object_dof : at.object_dof + 3].copy(),
@@ -70,7 +90,7 @@ class MujocoWorld(World):
 
     def set_joint_targets(self, targets: np.ndarray) -> None:
         """See :meth:`World.set_joint_targets`."""
-        self._data.ctrl[:] = targets
+        self._ctrl[:] = targets
 
     def step(self, n: int) -> None:
         """See :meth:`World.step`."""
@@ -78,49 +98,25 @@ class MujocoWorld(World):
         mujoco.mj_step(self._model, self._data, n)
         self._stepped = True
         self._update_kinematics()
+        self._option.disableflags = self._sensing
+        mujoco.mj_sensorAcc(self._model, self._data)
+        self._option.disableflags = self._silent
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.links`."""
-        at, data = self._at, self._data
-        body = at.link_body
-        rotation = data.xmat[body].reshape(-1, 3, 3)
-        pos = data.xpos[body] + np.einsum("kij,kj->ki", rotation, at.link_pos)
-        quat = _multiply(data.xquat[body], at.link_quat)
-        angvel, about_com = data.cvel[body, :3], data.cvel[body, 3:]
-        arm = pos - data.subtree_com[self._model.body_rootid[body]]  # MuJoCo refers velocities to the centre of mass of the whole tree
-        return pos, quat, about_com + np.cross(angvel, arm), angvel.copy()
+        return self._links
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.contacts`."""
-        at, data = self._at, self._data
-        tips = len(at.link_body) - 1
-        tip_force, touch, table_force = np.zeros((tips, 3)), np.zeros(tips, dtype=bool), np.zeros(3)
-        if not self._stepped or data.ncon == 0:
-            return tip_force, touch, table_force
-        contact = data.contact
-        roles = at.geom_role[contact.geom]  # [C, 2]
-        first, second = roles.T
-        mine = ((first == OBJECT) != (second == OBJECT)) & (contact.efc_address >= 0)
-        if not mine.any():
-            return tip_force, touch, table_force
-        rows = contact.efc_address[mine]
-        local = data.efc_force[rows[:, None] + np.arange(3)]  # elliptic cone: normal and two tangential forces
-        # A contact's force acts on the second geom, its frame's rows are the normal and the tangents.
-        force = np.einsum("ci,cij->cj", local, contact.frame[mine].reshape(-1, 3, 3))
-        on_object = np.where((second[mine] == OBJECT)[:, None], force, -force)
-        other = np.where(second[mine] == OBJECT, first[mine], second[mine])
-        table_force = on_object[other == TABLE].sum(axis=0)
-        for tip in range(tips):
-            by = other == tip
-            tip_force[tip] = on_object[by].sum(axis=0)
-            touch[tip] = (local[by, 0] > 0.0).any()
-        return tip_force, touch, table_force
+        tip_force = self._sum_by_tip @ self._geom_forces
+        # A contact in which no force acts is no touch.
+        return tip_force, tip_force.any(axis=1), -self._table_force
 
     def health(self) -> tuple[bool, bool]:
         """See :meth:`World.health`."""
-        data = self._data
-        finite = np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()
-        return not finite, self._overflows() > self._overflows_before
+        (q_ones, v_ones), overflows = self._ones, self._overflows()
+        finite = math.isfinite(self._qpos.dot(q_ones) + self._qvel.dot(v_ones))  # one bad number spoils a sum; cheaper than looking at each
+        return not finite, overflows > self._overflows_before
 
     def set_object_mass(self, mass: float) -> None:
         """See :meth:`World.set_object_mass`."""
@@ -144,19 +140,21 @@ class MujocoWorld(World):
 
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
         """See :meth:`World.set_object_wrench`."""
-        wrench = self._data.xfrc_applied[self._at.object_body]
-        wrench[:3], wrench[3:] = force, torque
+        self._wrench[:3], self._wrench[3:] = force, torque
 
     def _overflows(self) -> int:
         """How often contacts or constraints have found no room so far."""
-        kinds = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
-        return sum(int(self._data.warning[int(kind)].number) for kind in kinds)
+        return sum(warning.number for warning in self._full)
 
     def _update_kinematics(self) -> None:
         """Bring link poses and velocities up to date with qpos and qvel; contact forces stay those of the last step."""
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)
         mujoco.mj_comVel(self._model, self._data)
+        self._option.disableflags = self._sensing
+        mujoco.mj_sensorPos(self._model, self._data)
+        mujoco.mj_sensorVel(self._model, self._data)
+        self._option.disableflags = self._silent
 
 
 class MujocoBackend(PoolBackend):
@@ -190,7 +188,7 @@ class _Same:
 
 @lru_cache(maxsize=32)
 def _compiled(key: _Same, object_index: int) -> SceneModel:
-    return compile_scene(key.scene, object_index)
+    return compile_scene(key.scene, object_index, sensors=True)
 
 
 # Quaternions (numpy) -------------------------------------------------------------------------------------------------------------------
@@ -204,11 +202,3 @@ def _rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 def _rotate_inverse(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
     return _rotate(quat * np.array([1.0, -1.0, -1.0, -1.0]), vector)
-
-
-def _multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[K, 4] quaternion products."""
-    out = np.empty_like(a)
-    for row, left, right in zip(out, a, b, strict=True):
-        mujoco.mju_mulQuat(row, left, right)
-    return out

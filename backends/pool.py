@@ -22,7 +22,7 @@ import tempfile
 import traceback
 import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
@@ -67,7 +67,10 @@ class World(ABC):
 
     @abstractmethod
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Tracked links: position (K, 3), orientation (K, 4), velocity of the origin (K, 3), angular velocity (K, 3)."""
+        """Tracked links: position (K, 3), orientation (K, 4), velocity of the origin (K, 3), angular velocity (K, 3).
+
+        They may be views of the engine's memory, which the next call that changes the world overwrites.
+        """
 
     @abstractmethod
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -389,14 +392,8 @@ class _WorldFailure(Exception):
         self.world, self.kind, self.message, self.trace = world, kind, message, trace
 
 
-@contextlib.contextmanager
-def _naming(world: int) -> Iterator[None]:
-    try:
-        yield
-    except XResetError as error:
-        raise _WorldFailure(world, type(error), str(error), traceback.format_exc()) from error
-    except Exception as error:
-        raise _WorldFailure(world, None, f"{type(error).__name__}: {error}", traceback.format_exc()) from error
+_MOVING = frozenset(("build", "set_state", "step"))
+"""Commands after which a world reports something else than before."""
 
 
 class _Local:
@@ -408,12 +405,23 @@ class _Local:
         self._numbers = range(job.first, job.first + len(job.object_index))
         self._worlds: list[World] = []
 
-    def command(self, method: str, worlds: Sequence[int] | np.ndarray | None, argument: Any) -> None:
-        """Run one of the methods below for the given worlds (all if None)."""
-        action = getattr(self, f"_{method}")
-        for number in self._numbers if worlds is None else worlds:
-            with _naming(int(number)):
-                action(int(number), argument)
+    def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> None:
+        """Run one of the methods below for the given worlds (all if None), and publish what they then report.
+
+        All worlds act before any is published: engine and Python code take turns in the processor's caches once, not once per world.
+        """
+        numbers = self._numbers if worlds is None else worlds.tolist()
+        number, action = self._job.first, getattr(self, f"_{method}")
+        try:
+            for number in numbers:
+                action(number, argument)
+            if method in _MOVING:
+                for number in numbers:
+                    self._publish(number)
+        except XResetError as error:
+            raise _WorldFailure(number, type(error), str(error), traceback.format_exc()) from error
+        except Exception as error:
+            raise _WorldFailure(number, None, f"{type(error).__name__}: {error}", traceback.format_exc()) from error
 
     def close(self) -> None:
         """Close the worlds."""
@@ -431,7 +439,6 @@ class _Local:
     def _set_state(self, i: int, _) -> None:
         self._world(i).set_state({name: self._arrays[name][i].astype(np.float64) for name in STATE_FIELDS})
         self._arrays["nonfinite"][i] = self._arrays["overflow"][i] = False
-        self._publish(i)
 
     def _step(self, i: int, n: int) -> None:
         if self._arrays["nonfinite"][i]:
@@ -441,7 +448,6 @@ class _Local:
         wrench = self._arrays["wrench"][i].astype(np.float64)
         world.set_object_wrench(wrench[:3], wrench[3:])
         world.step(n)
-        self._publish(i)
 
     def _set_object_mass(self, i: int, _) -> None:
         self._world(i).set_object_mass(float(self._arrays["object_mass"][i]))
@@ -454,13 +460,17 @@ class _Local:
 
     def _publish(self, i: int) -> None:
         world, arrays = self._world(i), self._arrays
+        if arrays["nonfinite"][i]:  # nothing has moved since that was said
+            return
         for name, value in world.get_state().items():
             arrays[name][i] = value
         arrays["link_pos"][i], arrays["link_quat"][i], arrays["link_linvel"][i], arrays["link_angvel"][i] = world.links()
         arrays["tip_force"][i], arrays["tip_touch"][i], arrays["table_force"][i] = world.contacts()
         nonfinite, overflow = world.health()
-        arrays["nonfinite"][i] |= nonfinite
-        arrays["overflow"][i] |= overflow
+        if nonfinite:
+            arrays["nonfinite"][i] = True
+        if overflow:
+            arrays["overflow"][i] = True
 
 
 # Worker processes ----------------------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from unittest import mock
 import mujoco
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from tests.toy_robot import toy_hand_arm
 from xreset.backends.base import Backend
@@ -18,7 +19,7 @@ from xreset.backends.conformance.contact_checks import _grasp
 from xreset.backends.conformance.harness import Bench, snapshot
 from xreset.backends.conformance.scene import gripper, objects, scene
 from xreset.backends.mjcf import OBJECT, OTHER_LINK, TABLE, SceneModel, compile_scene
-from xreset.backends.mujoco import MujocoBackend
+from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.mujoco_warp import MujocoWarpBackend, _differing_fields
 from xreset.errors import BackendUnavailableError, ObjectError, RobotError, XResetError
 from xreset.spec import FingertipSpec
@@ -34,6 +35,45 @@ def colliding_geoms(model: mujoco.MjModel) -> set[frozenset[str]]:
     mujoco.mj_forward(model, data)
     names = [model.geom(i).name for i in range(model.ngeom)]
     return {frozenset(names[i] for i in pair) for pair in data.contact.geom}
+
+
+def worlds(backend: MujocoBackend) -> list[MujocoWorld]:
+    """The worlds of a backend without worker processes."""
+    return backend._team._worlds
+
+
+def plain_links(world: MujocoWorld) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Position, rotation matrix, velocity and angular velocity of the tracked links, one by one."""
+    at, data, rows = world._at, world._data, []
+    for body, pos, quat in zip(at.link_body, at.link_pos, at.link_quat, strict=True):
+        R, velocity = data.xmat[body].reshape(3, 3), np.zeros(6)
+        mujoco.mj_objectVelocity(world._model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
+        angvel, linvel = velocity[:3], velocity[3:]
+        own = Rotation.from_quat(quat, scalar_first=True).as_matrix()
+        rows.append((data.xpos[body] + R @ pos, R @ own, linvel + np.cross(angvel, R @ pos), angvel))
+    pos, rotation, linvel, angvel = (np.array(column) for column in zip(*rows, strict=True))
+    return pos, rotation, linvel, angvel
+
+
+def plain_contacts(world: MujocoWorld) -> tuple[np.ndarray, list[bool], np.ndarray]:
+    """Tip forces, tip touch and table force on the object, contact by contact."""
+    at, data = world._at, world._data
+    tips = len(at.link_body) - 1
+    tip_force, touch, table_force = np.zeros((tips, 3)), [False] * tips, np.zeros(3)
+    for i in range(data.ncon):
+        contact, local = data.contact[i], np.zeros(6)
+        mujoco.mj_contactForce(world._model, data, i, local)
+        force = contact.frame.reshape(3, 3).T @ local[:3]  # on the second geom
+        roles = at.geom_role[contact.geom]
+        if OBJECT not in roles:
+            continue
+        other, on_object = (roles[0], force) if roles[1] == OBJECT else (roles[1], -force)
+        if other == TABLE:
+            table_force += on_object
+        if other >= 0:
+            tip_force[other] += on_object
+            touch[other] |= local[0] > 0
+    return tip_force, touch, table_force
 
 
 class Model(unittest.TestCase):
@@ -224,6 +264,50 @@ class BothBackends(unittest.TestCase):
         a, b = self.warp.contacts(), self.c.contacts()
         torch.testing.assert_close(a.tip_force[[0, 3]], b.tip_force[[0, 3]], atol=0.02, rtol=0.0)
         torch.testing.assert_close(a.tip_touch, b.tip_touch)
+
+    def test_readings_are_those_of_a_plain_computation(self):
+        """The engine's sensors against loops over links and contacts: while a grasped box is swung about, and right after a set."""
+        state, _ = _grasp(self.bench)
+        moving = replace(state, joint_vel=state.joint_vel + 0.3, object_angvel=state.object_angvel + torch.tensor([0.5, -1.0, 2.0]))
+        touched = set()
+        for steps in (0, 1, 5, 30):
+            self.c.set_state(moving)
+            self.c.set_joint_targets(state.joint_target + torch.tensor([0.1, 0.2, 0.1, 0.0, 0.0]))
+            for _ in range(steps):
+                self.c.step()
+            links, contacts = self.c.links(), self.c.contacts()
+            for i in range(4):
+                pos, rotation, linvel, angvel = plain_links(worlds(self.c)[i])
+                np.testing.assert_allclose(links.pos[i], pos, atol=1e-6)
+                np.testing.assert_allclose(links.linvel[i], linvel, atol=1e-6)
+                np.testing.assert_allclose(links.angvel[i], angvel, atol=1e-6)
+                turned = Rotation.from_quat(links.quat[i].numpy(), scalar_first=True).as_matrix()
+                np.testing.assert_allclose(turned, rotation, atol=1e-6)
+                tip_force, touch, table_force = plain_contacts(worlds(self.c)[i])
+                np.testing.assert_allclose(contacts.tip_force[i], tip_force, rtol=1e-5, atol=1e-6)
+                np.testing.assert_allclose(contacts.table_force[i], table_force, rtol=1e-5, atol=1e-6)
+                self.assertEqual(contacts.tip_touch[i].tolist(), touch)
+                touched |= {("tip", tip) for tip in np.flatnonzero(touch)} | ({("table",)} if table_force.any() else set())
+        self.assertEqual(touched, {("tip", 0), ("tip", 1), ("table",)}, "nothing was compared")
+
+    def test_sensors_change_no_motion(self):
+        plain, sensing = compile_scene(self.scene, 0).model, compile_scene(self.scene, 0, sensors=True).model
+        self.assertEqual(plain.nsensordata, 0)
+        results = []
+        for model in (plain, sensing):
+            data = mujoco.MjData(model)
+            data.qvel[:] = 0.2
+            mujoco.mj_step(model, data, 50)
+            results.append(data.qpos.copy())
+        np.testing.assert_array_equal(*results)
+
+    def test_every_broken_number_is_noticed(self):
+        for bad in (np.nan, np.inf, -np.inf):
+            for array in ("qpos", "qvel"):
+                world = MujocoWorld(self.scene, 0)
+                self.assertFalse(world.health()[0])
+                getattr(world._data, array)[[0, 3]] = bad, 1.0
+                self.assertTrue(world.health()[0], f"{bad} in {array}")
 
     def test_bad_shapes_are_named(self):
         state = self.bench.start()

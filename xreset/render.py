@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ HAND_COLOR: Color = (0.45, 0.53, 0.68)
 PALM_COLOR: Color = (0.34, 0.40, 0.54)
 TIP_COLOR: Color = (0.16, 0.68, 0.62)
 OBJECT_COLOR: Color = (0.95, 0.58, 0.22)
+INVALID_COLOR: Color = (0.86, 0.13, 0.13)
 GOAL_COLOR: Color = (0.35, 0.78, 0.35)
 TABLE_COLORS: tuple[Color, Color] = ((0.84, 0.80, 0.74), (0.80, 0.76, 0.70))
 SKY_COLORS: tuple[Color, Color] = ((0.90, 0.93, 0.97), (0.98, 0.98, 0.98))
@@ -76,7 +77,7 @@ class Frames:
 
 
 @dataclass(frozen=True)
-class _Mesh:
+class Mesh:
     """Triangles of one body."""
 
     vertices: np.ndarray
@@ -106,31 +107,29 @@ class Renderer:
         self.camera = camera or Camera()
         self._scale = 2 if smooth else 1
         self._kinematics = Kinematics(scene.robot)
-        tree = self._kinematics.tree
-        self._robot = _Bodies(
-            [_merge([_shape_mesh(shape.geometry, shape.T_body_shape) for shape in tree.link(name).collisions]) for name in tree.link_names],
-            link_colors(scene.robot),
-        )
+        self._robot = _Bodies(link_meshes(scene.robot), link_colors(scene.robot))
         self._objects = [_Bodies([_mesh(spec.vertices, spec.faces)], [OBJECT_COLOR]) for spec in scene.objects]
         self._table = _table(scene.table)
 
     def draw(
         self,
-        joint_pos: np.ndarray,
+        joint_pos: np.ndarray | None,
         object_pose: np.ndarray | None = None,
         *,
         goal_pose: np.ndarray | None = None,
         object_index: int = 0,
+        robot_tint: Color | None = None,
         points: Sequence[Points] = (),
         frames: Sequence[Frames] = (),
     ) -> np.ndarray:
         """Draw one state.
 
         Args:
-            joint_pos: [J] rad (m), in the robot's joint order.
+            joint_pos: [J] rad (m), in the robot's joint order; None leaves the robot out.
             object_pose: [4, 4] pose of the object in the world; None leaves it out.
             goal_pose: [4, 4] pose at which the object is drawn once more, translucent.
             object_index: which of the scene's objects.
+            robot_tint: colour to mix into the robot's own (:func:`tinted`).
             points: dots on top.
             frames: axes on top.
 
@@ -139,12 +138,15 @@ class Renderer:
         """
         import torch
 
-        q = torch.as_tensor(np.asarray(joint_pos), dtype=torch.float64)
-        casters = [self._robot.placed(self._kinematics.link_poses(q).numpy())]
+        casters = []
+        if joint_pos is not None:
+            q = torch.as_tensor(np.asarray(joint_pos), dtype=torch.float64)
+            robot = self._robot.placed(self._kinematics.link_poses(q).numpy())
+            casters.append(robot if robot_tint is None else replace(robot, colors=tinted(robot.colors, robot_tint)))
         if object_pose is not None:
             casters.append(self._objects[object_index].placed(np.asarray(object_pose, dtype=float)[None]))
         view = _View(self.camera, (self.size[0] * self._scale, self.size[1] * self._scale))
-        picture, nearness = _shade(view, _join([*casters, self._table]), _Shadow(_join(casters)))
+        picture, nearness = _shade(view, _join([*casters, self._table]), _Shadow(_join(casters)) if casters else None)
         if goal_pose is not None:
             ghost = self._objects[object_index].placed(np.asarray(goal_pose, dtype=float)[None], color=GOAL_COLOR)
             over, ghost_nearness = _shade(view, ghost, None)
@@ -189,6 +191,19 @@ def write_png(path: str | Path, picture: np.ndarray) -> None:
         file.write(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6)) + chunk(b"IEND", b""))
 
 
+def tinted(color: np.ndarray, tint: Color) -> np.ndarray:
+    """Colours [..., 3] with more than half of another one mixed in: parts can still be told apart."""
+    return 0.4 * np.asarray(color, dtype=float) + 0.6 * np.asarray(tint)
+
+
+def link_meshes(robot: RobotSpec) -> list[Mesh | None]:
+    """The collision shapes of each link of the robot's URDF as one mesh in the link's frame; None for a link without shape."""
+    from xreset.urdf import robot_tree
+
+    tree = robot_tree(robot)
+    return [_merge([_shape_mesh(shape.geometry, shape.T_body_shape) for shape in tree.link(name).collisions]) for name in tree.link_names]
+
+
 def link_colors(robot: RobotSpec) -> list[Color]:
     """The colour of each link of the robot's URDF: arm, palm, fingers and fingertips are told apart."""
     from xreset.urdf import robot_tree
@@ -226,7 +241,7 @@ class _Placed:
 class _Bodies:
     """Rigid meshes that are placed together."""
 
-    def __init__(self, meshes: Sequence[_Mesh | None], colors: Sequence[Color]) -> None:
+    def __init__(self, meshes: Sequence[Mesh | None], colors: Sequence[Color]) -> None:
         drawn = [(index, mesh) for index, mesh in enumerate(meshes) if mesh is not None]
         self._body = np.concatenate([np.full(len(mesh.faces), index) for index, mesh in drawn])
         self._corners = np.concatenate([mesh.vertices[mesh.faces] for _, mesh in drawn])
@@ -247,7 +262,7 @@ def _join(parts: Sequence[_Placed]) -> _Placed:
     return _Placed(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("corners", "normals", "colors")))
 
 
-def _mesh(vertices: np.ndarray, faces: np.ndarray) -> _Mesh:
+def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     """A mesh with a normal at each corner: the mean over the faces around the vertex that meet this one at less than the crease angle."""
     vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces, dtype=np.int64)
     edges = vertices[faces]
@@ -268,21 +283,21 @@ def _mesh(vertices: np.ndarray, faces: np.ndarray) -> _Mesh:
     total = np.zeros((len(corner_vertex), 3))
     np.add.at(total, corner[together], cross[other[together]])
     total /= np.linalg.norm(total, axis=1, keepdims=True)
-    return _Mesh(vertices, faces, total.reshape(-1, 3, 3))
+    return Mesh(vertices, faces, total.reshape(-1, 3, 3))
 
 
-def _merge(meshes: Sequence[_Mesh]) -> _Mesh | None:
+def _merge(meshes: Sequence[Mesh]) -> Mesh | None:
     if not meshes:
         return None
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    return _Mesh(
+    return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]),
         np.concatenate([mesh.normals for mesh in meshes]),
     )
 
 
-def _shape_mesh(geometry: Geometry, T: np.ndarray) -> _Mesh:
+def _shape_mesh(geometry: Geometry, T: np.ndarray) -> Mesh:
     import trimesh
 
     if geometry.kind == "box":

@@ -17,6 +17,7 @@ COMMANDS: dict[str, str] = {
     "conformance": "Test that a physics engine keeps the interface's contracts.",
     "retarget": "Turn human demonstrations into robot trajectories.",
     "resets": "Try retargeted states in physics and keep the stable ones.",
+    "view": "Look at demonstrations, robot trajectories or a reset bank in a browser, or as pictures.",
     "train": "Train a policy.",
     "eval": "Evaluate a policy, or a baseline, in one or several engines.",
     "report": "Make a self-contained HTML page of a run's evaluations.",

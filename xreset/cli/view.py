@@ -1,0 +1,105 @@
+"""``xreset view``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from xreset.view.data import View
+
+
+def view(
+    file: Annotated[Path, tyro.conf.Positional],
+    *,
+    demos: Path | None = None,
+    objects: Path | None = None,
+    robot: str | None = None,
+    sequence: int | None = None,
+    frame: int | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    png: Path | None = None,
+    mp4: Path | None = None,
+) -> None:
+    """Look at demonstrations, robot trajectories or a reset bank in a browser, or write pictures of them.
+
+    The robot is red where a frame is not valid. The object's goal is translucent. Human keypoints are pink, those in contact yellow.
+
+    Args:
+        file: Demonstrations, or what `xreset retarget` or `xreset resets` made.
+        demos: Demonstrations that the file was made from: shows the human hand over the robot.
+        objects: Folder of real meshes; default: the built-in stand-ins.
+        robot: Folder of the robot, if it is not one that is known by name.
+        sequence: Which sequence, counted from 0. Default: the first; of a bank, all.
+        frame: Which frame of the sequence (state of the bank). Default: the first; for --png the middle one.
+        host: Address to serve at; 0.0.0.0 lets other machines in.
+        port: Port to serve at; the next free one if it is taken.
+        png: Picture to write, instead of serving a page.
+        mp4: Film of the sequence to write, instead of serving a page.
+    """
+    from xreset.view.data import load_view
+
+    shown = load_view(file, demos=demos, robot=robot, objects=objects)
+    if png is None and mp4 is None:
+        _serve(shown, host, port, sequence, frame or 0)
+        return
+    rows = shown.choose(sequence=sequence if sequence is not None or shown.kind == "reset states" else 0)
+    if png is not None:
+        _write_png(png, shown, rows, frame)
+    if mp4 is not None:
+        _write_mp4(mp4, shown, rows)
+
+
+def _serve(shown: View, host: str, port: int, sequence: int | None, frame: int) -> None:
+    from xreset.view.page import Page
+
+    page = Page(shown, host=host, port=port, sequence=sequence, frame=frame)
+    number = page.url.rpartition(":")[2]
+    print(f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {shown.kind} at {page.url}", flush=True)
+    print(f"From another machine: ssh -L {number}:localhost:{number} THIS_MACHINE, then open the same address. Ctrl-C ends.", flush=True)
+    try:
+        page.serve()
+    except KeyboardInterrupt:  # the way to end it, not a failure
+        print("\nclosed.")
+    finally:
+        page.close()
+
+
+def _write_png(path: Path, shown: View, rows: np.ndarray, frame: int | None) -> None:
+    from xreset.errors import XResetError
+    from xreset.render import write_png
+    from xreset.view.picture import drawer
+
+    chosen = len(rows) // 2 if frame is None else frame
+    if not 0 <= chosen < len(rows):
+        raise XResetError(f"there is no frame {chosen}; the choice has {len(rows)}, counted from 0.")
+    write_png(path, drawer(shown, size=(960, 720), smooth=True)(int(rows[chosen])))
+    print("\n".join((*shown.text(int(rows[chosen])), f"picture in {path}")))
+
+
+def _write_mp4(path: Path, shown: View, rows: np.ndarray) -> None:
+    import numpy as np
+    from rich.console import Console
+    from rich.progress import track
+
+    from xreset.errors import XResetError
+    from xreset.eval.report.clips import encode_mp4
+    from xreset.files import atomic_write
+    from xreset.view.picture import drawer
+
+    if not len(rows):
+        raise XResetError("this sequence has no state to film; choose another one with --sequence.")
+    draw = drawer(shown)
+    frames = [draw(int(row)) for row in track(rows, "drawing", console=Console(), transient=True)]
+    film = encode_mp4(np.stack(frames), shown.rate)
+    with atomic_write(path) as file:
+        file.write(film)
+    print(f"{len(rows)} frames in {path}")
+
+
+COMMAND = view

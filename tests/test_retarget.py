@@ -5,6 +5,7 @@ import tempfile
 import unittest
 from pathlib import Path
 from typing import ClassVar
+from unittest import mock
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from xreset.errors import DemoError, FileFormatError, RobotError
 from xreset.kinematics import Kinematics
 from xreset.objects.geometry import box, surface_of
 from xreset.retarget import hand as hand_module
+from xreset.retarget import pipeline as pipeline_module
 from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, measure, track
 from xreset.retarget.balls import inscribed_balls, sharp_points
 from xreset.retarget.chain import solve_chain
@@ -24,6 +26,7 @@ from xreset.retarget.collision import SelfCollision, height_above_table, support
 from xreset.retarget.file import Retargeted, read_retargeted, write_retargeted
 from xreset.retarget.hand import HandConfig, HandTargets, retarget_hand
 from xreset.retarget.hand_model import HandModel, keypoint_pairs
+from xreset.retarget.partial import discard, run_key
 from xreset.retarget.pipeline import RetargetConfig, rest_on_table, retarget
 from xreset.retarget.surface import Surface, keypoint_contacts, solid_nodes
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
@@ -560,6 +563,138 @@ class PipelineTest(unittest.TestCase):
         self.assertEqual(result.robot, "openarm")
         self.assertIn("005_toma", text.getvalue())
         self.assertEqual((self.folder / "jaws.png").read_bytes()[:4], b"\x89PNG")
+
+
+class StopAndContinueTest(unittest.TestCase):
+    """A run that is stopped and started again ends with what an uninterrupted one gives."""
+
+    CONFIG: ClassVar = RetargetConfig(
+        hand=HandConfig(iterations=3), arm=ArmConfig(restarts=2, branches=1, first_iterations=5, iterations=2)
+    )
+
+    @classmethod
+    def setUpClass(cls):
+        cls.enterClassContext(mock.patch.object(pipeline_module, "_SEQUENCES_PER_BATCH", 1))
+        cls.robot = robots.load("ur7e-sharpa")
+        demos = synthesize(["soup"], per_object=3, seed=1)
+        short = np.concatenate([np.arange(start + 20, start + 26) for start in demos.frame_offsets[:-1]])
+        frames = {name: getattr(demos, name)[short] for name in ("hand_keypoints", "hand_valid", "wrist_quat_wxyz")}
+        frames |= {name: getattr(demos, name)[short] for name in ("object_pos", "object_quat_wxyz")}
+        cls.demos = dataclasses.replace(demos, frame_offsets=np.arange(0, 24, 6, dtype=np.int32), **frames)
+        cls.objects = list(demo_objects(cls.demos).values())
+        cls.whole = retarget(cls.demos, cls.robot, cls.objects, cls.CONFIG)
+
+    def setUp(self):
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory())) / "out.npz.partial"
+        self.solved = []
+
+    def run_once(self, stop_in: int | None = None, demos=None, config=None, robot=None):
+        """One run; ``stop_in``: Ctrl-C comes while this batch is worked on. The batches that it works on are noted."""
+
+        def progress(done: float, total: int) -> None:
+            if done % 1:  # only work reports parts
+                self.solved += [int(done)] if int(done) not in self.solved else []
+                if stop_in is not None and int(done) == stop_in:
+                    raise KeyboardInterrupt
+
+        return retarget(
+            demos or self.demos, robot or self.robot, self.objects, config or self.CONFIG, progress=progress, partial=self.folder
+        )
+
+    def stopped(self, batch: int = 2) -> None:
+        with self.assertRaises(KeyboardInterrupt):
+            self.run_once(stop_in=batch)
+        self.solved = []
+
+    def assert_same(self, result: Retargeted, expected: Retargeted) -> None:
+        for field in dataclasses.fields(Retargeted):
+            np.testing.assert_array_equal(getattr(result, field.name), getattr(expected, field.name), field.name)
+
+    def test_the_second_start_does_the_rest_and_the_result_is_the_same_bit_by_bit(self):
+        self.stopped()
+        result = self.run_once()
+        self.assertEqual(self.solved, [2])
+        self.assert_same(result, self.whole)
+
+    def test_what_other_inputs_made_is_not_used(self):
+        self.stopped()
+        louder = dataclasses.replace(self.CONFIG, contact_distance=0.015)
+        shifted = dataclasses.replace(self.demos, object_pos=self.demos.object_pos + np.float32([0.01, 0, 0]))
+        other = dataclasses.replace(self.robot, name="other")
+        for changes in ({"config": louder}, {"demos": shifted}, {"robot": other}):
+            with self.subTest(*changes), self.assertRaises(KeyboardInterrupt):
+                self.run_once(stop_in=0, **changes)
+        self.assert_same(self.run_once(), self.whole)
+
+    def test_the_objects_count(self):
+        keys = {
+            run_key(self.demos, self.robot, objects, self.CONFIG, size)
+            for objects, size in (
+                (self.objects, 1),
+                (self.objects, 2),
+                ([dataclasses.replace(self.objects[0], pieces=self.objects[0].pieces * 2)], 1),
+            )
+        }
+        self.assertEqual(len(keys), 3)
+
+    def test_a_damaged_batch_is_made_again(self):
+        self.stopped()
+        first = self.folder / "batch_0000.npz"
+        first.write_bytes(first.read_bytes()[:1000])
+        result = self.run_once()
+        self.assertEqual(self.solved, [0, 2])
+        self.assert_same(result, self.whole)
+
+    def test_discard_removes_its_own_files_only(self):
+        self.folder.mkdir()
+        for name in ("batch_0000.npz", ".batch_0001.npz.abc.part", "notes.txt"):
+            (self.folder / name).touch()
+        discard(self.folder)
+        self.assertEqual([path.name for path in self.folder.iterdir()], ["notes.txt"])
+        (self.folder / "notes.txt").unlink()
+        discard(self.folder)
+        self.assertFalse(self.folder.exists())
+        discard(self.folder)
+
+    def test_the_command_says_how_to_continue_and_cleans_up(self):
+        from xreset.cli.retarget import retarget as command
+
+        demos, out = self.folder.parent / "demos.npz", self.folder.parent / "out.npz"
+        write_demos(demos, self.demos)
+
+        def run(stop_in: int | None = None, restart: bool = False) -> str:
+            """Ctrl-C comes at the beginning of the batch ``stop_in``."""
+            self.solved = []
+            solve = pipeline_module._solve
+
+            def counted(demos, sequences, *rest):
+                if sequences == [stop_in]:
+                    raise KeyboardInterrupt
+                self.solved += sequences
+                return solve(demos, sequences, *rest)
+
+            text = io.StringIO()
+            with (
+                contextlib.redirect_stdout(text),
+                mock.patch.object(pipeline_module, "_solve", counted),
+                mock.patch.object(pipeline_module, "RetargetConfig", lambda: self.CONFIG),
+                contextlib.ExitStack() as stack,
+            ):
+                if stop_in is not None:
+                    stack.enter_context(self.assertRaises(KeyboardInterrupt))
+                command(demos, robot="ur7e-sharpa", out=out, restart=restart)
+            return " ".join(text.getvalue().split())
+
+        self.assertIn("give the same command again to continue", run(stop_in=1))
+        self.assertEqual(self.solved, [0])
+        run(stop_in=2)
+        self.assertEqual(self.solved, [1])
+        run(stop_in=1, restart=True)
+        self.assertEqual(self.solved, [0])
+        run()
+        self.assertEqual(self.solved, [1, 2])
+        self.assertFalse(self.folder.exists())
+        self.assert_same(read_retargeted(out), self.whole)
 
 
 class RealDataTest(unittest.TestCase):

@@ -15,9 +15,12 @@ def retarget(
     out: Path,
     objects: Path | None = None,
     max_per_object: int | None = None,
+    restart: bool = False,
     picture: Path | None = None,
 ) -> None:
     """Turn human demonstrations into robot trajectories.
+
+    What is finished is kept in the folder OUT.partial until all is: after a stop, the same command goes on from there.
 
     Args:
         demos: Archive of demonstrations (see `xreset demos`).
@@ -25,6 +28,7 @@ def retarget(
         out: File to write.
         objects: Folder of real meshes; default: the built-in stand-ins.
         max_per_object: Only the first so many sequences of each object.
+        restart: Begin anew, whatever an earlier run has finished.
         picture: PNG to write: one grasp per object, the human keypoints over it.
     """
     from dataclasses import asdict
@@ -38,6 +42,7 @@ def retarget(
     from xreset.demos import demo_objects, read_demos
     from xreset.files import file_hash
     from xreset.retarget import pipeline
+    from xreset.retarget.partial import discard
 
     console = Console()
     spec = robots.load(robot)
@@ -46,17 +51,27 @@ def retarget(
         chosen = chosen.select(max_per_object=max_per_object)
     specs = demo_objects(chosen, objects)
     config = pipeline.RetargetConfig()
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task("sequences", total=chosen.num_sequences)
-        result = pipeline.retarget(
-            chosen, spec, list(specs.values()), config, progress=lambda done, total: bar.update(task, completed=done, total=total)
-        )
+    partial = out.with_name(f"{out.name}.partial")
+    if restart:
+        discard(partial)
+    try:
+        with Progress(console=console, transient=True) as bar:
+            task = bar.add_task("sequences", total=chosen.num_sequences)
+            result = pipeline.retarget(
+                chosen, spec, list(specs.values()), config,
+                progress=lambda done, total: bar.update(task, completed=done, total=total), partial=partial,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        if partial.is_dir():
+            console.print(f"What is finished is kept in {partial}; give the same command again to continue, with --restart to begin anew.")
+        raise
     pipeline.write_retargeted(
         out,
         result,
         config={"retarget": asdict(config), "robot": robot, "max_per_object": max_per_object},
         inputs={"demos": file_hash(demos), "robot": spec.fingerprint} | {f"object {s.name}": s.source for s in specs.values()},
     )
+    discard(partial)
 
     if picture is not None:
         from xreset.render import write_png

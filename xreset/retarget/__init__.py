@@ -5,5 +5,5 @@ trajectories = retarget(demos, robot, objects)      # hand, then arm, then valid
 trajectories.joint_pos[trajectories.valid]          # robot states that may become resets
 
 Modules: ``pipeline`` (the whole), ``hand`` with ``hand_model``, ``terms``, ``balls`` and ``chain``, ``arm`` with ``collision``,
-``surface`` (the object), ``validity``, ``file``, ``picture``.
+``surface`` (the object), ``validity``, ``file``, ``partial`` (stop and continue), ``picture``.
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
 from xreset.retarget.file import SCHEMA, Retargeted, read_retargeted, write_retargeted
 from xreset.retarget.hand import HandConfig, HandTargets, retarget_hand
 from xreset.retarget.hand_model import HandModel
+from xreset.retarget.partial import Batch, Partial, run_key
 from xreset.retarget.surface import Surface, keypoint_contacts
 from xreset.retarget.validity import REASONS, Thresholds, classify
 from xreset.rotations import matrix_to_quat
@@ -54,8 +56,12 @@ def retarget(
     config: RetargetConfig | None = None,
     *,
     progress: Callable[[float, int], None] = lambda done, total: None,
+    partial: Path | None = None,
 ) -> Retargeted:
     """Retarget demonstrations; sequences are independent of one another, and the result depends on nothing but the arguments.
+
+    With ``partial``, every finished batch of sequences is kept in that folder, and a second call with the same other arguments goes on
+    from there, to the same result, bit by bit. Whoever has the result calls :func:`xreset.retarget.partial.discard`.
 
     Args:
         demos: human demonstrations; they need not rest on the table yet.
@@ -63,6 +69,7 @@ def retarget(
         objects: geometry of every object that the demonstrations name.
         config: weights and thresholds.
         progress: called with (sequences done, sequences in all).
+        partial: folder for what is finished, made when needed; batches in it that other arguments made are not used.
 
     Returns:
         Trajectories of every sequence; a sequence whose hand was never annotated stays at home, without a valid frame.
@@ -78,33 +85,29 @@ def retarget(
     surfaces = {name: Surface(spec) for name, spec in by_name.items()}
 
     touched, touches = _contacts(demos, surfaces, config.contact_distance)
+    kept = None
+    if partial is not None:
+        kept = Partial(partial, run_key(demos, robot, list(by_name.values()), config, _SEQUENCES_PER_BATCH))
     joint_pos = np.tile(robot.home, (demos.num_frames, 1))
     reason = np.full(demos.num_frames, REASONS.index("not annotated"), dtype=np.int32)
     hand_error, wrist_error = np.full(demos.num_frames, np.inf), np.full(demos.num_frames, np.inf)
     todo = [i for i in range(demos.num_sequences) if demos.hand_valid[demos.frames(i)].any()]
-    for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
-        batch = todo[begin : begin + _SEQUENCES_PER_BATCH]
+    for number, begin in enumerate(range(0, len(todo), _SEQUENCES_PER_BATCH)):
+        sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
+        solved = kept.read(number) if kept else None
+        if solved is None:
 
-        def report(share: float, start: int = begin, size: int = len(batch)) -> None:
-            progress(start + share * size, len(todo))
+            def report(share: float, start: int = begin, size: int = len(sequences)) -> None:
+                progress(start + share * size, len(todo))
 
-        targets = _hand_targets(demos, hand, batch, surfaces, touched, touches)
-        motion = retarget_hand(hand, targets, config.hand, lambda share, r=report: r(0.5 * share))
-        error = (motion.keypoints - targets.keypoints)[:, :, torch.as_tensor(hand.is_tip)].norm(dim=-1).mean(-1)
-        arm_targets = ArmTargets(
-            root_pos=motion.root_pos,
-            root_quat=motion.root_quat,
-            hand_joints=motion.joints,
-            annotated=targets.annotated,
-            hand_error=error,
-            hand_clearance=arm.hand_clearance(motion.joints),
-        )
-        joints, measures = track(arm, arm_targets, config.thresholds, config.arm, lambda share, r=report: r(0.5 + 0.5 * share))
-        _scatter(demos, batch, arm.full(joints, motion.joints), joint_pos)
-        _scatter(demos, batch, classify(measures, config.thresholds), reason)
-        _scatter(demos, batch, error.masked_fill(~targets.annotated, np.inf), hand_error)
-        _scatter(demos, batch, measures.wrist_position.masked_fill(~targets.annotated, np.inf), wrist_error)
-    progress(len(todo), len(todo))
+            targets = _hand_targets(demos, hand, sequences, surfaces, touched, touches)
+            solved = _solve(demos, sequences, hand, arm, targets, config, report)
+            if kept:
+                kept.write(number, solved)
+        rows = np.concatenate([np.arange(demos.num_frames)[demos.frames(i)] for i in sequences])
+        joint_pos[rows], reason[rows] = solved.joint_pos, solved.reason
+        hand_error[rows], wrist_error[rows] = solved.hand_error, solved.wrist_error
+        progress(begin + len(sequences), len(todo))
 
     links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
     contact = np.asarray(touches.any(axis=1))
@@ -180,11 +183,38 @@ def _hand_targets(
     )
 
 
-def _scatter(demos: Demos, sequences: Sequence[int], values: Tensor, out: np.ndarray) -> None:
-    """Write [S, T, ...] padded values into the frames of their sequences."""
-    for s, i in enumerate(sequences):
-        rows = demos.frames(i)
-        out[rows] = values[s, : rows.stop - rows.start].numpy()
+def _solve(
+    demos: Demos,
+    sequences: Sequence[int],
+    hand: HandModel,
+    arm: ArmModel,
+    targets: HandTargets,
+    config: RetargetConfig,
+    progress: Callable[[float], None],
+) -> Batch:
+    """Hand, arm and validity of some sequences; ``targets`` are theirs."""
+    motion = retarget_hand(hand, targets, config.hand, lambda share: progress(0.5 * share))
+    error = (motion.keypoints - targets.keypoints)[:, :, torch.as_tensor(hand.is_tip)].norm(dim=-1).mean(-1)
+    arm_targets = ArmTargets(
+        root_pos=motion.root_pos,
+        root_quat=motion.root_quat,
+        hand_joints=motion.joints,
+        annotated=targets.annotated,
+        hand_error=error,
+        hand_clearance=arm.hand_clearance(motion.joints),
+    )
+    joints, measures = track(arm, arm_targets, config.thresholds, config.arm, lambda share: progress(0.5 + 0.5 * share))
+    lengths = [rows.stop - rows.start for rows in map(demos.frames, sequences)]
+
+    def unpadded(values: Tensor) -> np.ndarray:
+        return torch.cat([values[s, :length] for s, length in enumerate(lengths)]).numpy()
+
+    return Batch(
+        joint_pos=unpadded(arm.full(joints, motion.joints)),
+        reason=unpadded(classify(measures, config.thresholds)),
+        hand_error=unpadded(error.masked_fill(~targets.annotated, np.inf)),
+        wrist_error=unpadded(measures.wrist_position.masked_fill(~targets.annotated, np.inf)),
+    )
 
 
 def _first(flags: np.ndarray) -> int:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import unittest
+from unittest import mock
 
 from xreset.cli import COMMANDS, main
 
@@ -79,6 +80,13 @@ class UsageTest(unittest.TestCase):
         wide = os.environ | {"COLUMNS": "300"}
         out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=wide).stdout
         self.assertRegex(out, r"pybullet .* no: .*pip install 'xreset\[pybullet\]'")
+
+    def test_naming_engines_replaces_the_default(self):
+        for given, expected in (((), ["mujoco"]), (("sapien", "pybullet", "sapien"), ["sapien", "pybullet"])):
+            argv = ["eval", "zero", "--robot", "openarm", "--demos", "x.npz", *(w for name in given for w in ("--backend", name))]
+            with mock.patch("xreset.eval.evaluate.evaluate", side_effect=KeyboardInterrupt) as evaluate:
+                self.assertEqual(run(*argv)[0], 130)
+            self.assertEqual(evaluate.call_args.args[1], expected)
 
     def test_a_policy_that_does_not_exist(self):
         code, _, err = run("eval", "nonsense", "--demos", "x.npz")

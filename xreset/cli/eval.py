@@ -11,7 +11,7 @@ import tyro
 def evaluate(
     policy: Annotated[str, tyro.conf.Positional],
     *,
-    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ("mujoco",),
+    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),  # a default would be appended to
     demos: Path,
     episodes: int = 5,
     seed: int = 0,
@@ -44,14 +44,15 @@ def evaluate(
 
     if episodes < 1 or num_envs < 1:
         raise XResetError(f"--episodes and --num-envs must be at least 1, found {episodes} and {num_envs}.")
+    backends = list(dict.fromkeys(backend)) or ["mujoco"]
     console = Console()
     subject = resolve(policy, robot, seed)
     folder = out or subject.folder
     with Progress(console=console, transient=True) as bar:
-        tasks = {name: bar.add_task(name, total=None) for name in backend}
+        tasks = {name: bar.add_task(name, total=None) for name in backends}
         summaries = evaluate(
             subject,
-            list(dict.fromkeys(backend)),
+            backends,
             demos,
             episodes=episodes,
             seed=seed,

@@ -130,6 +130,11 @@ class Backend(ABC):
     def engine_version(cls) -> str:
         """Version of the engine; ``BackendUnavailableError`` with reason and remedy if it cannot be imported or used here."""
 
+    @classmethod
+    def devices(cls) -> list[str]:
+        """Kinds of devices that can be used here, the best first: ``cuda``, ``cpu``."""
+        return ["cpu"]
+
     # State -----------------------------------------------------------------------------------------------------------------------
 
     @abstractmethod

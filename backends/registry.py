@@ -72,4 +72,4 @@ def backend_status(name: str) -> BackendStatus:
         version = cls.engine_version()
     except BackendUnavailableError as error:
         return BackendStatus(name, None, "-", str(error))
-    return BackendStatus(name, version, ", ".join(getattr(cls, "devices", lambda: ["cpu"])()), None)
+    return BackendStatus(name, version, ", ".join(cls.devices()), None)

@@ -167,7 +167,7 @@ def evaluate(
             repetitions=episodes,
             seed=seed,
             num_envs=num_envs,
-            device=device if "cuda" in getattr(backend_class(name), "devices", lambda: ["cpu"])() else "cpu",
+            device=device if "cuda" in backend_class(name).devices() else "cpu",
             progress=lambda done, total, name=name: progress(name, done, total),
         )
         summary = summarize(

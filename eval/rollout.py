@@ -115,14 +115,15 @@ def roll_out(
     found: dict[int, Episode] = {}
     traces: list[Trace] = []
     steps, spent = 0, 0.0
-    options = {"device": device} if device != "cpu" else {}
-    with make_backend(backend_name, scene, len(plan.object_index), object_index=torch.as_tensor(plan.object_index), **options) as backend:
-        resets = ResetDistribution(demos, robot, names, task.reset, backend.device)
+    worlds = torch.as_tensor(plan.object_index)
+    with make_backend(backend_name, scene, len(worlds), object_index=worlds, device=device) as backend:
+        on_cpu = ResetDistribution(demos, robot, names, task.reset)
+        resets = on_cpu if backend.device.type == "cpu" else ResetDistribution(demos, robot, names, task.reset, backend.device)
         env = ManipulationEnv(backend, task, resets, seed=seed)
         points = torch.stack([torch.as_tensor(keypoints(o), dtype=torch.float32) for o in objects]).to(backend.device)[backend.object_index]
         every = max(1, round(trace_interval / scene.control_dt))
         for number, (items, fresh) in enumerate(plan):
-            env.reset(start=_starts(resets, sequences[items], repetition[items], seed, demos, robot, names, task))
+            env.reset(start=_starts(on_cpu, sequences[items], repetition[items], seed).to(backend.device))
             policy.begin(env)
             reading = env.reading()
             result = EpisodeMetrics(reading, env.goal_pos, env.goal_quat, points, metrics or MetricsConfig())
@@ -144,17 +145,13 @@ def roll_out(
     return Rollouts(episodes=episodes, traces=tuple(sorted(traces, key=lambda t: t.sequence)), control_steps_per_second=steps / spent)
 
 
-def _starts(
-    resets: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int, demos: ResetBank, robot: RobotSpec,
-    names: tuple[str, ...], task: TaskConfig,
-) -> Reset:  # fmt: skip
+def _starts(on_cpu: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int) -> Reset:
     """One start per world. Each has random numbers of its own, drawn on the CPU, so engine and number of worlds change nothing."""
-    on_cpu = resets if resets.device.type == "cpu" else ResetDistribution(demos, robot, names, task.reset)
     parts = []
     for s, r in zip(sequence.tolist(), repetition.tolist(), strict=True):
         generator = torch.Generator().manual_seed(int(np.random.SeedSequence([seed, s, r]).generate_state(1)[0]))
         parts.append(on_cpu.home(torch.tensor([s]), generator))
-    return Reset.stack(parts).to(resets.device)
+    return Reset.stack(parts)
 
 
 def _episode(result: EpisodeMetrics, world: int, sequence: int, repetition: int, demos: ResetBank) -> Episode:

@@ -125,7 +125,7 @@ def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str,
     """
     try:
         content = torch.load(path, map_location=device, weights_only=True)
-        return {key: content[key] for key in (*_CHECKPOINT_KEYS,)}
+        return {key: content[key] for key in _CHECKPOINT_KEYS}
     except KeyError as error:
         raise RunError(f"{path} is not a checkpoint of xreset: it has no entry {error}.") from error
     except Exception as error:

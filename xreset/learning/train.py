@@ -109,8 +109,7 @@ def train(out: Path, info: RunInfo, *, resume: bool = False) -> None:
 
 def default_device(backend: str) -> str:
     """``cuda`` where there is a GPU that the engine can use, else ``cpu``."""
-    devices = getattr(backend_class(backend), "devices", lambda: ["cpu"])()
-    return "cuda" if "cuda" in devices and torch.cuda.is_available() else "cpu"
+    return "cuda" if "cuda" in backend_class(backend).devices() and torch.cuda.is_available() else "cpu"
 
 
 def resumed(out: Path, *, iterations: int | None) -> RunInfo:

@@ -119,8 +119,8 @@ def make_bank(
         if not len(left):
             break
         plan = schedule(object_of[left], num_envs)
-        options = {"device": device} if device != "cpu" else {}
-        with make_backend(name, scene, len(plan.object_index), object_index=torch.as_tensor(plan.object_index), **options) as backend:
+        worlds = torch.as_tensor(plan.object_index)
+        with make_backend(name, scene, len(worlds), object_index=worlds, device=device) as backend:
             tried = 0
             for items, fresh in plan:
                 rows = frames[left[items]]

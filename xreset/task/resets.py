@@ -67,7 +67,7 @@ class ResetDistribution:
         Raises:
             DemoError: an object of the scene has no demonstration in the bank.
         """
-        self.config, self.device = config, torch.device(device)
+        self.config = config
         if config.pre_contact_only:
             bank = bank.select(pre_contact_only=True)
         missing = [name for name in object_names if name not in bank.sequence_object]

@@ -151,6 +151,13 @@ class Pictures(unittest.TestCase):
         frames = Frames(poses=np.stack((at(50, 0, 0), at(1.3, -1.5, 0.9))))
         np.testing.assert_array_equal(self.renderer.draw(self.home, points=[far], frames=[frames]), self.renderer.draw(self.home))
 
+    def test_a_picture_may_have_its_own_camera(self):
+        near = Camera(eye=(0.8, -0.1, 0.5), target=(0.4, 0.1, 0.1))
+        T = at(0.4, 0.1, 0.04)
+        own = Renderer(self.renderer.scene, size=self.size, camera=near).draw(self.home, T)
+        np.testing.assert_array_equal(self.renderer.draw(self.home, T, camera=near), own)
+        self.assertGreater(self.changed(self.renderer.draw(self.home, T), own).mean(), 0.1)
+
     def test_smooth_is_the_same_picture(self):
         smooth = Renderer(self.renderer.scene, size=self.size, smooth=True)
         a, b = (r.draw(self.home, at(0.4, 0.1, 0.04)).astype(float) for r in (self.renderer, smooth))
@@ -175,18 +182,18 @@ class Pictures(unittest.TestCase):
 class Meshes(unittest.TestCase):
     def test_normals_are_round_on_round_shapes_and_flat_on_boxes(self):
         T = pose_matrix(np.array([0.1, 0.2, 0.3]), np.array([0.5, 0.5, -0.5, 0.5]))
-        box = render._shape_mesh(Geometry(kind="box", size=(0.1, 0.2, 0.3)), T)
+        box = render._shape_mesh(Shape(geometry=Geometry(kind="box", size=(0.1, 0.2, 0.3)), T_body_shape=T))
         corners = box.vertices[box.faces]
         flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         flat /= np.linalg.norm(flat, axis=1, keepdims=True)
         np.testing.assert_allclose(box.normals, np.broadcast_to(flat[:, None], box.normals.shape), atol=1e-9)
-        sphere = render._shape_mesh(Geometry(kind="sphere", size=(0.2,)), T)
+        sphere = render._shape_mesh(Shape(geometry=Geometry(kind="sphere", size=(0.2,)), T_body_shape=T))
         outward = (sphere.vertices[sphere.faces] - T[:3, 3]) / 0.2
         np.testing.assert_allclose((sphere.normals * outward).sum(-1), 1.0, atol=0.01)
 
     def test_capsules_and_cylinders_are_centred(self):
         for kind, top in (("capsule", 0.15), ("cylinder", 0.1)):
-            mesh = render._shape_mesh(Geometry(kind=kind, size=(0.05, 0.1)), np.eye(4))
+            mesh = render._shape_mesh(Shape(geometry=Geometry(kind=kind, size=(0.05, 0.1)), T_body_shape=np.eye(4)))
             np.testing.assert_allclose((mesh.vertices[:, 2].min(), mesh.vertices[:, 2].max()), (-top, top), atol=1e-6)
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from xreset.files import atomic_write
-from xreset.spec import Geometry, RobotSpec, SceneSpec, TableSpec
+from xreset.spec import Geometry, RobotSpec, SceneSpec, Shape, TableSpec
 
 Color = tuple[float, float, float]
 """Red, green, blue in 0..1."""
@@ -121,6 +121,7 @@ class Renderer:
         robot_tint: Color | None = None,
         points: Sequence[Points] = (),
         frames: Sequence[Frames] = (),
+        camera: Camera | None = None,
     ) -> np.ndarray:
         """Draw one state.
 
@@ -132,6 +133,7 @@ class Renderer:
             robot_tint: colour to mix into the robot's own (:func:`tinted`).
             points: dots on top.
             frames: axes on top.
+            camera: for this picture instead of the renderer's.
 
         Returns:
             [H, W, 3] uint8 picture.
@@ -145,7 +147,7 @@ class Renderer:
             casters.append(robot if robot_tint is None else replace(robot, colors=tinted(robot.colors, robot_tint)))
         if object_pose is not None:
             casters.append(self._objects[object_index].placed(np.asarray(object_pose, dtype=float)[None]))
-        view = _View(self.camera, (self.size[0] * self._scale, self.size[1] * self._scale))
+        view = _View(camera or self.camera, (self.size[0] * self._scale, self.size[1] * self._scale))
         picture, nearness = _shade(view, _join([*casters, self._table]), _Shadow(_join(casters)) if casters else None)
         if goal_pose is not None:
             ghost = self._objects[object_index].placed(np.asarray(goal_pose, dtype=float)[None], color=GOAL_COLOR)
@@ -201,7 +203,7 @@ def link_meshes(robot: RobotSpec) -> list[Mesh | None]:
     from xreset.urdf import robot_tree
 
     tree = robot_tree(robot)
-    return [_merge([_shape_mesh(shape.geometry, shape.T_body_shape) for shape in tree.link(name).collisions]) for name in tree.link_names]
+    return [_merge([_shape_mesh(shape) for shape in tree.link(name).collisions]) for name in tree.link_names]
 
 
 def link_colors(robot: RobotSpec) -> list[Color]:
@@ -297,21 +299,11 @@ def _merge(meshes: Sequence[Mesh]) -> Mesh | None:
     )
 
 
-def _shape_mesh(geometry: Geometry, T: np.ndarray) -> Mesh:
-    import trimesh
+def _shape_mesh(shape: Shape) -> Mesh:
+    from xreset.objects.geometry import shape_mesh
 
-    if geometry.kind == "box":
-        mesh = trimesh.creation.box(extents=[2 * s for s in geometry.size])
-    elif geometry.kind == "sphere":
-        mesh = trimesh.creation.icosphere(subdivisions=2, radius=geometry.size[0])
-    elif geometry.kind == "cylinder":
-        mesh = trimesh.creation.cylinder(radius=geometry.size[0], height=2 * geometry.size[1], sections=24)
-    elif geometry.kind == "capsule":
-        mesh = trimesh.creation.capsule(radius=geometry.size[0], height=2 * geometry.size[1], count=(10, 14))
-        mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])  # trimesh has had its origin at one end or in the middle
-    else:
-        return _mesh(np.asarray(geometry.vertices) @ T[:3, :3].T + T[:3, 3], np.asarray(geometry.faces))
-    return _mesh(mesh.vertices @ T[:3, :3].T + T[:3, 3], mesh.faces)
+    mesh = shape_mesh(shape, coarse=True)
+    return _mesh(mesh.vertices, mesh.faces)
 
 
 def _table(table: TableSpec) -> _Placed:
@@ -329,7 +321,7 @@ def _table(table: TableSpec) -> _Placed:
     colors = np.array(TABLE_COLORS)[np.tile((i + j) % 2, 2)]
     T = np.eye(4)
     T[:3, 3] = (cx, cy, -hz)
-    body = _shape_mesh(Geometry(kind="box", size=table.half_size), T)
+    body = _shape_mesh(Shape(geometry=Geometry(kind="box", size=table.half_size), T_body_shape=T))
     sides = ~(body.normals[:, 0, 2] > 0.5)
     return _Placed(
         np.concatenate((top, body.vertices[body.faces[sides]])),

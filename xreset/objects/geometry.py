@@ -77,19 +77,25 @@ def prism(outline: Sequence[tuple[float, float]], bottom: float, top: float) -> 
     return loft([np.column_stack([xy, np.full(len(xy), z)]) for z in (bottom, top)])
 
 
-def shape_mesh(shape: Shape) -> trimesh.Trimesh:
-    """The closed triangle mesh of a convex shape, in its body's frame."""
+def shape_mesh(shape: Shape, *, coarse: bool = False) -> trimesh.Trimesh:
+    """The closed triangle mesh of a convex shape, in its body's frame.
+
+    Args:
+        shape: the shape.
+        coarse: round shapes with few triangles: enough for a picture, not for a distance.
+    """
     import trimesh
 
     geometry = shape.geometry
     if geometry.kind == "box":
         mesh = trimesh.creation.box(2 * np.array(geometry.size))
     elif geometry.kind == "sphere":
-        mesh = trimesh.creation.icosphere(3, geometry.size[0])
+        mesh = trimesh.creation.icosphere(2 if coarse else 3, geometry.size[0])
     elif geometry.kind == "cylinder":
-        mesh = trimesh.creation.cylinder(geometry.size[0], 2 * geometry.size[1], sections=CYLINDER_SECTIONS)
+        mesh = trimesh.creation.cylinder(geometry.size[0], 2 * geometry.size[1], sections=24 if coarse else CYLINDER_SECTIONS)
     elif geometry.kind == "capsule":
-        mesh = trimesh.creation.capsule(radius=geometry.size[0], height=2 * geometry.size[1])
+        mesh = trimesh.creation.capsule(radius=geometry.size[0], height=2 * geometry.size[1], count=(10, 14) if coarse else (32, 32))
+        mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])  # trimesh has had its origin at one end or in the middle
     else:
         mesh = trimesh.Trimesh(geometry.vertices, geometry.faces, process=False)
     mesh.apply_transform(shape.T_body_shape)

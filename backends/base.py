@@ -16,8 +16,9 @@ from torch import Tensor
 from xreset.errors import BackendUnavailableError, CapabilityError
 from xreset.spec import SceneSpec
 
-Capability = Literal["object_mass", "friction", "object_gravity", "object_wrench", "overflow"]
-"""What a backend may be unable to do: per-world object mass, pair friction or gravity fraction; a wrench; counting overflows."""
+Capability = Literal["object_mass", "friction", "object_gravity", "object_wrench", "overflow", "mass_properties"]
+"""What a backend may be unable to do: per-world object mass, pair friction or gravity fraction; a wrench; counting overflows; reading back
+masses, centres of mass and inertias."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +85,40 @@ class Health:
     """[N] bool: contacts or constraints were dropped for want of room."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class MassProperties:
+    """What the engine itself holds of the bodies that move: B of the robot (links fixed to one another are one), then the object.
+
+    The robot's bodies are in the order of :func:`xreset.backends.rigid.mechanism`, without the base.
+    """
+
+    mass: Tensor
+    """[N, B + 1] kg."""
+    com: Tensor
+    """[N, B + 1, 3] centre of mass in the body's frame [m]; the object's body frame is its mesh frame."""
+    inertia: Tensor
+    """[N, B + 1, 3, 3] about the centre of mass, along the body frame's axes [kg m^2]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownDifference:
+    """A tolerance of the conformance suite that an engine is known to miss, by how much at most, and why.
+
+    It is still measured: beyond the bound the check fails.
+    """
+
+    check: str
+    """Name of the check."""
+    measure: str
+    """Which of its measures: :attr:`xreset.backends.conformance.Measure.what`."""
+    bound: float
+    """The largest value that is accepted, in the unit of the measure."""
+    reason: str
+    """Why the engine cannot do better."""
+    robot: str | None = None
+    """The robot with which it differs; None: any."""
+
+
 class Backend(ABC):
     """N worlds of one scene in one physics engine. World i holds object ``scene.objects[object_index[i]]``.
 
@@ -100,6 +135,8 @@ class Backend(ABC):
     """Name in the registry."""
     capabilities: ClassVar[frozenset[Capability]]
     """What this backend can do beyond the obligatory."""
+    known_differences: ClassVar[tuple[KnownDifference, ...]] = ()
+    """What cannot agree with the reference, each with its size and reason."""
 
     def __init__(self, scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None, device: str = "cpu") -> None:
         """Build the worlds; every world starts with the robot at home and its object at rest height at the table's centre.
@@ -171,6 +208,10 @@ class Backend(ABC):
     @abstractmethod
     def health(self) -> Health:
         """What went wrong since each world's state was last set."""
+
+    def mass_properties(self) -> MassProperties:
+        """Masses, centres of mass and inertias read back from the engine; the present ones, of objects whose mass was set too."""
+        raise CapabilityError(f"the backend {self.name!r} cannot read back mass properties: trust what the scene says.")
 
     # Physical parameters: each stays through set_state, except the wrench ----------------------------------------------------------
 

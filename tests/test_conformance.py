@@ -7,6 +7,7 @@ import io
 import json
 import tempfile
 import unittest
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 from unittest import mock
@@ -15,6 +16,7 @@ import numpy as np
 import torch
 
 from xreset.backends import backend_names, backend_status, make_backend
+from xreset.backends.base import KnownDifference
 from xreset.backends.conformance import CHECKS, CheckResult, Measure, run
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.cli import main
@@ -28,8 +30,8 @@ def make_local(name: str):
 
 
 def explain(result: CheckResult) -> str:
-    wrong = "; ".join(f"{m.what} {m.error:.3g} > {m.tolerance:.3g} {m.unit}" for m in result.measures if not m.ok)
-    return f"{result.name}: {result.claim}: {result.problem or wrong}"
+    wrong = "; ".join(f"{m.what} {m.measured:.3g} > {m.tolerance:.3g} {m.unit}" for m in result.measures if m.verdict != "passed")
+    return f"{result.name}: {result.check.statement}: {result.problem or wrong}"
 
 
 class EveryBackend(unittest.TestCase):
@@ -41,7 +43,7 @@ class EveryBackend(unittest.TestCase):
                     self.skipTest(f"{name}: {status.reason}")
                 results = run(make_local(name))
                 self.assertEqual([r.name for r in results], [c.name for c in CHECKS])
-                self.assertEqual([explain(r) for r in results if r.status != "passed"], [])
+                self.assertEqual([explain(r) for r in results if r.verdict != "passed"], [])
 
 
 class TheSuiteCanFail(unittest.TestCase):
@@ -60,8 +62,8 @@ class TheSuiteCanFail(unittest.TestCase):
 
     def assert_red(self, world: type[MujocoWorld], *checks: str):
         for name, result in self.outcome(world, *checks).items():
-            self.assertEqual(result.status, "failed", name)
-            self.assertTrue(result.hint)
+            self.assertEqual(result.verdict, "failed", name)
+            self.assertTrue(result.check.cause)
             self.assertEqual(result.problem, "", "it must fail by a measure, not by an exception")
 
     def test_joints_in_alphabetical_order(self):
@@ -97,7 +99,7 @@ class TheSuiteCanFail(unittest.TestCase):
                 at = self._at
                 return {**super().get_state(), "object_angvel": self._data.qvel[at.object_dof + 3 : at.object_dof + 6].copy()}
 
-        self.assertEqual(self.outcome(World, "state_round_trip")["state_round_trip"].status, "passed")
+        self.assertEqual(self.outcome(World, "state_round_trip")["state_round_trip"].verdict, "passed")
         self.assert_red(World, "free_fall")
 
     def test_linear_velocity_of_the_centre_of_mass(self):
@@ -195,10 +197,10 @@ class TheSuiteCanFail(unittest.TestCase):
                     self._last = super().contacts()
                 return super().contacts() if self._last is None else self._last
 
-        self.assertEqual(self.outcome(World, "resting_weight")["resting_weight"].status, "passed")  # no step came before
+        self.assertEqual(self.outcome(World, "resting_weight")["resting_weight"].verdict, "passed")  # no step came before
         results = self.outcome(World, "nothing_stays", "resting_weight")
-        self.assertEqual(results["nothing_stays"].status, "passed")
-        self.assertEqual(results["resting_weight"].status, "failed")
+        self.assertEqual(results["nothing_stays"].verdict, "passed")
+        self.assertEqual(results["resting_weight"].verdict, "failed")
 
     def test_worlds_that_influence_one_another(self):
         class World(MujocoWorld):
@@ -277,11 +279,11 @@ class TheSuiteCanFail(unittest.TestCase):
     def test_missing_capability_must_be_refused(self):
         lacking = MujocoBackend.capabilities - {"object_gravity"}
         result = self.outcome(MujocoWorld, "object_gravity", capabilities=lacking)["object_gravity"]
-        self.assertEqual(result.status, "unsupported")
+        self.assertEqual(result.verdict, "unsupported")
         self.assertIn("object gravity", result.problem)
         with mock.patch.object(MujocoBackend, "_require", lambda *_: None):
             result = self.outcome(MujocoWorld, "object_gravity", capabilities=lacking)["object_gravity"]
-        self.assertEqual(result.status, "failed")
+        self.assertEqual(result.verdict, "failed")
         self.assertIn("did not refuse", result.problem)
 
     def test_an_exception_is_a_failure_of_that_check_only(self):
@@ -291,15 +293,38 @@ class TheSuiteCanFail(unittest.TestCase):
 
         results = self.outcome(World, "object_mass", "resting_weight")
         self.assertIn("boom", results["object_mass"].problem)
-        self.assertEqual(results["object_mass"].status, "failed")
-        self.assertEqual(results["resting_weight"].status, "passed")
+        self.assertEqual(results["object_mass"].verdict, "failed")
+        self.assertEqual(results["resting_weight"].verdict, "passed")
 
 
 class Harness(unittest.TestCase):
     def test_a_number_that_is_not_finite_is_not_ok(self):
-        self.assertFalse(Measure(what="x", error=float("nan"), tolerance=1.0).ok)
-        self.assertFalse(Measure(what="x", error=1.1, tolerance=1.0).ok)
-        self.assertTrue(Measure(what="x", error=0.9, tolerance=1.0).ok)
+        for measured, verdict in ((float("nan"), "failed"), (1.1, "failed"), (0.9, "passed")):
+            self.assertEqual(Measure(what="x", measured=measured, tolerance=1.0).verdict, verdict)
+
+    def test_a_known_difference_is_accepted_up_to_its_bound(self):
+        known = KnownDifference(check="free_fall", measure="x", bound=2.0, reason="r")
+        for measured, verdict in ((0.5, "passed"), (1.5, "known difference"), (2.5, "failed"), (float("nan"), "failed")):
+            self.assertEqual(Measure(what="x", measured=measured, tolerance=1.0, known=known).verdict, verdict)
+
+    def test_a_backend_declares_its_known_differences(self):
+        def differing(bound, robot=None):
+            class Different(MujocoBackend):
+                known_differences: ClassVar = (
+                    KnownDifference(check="free_fall", measure="linvel", bound=bound, reason="it is upside down", robot=robot),
+                )
+
+                def state(self):
+                    return replace(super().state(), object_linvel=-super().state().object_linvel)
+
+            def make(scene, num_worlds, *, object_index=None):
+                return Different(scene, num_worlds, object_index=object_index, workers=0)
+
+            return run(make, only=["free_fall"])[0].verdict
+
+        self.assertEqual(differing(10.0), "known difference")
+        self.assertEqual(differing(0.1), "failed")
+        self.assertEqual(differing(10.0, robot="another"), "failed")
 
     def test_unknown_check(self):
         with self.assertRaisesRegex(ValueError, "free_fall"):
@@ -317,12 +342,13 @@ class Harness(unittest.TestCase):
             file = Path(folder) / "c.json"
             with contextlib.redirect_stdout(io.StringIO()) as out:
                 main(["conformance", "--backend", "mujoco", "--check", "free_fall", "--json", str(file)])
-            self.assertIn("all checks passed", out.getvalue())
+            self.assertIn("no check failed", out.getvalue())
             data = json.loads(file.read_text())
-            self.assertEqual(data["schema"], "xreset-conformance/1")
-            self.assertEqual([c["status"] for c in data["backends"][0]["checks"]], ["passed"])
-            broken = Measure(what="x", error=float("nan"), tolerance=1.0)
-            red = CheckResult(name="free_fall", claim="c", status="failed", measures=(broken,), hint="h")
+            self.assertEqual(data["schema"], "xreset-conformance/2")
+            self.assertEqual([c["verdict"] for c in data["runs"][0]["checks"]], ["passed"])
+            broken = Measure(what="x", measured=float("nan"), tolerance=1.0)
+            check = next(check for check in CHECKS if check.name == "free_fall")
+            red = CheckResult(check=check, verdict="failed", measures=(broken,))
             with (
                 mock.patch("xreset.backends.conformance._run_one", lambda check, bench: red),
                 contextlib.redirect_stdout(io.StringIO()),
@@ -330,7 +356,7 @@ class Harness(unittest.TestCase):
             ):
                 main(["conformance", "--backend", "mujoco", "--check", "free_fall", "--json", str(file)])
             self.assertEqual(raised.exception.code, 1)
-            self.assertEqual(json.loads(file.read_text())["backends"][0]["checks"][0]["measures"][0]["error"], "nan")
+            self.assertEqual(json.loads(file.read_text())["runs"][0]["checks"][0]["measures"][0]["measured"], "nan")
 
 
 if __name__ == "__main__":

@@ -3,17 +3,20 @@
     from xreset.backends.conformance import run
     results = run(lambda scene, num_worlds, **kw: MyBackend(scene, num_worlds, **kw))
 
-Every check compares with something computed independently of any engine (kinematics of the URDF, equations of motion, m g), and says
-what it asserts, its tolerance, what it measured, and the likely cause of a failure.
+Every check compares with something computed independently of the engine: kinematics of the URDF, equations of motion, m g, or the reference
+engine, MuJoCo. It says what it asserts, its tolerance, what it measured, and what usually causes a failure.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
+from xreset.backends.base import KnownDifference
 from xreset.backends.conformance import contact_checks, motion_checks, state_checks
-from xreset.backends.conformance.harness import Bench, Check, CheckResult, MakeBackend, Measure
+from xreset.backends.conformance.harness import Bench, MakeBackend
+from xreset.backends.conformance.results import SCHEMA, Check, CheckResult, Measure, Skipped, Verdict, judge
 from xreset.backends.conformance.scene import scene
 from xreset.errors import BackendUnavailableError, CapabilityError
 from xreset.spec import RobotSpec
@@ -21,7 +24,7 @@ from xreset.spec import RobotSpec
 CHECKS: tuple[Check, ...] = (*state_checks.CHECKS, *motion_checks.CHECKS, *contact_checks.CHECKS, *state_checks.LAST)
 """All checks, in the order in which they run."""
 
-__all__ = ["CHECKS", "Check", "CheckResult", "MakeBackend", "Measure", "run"]
+__all__ = ["CHECKS", "SCHEMA", "Check", "CheckResult", "MakeBackend", "Measure", "run"]
 
 
 def run(
@@ -35,7 +38,7 @@ def run(
 
     Args:
         make: builds the backend under test.
-        robot: robot to test with; default the suite's own. Some checks need the suite's own and are left out with another.
+        robot: robot to test with; default the suite's own. Checks that need the suite's own are skipped with another.
         only: names of the checks to run; default all.
         report: called with each result as it comes.
 
@@ -50,10 +53,9 @@ def run(
     results = []
     try:
         for check in CHECKS:
-            if (wanted is not None and check.name not in wanted) or (check.own_robot_only and not bench.own_robot):
-                continue
-            results.append(_run_one(check, bench))
-            report(results[-1])
+            if wanted is None or check.name in wanted:
+                results.append(_run_one(check, bench))
+                report(results[-1])
     finally:
         bench.close()
     return results
@@ -62,23 +64,35 @@ def run(
 def _run_one(check: Check, bench: Bench) -> CheckResult:
     start = time.perf_counter()
 
-    def result(status, measures=(), problem="") -> CheckResult:
-        hint = check.hint if status == "failed" else ""
-        seconds = time.perf_counter() - start
-        return CheckResult(
-            name=check.name, claim=check.claim, status=status, measures=tuple(measures), problem=problem, hint=hint, seconds=seconds
-        )
+    def result(verdict: Verdict, problem: str = "", measures: tuple[Measure, ...] = ()) -> CheckResult:
+        return CheckResult(check=check, verdict=verdict, measures=measures, problem=problem, seconds=time.perf_counter() - start)
 
+    if check.own_robot_only and not bench.own_robot:
+        return result("skipped", "it needs the suite's own robot")
     try:
         measures = check.run(bench)
-        lacking = set(check.capabilities) - bench.backend().capabilities
+    except Skipped as reason:
+        return result("skipped", str(reason))
     except CapabilityError as error:
-        lacking = set(check.capabilities) - bench.backend().capabilities
-        return result("unsupported" if lacking else "failed", problem=str(error))
+        return result("unsupported" if _lacking(check, bench) else "failed", str(error))
     except BackendUnavailableError:  # nothing can be tested
         raise
     except Exception as error:
-        return result("failed", problem=f"{type(error).__name__}: {error}")
-    if lacking:
-        return result("failed", measures, f"the backend says that it cannot set {', '.join(sorted(lacking))}, but did not refuse to")
-    return result("passed" if all(m.ok for m in measures) else "failed", measures)
+        return result("failed", f"{type(error).__name__}: {error}")
+    measures = tuple(replace(m, known=_known(check, m, bench)) for m in measures)
+    if lacking := _lacking(check, bench):
+        problem = f"the backend says that it cannot do {', '.join(sorted(lacking))}, but did not refuse to"
+        return result("failed", problem, measures)
+    return result(judge(measures), "", measures)
+
+
+def _lacking(check: Check, bench: Bench) -> set[str]:
+    return set(check.capabilities) - bench.backend().capabilities
+
+
+def _known(check: Check, measure: Measure, bench: Bench) -> KnownDifference | None:
+    """What the backend declares about a measure."""
+    for known in bench.backend().known_differences:
+        if (known.check, known.measure) == (check.name, measure.what) and known.robot in (None, bench.scene.robot.name):
+            return known
+    return None

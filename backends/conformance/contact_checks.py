@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from xreset.backends.base import State
-from xreset.backends.conformance.harness import Bench, Check, Measure, largest, replace_fields, snapshot
+from xreset.backends.conformance.harness import Bench, largest, replace_fields, snapshot
+from xreset.backends.conformance.results import Check, Measure
 from xreset.rotations import matrix_to_quat
 from xreset.spec import GRAVITY
 
@@ -23,13 +24,13 @@ def resting_weight(bench: Bench) -> list[Measure]:
     weight = GRAVITY * torch.tensor([o.mass for o in bench.objects])
     force = contacts.table_force.cpu()
     return [
-        Measure(what="force right after setting", error=at_once, tolerance=1e-6, unit="N"),
-        Measure(what="vertical force", error=largest(force[:, 2] / weight - 1.0), tolerance=0.02, unit="of m g"),
-        Measure(what="horizontal force", error=largest(force[:, :2] / weight[:, None]), tolerance=0.02, unit="of m g"),
-        Measure(what="force of the fingers", error=largest(contacts.tip_force), tolerance=1e-6, unit="N"),
-        Measure(what="fingers that say they touch", error=float(contacts.tip_touch.sum()), tolerance=0.5),
-        Measure(what="sinking", error=largest(state.object_pos[:, 2] - bench.start().object_pos[:, 2]), tolerance=2e-3, unit="m"),
-        Measure(what="sliding", error=largest(state.object_pos[:, :2] - bench.start().object_pos[:, :2]), tolerance=2e-3, unit="m"),
+        Measure(what="force right after setting", measured=at_once, tolerance=1e-6, unit="N"),
+        Measure(what="vertical force", measured=largest(force[:, 2] / weight - 1.0), tolerance=0.02, unit="of m g"),
+        Measure(what="horizontal force", measured=largest(force[:, :2] / weight[:, None]), tolerance=0.02, unit="of m g"),
+        Measure(what="force of the fingers", measured=largest(contacts.tip_force), tolerance=1e-6, unit="N"),
+        Measure(what="fingers that say they touch", measured=float(contacts.tip_touch.sum()), tolerance=0.5),
+        Measure(what="sinking", measured=largest(state.object_pos[:, 2] - bench.start().object_pos[:, 2]), tolerance=2e-3, unit="m"),
+        Measure(what="sliding", measured=largest(state.object_pos[:, :2] - bench.start().object_pos[:, :2]), tolerance=2e-3, unit="m"),
     ]
 
 
@@ -42,7 +43,7 @@ def object_mass(bench: Bench) -> list[Measure]:
     backend.set_state(bench.start(backend.device))
     backend.step(_SETTLE)
     force = backend.contacts().table_force[:, 2].cpu()
-    return [Measure(what="vertical force", error=largest(force / (GRAVITY * mass) - 1.0), tolerance=0.02, unit="of m g")]
+    return [Measure(what="vertical force", measured=largest(force / (GRAVITY * mass) - 1.0), tolerance=0.02, unit="of m g")]
 
 
 def table_friction(bench: Bench) -> list[Measure]:
@@ -70,13 +71,13 @@ def table_friction(bench: Bench) -> list[Measure]:
 
     stuck = push(0.7, 48)
     crept = stuck.object_pos[worlds] - start.object_pos.cpu()[worlds]
-    measures = [Measure(what="creep at 0.7 mu m g", error=largest(crept[:, :2]), tolerance=2e-3, unit="m")]
+    measures = [Measure(what="creep at 0.7 mu m g", measured=largest(crept[:, :2]), tolerance=2e-3, unit="m")]
     before, after = push(1.5, 8), push(1.5, 24)
     gained = (after.object_linvel - before.object_linvel)[worlds]
     for i in range(len(worlds)):
         drag = 1.5 * float(mu[i]) - float(gained[i, 0]) / (24 * bench.scene.timestep * GRAVITY)  # of the friction, in m g
-        measures.append(Measure(what=f"drag at mu = {mu[i]:.2f}", error=abs(drag / float(mu[i]) - 1.0), tolerance=0.1, unit="of mu m g"))
-    measures.append(Measure(what="sideways velocity", error=largest(after.object_linvel[worlds, 1]), tolerance=0.03, unit="m/s"))
+        measures.append(Measure(what=f"drag at mu = {mu[i]:.2f}", measured=abs(drag / float(mu[i]) - 1.0), tolerance=0.1, unit="of mu m g"))
+    measures.append(Measure(what="sideways velocity", measured=largest(after.object_linvel[worlds, 1]), tolerance=0.03, unit="m/s"))
     return measures
 
 
@@ -93,12 +94,12 @@ def held_object(bench: Bench) -> list[Measure]:
     total = force.sum(1)
     squeeze = torch.stack((force[:, 0] @ closing, -force[:, 1] @ closing), dim=1)  # of thumb and index finger, each towards the other
     return [
-        Measure(what="vertical force", error=largest(total[:, 2] / weight - 1.0), tolerance=0.05, unit="of m g"),
-        Measure(what="horizontal force", error=largest(total[:, :2] / weight), tolerance=0.05, unit="of m g"),
-        Measure(what="squeeze missing", error=float((3.0 - squeeze).clamp_min(0.0).max()), tolerance=1.5, unit="N"),
-        Measure(what="fingers that do not say they touch", error=float((~contacts.tip_touch.cpu()[bricks]).sum()), tolerance=0.5),
-        Measure(what="force of the table", error=largest(contacts.table_force[bricks]), tolerance=1e-6, unit="N"),
-        Measure(what="slip", error=largest(end.object_pos[bricks, 2] - state.object_pos[bricks, 2]), tolerance=5e-3, unit="m"),
+        Measure(what="vertical force", measured=largest(total[:, 2] / weight - 1.0), tolerance=0.05, unit="of m g"),
+        Measure(what="horizontal force", measured=largest(total[:, :2] / weight), tolerance=0.05, unit="of m g"),
+        Measure(what="squeeze missing", measured=float((3.0 - squeeze).clamp_min(0.0).max()), tolerance=1.5, unit="N"),
+        Measure(what="fingers that do not say they touch", measured=float((~contacts.tip_touch.cpu()[bricks]).sum()), tolerance=0.5),
+        Measure(what="force of the table", measured=largest(contacts.table_force[bricks]), tolerance=1e-6, unit="N"),
+        Measure(what="slip", measured=largest(end.object_pos[bricks, 2] - state.object_pos[bricks, 2]), tolerance=5e-3, unit="m"),
     ]
 
 
@@ -114,8 +115,8 @@ def tip_friction(bench: Bench) -> list[Measure]:
     backend.step(_SETTLE)
     fallen = state.object_pos[:, 2] - snapshot(backend.state()).object_pos[:, 2]
     return [
-        Measure(what="slip at mu = 0.9", error=abs(float(fallen[held])), tolerance=5e-3, unit="m"),
-        Measure(what="fall missing at mu = 0.05", error=max(0.0, 0.1 - float(fallen[dropped])), tolerance=0.05, unit="m"),
+        Measure(what="slip at mu = 0.9", measured=abs(float(fallen[held])), tolerance=5e-3, unit="m"),
+        Measure(what="fall missing at mu = 0.05", measured=max(0.0, 0.1 - float(fallen[dropped])), tolerance=0.05, unit="m"),
     ]
 
 
@@ -146,35 +147,40 @@ def _grasp(bench: Bench) -> tuple[State, Tensor]:
 CHECKS = (
     Check(
         name="resting_weight",
-        claim="the table pushes a resting object up with m g; nothing else does, and nothing right after setting",
-        hint="a contact force has the wrong sign, frame, scale or step; or readings survive setting a state; or contacts overflow",
+        group="contact",
+        statement="the table pushes a resting object up with m g; nothing else does, and nothing right after setting",
+        cause="a contact force has the wrong sign, frame, scale or step; or readings survive setting a state; or contacts overflow",
         run=resting_weight,
     ),
     Check(
         name="object_mass",
-        claim="the object's mass is set world by world, and setting a state keeps it",
-        hint="mass is shared by all worlds or lost with the state, or what derives from it is stale",
+        group="contact",
+        statement="the object's mass is set world by world, and setting a state keeps it",
+        cause="mass is shared by all worlds or lost with the state, or what derives from it is stale",
         run=object_mass,
         capabilities=("object_mass",),
     ),
     Check(
         name="table_friction",
-        claim="the table holds or brakes an object with the friction of the pair",
-        hint="friction is combined (product, average) from coefficients that were not solved for the pair; or shared by all worlds",
+        group="contact",
+        statement="the table holds or brakes an object with the friction of the pair",
+        cause="friction is combined (product, average) from coefficients that were not solved for the pair; or shared by all worlds",
         run=table_friction,
         capabilities=("friction", "object_wrench"),
     ),
     Check(
         name="held_object",
-        claim="fingers carry a held object; each one's force on it has the right sign and names the right finger",
-        hint="forces are by the object, not on it; or go to the wrong finger; or the mimic jaw gives way; or the drive's force is wrong",
+        group="contact",
+        statement="fingers carry a held object; each one's force on it has the right sign and names the right finger",
+        cause="forces are by the object, not on it; or go to the wrong finger; or the mimic jaw gives way; or the drive's force is wrong",
         run=held_object,
         own_robot_only=True,
     ),
     Check(
         name="tip_friction",
-        claim="an object is held or slips by the friction of the pair with the fingertips",
-        hint="the fingertips' friction is not set where their contact links are, or not world by world",
+        group="contact",
+        statement="an object is held or slips by the friction of the pair with the fingertips",
+        cause="the fingertips' friction is not set where their contact links are, or not world by world",
         run=tip_friction,
         capabilities=("friction",),
         own_robot_only=True,

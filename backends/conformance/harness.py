@@ -1,18 +1,18 @@
-"""How the suite measures: results, and the worlds that the checks run in."""
+"""The worlds that the checks run in, and how they are compared."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
-from typing import Any, Literal, Protocol
+from dataclasses import fields
+from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.base import Backend, Capability, State
+from xreset.backends.base import Backend, State
+from xreset.backends.conformance.results import Measure
 from xreset.backends.conformance.scene import gripper
 from xreset.backends.pool import initial_state
 from xreset.kinematics import Kinematics
@@ -25,74 +25,6 @@ class MakeBackend(Protocol):
     def __call__(self, scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None) -> Backend:
         """Build ``num_worlds`` worlds."""
         ...
-
-
-@dataclass(frozen=True, kw_only=True)
-class Measure:
-    """One number of a check."""
-
-    what: str
-    """Such as ``joint_pos``."""
-    error: float
-    """Distance from what it should be."""
-    tolerance: float
-    unit: str = ""
-
-    @property
-    def ok(self) -> bool:
-        """Whether the error is within the tolerance; a number that is not finite is not."""
-        return math.isfinite(self.error) and self.error <= self.tolerance
-
-
-@dataclass(frozen=True, kw_only=True)
-class CheckResult:
-    """Outcome of a check."""
-
-    name: str
-    claim: str
-    """What the check asserts."""
-    status: Literal["passed", "failed", "unsupported"]
-    """``unsupported``: the backend states that it lacks the capability, and refuses as the contract asks."""
-    measures: tuple[Measure, ...] = ()
-    problem: str = ""
-    """What was raised, if something was."""
-    hint: str = ""
-    """Likely cause of a failure."""
-    seconds: float = 0.0
-
-    @property
-    def worst(self) -> Measure | None:
-        """The measure nearest to its tolerance, or furthest beyond it."""
-        return max(self.measures, key=lambda m: m.error / m.tolerance if math.isfinite(m.error) else math.inf, default=None)
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON-able content; a number that is not finite becomes text."""
-        data = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "measures"}
-        data["measures"] = [
-            {
-                "what": m.what,
-                "error": m.error if math.isfinite(m.error) else str(m.error),
-                "tolerance": m.tolerance,
-                "unit": m.unit,
-                "ok": m.ok,
-            }
-            for m in self.measures
-        ]
-        return data
-
-
-@dataclass(frozen=True, kw_only=True)
-class Check:
-    """A contract and how to test it."""
-
-    name: str
-    claim: str
-    hint: str
-    run: Callable[[Bench], list[Measure]]
-    capabilities: tuple[Capability, ...] = ()
-    """Capabilities that it needs and that a backend may lack."""
-    own_robot_only: bool = False
-    """Whether it needs the suite's own robot."""
 
 
 class Bench:
@@ -195,7 +127,7 @@ def compare_states(found: State, expected: State, tolerances: Mapping[str, tuple
         a, b = getattr(found, name).cpu(), getattr(expected, name).cpu()
         if name == "object_quat":
             a = torch.where((a * b).sum(-1, keepdim=True) < 0, -a, a)
-        measures.append(Measure(what=name, error=largest(a - b), tolerance=tolerance, unit=unit))
+        measures.append(Measure(what=name, measured=largest(a - b), tolerance=tolerance, unit=unit))
     return measures
 
 

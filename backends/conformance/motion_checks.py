@@ -7,7 +7,8 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from xreset.backends.conformance.harness import Bench, Check, Measure, largest, replace_fields, snapshot
+from xreset.backends.conformance.harness import Bench, largest, replace_fields, snapshot
+from xreset.backends.conformance.results import Check, Measure
 from xreset.spec import GRAVITY, ObjectSpec
 from xreset.urdf import robot_tree
 
@@ -62,7 +63,7 @@ def free_fall(bench: Bench) -> list[Measure]:
         "orientation": (0.02, "rad"),
         "angvel": (0.2, "rad/s"),  # engines differ in how they treat gyroscopic torque
     }
-    return [Measure(what=name, error=error, tolerance=limits[name][0], unit=limits[name][1]) for name, error in errors.items()]
+    return [Measure(what=name, measured=error, tolerance=limits[name][0], unit=limits[name][1]) for name, error in errors.items()]
 
 
 def object_gravity(bench: Bench) -> list[Measure]:
@@ -77,8 +78,8 @@ def object_gravity(bench: Bench) -> list[Measure]:
     full = GRAVITY * _STEPS * bench.scene.timestep
     spin = largest(backend.state().object_angvel)
     return [
-        Measure(what="velocity gained", error=largest(fallen - expected) / full, tolerance=0.005, unit="of g t"),
-        Measure(what="spin gained", error=spin, tolerance=0.01, unit="rad/s"),
+        Measure(what="velocity gained", measured=largest(fallen - expected) / full, tolerance=0.005, unit="of g t"),
+        Measure(what="spin gained", measured=spin, tolerance=0.01, unit="rad/s"),
     ]
 
 
@@ -110,9 +111,9 @@ def object_wrench(bench: Bench) -> list[Measure]:
     backend.step(steps)
     rest = largest(snapshot(backend.state()).object_linvel[:, :2])
     return [
-        Measure(what="velocity of the centre of mass", error=linear, tolerance=0.01, unit="of its own"),
-        Measure(what="angular velocity", error=angular, tolerance=0.05, unit="of its own"),
-        Measure(what="push after the state was set", error=rest, tolerance=1e-3, unit="m/s"),
+        Measure(what="velocity of the centre of mass", measured=linear, tolerance=0.01, unit="of its own"),
+        Measure(what="angular velocity", measured=angular, tolerance=0.05, unit="of its own"),
+        Measure(what="push after the state was set", measured=rest, tolerance=1e-3, unit="m/s"),
     ]
 
 
@@ -145,7 +146,7 @@ def drive_response(bench: Bench) -> list[Measure]:
 
         exact = solve_ivp(motion, (0.0, times[-1]), [0.0, 0.0], t_eval=times, rtol=1e-6, atol=1e-9, max_step=1e-3).y[0]
         error = np.abs(np.array([x[i] for x in found]) - robot.joints[index].home - exact).max() / abs(step)
-        measures.append(Measure(what=f"step of {step:+.2f} m", error=float(error), tolerance=0.06, unit="of the step"))
+        measures.append(Measure(what=f"step of {step:+.2f} m", measured=float(error), tolerance=0.06, unit="of the step"))
     return measures
 
 
@@ -171,28 +172,32 @@ def _spin(thing: ObjectSpec, quat: np.ndarray, angvel: np.ndarray, t: float) -> 
 CHECKS = (
     Check(
         name="free_fall",
-        claim="thrown, spinning objects fly as rigid bodies do; linear velocity is that of the mesh-frame origin",
-        hint="linear velocity refers to the centre of mass; or angular velocity is in the body's frame; or the engine damps by default",
+        group="object",
+        statement="thrown, spinning objects fly as rigid bodies do; linear velocity is that of the mesh-frame origin",
+        cause="linear velocity refers to the centre of mass; or angular velocity is in the body's frame; or the engine damps by default",
         run=free_fall,
     ),
     Check(
         name="object_gravity",
-        claim="the object feels its gravity fraction, world by world, and setting a state keeps it",
-        hint="the fraction is ignored, shared by all worlds, lost with the state, or acts off the centre of mass",
+        group="object",
+        statement="the object feels its gravity fraction, world by world, and setting a state keeps it",
+        cause="the fraction is ignored, shared by all worlds, lost with the state, or acts off the centre of mass",
         run=object_gravity,
         capabilities=("object_gravity",),
     ),
     Check(
         name="object_wrench",
-        claim="a wrench accelerates the object by F/m and I^-1 tau, until a state is set",
-        hint="the force acts at the mesh-frame origin, is cleared after one step, or survives the state; or inertia ignores the mass",
+        group="object",
+        statement="a wrench accelerates the object by F/m and I^-1 tau, until a state is set",
+        cause="the force acts at the mesh-frame origin, is cleared after one step, or survives the state; or inertia ignores the mass",
         run=object_wrench,
         capabilities=("object_wrench",),
     ),
     Check(
         name="drive_response",
-        claim="a drive is a PD position drive with effort limit and armature",
-        hint="gains are scaled, armature or effort limit are missing, joint damping or friction is added, or gravity is not compensated",
+        group="object",
+        statement="a drive is a PD position drive with effort limit and armature",
+        cause="gains are scaled, armature or effort limit are missing, joint damping or friction is added, or gravity is not compensated",
         run=drive_response,
         own_robot_only=True,
     ),

@@ -8,17 +8,8 @@ import torch
 from torch import Tensor
 
 from xreset.backends.base import Links, State
-from xreset.backends.conformance.harness import (
-    ROUND_TRIP,
-    Bench,
-    Check,
-    Measure,
-    compare_states,
-    largest,
-    replace_fields,
-    snapshot,
-    start_state,
-)
+from xreset.backends.conformance.harness import ROUND_TRIP, Bench, compare_states, largest, replace_fields, snapshot, start_state
+from xreset.backends.conformance.results import Check, Measure
 from xreset.backends.conformance.scene import reorder_joints
 from xreset.kinematics import Kinematics
 from xreset.rotations import matrix_to_quat, quat_normalize
@@ -70,10 +61,10 @@ def link_measures(kinematics: Kinematics, state: State, links: Links, tolerance:
     found = torch.where((quat * found).sum(-1, keepdim=True) < 0, -found, found)
     linvel, angvel = (jacobian.linear @ qd[:, None, :, None])[..., 0], (jacobian.angular @ qd[:, None, :, None])[..., 0]
     return [
-        Measure(what="pos", error=largest(links.pos.cpu() - poses[..., :3, 3]), tolerance=tolerance, unit="m"),
-        Measure(what="quat", error=largest(found - quat), tolerance=tolerance),
-        Measure(what="linvel", error=largest(links.linvel.cpu() - linvel), tolerance=10.0 * tolerance, unit="m/s"),
-        Measure(what="angvel", error=largest(links.angvel.cpu() - angvel), tolerance=10.0 * tolerance, unit="rad/s"),
+        Measure(what="pos", measured=largest(links.pos.cpu() - poses[..., :3, 3]), tolerance=tolerance, unit="m"),
+        Measure(what="quat", measured=largest(found - quat), tolerance=tolerance),
+        Measure(what="linvel", measured=largest(links.linvel.cpu() - linvel), tolerance=10.0 * tolerance, unit="m/s"),
+        Measure(what="angvel", measured=largest(links.angvel.cpu() - angvel), tolerance=10.0 * tolerance, unit="rad/s"),
     ]
 
 
@@ -102,9 +93,9 @@ def links_after_steps(bench: Bench) -> list[Measure]:
     for _ in range(6):
         backend.step(4)
         for measure in link_measures(bench.kinematics, snapshot(backend.state()), backend.links())[:2]:
-            worst[measure.what] = max(worst.get(measure.what, 0.0), measure.error)
+            worst[measure.what] = max(worst.get(measure.what, 0.0), measure.measured)
     loose = 1e-3 if bench.scene.robot.mimics else 1e-5  # a mimic joint follows through a stiff constraint, not exactly
-    return [Measure(what=what, error=error, tolerance=loose, unit="m" if what == "pos" else "") for what, error in worst.items()]
+    return [Measure(what=what, measured=error, tolerance=loose, unit="m" if what == "pos" else "") for what, error in worst.items()]
 
 
 def joint_order(bench: Bench) -> list[Measure]:
@@ -127,9 +118,9 @@ def joint_order(bench: Bench) -> list[Measure]:
         backend.step(144)  # until they rest: on the way, an arm's motion shakes its fingers
         moved = ((backend.state().joint_pos - start.joint_pos) / motion).cpu()
         wrong = moved - torch.eye(count)
-        measures.append(Measure(what="way that the joint named has not gone", error=largest(wrong.diagonal()), tolerance=0.1, unit="of it"))
+        measures.append(Measure(what="way missing of the joint named", measured=largest(wrong.diagonal()), tolerance=0.1, unit="of it"))
         others = wrong - torch.diag(wrong.diagonal())
-        measures.append(Measure(what="way that others have gone", error=largest(others), tolerance=0.1, unit="of theirs"))
+        measures.append(Measure(what="way of others", measured=largest(others), tolerance=0.1, unit="of theirs"))
     return measures
 
 
@@ -152,7 +143,7 @@ def nothing_stays(bench: Bench) -> list[Measure]:
     measures = compare_states(state[[disturbed]], state[[calm]], _SETTLED)
     if bench.scene.robot.gravity_compensated:
         drift = largest(state.joint_pos[disturbed] - start.joint_pos[disturbed])
-        measures.append(Measure(what="drift from the target", error=drift, tolerance=1e-3, unit="rad, m"))
+        measures.append(Measure(what="drift from the target", measured=drift, tolerance=1e-3, unit="rad, m"))
     return measures
 
 
@@ -219,14 +210,14 @@ def objects_in_a_batch(bench: Bench) -> list[Measure]:
             state = snapshot(alone.state())
             force = alone.contacts().table_force[0, 2].cpu()
         measures.append(
-            Measure(what=f"pos of {thing.name}", error=largest(together.object_pos[i] - state.object_pos[0]), tolerance=1e-4, unit="m")
+            Measure(what=f"pos of {thing.name}", measured=largest(together.object_pos[i] - state.object_pos[0]), tolerance=1e-4, unit="m")
         )
         quat, other = together.object_quat[i], state.object_quat[0]
         error = min(largest(quat - other), largest(quat + other))
-        measures.append(Measure(what=f"quat of {thing.name}", error=error, tolerance=2e-3))
+        measures.append(Measure(what=f"quat of {thing.name}", measured=error, tolerance=2e-3))
         weight = thing.mass * 9.81
         measures.append(
-            Measure(what=f"weight of {thing.name}", error=abs(float(weights[i, 2] - force)) / weight, tolerance=0.05, unit="of m g")
+            Measure(what=f"weight of {thing.name}", measured=abs(float(weights[i, 2] - force)) / weight, tolerance=0.05, unit="of m g")
         )
     return measures
 
@@ -246,13 +237,13 @@ def broken_world(bench: Bench) -> list[Measure]:
     flags = backend.health().nonfinite.cpu()
     others = [0, 2, 3]
     wrong = (flags != torch.tensor([False, True, False, False])).float()
-    measures = [Measure(what="worlds named wrongly", error=float(wrong.sum()), tolerance=0.5)]
+    measures = [Measure(what="worlds named wrongly", measured=float(wrong.sum()), tolerance=0.5)]
     measures += compare_states(snapshot(backend.state())[others], expected[others], _SETTLED)
     backend.set_state(good[[1]].to(backend.device), torch.tensor([1], device=backend.device))
     backend.step(1)
-    measures.append(Measure(what="worlds broken after healing", error=float(backend.health().nonfinite.sum()), tolerance=0.5))
+    measures.append(Measure(what="worlds broken after healing", measured=float(backend.health().nonfinite.sum()), tolerance=0.5))
     measures.append(
-        Measure(what="healed object_pos", error=largest(backend.state().object_pos[1].cpu() - good.object_pos[1]), tolerance=1e-3)
+        Measure(what="healed object_pos", measured=largest(backend.state().object_pos[1].cpu() - good.object_pos[1]), tolerance=1e-3)
     )
     return measures
 
@@ -273,50 +264,58 @@ def _at_place(bench: Bench, state: State) -> State:
 CHECKS = (
     Check(
         name="state_round_trip",
-        claim="a state that is set is read back, every field of it",
-        hint="a field is dropped, permuted or changed: velocities, quaternion order, body-frame angular velocity, joint order",
+        group="state",
+        statement="a state that is set is read back, every field of it",
+        cause="a field is dropped, permuted or changed: velocities, quaternion order, body-frame angular velocity, joint order",
         run=state_round_trip,
     ),
     Check(
         name="links_after_set",
-        claim="link poses and velocities belong to the state just set, without a step",
-        hint="kinematics are stale after a write; a velocity is of a centre of mass or in the body's frame; a mimic joint is not set",
+        group="state",
+        statement="link poses and velocities belong to the state just set, without a step",
+        cause="kinematics are stale after a write; a velocity is of a centre of mass or in the body's frame; a mimic joint is not set",
         run=links_after_set,
     ),
     Check(
         name="links_after_steps",
-        claim="link poses belong to the joint positions after steps, mimic joints included",
-        hint="links are read before the last integration; or mimic joints do not follow",
+        group="state",
+        statement="link poses belong to the joint positions after steps, mimic joints included",
+        cause="links are read before the last integration; or mimic joints do not follow",
         run=links_after_steps,
     ),
     Check(
         name="joint_order",
-        claim="joints go by name, whatever order the robot spec has",
-        hint="the engine's own joint order shows through in states or in targets",
+        group="state",
+        statement="joints go by name, whatever order the robot spec has",
+        cause="the engine's own joint order shows through in states or in targets",
         run=joint_order,
     ),
     Check(
         name="nothing_stays",
-        claim="setting a state leaves nothing of the past: no target, velocity, force or warm start",
-        hint="targets are not reset with the state; or warm starts, external forces or contact caches survive it",
+        group="state",
+        statement="setting a state leaves nothing of the past: no target, velocity, force or warm start",
+        cause="targets are not reset with the state; or warm starts, external forces or contact caches survive it",
         run=nothing_stays,
     ),
     Check(
         name="selected_worlds",
-        claim="setting some worlds gives each its state and leaves the others alone",
-        hint="indices are sorted or ignored; or setting some worlds resets something of all",
+        group="state",
+        statement="setting some worlds gives each its state and leaves the others alone",
+        cause="indices are sorted or ignored; or setting some worlds resets something of all",
         run=selected_worlds,
     ),
     Check(
         name="worlds_independent",
-        claim="worlds do not influence one another",
-        hint="worlds share memory, a collision space, a random stream or a solver's convergence test",
+        group="state",
+        statement="worlds do not influence one another",
+        cause="worlds share memory, a collision space, a random stream or a solver's convergence test",
         run=worlds_independent,
     ),
     Check(
         name="objects_in_a_batch",
-        claim="a world with its own object in a batch does what that object does alone",
-        hint="a model field (shape, mass, inertia, bounds or something derived from them) is world 0's in all worlds",
+        group="state",
+        statement="a world with its own object in a batch does what that object does alone",
+        cause="a model field (shape, mass, inertia, bounds or something derived from them) is world 0's in all worlds",
         run=objects_in_a_batch,
     ),
 )
@@ -324,8 +323,9 @@ CHECKS = (
 LAST = (
     Check(
         name="broken_world",
-        claim="a world that is not finite is named, harms no other, and is healed by setting it",
-        hint="the engine hides it (automatic reset), spreads it, or keeps it in a cache",
+        group="state",
+        statement="a world that is not finite is named, harms no other, and is healed by setting it",
+        cause="the engine hides it (automatic reset), spreads it, or keeps it in a cache",
         run=broken_world,
     ),
 )

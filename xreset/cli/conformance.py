@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -34,9 +35,11 @@ def conformance(
     """
     from rich.console import Console
 
-    from xreset import robots
+    from xreset import __version__, robots
     from xreset.backends import backend_status
-    from xreset.backends.conformance import CHECKS, run
+    from xreset.backends.conformance import CHECKS, SCHEMA, run
+    from xreset.backends.conformance.scene import gripper
+    from xreset.backends.registry import backend_class
     from xreset.errors import XResetError
     from xreset.files import write_json
 
@@ -44,28 +47,40 @@ def conformance(
     if unknown := sorted(set(check) - set(known)):
         raise XResetError(f"there is no check {', '.join(unknown)}; there are {', '.join(known)}.")
     console = Console(highlight=False, soft_wrap=True)
-    spec = None if robot is None else robots.load(robot)
-    records = []
+    spec = gripper() if robot is None else robots.load(robot)
+    runs = []
     for name in dict.fromkeys(backend) or _usable(console):
         status = backend_status(name)
         used = device if device.split(":")[0] in status.device else "cpu"
-        console.print(f"[bold]{name}[/] on {used}: status, check, and what came nearest to its tolerance")
+        console.print(f"[bold]{name}[/] {status.version}, {spec.name}, {used}: verdict, check, and what came nearest to its tolerance")
         results = run(_maker(name, used), robot=spec, only=check or None, report=lambda r: _print(console, r, verbose))
-        records.append(
+        runs.append(
             {
-                "backend": name,
-                "backend_version": status.version,
+                "engine": name,
+                "engine_version": status.version,
+                "robot": spec.name,
                 "device": used,
+                "capabilities": sorted(backend_class(name).capabilities),
+                "seconds": round(sum(result.seconds for result in results), 3),
                 "checks": [result.as_dict() for result in results],
             }
         )
     if json is not None:
-        write_json(json, {"schema": "xreset-conformance/1", "robot": robot, "backends": records})
+        command = _command(backend, robot, device, check)
+        write_json(json, {"schema": SCHEMA, "xreset_version": __version__, "command": command, "runs": runs})
         console.print(f"wrote {json}", markup=False)
-    failed = sum(result["status"] == "failed" for record in records for result in record["checks"])
-    console.print(f"{failed} checks failed" if failed else "all checks passed", style="bold red" if failed else "bold green")
+    failed = sum(result["verdict"] == "failed" for record in runs for result in record["checks"])
+    console.print(f"{failed} checks failed" if failed else "no check failed", style="bold red" if failed else "bold green")
     if failed:
         raise SystemExit(1)
+
+
+def _command(backends: tuple[str, ...], robot: str | None, device: str, checks: tuple[str, ...]) -> str:
+    """What to type to get the same numbers."""
+    words = ["xreset", "conformance", *(word for name in backends for word in ("--backend", name))]
+    words += [] if robot is None else ["--robot", robot]
+    words += [] if device == "cpu" else ["--device", device]
+    return shlex.join([*words, *(word for name in checks for word in ("--check", name))])
 
 
 def _usable(console: Console) -> list[str]:
@@ -88,28 +103,29 @@ def _maker(name: str, device: str) -> MakeBackend:
     return lambda scene, num_worlds, *, object_index=None: make_backend(name, scene, num_worlds, object_index=object_index, device=device)
 
 
-_STYLE = {"passed": "green", "failed": "bold red", "unsupported": "yellow"}
+_STYLE = {"passed": "green", "known difference": "cyan", "failed": "bold red", "unsupported": "yellow", "skipped": "dim"}
 
 
 def _print(console: Console, result: CheckResult, verbose: bool) -> None:
-    console.print(
-        f"  [{_STYLE[result.status]}]{result.status:<11}[/] {result.name:<20} {result.seconds:5.1f} s  {_text(result.worst)}".rstrip()
-    )
-    if verbose or result.status == "failed":
-        for measure in result.measures:
-            if verbose or not measure.ok:
-                console.print(f"{'':14}{'ok ' if measure.ok else 'BAD'} {_text(measure)}", markup=False)
-    if result.status == "failed":
-        console.print(f"{'':14}asserted: {result.claim}", markup=False)
+    detail = _text(result.worst) if result.measures else result.problem
+    console.print(f"  [{_STYLE[result.verdict]}]{result.verdict:<16}[/] {result.name:<22} {result.seconds:5.1f} s  ", end="")
+    console.print(detail, markup=False)
+    for measure in result.measures:
+        if verbose or measure.verdict != "passed":
+            console.print(f"{'':19}{measure.verdict}: {_text(measure)}", markup=False)
+            if measure.verdict == "known difference" and measure.known is not None:
+                console.print(f"{'':19}accepted up to {measure.known.bound:.3g}: {measure.known.reason}", markup=False)
+    if result.verdict == "failed":
+        console.print(f"{'':19}asserted: {result.check.statement}", markup=False)
         if result.problem:
-            console.print(f"{'':14}raised: {result.problem}", markup=False)
-        console.print(f"{'':14}likely: {result.hint}", markup=False)
+            console.print(f"{'':19}raised: {result.problem}", markup=False)
+        console.print(f"{'':19}likely: {result.check.cause}", markup=False)
 
 
 def _text(measure: Measure | None) -> str:
     if measure is None:
         return ""
-    return f"{measure.what}: {measure.error:.2g}, tolerance {measure.tolerance:.2g} {measure.unit}".rstrip()
+    return f"{measure.what}: {measure.measured:.2g}, tolerance {measure.tolerance:.2g} {measure.unit}".rstrip()
 
 
 COMMAND = conformance

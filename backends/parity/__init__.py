@@ -1,0 +1,1 @@
+"""Whether engines agree on grasps: the same hand, object and joint targets in each, and how far what happens differs."""

@@ -2,6 +2,7 @@
 
 import unittest
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from xreset import robots
 from xreset.backends.base import Health
 from xreset.errors import DemoError
 from xreset.objects import load_objects, rest_height
-from xreset.resets.filter import REASONS, FilterConfig, acceptance_table, make_bank, try_states
+from xreset.resets.filter import REASONS, FilterConfig, make_bank, try_states
 from xreset.retarget.pipeline import Retargeted
 from xreset.spec import SceneSpec
 
@@ -119,10 +120,11 @@ class FilterTest(unittest.TestCase):
         np.testing.assert_array_equal(few.frame_index, many.frame_index)
         np.testing.assert_array_equal(few.rejected_reason, many.rejected_reason)
 
-    def test_the_table_counts_by_object_and_phase(self):
+    def test_accounts_by_object_and_phase(self):
         bank = make_bank(self.retargeted(), self.robot, self.objects, ["mujoco"], num_envs=4)
+        found = [(a.object_name, a.phase, a.kept, a.total, a.lost) for a in bank.accounts()]
         self.assertEqual(
-            acceptance_table(bank),
+            found,
             [
                 (SOUP, "pre-contact", 1, 2, {"object linear velocity": 1}),
                 (SOUP, "post-contact", 1, 1, {}),
@@ -130,6 +132,33 @@ class FilterTest(unittest.TestCase):
                 (SPAM, "post-contact", 0, 0, {}),
             ],
         )
+
+    def test_a_gpu_is_for_engines_that_can_use_one(self):
+        bank = make_bank(self.retargeted(), self.robot, self.objects, ["mujoco"], num_envs=4, device="cuda:0")
+        self.assertEqual(bank.num_states, 4)
+
+    def test_several_engines_keep_what_all_accept(self):
+        class Moves(MujocoBackend):
+            """Finds that the states near x = 0.53 m move."""
+
+            name = "moves"
+
+            def state(self):
+                state = super().state()
+                return replace(state, joint_vel=state.joint_vel + 9.0 * ((state.object_pos[:, :1] - 0.53).abs() < 0.005))
+
+        def made(name, *args, **options):
+            return (Moves if name == "moves" else MujocoBackend)(*args, workers=0, **options)
+
+        with (
+            mock.patch("xreset.resets.filter.make_backend", made),
+            mock.patch("xreset.resets.filter.backend_class", lambda name: Moves),
+        ):
+            bank = make_bank(self.retargeted(), self.robot, self.objects, ["mujoco", "moves"], num_envs=2)
+        self.assertEqual(bank.backends, ("mujoco", "moves"))
+        self.assertEqual(list(zip(bank.sequence_index.tolist(), bank.frame_index.tolist())), [(0, 0), (0, 2), (1, 2)])
+        rejected = list(zip(bank.rejected_frame_index.tolist(), (REASONS[r] for r in bank.rejected_reason)))
+        self.assertEqual(rejected, [(1, "object linear velocity"), (1, "joint velocity")])
 
     def test_nothing_valid_is_an_error(self):
         none = self.retargeted(valid=np.zeros(6, dtype=bool), reason=np.ones(6, dtype=int))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -27,21 +28,22 @@ def resets(
         robot: Folder of the robot, if it is not one that is known by name.
         objects: Folder of real meshes; default: the built-in stand-ins.
         num_envs: Worlds at a time.
-        device: Where GPU engines run: cpu or cuda.
+        device: Where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
     """
     from rich.console import Console
     from rich.progress import Progress
     from rich.table import Table
 
     from xreset import robots
+    from xreset.accounts import accounts_path, described, with_totals, write_accounts
     from xreset.files import file_hash
     from xreset.objects import load_objects
     from xreset.resets.bank import check_robot, write_bank
-    from xreset.resets.filter import acceptance_table, make_bank
+    from xreset.resets.filter import make_bank
     from xreset.retarget.pipeline import read_retargeted
 
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 160)  # a file or a pipe has no width of its own
     data = read_retargeted(retargeted)
     spec = robots.load(robot or data.robot)
     check_robot(
@@ -55,14 +57,28 @@ def resets(
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
     write_bank(out, bank, config={"backends": backends, "num_envs": num_envs}, inputs={"retargeted": file_hash(retargeted)})
+    write_accounts(accounts_path(out), of="states tried in physics", rows=bank.accounts())
+
+    annotated = {(row.object_name, row.phase): row.without("not annotated").total for row in with_totals(data.accounts())}
     table = Table(
-        "object", "phase", "accepted", "tried", "rejected because of", title=f"{spec.name}: states stable in {', '.join(backends)}"
-    )
-    for name, phase, accepted, tried, reasons in acceptance_table(bank):
-        share = f"{accepted} ({accepted / tried:.0%})" if tried else "0"
-        table.add_row(name, phase, share, str(tried), ", ".join(f"{reason} {n}" for reason, n in reasons.items()))
+        "object", "phase", "annotated frames", "valid: tried", "accepted", "of annotated", "rejected because of",
+        title=f"{spec.name}: states stable in {', '.join(backends)}",
+    )  # fmt: skip
+    for row in with_totals(bank.accounts()):
+        frames = annotated.get((row.object_name, row.phase), 0)
+        table.add_row(
+            row.object_name,
+            row.phase,
+            str(frames),
+            str(row.total),
+            f"{row.kept} ({row.share:.0%})" if row.total else "0",
+            f"{row.kept / frames:.0%}" if frames else "-",
+            described(row.lost),
+        )
     console.print(table)
-    console.print(f"{bank.num_states} states of {bank.num_states + len(bank.rejected_reason)} kept in {out}")
+    console.print(
+        f"{bank.num_states} states of {bank.num_states + len(bank.rejected_reason)} kept in {out}; counts in {accounts_path(out)}"
+    )
 
 
 COMMAND = resets

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -33,18 +34,18 @@ def retarget(
     """
     from dataclasses import asdict
 
-    import numpy as np
     from rich.console import Console
     from rich.progress import Progress
     from rich.table import Table
 
     from xreset import robots
+    from xreset.accounts import accounts_path, described, with_totals, write_accounts
     from xreset.demos import demo_objects, read_demos
     from xreset.files import file_hash
     from xreset.retarget import pipeline
     from xreset.retarget.partial import discard
 
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 160)  # a file or a pipe has no width of its own
     spec = robots.load(robot)
     chosen = read_demos(demos)
     if max_per_object is not None:
@@ -79,27 +80,28 @@ def retarget(
 
         write_png(picture, grasp_sheet(result, pipeline.rest_on_table(chosen, list(specs.values())), spec, list(specs.values())))
 
+    rows = result.accounts()
+    write_accounts(accounts_path(out), of="frames", rows=rows)
     table = Table(
-        "object", "sequences", "frames", "annotated", "valid", "fingertips [mm]", "invalid because of", title=f"retargeted to {spec.name}"
+        "object", "phase", "frames", "annotated", "valid", "fingertips [mm]", "invalid because of", title=f"retargeted to {spec.name}"
     )
-    owner = np.repeat(np.arange(len(result.object_name)), np.diff(result.frame_offsets))
-    names = result.object_name[owner]
-    for name in [*sorted(specs), "all"]:
-        mine = (names == name) | (name == "all")
-        annotated, valid = result.annotated & mine, result.valid & mine
-        counts = np.bincount(result.reason[annotated], minlength=len(result.reason_names))
+    names = result.object_name[result.sequence_of_frame]
+    for row in with_totals(rows):
+        mine = result.annotated & ((names == row.object_name) | (row.object_name == "all"))
+        if row.phase != "both":
+            mine &= result.post_contact == (row.phase == "post-contact")
+        annotated = row.without("not annotated")
         table.add_row(
-            name,
-            str(len(set(owner[mine]))),
-            str(int(mine.sum())),
-            str(int(annotated.sum())),
-            f"{int(valid.sum())} ({valid.sum() / max(annotated.sum(), 1):.0%})",
-            f"{1e3 * result.hand_error[annotated].mean():.1f}" if annotated.any() else "-",
-            ", ".join(f"{reason} {n}" for reason, n in zip(result.reason_names[1:], counts[1:], strict=True) if n),
-            end_section=name == sorted(specs)[-1],
+            row.object_name,
+            row.phase,
+            str(row.total),
+            str(annotated.total),
+            f"{row.kept} ({annotated.share:.0%})" if annotated.total else "0",
+            f"{1e3 * result.hand_error[mine].mean():.1f}" if mine.any() else "-",
+            described(annotated.lost),
         )
     console.print(table)
-    console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}")
+    console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}; counts in {accounts_path(out)}")
 
 
 COMMAND = retarget

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from xreset.accounts import Account, accounts
 from xreset.errors import FileFormatError
 from xreset.files import Field, Schema, read_npz, write_npz
 from xreset.spec import ObjectSpec, RobotSpec
@@ -88,6 +89,15 @@ class ResetBank:
     def num_states(self) -> int:
         """L"""
         return len(self.joint_pos)
+
+    def accounts(self) -> list[Account]:
+        """What became of every state that was tried, by object and phase."""
+        lost = np.asarray(self.sequence_object)[self.rejected_sequence_index]
+        return accounts(
+            np.concatenate((self.object_name, lost)),
+            np.concatenate((self.post_contact, self.rejected_post_contact)),
+            np.concatenate((np.full(self.num_states, ""), np.asarray(self.reason_names)[self.rejected_reason])),
+        )
 
     def select(self, *, sequences: np.ndarray | None = None, pre_contact_only: bool = False) -> ResetBank:
         """A bank with the states of some sequences [bool mask over S], or only those before first contact; sequences stay listed."""

@@ -14,6 +14,7 @@ import torch
 
 from xreset.backends import make_backend
 from xreset.backends.base import Backend
+from xreset.backends.registry import backend_class
 from xreset.env import rest_state
 from xreset.errors import DemoError
 from xreset.resets.bank import ResetBank
@@ -95,7 +96,7 @@ def make_bank(
         objects: geometry of the objects that they name.
         backends: engines, tried in this order; a rejection carries the first one's reason.
         num_envs: worlds at a time.
-        device: where GPU engines run.
+        device: where engines run that can use it; the others run on the CPU.
         config: steps and thresholds.
         progress: called with (candidates tried, candidates in all).
 
@@ -108,7 +109,7 @@ def make_bank(
         raise DemoError(
             "no frame of the retargeted trajectories is valid, so there is no state to try; look at the reasons of xreset retarget."
         )
-    sequence = np.searchsorted(retargeted.frame_offsets, frames, side="right") - 1
+    sequence = retargeted.sequence_of_frame[frames]
     names = np.asarray(retargeted.object_name)[sequence]
     used = tuple(o for o in objects if o.name in set(names.tolist()))
     reason = np.full(len(frames), -1, dtype=np.int64)
@@ -120,7 +121,8 @@ def make_bank(
             break
         plan = schedule(object_of[left], num_envs)
         worlds = torch.as_tensor(plan.object_index)
-        with make_backend(name, scene, len(worlds), object_index=worlds, device=device) as backend:
+        kind = device if torch.device(device).type in backend_class(name).devices() else "cpu"
+        with make_backend(name, scene, len(worlds), object_index=worlds, device=kind) as backend:
             tried = 0
             for items, fresh in plan:
                 rows = frames[left[items]]
@@ -146,8 +148,7 @@ def _bank(
     reason: np.ndarray,
 ) -> ResetBank:
     local = frames - retargeted.frame_offsets[sequence]
-    first_contact = retargeted.first_contact[sequence]
-    post = (first_contact >= 0) & (local >= first_contact)
+    post = retargeted.post_contact[frames]
     keep, reject = reason < 0, reason >= 0
     rows = frames[keep]
     starts, ends = retargeted.frame_offsets[:-1], retargeted.frame_offsets[1:] - 1
@@ -180,17 +181,3 @@ def _bank(
         rejected_reason=reason[reject].astype(np.int32),
         reason_names=REASONS,
     )
-
-
-def acceptance_table(bank: ResetBank) -> list[tuple[str, str, int, int, dict[str, int]]]:
-    """Per object and phase: (object, phase, accepted, tried, reason -> rejected)."""
-    rows = []
-    rejected_object = bank.sequence_object[bank.rejected_sequence_index]
-    for name in bank.object_names:
-        for phase, post in (("pre-contact", False), ("post-contact", True)):
-            accepted = int(((bank.object_name == name) & (bank.post_contact == post)).sum())
-            mine = (rejected_object == name) & (bank.rejected_post_contact == post)
-            counts = np.bincount(bank.rejected_reason[mine], minlength=len(bank.reason_names))
-            reasons = {reason: int(n) for reason, n in zip(bank.reason_names, counts, strict=True) if n}
-            rows.append((name, phase, accepted, accepted + int(mine.sum()), reasons))
-    return rows

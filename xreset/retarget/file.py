@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from xreset.accounts import Account, accounts
 from xreset.files import Field, Schema, read_npz, write_npz
 
 SCHEMA = "xreset-retargeted/1"
@@ -88,6 +89,23 @@ class Retargeted:
     """[F] mean distance of the robot's fingertips from the human's [m]; infinite where not annotated."""
     wrist_error: np.ndarray
     """[F] distance of the hand root from where hand retargeting wants it [m]; infinite where not annotated."""
+
+    @property
+    def sequence_of_frame(self) -> np.ndarray:
+        """[F] index of every frame's sequence."""
+        return np.repeat(np.arange(len(self.sequence_name)), np.diff(self.frame_offsets))
+
+    @property
+    def post_contact(self) -> np.ndarray:
+        """[F] bool: whether the human has touched the object by that frame."""
+        owner = self.sequence_of_frame
+        first = np.asarray(self.first_contact)[owner]
+        return (first >= 0) & (np.arange(len(owner)) - self.frame_offsets[owner] >= first)
+
+    def accounts(self) -> list[Account]:
+        """What became of every frame, by object and phase."""
+        reason = np.where(self.valid, "", np.asarray(self.reason_names)[self.reason])
+        return accounts(np.asarray(self.object_name)[self.sequence_of_frame], self.post_contact, reason)
 
 
 def write_retargeted(path: str | Path, retargeted: Retargeted, *, config: Mapping[str, Any], inputs: Mapping[str, str]) -> None:

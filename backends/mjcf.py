@@ -81,6 +81,8 @@ class SceneModel:
     """[K, 3] position of the tracked link in that body's frame."""
     link_quat: np.ndarray
     """[K, 4]"""
+    moving_bodies: np.ndarray
+    """[B] the robot's bodies that move, in the order of the mechanism."""
     object_body: int
     """Its frame is the object's mesh frame."""
     object_qpos: int
@@ -417,6 +419,7 @@ def _locate(robot: Mechanism, model: mujoco.MjModel, roles: dict[str, int], park
         link_body=np.array([model.body(_body_name(robot.bodies[i])).id for i, _ in frames], dtype=np.int64),
         link_pos=np.array([pos for pos, _ in poses]),
         link_quat=np.array([quat for _, quat in poses]),
+        moving_bodies=np.array([model.body(_body_name(body)).id for body in robot.bodies[1:]], dtype=np.int64),
         object_body=model.body("object").id,
         object_qpos=qpos["object"],
         object_dof=dof["object"],

@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar
+from typing import ClassVar, get_args
 
 import numpy as np
 
 from xreset.backends.base import Capability, unavailable
 from xreset.backends.pool import PoolBackend, World
+from xreset.backends.rigid import Inertia
 from xreset.spec import SceneSpec
 
 try:
@@ -118,6 +119,12 @@ class MujocoWorld(World):
         finite = math.isfinite(self._qpos.dot(q_ones) + self._qvel.dot(v_ones))  # one bad number spoils a sum; cheaper than looking at each
         return not finite, overflows > self._overflows_before
 
+    def mass_properties(self) -> list[Inertia]:
+        """See :meth:`World.mass_properties`."""
+        m = self._model
+        bodies = (*self._at.moving_bodies, self._at.object_body)
+        return [Inertia(mass=m.body_mass[i], com=m.body_ipos[i], quat=m.body_iquat[i], moments=m.body_inertia[i]) for i in bodies]
+
     def set_object_mass(self, mass: float) -> None:
         """See :meth:`World.set_object_mass`."""
         at, model, nominal = self._at, self._model, self._at.model
@@ -161,7 +168,7 @@ class MujocoBackend(PoolBackend):
     """MuJoCo on the CPU, worlds in a pool of processes."""
 
     name: ClassVar[str] = "mujoco"
-    capabilities: ClassVar[frozenset[Capability]] = frozenset(("object_mass", "friction", "object_gravity", "object_wrench", "overflow"))
+    capabilities: ClassVar[frozenset[Capability]] = frozenset(get_args(Capability))
     world_class: ClassVar[type[World]] = MujocoWorld
 
     @classmethod

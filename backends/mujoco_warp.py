@@ -7,15 +7,16 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.base import Backend, Capability, Contacts, Health, Links, State, unavailable
+from xreset.backends.base import Backend, Capability, Contacts, Health, Links, MassProperties, State, unavailable
 from xreset.backends.pool import initial_state
 from xreset.errors import BackendUnavailableError, XResetError
+from xreset.rotations import quat_to_matrix
 from xreset.spec import SceneSpec
 
 try:
@@ -55,7 +56,7 @@ class MujocoWarpBackend(Backend):
     """
 
     name: ClassVar[str] = "mujoco-warp"
-    capabilities: ClassVar[frozenset[Capability]] = frozenset(("object_mass", "friction", "object_gravity", "object_wrench", "overflow"))
+    capabilities: ClassVar[frozenset[Capability]] = frozenset(get_args(Capability))
 
     def __init__(
         self,
@@ -189,6 +190,17 @@ class MujocoWarpBackend(Backend):
         """See :meth:`Backend.health`. Contacts are pooled: when the pool is full, every world reports an overflow."""
         self._must_be_open()
         return Health(nonfinite=self._nonfinite, overflow=(self._overflow & _OVERFLOW) != 0)
+
+    def mass_properties(self) -> MassProperties:
+        """See :meth:`Backend.mass_properties`."""
+        self._must_be_open()
+        bodies = [*self._at.moving_bodies.tolist(), self._at.object_body]
+        mass, com, quat, moments = (
+            wp.to_torch(getattr(self._model, name))[:, bodies].expand(self.num_worlds, *([-1] * rank))
+            for name, rank in (("body_mass", 1), ("body_ipos", 2), ("body_iquat", 2), ("body_inertia", 2))
+        )
+        axes = quat_to_matrix(quat)
+        return MassProperties(mass=mass.clone(), com=com.clone(), inertia=axes @ torch.diag_embed(moments) @ axes.mT)
 
     # Physical parameters ---------------------------------------------------------------------------------------------------------
 

@@ -31,9 +31,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.base import Backend, Contacts, Health, Links, State
+from xreset.backends.base import Backend, Contacts, Health, Links, MassProperties, State
+from xreset.backends.rigid import Inertia
 from xreset.errors import CapabilityError, XResetError
-from xreset.spec import SceneSpec, Shape
+from xreset.spec import RobotSpec, SceneSpec, Shape
 
 STATE_FIELDS = tuple(field.name for field in fields(State))
 
@@ -79,6 +80,13 @@ class World(ABC):
     @abstractmethod
     def health(self) -> tuple[bool, bool]:
         """Whether, now, the state is not finite, and whether contacts overflowed in the last :meth:`step`."""
+
+    def mass_properties(self) -> list[Inertia]:
+        """What the engine itself holds: of each moving body of the robot, in the order of the mechanism, then of the object.
+
+        Asked for only where the backend has the capability ``mass_properties``.
+        """
+        raise NotImplementedError
 
     @abstractmethod
     def set_object_mass(self, mass: float) -> None:
@@ -144,7 +152,7 @@ class PoolBackend(Backend):
         if workers < 0:
             raise ValueError(f"workers is {workers}, expected 0 or more")
         workers = min(workers, num_worlds)
-        layout = _layout(num_worlds, len(scene.robot.joints), len(scene.robot.fingertips))
+        layout = _layout(num_worlds, scene.robot)
         owned = np.array_split(np.arange(num_worlds), max(workers, 1))
         jobs = [
             _Job(self.name, self.world_class, dict(world_options), scene, int(w[0]), tuple(self.object_index[w].tolist())) for w in owned
@@ -211,6 +219,14 @@ class PoolBackend(Backend):
         """See :meth:`Backend.health`: views of shared memory."""
         self._must_be_open()
         return self._health
+
+    def mass_properties(self) -> MassProperties:
+        """See :meth:`Backend.mass_properties`."""
+        if "mass_properties" not in self.capabilities:
+            return super().mass_properties()
+        self._command("mass_properties")
+        mass, com, inertia = (torch.from_numpy(self._arrays[f"body_{name}"].copy()) for name in ("mass", "com", "inertia"))
+        return MassProperties(mass=mass, com=com, inertia=inertia)
 
     def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
         """See :meth:`Backend.set_object_mass`."""
@@ -318,9 +334,10 @@ def _lowest(shape: Shape) -> float:
 Layout = Mapping[str, tuple[tuple[int, ...], type]]
 
 
-def _layout(n: int, joints: int, tips: int) -> Layout:
+def _layout(n: int, robot: RobotSpec) -> Layout:
     """Name -> shape and type of every shared array. The state is both what a world is set to and what it reports."""
-    links = 1 + tips
+    joints, tips = len(robot.joints), len(robot.fingertips)
+    links, bodies = 1 + tips, joints + len(robot.mimics) + 1
     f = np.float32
     return {
         "joint_pos": ((n, joints), f),
@@ -343,6 +360,9 @@ def _layout(n: int, joints: int, tips: int) -> Layout:
         "friction": ((n, 3), f),
         "object_gravity": ((n,), f),
         "wrench": ((n, 6), f),
+        "body_mass": ((n, bodies), f),
+        "body_com": ((n, bodies, 3), f),
+        "body_inertia": ((n, bodies, 3, 3), f),
     }
 
 
@@ -448,6 +468,11 @@ class _Local:
         wrench = self._arrays["wrench"][i].astype(np.float64)
         world.set_object_wrench(wrench[:3], wrench[3:])
         world.step(n)
+
+    def _mass_properties(self, i: int, _) -> None:
+        for k, body in enumerate(self._world(i).mass_properties()):
+            self._arrays["body_mass"][i, k], self._arrays["body_com"][i, k] = body.mass, body.com
+            self._arrays["body_inertia"][i, k] = body.matrix
 
     def _set_object_mass(self, i: int, _) -> None:
         self._world(i).set_object_mass(float(self._arrays["object_mass"][i]))

@@ -19,11 +19,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
-from xreset.backends.base import unavailable
+from xreset.backends.base import Capability, unavailable
 from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import (
     Inertia,
@@ -189,6 +189,12 @@ class PybulletWorld(World):
         values = [*self._p.getBasePositionAndOrientation(self._object.body, physicsClientId=self._client)[0]]
         return not bool(np.isfinite(values).all() and all(np.isfinite(x).all() for x in self._drives.read())), False
 
+    def mass_properties(self) -> list[Inertia]:
+        """See :meth:`World.mass_properties`."""
+        moving = [(self._robot.body, link) for link in range(1, len(self._mechanism.bodies))]
+        infos = [self._p.getDynamicsInfo(*place, physicsClientId=self._client) for place in (*moving, (self._object.body, -1))]
+        return [Inertia(mass=i[0], com=np.array(i[3]), quat=_wxyz(i[4]), moments=np.array(i[2])) for i in infos]
+
     def set_object_mass(self, mass: float) -> None:
         """See :meth:`World.set_object_mass`."""
         self._mass = mass
@@ -284,7 +290,7 @@ class PybulletBackend(PoolBackend):
     """N worlds of Bullet; the keyword ``settings`` takes :class:`PybulletSettings`."""
 
     name = "pybullet"
-    capabilities = frozenset({"object_mass", "friction", "object_gravity", "object_wrench", "overflow"})
+    capabilities = frozenset(get_args(Capability))
     world_class = PybulletWorld
 
     @classmethod

@@ -29,6 +29,12 @@ class Inertia:
     moments: np.ndarray
     """[3] principal moments about the centre of mass [kg m^2]."""
 
+    @property
+    def matrix(self) -> np.ndarray:
+        """[3, 3] inertia about the centre of mass, along the axes of the body's frame [kg m^2]."""
+        axes = np.stack([rotate(self.quat, axis) for axis in np.eye(3)])
+        return axes.T @ (self.moments[:, None] * axes)
+
 
 @dataclass(frozen=True, kw_only=True)
 class LinkShape:

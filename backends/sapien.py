@@ -17,11 +17,11 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from xreset.backends.base import unavailable
+from xreset.backends.base import Capability, unavailable
 from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import (
     Inertia,
@@ -159,6 +159,15 @@ class SapienWorld(World):
         """See :meth:`World.health`. PhysX allocates contacts as it needs them: none is ever dropped."""
         pose = self._object.entity.pose
         return not all(np.isfinite(x).all() for x in (pose.p, pose.q, self._object.linear_velocity, *self._joints.read())), False
+
+    def mass_properties(self) -> list[Inertia]:
+        """See :meth:`World.mass_properties`."""
+        bodies = (*self._bodies[1:], self._object)
+        frames = [body.cmass_local_pose for body in bodies]
+        return [
+            Inertia(mass=body.mass, com=frame.p.astype(float), quat=frame.q.astype(float), moments=body.inertia.astype(float))
+            for body, frame in zip(bodies, frames, strict=True)
+        ]
 
     def set_object_mass(self, mass: float) -> None:
         """See :meth:`World.set_object_mass`."""
@@ -318,7 +327,7 @@ class SapienBackend(PoolBackend):
     """N worlds of PhysX; the keyword ``settings`` takes :class:`SapienSettings`."""
 
     name = "sapien"
-    capabilities = frozenset({"object_mass", "friction", "object_gravity", "object_wrench", "overflow"})
+    capabilities = frozenset(get_args(Capability))
     world_class = SapienWorld
 
     @classmethod

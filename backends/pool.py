@@ -148,7 +148,7 @@ class PoolBackend(Backend):
             )
         super().__init__(scene, num_worlds, object_index=object_index, device=device)
         if workers is None:
-            workers = 0 if num_worlds == 1 else min(_usable_cores(), num_worlds)
+            workers = 0 if num_worlds == 1 else min(usable_cores(), num_worlds)
         if workers < 0:
             raise ValueError(f"workers is {workers}, expected 0 or more")
         workers = min(workers, num_worlds)
@@ -385,7 +385,8 @@ def _map(path: str, layout: Layout) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _usable_cores() -> int:
+def usable_cores() -> int:
+    """Cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

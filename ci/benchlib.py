@@ -1,0 +1,106 @@
+"""What the sections of the benchmark share: timing, tables of engines, and a grasp that is held."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.markup import escape
+
+from xreset.backends import backend_names, backend_status
+from xreset.backends.base import State
+from xreset.spec import ObjectSpec, RobotSpec
+
+OBJECT = "005_tomato_soup_can"
+
+_PRESS = 8.0
+"""Force of each fingertip of a grasp [N]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What all sections are told; their own options are in ``extra``."""
+
+    robot: str
+    backends: tuple[str, ...]
+    """Engines to measure, all if empty."""
+    num_envs: int
+    device: str
+    """``cpu``, or ``cuda`` for the engines that can."""
+    seconds: float
+    """How long to measure each thing."""
+    extra: Mapping[str, object]
+    """Options that sections have added, by name."""
+
+
+def engines(options: Options, console: Console) -> Iterator[tuple[str, str]]:
+    """Name and device of the engines asked for that work here; says why others are left out."""
+    for name in options.backends or tuple(backend_names()):
+        status = backend_status(name)
+        if status.reason is None:
+            yield name, options.device if "cuda" in status.device else "cpu"
+        else:
+            console.print(f"{name}: left out. {escape(status.reason)}")
+
+
+def seconds_of(action: Callable[[], object], device: str = "cpu") -> float:
+    """Wall time of one call, a GPU's work included."""
+    start = time.perf_counter()
+    action()
+    if device.startswith("cuda"):
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def rate(step: Callable[[], object], seconds: float, device: str) -> float:
+    """Calls per second: the median over bursts of five calls, after two bursts of warm-up."""
+
+    def burst() -> float:
+        return seconds_of(lambda: [step() for _ in range(5)], device)
+
+    burst(), burst()
+    end, bursts = time.perf_counter() + seconds, []
+    while not bursts or time.perf_counter() < end:
+        bursts.append(burst())
+    return 5 / float(np.median(bursts))
+
+
+def run_time(command: Sequence[str]) -> float:
+    """Wall time of a command [s]."""
+    return seconds_of(lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL))
+
+
+def held_grasp(robot: RobotSpec, objects: Sequence[ObjectSpec]) -> State:
+    """One world ([1, ...]) in which the robot has closed its fingers around the first object in the air, and presses.
+
+    A retargeted synthetic demonstration gives the hand's shape; the drives' targets lie where each fingertip presses towards the object's
+    centre.
+    """
+    from xreset.demos.synth import synthesize
+    from xreset.kinematics import Kinematics
+    from xreset.retarget.pipeline import rest_on_table, retarget
+
+    moved = retarget(rest_on_table(synthesize([objects[0].name], 1, seed=0), objects), robot, objects)
+    frame = int(np.flatnonzero(moved.valid & (moved.object_pos[:, 2] > moved.object_pos[0, 2] + 0.1))[0])
+    center = torch.as_tensor(moved.object_pos[frame], dtype=torch.float64)
+    position = torch.as_tensor(moved.joint_pos[frame], dtype=torch.float64).requires_grad_()
+    poses = Kinematics(robot).link_poses(position, [tip.link for tip in robot.fingertips])
+    (poses[:, :3, 3] - center).norm(dim=-1).sum().backward()  # its gradient is - J^T of a unit force on each tip towards the centre
+    assert position.grad is not None
+    hand = torch.tensor([joint.group == "hand" for joint in robot.joints])
+    stiffness = torch.tensor([joint.drive.kp for joint in robot.joints], dtype=torch.float64)
+    target = position.detach() - torch.where(hand, _PRESS * position.grad / stiffness, 0.0)
+    return State(
+        joint_pos=position.detach()[None].float(),
+        joint_vel=torch.zeros(1, len(robot.joints)),
+        joint_target=target[None].float(),
+        object_pos=center[None].float(),
+        object_quat=torch.as_tensor(moved.object_quat_wxyz[frame], dtype=torch.float32)[None],
+        object_linvel=torch.zeros(1, 3),
+        object_angvel=torch.zeros(1, 3),
+    )

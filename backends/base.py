@@ -237,6 +237,29 @@ class Backend(ABC):
         It stays until it is replaced, or the world's state is set.
         """
 
+    # Many worlds at once --------------------------------------------------------------------------------------------------------------
+
+    def set_where(self, mask: Tensor, *, state: State, friction: Tensor, object_mass: Tensor, object_gravity: Tensor) -> None:
+        """Set state and physical parameters of the worlds of a mask, as the single setters do.
+
+        Values are given for all worlds, and those outside the mask are ignored: a backend on a GPU overrides this so that nothing waits
+        for the number of worlds.
+
+        Args:
+            mask: [N] bool.
+            state: [N, ...]
+            friction: [N, 3]
+            object_mass: [N] kg.
+            object_gravity: [N]
+        """
+        worlds = mask.nonzero().squeeze(-1)
+        if not len(worlds):
+            return
+        self.set_friction(friction[worlds], worlds)
+        self.set_object_mass(object_mass[worlds], worlds)
+        self.set_object_gravity(object_gravity[worlds], worlds)
+        self.set_state(state[worlds], worlds)
+
     # The end ---------------------------------------------------------------------------------------------------------------------
 
     @abstractmethod

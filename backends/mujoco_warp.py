@@ -133,23 +133,8 @@ class MujocoWarpBackend(Backend):
         new = {f.name: self._checked(f.name, getattr(state, f.name), len(index)) for f in fields(State)}
         if not len(index):
             return
-        d, out, at = self._data, self._out, self._at
         with self._on_stream():
-            wp.launch(
-                kernels.write_state,
-                dim=len(index),
-                inputs=[
-                    wp.from_torch(index.contiguous()), wp.from_torch(new["joint_pos"]), wp.from_torch(new["joint_vel"]),
-                    wp.from_torch(new["joint_target"]), wp.from_torch(new["object_pos"], dtype=wp.vec3),
-                    wp.from_torch(new["object_quat"], dtype=wp.quat), wp.from_torch(new["object_linvel"], dtype=wp.vec3),
-                    wp.from_torch(new["object_angvel"], dtype=wp.vec3), *self._addresses, *self._mimic, at.object_qpos, at.object_dof,
-                    at.object_body,
-                ],
-                outputs=[
-                    d.qpos, d.qvel, d.ctrl, d.qacc_warmstart, d.xfrc_applied, d.overflow, out["nonfinite"], out["tip_force"],
-                    out["tip_touch"], out["table_force"],
-                ],
-            )  # fmt: skip
+            self._write_state(index.contiguous(), self._everything[: len(index)], new)
             self._run("refresh")
 
     def state(self) -> State:
@@ -190,6 +175,17 @@ class MujocoWarpBackend(Backend):
         """See :meth:`Backend.health`. Contacts are pooled: when the pool is full, every world reports an overflow."""
         self._must_be_open()
         return Health(nonfinite=self._nonfinite, overflow=(self._overflow & _OVERFLOW) != 0)
+
+    def set_where(self, mask: Tensor, *, state: State, friction: Tensor, object_mass: Tensor, object_gravity: Tensor) -> None:
+        """See :meth:`Backend.set_where`: a few copies and one graph."""
+        self._must_be_open()
+        self._coming["mask"].copy_(mask)
+        for f in fields(State):
+            self._coming[f.name].copy_(self._checked(f.name, getattr(state, f.name), self.num_worlds))
+        for name, value in (("friction", friction), ("mass", object_mass), ("gravity", object_gravity)):
+            self._coming[name].copy_(self._rows(value, self._coming[name].shape))
+        with self._on_stream():
+            self._run("begin")
 
     def mass_properties(self) -> MassProperties:
         """See :meth:`Backend.mass_properties`."""
@@ -290,7 +286,7 @@ class MujocoWarpBackend(Backend):
             wp.array(at.mimic_multiplier, dtype=float), wp.array(at.mimic_offset, dtype=float),
         ]  # fmt: skip
         self._link_arrays = [ints(at.link_body), wp.array(at.link_pos, dtype=wp.vec3), wp.array(at.link_quat, dtype=wp.quat)]
-        self._geom_role = ints(at.geom_role)
+        self._geom_role, self._friction_columns = ints(at.geom_role), ints(at.friction_column)
 
         view = {name: wp.to_torch(array) for name, array in self._out.items()}
         self._ctrl, self._xfrc_applied = wp.to_torch(self._data.ctrl), wp.to_torch(self._data.xfrc_applied)
@@ -302,6 +298,11 @@ class MujocoWarpBackend(Backend):
         self._links = Links(pos=view["link_pos"], quat=view["link_quat"], linvel=view["link_linvel"], angvel=view["link_angvel"])
         self._contacts = Contacts(tip_force=view["tip_force"], tip_touch=view["tip_touch"], table_force=view["table_force"])
         self._every_world = torch.arange(n, device=self.device)
+        self._everything = torch.ones(n, dtype=torch.bool, device=self.device)
+        self._coming = {f.name: torch.zeros_like(getattr(self._state, f.name)) for f in fields(State)}
+        self._coming |= {"mask": torch.zeros_like(self._everything), "friction": torch.ones(n, 3, device=self.device)}
+        self._coming |= {name: torch.ones(n, device=self.device) for name in ("mass", "gravity")}
+        self._coming["object_quat"][:, 0] = 1.0
         self._field = {name: wp.to_torch(getattr(self._model, name)) for name in _SET_PER_WORLD}
         self._friction_column = torch.as_tensor(at.friction_column, device=self.device)
         body, dofs = at.object_body, slice(at.object_dof, at.object_dof + 6)
@@ -315,7 +316,12 @@ class MujocoWarpBackend(Backend):
 
     def _prepare(self) -> None:
         """Run each sequence of kernels once, which compiles it, then capture it as a graph: even on the CPU that saves most of the time."""
-        sequences: dict[str, Callable[[], None]] = {"step": self._step, "contacts": self._read_contacts, "refresh": self._refresh}
+        sequences: dict[str, Callable[[], None]] = {
+            "step": self._step,
+            "contacts": self._read_contacts,
+            "refresh": self._refresh,
+            "begin": self._begin,
+        }
         for sequence in sequences.values():
             sequence()
         wp.synchronize_device(self._warp_device)
@@ -374,6 +380,45 @@ class MujocoWarpBackend(Backend):
             inputs=[*self._link_arrays, m.body_rootid, d.xpos, d.xquat, d.cvel, d.subtree_com],
             outputs=[out["link_pos"], out["link_quat"], out["link_linvel"], out["link_angvel"]],
         )
+
+    def _begin(self) -> None:
+        """Give the worlds of a mask what is coming to them."""
+        new, m, nominal, at = self._coming, self._model, self._nominal, self._at
+        self._write_state(self._every_world, new["mask"], new)
+        wp.launch(
+            kernels.write_parameters,
+            dim=self.num_worlds,
+            inputs=[
+                wp.from_torch(self._every_world), wp.from_torch(new["mask"]), wp.from_torch(new["mass"]), wp.from_torch(new["gravity"]),
+                wp.from_torch(new["friction"], dtype=wp.vec3), wp.from_torch(nominal["mass"]),
+                wp.from_torch(nominal["inertia"], dtype=wp.vec3), wp.from_torch(nominal["total_mass"]),
+                wp.from_torch(nominal["body_invweight"], dtype=wp.vec2), wp.from_torch(nominal["dof_invweight"]),
+                self._friction_columns, MIN_FRICTION, at.object_body, at.object_dof,
+            ],
+            outputs=[
+                m.body_mass, m.body_inertia, m.body_subtreemass, m.body_invweight0, m.dof_invweight0, m.body_gravcomp, m.geom_friction,
+            ],
+        )  # fmt: skip
+        self._refresh()
+
+    def _write_state(self, worlds: Tensor, chosen: Tensor, new: dict[str, Tensor]) -> None:
+        """Write the chosen ones of M new states into ``worlds`` [M]."""
+        d, out, at = self._data, self._out, self._at
+        wp.launch(
+            kernels.write_state,
+            dim=len(worlds),
+            inputs=[
+                wp.from_torch(worlds), wp.from_torch(chosen), wp.from_torch(new["joint_pos"]), wp.from_torch(new["joint_vel"]),
+                wp.from_torch(new["joint_target"]), wp.from_torch(new["object_pos"], dtype=wp.vec3),
+                wp.from_torch(new["object_quat"], dtype=wp.quat), wp.from_torch(new["object_linvel"], dtype=wp.vec3),
+                wp.from_torch(new["object_angvel"], dtype=wp.vec3), *self._addresses, *self._mimic, at.object_qpos, at.object_dof,
+                at.object_body,
+            ],
+            outputs=[
+                d.qpos, d.qvel, d.ctrl, d.qacc_warmstart, d.xfrc_applied, d.overflow, out["nonfinite"], out["tip_force"],
+                out["tip_touch"], out["table_force"],
+            ],
+        )  # fmt: skip
 
     def _run(self, name: str) -> None:
         wp.capture_launch(self._graphs[name])

@@ -40,8 +40,9 @@ def _conjugate(q: wp.quat) -> wp.quat:
 
 @wp.kernel(enable_backward=False)
 def write_state(
-    # The new state of M worlds.
+    # The new state of M worlds; only the chosen ones take it.
     worlds: wp.array[wp.int64],
+    chosen: wp.array[wp.bool],
     joint_pos: wp.array2d[float],
     joint_vel: wp.array2d[float],
     joint_target: wp.array2d[float],
@@ -74,6 +75,8 @@ def write_state(
 ):
     """Set the state of some worlds and clear what remains of their past."""
     m = wp.tid()
+    if not chosen[m]:
+        return
     world = int(worlds[m])
     for j in range(joint_qpos.shape[0]):
         qpos[world, joint_qpos[j]] = joint_pos[m, j]
@@ -102,6 +105,56 @@ def write_state(
         tip_force[world, e] = wp.vec3(0.0)
         tip_touch[world, e] = False
     table_force[world] = wp.vec3(0.0)
+
+
+@wp.kernel(enable_backward=False)
+def write_parameters(
+    # The new parameters of M worlds; only the chosen ones take them.
+    worlds: wp.array[wp.int64],
+    chosen: wp.array[wp.bool],
+    mass: wp.array[float],
+    gravity_fraction: wp.array[float],
+    friction: wp.array[wp.vec3],
+    # What they start from.
+    nominal_mass: wp.array[float],
+    nominal_inertia: wp.array[wp.vec3],
+    nominal_total: wp.array[float],
+    nominal_body_invweight: wp.array[wp.vec2],
+    nominal_dof_invweight: wp.array2d[float],
+    friction_column: wp.array[int],
+    min_friction: float,
+    object_body: int,
+    object_dof: int,
+    # Out.
+    body_mass: wp.array2d[float],
+    body_inertia: wp.array2d[wp.vec3],
+    body_subtreemass: wp.array2d[float],
+    body_invweight: wp.array2d[wp.vec2],
+    dof_invweight: wp.array2d[float],
+    body_gravcomp: wp.array2d[float],
+    geom_friction: wp.array2d[wp.vec3],
+):
+    """Set mass, gravity fraction and pair friction of some worlds' objects, and all that MuJoCo derives from them."""
+    m = wp.tid()
+    if not chosen[m]:
+        return
+    world = int(worlds[m])
+    ratio = mass[m] / nominal_mass[world]
+    body_mass[world, object_body] = mass[m]
+    body_inertia[world, object_body] = nominal_inertia[world] * ratio
+    body_subtreemass[world, object_body] = mass[m]
+    body_subtreemass[world, 0] = nominal_total[world] + mass[m] - nominal_mass[world]
+    body_invweight[world, object_body] = nominal_body_invweight[world] / ratio  # of a free body: the inverse of mass and inertia
+    for k in range(6):
+        dof_invweight[world, object_dof + k] = nominal_dof_invweight[world, k] / ratio
+    body_gravcomp[world, object_body] = 1.0 - gravity_fraction[m]
+    for g in range(friction_column.shape[0]):
+        column = friction_column[g]
+        slide = min_friction
+        if column < 3:
+            slide = wp.max(friction[m][column], min_friction)
+        value = geom_friction[world, g]
+        geom_friction[world, g] = wp.vec3(slide, value[1], value[2])
 
 
 @wp.kernel(enable_backward=False)

@@ -194,11 +194,11 @@ class ResetTest(WithEnv):
         ):
             env.reset(torch.tensor([2, 0]))
         for call in (mass, friction, gravity):
-            self.assertEqual(call.call_args.args[1].tolist(), [2, 0])
+            self.assertEqual(call.call_args.args[1].tolist(), [0, 2])
         scale = mass.call_args.args[0] / self.objects[0].mass
         self.assertTrue(bool(((scale >= 0.7) & (scale <= 1.3)).all()) and float(scale[0]) != float(scale[1]))
         self.assertEqual(tuple(friction.call_args.args[0].shape), (2, 3))
-        self.assertTrue(torch.equal(gravity.call_args.args[0], env.gravity_fraction[[2, 0]]))
+        self.assertTrue(torch.equal(gravity.call_args.args[0], env.gravity_fraction[[0, 2]]))
 
 
 class FailureTest(WithEnv):

@@ -6,12 +6,13 @@ same class, with another configuration, runs evaluations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from xreset.capture import GraphRunner
 from xreset.objects import surface_points
 from xreset.rotations import quat_rotate_inverse
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
@@ -49,13 +50,13 @@ class Reading:
 class ManipulationEnv:
     """N worlds in which a robot brings an object to a goal pose.
 
-    All tensors live on the backend's device. World i always holds the same object.
+    All tensors live on the backend's device. World i always holds the same object. What a step does besides physics is a few functions
+    over fixed buffers, without a branch on what a world is doing, so that a GPU replays them as graphs.
 
     Attributes:
         num_envs: N.
         num_actions: J.
         max_episode_length: control steps until the time limit.
-        episode_length_buf: [N] control steps since each world's reset.
         goal_pos, goal_quat: [N, 3], [N, 4] goal of each world.
         sequence: [N] demonstration of each world.
         gravity_fraction: [N]
@@ -71,6 +72,8 @@ class ManipulationEnv:
             resets: where episodes start, on the backend's device.
             seed: of every random number that the environment draws.
         """
+        from tensordict import TensorDict
+
         self.backend, self.task, self.resets = backend, task, resets
         self.cfg = task
         self.device = backend.device
@@ -80,6 +83,7 @@ class ManipulationEnv:
         self.max_episode_length = episode_steps(task.termination, scene.control_dt)
         self.generator = torch.Generator(device=self.device)
         self.generator.manual_seed(seed)
+        self._graphs = GraphRunner(self.device, self.generator)
         self.actions = ActionSpace.of(scene.robot, task.action, self.device)
 
         def per_object(count: int) -> Tensor:
@@ -96,22 +100,47 @@ class ManipulationEnv:
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(n, *shape, dtype=dtype, device=self.device)
 
-        self.episode_length_buf = zeros(dtype=torch.long)
+        self._episode_length = zeros(dtype=torch.long)
         self.goal_pos, self.goal_quat = zeros(3), zeros(4)
         self.gravity_fraction, self.sequence = zeros(), zeros(dtype=torch.long)
         self.from_bank = zeros(dtype=torch.bool)
         self.nonfinite_count, self.overflow_count = zeros(dtype=torch.long).sum(), zeros(dtype=torch.long).sum()
-        self._target, self._previous_action = zeros(self.num_actions), zeros(self.num_actions)
-        self._best_reach, self._reward = zeros(), zeros()
+        self._action, self._previous_action = zeros(self.num_actions), zeros(self.num_actions)
+        self._target = zeros(self.num_actions)
+        self._best_reach, self._reward, self._time_out = zeros(), zeros(), zeros(dtype=torch.bool)
         self._cloud = zeros(task.observation.cloud_history, task.observation.cloud_points, 3)
-        self._episode_terms: dict[str, Tensor] = {}
+        # What a step puts down for the next part of it: which worlds begin anew, how, and what there is to log.
+        self._fresh = zeros(dtype=torch.bool)
+        self._start = Reset(
+            joint_pos=zeros(self.num_actions),
+            object_pos=zeros(3),
+            object_quat=zeros(4),
+            goal_pos=zeros(3),
+            goal_quat=zeros(4),
+            gravity_fraction=zeros(),
+            from_bank=zeros(dtype=torch.bool),
+            sequence=zeros(dtype=torch.long),
+        )
+        self._friction, self._mass = zeros(3), zeros()
+        self._log_names: tuple[str, ...] = ()
+        self._log_values = torch.zeros(0, device=self.device)
+        self._observations = TensorDict({}, batch_size=[n], device=self.device)
         self.reset()
 
     # rsl-rl's contract -------------------------------------------------------------------------------------------------------------
 
+    @property
+    def episode_length_buf(self) -> Tensor:
+        """[N] control steps since each world's reset; what is assigned is copied."""
+        return self._episode_length
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: Tensor) -> None:
+        self._episode_length.copy_(value)
+
     def get_observations(self) -> TensorDict:
         """Observations of the present state, by group."""
-        return self._observations
+        return self._observations.clone()
 
     def step(self, action: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """One control step, then a reset of every world whose episode has ended.
@@ -123,22 +152,24 @@ class ManipulationEnv:
             Observations (of the new episode where one has begun), reward [N], done [N] (0 or 1), extras with ``time_outs`` [N] (ended
             without failing: the value is to be bootstrapped) and ``log``.
         """
-        reading, reward, failed, time_out = self._advance(action)
-        done = failed | time_out
-        log = self._log(reward, done, sound=~reading.health.nonfinite)
-        finished = done.nonzero().squeeze(-1)
-        if len(finished):
-            self.reset(finished)
-        else:
-            self._observe(reading)
-        return self._observations, self._last_reward, done.long(), {"time_outs": time_out.float(), "log": log}
+        self._move(action)
+        self._graphs.run(self._judge)
+        reward, done, time_out = self._reward.clone(), self._fresh.long(), self._time_out.float()
+        log = dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True))
+        if self._graphs.active or bool(self._fresh.any()):
+            self._graphs.run(self._draw)
+            self._begin()
+        self._graphs.run(self._observe)
+        return self.get_observations(), reward, done, {"time_outs": time_out, "log": log}
 
     # Stepping and resetting --------------------------------------------------------------------------------------------------------
 
     def advance(self, action: Tensor) -> tuple[Reading, Reward]:
         """One control step without any reset: for evaluation, which ends episodes by itself."""
-        reading, reward, _, _ = self._advance(action)
-        self._observe(reading)
+        self._move(action)
+        reading, reward = self._judge()
+        self._fresh.zero_()
+        self._observe()
         return reading, reward
 
     def reset(self, worlds: Tensor | None = None, start: Reset | None = None) -> None:
@@ -150,25 +181,14 @@ class ManipulationEnv:
         """
         if worlds is None:
             worlds = torch.arange(self.num_envs, device=self.device)
-        if start is None:
-            start = self.resets.sample(self.backend.object_index[worlds], self.generator)
-        backend, m = self.backend, len(worlds)
-        friction = sample_friction(m, self.task.randomization, self.generator)
-        mass = self._nominal_mass[worlds] * sample_mass_scale(m, self.task.randomization, self.generator)
-        backend.set_friction(friction, worlds)
-        backend.set_object_mass(mass, worlds)
-        backend.set_object_gravity(start.gravity_fraction, worlds)
-        backend.set_state(rest_state(start.joint_pos, start.object_pos, start.object_quat), worlds)
-        self.goal_pos[worlds], self.goal_quat[worlds] = start.goal_pos, start.goal_quat
-        self.gravity_fraction[worlds], self.sequence[worlds] = start.gravity_fraction, start.sequence
-        self.from_bank[worlds] = start.from_bank
-        self.episode_length_buf[worlds] = 0
-        self._target[worlds] = start.joint_pos
-        self._previous_action[worlds] = 0.0
-        self._reward[worlds] = 0.0
-        reading = self._read()
-        self._best_reach[worlds] = reading.tip_distance.mean(dim=-1)[worlds]
-        self._observe(reading, fresh=worlds)
+        self._fresh.zero_()
+        self._fresh[worlds] = True
+        if start is not None:
+            for f in fields(Reset):
+                getattr(self._start, f.name)[worlds] = getattr(start, f.name)
+        self._draw(start is None)
+        self._begin()
+        self._observe()
 
     def reading(self) -> Reading:
         """The present physical state and what follows from it."""
@@ -189,11 +209,19 @@ class ManipulationEnv:
 
     # Parts -------------------------------------------------------------------------------------------------------------------------
 
-    def _advance(self, action: Tensor) -> tuple[Reading, Reward, Tensor, Tensor]:
-        action = action.clamp(-1.0, 1.0)
-        self._target = self.actions.targets(action, self._target, self._joint_pos)
+    def _move(self, action: Tensor) -> None:
+        self._action.copy_(action)
+        self._graphs.run(self._aim)
         self.backend.set_joint_targets(self._target)
         self.backend.step()
+
+    def _aim(self) -> None:
+        """From the action to the drives' targets."""
+        self._action.clamp_(-1.0, 1.0)
+        self._target.copy_(self.actions.targets(self._action, self._target, self.backend.state().joint_pos))
+
+    def _judge(self) -> tuple[Reading, Reward]:
+        """What the step has brought: reward, ends of episodes, numbers to log."""
         reading = self._read()
         # The worlds that broke say nothing true any more: they end, teach nothing (reward 0, bootstrapped like a time-out) and are counted.
         broken = reading.health.nonfinite
@@ -201,33 +229,70 @@ class ManipulationEnv:
         self.overflow_count += reading.health.overflow.sum()
         lost = out_of_bounds(reading.state.object_pos, self.backend.scene.table, self.task.termination) & ~broken
         reach = reading.tip_distance.mean(dim=-1)
-        self._best_reach = torch.where(broken, self._best_reach, torch.minimum(self._best_reach, reach))
+        self._best_reach.copy_(torch.where(broken, self._best_reach, torch.minimum(self._best_reach, reach)))
         reward = compute_reward(
             RewardInput(
                 tip_distance=reading.tip_distance,
-                best_reach=self._best_reach,
+                best_reach=self._best_reach.clone(),
                 tip_force=reading.contacts.tip_force.norm(dim=-1),
                 object_pos=reading.state.object_pos,
                 object_quat=reading.state.object_quat,
                 goal_pos=self.goal_pos,
                 goal_quat=self.goal_quat,
-                action=action,
+                action=self._action,
                 previous_action=self._previous_action,
                 out_of_bounds=lost,
             ),
             self.task.reward,
         )
-        self._last_reward = torch.where(broken, 0.0, reward.total)
-        self._reward = self._last_reward.clone()
-        self._previous_action = action
-        self.episode_length_buf += 1
-        time_out = (self.episode_length_buf >= self.max_episode_length) | broken
-        return reading, reward, lost, time_out & ~lost
+        self._reward.copy_(torch.where(broken, 0.0, reward.total))
+        self._previous_action.copy_(self._action)
+        self._episode_length += 1
+        time_out = (self._episode_length >= self.max_episode_length) | broken
+        self._time_out.copy_(time_out & ~lost)
+        self._fresh.copy_(lost | time_out)
+        log = self._log(reward, self._fresh, sound=~broken)
+        values = torch.stack(list(log.values()))
+        if not self._log_names:
+            self._log_names, self._log_values = tuple(log), torch.zeros_like(values)
+        self._log_values.copy_(values)
+        return reading, reward
+
+    def _draw(self, from_distribution: bool = True) -> None:
+        """Draw how every world would begin anew, so that nothing waits for their number, and let the fresh ones take it over."""
+        fresh, start = self._fresh, self._start
+        if from_distribution:
+            drawn = self.resets.sample(self.backend.object_index, self.generator)
+            for f in fields(Reset):
+                getattr(start, f.name).copy_(getattr(drawn, f.name))
+        self._friction.copy_(sample_friction(self.num_envs, self.task.randomization, self.generator))
+        self._mass.copy_(self._nominal_mass * sample_mass_scale(self.num_envs, self.task.randomization, self.generator))
+        for new, old in (
+            (start.goal_pos, self.goal_pos),
+            (start.goal_quat, self.goal_quat),
+            (start.gravity_fraction, self.gravity_fraction),
+            (start.sequence, self.sequence),
+            (start.from_bank, self.from_bank),
+            (start.joint_pos, self._target),
+        ):
+            old.copy_(torch.where(fresh.view(-1, *[1] * (old.ndim - 1)), new, old))
+        for cleared in (self._episode_length, self._previous_action, self._reward):
+            cleared.masked_fill_(fresh.view(-1, *[1] * (cleared.ndim - 1)), 0)
+
+    def _begin(self) -> None:
+        """Put the fresh worlds into their new states."""
+        start = self._start
+        self.backend.set_where(
+            self._fresh,
+            state=rest_state(start.joint_pos, start.object_pos, start.object_quat),
+            friction=self._friction,
+            object_mass=self._mass,
+            object_gravity=start.gravity_fraction,
+        )
 
     def _read(self) -> Reading:
         state, links = self.backend.state(), self.backend.links()
         local = quat_rotate_inverse(state.object_quat[:, None], links.pos[:, 1:] - state.object_pos[:, None])
-        self._joint_pos = state.joint_pos
         return Reading(
             state=state,
             links=links,
@@ -236,11 +301,11 @@ class ManipulationEnv:
             tip_distance=torch.cdist(local, self._surface_points).amin(dim=-1),
         )
 
-    def _observe(self, reading: Reading, fresh: Tensor | None = None) -> None:
-        """Refresh the observations; worlds in ``fresh`` [M] have just been reset and start with a history of copies."""
-        from tensordict import TensorDict
-
+    def _observe(self) -> None:
+        """Refresh the observations; fresh worlds start with a cloud history of copies, and with this reach as their best."""
+        reading = self._read()
         c, state, links = self.task.observation, reading.state, reading.links
+        self._best_reach.copy_(torch.where(self._fresh, reading.tip_distance.mean(dim=-1), self._best_reach))
         x = obs.ObservationInput(
             joint_pos=state.joint_pos,
             joint_vel=state.joint_vel,
@@ -263,17 +328,19 @@ class ManipulationEnv:
             tip_distance=reading.tip_distance,
             reward=self._reward,
         )
-        frame = obs.cloud_frame(self._cloud_points, state.object_pos, state.object_quat, c.noise.cloud, self.generator)
-        self._cloud = torch.cat((self._cloud[:, 1:], frame[:, None]), dim=1)
-        if fresh is not None:
-            self._cloud[fresh] = frame[fresh, None]
+        frame = obs.cloud_frame(self._cloud_points, state.object_pos, state.object_quat, c.noise.cloud, self.generator)[:, None]
+        history = torch.cat((self._cloud[:, 1:], frame), dim=1)
+        self._cloud.copy_(torch.where(self._fresh.view(-1, 1, 1, 1), frame, history))
         groups = {
             "policy": obs.policy_group(x, c.noise, self.generator),
             "proprio": obs.proprio_group(x, c, self.generator),
             "perception": self._cloud,
             "privileged": obs.privileged_group(x),
         }
-        self._observations = TensorDict(groups, batch_size=[self.num_envs], device=self.device)
+        for name, value in groups.items():
+            if name not in self._observations:
+                self._observations[name] = torch.zeros_like(value)
+            self._observations[name].copy_(value)
 
     def _log(self, reward: Reward, done: Tensor, sound: Tensor) -> dict[str, Tensor]:
         """Means over worlds of this step, by name; scalars on the device, so that nothing waits for them.

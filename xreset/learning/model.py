@@ -7,6 +7,7 @@ sequences), L steps of a sequence, H history, P points, D flat width.
 from __future__ import annotations
 
 import copy
+import importlib.util
 
 import torch
 from rsl_rl.models import MLPModel
@@ -30,11 +31,18 @@ class PointNet(nn.Module):
         self.mlp = nn.Sequential(*layers)
         self.use_bfloat16 = False
         """Whether to compute in bfloat16 where the clouds are on a GPU; the result is float32 all the same."""
+        self._fusible = activation == "elu" and len(dims) == 3
 
     def forward(self, cloud: Tensor) -> Tensor:
         """[..., P, 3] -> [..., dims[-1]]."""
         if not (self.use_bfloat16 and cloud.is_cuda):
             return self.mlp(cloud).amax(dim=-2)
+        linear = [layer for layer in self.mlp if isinstance(layer, nn.Linear)]
+        if self._fusible and importlib.util.find_spec("triton") is not None:
+            from xreset.learning import fused
+
+            if fused.supports(cloud.shape[-2], tuple(layer.out_features for layer in linear)):
+                return fused.fused_pointnet(cloud, *(parameter for layer in linear for parameter in (layer.weight, layer.bias)))
         with torch.autocast("cuda", dtype=torch.bfloat16):
             return self.mlp(cloud).amax(dim=-2).float()
 

@@ -157,7 +157,8 @@ class _Log:
         self._returns, self._lengths = torch.zeros(num_envs, device=device), torch.zeros(num_envs, device=device)
         self._finished = torch.zeros(3, device=device)  # sum of returns, sum of lengths, number of episodes
         self._recent: deque[list[float]] = deque(maxlen=20)
-        self._sums: dict[str, Tensor] = {}
+        self._names: tuple[str, ...] = ()
+        self._sums: Tensor | None = None
         self._steps = 0
         self._console = Console()
         self._total = total
@@ -181,13 +182,14 @@ class _Log:
         self._finished += torch.stack(((self._returns * ended).sum(), (self._lengths * ended).sum(), ended.sum()))
         self._returns *= 1 - ended
         self._lengths *= 1 - ended
-        for name, value in log.items():
-            self._sums[name] = self._sums.get(name, 0.0) + value
+        self._names, values = tuple(log), torch.stack(list(log.values()))
+        self._sums = values if self._sums is None else self._sums + values
         self._steps += 1
 
     def write(self, runner: TrainingRunner, losses: dict[str, float], *, collect: float, learn: float) -> None:
         it, alg = runner.iteration, runner.alg
-        means = {name: float(value) / self._steps for name, value in self._sums.items()}
+        assert self._sums is not None, "an iteration has at least one step"
+        means = dict(zip(self._names, (self._sums / self._steps).tolist(), strict=True))
         self._recent.append(self._finished.tolist())
         returns, lengths, episodes = (sum(column) for column in zip(*self._recent, strict=True))
         fps = self._steps * runner.env.num_envs * runner.gpu_world_size / (collect + learn)
@@ -212,7 +214,7 @@ class _Log:
             self._last_line = time.monotonic()
             print(f"iteration {it}/{self._total}  {text}", flush=True)
         self._finished.zero_()
-        self._sums, self._steps = {}, 0
+        self._sums, self._steps = None, 0
 
     def close(self, *, stopped: bool) -> None:
         self._progress.stop()

@@ -14,8 +14,7 @@ def pair_friction(material: Tensor, c: RandomizationConfig) -> Tensor:
     Args:
         material: [M] the object material's coefficient. A pair's coefficient is the mean of its two materials.
     """
-    others = torch.tensor([c.elastomer, c.metal, c.table], dtype=material.dtype, device=material.device)
-    return (material[:, None] + others) / 2
+    return torch.stack([(material + other) / 2 for other in (c.elastomer, c.metal, c.table)], dim=-1)
 
 
 def sample_friction(count: int, c: RandomizationConfig, generator: torch.Generator) -> Tensor:

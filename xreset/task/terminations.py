@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from xreset.spec import TableSpec
@@ -15,9 +14,8 @@ def out_of_bounds(object_pos: Tensor, table: TableSpec, c: TerminationConfig) ->
     Args:
         object_pos: [N, 3] origin of the object, world frame.
     """
-    center = torch.tensor(table.center, dtype=object_pos.dtype, device=object_pos.device)
-    half = torch.tensor(table.half_size[:2], dtype=object_pos.dtype, device=object_pos.device) + c.margin
-    beside = ((object_pos[:, :2] - center).abs() > half).any(dim=-1)
+    offset = [(object_pos[:, k] - table.center[k]).abs() > table.half_size[k] + c.margin for k in range(2)]
+    beside = offset[0] | offset[1]
     return beside | (object_pos[:, 2] < c.object_low) | (object_pos[:, 2] > c.object_high)
 
 

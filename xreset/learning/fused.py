@@ -1,0 +1,157 @@
+"""The PointNet as one GPU kernel: a cloud's activations never leave the chip (Triton, bfloat16 products, float32 sums).
+
+The plain layers write some 500 values per point to memory and read them back, forward and backward; that, not arithmetic, is their cost.
+Here one program takes a cloud through all three layers and the maximum. The backward kernel computes the activations anew and starts from
+the points that were the maximum of a channel: no other point has a gradient.
+
+Letters: F clouds, P points, A, B, C widths of the three layers. :class:`xreset.learning.model.PointNet` is the reference.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+FACTORS = torch.bfloat16
+"""Precision of the matrix products' factors. (Triton's interpreter, with which tests run the kernels on a CPU, knows no bfloat16.)"""
+_PROGRAMS_PER_PROCESSOR = 4
+"""Forward programs on each multiprocessor; each loops over clouds and loads the weights once."""
+
+
+@triton.jit
+def _elu(x):
+    return tl.where(x > 0, x, tl.exp(tl.minimum(x, 0.0)) - 1.0)
+
+
+@triton.jit
+def _elu_slope(x, activated):
+    return tl.where(x > 0, 1.0, activated + 1.0)
+
+
+@triton.jit
+def _first_layer(cloud, frame, w1, b1, P: tl.constexpr, A: tl.constexpr):
+    """The points' coordinates [P] each and the first layer before its activation [P, A]: three multiplications, no matrix product."""
+    p, a = tl.arange(0, P), tl.arange(0, A)
+    at = cloud + frame * (3 * P) + p * 3
+    x, y, z = tl.load(at), tl.load(at + 1), tl.load(at + 2)
+    wx, wy, wz = tl.load(w1 + a * 3), tl.load(w1 + a * 3 + 1), tl.load(w1 + a * 3 + 2)
+    sums = x[:, None] * wx[None, :] + y[:, None] * wy[None, :] + z[:, None] * wz[None, :] + tl.load(b1 + a)[None, :]
+    return x, y, z, sums
+
+
+@triton.jit
+def _forward(
+    cloud, w1, b1, w2, b2, w3, b3, out, winner, frames, P: tl.constexpr, A: tl.constexpr, B: tl.constexpr, C: tl.constexpr,
+):  # fmt: skip
+    a, b, c = tl.arange(0, A), tl.arange(0, B), tl.arange(0, C)
+    second = tl.load(w2 + b[None, :] * A + a[:, None])  # [A, B], in the factors' precision
+    third = tl.load(w3 + c[None, :] * B + b[:, None])  # [B, C]
+    bias2, bias3 = tl.load(b2 + b), tl.load(b3 + c)
+    for frame in range(tl.program_id(0), frames, tl.num_programs(0)):
+        _, _, _, z1 = _first_layer(cloud, frame, w1, b1, P, A)
+        z2 = tl.dot(_elu(z1).to(second.dtype), second) + bias2[None, :]
+        z3 = tl.dot(_elu(z2).to(second.dtype), third)
+        best, point = tl.max(z3, axis=0, return_indices=True)
+        at = frame * C + c
+        tl.store(out + at, best + bias3)
+        tl.store(winner + at, point.to(tl.int16))
+
+
+@triton.jit
+def _backward(
+    cloud, w1, b1, w2, b2, w3, gradient, winner, d1, d2, db2, d3, frames,
+    P: tl.constexpr, A: tl.constexpr, B: tl.constexpr, C: tl.constexpr,
+):  # fmt: skip
+    """One partial sum of every weight's gradient per program: d1 [4, A] (x, y, z, bias), d2 [A, B], db2 [B], d3 [B, C]."""
+    a, b, c, p = tl.arange(0, A), tl.arange(0, B), tl.arange(0, C), tl.arange(0, P)
+    second = tl.load(w2 + b[None, :] * A + a[:, None])  # [A, B]
+    second_t = tl.load(w2 + b[:, None] * A + a[None, :])  # [B, A]
+    third_t = tl.load(w3 + c[:, None] * B + b[None, :])  # [C, B]
+    bias2 = tl.load(b2 + b)
+    sum_x, sum_y, sum_z, sum_1 = tl.zeros([A], tl.float32), tl.zeros([A], tl.float32), tl.zeros([A], tl.float32), tl.zeros([A], tl.float32)
+    sum_2, sum_b2, sum_3 = tl.zeros([A, B], tl.float32), tl.zeros([B], tl.float32), tl.zeros([B, C], tl.float32)
+    for frame in range(tl.program_id(0), frames, tl.num_programs(0)):
+        x, y, z, z1 = _first_layer(cloud, frame, w1, b1, P, A)
+        a1 = _elu(z1)
+        a1_low = a1.to(second.dtype)
+        z2 = tl.dot(a1_low, second) + bias2[None, :]
+        a2 = _elu(z2)
+        at = frame * C + c
+        g3 = tl.where(tl.load(winner + at).to(tl.int32)[None, :] == p[:, None], tl.load(gradient + at)[None, :], 0.0).to(second.dtype)
+        sum_3 = tl.dot(tl.trans(a2.to(second.dtype)), g3, sum_3)
+        g2 = tl.dot(g3, third_t) * _elu_slope(z2, a2)
+        g2_low = g2.to(second.dtype)
+        sum_b2 += tl.sum(g2, axis=0)
+        sum_2 = tl.dot(tl.trans(a1_low), g2_low, sum_2)
+        g1 = tl.dot(g2_low, second_t) * _elu_slope(z1, a1)
+        sum_x += tl.sum(g1 * x[:, None], axis=0)
+        sum_y += tl.sum(g1 * y[:, None], axis=0)
+        sum_z += tl.sum(g1 * z[:, None], axis=0)
+        sum_1 += tl.sum(g1, axis=0)
+    program = tl.program_id(0)
+    tl.store(d1 + program * 4 * A + a, sum_x)
+    tl.store(d1 + program * 4 * A + A + a, sum_y)
+    tl.store(d1 + program * 4 * A + 2 * A + a, sum_z)
+    tl.store(d1 + program * 4 * A + 3 * A + a, sum_1)
+    tl.store(d2 + program * A * B + a[:, None] * B + b[None, :], sum_2)
+    tl.store(db2 + program * B + b, sum_b2)
+    tl.store(d3 + program * B * C + b[:, None] * C + c[None, :], sum_3)
+
+
+class _FusedPointNet(torch.autograd.Function):
+    """(cloud [F, P, 3], weights and biases of three layers) -> [F, C]. Clouds are observations: they get no gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, cloud: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor) -> Tensor:
+        frames, points, _ = cloud.shape
+        sizes = {"P": points, "A": len(w1), "B": len(w2), "C": len(w3)}
+        if cloud.numel() >= 2**31:
+            raise ValueError(f"{frames} clouds of {points} points are more than the kernels can address at once; pass fewer")
+        low2, low3 = w2.to(FACTORS), w3.to(FACTORS)
+        out = torch.empty(frames, len(w3), device=cloud.device)
+        winner = torch.empty(frames, len(w3), dtype=torch.int16, device=cloud.device)
+        grid = (min(frames, _PROGRAMS_PER_PROCESSOR * _processors(cloud.device)),)
+        _forward[grid](cloud, w1, b1, low2, b2, low3, b3, out, winner, frames, **sizes, num_warps=4)
+        ctx.save_for_backward(cloud, w1, b1, low2, b2, low3, winner)
+        ctx.sizes = sizes
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        cloud, w1, b1, low2, b2, low3, winner = ctx.saved_tensors
+        gradient = gradient.contiguous()
+        programs = min(len(cloud), _processors(cloud.device))
+        a, b, c = len(w1), len(low2), len(low3)
+
+        def partial(*shape: int) -> Tensor:
+            return torch.empty(programs, *shape, device=cloud.device)
+
+        d1, d2, db2, d3 = partial(4, a), partial(a, b), partial(b), partial(b, c)
+        _backward[(programs,)](cloud, w1, b1, low2, b2, low3, gradient, winner, d1, d2, db2, d3, len(cloud), **ctx.sizes, num_warps=8)
+        first = d1.sum(dim=0)
+        return None, first[:3].T, first[3], d2.sum(dim=0).T, db2.sum(dim=0), d3.sum(dim=0).T, gradient.sum(dim=0)
+
+
+@functools.cache
+def _processors(device: torch.device) -> int:
+    """Multiprocessors of a GPU; 2 elsewhere, where Triton's interpreter runs the programs one after the other."""
+    return torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 2
+
+
+def supports(points: int, widths: tuple[int, ...]) -> bool:
+    """Whether the kernels can take clouds of that many points through layers of these widths: three of them, powers of two."""
+    return len(widths) == 3 and all(n >= 16 and n & (n - 1) == 0 for n in (points, *widths)) and max(widths) <= 128 and points <= 128
+
+
+def fused_pointnet(cloud: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor) -> Tensor:
+    """Embed clouds [..., P, 3] as [..., C]: layers 3 -> A -> B -> C (weights as of ``nn.Linear``) with ELU between, maximum over points.
+
+    Matrix products take bfloat16 factors: against the plain layers in float32 the result differs by some 1e-3 of its size.
+    """
+    frames = cloud.reshape(-1, *cloud.shape[-2:]).contiguous()
+    return _FusedPointNet.apply(frames, w1, b1, w2, b2, w3, b3).reshape(*cloud.shape[:-2], -1)  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]

@@ -266,8 +266,8 @@ class TheSuiteCanFail(unittest.TestCase):
                 super().__init__(scene, object_index)
                 self._model.actuator_forcelimited[:] = 0
 
-        self.assert_red(NoArmature, "drive_response")
-        self.assert_red(NoLimit, "drive_response")
+        self.assert_red(NoArmature, "drive_equation")
+        self.assert_red(NoLimit, "drive_equation")
 
     def test_hidden_broken_world(self):
         class World(MujocoWorld):

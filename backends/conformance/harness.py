@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Protocol
 
 import numpy as np
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from xreset.backends.base import Backend, State
-from xreset.backends.conformance.results import Measure
+from xreset.backends.conformance.results import Measure, Skipped
 from xreset.backends.conformance.scene import gripper
 from xreset.backends.pool import initial_state
 from xreset.kinematics import Kinematics
@@ -25,6 +25,12 @@ class MakeBackend(Protocol):
     def __call__(self, scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None) -> Backend:
         """Build ``num_worlds`` worlds."""
         ...
+
+
+REFERENCE = "mujoco"
+"""Backend that others are compared with."""
+REFINEMENT = 8
+"""How much finer the steps are of the reference that the reference is compared with."""
 
 
 class Bench:
@@ -75,11 +81,30 @@ class Bench:
         finally:
             backend.close()
 
+    @contextmanager
+    def reference(self, scene: SceneSpec, num_worlds: int, object_index: Tensor | None = None) -> Iterator[tuple[Backend, int]]:
+        """The same worlds in the reference engine, and how many of its steps make one step of the scene.
+
+        The reference itself, if it is what is tested, is compared with finer steps of its own.
+        """
+        from xreset.backends.registry import backend_status, make_backend
+
+        status = backend_status(REFERENCE)
+        if status.reason is not None:
+            raise Skipped(f"it compares with the reference engine: {status.reason}")
+        finer = REFINEMENT if self.backend().name == REFERENCE else 1
+        scene = replace(scene, timestep=scene.timestep / finer)
+        with make_backend(REFERENCE, scene, num_worlds, object_index=object_index, workers=0) as backend:
+            yield backend, finer
+
     def start(self, device: torch.device | str = "cpu") -> State:
         """[N] initial states, the object resting where the robot is not."""
-        state = start_state(self.scene, self.object_index)
-        place = torch.tensor(self.place, dtype=torch.float32)
-        return replace_fields(state, object_pos=torch.cat((place.expand(self.NUM_WORLDS, 2), state.object_pos[:, 2:]), dim=1)).to(device)
+        return self.placed(start_state(self.scene, self.object_index)).to(device)
+
+    def placed(self, state: State) -> State:
+        """The same states with the object moved to where the robot is not, at the same height."""
+        place = torch.tensor(self.place, dtype=torch.float32).expand(len(state.object_pos), 2)
+        return replace_fields(state, object_pos=torch.cat((place, state.object_pos[:, 2:]), dim=1))
 
     @property
     def place(self) -> tuple[float, float]:
@@ -118,6 +143,13 @@ def snapshot(state: State) -> State:
 def largest(difference: Tensor) -> float:
     """The largest absolute value; NaN if there is one."""
     return float(difference.detach().abs().double().max()) if difference.numel() else 0.0
+
+
+def rotation_angle(a: Tensor, b: Tensor) -> Tensor:
+    """[...] angle between the orientations of unit quaternions [..., 4]: precise for small ones, where the arc cosine is not."""
+    (aw, av), (bw, bv) = (q.split((1, 3), dim=-1) for q in (a.double(), b.double()))
+    vector = aw * bv - bw * av - torch.linalg.cross(av, bv)  # of conjugate(a) b
+    return 2.0 * torch.atan2(vector.norm(dim=-1), (a.double() * b.double()).sum(-1).abs())
 
 
 def compare_states(found: State, expected: State, tolerances: Mapping[str, tuple[float, str]]) -> list[Measure]:

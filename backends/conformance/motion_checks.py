@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from xreset.backends.conformance.harness import Bench, largest, replace_fields, snapshot
 from xreset.backends.conformance.results import Check, Measure
 from xreset.spec import GRAVITY, ObjectSpec
-from xreset.urdf import robot_tree
 
 _HEIGHT = 1.5  # m, above everything
 _STEPS = 24
@@ -117,39 +116,6 @@ def object_wrench(bench: Bench) -> list[Measure]:
     ]
 
 
-def drive_response(bench: Bench) -> list[Measure]:
-    """Step the target of the vertical slide and compare with the drive's differential equation, effort limit and armature included.
-
-    (m + armature) x'' = clip(kp (target - x) - kd x', effort). The robot's weight is compensated, so it does not appear.
-    """
-    robot = bench.scene.robot
-    index = robot.joint_names.index("lift")
-    drive = robot.joints[index].drive
-    tree = robot_tree(robot)
-    carried = sum(tree.link(name).mass for name in ("carriage", "wrist", "palm", "jaw_a", "jaw_b", "finger_b"))
-    steps = torch.tensor([0.01, -0.01, 0.08, -0.08])  # the last two run into the effort limit
-    backend = bench.backend()
-    target = bench.start().joint_pos.clone()
-    target[:, index] += steps
-    backend.set_joint_targets(target.to(backend.device))
-    found = []
-    for _ in range(12):
-        backend.step(4)
-        found.append(snapshot(backend.state()).joint_pos[:, index].double().numpy())
-    times = 4 * bench.scene.timestep * np.arange(1, 13)
-    measures = []
-    for i, step in enumerate(steps.tolist()):
-
-        def motion(_, y: np.ndarray, goal: float = step) -> list[float]:
-            effort = np.clip(drive.kp * (goal - y[0]) - drive.kd * y[1], -drive.effort, drive.effort)
-            return [y[1], effort / (carried + drive.armature)]
-
-        exact = solve_ivp(motion, (0.0, times[-1]), [0.0, 0.0], t_eval=times, rtol=1e-6, atol=1e-9, max_step=1e-3).y[0]
-        error = np.abs(np.array([x[i] for x in found]) - robot.joints[index].home - exact).max() / abs(step)
-        measures.append(Measure(what=f"step of {step:+.2f} m", measured=float(error), tolerance=0.06, unit="of the step"))
-    return measures
-
-
 def _in_the_air(bench: Bench):
     return replace_fields(bench.start(), object_pos=torch.tensor([*bench.place, _HEIGHT]))
 
@@ -192,13 +158,5 @@ CHECKS = (
         cause="the force acts at the mesh-frame origin, is cleared after one step, or survives the state; or inertia ignores the mass",
         run=object_wrench,
         capabilities=("object_wrench",),
-    ),
-    Check(
-        name="drive_response",
-        group="object",
-        statement="a drive is a PD position drive with effort limit and armature",
-        cause="gains are scaled, armature or effort limit are missing, joint damping or friction is added, or gravity is not compensated",
-        run=drive_response,
-        own_robot_only=True,
     ),
 )

@@ -5,7 +5,7 @@ The file that ``xreset conformance --json`` writes (schema :data:`SCHEMA`)::
     {"schema": ..., "xreset_version": ..., "command": ...,
      "runs": [{"engine", "engine_version", "robot", "device", "capabilities": [...], "seconds",
                "checks": [{"check", "group", "statement", "cause", "verdict", "problem", "seconds",
-                           "measures": [{"what", "measured", "tolerance", "unit", "verdict", "bound", "reason"}]}]}]}
+                           "measures": [{"what", "measured", "tolerance", "unit", "where", "verdict", "bound", "reason"}]}]}]}
 
 A check's verdict is passed, known difference, failed, unsupported (the backend states that it lacks the capability, and refuses as the
 contract asks) or skipped (it cannot be done here: ``problem`` says why). A measure's is one of the first three; ``bound`` and ``reason``
@@ -43,6 +43,8 @@ class Measure:
     """Distance from what it should be."""
     tolerance: float
     unit: str = ""
+    where: str = ""
+    """Such as the joint or the object that came out worst."""
     known: KnownDifference | None = None
     """What the backend declares about it."""
 
@@ -62,6 +64,7 @@ class Measure:
             "measured": self.measured if math.isfinite(self.measured) else str(self.measured),
             "tolerance": self.tolerance,
             "unit": self.unit,
+            "where": self.where,
             "verdict": self.verdict,
             "bound": None if self.known is None else self.known.bound,
             "reason": "" if self.known is None else self.known.reason,

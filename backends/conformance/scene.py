@@ -23,6 +23,7 @@ from xreset.spec import (
     SceneSpec,
     Shape,
 )
+from xreset.urdf import robot_tree
 
 
 @cache
@@ -81,6 +82,12 @@ def objects() -> tuple[ObjectSpec, ...]:
 def scene(robot: RobotSpec | None = None) -> SceneSpec:
     """The suite's scene: its own robot or another one, and its three objects."""
     return SceneSpec(robot=robot or gripper(), objects=objects(), friction=PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002))
+
+
+def without_collisions(scene: SceneSpec) -> SceneSpec:
+    """The same scene with a robot whose links touch neither one another nor the table."""
+    robot = scene.robot
+    return replace(scene, robot=replace(robot, self_collision_links=(), table_exclude=robot_tree(robot).link_names))
 
 
 def reorder_joints(scene: SceneSpec) -> SceneSpec:

@@ -111,7 +111,7 @@ def joint_order(bench: Bench) -> list[Measure]:
         measures = link_measures(kinematics, state, links)[:2]
         measures += compare_states(snapshot(backend.state()), state, {name: ROUND_TRIP[name] for name in ("joint_pos", "joint_vel")})
 
-        start = _at_place(bench, start_state(scene, which)).to(backend.device)
+        start = bench.placed(start_state(scene, which)).to(backend.device)
         motion = _small_motion(kinematics).to(backend.device)
         backend.set_state(start)
         backend.set_joint_targets(start.joint_pos + torch.diag(motion))  # world i moves joint i
@@ -205,7 +205,7 @@ def objects_in_a_batch(bench: Bench) -> list[Measure]:
     for i, thing in enumerate(bench.scene.objects):
         which = torch.tensor([i])
         with bench.other(bench.scene, 1, object_index=which) as alone:
-            alone.set_state(drop(_at_place(bench, start_state(bench.scene, which))).to(alone.device))
+            alone.set_state(drop(bench.placed(start_state(bench.scene, which))).to(alone.device))
             alone.step(48)
             state = snapshot(alone.state())
             force = alone.contacts().table_force[0, 2].cpu()
@@ -254,11 +254,6 @@ def _small_motion(kinematics: Kinematics) -> Tensor:
     lower, upper = kinematics.lower.clamp_min(-3.0), kinematics.upper.clamp_max(3.0)
     step = 0.05 * (upper - lower)
     return torch.where(home > (lower + upper) / 2, -step, step).float()
-
-
-def _at_place(bench: Bench, state: State) -> State:
-    place = torch.tensor(bench.place).expand(len(state.object_pos), 2)
-    return replace_fields(state, object_pos=torch.cat((place, state.object_pos[:, 2:]), dim=1))
 
 
 CHECKS = (

@@ -44,6 +44,10 @@ class Motion:
     frequency: float = 2.5
     """Of the shake [Hz]; it grows from nothing and fades again."""
 
+    def closing_steps(self, dt: float) -> int:
+        """Control steps of :func:`closing_episode` before the lift begins."""
+        return sum(round(seconds / dt) for seconds in (self.settle, self.close, self.hold))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
@@ -58,9 +62,9 @@ class Episode:
         """T"""
         return len(self.targets)
 
-    def __getitem__(self, worlds: Tensor) -> Episode:
-        """The episode of some grasps."""
-        return Episode(start=self.start[worlds], targets=self.targets[:, worlds])
+    def first(self, steps: int) -> Episode:
+        """Its first control steps."""
+        return Episode(start=self.start, targets=self.targets[:steps])
 
 
 def closing_episode(

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from xreset.errors import RobotError
-from xreset.spec import KEYPOINTS, DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
+from xreset.spec import KEYPOINTS, DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, PlacementSpec, RobotSpec
 
 GROUP = "xreset.robots"
 """Entry-point group: ``name = "package.module"``."""
@@ -109,6 +109,7 @@ def _robot(top: _Table, path: Path) -> RobotSpec:
         mimics=tuple(_mimic(row) for row in top.rows("mimics", optional=True)),
         base_pos=base.numbers("pos", 3),
         base_quat=base.numbers("quat", 4),
+        placement=_placement(base.table("placement")) if "placement" in base.data else None,
         palm=hand.text("palm"),
         hand_root=hand.text("root"),
         fingertips=tuple(_fingertip(row) for row in top.rows("fingertips")),
@@ -143,6 +144,10 @@ def _mimic(row: _Table) -> MimicSpec:
     return MimicSpec(
         joint=row.text("joint"), source=row.text("source"), multiplier=row.number("multiplier", 1.0), offset=row.number("offset", 0.0)
     )
+
+
+def _placement(row: _Table) -> PlacementSpec:
+    return PlacementSpec(reached=row.number("reached"), frames=int(row.number("frames")), command=row.text("command"))
 
 
 def _fingertip(row: _Table) -> FingertipSpec:

@@ -109,6 +109,18 @@ class KeypointSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlacementSpec:
+    """How good a robot's base placement is, and how it was found (``xreset robots place``)."""
+
+    reached: float
+    """Share of wrist poses that the arm reaches, each on its own."""
+    frames: int
+    """Number of those wrist poses."""
+    command: str
+    """What found it."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RobotSpec:
     """A robot: a URDF and one small typed description. See :func:`xreset.robots.load`."""
 
@@ -142,6 +154,8 @@ class RobotSpec:
     """Whether the robot's own weight is taken off (as an arm's controller does); the object's load stays."""
     home_std: tuple[float, float] = (0.075, 0.10)
     """Spread of the home configuration: standard deviation of arm and hand joints [rad], the paper's Table IX."""
+    placement: PlacementSpec | None = field(default=None, repr=False)
+    """Where ``base_pos`` and ``base_quat`` come from, if a search found them; no part of the :attr:`fingerprint`."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:

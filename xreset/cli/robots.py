@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from xreset.errors import RobotError
+from xreset.robots.placement import PlaceConfig, Placement, Reach
 
 
 def list_robots() -> None:
@@ -71,4 +72,72 @@ def check(
         raise SystemExit(1)
 
 
-COMMAND = {"list": list_robots, "check": check}
+def place(
+    robot: Annotated[str, tyro.conf.Positional],
+    /,
+    *,
+    demos: Path,
+    objects: Path | None = None,
+    max_per_object: int = 4,
+    write: bool = False,
+    search: PlaceConfig = PlaceConfig(),  # noqa: B008  tyro reads flags from the default
+) -> None:
+    """Find the place of a robot's base from which its arm reaches most wrist poses of demonstrations.
+
+    Args:
+        robot: name of a registered robot, or a folder with a robot.toml.
+        demos: archive of demonstrations (see `xreset demos`).
+        objects: folder of real meshes; default: the built-in stand-ins.
+        max_per_object: only the first so many sequences of each object.
+        write: put the placement, its home and its figure into the robot's robot.toml.
+        search: ranges and effort.
+    """
+    import shlex
+
+    import numpy as np
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from xreset import robots
+    from xreset.demos import demo_objects, read_demos
+    from xreset.retarget.pipeline import RetargetConfig, rest_on_table, wrist_paths
+    from xreset.robots.place import place as search_place
+    from xreset.robots.place import single_frames
+    from xreset.robots.placement import write_placement
+    from xreset.robots.registry import DESCRIPTION, robot_folder
+
+    console = Console()
+    spec = robots.load(robot)
+    chosen = read_demos(demos).select(max_per_object=max_per_object)
+    specs = list(demo_objects(chosen, objects).values())
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("hand retargeting", total=chosen.num_sequences)
+        paths = wrist_paths(chosen, spec, specs, progress=lambda done, total: bar.update(task, completed=done, total=total))
+        wrists = single_frames(paths, RetargetConfig().thresholds.hand_error)
+        avoid = np.concatenate((wrists.root_pos[:, 0].numpy(), rest_on_table(chosen, specs).object_pos))
+        task = bar.add_task("placements", total=1.0)
+
+        def report(done: float, placement: Placement, reach: Reach) -> None:
+            bar.update(task, completed=done, description=f"placements (best yet: {reach.reached:.0%})")
+
+        found = search_place(spec, wrists, avoid, search, report)
+    lines = (
+        ("as described", Placement(pos=spec.base_pos, quat=spec.base_quat), found.own_reach),
+        ("best found", found.best, found.best_reach),
+    )
+    for title, placement, reach in lines:
+        pos, quat = (", ".join(f"{v:.4f}" for v in values) for values in (placement.pos, placement.quat))
+        console.print(
+            f"{title:12}  pos [{pos}], quat [{quat}]: reaches {reach.reached:.1%}, dexterity {reach.dexterity:.3f}", highlight=False
+        )
+    if found.home is not None:
+        console.print(f"{'its home':12}  {', '.join(f'{v:.3f}' for v in found.home)}", highlight=False)
+    console.print(f"of {found.frames} wrist poses of {chosen.num_sequences} sequences, each on its own", highlight=False)
+    if write:
+        given = [] if objects is None else ["--objects", objects.name]
+        command = ["xreset", "robots", "place", spec.name, "--demos", demos.name, *given, "--max-per-object", str(max_per_object)]
+        write_placement(robot_folder(robot) / DESCRIPTION, spec, found, shlex.join(command))
+        console.print(f"wrote {robot_folder(robot) / DESCRIPTION}", highlight=False)
+
+
+COMMAND = {"list": list_robots, "check": check, "place": place}

@@ -140,6 +140,34 @@ def retarget(
     )
 
 
+def wrist_paths(
+    demos: Demos,
+    robot: RobotSpec,
+    objects: Sequence[ObjectSpec],
+    config: RetargetConfig | None = None,
+    *,
+    progress: Callable[[float, int], None] = lambda done, total: None,
+) -> list[ArmTargets]:
+    """Hand retargeting alone: what it asks of the arm, in batches of sequences. Arguments and errors as in :func:`retarget`."""
+    config = config or RetargetConfig()
+    by_name = _by_name(demos, objects)
+    demos = rest_on_table(demos, objects)
+    hand, arm = HandModel(robot), ArmModel(robot)
+    surfaces = {name: Surface(spec) for name, spec in by_name.items()}
+    touched, touches = _contacts(demos, surfaces, config.contact_distance)
+    todo = [i for i in range(demos.num_sequences) if demos.hand_valid[demos.frames(i)].any()]
+    paths = []
+    for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
+        sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
+        targets = _hand_targets(demos, hand, sequences, surfaces, touched, touches)
+
+        def report(share: float, start: int = begin, size: int = len(sequences)) -> None:
+            progress(start + share * size, len(todo))
+
+        paths.append(_arm_targets(hand, arm, targets, config.hand, report))
+    return paths
+
+
 def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpec]:
     by_name = {spec.name: spec for spec in objects}
     if missing := sorted(set(demos.object_name.tolist()) - set(by_name)):
@@ -193,16 +221,7 @@ def _solve(
     progress: Callable[[float], None],
 ) -> Batch:
     """Hand, arm and validity of some sequences; ``targets`` are theirs."""
-    motion = retarget_hand(hand, targets, config.hand, lambda share: progress(0.5 * share))
-    error = (motion.keypoints - targets.keypoints)[:, :, torch.as_tensor(hand.is_tip)].norm(dim=-1).mean(-1)
-    arm_targets = ArmTargets(
-        root_pos=motion.root_pos,
-        root_quat=motion.root_quat,
-        hand_joints=motion.joints,
-        annotated=targets.annotated,
-        hand_error=error,
-        hand_clearance=arm.hand_clearance(motion.joints),
-    )
+    arm_targets = _arm_targets(hand, arm, targets, config.hand, lambda share: progress(0.5 * share))
     joints, measures = track(arm, arm_targets, config.thresholds, config.arm, lambda share: progress(0.5 + 0.5 * share))
     lengths = [rows.stop - rows.start for rows in map(demos.frames, sequences)]
 
@@ -210,10 +229,23 @@ def _solve(
         return torch.cat([values[s, :length] for s, length in enumerate(lengths)]).numpy()
 
     return Batch(
-        joint_pos=unpadded(arm.full(joints, motion.joints)),
+        joint_pos=unpadded(arm.full(joints, arm_targets.hand_joints)),
         reason=unpadded(classify(measures, config.thresholds)),
-        hand_error=unpadded(error.masked_fill(~targets.annotated, np.inf)),
+        hand_error=unpadded(arm_targets.hand_error.masked_fill(~targets.annotated, np.inf)),
         wrist_error=unpadded(measures.wrist_position.masked_fill(~targets.annotated, np.inf)),
+    )
+
+
+def _arm_targets(hand: HandModel, arm: ArmModel, targets: HandTargets, config: HandConfig, progress: Callable[[float], None]) -> ArmTargets:
+    """What hand retargeting asks of the arm."""
+    motion = retarget_hand(hand, targets, config, progress)
+    return ArmTargets(
+        root_pos=motion.root_pos,
+        root_quat=motion.root_quat,
+        hand_joints=motion.joints,
+        annotated=targets.annotated,
+        hand_error=(motion.keypoints - targets.keypoints)[:, :, torch.as_tensor(hand.is_tip)].norm(dim=-1).mean(-1),
+        hand_clearance=arm.hand_clearance(motion.joints),
     )
 
 

@@ -1,0 +1,173 @@
+"""Base placement: wrist poses that are within reach by construction are found so, and a robot that stands wrong is moved."""
+
+import dataclasses
+import shutil
+import tempfile
+import unittest
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from xreset import robots
+from xreset.errors import RobotError
+from xreset.retarget.arm import ArmModel, ArmTargets
+from xreset.robots import load, registry
+from xreset.robots.placement import PlaceConfig, Placement, Reach, Search, write_placement
+from xreset.rotations import matrix_to_quat, quat_multiply
+
+try:
+    from xreset.robots import place as placing
+except ImportError as error:
+    raise unittest.SkipTest(str(error)) from error
+
+CONFIG = PlaceConfig(x=(0.2, 0.7), y=(0.4, 0.8), z=(0.4, 0.7), frames=12, final_frames=40, candidates=8, rounds=2, elite=2)
+
+
+def wrists_around_home(robot, count: int) -> ArmTargets:
+    """Hand root poses that the robot takes with arm joints near home: all of them within reach."""
+    model = ArmModel(robot)
+    generator = torch.Generator().manual_seed(0)
+    joints = torch.as_tensor(robot.home).repeat(count, 1)
+    spread = torch.randn(count, len(robot.arm_indices), generator=generator, dtype=joints.dtype)
+    joints[:, model.arm] = (joints[:, model.arm] + 0.15 * spread).clamp(model.lower, model.upper)
+    root = model.kinematics.link_poses(joints, [robot.hand_root])
+    return ArmTargets(
+        root_pos=root[:, :, :3, 3],
+        root_quat=matrix_to_quat(root[:, :, :3, :3]),
+        hand_joints=joints[:, None, robot.hand_indices],
+        annotated=torch.ones(count, 1, dtype=torch.bool),
+        hand_error=torch.zeros(count, 1, dtype=joints.dtype),
+        hand_clearance=torch.ones(count, 1, dtype=joints.dtype),
+    )
+
+
+class PlaceTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.robot = robots.load("openarm")
+        cls.own = Placement(pos=cls.robot.base_pos, quat=cls.robot.base_quat)
+        cls.wrists = wrists_around_home(cls.robot, 60)
+
+    def test_reach_of_poses_within_reach_and_out_of_it(self):
+        here = placing.reach(self.robot, self.own, self.wrists, CONFIG)
+        self.assertGreater(here.reached, 0.95)
+        self.assertGreater(here.dexterity, 0.1)
+        far = Placement(pos=(0.45, 0.6, 3.0), quat=self.robot.base_quat)
+        self.assertEqual(placing.reach(self.robot, far, self.wrists, CONFIG), Reach(reached=0.0, dexterity=0.0))
+
+    def test_reach_moves_with_the_scene(self):
+        """Turned about the vertical together, base and wrists keep their reach; the table's top is everywhere at the same height."""
+        turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+        half = np.sqrt(0.5)
+        quat = torch.tensor([half, 0, 0, half], dtype=torch.float64)
+        moved = dataclasses.replace(
+            self.wrists,
+            root_pos=self.wrists.root_pos @ turn.T,
+            root_quat=quat_multiply(quat.expand_as(self.wrists.root_quat), self.wrists.root_quat),
+        )
+        base = torch.tensor(self.own.pos, dtype=torch.float64)
+        there = Placement(
+            pos=tuple((turn @ base).tolist()), quat=tuple(quat_multiply(quat, torch.tensor(self.own.quat, dtype=torch.float64)).tolist())
+        )
+        here = placing.reach(self.robot, self.own, self.wrists, CONFIG)
+        self.assertAlmostEqual(placing.reach(self.robot, there, moved, CONFIG).reached, here.reached, delta=0.03)
+
+    def test_a_robot_that_stands_wrong_is_moved_to_where_it_reaches(self):
+        lost = dataclasses.replace(self.robot, base_pos=(0.45, 0.6, 3.0))
+        seen = []
+        avoid = self.wrists.root_pos[:, 0].numpy()
+        found = placing.place(lost, self.wrists, avoid, CONFIG, lambda done, placement, reach: seen.append((done, reach.rank)))
+        self.assertEqual(found.own_reach.reached, 0.0)
+        self.assertGreater(found.best_reach.reached, 0.2)
+        self.assertEqual(found.frames, 40)
+        self.assertGreaterEqual(np.linalg.norm(avoid - found.best.pos, axis=1).min(), CONFIG.clear)
+        self.assertEqual(seen, sorted(seen))  # the best yet never gets worse
+        self.assertIsNone(found.home)  # home held the hand three metres up
+
+    def test_the_same_seed_finds_the_same(self):
+        small = dataclasses.replace(CONFIG, candidates=2, rounds=1)
+        first, second = (placing.place(self.robot, self.wrists, np.zeros((0, 3)), small) for _ in range(2))
+        self.assertEqual(first.best, second.best)
+        self.assertEqual(first.own_reach, second.own_reach)
+
+    def test_home_holds_the_hand_where_it_did(self):
+        near = Placement(pos=(0.46, 0.61, 0.56), quat=self.robot.base_quat)
+        home = placing._home(self.robot, near)
+        moved = dataclasses.replace(self.robot, base_pos=near.pos)
+        q = torch.tensor(self.robot.home)
+        before = ArmModel(self.robot).kinematics.link_poses(q, ["palm"])
+        q[self.robot.arm_indices] = torch.as_tensor(home)
+        torch.testing.assert_close(ArmModel(moved).kinematics.link_poses(q, ["palm"]), before, atol=5e-3, rtol=0)
+
+    def test_nothing_to_reach_is_an_error(self):
+        none = ArmTargets(**{name: value[:0] for name, value in vars(self.wrists).items()})
+        with self.assertRaisesRegex(RobotError, "no frame to reach"):
+            placing.place(self.robot, none, np.zeros((0, 3)), CONFIG)
+
+    def test_parameters_of_a_placement_come_back(self):
+        rng = np.random.default_rng(0)
+        for _ in range(20):
+            placement = placing._placement(
+                np.array([*rng.uniform(-1, 1, 3), rng.uniform(-180, 180), rng.uniform(0, 180), rng.uniform(-180, 180)])
+            )
+            again = placing._placement(placing._parameters(placement))
+            np.testing.assert_allclose(again.pos, placement.pos)
+            self.assertAlmostEqual(abs(np.dot(again.quat, placement.quat)), 1.0, places=9)
+
+    def test_single_frames_are_those_that_the_hand_follows(self):
+        path = ArmTargets(**{name: value.view(3, 20, *value.shape[2:]) for name, value in vars(self.wrists).items()})
+        error = torch.zeros(3, 20, dtype=torch.float64)
+        error[0, 3] = 0.05
+        annotated = torch.ones(3, 20, dtype=torch.bool)
+        annotated[2, 19] = False
+        frames = placing.single_frames([dataclasses.replace(path, hand_error=error, annotated=annotated)], 0.03)
+        self.assertEqual(frames.root_pos.shape, (58, 1, 3))
+        torch.testing.assert_close(frames.root_pos[3], self.wrists.root_pos[4])
+
+
+class WritePlacementTest(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name) / "arm"
+        shutil.copytree(registry.robot_folder("openarm"), self.folder)
+        self.file = self.folder / registry.DESCRIPTION
+        self.found = Search(
+            best=Placement(pos=(0.1, 0.2, 0.3), quat=(0.6, 0.0, 0.8, 0.0)),
+            best_reach=Reach(reached=0.912345, dexterity=0.5),
+            own_reach=Reach(reached=0.5, dexterity=0.5),
+            home=np.linspace(-0.3, 0.4, 7),
+            frames=321,
+        )
+
+    def test_the_description_reads_back(self):
+        before = load(self.folder)
+        for _ in range(2):  # the second one replaces the first
+            write_placement(self.file, before, self.found, 'xreset robots place openarm --demos "my demos.npz"')
+            after = load(self.folder)
+            self.assertEqual((after.base_pos, after.base_quat), (self.found.best.pos, self.found.best.quat))
+            np.testing.assert_allclose(after.home[after.arm_indices], self.found.home, atol=1e-3)
+            np.testing.assert_allclose(after.home[after.hand_indices], before.home[before.hand_indices])
+            self.assertEqual((after.placement.reached, after.placement.frames), (0.9123, 321))
+            self.assertIn('"my demos.npz"', after.placement.command)
+        self.assertEqual([joint.drive for joint in after.joints], [joint.drive for joint in before.joints])
+
+    def test_the_figure_is_no_part_of_the_fingerprint(self):
+        before = load(self.folder)
+        stated = dataclasses.replace(before, placement=None).fingerprint
+        self.file.write_text(self.file.read_text().replace("[base]", "[base]\nplacement = { reached = 0.5, frames = 3, command = 'x' }", 1))
+        self.assertEqual(load(self.folder).fingerprint, stated)
+        self.assertEqual(load(self.folder).placement.frames, 3)
+
+    def test_refusals(self):
+        robot = load(self.folder)
+        with self.assertRaisesRegex(RobotError, "choose a home by hand"):
+            write_placement(self.file, robot, dataclasses.replace(self.found, home=None), "x")
+        self.file.write_text(self.file.read_text().replace("pos = [", "position = ["))
+        with self.assertRaisesRegex(RobotError, "edit it by hand"):
+            write_placement(self.file, robot, self.found, "x")
+
+
+if __name__ == "__main__":
+    unittest.main()

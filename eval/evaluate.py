@@ -17,7 +17,7 @@ from xreset.errors import FileFormatError, PolicyError
 from xreset.eval.baselines import KinematicRetargeting
 from xreset.eval.results import summarize, write_results
 from xreset.eval.rollout import roll_out
-from xreset.files import file_hash
+from xreset.files import file_hash, npz_schema
 from xreset.objects import load_objects
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
 from xreset.resets.bank import ResetBank, check_robot
@@ -102,7 +102,7 @@ def load_motion(path: Path, robot: RobotSpec, objects_folder: Path | None, *, tr
         objects_folder: folder of meshes; None: stand-ins.
         trajectories: whether robot trajectories are needed; demonstrations are then retargeted here.
     """
-    schema = _schema_of(path)
+    schema = npz_schema(path)
     if schema == RETARGETED:
         data = read_retargeted(path)
         names = tuple(data.joint_names)
@@ -189,16 +189,6 @@ def evaluate(
 def _given(trajectories: Retargeted | None) -> Retargeted:
     assert trajectories is not None, "the ik baseline needs trajectories"
     return trajectories
-
-
-def _schema_of(path: Path) -> str | None:
-    if not path.is_file():
-        raise FileFormatError(f"there is no {path} (demonstrations or retargeted trajectories).")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return str(file["schema"]) if "schema" in file.files else None
-    except Exception as error:
-        raise FileFormatError(f"{path} cannot be read as an npz file: {error}. It is damaged, truncated, or something else.") from error
 
 
 def _starts_and_goals(robot: RobotSpec, names: Any, object_names: Any, offsets: np.ndarray, motion: Any) -> ResetBank:

@@ -157,6 +157,21 @@ def read_npz(
     return arrays
 
 
+def npz_schema(path: str | Path) -> str:
+    """The schema that an npz file states; its reader checks all the rest.
+
+    Raises:
+        FileFormatError: it is no npz file, or states none.
+    """
+    path = Path(path)
+    _must_exist(path, "npz file")
+    try:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+            return str(file["schema"])
+    except Exception as error:  # zlib.error and others from damaged members
+        raise FileFormatError(f"{path} is not one of xreset's npz files, or it is damaged ({error}). Is it the right file?") from error
+
+
 def meta_of(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Provenance of a file read with :func:`read_npz`: ``{"xreset", "config", "inputs"}``; empty if it has none."""
     return json.loads(str(arrays["meta"])) if "meta" in arrays else {}

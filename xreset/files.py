@@ -164,7 +164,8 @@ def npz_schema(path: str | Path) -> str:
         FileFormatError: it is no npz file, or states none.
     """
     path = Path(path)
-    _must_exist(path, "npz file")
+    if not path.is_file():
+        raise FileFormatError(f"there is no file {path}. Check the path, or make the file first.")
     try:
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             return str(file["schema"])

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from xreset.backends.base import Backend
-from xreset.backends.conformance.harness import MakeBackend
 from xreset.backends.parity.grasps import Frames, Grasps, find_grasps
 from xreset.backends.parity.metrics import (
     Metric,
@@ -26,6 +25,7 @@ from xreset.backends.parity.trials import (
     Closings,
     CommonStates,
     Engine,
+    MakeBackend,
     ParityConfig,
     common_states,
     engine,
@@ -231,7 +231,7 @@ def _surface(objects: Sequence[ObjectSpec], object_index: Tensor) -> Tensor:
 
 
 def _at_half_timestep(make: MakeBackend) -> MakeBackend:
-    def finer(scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None) -> Backend:
-        return make(replace(scene, timestep=scene.timestep / 2, substeps=2 * scene.substeps), num_worlds, object_index=object_index)
+    def finer(scene: SceneSpec, num_worlds: int, object_index: Tensor) -> Backend:
+        return make(replace(scene, timestep=scene.timestep / 2, substeps=2 * scene.substeps), num_worlds, object_index)
 
     return finer

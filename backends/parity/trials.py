@@ -5,7 +5,7 @@ Shape letters: G grasps (one per world), M moved or chosen ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -14,12 +14,14 @@ import torch
 from torch import Tensor
 
 from xreset.backends.base import Backend, State
-from xreset.backends.conformance.harness import MakeBackend
 from xreset.backends.parity.episodes import Motion, closing_episode, holding_episode, lifting_episode, squeezing_state
 from xreset.backends.parity.grasps import Grasps
 from xreset.backends.parity.recording import Recording, play
 from xreset.backends.registry import backend_class, make_backend
 from xreset.spec import RobotSpec, SceneSpec
+
+MakeBackend = Callable[[SceneSpec, int, Tensor], Backend]
+"""Builds worlds of a scene: how many, and which object each holds [G]."""
 
 SAME_EQUATIONS = frozenset({"mujoco-warp"})
 """Backends that solve the equations of ``mujoco``, in other arithmetic."""
@@ -75,7 +77,7 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
     version = cls.engine_version()
     used = device if device.split(":")[0] in cls.devices() else "cpu"
 
-    def make(scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None) -> Backend:
+    def make(scene: SceneSpec, num_worlds: int, object_index: Tensor) -> Backend:
         return make_backend(name, scene, num_worlds, object_index=object_index, device=used, **options)
 
     same = name in SAME_EQUATIONS
@@ -177,5 +179,5 @@ def common_states(
 
 @contextmanager
 def _worlds(tested: Engine, scene: SceneSpec, object_index: Tensor) -> Iterator[Backend]:
-    with tested.make(scene, len(object_index), object_index=object_index) as backend:
+    with tested.make(scene, len(object_index), object_index) as backend:
         yield backend

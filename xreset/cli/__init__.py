@@ -15,6 +15,7 @@ COMMANDS: dict[str, str] = {
     "robots": "List robots, and check one.",
     "backends": "List physics engines and whether they can be used here.",
     "conformance": "Test that a physics engine keeps the interface's contracts.",
+    "parity": "Measure how far physics engines agree on grasps.",
     "retarget": "Turn human demonstrations into robot trajectories.",
     "resets": "Try retargeted states in physics and keep the stable ones.",
     "view": "Look at demonstrations, robot trajectories or a reset bank in a browser, or as pictures.",

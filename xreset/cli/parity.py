@@ -1,0 +1,127 @@
+"""``xreset parity``: whether physics engines agree on grasps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from xreset.backends.parity.compare import EngineParity, Parity
+    from xreset.backends.parity.metrics import Metric
+
+
+def parity(
+    motion: Annotated[Path, tyro.conf.Positional],
+    *,
+    robot: str | None = None,
+    objects: Path | None = None,
+    only: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    grasps: int = 48,
+    device: str = "cpu",
+    json: Path | None = None,
+) -> None:
+    """Measure how far physics engines agree with MuJoCo on grasps. Exits with 1 if one misses a target.
+
+    Hands close on objects that nothing moves (press), close on objects on the table, lift and shake them (closing), and lift and shake
+    from common states that favour no engine (hold). MuJoCo-Warp, which solves MuJoCo's equations, is compared step by step (path); on the
+    CPU, where it is slow, that is all. The column of MuJoCo at half the timestep shows how far two honest solutions differ.
+
+    Args:
+        motion: Where grasps are taken from: a file of `xreset retarget` (best: no engine has had a say), of `xreset resets`, or of
+            `xreset demos`, which is then retargeted first.
+        robot: Name or folder of the robot; default: the file's. Demonstrations need it.
+        objects: Folder of real meshes; default: the built-in stand-ins.
+        only: Object to use; give it again for several. Default: all of the file.
+        backend: Engine to measure; give it again for several. Default: all that can be used here.
+        grasps: How many closings, and how many holds.
+        device: Where engines run that can run on GPUs: cpu or cuda.
+        json: File to write the results to.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from xreset.backends.parity.compare import REFERENCE, compare
+    from xreset.backends.parity.load import load_frames
+    from xreset.backends.parity.trials import engine
+    from xreset.errors import XResetError
+    from xreset.files import file_hash, write_json
+
+    if grasps < 1:
+        raise XResetError(f"--grasps must be at least 1, found {grasps}.")
+    console = Console(highlight=False, soft_wrap=True)
+    names = [name for name in dict.fromkeys(backend) if name != REFERENCE] if backend else _usable(console, REFERENCE)
+    engines = [engine(name, device=device) for name in names]
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("reading")
+        spec, loaded, frames = load_frames(
+            motion, robot=robot, objects_folder=objects, only=only,
+            progress=lambda doing, done, total: bar.update(task, description=doing, completed=done, total=total),
+        )  # fmt: skip
+        result = compare(
+            spec, loaded, frames, engines, grasps=grasps,
+            progress=lambda doing, done, total: bar.update(task, description=doing, completed=done, total=total),
+        )  # fmt: skip
+    console.print(_table(result))
+    for tested in (result.reference, result.floor, *result.engines):
+        if tested.broken:
+            console.print(f"{tested.engine.name}: {tested.broken} worlds were not finite or dropped contacts", style="bold red")
+    if json is not None:
+        write_json(json, result.as_dict() | {"inputs": {"motion": file_hash(motion)}})
+        console.print(f"wrote {json}", markup=False)
+    missed = [f"{tested.engine.name}: {metric.name}" for tested in result.engines for metric in tested.metrics if not metric.ok]
+    console.print(
+        f"missed: {'; '.join(missed)}" if missed else "all targets met", style="bold red" if missed else "bold green", markup=False
+    )
+    if missed:
+        raise SystemExit(1)
+
+
+def _usable(console, reference: str) -> list[str]:
+    """Names of the backends that can be used here, besides the reference; says why others cannot."""
+    from xreset.backends import backend_names, backend_status
+
+    names = []
+    for name in backend_names():
+        status = backend_status(name)
+        if status.reason is not None:
+            console.print(f"left out {name}: {status.reason}", markup=False)
+        elif name != reference:
+            names.append(name)
+    return names
+
+
+def _table(result: Parity) -> Table:
+    from rich.table import Table
+
+    columns: tuple[EngineParity, ...] = (result.floor, *result.engines)
+    held = sum(sum(flags) for name, flags in result.reference.carried.items() if name != "closing")
+    tried = sum(len(flags) for name, flags in result.reference.carried.items() if name != "closing")
+    table = Table(
+        "against " + result.reference.engine.name,
+        "target",
+        *(f"{tested.engine.name}\n{tested.engine.version}, {tested.engine.device}" for tested in columns),
+        title=f"{result.robot.name}, {len(result.objects)} objects: {len(result.closing)} closings, {tried} holds, of which "
+        f"{result.reference.engine.name} carries {sum(result.reference.carried['closing'])} and {held}",
+    )
+    rows = {metric.name: metric for tested in columns for metric in tested.metrics}
+    for name, row in rows.items():
+        cells = [next((_cell(m) for m in tested.metrics if m.name == name), "-") for tested in columns]
+        table.add_row(name, f"{row.sense} {_number(row.target, row.unit)}", *cells)
+    return table
+
+
+def _cell(metric: Metric) -> str:
+    style = "green" if metric.ok else "bold red"
+    return f"[{style}]{_number(metric.measured, metric.unit)}[/] (n = {metric.n})"
+
+
+def _number(value: float, unit: str) -> str:
+    return f"{value:.3g} {unit}" if unit else f"{100 * value:.1f} %"
+
+
+COMMAND = parity

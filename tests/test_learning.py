@@ -75,6 +75,40 @@ class ModelTest(unittest.TestCase):
         self.assertGreater(float((carried - together).detach()[:3, 0].abs().max()), 1e-4)
         torch.testing.assert_close(carried[3:, 0], together[3:, 0])
 
+    def test_pieces_begin_with_their_own_states(self):
+        """Two pieces in one call give what two calls give, and no gradient crosses from one to the other."""
+        first = torch.zeros(T, N, dtype=torch.bool)
+        first[2, 1] = first[6, 0] = True
+        model, obs = make_model(), with_real_history(observations(T, N), first)
+        g = torch.Generator().manual_seed(3)
+        h, c = (torch.randn(2, N, SMALL["lstm_dim"], generator=g) for _ in range(2))
+        obs["policy"].requires_grad_(True)
+        together = model(obs, masks=first, hidden_state=(h.flatten(0, 1)[None], c.flatten(0, 1)[None]))
+        apart = [
+            model(obs[i * L : (i + 1) * L], masks=first[i * L : (i + 1) * L], hidden_state=(h[i : i + 1], c[i : i + 1])) for i in range(2)
+        ]
+        torch.testing.assert_close(together, torch.cat(apart))
+        together[L:].sum().backward()
+        self.assertEqual(float(obs["policy"].grad[:L].abs().max()), 0.0)
+        self.assertGreater(float(obs["policy"].grad[L:].abs().max()), 0.0)
+
+    def test_reused_embeddings_are_those_of_the_whole_history(self):
+        dones = torch.zeros(T, N, dtype=torch.bool)
+        dones[2, 0] = dones[5, 2] = True
+        first = torch.zeros_like(dones)
+        first[1:] = dones[:-1]
+        plain, reusing, obs = make_model(), make_model(), with_real_history(observations(T, N), first)
+        reusing.reuse_embeddings = True
+        for t in range(T):
+            torch.testing.assert_close(reusing(obs[t]), plain(obs[t]))
+            for model in (plain, reusing):
+                model.reset(dones[t])
+        with torch.no_grad():
+            for model in (plain, reusing):
+                model(obs, masks=first, hidden_state=(torch.zeros(1, N, 12), torch.zeros(1, N, 12)))  # as an update does
+                model.trunk.pointnet.mlp[0].weight.mul_(2.0)
+        torch.testing.assert_close(reusing(obs[T - 1]), plain(obs[T - 1]))
+
     def test_gradients_do_not_cross_an_episode_end(self):
         model, obs = make_model(), observations(T, N)
         obs["policy"].requires_grad_(True)
@@ -117,11 +151,11 @@ class StorageTest(unittest.TestCase):
         for batch in storage.recurrent_mini_batch_generator(2, 1):
             seen += batch.values.flatten().tolist()
             torch.testing.assert_close(batch.values[1:] - batch.values[:-1], torch.full_like(batch.values[1:], N))
-            torch.testing.assert_close(batch.hidden_states[0][0][0, :, 0], batch.values[0, :, 0])
-            # a step is the first of an episode where the step before it, in the same piece, was the last
+            torch.testing.assert_close(batch.hidden_states[0][0][0, :, 0], batch.values[::L, :, 0].flatten())
+            # a step is the first of an episode where the step before it was the last
             world, step = (batch.values % N).squeeze(-1), (batch.values // N).squeeze(-1)
-            expected = (world == 0) & (step == 3)
-            self.assertTrue(torch.equal(batch.masks & (step % L != 0), expected))
+            expected = ((world == 0) & (step == 3)) | ((world == 1) & (step == 4))
+            self.assertTrue(torch.equal(batch.masks, expected))
         self.assertEqual(sorted(seen), list(range(T * N)))
 
     def test_ppo_improves_a_bandit(self):

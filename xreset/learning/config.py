@@ -47,8 +47,8 @@ class PpoConfig:
     """Weight of the value loss. Not in the paper."""
     grad_norm: float = 1.0
     precision: Literal["float32", "tf32", "bfloat16"] = "tf32"
-    """Arithmetic of matrix products on a GPU. ``bfloat16``: the point-cloud encoder in bfloat16, all else in TF32. The CPU and the
-    exported policy use float32. Not in the paper."""
+    """Arithmetic of matrix products on a GPU. ``bfloat16``: factors of point-cloud encoder and LSTM in bfloat16 (sums in float32), all else
+    in TF32. The CPU and the exported policy use float32. Not in the paper."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
             "class_name": "xreset.learning.ppo:SequencePpo",
             "sequence_length": p.sequence_length,
             "num_learning_epochs": p.mini_epochs,
-            "num_mini_batches": max(1, min(num_envs * p.horizon // p.minibatch_size, num_envs * p.horizon // p.sequence_length // 2)),
+            "num_mini_batches": max(1, min(num_envs * p.horizon // p.minibatch_size, num_envs // 2)),
             "clip_param": p.clip,
             "gamma": p.discount,
             "lam": p.gae_lambda,

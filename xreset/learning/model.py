@@ -1,7 +1,7 @@
 """The paper's network (appendix C, Table VIII): PointNet per cloud frame, LSTM with layer norm, MLP.
 
 Observation groups with two dimensions are flat; groups with four, [N, H, P, 3], are cloud histories. Shape letters: N worlds (or
-sequences), L steps of a sequence, H history, P points, D flat width.
+sequences), T steps of a rollout, L steps of a sequence, H history (or the LSTM's width), P points, D flat width.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def embed_sequences(pointnet: PointNet, cloud: Tensor, first: Tensor) -> Tensor:
     """[L, N, H, embedding] embeddings of cloud histories [L, N, H, P, 3], every distinct frame embedded once.
 
     Step t's history is step t-1's, shifted by one, with the newest frame at the end; where an episode begins (``first`` [L, N]) it is H
-    copies of the newest. So L steps hold H - 1 + L distinct frames and not L * H: with the paper's 4 and 5, 8 and not 20.
+    copies of the newest. So L steps hold H - 1 + L distinct frames and not L * H: with a horizon of 16 and a history of 5, 20 and not 80.
     """
     steps, _, history = cloud.shape[:3]
     frames = torch.cat((cloud[0, :, :-1].transpose(0, 1), cloud[:, :, -1]))  # [H - 1 + L, N, P, 3]
@@ -61,6 +61,41 @@ def embed_sequences(pointnet: PointNet, cloud: Tensor, first: Tensor) -> Tensor:
     shifted = step[:, None, None] + torch.arange(1 - history, 1, device=cloud.device)  # [L, 1, H] step whose newest frame it was
     source = torch.maximum(shifted, begin[..., None]) + history - 1
     return embedded.transpose(0, 1)[torch.arange(cloud.shape[1], device=cloud.device)[:, None], source]
+
+
+def run_lstm(lstm: nn.LSTM, x: Tensor, keep: Tensor, state: LstmState, *, bfloat16: bool = False) -> tuple[Tensor, LstmState]:
+    """One LSTM layer over L steps whose state may be zeroed before any of them.
+
+    On a GPU the inputs of all steps are multiplied at once, with widths that suit the matrix units, and each step is one product and one
+    fused kernel: the library's layer would have to be called, forward and backward, for every step. Elsewhere it is.
+
+    Args:
+        lstm: the layer.
+        x: [L, N, D]
+        keep: [L, N] False where an episode begins.
+        state: [1, N, H] each.
+        bfloat16: whether matrix products on a GPU take bfloat16 factors; sums and the state stay float32.
+
+    Returns:
+        outputs [L, N, H], new state.
+    """
+    h, c = state
+    out = []
+    if not x.is_cuda:
+        for step, kept in zip(x, keep.to(h.dtype)[:, None, :, None], strict=True):
+            y, (h, c) = lstm(step[None], (h * kept, c * kept))
+            out.append(y)
+        return torch.cat(out), (h, c)
+    low = torch.bfloat16 if bfloat16 else x.dtype
+    padding = (0, -x.shape[-1] % 8)
+    inputs = nn.functional.linear(nn.functional.pad(x, padding).to(low), nn.functional.pad(lstm.weight_ih_l0, padding).to(low)).to(x.dtype)
+    recurrent = lstm.weight_hh_l0.to(low)
+    h, c = h[0], c[0]
+    for step, kept in zip(inputs, keep.to(h.dtype)[..., None], strict=True):
+        gates = nn.functional.linear((h * kept).to(low), recurrent).to(x.dtype)
+        h, c, _ = torch.ops.aten._thnn_fused_lstm_cell(step, gates, c * kept, lstm.bias_ih_l0, lstm.bias_hh_l0)
+        out.append(h)
+    return torch.stack(out), (h[None], c[None])
 
 
 class Trunk(nn.Module):
@@ -89,8 +124,9 @@ class Trunk(nn.Module):
 class PointNetLstmModel(MLPModel):
     """Actor or critic for rsl-rl's runner.
 
-    In a rollout the model keeps its own LSTM state. In an update it gets sequences [L, N, ...], the state each began with, and ``masks``
-    [L, N], True where a step is the first of an episode: there the state is zeroed, so gradients never cross an episode's end.
+    In a rollout the model keeps its own LSTM state. In an update it gets whole rollouts [T, N, ...] of some worlds, the state that each
+    piece of them began with, and ``masks`` [T, N], True where a step is the first of an episode: there the state is zeroed, so gradients
+    cross neither an episode's end nor that of a piece.
     """
 
     is_recurrent: bool = True
@@ -117,33 +153,61 @@ class PointNetLstmModel(MLPModel):
         self.trunk = Trunk(self.obs_dim, obs[self.cloud_group].shape[1], list(pointnet_dims), lstm_dim, activation, normalizer)
         self.trunk.pointnet.use_bfloat16 = bfloat16_clouds
         self.state: LstmState | None = None
+        self.reuse_embeddings = False
+        """Whether successive clouds in a rollout are shifted histories, so that only the newest frame is new. Training switches it on."""
+        self._embeddings: Tensor | None = None
+        self._began: Tensor | None = None
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None) -> Tensor:
-        """The MLP's input: [N, lstm] in a rollout, [L, N, lstm] in an update."""
+        """The MLP's input: [N, lstm] in a rollout, [T, N, lstm] in an update.
+
+        In an update the T steps are cut into pieces; ``hidden_state`` [1, pieces * N, lstm] is what each began with, piece by piece.
+        """
         flat = torch.cat([obs[group] for group in self.obs_groups], dim=-1)
-        cloud = obs[self.cloud_group]
+        cloud, trunk = obs[self.cloud_group], self.trunk
         if masks is None:
             if self.state is None:
                 zero = flat.new_zeros(1, flat.shape[0], self._latent_dim)
                 self.state = (zero, zero.clone())
-            latent, self.state = self.trunk(flat, cloud, self.state)
-            return latent
+            joined = trunk.join(flat, self._embed(cloud))
+            out, self.state = self._lstm(joined[None], torch.ones_like(joined[None, :, 0], dtype=torch.bool), self.state)
+            return trunk.norm(out[0])
         assert isinstance(hidden_state, tuple), "an update needs the LSTM state that each sequence began with"
-        embedded = self.trunk.join(flat, embed_sequences(self.trunk.pointnet, cloud, masks))
-        h, c = hidden_state
-        out = []
-        for step, first in zip(embedded, masks, strict=True):
-            keep = (~first).to(h.dtype)[None, :, None]
-            y, (h, c) = self.trunk.lstm(step[None], (h * keep, c * keep))
-            out.append(y)
-        return self.trunk.norm(torch.cat(out))
+        self._embeddings = None  # the weights are about to change
+        joined = trunk.join(flat, embed_sequences(trunk.pointnet, cloud, masks))
+        pieces = hidden_state[0].shape[1] // joined.shape[1]
+
+        def cut(value: Tensor) -> Tensor:
+            """[T, N, ...] -> [T / pieces, pieces * N, ...]"""
+            return value.unflatten(0, (pieces, -1)).transpose(0, 1).flatten(1, 2)
+
+        out, _ = self._lstm(cut(joined), ~cut(masks), hidden_state)
+        return trunk.norm(out).unflatten(1, (pieces, -1)).transpose(0, 1).flatten(0, 1)
+
+    def _lstm(self, x: Tensor, keep: Tensor, state: LstmState) -> tuple[Tensor, LstmState]:
+        return run_lstm(self.trunk.lstm, x, keep, state, bfloat16=self.trunk.pointnet.use_bfloat16)
+
+    def _embed(self, cloud: Tensor) -> Tensor:
+        """[N, H, embedding] embeddings of the histories [N, H, P, 3] that an environment shows in a rollout."""
+        if not self.reuse_embeddings:
+            return self.trunk.pointnet(cloud)
+        if self._embeddings is None:
+            self._embeddings = self.trunk.pointnet(cloud)
+        else:
+            newest = self.trunk.pointnet(cloud[:, -1:])
+            shifted = torch.cat((self._embeddings[:, 1:], newest), dim=1)
+            self._embeddings = shifted if self._began is None else torch.where(self._began[:, None, None], newest, shifted)
+        self._began = None
+        return self._embeddings
 
     def reset(self, dones: Tensor | None = None, hidden_state: HiddenState = None) -> None:
         """Forget everything, take over a state, or zero the state of worlds whose episode has ended ([N] bool or 0/1)."""
         if dones is None:
             self.state = hidden_state  # pyright: ignore[reportAttributeAccessIssue]
+            self._embeddings = None
         elif self.state is not None:
-            keep = (dones == 0).to(self.state[0].dtype)[None, :, None]
+            self._began = dones != 0
+            keep = (~self._began).to(self.state[0].dtype)[None, :, None]
             self.state = (self.state[0] * keep, self.state[1] * keep)
 
     def get_hidden_state(self) -> HiddenState:

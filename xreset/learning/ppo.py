@@ -1,7 +1,8 @@
 """PPO over short sequences: Table VIII's sequence length 4 inside a horizon of 16, on top of rsl-rl's PPO.
 
 rsl-rl back-propagates through whole horizons. Here a rollout [T, N] is cut into pieces [T / L, L, N]; each piece starts from the LSTM state
-that the rollout had there, an episode's end inside a piece zeroes the state, and pieces are shuffled. Returns still use the whole horizon.
+that the rollout had there, and an episode's end inside a piece zeroes the state. A minibatch holds all pieces of some worlds, drawn anew in
+every epoch, so that the cloud frames that pieces share are embedded once. Returns use the whole horizon.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from torch import Tensor
 
 
 class SequenceStorage(RolloutStorage):
-    """A rollout that is handed out as shuffled sequences of fixed length."""
+    """A rollout that is handed out world by world, cut into sequences of fixed length."""
 
     def __init__(self, sequence_length: int, *args: Any, **options: Any) -> None:
         """Allocate; ``sequence_length`` divides the number of steps."""
@@ -29,37 +30,33 @@ class SequenceStorage(RolloutStorage):
         self.sequence_length = sequence_length
 
     def recurrent_mini_batch_generator(self, num_mini_batches: int, num_epochs: int = 8) -> Generator[RolloutStorage.Batch, None, None]:
-        """Yield minibatches of sequences [L, M, ...]; ``masks`` [L, M] is True where a step is the first of an episode."""
-        length, pieces = self.sequence_length, self.num_transitions_per_env // self.sequence_length
-        total = pieces * self.num_envs
+        """Yield minibatches [T, M, ...] of M worlds.
+
+        ``masks`` [T, M] is True where a step is the first of an episode; ``hidden_states`` [1, pieces * M, lstm] are the states that the
+        pieces began with, all worlds of the first piece first.
+        """
         first = torch.zeros_like(self.dones, dtype=torch.bool)
         first[1:] = self.dones[:-1].bool()  # step 0 begins with the state that was saved there, zeroed where an episode had ended
-
-        def cut(value: Tensor | TensorDict) -> Any:
-            """[T, N, ...] -> [L, pieces * N, ...], a view where possible."""
-            return value.unflatten(0, (pieces, length)).transpose(0, 1).flatten(1, 2)
-
-        observations, starts = cut(self.observations), cut(first).squeeze(-1)
-        actions, values, returns = cut(self.actions), cut(self.values), cut(self.returns)
-        advantages, log_prob = cut(self.advantages), cut(self.actions_log_prob)
-        distribution = tuple(cut(p) for p in self.distribution_params or ())
-        # [T, 1, N, lstm] -> the state at each piece's first step, [1, pieces * N, lstm]
+        first = first.squeeze(-1)
+        # [T, 1, N, lstm] -> [pieces, N, lstm]
         states = [
-            tuple(s[::length].squeeze(1).flatten(0, 1)[None] for s in saved) if saved is not None else None
+            tuple(s[:: self.sequence_length].squeeze(1) for s in saved) if saved is not None else None
             for saved in (self.saved_hidden_state_a, self.saved_hidden_state_c)
         ]
         for _ in range(num_epochs):
-            for pick in torch.randperm(total, device=self.device).tensor_split(num_mini_batches):
+            for pick in torch.randperm(self.num_envs, device=self.device).tensor_split(num_mini_batches):
                 yield RolloutStorage.Batch(
-                    observations=observations[:, pick],
-                    actions=actions[:, pick],
-                    values=values[:, pick],
-                    advantages=advantages[:, pick],
-                    returns=returns[:, pick],
-                    old_actions_log_prob=log_prob[:, pick],
-                    old_distribution_params=tuple(p[:, pick] for p in distribution),
-                    hidden_states=tuple(tuple(s[:, pick] for s in state) if state is not None else None for state in states),  # pyright: ignore[reportArgumentType]
-                    masks=starts[:, pick],
+                    observations=self.observations[:, pick],
+                    actions=self.actions[:, pick],
+                    values=self.values[:, pick],
+                    advantages=self.advantages[:, pick],
+                    returns=self.returns[:, pick],
+                    old_actions_log_prob=self.actions_log_prob[:, pick],
+                    old_distribution_params=tuple(p[:, pick] for p in self.distribution_params or ()),
+                    hidden_states=tuple(
+                        tuple(s[:, pick].flatten(0, 1)[None] for s in state) if state is not None else None for state in states
+                    ),  # pyright: ignore[reportArgumentType]
+                    masks=first[:, pick],
                 )
 
 
@@ -86,6 +83,7 @@ class SequencePpo(PPO):
             groups = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
         actor = actor_class(obs, groups, "actor", env.num_actions, **actor_cfg).to(device)
         critic = critic_class(obs, groups, "critic", 1, **critic_cfg).to(device)
+        actor.reuse_embeddings = critic.reuse_embeddings = True
         length = alg_cfg.pop("sequence_length")
         storage = SequenceStorage(length, "rl", env.num_envs, cfg["num_steps_per_env"], obs, [env.num_actions], device)
         return alg_class(actor, critic, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])

@@ -141,6 +141,8 @@ def _write_link(robot: Element, link: Link) -> None:
         geometry, size = SubElement(collision, "geometry"), shape.geometry.size
         if shape.geometry.kind == "box":
             SubElement(geometry, "box", size=_numbers(2 * s for s in size))
+        elif shape.geometry.kind == "sphere":
+            SubElement(geometry, "sphere", radius=_number(size[0]))
         else:
             SubElement(geometry, shape.geometry.kind, radius=_number(size[0]), length=_number(2 * size[1]))
 

@@ -1,0 +1,110 @@
+"""A hand that nobody of this project wrote, from a package, made known by a plugin: described, retargeted, and tried in physics."""
+
+import contextlib
+import importlib
+import io
+import json
+import sys
+import tempfile
+import unittest
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import torch
+
+from tests import allegro_plugin
+from xreset.cli import main
+from xreset.demos import read_demos, synthesize, write_demos
+from xreset.kinematics import Kinematics
+from xreset.resets.bank import read_bank
+from xreset.retarget.file import read_retargeted
+from xreset.robots import load, robot_names
+from xreset.robots.check import check_description
+from xreset.urdf import load_urdf
+
+OBJECTS = ["005_tomato_soup_can", "010_potted_meat_can"]
+
+
+def run(*arguments: str) -> str:
+    """What a command prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as output:
+        main(list(arguments))
+    return output.getvalue()
+
+
+class ThirdHandTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        allegro_plugin.package_urdf()  # skips
+        for engine in ("mujoco", "coal"):
+            try:
+                importlib.import_module(engine)
+            except ImportError as error:
+                raise unittest.SkipTest(str(error)) from error
+        folder = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(folder.cleanup)
+        cls.folder = Path(folder.name)
+        allegro_plugin.write_plugin(cls.folder / "site")
+        sys.path.insert(0, str(cls.folder / "site"))
+        cls.addClassCleanup(sys.path.remove, str(cls.folder / "site"))
+        cls.addClassCleanup(sys.modules.pop, "allegro_plugin", None)
+        importlib.invalidate_caches()
+        cls.robot = load(allegro_plugin.NAME)
+
+    def test_the_plugin_is_found_and_nothing_is_wrong_with_it(self):
+        self.assertIn(allegro_plugin.NAME, robot_names())
+        _, findings = check_description(allegro_plugin.NAME)
+        self.assertEqual([f for f in findings if f.level in ("warning", "error")], [])
+
+    def test_its_kinematics_are_the_package_s(self):
+        """The hand below its palm, against the package's own file, at random joint positions."""
+        import mujoco
+
+        hand = load_urdf(allegro_plugin.package_urdf())
+        model = mujoco.MjModel.from_xml_string(_for_mujoco(allegro_plugin.package_urdf()))
+        data = mujoco.MjData(model)
+        kinematics = Kinematics(self.robot, root=hand.root)
+        tips = [tip.link for tip in self.robot.fingertips]
+        generator = torch.Generator().manual_seed(0)
+        q = kinematics.lower + (kinematics.upper - kinematics.lower) * torch.rand(20, 16, generator=generator, dtype=torch.float64)
+        found = kinematics.points(q, tips).numpy()
+        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(model.njnt)]
+        for row, expected in zip(q.numpy(), found, strict=True):
+            data.qpos[[model.jnt_qposadr[names.index(name)] for name in kinematics.joint_names]] = row
+            mujoco.mj_kinematics(model, data)
+            np.testing.assert_allclose([data.body(tip).xpos for tip in tips], expected, atol=1e-6)
+
+    def test_demonstrations_become_states_that_physics_accepts(self):
+        files = {name: str(self.folder / f"{name}.npz") for name in ("demos", "retargeted", "resets")}
+        write_demos(files["demos"], synthesize(OBJECTS, per_object=1, seed=0))
+        said = run("retarget", files["demos"], "--robot", allegro_plugin.NAME, "--out", files["retargeted"])
+        self.assertIn("retargeted to allegro", said)
+        trajectories = read_retargeted(files["retargeted"])
+        annotated = read_demos(files["demos"]).hand_valid
+        self.assertGreater(trajectories.valid.sum(), 0.8 * annotated.sum())
+        self.assertLess(trajectories.hand_error[annotated].mean(), 0.020)
+        self.assertTrue((np.asarray(trajectories.joint_pos) >= Kinematics(self.robot).lower.numpy() - 1e-9).all())
+
+        run("resets", files["retargeted"], "--out", files["resets"])
+        bank = read_bank(files["resets"], robot=self.robot)
+        tried = bank.num_states + len(bank.rejected_reason)
+        self.assertEqual(tried, trajectories.valid.sum())
+        self.assertGreater(bank.num_states, 0.5 * tried)
+        self.assertGreater(bank.post_contact.sum(), 0.5 * (trajectories.valid & trajectories.post_contact).sum())
+        rows = json.loads((self.folder / "resets.accounts.json").read_text())["rows"]
+        self.assertEqual(rows[-1]["kept"], bank.num_states)
+
+
+def _for_mujoco(urdf: Path) -> str:
+    """The package's file without its meshes, which MuJoCo would look for, and with its tips, which MuJoCo would fuse."""
+    root = ElementTree.parse(urdf).getroot()
+    for link in root.findall("link"):
+        for visual in link.findall("visual"):
+            link.remove(visual)
+    ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", fusestatic="false", balanceinertia="true")
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+if __name__ == "__main__":
+    unittest.main()

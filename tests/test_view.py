@@ -9,6 +9,7 @@ import time
 import unittest
 import urllib.request
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from unittest import mock
@@ -21,11 +22,13 @@ from xreset.cli import main
 from xreset.demos.archive import Demos, write_demos
 from xreset.errors import FileFormatError, XResetError
 from xreset.kinematics import Kinematics
-from xreset.render import INVALID_COLOR, write_png
+from xreset.render import tinted, write_png
 from xreset.resets.bank import write_bank
 from xreset.retarget.file import Retargeted, write_retargeted
-from xreset.view.data import load_view
-from xreset.view.picture import drawer
+from xreset.view.colors import reason_color
+from xreset.view.load import load_view
+from xreset.view.picture import Drawer
+from xreset.view.sheet import moment_tiles, reason_tiles
 
 FRAMES = 4
 NAMES = np.array(["demo_a", "demo_b"])
@@ -62,9 +65,9 @@ def toy_retargeted(robot) -> Retargeted:
         hand_side=np.array(["right", "right"]), frame_offsets=OFFSETS, fps=30.0, joint_names=robot.joint_names,
         joint_pos=np.tile(robot.home, (total, 1)).astype(float), palm_pos=pos, palm_quat_wxyz=quat, fingertip_names=robot.fingertip_names,
         fingertip_pos=np.zeros((total, tips, 3)), object_pos=pos, object_quat_wxyz=quat, goal_pos=pos[[3, 7]], goal_quat_wxyz=quat[[3, 7]],
-        annotated=np.ones(total, dtype=bool), valid=reason == 0, reason=reason, reason_names=("valid", "joint limit"),
+        annotated=np.ones(total, dtype=bool), valid=reason == 0, reason=reason, reason_names=("valid", "joint limit", "arm jump"),
         contact=np.tile([False, False, True, False], 2), first_contact=np.array([2, 2], dtype=np.int32),
-        hand_error=np.zeros(total), wrist_error=np.zeros(total),
+        hand_error=np.full(total, 0.0121), wrist_error=np.full(total, 0.0032),
     )  # fmt: skip
 
 
@@ -79,6 +82,36 @@ class WithFiles(unittest.TestCase):
         write_demos(cls.demos, toy_demos())
         write_retargeted(cls.retargeted, toy_retargeted(cls.robot), config={}, inputs={})
         write_bank(cls.bank, toy_bank(cls.robot), config={}, inputs={})
+
+    def filtered(self) -> tuple[Path, Path]:
+        """A bank, made of toy trajectories: frame 2 of sequence 0 and frame 3 of sequence 1 were rejected."""
+        made_from, bank = self.folder / "source.npz", self.folder / "filtered.npz"
+        data = toy_retargeted(self.robot)
+        data.joint_pos[:, 0] += 0.01 * np.arange(2 * FRAMES)
+        write_retargeted(made_from, data, config={}, inputs={})
+        kept, lost = np.array([0, 3, 4, 6]), np.array([2, 7])
+        changes = {
+            "joint_pos": data.joint_pos[kept],
+            "object_pos": data.object_pos[kept],
+            "object_quat_wxyz": data.object_quat_wxyz[kept],
+            "object_name": OBJECTS[kept // FRAMES],
+            "sequence_index": kept // FRAMES,
+            "frame_index": kept % FRAMES,
+            "post_contact": kept % FRAMES >= 2,
+            "sequence_name": NAMES,
+            "sequence_object": OBJECTS,
+            "start_pos": data.object_pos[[0, 4]],
+            "start_quat_wxyz": data.object_quat_wxyz[[0, 4]],
+            "goal_pos": data.goal_pos,
+            "goal_quat_wxyz": data.goal_quat_wxyz,
+            "rejected_sequence_index": lost // FRAMES,
+            "rejected_frame_index": lost % FRAMES,
+            "rejected_post_contact": lost % FRAMES >= 2,
+            "rejected_reason": np.array([0, 1]),
+            "reason_names": ("joint velocity", "overflow"),
+        }
+        write_bank(bank, toy_bank(self.robot, **changes), config={}, inputs={})
+        return bank, made_from
 
     def run_view(self, *argv) -> tuple[int, str]:
         """Exit code and all that was printed."""
@@ -99,7 +132,7 @@ class Data(WithFiles):
         np.testing.assert_array_equal(view.frame, [0, 1, 2, 3] * 2)
         np.testing.assert_array_equal(view.contact, [False, False, True, False] * 2)
         np.testing.assert_array_equal(view.post_contact, [False, False, True, True] * 2)
-        self.assertEqual(view.text(3)[0], "hand not annotated")
+        self.assertEqual(view.text(3)[0], "not annotated")
         self.assertIn("21 keypoints", view.text(2)[-1])
         lowest = view.object_pos[0, 2] + view.objects[0].vertices[:, 2].min()
         self.assertAlmostEqual(lowest, 0.0, delta=2e-3)  # the object rests on the table, and the hand has moved with it
@@ -110,7 +143,9 @@ class Data(WithFiles):
         view = load_view(self.retargeted)
         self.assertEqual([bool(reason) for reason in view.reason], [False, True, False, False] * 2)
         self.assertEqual(view.text(1)[:2], ("not valid: joint limit", SOUP))
-        self.assertEqual(view.text(6)[2:], ("sequence 1: demo_b", "frame 2", "after contact, human touches"))
+        self.assertEqual(
+            view.text(6)[2:], ("sequence 1: demo_b", "frame 2", "after contact, human touches", "off by 12 mm (fingertips), 3 mm (wrist)")
+        )
         np.testing.assert_array_equal(view.choose(phase="before contact"), [0, 1, 4, 5])
         self.assertIsNone(view.human)
 
@@ -124,6 +159,42 @@ class Data(WithFiles):
         self.assertGreater(human.keypoints[6, 0, 1], human.keypoints[2, 0, 1] + 0.005)
         with self.assertRaisesRegex(XResetError, "demo_c"):
             load_view(self.bank, demos=swapped)
+
+    def test_what_is_off_and_where_it_touches(self):
+        self.assertEqual(load_view(self.retargeted).text(0)[-1], "off by 12 mm (fingertips), 3 mm (wrist)")
+        view = load_view(self.demos)
+        assert view.human is not None
+        np.testing.assert_array_equal(np.isfinite(view.human.contacts).all(axis=-1), view.human.touching)
+        can = view.objects[0]
+        low, high = can.vertices.min(axis=0), can.vertices.max(axis=0)
+        touched = (view.human.contacts[2] - view.object_pos[2] - (low + high) / 2) / ((high - low) / 2)  # upright: of an upright unit can
+        on_wall_or_lid = np.maximum(np.linalg.norm(touched[:, :2], axis=1), np.abs(touched[:, 2]))
+        np.testing.assert_allclose(on_wall_or_lid, 1.0, atol=0.02)
+
+    def test_rows_with_one_reason(self):
+        view = load_view(self.retargeted)
+        self.assertEqual(view.counts(), {"": 6, "joint limit": 2, "arm jump": 0})
+        np.testing.assert_array_equal(view.choose(reason="joint limit"), [1, 5])
+        np.testing.assert_array_equal(view.choose(sequence=1, reason=""), [4, 6, 7])
+        with self.assertRaisesRegex(XResetError, "no reason 'cold'; there are joint limit, arm jump"):
+            view.choose(reason="cold")
+
+    def test_states_that_physics_rejected(self):
+        bank, made_from = self.filtered()
+        view = load_view(bank, retargeted=made_from)
+        np.testing.assert_array_equal(view.sequence, [0, 0, 0, 1, 1, 1])
+        np.testing.assert_array_equal(view.frame, [0, 2, 3, 0, 2, 3])
+        self.assertEqual(view.reason, ("", "joint velocity", "", "", "", "overflow"))
+        self.assertEqual(view.text(1)[:2], ("rejected: joint velocity", SOUP))
+        self.assertEqual(view.text(5)[:2], ("rejected: overflow", SPAM))
+        trajectories = load_view(made_from)
+        assert view.joint_pos is not None and trajectories.joint_pos is not None
+        np.testing.assert_allclose(view.joint_pos, trajectories.joint_pos[[0, 2, 3, 4, 6, 7]], atol=1e-6)
+        np.testing.assert_allclose(view.object_pos, trajectories.object_pos[[0, 2, 3, 4, 6, 7]], atol=1e-6)
+        with self.assertRaisesRegex(XResetError, "was not made from"):
+            load_view(self.bank, retargeted=made_from)
+        with self.assertRaisesRegex(XResetError, "no reset bank"):
+            load_view(made_from, retargeted=made_from)
 
     def test_bank(self):
         view = load_view(self.bank)
@@ -151,15 +222,25 @@ class Data(WithFiles):
 
 
 class Pictures(WithFiles):
-    def test_an_invalid_robot_is_red(self):
-        draw = drawer(load_view(self.retargeted), size=(160, 120))
+    def test_an_invalid_robot_has_the_colour_of_its_reason(self):
+        draw = Drawer(load_view(self.retargeted), size=(160, 120)).draw
         valid, invalid = draw(0).astype(int), draw(1).astype(int)
-        redness = [(picture[..., 0] - picture[..., 1] > 60) & (picture[..., 2] < picture[..., 0] - 60) for picture in (valid, invalid)]
-        self.assertGreater(redness[1].sum(), redness[0].sum() + 200)
+        changed = np.abs(valid - invalid).max(axis=-1) > 12
+        hue = invalid[changed].mean(axis=0) - invalid[changed].mean()
+        wanted = np.array(reason_color("joint limit")) - np.mean(reason_color("joint limit"))
+        self.assertGreater(hue @ wanted / np.linalg.norm(hue) / np.linalg.norm(wanted), 0.9)
+        self.assertGreater(changed.sum(), 200)
+
+    def test_a_near_picture_shows_hand_and_object(self):
+        drawer = Drawer(load_view(self.demos), size=(160, 120))
+        pictures = [drawer.draw(2, near=near).astype(int) for near in (False, True)]
+        far, near = (int(((p[..., 0] - p[..., 2] > 60) & (p[..., 1] > 60)).sum()) for p in pictures)
+        self.assertGreater(near, 3 * far)
+        self.assertGreater(far, 0)
 
     def test_demonstrations_have_no_robot_but_a_hand(self):
         view = load_view(self.demos)
-        draw = drawer(view, size=(160, 120))
+        draw = Drawer(view, size=(160, 120)).draw
         hand_away, touching, unknown = draw(0).astype(int), draw(2).astype(int), draw(3).astype(int)
         yellow = [((p[..., 0] > 240) & (p[..., 1] > 190) & (p[..., 2] < 60)).sum() for p in (hand_away, touching, unknown)]
         self.assertGreater(yellow[1], 0)
@@ -171,11 +252,60 @@ class Pictures(WithFiles):
         self.assertEqual(code, 0, text)
         self.assertIn("not valid: joint limit", text)
         expected = self.folder / "expected.png"
-        write_png(expected, drawer(load_view(self.retargeted), size=(960, 720), smooth=True)(5))
+        write_png(expected, Drawer(load_view(self.retargeted), size=(960, 720), smooth=True).draw(5))
         self.assertEqual(out.read_bytes(), expected.read_bytes())
         code, text = self.run_view(self.retargeted, "--png", out, "--frame", "4")
         self.assertEqual(code, 1)
         self.assertIn("no frame 4", text)
+
+    def test_moments_of_a_demonstration(self):
+        tiles = moment_tiles(load_view(self.retargeted))
+        self.assertEqual([tile.row for tile in tiles], [2, 2, 3, 6, 6, 7])
+        self.assertEqual(tiles[2].caption[:3], (f"{SOUP}: goal", "valid", "sequence 0: demo_a, frame 3"))
+        view = load_view(self.demos)
+        self.assertEqual([tile.row for tile in moment_tiles(view)], [2, 2, 2, 6, 6, 6])  # no hand in the last frame
+        never = replace(view, post_contact=np.zeros(8, dtype=bool))
+        self.assertEqual([(tile.row, tile.caption[1]) for tile in moment_tiles(never)], [(None, "no example in this file")] * 6)
+
+    def test_mid_lift_is_half_way_up(self):
+        view = load_view(self.demos)
+        many = 20
+        pos = np.tile([0.5, 0.3, 0.05], (many, 1))
+        pos[:, 2] += np.interp(np.arange(many), [0, 5, 15, 20], [0, 0, 0.3, 0.3])
+        lifted = replace(
+            view, objects=view.objects[:1], sequence=np.zeros(many, int), frame=np.arange(many), object_index=np.zeros(many, int),
+            object_pos=pos, object_quat=np.tile(UPRIGHT, (many, 1)), reason=("",) * many, human=None,
+            post_contact=np.arange(many) >= 4, contact=np.arange(many) >= 4,
+        )  # fmt: skip
+        self.assertEqual([tile.row for tile in moment_tiles(lifted)], [4, 10, 19])
+
+    def test_one_example_of_every_reason(self):
+        bank, made_from = self.filtered()
+        tiles = reason_tiles(load_view(bank, retargeted=made_from))
+        self.assertEqual([tile.row for tile in tiles], [1, 5])
+        self.assertEqual(tiles[0].caption[0], "joint velocity: 1 of 6")
+        tiles = reason_tiles(load_view(self.retargeted))
+        self.assertEqual([tile.row for tile in tiles], [5, None])
+        with self.assertRaisesRegex(XResetError, "--retargeted"):
+            reason_tiles(load_view(self.bank))
+
+    @unittest.skipUnless(find_spec("PIL"), "Pillow is not installed")
+    def test_sheets_from_the_command_line(self):
+        out = self.folder / "sheet.png"
+        code, text = self.run_view(self.retargeted, "--png", out, "--reasons")
+        self.assertEqual(code, 0, text)
+        self.assertIn("joint limit: 2 of 8; not valid: joint limit; sequence 1: demo_b, frame 1", text)
+        self.assertIn("arm jump: 0 of 8; no example", text)
+        from PIL import Image
+
+        picture = np.asarray(Image.open(out))
+        self.assertEqual(picture.shape, (360 + 5 * 16 + 8, 3 * 420, 3))
+        self.assertGreater(len(np.unique(picture[:360, :420].reshape(-1, 3), axis=0)), 1000)  # a picture
+        self.assertEqual(len(np.unique(picture[:360, 420:840])), 1)  # no example
+        self.assertLess(picture[360:376, 420:840].min(), 100)  # but its caption
+        code, text = self.run_view(self.retargeted, "--reasons")
+        self.assertEqual(code, 1)
+        self.assertIn("a file with --png", text)
 
     @unittest.skipUnless(find_spec("imageio_ffmpeg"), "imageio-ffmpeg is not installed")
     def test_mp4_from_the_command_line(self):
@@ -215,11 +345,25 @@ class Served(WithFiles):
         where = kinematics.link_poses(kinematics.base.new_tensor(self.robot.home))[:, :3, 3].numpy()
         for i, link in scene._links.items():
             np.testing.assert_allclose(link.position, where[i], atol=1e-6)
-            self.assertGreater(link.color[0], 255 * 0.6 * INVALID_COLOR[0])
-            self.assertLess(link.color[2], link.color[0])
+            np.testing.assert_allclose(link.color, 255 * tinted(scene._colors[i], reason_color("joint limit")), atol=1)
         page._frame.value = 2
         page.show()
-        self.assertFalse(all(link.color[2] < link.color[0] for link in scene._links.values()))
+        for i, link in scene._links.items():
+            np.testing.assert_allclose(link.color, 255 * np.array(scene._colors[i]), atol=1)
+
+    def test_frames_of_one_reason_are_picked(self):
+        page = self.page(self.retargeted)
+        self.assertEqual(page._bar.content.count("flex:"), 3)  # valid, joint limit, valid
+        page._sequence.value = "all"
+        page._choose()
+        self.assertEqual(page._bar.content.count("flex:"), 5)
+        self.assertIn("joint limit 2", page._legend.content)
+        page._reason.value = "joint limit (2)"
+        page._choose()
+        np.testing.assert_array_equal(page._rows, [1, 5])
+        page._step(1)
+        page.show()
+        self.assertIn("left:75.00%", page._mark.content)
 
     def test_a_bank_is_filtered(self):
         page = self.page(self.bank)

@@ -17,6 +17,7 @@ def view(
     file: Annotated[Path, tyro.conf.Positional],
     *,
     demos: Path | None = None,
+    retargeted: Path | None = None,
     objects: Path | None = None,
     robot: str | None = None,
     sequence: int | None = None,
@@ -25,14 +26,18 @@ def view(
     port: int = 8080,
     png: Path | None = None,
     mp4: Path | None = None,
+    moments: bool = False,
+    reasons: bool = False,
 ) -> None:
     """Look at demonstrations, robot trajectories or a reset bank in a browser, or write pictures of them.
 
-    The robot is red where a frame is not valid. The object's goal is translucent. Human keypoints are pink, those in contact yellow.
+    Where a frame is not valid the robot has the colour of the reason. The object's goal is translucent. Human keypoints are pink, those
+    in contact yellow, with a black dot where they touch the object; the robot's fingertips are blue.
 
     Args:
         file: Demonstrations, or what `xreset retarget` or `xreset resets` made.
         demos: Demonstrations that the file was made from: shows the human hand over the robot.
+        retargeted: Robot trajectories that a bank was made from: shows the states too that physics rejected.
         objects: Folder of real meshes; default: the built-in stand-ins.
         robot: Folder of the robot, if it is not one that is known by name.
         sequence: Which sequence, counted from 0. Default: the first; of a bank, all.
@@ -41,10 +46,18 @@ def view(
         port: Port to serve at; the next free one if it is taken.
         png: Picture to write, instead of serving a page.
         mp4: Film of the sequence to write, instead of serving a page.
+        moments: Let --png show first contact, mid-lift and goal of one demonstration of each object.
+        reasons: Let --png show one example of every reason for which a frame or state is not used.
     """
-    from xreset.view.data import load_view
+    from xreset.errors import XResetError
+    from xreset.view.load import load_view
 
-    shown = load_view(file, demos=demos, robot=robot, objects=objects)
+    if (moments or reasons) and (png is None or (moments and reasons)):
+        raise XResetError("--moments and --reasons say what picture to write: give one of them, and a file with --png.")
+    shown = load_view(file, demos=demos, retargeted=retargeted, robot=robot, objects=objects)
+    if png is not None and (moments or reasons):
+        _write_sheet(png, shown, moments=moments)
+        return
     if png is None and mp4 is None:
         _serve(shown, host, port, sequence, frame or 0)
         return
@@ -73,13 +86,31 @@ def _serve(shown: View, host: str, port: int, sequence: int | None, frame: int) 
 def _write_png(path: Path, shown: View, rows: np.ndarray, frame: int | None) -> None:
     from xreset.errors import XResetError
     from xreset.render import write_png
-    from xreset.view.picture import drawer
+    from xreset.view.picture import Drawer
 
     chosen = len(rows) // 2 if frame is None else frame
     if not 0 <= chosen < len(rows):
         raise XResetError(f"there is no frame {chosen}; the choice has {len(rows)}, counted from 0.")
-    write_png(path, drawer(shown, size=(960, 720), smooth=True)(int(rows[chosen])))
+    write_png(path, Drawer(shown, size=(960, 720), smooth=True).draw(int(rows[chosen])))
     print("\n".join((*shown.text(int(rows[chosen])), f"picture in {path}")))
+
+
+def _write_sheet(path: Path, shown: View, *, moments: bool) -> None:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from xreset.render import write_png
+    from xreset.view.sheet import draw_sheet, moment_tiles, reason_tiles
+
+    tiles = moment_tiles(shown) if moments else reason_tiles(shown)
+    console = Console()
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("drawing", total=len(tiles))
+        picture = draw_sheet(shown, tiles, progress=lambda done, total: bar.update(task, completed=done, total=total))
+    write_png(path, picture)
+    for tile in tiles:
+        print("; ".join(tile.caption))
+    print(f"{sum(tile.row is not None for tile in tiles)} pictures in {path}")
 
 
 def _write_mp4(path: Path, shown: View, rows: np.ndarray) -> None:
@@ -90,11 +121,11 @@ def _write_mp4(path: Path, shown: View, rows: np.ndarray) -> None:
     from xreset.errors import XResetError
     from xreset.eval.report.clips import encode_mp4
     from xreset.files import atomic_write
-    from xreset.view.picture import drawer
+    from xreset.view.picture import Drawer
 
     if not len(rows):
         raise XResetError("this sequence has no state to film; choose another one with --sequence.")
-    draw = drawer(shown)
+    draw = Drawer(shown).draw
     frames = [draw(int(row)) for row in track(rows, "drawing", console=Console(), transient=True)]
     film = encode_mp4(np.stack(frames), shown.rate)
     with atomic_write(path) as file:

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from xreset.errors import XResetError
-from xreset.render import GOAL_COLOR, INVALID_COLOR, OBJECT_COLOR, TABLE_COLORS, Camera, link_colors, link_meshes, tinted
+from xreset.render import GOAL_COLOR, OBJECT_COLOR, TABLE_COLORS, Camera, link_colors, link_meshes, tinted
 from xreset.spec import TableSpec
-from xreset.view.data import BONES, PHASES, View
-from xreset.view.picture import HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR
+from xreset.view.colors import CONTACT_COLOR, HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
+from xreset.view.data import BONES, GOOD, PHASES, View
+from xreset.view.timeline import bar, legend, mark
 
 _ALL = "all"
 _IDLE = 0.1
@@ -42,7 +43,8 @@ class Page:
                 f"viser cannot be imported ({error}). Install it with: pip install 'xreset[viewer]'; --png and --mp4 work without it."
             ) from error
         self.view = view
-        self._rows = view.choose(sequence=sequence if sequence is not None or view.kind == "reset states" else 0)
+        sequence = 0 if sequence is None and view.kind != "reset states" else sequence
+        self._rows = view.choose(sequence=sequence)
         if not 0 <= frame < len(self._rows):
             raise XResetError(f"there is no frame {frame}; the sequence has {len(self._rows)}, counted from 0.")
         self._lock = threading.RLock()
@@ -51,7 +53,8 @@ class Page:
         except OSError as error:
             raise XResetError(f"the page cannot be served at {host}:{port}: {error}. Choose others with --host and --port.") from error
         self._scene = _Scene(view, self._server)
-        self._make_controls(None if len(self._rows) == len(view.frame) and sequence is None else sequence or 0)
+        self._make_controls(sequence)
+        self._show_choice()
         self._frame.value = frame
         self.show()
 
@@ -71,6 +74,7 @@ class Page:
         with self._lock, self._server.atomic():
             row = self.row
             self._scene.show(row)
+            self._mark.content = "" if row is None else mark(int(self._frame.value), len(self._rows))
             if row is None:
                 self._text.content = "nothing meets this choice"
                 return
@@ -93,18 +97,22 @@ class Page:
 
     def _make_controls(self, sequence: int | None) -> None:
         gui, view = self._server.gui, self.view
-        bank = view.kind == "reset states"
+        self._reason_of = {f"{reason or GOOD[view.kind]} ({count})": reason for reason, count in view.counts().items() if count}
         names = [f"{s}: {name}" for s, name in enumerate(view.sequence_name)]
-        options = [_ALL, *names] if bank else names
-        self._sequence: Any = gui.add_dropdown("sequence", options, initial_value=_ALL if sequence is None else names[sequence])
-        self._object: Any = gui.add_dropdown("object", [_ALL, *(spec.name for spec in view.objects)], initial_value=_ALL, visible=bank)
+        first = _ALL if sequence is None else names[sequence]
+        self._sequence: Any = gui.add_dropdown("sequence", [_ALL, *names], initial_value=first)
+        self._object: Any = gui.add_dropdown("object", [_ALL, *(spec.name for spec in view.objects)], initial_value=_ALL)
         self._phase: Any = gui.add_dropdown("phase", [_ALL, *PHASES], initial_value=_ALL)
-        self._frame: Any = gui.add_slider("state" if bank else "frame", 0, max(len(self._rows) - 1, 1), 1, 0)
+        self._reason: Any = gui.add_dropdown("state", [_ALL, *self._reason_of], initial_value=_ALL, visible=bool(view.reasons))
+        self._frame: Any = gui.add_slider("number" if view.kind == "reset states" else "frame", 0, max(len(self._rows) - 1, 1), 1, 0)
         back, on = gui.add_button("previous"), gui.add_button("next")
         self._play: Any = gui.add_checkbox("play", False)
         self._speed: Any = gui.add_slider("speed", 0.1, 2.0, 0.1, 1.0)
+        self._bar: Any = gui.add_html("")
+        self._mark: Any = gui.add_html("")
+        self._legend: Any = gui.add_html("")
         self._text: Any = gui.add_markdown("")
-        for control in (self._sequence, self._object, self._phase):
+        for control in (self._sequence, self._object, self._phase, self._reason):
             control.on_update(lambda _: self._choose())
         self._frame.on_update(lambda _: self.show())
         back.on_click(lambda _: self._step(-1))
@@ -117,10 +125,16 @@ class Page:
                 sequence=None if sequence == _ALL else int(sequence.partition(":")[0]),
                 object_name=None if name == _ALL else name,
                 phase=None if phase == _ALL else phase,
+                reason=None if self._reason.value == _ALL else self._reason_of[self._reason.value],
             )
+            self._show_choice()
             self._frame.max = max(len(self._rows) - 1, 1)  # a slider needs some length
             self._frame.value = 0
             self.show()
+
+    def _show_choice(self) -> None:
+        reasons = [self.view.reason[row] for row in self._rows]
+        self._bar.content, self._legend.content = bar(reasons), legend(reasons, GOOD[self.view.kind])
 
     def _step(self, by: int) -> None:
         with self._lock:
@@ -145,7 +159,7 @@ class _Scene:
         ]
         self._links: dict[int, Any] = {}
         self._colors: list[Any] = []
-        self._tinted = False
+        self._reason = ""
         if view.robot is not None:
             from xreset.kinematics import Kinematics
 
@@ -160,6 +174,7 @@ class _Scene:
         points = {"point_shape": "circle", "precision": "float32"}
         self._keypoints = scene.add_point_cloud("/human/keypoints", nowhere, _rgb(HUMAN_COLOR), point_size=0.012, **points)
         self._bones = scene.add_line_segments("/human/bones", np.zeros((20, 2, 3), np.float32), _rgb(HUMAN_COLOR), thickness=0.003)
+        self._contacts = scene.add_point_cloud("/human/contacts", nowhere, _rgb(CONTACT_COLOR), point_size=0.006, **points)
         self._tips = scene.add_point_cloud("/robot/fingertips", nowhere, _rgb(REACHED_COLOR), point_size=0.008, **points)
 
     def show(self, row: int | None) -> None:
@@ -169,6 +184,7 @@ class _Scene:
             body.visible = goal.visible = row is not None and i == view.object_index[row]
         human = view.human if row is not None and view.human is not None and np.isfinite(view.human.keypoints[row]).all() else None
         self._keypoints.visible = self._bones.visible = human is not None
+        self._contacts.visible = human is not None and bool(human.touching[row].any())
         self._tips.visible = row is not None and view.fingertips is not None
         for link in self._links.values():
             link.visible = row is not None
@@ -181,12 +197,14 @@ class _Scene:
             self._keypoints.points = human.keypoints[row].astype(np.float32)
             self._keypoints.colors = np.where(human.touching[row][:, None], _rgb(TOUCH_COLOR), _rgb(HUMAN_COLOR)).astype(np.uint8)
             self._bones.points = human.keypoints[row][BONES].astype(np.float32)
+            if self._contacts.visible:
+                self._contacts.points = human.contacts[row][human.touching[row]].astype(np.float32)
         if view.fingertips is not None:
             self._tips.points = view.fingertips[row].astype(np.float32)
         if view.joint_pos is not None:
-            self._place_robot(view.joint_pos[row], bool(view.reason[row]))
+            self._place_robot(view.joint_pos[row], view.reason[row])
 
-    def _place_robot(self, joint_pos: np.ndarray, invalid: bool) -> None:
+    def _place_robot(self, joint_pos: np.ndarray, reason: str) -> None:
         import torch
 
         from xreset.rotations import matrix_to_quat
@@ -195,9 +213,9 @@ class _Scene:
         quats = matrix_to_quat(poses[:, :3, :3]).numpy()
         for i, link in self._links.items():
             link.position, link.wxyz = poses[i, :3, 3].numpy(), quats[i]
-            if invalid != self._tinted:
-                link.color = _rgb(tinted(self._colors[i], INVALID_COLOR) if invalid else self._colors[i])
-        self._tinted = invalid
+            if reason != self._reason:
+                link.color = _rgb(tinted(self._colors[i], reason_color(reason)) if reason else self._colors[i])
+        self._reason = reason
 
 
 def _rgb(color: Any) -> tuple[int, int, int]:

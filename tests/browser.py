@@ -1,0 +1,129 @@
+"""A headless Chromium that tests drive through its DevTools protocol."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import shutil
+import subprocess
+import tempfile
+import time
+import unittest
+import urllib.request
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+_NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+_FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--disable-extensions", "--mute-audio", "--hide-scrollbars",
+    "--enable-unsafe-swiftshader",  # WebGL without a GPU
+    "--remote-debugging-port=0", "--window-size=640,600",
+)  # fmt: skip
+_KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "ArrowDown": 40, "Enter": 13, "End": 35, "Home": 36}
+
+
+def find_chromium() -> str:
+    """The browser's program; skips the test where there is none, or nothing to talk to it with."""
+    program = next(filter(None, map(shutil.which, _NAMES)), None)
+    if program is None:
+        raise unittest.SkipTest(f"no Chromium here (looked for {', '.join(_NAMES)})")
+    if not find_spec("websockets"):
+        raise unittest.SkipTest("websockets is not installed (it comes with viser)")
+    return program
+
+
+class Browser:
+    """One tab. ``problems`` collects console errors and exceptions of its pages."""
+
+    def __init__(self, program: str) -> None:
+        from websockets.sync.client import connect
+
+        self.problems: list[str] = []
+        self._profile = tempfile.TemporaryDirectory(prefix="xreset-chromium-", ignore_cleanup_errors=True)
+        self._process = subprocess.Popen(
+            [program, *_FLAGS, f"--user-data-dir={self._profile.name}", "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        port_file = Path(self._profile.name) / "DevToolsActivePort"
+        wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), "Chromium to start", seconds=60)
+        port = port_file.read_text().split()[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=20) as answer:
+            tab = next(target for target in json.load(answer) if target["type"] == "page")
+        self._socket = connect(tab["webSocketDebuggerUrl"], max_size=2**27, open_timeout=20)
+        self._number = itertools.count(1)
+        for domain in ("Page", "Runtime", "Log"):
+            self.send(f"{domain}.enable")
+
+    def close(self) -> None:
+        self._socket.close()
+        self._process.terminate()
+        try:
+            self._process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._profile.cleanup()
+
+    def send(self, method: str, **params: Any) -> dict[str, Any]:
+        """One command and its answer; what the page reports meanwhile is looked through for problems."""
+        number = next(self._number)
+        self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
+        while True:
+            message = json.loads(self._socket.recv(timeout=60))
+            if message.get("id") == number:
+                if "error" in message:
+                    raise AssertionError(f"{method}: {message['error']['message']}")
+                return message["result"]
+            self._note(message.get("method"), message.get("params", {}))
+
+    def _note(self, event: str | None, params: dict[str, Any]) -> None:
+        if event == "Runtime.exceptionThrown":
+            self.problems.append(json.dumps(params["exceptionDetails"])[:500])
+        elif event == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert"):
+            self.problems.append(" ".join(str(arg.get("value", arg.get("description"))) for arg in params["args"])[:500])
+        elif event == "Log.entryAdded" and params["entry"]["level"] == "error":
+            self.problems.append(f"{params['entry']['text']} ({params['entry'].get('url')})")
+
+    def open(self, url: str) -> None:
+        self.send("Page.navigate", url=url)
+
+    def evaluate(self, expression: str) -> Any:
+        result = self.send("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in result:
+            raise AssertionError(f"{expression}: {result['exceptionDetails']}")
+        return result["result"].get("value")
+
+    def key(self, name: str) -> None:
+        """Press a key where the focus is."""
+        for kind in ("rawKeyDown", "keyUp"):
+            self.send("Input.dispatchKeyEvent", type=kind, key=name, code=name, windowsVirtualKeyCode=_KEYS[name])
+
+    def type(self, text: str) -> None:
+        """Type text where the focus is."""
+        self.send("Input.insertText", text=text)
+
+    def click(self, element: str) -> None:
+        """Click the middle of the element that a JavaScript expression gives."""
+        x, y = self.evaluate(
+            f"(e => {{ e.scrollIntoView({{block: 'center'}}); const r = e.getBoundingClientRect();"
+            f" return [r.x + r.width / 2, r.y + r.height / 2]; }})({element})"
+        )
+        for kind in ("mousePressed", "mouseReleased"):
+            self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+
+    def screenshot(self) -> bytes:
+        """The page as PNG."""
+        return base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
+
+
+def wait_until(condition: Callable[[], Any], what: str, seconds: float = 20.0) -> Any:
+    """Wait until a condition holds and return what it gave; ``AssertionError`` if it does not in time."""
+    end = time.monotonic() + seconds
+    while not (value := condition()):
+        if time.monotonic() > end:
+            raise AssertionError(f"waited {seconds:g} s for {what}")
+        time.sleep(0.05)
+    return value

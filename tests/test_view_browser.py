@@ -1,0 +1,128 @@
+"""xreset view in a real, headless browser: what the user moves there is what the server shows."""
+
+import io
+import tempfile
+import unittest
+from contextlib import redirect_stdout
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from tests.browser import Browser, find_chromium, wait_until
+from tests.test_view import toy_demos, toy_retargeted
+from tests.toy_bank import SOUP, toy_bank
+from xreset import robots
+from xreset.demos.archive import write_demos
+from xreset.resets.bank import write_bank
+from xreset.retarget.file import write_retargeted
+from xreset.view.load import load_view
+
+INPUT = "document.getElementById([...document.querySelectorAll('label')].find(e => e.textContent === '{label}').htmlFor)"
+SLIDER = INPUT + ".querySelector('[role=slider]')"
+BUTTON = "[...document.querySelectorAll('button')].find(e => e.textContent === '{label}')"
+OPTION = "[...document.querySelectorAll('[role=option]')].find(e => e.textContent === '{label}' && e.offsetParent)"
+
+
+@unittest.skipUnless(find_spec("viser"), "viser is not installed")
+class InTheBrowser(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.browser = Browser(find_chromium())
+        cls.addClassCleanup(cls.browser.close)
+        folder = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(folder.cleanup)
+        robot = robots.load("openarm")
+        cls.demos, cls.retargeted, cls.bank = (Path(folder.name) / f"{name}.npz" for name in ("demos", "retargeted", "bank"))
+        write_demos(cls.demos, toy_demos())
+        write_retargeted(cls.retargeted, toy_retargeted(robot), config={}, inputs={})
+        write_bank(cls.bank, toy_bank(robot), config={}, inputs={})
+
+    def open(self, path: Path, **options):
+        """A page that the browser shows."""
+        from xreset.view.page import Page
+
+        with redirect_stdout(io.StringIO()):
+            page = Page(load_view(path, **options), port=8940)
+        self.addCleanup(page.close)
+        self.browser.problems.clear()
+        self.addCleanup(self.browser.open, "about:blank")  # first: a page without its server is a problem
+        self.browser.open(page.url)
+        self.until(lambda: self.exists(INPUT.format(label="sequence")) and "1 of" in self.text(), "the controls", seconds=60)
+        return page
+
+    def until(self, condition, what: str, seconds: float = 20.0):
+        wait_until(condition, what, seconds)
+
+    def exists(self, element: str) -> bool:
+        return self.browser.evaluate(f"(() => {{ try {{ return !!{element} }} catch {{ return false }} }})()")
+
+    def text(self) -> str:
+        return self.browser.evaluate("document.body.innerText")
+
+    def choose(self, label: str, option: str) -> None:
+        """Open a drop-down and click one of its options."""
+        self.browser.click(INPUT.format(label=label))
+        self.until(lambda: self.exists(OPTION.format(label=option)), f"the option {option}")
+        self.browser.click(OPTION.format(label=option))
+
+    def press(self, button: str) -> None:
+        self.browser.click(BUTTON.format(label=button))
+
+    def orange_pixels(self) -> int:
+        """How much of the page has the object's colour."""
+        from PIL import Image
+
+        rgb = np.asarray(Image.open(io.BytesIO(self.browser.screenshot())).convert("RGB")).astype(int)
+        return int(((rgb[..., 0] - rgb[..., 2] > 60) & (rgb[..., 1] > 100)).sum())
+
+    def assert_no_problem(self):
+        self.browser.evaluate("1")  # takes in what is still under way
+        self.assertEqual(self.browser.problems, [])
+
+    def test_scrubbing_and_changing_the_sequence(self):
+        page = self.open(self.retargeted, demos=self.demos)
+        self.assertEqual(page.row, 0)
+        can = page._scene._objects[0]
+        np.testing.assert_allclose(can.position, page.view.object_pos[0])
+        self.browser.evaluate(f"{SLIDER.format(label='frame')}.focus()")
+        self.browser.key("ArrowRight")
+        self.until(lambda: np.allclose(can.position, page.view.object_pos[1], rtol=0, atol=1e-6), "the can to move to frame 1")
+        self.until(lambda: "not valid: joint limit" in self.text(), "the reason in the browser")
+        self.assertIn("joint limit 1", self.text())
+        self.browser.key("End")
+        self.until(lambda: page.row == 3 and not page._scene._keypoints.visible, "the last frame, where no hand is annotated")
+        self.choose("sequence", "1: demo_b")
+        self.until(lambda: [body.visible for body in page._scene._objects] == [False, True], "the other sequence's object")
+        self.assertEqual(page.row, 4)
+        self.until(lambda: "sequence 1: demo_b" in self.text(), "its name in the browser")
+        self.assertGreater(self.orange_pixels(), 20, "the object is not to be seen")
+        self.assert_no_problem()
+
+    def test_stepping_through_the_states_of_a_bank(self):
+        page = self.open(self.bank)
+        self.assertEqual(page.row, 0)
+        self.press("next")
+        can = page._scene._objects[0]
+        self.until(lambda: np.allclose(can.position, page.view.object_pos[1], rtol=0, atol=1e-6), "the next state")
+        self.choose("object", SOUP)
+        self.until(lambda: len(page._rows) == 4, "the states of one object")
+        self.choose("phase", "after contact")
+        self.until(lambda: len(page._rows) == 2, "the states of one phase")
+        self.press("previous")
+        self.until(lambda: page.row == 5, "the last state")
+        self.until(lambda: "2 of 2" in self.text() and "sequence 2: demo_c" in self.text(), "the text in the browser")
+        self.assert_no_problem()
+
+    def test_only_frames_with_one_reason(self):
+        page = self.open(self.retargeted)
+        self.choose("sequence", "all")
+        self.until(lambda: len(page._rows) == 8, "all sequences")
+        self.choose("state", "joint limit (2)")
+        self.until(lambda: page._rows.tolist() == [1, 5], "the frames with that reason")
+        self.assertTrue(self.exists("document.querySelector('div[title=\"joint limit\"]')"))
+        self.assert_no_problem()
+
+
+if __name__ == "__main__":
+    unittest.main()

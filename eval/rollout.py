@@ -123,7 +123,7 @@ def roll_out(
         points = torch.stack([torch.as_tensor(keypoints(o), dtype=torch.float32) for o in objects]).to(backend.device)[backend.object_index]
         every = max(1, round(trace_interval / scene.control_dt))
         for number, (items, fresh) in enumerate(plan):
-            env.reset(start=_starts(on_cpu, sequences[items], repetition[items], seed).to(backend.device))
+            env.reset(start=episode_starts(on_cpu, sequences[items], repetition[items], seed).to(backend.device))
             policy.begin(env)
             reading = env.reading()
             result = EpisodeMetrics(reading, env.goal_pos, env.goal_quat, points, metrics or MetricsConfig())
@@ -145,7 +145,7 @@ def roll_out(
     return Rollouts(episodes=episodes, traces=tuple(sorted(traces, key=lambda t: t.sequence)), control_steps_per_second=steps / spent)
 
 
-def _starts(on_cpu: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int) -> Reset:
+def episode_starts(on_cpu: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int) -> Reset:
     """One start per world. Each has random numbers of its own, drawn on the CPU, so engine and number of worlds change nothing."""
     parts = []
     for s, r in zip(sequence.tolist(), repetition.tolist(), strict=True):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -111,7 +111,7 @@ def svg(draw: Callable[[Figure], None], size: tuple[float, float], *, salt: str)
         size: width and height [inches].
         salt: keeps its identifiers apart from those of other figures on the page; the same salt and drawing give the same text.
     """
-    with _matplotlib({"svg.hashsalt": salt, "svg.fonttype": "none"}) as figure_class:
+    with figure_style({"svg.hashsalt": salt, "svg.fonttype": "none"}) as figure_class:
         figure = figure_class(figsize=size, layout="constrained")
         draw(figure)
         buffer = io.StringIO()
@@ -168,7 +168,7 @@ def write_overview(path: Path, title: str, summaries: Summaries, clips: Sequence
     width = max(2.9 * columns, 9.0)
     picture_height = 2 * width / columns * 0.75 + 0.45 if clips else 0.0
     plot_height = 1.6 + 0.36 * len(summaries)
-    with _matplotlib({"font.size": 10}) as figure_class:
+    with figure_style({"font.size": 10}) as figure_class:
         figure = figure_class(figsize=(width, plot_height + picture_height + 0.4), layout="constrained", facecolor="white")
         figure.suptitle(title, fontsize="large", fontweight="bold")
         heights = (plot_height, picture_height) if clips else (plot_height,)
@@ -205,8 +205,8 @@ def _percent(ax: Axes, which: str) -> None:
 
 
 @contextmanager
-def _matplotlib(style: dict[str, Any]):
-    """matplotlib's ``Figure`` class within this report's style; no window, no global state."""
+def figure_style(style: dict[str, Any]) -> Iterator[type[Figure]]:
+    """matplotlib's ``Figure`` class within the style of the project's plots; no window, no global state."""
     try:
         import matplotlib
         from matplotlib.figure import Figure

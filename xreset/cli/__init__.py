@@ -21,6 +21,7 @@ COMMANDS: dict[str, str] = {
     "view": "Look at demonstrations, robot trajectories or a reset bank in a browser, or as pictures.",
     "train": "Train a policy.",
     "eval": "Evaluate a policy, or a baseline, in one or several engines.",
+    "trace": "Replay one action sequence in several engines, and see when, where and by how much they part.",
     "report": "Make a self-contained HTML page of a run's evaluations.",
 }
 """Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``: a function, or a dictionary of sub-commands."""

@@ -1,8 +1,8 @@
 """Where a robot should stand: the base placement from which its arm reaches most of what human hands did.
 
-Hand retargeting says where the hand root must be in every frame of some demonstrations. Each frame is solved on its own, from several
-starts, so the figure is what the arm *can* reach; what it follows without a jump is for ``xreset retarget`` to say. Candidates are drawn at
-random, then around the best of them (the cross-entropy method).
+Hand retargeting says where the hand root must be in every frame of some demonstrations. Candidates are drawn at random, then around the
+best of them (the cross-entropy method), and tried on frames each on its own, from several starts: what the arm *can* reach. The few best,
+and the robot's own placement, then follow whole motions as in ``xreset retarget``, and the one that follows most wins.
 
 Shape letters: F frames, n arm joints.
 """
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from xreset.errors import RobotError
 from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
 from xreset.retarget.validity import Thresholds, classify
-from xreset.robots.placement import PlaceConfig, Placement, Reach, Search
+from xreset.robots.placement import Finalist, PlaceConfig, Placement, Reach, Search
 from xreset.rotations import matrix_to_quat
 from xreset.spec import RobotSpec
 
@@ -31,46 +31,49 @@ _SHRINK = 0.6
 
 def place(
     robot: RobotSpec,
-    wrists: ArmTargets,
+    paths: list[ArmTargets],
     avoid: np.ndarray,
     config: PlaceConfig | None = None,
-    progress: Callable[[float, Placement, Reach], None] = lambda done, placement, reach: None,
+    progress: Callable[[float, Reach], None] = lambda done, best: None,
 ) -> Search:
-    """The placement from which the robot reaches most wrist poses.
+    """The placement from which the robot follows most of the motions.
 
     Args:
-        robot: the robot; its own placement is the first candidate.
-        wrists: [F, 1, ...] what hand retargeting asks of the arm; see :func:`single_frames`.
+        robot: the robot; its own placement is the first candidate, and a finalist.
+        paths: what hand retargeting asks of the arm: see :func:`xreset.retarget.pipeline.wrist_paths`.
         avoid: [., 3] points that the base keeps clear of.
         config: ranges and effort.
-        progress: called with the share that is done, the best placement yet and its reach.
+        progress: called with the share that is done and the best reach yet.
 
     Raises:
         RobotError: there is no wrist pose to reach.
     """
     config = config or PlaceConfig()
+    wrists = single_frames(paths, Thresholds().hand_error)
     if not len(wrists.annotated):
         raise RobotError(f"robot {robot.name!r}: there is no frame to reach; hand retargeting followed none within its threshold.")
     random = np.random.default_rng(config.seed)
     order = random.permutation(len(wrists.annotated))
-    tried, kept = order[: config.frames], order[config.frames :][: config.final_frames]
-    kept = kept if len(kept) else tried
+    tried, kept = _chosen(wrists, order[: config.frames]), _chosen(wrists, order[config.frames :][: config.final_frames])
+    if not len(kept.annotated):
+        kept = tried
     own = Placement(pos=robot.base_pos, quat=robot.base_quat)
-    found = [(own, reach(robot, own, _chosen(wrists, tried), config))]
-    steps = config.rounds * config.candidates
-    draws = _draws(robot, avoid, config, random, found)
-    for step, candidate in enumerate(draws):
-        found.append((candidate, reach(robot, candidate, _chosen(wrists, tried), config)))
+    found = [(own, reach(robot, own, tried, config))]
+    effort = config.rounds * config.candidates + 10 * (1 + config.elite)  # a finalist takes as long as ten candidates or so
+    for step, candidate in enumerate(_draws(robot, avoid, config, random, found)):
+        found.append((candidate, reach(robot, candidate, tried, config)))
         found.sort(key=lambda pair: pair[1].rank, reverse=True)
-        progress((step + 1) / (steps + 2), *found[0])
-    best, last = found[0][0], _chosen(wrists, kept)
-    return Search(
-        best=best,
-        best_reach=reach(robot, best, last, config),
-        own_reach=reach(robot, own, last, config),
-        home=_home(robot, best),
-        frames=len(kept),
-    )
+        progress((step + 1) / effort, found[0][1])
+
+    finalists = []
+    for placement in dict.fromkeys([own, *(placement for placement, _ in found[: config.elite if config.rounds else 0])]):
+        finalists.append(
+            Finalist(placement=placement, reach=reach(robot, placement, kept, config), followed=_followed(robot, placement, paths))
+        )
+        progress(1.0 - 10 * (1 + config.elite - len(finalists)) / effort, found[0][1])
+    best = max(finalists, key=lambda finalist: finalist.followed)
+    home = robot.home[robot.arm_indices] if best.placement == own else _home(robot, best.placement)
+    return Search(best=best, own=finalists[0], home=home, frames=sum(int(path.annotated.sum()) for path in paths))
 
 
 def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: PlaceConfig) -> Reach:
@@ -94,6 +97,13 @@ def single_frames(paths: list[ArmTargets], hand_error: float) -> ArmTargets:
         return torch.cat([getattr(path, name)[path.annotated & (path.hand_error <= hand_error)] for path in paths])[:, None]
 
     return ArmTargets(**{name: flat(name) for name in vars(paths[0])})
+
+
+def _followed(robot: RobotSpec, placement: Placement, paths: list[ArmTargets]) -> float:
+    """Share of the annotated frames that are valid when the arm follows the paths from a placement."""
+    model = ArmModel(replace(robot, base_pos=placement.pos, base_quat=placement.quat))
+    valid = sum(int((classify(track(model, path, Thresholds())[1], Thresholds()) == 0).sum()) for path in paths)
+    return valid / sum(int(path.annotated.sum()) for path in paths)
 
 
 def _draws(

@@ -10,7 +10,7 @@ import numpy as np
 
 from xreset.errors import RobotError
 from xreset.files import atomic_write
-from xreset.spec import PlacementSpec, RobotSpec
+from xreset.spec import RobotSpec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,14 +26,15 @@ class PlaceConfig:
     clear: float = 0.20
     """Distance that the base's origin keeps from every wrist and object of the demonstrations [m]."""
     frames: int = 100
-    """Frames that each candidate is tried on."""
+    """Frames that each candidate is tried on, each on its own."""
     final_frames: int = 600
-    """Other frames, on which the best candidate and the description's own placement are compared."""
+    """Other frames, on which the finalists are tried."""
     candidates: int = 40
     """Of each round."""
     rounds: int = 5
+    """Of candidates; 0 measures the description's own placement only."""
     elite: int = 5
-    """Best candidates that the next round is drawn around."""
+    """Best candidates: the next round is drawn around them, and in the end they and the description's own placement are the finalists."""
     position: float = 0.005
     """Largest distance of a reached hand root from its target [m]."""
     orientation: float = 5.0
@@ -67,17 +68,28 @@ class Reach:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
-    """Result of :func:`place`."""
+class Finalist:
+    """A placement that was also tried on whole motions."""
 
-    best: Placement
-    best_reach: Reach
-    own_reach: Reach
-    """Of the description's own placement, on the same frames."""
+    placement: Placement
+    reach: Reach
+    """On the final frames."""
+    followed: float
+    """Share of all annotated frames that are valid when the arm follows the motions from frame to frame, as in ``xreset retarget``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """Result of :func:`xreset.robots.place.place`."""
+
+    best: Finalist
+    """The one that follows most."""
+    own: Finalist
+    """The description's own placement."""
     home: np.ndarray | None
     """[n] arm joints that hold the hand, from the best placement, where the description's home holds it; None: it is out of reach there."""
     frames: int
-    """That both figures are of."""
+    """Annotated frames of the motions."""
 
 
 def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) -> None:
@@ -90,12 +102,12 @@ def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) 
         raise RobotError(
             f"robot {robot.name!r}: from the best placement the arm cannot hold the hand where home holds it; choose a home by hand."
         )
-    stated = PlacementSpec(reached=round(search.best_reach.reached, 4), frames=search.frames, command=command)
     text = path.read_text()
     text = re.sub(r"^placement *=.*\n", "", text, flags=re.MULTILINE)
-    pos, quat = (", ".join(f"{v:.4f}" for v in values) for values in (search.best.pos, search.best.quat))
+    pos, quat = (", ".join(f"{v:.4f}" for v in values) for values in (search.best.placement.pos, search.best.placement.quat))
     quoted = command.replace("\\", "\\\\").replace('"', '\\"')
-    entry = f'placement = {{ reached = {stated.reached}, frames = {stated.frames}, command = "{quoted}" }}'
+    figures = f"reached = {search.best.reach.reached:.3f}, followed = {search.best.followed:.3f}, frames = {search.frames}"
+    entry = f'placement = {{ {figures}, command = "{quoted}" }}'
     edits = [(r"^pos *=.*$", f"pos = [{pos}]"), (r"^quat *=.*$", f"quat = [{quat}]\n{entry}")]
     for name, value in zip((robot.joint_names[i] for i in robot.arm_indices), search.home, strict=True):
         edits.append((rf'(name *= *"{re.escape(name)}".*?\bhome *= *)[-+.\deE]+', rf"\g<1>{value:.3f}"))

@@ -147,7 +147,9 @@ def _mimic(row: _Table) -> MimicSpec:
 
 
 def _placement(row: _Table) -> PlacementSpec:
-    return PlacementSpec(reached=row.number("reached"), frames=int(row.number("frames")), command=row.text("command"))
+    return PlacementSpec(
+        reached=row.number("reached"), followed=row.number("followed"), frames=int(row.number("frames")), command=row.text("command")
+    )
 
 
 def _fingertip(row: _Table) -> FingertipSpec:

@@ -13,7 +13,7 @@ from xreset import robots
 from xreset.errors import RobotError
 from xreset.retarget.arm import ArmModel, ArmTargets
 from xreset.robots import load, registry
-from xreset.robots.placement import PlaceConfig, Placement, Reach, Search, write_placement
+from xreset.robots.placement import Finalist, PlaceConfig, Placement, Reach, Search, write_placement
 from xreset.rotations import matrix_to_quat, quat_multiply
 
 try:
@@ -21,7 +21,7 @@ try:
 except ImportError as error:
     raise unittest.SkipTest(str(error)) from error
 
-CONFIG = PlaceConfig(x=(0.2, 0.7), y=(0.4, 0.8), z=(0.4, 0.7), frames=12, final_frames=40, candidates=8, rounds=2, elite=2)
+CONFIG = PlaceConfig(x=(0.2, 0.7), y=(0.4, 0.8), z=(0.4, 0.7), frames=10, final_frames=20, candidates=8, rounds=2, elite=1)
 
 
 def wrists_around_home(robot, count: int) -> ArmTargets:
@@ -47,7 +47,7 @@ class PlaceTest(unittest.TestCase):
     def setUpClass(cls):
         cls.robot = robots.load("openarm")
         cls.own = Placement(pos=cls.robot.base_pos, quat=cls.robot.base_quat)
-        cls.wrists = wrists_around_home(cls.robot, 60)
+        cls.wrists = wrists_around_home(cls.robot, 40)
 
     def test_reach_of_poses_within_reach_and_out_of_it(self):
         here = placing.reach(self.robot, self.own, self.wrists, CONFIG)
@@ -77,19 +77,24 @@ class PlaceTest(unittest.TestCase):
         lost = dataclasses.replace(self.robot, base_pos=(0.45, 0.6, 3.0))
         seen = []
         avoid = self.wrists.root_pos[:, 0].numpy()
-        found = placing.place(lost, self.wrists, avoid, CONFIG, lambda done, placement, reach: seen.append((done, reach.rank)))
-        self.assertEqual(found.own_reach.reached, 0.0)
-        self.assertGreater(found.best_reach.reached, 0.2)
+        found = placing.place(lost, [self.wrists], avoid, CONFIG, lambda done, best: seen.append((done, best.rank)))
+        self.assertEqual((found.own.reach.reached, found.own.followed), (0.0, 0.0))
+        self.assertGreater(found.best.reach.reached, 0.2)
+        self.assertAlmostEqual(found.best.followed, found.best.reach.reached, delta=0.2)  # here, every path is one frame long
         self.assertEqual(found.frames, 40)
-        self.assertGreaterEqual(np.linalg.norm(avoid - found.best.pos, axis=1).min(), CONFIG.clear)
+        self.assertGreaterEqual(np.linalg.norm(avoid - found.best.placement.pos, axis=1).min(), CONFIG.clear)
         self.assertEqual(seen, sorted(seen))  # the best yet never gets worse
         self.assertIsNone(found.home)  # home held the hand three metres up
 
     def test_the_same_seed_finds_the_same(self):
         small = dataclasses.replace(CONFIG, candidates=2, rounds=1)
-        first, second = (placing.place(self.robot, self.wrists, np.zeros((0, 3)), small) for _ in range(2))
-        self.assertEqual(first.best, second.best)
-        self.assertEqual(first.own_reach, second.own_reach)
+        first, second = (placing.place(self.robot, [self.wrists], np.zeros((0, 3)), small) for _ in range(2))
+        self.assertEqual((first.best, first.own), (second.best, second.own))
+
+    def test_without_a_round_the_own_placement_is_measured(self):
+        found = placing.place(self.robot, [self.wrists], np.zeros((0, 3)), dataclasses.replace(CONFIG, rounds=0))
+        self.assertEqual((found.best, found.best.placement), (found.own, self.own))
+        np.testing.assert_array_equal(found.home, self.robot.home[self.robot.arm_indices])
 
     def test_home_holds_the_hand_where_it_did(self):
         near = Placement(pos=(0.46, 0.61, 0.56), quat=self.robot.base_quat)
@@ -103,7 +108,7 @@ class PlaceTest(unittest.TestCase):
     def test_nothing_to_reach_is_an_error(self):
         none = ArmTargets(**{name: value[:0] for name, value in vars(self.wrists).items()})
         with self.assertRaisesRegex(RobotError, "no frame to reach"):
-            placing.place(self.robot, none, np.zeros((0, 3)), CONFIG)
+            placing.place(self.robot, [none], np.zeros((0, 3)), CONFIG)
 
     def test_parameters_of_a_placement_come_back(self):
         rng = np.random.default_rng(0)
@@ -116,13 +121,13 @@ class PlaceTest(unittest.TestCase):
             self.assertAlmostEqual(abs(np.dot(again.quat, placement.quat)), 1.0, places=9)
 
     def test_single_frames_are_those_that_the_hand_follows(self):
-        path = ArmTargets(**{name: value.view(3, 20, *value.shape[2:]) for name, value in vars(self.wrists).items()})
-        error = torch.zeros(3, 20, dtype=torch.float64)
+        path = ArmTargets(**{name: value.view(2, 20, *value.shape[2:]) for name, value in vars(self.wrists).items()})
+        error = torch.zeros(2, 20, dtype=torch.float64)
         error[0, 3] = 0.05
-        annotated = torch.ones(3, 20, dtype=torch.bool)
-        annotated[2, 19] = False
+        annotated = torch.ones(2, 20, dtype=torch.bool)
+        annotated[1, 19] = False
         frames = placing.single_frames([dataclasses.replace(path, hand_error=error, annotated=annotated)], 0.03)
-        self.assertEqual(frames.root_pos.shape, (58, 1, 3))
+        self.assertEqual(frames.root_pos.shape, (38, 1, 3))
         torch.testing.assert_close(frames.root_pos[3], self.wrists.root_pos[4])
 
 
@@ -133,30 +138,29 @@ class WritePlacementTest(unittest.TestCase):
         self.folder = Path(folder.name) / "arm"
         shutil.copytree(registry.robot_folder("openarm"), self.folder)
         self.file = self.folder / registry.DESCRIPTION
-        self.found = Search(
-            best=Placement(pos=(0.1, 0.2, 0.3), quat=(0.6, 0.0, 0.8, 0.0)),
-            best_reach=Reach(reached=0.912345, dexterity=0.5),
-            own_reach=Reach(reached=0.5, dexterity=0.5),
-            home=np.linspace(-0.3, 0.4, 7),
-            frames=321,
+        best = Finalist(
+            placement=Placement(pos=(0.1, 0.2, 0.3), quat=(0.6, 0.0, 0.8, 0.0)), reach=Reach(reached=0.9123, dexterity=0.5), followed=0.8765
         )
+        self.found = Search(best=best, own=best, home=np.linspace(-0.3, 0.4, 7), frames=321)
 
     def test_the_description_reads_back(self):
         before = load(self.folder)
         for _ in range(2):  # the second one replaces the first
             write_placement(self.file, before, self.found, 'xreset robots place openarm --demos "my demos.npz"')
             after = load(self.folder)
-            self.assertEqual((after.base_pos, after.base_quat), (self.found.best.pos, self.found.best.quat))
+            self.assertEqual((after.base_pos, after.base_quat), (self.found.best.placement.pos, self.found.best.placement.quat))
             np.testing.assert_allclose(after.home[after.arm_indices], self.found.home, atol=1e-3)
             np.testing.assert_allclose(after.home[after.hand_indices], before.home[before.hand_indices])
-            self.assertEqual((after.placement.reached, after.placement.frames), (0.9123, 321))
+            self.assertEqual((after.placement.reached, after.placement.followed, after.placement.frames), (0.912, 0.876, 321))
             self.assertIn('"my demos.npz"', after.placement.command)
         self.assertEqual([joint.drive for joint in after.joints], [joint.drive for joint in before.joints])
 
     def test_the_figure_is_no_part_of_the_fingerprint(self):
         before = load(self.folder)
         stated = dataclasses.replace(before, placement=None).fingerprint
-        self.file.write_text(self.file.read_text().replace("[base]", "[base]\nplacement = { reached = 0.5, frames = 3, command = 'x' }", 1))
+        self.file.write_text(
+            self.file.read_text().replace("[base]", "[base]\nplacement = { reached = 0.5, followed = 0.4, frames = 3, command = 'x' }", 1)
+        )
         self.assertEqual(load(self.folder).fingerprint, stated)
         self.assertEqual(load(self.folder).placement.frames, 3)
 

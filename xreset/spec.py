@@ -114,8 +114,10 @@ class PlacementSpec:
 
     reached: float
     """Share of wrist poses that the arm reaches, each on its own."""
+    followed: float
+    """Share of annotated frames that are valid when the arm follows the motions."""
     frames: int
-    """Number of those wrist poses."""
+    """Annotated frames of those motions."""
     command: str
     """What found it."""
 

@@ -34,13 +34,15 @@ def retarget(
     """
     from dataclasses import asdict
 
+    import numpy as np
     from rich.console import Console
     from rich.progress import Progress
     from rich.table import Table
 
     from xreset import robots
     from xreset.accounts import accounts_path, described, with_totals, write_accounts
-    from xreset.demos import demo_objects, read_demos
+    from xreset.demos import demo_objects, levelled, read_demos
+    from xreset.demos.align import on_something
     from xreset.files import file_hash
     from xreset.retarget import pipeline
     from xreset.retarget.partial import discard
@@ -101,6 +103,8 @@ def retarget(
             described(annotated.lost),
         )
     console.print(table)
+    for index in np.flatnonzero(on_something(levelled(chosen), specs)):
+        console.print(f"{chosen.sequence_name[index]}: the object starts on top of something that the scene does not have; not lowered.")
     console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}; counts in {accounts_path(out)}")
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from xreset.errors import RobotError
-from xreset.robots.placement import PlaceConfig, Placement, Reach
+from xreset.robots.placement import PlaceConfig, Reach
 
 
 def list_robots() -> None:
@@ -100,9 +100,8 @@ def place(
 
     from xreset import robots
     from xreset.demos import demo_objects, read_demos
-    from xreset.retarget.pipeline import RetargetConfig, rest_on_table, wrist_paths
+    from xreset.retarget.pipeline import rest_on_table, wrist_paths
     from xreset.robots.place import place as search_place
-    from xreset.robots.place import single_frames
     from xreset.robots.placement import write_placement
     from xreset.robots.registry import DESCRIPTION, robot_folder
 
@@ -113,26 +112,25 @@ def place(
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("hand retargeting", total=chosen.num_sequences)
         paths = wrist_paths(chosen, spec, specs, progress=lambda done, total: bar.update(task, completed=done, total=total))
-        wrists = single_frames(paths, RetargetConfig().thresholds.hand_error)
-        avoid = np.concatenate((wrists.root_pos[:, 0].numpy(), rest_on_table(chosen, specs).object_pos))
+        wrists = np.concatenate([path.root_pos[path.annotated].numpy() for path in paths])
+        avoid = np.concatenate((wrists, rest_on_table(chosen, specs).object_pos))
         task = bar.add_task("placements", total=1.0)
 
-        def report(done: float, placement: Placement, reach: Reach) -> None:
-            bar.update(task, completed=done, description=f"placements (best yet: {reach.reached:.0%})")
+        def report(done: float, best: Reach) -> None:
+            bar.update(task, completed=done, description=f"placements (best yet reaches {best.reached:.0%})")
 
-        found = search_place(spec, wrists, avoid, search, report)
-    lines = (
-        ("as described", Placement(pos=spec.base_pos, quat=spec.base_quat), found.own_reach),
-        ("best found", found.best, found.best_reach),
-    )
-    for title, placement, reach in lines:
-        pos, quat = (", ".join(f"{v:.4f}" for v in values) for values in (placement.pos, placement.quat))
+        found = search_place(spec, paths, avoid, search, report)
+    for title, finalist in (("as described", found.own), ("best found", found.best)):
+        pos, quat = (", ".join(f"{v:.4f}" for v in values) for values in (finalist.placement.pos, finalist.placement.quat))
         console.print(
-            f"{title:12}  pos [{pos}], quat [{quat}]: reaches {reach.reached:.1%}, dexterity {reach.dexterity:.3f}", highlight=False
+            f"{title:12}  follows {finalist.followed:.1%}, reaches {finalist.reach.reached:.1%}, dexterity {finalist.reach.dexterity:.3f}: "
+            f"pos [{pos}], quat [{quat}]",
+            highlight=False,
+            soft_wrap=True,
         )
     if found.home is not None:
-        console.print(f"{'its home':12}  {', '.join(f'{v:.3f}' for v in found.home)}", highlight=False)
-    console.print(f"of {found.frames} wrist poses of {chosen.num_sequences} sequences, each on its own", highlight=False)
+        console.print(f"{'its home':12}  {', '.join(f'{v:.3f}' for v in found.home)}", highlight=False, soft_wrap=True)
+    console.print(f"of {found.frames} annotated frames of {chosen.num_sequences} sequences", highlight=False)
     if write:
         given = [] if objects is None else ["--objects", objects.name]
         command = ["xreset", "robots", "place", spec.name, "--demos", demos.name, *given, "--max-per-object", str(max_per_object)]

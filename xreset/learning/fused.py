@@ -19,8 +19,11 @@ from torch import Tensor
 
 FACTORS = torch.bfloat16
 """Precision of the matrix products' factors. (Triton's interpreter, with which tests run the kernels on a CPU, knows no bfloat16.)"""
-_PROGRAMS_PER_PROCESSOR = 4
-"""Forward programs on each multiprocessor; each loops over clouds and loads the weights once."""
+_FORWARD = {"num_warps": 2, "num_stages": 3}
+_BACKWARD = {"num_warps": 4, "num_stages": 1}
+_FORWARD_PROGRAMS, _BACKWARD_PROGRAMS = 8, 2
+"""Programs on each multiprocessor; each loops over clouds and loads the weights once. These settings were the fastest of those tried on an
+H100: 65,536 clouds of 64 points forward in 0.8 ms and backward in 3.6 ms, where plain layers in bfloat16 take 12.5 ms."""
 
 
 @triton.jit
@@ -29,19 +32,28 @@ def _elu(x):
 
 
 @triton.jit
-def _elu_slope(x, activated):
-    return tl.where(x > 0, 1.0, activated + 1.0)
+def _elu_slope(activated):
+    return tl.where(activated > 0, 1.0, activated + 1.0)
 
 
 @triton.jit
 def _first_layer(cloud, frame, w1, b1, P: tl.constexpr, A: tl.constexpr):
-    """The points' coordinates [P] each and the first layer before its activation [P, A]: three multiplications, no matrix product."""
+    """The first layer before its activation [P, A]: three multiplications, no matrix product."""
     p, a = tl.arange(0, P), tl.arange(0, A)
     at = cloud + frame * (3 * P) + p * 3
     x, y, z = tl.load(at), tl.load(at + 1), tl.load(at + 2)
     wx, wy, wz = tl.load(w1 + a * 3), tl.load(w1 + a * 3 + 1), tl.load(w1 + a * 3 + 2)
-    sums = x[:, None] * wx[None, :] + y[:, None] * wy[None, :] + z[:, None] * wz[None, :] + tl.load(b1 + a)[None, :]
-    return x, y, z, sums
+    return x[:, None] * wx[None, :] + y[:, None] * wy[None, :] + z[:, None] * wz[None, :] + tl.load(b1 + a)[None, :]
+
+
+@triton.jit
+def _points(cloud, frame, low, P: tl.constexpr):
+    """[P, 16] x, y, z, 1, then what rounding took from x, y, z. With it sums over points, too, are products of the matrix units."""
+    p, k = tl.arange(0, P), tl.arange(0, 16)
+    exact = tl.load(cloud + frame * (3 * P) + p[:, None] * 3 + (k % 4)[None, :], mask=(k % 4 < 3)[None, :], other=1.0)
+    rounded = exact.to(low)
+    rest = tl.where((k < 7)[None, :], exact - rounded.to(tl.float32), 0.0).to(low)
+    return tl.where((k < 4)[None, :], rounded, rest)
 
 
 @triton.jit
@@ -53,8 +65,7 @@ def _forward(
     third = tl.load(w3 + c[None, :] * B + b[:, None])  # [B, C]
     bias2, bias3 = tl.load(b2 + b), tl.load(b3 + c)
     for frame in range(tl.program_id(0), frames, tl.num_programs(0)):
-        _, _, _, z1 = _first_layer(cloud, frame, w1, b1, P, A)
-        z2 = tl.dot(_elu(z1).to(second.dtype), second) + bias2[None, :]
+        z2 = tl.dot(_elu(_first_layer(cloud, frame, w1, b1, P, A)).to(second.dtype), second) + bias2[None, :]
         z3 = tl.dot(_elu(z2).to(second.dtype), third)
         best, point = tl.max(z3, axis=0, return_indices=True)
         at = frame * C + c
@@ -65,42 +76,41 @@ def _forward(
 @triton.jit
 def _backward(
     cloud, w1, b1, w2, b2, w3, gradient, winner, d1, d2, db2, d3, frames,
-    P: tl.constexpr, A: tl.constexpr, B: tl.constexpr, C: tl.constexpr,
+    P: tl.constexpr, A: tl.constexpr, B: tl.constexpr, C: tl.constexpr, LOWER: tl.constexpr,
 ):  # fmt: skip
-    """One partial sum of every weight's gradient per program: d1 [4, A] (x, y, z, bias), d2 [A, B], db2 [B], d3 [B, C]."""
-    a, b, c, p = tl.arange(0, A), tl.arange(0, B), tl.arange(0, C), tl.arange(0, P)
+    """One partial sum per program: of d1 [16, A], d2 [A, B] and db2 [16, B] if LOWER, else of d3 [B, C].
+
+    The rows of d1 and db2 are the columns of :func:`_points`. Together the sums would not fit into the registers.
+    """
+    a, b, c, p, k = tl.arange(0, A), tl.arange(0, B), tl.arange(0, C), tl.arange(0, P), tl.arange(0, 16)
     second = tl.load(w2 + b[None, :] * A + a[:, None])  # [A, B]
     second_t = tl.load(w2 + b[:, None] * A + a[None, :])  # [B, A]
     third_t = tl.load(w3 + c[:, None] * B + b[None, :])  # [C, B]
     bias2 = tl.load(b2 + b)
-    sum_x, sum_y, sum_z, sum_1 = tl.zeros([A], tl.float32), tl.zeros([A], tl.float32), tl.zeros([A], tl.float32), tl.zeros([A], tl.float32)
-    sum_2, sum_b2, sum_3 = tl.zeros([A, B], tl.float32), tl.zeros([B], tl.float32), tl.zeros([B, C], tl.float32)
+    sum_1, sum_2, sum_b2 = tl.zeros([16, A], tl.float32), tl.zeros([A, B], tl.float32), tl.zeros([16, B], tl.float32)
+    sum_3 = tl.zeros([B, C], tl.float32)
     for frame in range(tl.program_id(0), frames, tl.num_programs(0)):
-        x, y, z, z1 = _first_layer(cloud, frame, w1, b1, P, A)
-        a1 = _elu(z1)
+        a1 = _elu(_first_layer(cloud, frame, w1, b1, P, A))
         a1_low = a1.to(second.dtype)
-        z2 = tl.dot(a1_low, second) + bias2[None, :]
-        a2 = _elu(z2)
+        a2 = _elu(tl.dot(a1_low, second) + bias2[None, :])
         at = frame * C + c
         g3 = tl.where(tl.load(winner + at).to(tl.int32)[None, :] == p[:, None], tl.load(gradient + at)[None, :], 0.0).to(second.dtype)
-        sum_3 = tl.dot(tl.trans(a2.to(second.dtype)), g3, sum_3)
-        g2 = tl.dot(g3, third_t) * _elu_slope(z2, a2)
-        g2_low = g2.to(second.dtype)
-        sum_b2 += tl.sum(g2, axis=0)
-        sum_2 = tl.dot(tl.trans(a1_low), g2_low, sum_2)
-        g1 = tl.dot(g2_low, second_t) * _elu_slope(z1, a1)
-        sum_x += tl.sum(g1 * x[:, None], axis=0)
-        sum_y += tl.sum(g1 * y[:, None], axis=0)
-        sum_z += tl.sum(g1 * z[:, None], axis=0)
-        sum_1 += tl.sum(g1, axis=0)
+        if LOWER:
+            points = tl.trans(_points(cloud, frame, second.dtype, P))
+            g2 = (tl.dot(g3, third_t) * _elu_slope(a2)).to(second.dtype)
+            sum_b2 = tl.dot(points, g2, sum_b2)
+            sum_2 = tl.dot(tl.trans(a1_low), g2, sum_2)
+            g1 = (tl.dot(g2, second_t) * _elu_slope(a1)).to(second.dtype)
+            sum_1 = tl.dot(points, g1, sum_1)
+        else:
+            sum_3 = tl.dot(tl.trans(a2.to(second.dtype)), g3, sum_3)
     program = tl.program_id(0)
-    tl.store(d1 + program * 4 * A + a, sum_x)
-    tl.store(d1 + program * 4 * A + A + a, sum_y)
-    tl.store(d1 + program * 4 * A + 2 * A + a, sum_z)
-    tl.store(d1 + program * 4 * A + 3 * A + a, sum_1)
-    tl.store(d2 + program * A * B + a[:, None] * B + b[None, :], sum_2)
-    tl.store(db2 + program * B + b, sum_b2)
-    tl.store(d3 + program * B * C + b[:, None] * C + c[None, :], sum_3)
+    if LOWER:
+        tl.store(d1 + program * 16 * A + k[:, None] * A + a[None, :], sum_1)
+        tl.store(d2 + program * A * B + a[:, None] * B + b[None, :], sum_2)
+        tl.store(db2 + program * 16 * B + k[:, None] * B + b[None, :], sum_b2)
+    else:
+        tl.store(d3 + program * B * C + b[:, None] * C + c[None, :], sum_3)
 
 
 class _FusedPointNet(torch.autograd.Function):
@@ -115,8 +125,8 @@ class _FusedPointNet(torch.autograd.Function):
         low2, low3 = w2.to(FACTORS), w3.to(FACTORS)
         out = torch.empty(frames, len(w3), device=cloud.device)
         winner = torch.empty(frames, len(w3), dtype=torch.int16, device=cloud.device)
-        grid = (min(frames, _PROGRAMS_PER_PROCESSOR * _processors(cloud.device)),)
-        _forward[grid](cloud, w1, b1, low2, b2, low3, b3, out, winner, frames, **sizes, num_warps=4)
+        grid = (min(frames, _FORWARD_PROGRAMS * _processors(cloud.device)),)
+        _forward[grid](cloud, w1, b1, low2, b2, low3, b3, out, winner, frames, **sizes, **_FORWARD)
         ctx.save_for_backward(cloud, w1, b1, low2, b2, low3, winner)
         ctx.sizes = sizes
         return out
@@ -125,16 +135,20 @@ class _FusedPointNet(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         cloud, w1, b1, low2, b2, low3, winner = ctx.saved_tensors
         gradient = gradient.contiguous()
-        programs = min(len(cloud), _processors(cloud.device))
+        programs = min(len(cloud), _BACKWARD_PROGRAMS * _processors(cloud.device))
         a, b, c = len(w1), len(low2), len(low3)
 
         def partial(*shape: int) -> Tensor:
             return torch.empty(programs, *shape, device=cloud.device)
 
-        d1, d2, db2, d3 = partial(4, a), partial(a, b), partial(b), partial(b, c)
-        _backward[(programs,)](cloud, w1, b1, low2, b2, low3, gradient, winner, d1, d2, db2, d3, len(cloud), **ctx.sizes, num_warps=8)
+        d1, d2, db2, d3 = partial(16, a), partial(a, b), partial(16, b), partial(b, c)
+        for lower in (False, True):
+            _backward[(programs,)](
+                cloud, w1, b1, low2, b2, low3, gradient, winner, d1, d2, db2, d3, len(cloud),
+                **ctx.sizes, LOWER=lower, **_BACKWARD,
+            )  # fmt: skip
         first = d1.sum(dim=0)
-        return None, first[:3].T, first[3], d2.sum(dim=0).T, db2.sum(dim=0), d3.sum(dim=0).T, gradient.sum(dim=0)
+        return None, (first[:3] + first[4:7]).T, first[3], d2.sum(dim=0).T, db2[:, 3].sum(dim=0), d3.sum(dim=0).T, gradient.sum(dim=0)
 
 
 @functools.cache

@@ -53,7 +53,7 @@ def retarget(
     if max_per_object is not None:
         chosen = chosen.select(max_per_object=max_per_object)
     specs = demo_objects(chosen, objects)
-    config = pipeline.RetargetConfig()
+    config, timing = pipeline.RetargetConfig(), pipeline.Timing()
     partial = out.with_name(f"{out.name}.partial")
     if restart:
         discard(partial)
@@ -62,7 +62,7 @@ def retarget(
             task = bar.add_task("sequences", total=chosen.num_sequences)
             result = pipeline.retarget(
                 chosen, spec, list(specs.values()), config,
-                progress=lambda done, total: bar.update(task, completed=done, total=total), partial=partial,
+                progress=lambda done, total: bar.update(task, completed=done, total=total), partial=partial, timing=timing,
             )  # fmt: skip
     except KeyboardInterrupt:
         if partial.is_dir():
@@ -105,6 +105,7 @@ def retarget(
     console.print(table)
     for index in np.flatnonzero(on_something(levelled(chosen), specs)):
         console.print(f"{chosen.sequence_name[index]}: the object starts on top of something that the scene does not have; not lowered.")
+    console.print(f"hand {timing.hand:.1f} s, arm {timing.arm:.1f} s", highlight=False)
     console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}; counts in {accounts_path(out)}")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import torch
@@ -40,6 +41,14 @@ class RetargetConfig:
     """A human keypoint nearer than this to the object's surface touches it [m]."""
 
 
+@dataclass(kw_only=True)
+class Timing:
+    """Wall time spent [s]; batches that an earlier run has finished do not count."""
+
+    hand: float = 0.0
+    arm: float = 0.0
+
+
 def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
     """The demonstrations over a level table on which each object rests in its first frame (the paper, appendix D.a).
 
@@ -57,6 +66,7 @@ def retarget(
     *,
     progress: Callable[[float, int], None] = lambda done, total: None,
     partial: Path | None = None,
+    timing: Timing | None = None,
 ) -> Retargeted:
     """Retarget demonstrations; sequences are independent of one another, and the result depends on nothing but the arguments.
 
@@ -70,6 +80,7 @@ def retarget(
         config: weights and thresholds.
         progress: called with (sequences done, sequences in all).
         partial: folder for what is finished, made when needed; batches in it that other arguments made are not used.
+        timing: to add the time spent to.
 
     Returns:
         Trajectories of every sequence; a sequence whose hand was never annotated stays at home, without a valid frame.
@@ -101,7 +112,7 @@ def retarget(
                 progress(start + share * size, len(todo))
 
             targets = _hand_targets(demos, hand, sequences, surfaces, touched, touches)
-            solved = _solve(demos, sequences, hand, arm, targets, config, report)
+            solved = _solve(demos, sequences, hand, arm, targets, config, report, timing or Timing())
             if kept:
                 kept.write(number, solved)
         rows = np.concatenate([np.arange(demos.num_frames)[demos.frames(i)] for i in sequences])
@@ -219,10 +230,15 @@ def _solve(
     targets: HandTargets,
     config: RetargetConfig,
     progress: Callable[[float], None],
+    timing: Timing,
 ) -> Batch:
     """Hand, arm and validity of some sequences; ``targets`` are theirs."""
+    started = perf_counter()
     arm_targets = _arm_targets(hand, arm, targets, config.hand, lambda share: progress(0.5 * share))
+    between = perf_counter()
     joints, measures = track(arm, arm_targets, config.thresholds, config.arm, lambda share: progress(0.5 + 0.5 * share))
+    timing.hand += between - started
+    timing.arm += perf_counter() - between
     lengths = [rows.stop - rows.start for rows in map(demos.frames, sequences)]
 
     def unpadded(values: Tensor) -> np.ndarray:

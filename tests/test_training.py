@@ -19,7 +19,7 @@ from xreset.errors import FileFormatError, RunError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.learning.runner import read_checkpoint
-from xreset.learning.train import ensure_policy, resumed, start_run, train
+from xreset.learning.train import ensure_policy, load_inputs, resumed, start_run, train
 from xreset.policy import OnnxPolicy, check_contract
 from xreset.resets.bank import write_bank
 from xreset.task.config import ObservationConfig, TaskConfig
@@ -54,8 +54,9 @@ class TrainingTest(unittest.TestCase):
 
     @classmethod
     def start(cls, out, **changes):
-        options = {"robot": "openarm", "resets": cls.bank, "objects": None, "backend": "mujoco", "device": "cpu", "num_envs": 4, "seed": 3}
-        return start_run(**(options | {"config": CONFIG, "out": out} | changes))
+        inputs = load_inputs(changes.pop("robot", "openarm"), changes.pop("resets", cls.bank), None)
+        options = {"backend": "mujoco", "device": "cpu", "num_envs": 4, "seed": 3, "config": CONFIG, "out": out}
+        return start_run(inputs, **(options | changes))
 
     def test_the_run_says_how_it_was_made(self):
         info = read_run(self.out)

@@ -48,10 +48,9 @@ def train(
         raise RunError("a new run needs --robot and --resets; --resume continues the run in --out.")
     if iterations is not None:
         config = replace(config, iterations=iterations)
+    inputs = training.load_inputs(robot, resets, objects)
     info = training.start_run(
-        robot=robot,
-        resets=resets,
-        objects=objects,
+        inputs,
         backend=backend,
         device=device or training.default_device(backend),
         num_envs=num_envs,
@@ -59,7 +58,7 @@ def train(
         config=config,
         out=out,
     )
-    training.train(out, info)
+    training.train(out, info, inputs)
 
 
 COMMAND = train

@@ -20,6 +20,7 @@ from xreset.env import ManipulationEnv
 from xreset.errors import RunError
 from xreset.files import atomic_write
 from xreset.learning.config import TrainConfig, rsl_rl_config
+from xreset.learning.distributed import Processes
 
 
 class TrainingRunner(OnPolicyRunner):
@@ -34,7 +35,19 @@ class TrainingRunner(OnPolicyRunner):
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0
-        self.is_main = self.gpu_global_rank == 0
+
+    def _configure_multi_gpu(self) -> None:
+        """What rsl-rl's runner does here, for CPUs too."""
+        self.processes = Processes.of_environment()
+        self.processes.join(self.device)
+        self.gpu_global_rank, self.gpu_local_rank, self.gpu_world_size = (
+            self.processes.rank,
+            self.processes.local_rank,
+            self.processes.count,
+        )
+        self.is_distributed = self.gpu_world_size > 1
+        ranks = {"global_rank": self.gpu_global_rank, "local_rank": self.gpu_local_rank, "world_size": self.gpu_world_size}
+        self.cfg["multi_gpu"] = ranks if self.is_distributed else None
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train until ``num_learning_iterations`` iterations are done in all; returns early, checkpoint written, after Ctrl-C."""
@@ -45,7 +58,7 @@ class TrainingRunner(OnPolicyRunner):
         if self.is_distributed:
             alg.broadcast_parameters()
         obs = env.get_observations()
-        log = _Log(self.folder, env.num_envs, str(env.device), num_learning_iterations) if self.is_main else None
+        log = _Log(self.folder, env.num_envs, str(env.device), num_learning_iterations) if self.processes.is_main else None
         saved_at = self.iteration
         with _stop_on_interrupt() as stop:
             while self.iteration < num_learning_iterations and not stop:
@@ -75,17 +88,16 @@ class TrainingRunner(OnPolicyRunner):
             log.close(stopped=bool(stop))
 
     def save_checkpoint(self) -> None:
-        """Write ``checkpoints/ITERATION.pt`` whole or not at all (main process only)."""
-        if not self.is_main:
+        """Write ``checkpoints/ITERATION.pt`` whole or not at all. The main process writes; all must call it."""
+        random = self.processes.gather(self._random_state())
+        if not self.processes.is_main:
             return
         content = self.alg.save() | {
             "iteration": self.iteration,
             "env_steps": self.env_steps,
             "elapsed": self.elapsed,
             "learning_rate": self.alg.learning_rate,
-            "env_rng": self.env.rng_state(),  # pyright: ignore[reportAttributeAccessIssue]
-            "torch_rng": torch.get_rng_state(),
-            "cuda_rng": torch.cuda.get_rng_state() if torch.cuda.is_available() else None,
+            "random": random,
         }
         buffer = io.BytesIO()
         torch.save(content, buffer)
@@ -98,11 +110,24 @@ class TrainingRunner(OnPolicyRunner):
         self.alg.load(content, None, strict=True)
         self.alg.learning_rate = content["learning_rate"]
         self.iteration, self.env_steps, self.elapsed = content["iteration"], content["env_steps"], content["elapsed"]
-        torch.set_rng_state(content["torch_rng"].cpu())
-        if content["cuda_rng"] is not None and torch.cuda.is_available():
-            torch.cuda.set_rng_state(content["cuda_rng"].cpu())
-        if content["env_rng"].shape == self.env.rng_state().shape:  # pyright: ignore[reportAttributeAccessIssue]
-            self.env.set_rng_state(content["env_rng"])  # pyright: ignore[reportAttributeAccessIssue]
+        if self.processes.rank < len(content["random"]):
+            self._set_random_state(content["random"][self.processes.rank])
+
+    def _random_state(self) -> dict[str, Tensor | None]:
+        """Of the numbers that this process draws."""
+        return {
+            "env": self.env.rng_state().cpu(),  # pyright: ignore[reportAttributeAccessIssue]
+            "torch": torch.get_rng_state(),
+            "cuda": torch.cuda.get_rng_state() if torch.cuda.is_available() else None,
+        }
+
+    def _set_random_state(self, state: dict[str, Tensor | None]) -> None:
+        if state["torch"] is not None:
+            torch.set_rng_state(state["torch"].cpu())
+        if state["cuda"] is not None and torch.cuda.is_available():
+            torch.cuda.set_rng_state(state["cuda"].cpu())
+        if state["env"] is not None and state["env"].shape == self.env.rng_state().shape:  # pyright: ignore[reportAttributeAccessIssue]
+            self.env.set_rng_state(state["env"])  # pyright: ignore[reportAttributeAccessIssue]
 
     def _check_finite(self, obs: Any) -> None:
         """One look per iteration: what is not finite here comes from a world whose health said that it was sound."""
@@ -140,9 +165,7 @@ _CHECKPOINT_KEYS = (
     "env_steps",
     "elapsed",
     "learning_rate",
-    "env_rng",
-    "torch_rng",
-    "cuda_rng",
+    "random",
 )
 
 

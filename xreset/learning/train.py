@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from xreset.env import ManipulationEnv, make_scene
 from xreset.errors import RunError
 from xreset.files import file_hash
 from xreset.learning.config import TrainConfig
+from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx
 from xreset.learning.run import RunInfo, latest_checkpoint, read_run, write_run
 from xreset.learning.runner import TrainingRunner
@@ -26,46 +26,56 @@ from xreset.task.resets import ResetDistribution
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Inputs:
-    """What a run's files say, loaded and checked against one another."""
+class RunInputs:
+    """The files of a run, loaded once and checked against one another."""
 
+    robot_name: str
+    """Name or folder, as given."""
+    resets: Path
+    """Path of the reset bank."""
+    resets_hash: str
+    """Its SHA-256."""
+    objects_folder: Path | None
+    """Folder of object meshes; None: the built-in stand-ins."""
     robot: RobotSpec
     bank: ResetBank
     objects: tuple[ObjectSpec, ...]
 
 
-def load_inputs(robot: str, resets: str | Path, objects: str | Path | None) -> _Inputs:
+def load_inputs(robot: str, resets: str | Path, objects: str | Path | None) -> RunInputs:
     """Load robot, bank and objects, and refuse what does not belong together."""
+    folder = Path(objects) if objects else None
     spec = robots.load(robot)
     bank = read_bank(resets, robot=spec)
-    loaded = tuple(load_objects(bank.object_names, Path(objects) if objects else None))
+    loaded = tuple(load_objects(bank.object_names, folder))
     check_objects(resets, bank, loaded)
-    return _Inputs(robot=spec, bank=bank, objects=loaded)
+    return RunInputs(
+        robot_name=robot, resets=Path(resets), resets_hash=file_hash(resets), objects_folder=folder, robot=spec, bank=bank, objects=loaded
+    )
 
 
 def start_run(
-    *, robot: str, resets: str | Path, objects: str | Path | None, backend: str, device: str, num_envs: int, seed: int,
-    config: TrainConfig, out: Path,
+    inputs: RunInputs, *, backend: str, device: str, num_envs: int, seed: int, config: TrainConfig, out: Path,
 ) -> RunInfo:  # fmt: skip
-    """Check everything that a training needs and write ``run.json``.
+    """Check everything that a training needs and write ``run.json`` (the main process only).
 
     Raises:
-        RunError: the folder holds a run already.
+        RunError: the folder holds a run already, or there is no state to reset to.
     """
-    if (out / "run.json").exists():
+    main = Processes.of_environment().is_main
+    if main and (out / "run.json").exists():
         raise RunError(f"{out} holds a run already. Continue it with --resume, or choose another --out.")
-    inputs = load_inputs(robot, resets, objects)
     version = backend_class(backend).engine_version()
     if config.task.reset.demo_probability > 0 and not inputs.bank.num_states:
         raise RunError(
-            f"{resets} holds no state to reset to: every candidate was rejected. Look at its reasons (xreset resets), "
+            f"{inputs.resets} holds no state to reset to: every candidate was rejected. Look at its reasons (xreset resets), "
             "or train without it: --config.task.reset.demo-probability 0"
         )
     info = RunInfo(
-        robot=robot,
-        resets=str(resets),
-        resets_hash=file_hash(resets),
-        objects=str(objects) if objects else None,
+        robot=inputs.robot_name,
+        resets=str(inputs.resets),
+        resets_hash=inputs.resets_hash,
+        objects=str(inputs.objects_folder) if inputs.objects_folder else None,
         backend=backend,
         backend_version=version,
         device=device,
@@ -74,37 +84,46 @@ def start_run(
         config=config,
         contract=policy_contract(inputs.robot, config.task, tuple(o.name for o in inputs.objects)),
     )
-    write_run(out, info)
+    if main:
+        write_run(out, info)
     return info
 
 
-def train(out: Path, info: RunInfo, *, resume: bool = False) -> None:
+def train(out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: bool = False) -> None:
     """Train a run that :func:`start_run` has set up, or continue it; export the policy at the end.
 
-    With ``torchrun``, every process simulates ``num_envs`` worlds on its own GPU.
+    With ``torchrun``, every process simulates ``num_envs`` worlds of its own, each on its own GPU, or all on the CPU.
+
+    Args:
+        out: the run's folder.
+        info: what is in its ``run.json``.
+        inputs: the run's files, if they are loaded already.
+        resume: continue from the newest checkpoint.
     """
-    rank, device = int(os.environ.get("RANK", "0")), info.device
-    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
+    processes = Processes.of_environment()
+    device, seed = processes.device(info.device), processes.seed(info.seed)
     if device.startswith("cuda:"):
         torch.cuda.set_device(device)
-    inputs = load_inputs(info.robot, info.resets, info.objects)
-    if file_hash(info.resets) != info.resets_hash:
+    inputs = inputs or load_inputs(info.robot, info.resets, info.objects)
+    if inputs.resets_hash != info.resets_hash:
         raise RunError(f"{info.resets} is not the file that this run was started with. Put it back, or start a new run.")
-    config = info.config
-    torch.manual_seed(info.seed + 7919 * rank)
+    config, names = info.config, tuple(o.name for o in inputs.objects)
+    torch.manual_seed(seed)
     scene = make_scene(inputs.robot, inputs.objects, config.task)
-    with make_backend(info.backend, scene, info.num_envs, device=device) as backend:
-        resets = ResetDistribution(inputs.bank, inputs.robot, tuple(o.name for o in inputs.objects), config.task.reset, backend.device)
-        env = ManipulationEnv(backend, config.task, resets, seed=info.seed + 7919 * rank)
-        runner = TrainingRunner(env, config, out)
-        if resume:
-            runner.load_checkpoint(latest_checkpoint(out))
-            print(f"continuing after iteration {runner.iteration}", flush=True)
-        runner.learn(config.iterations, init_at_random_ep_len=config.random_episode_start)
-        if rank == 0:
-            export_onnx(runner.alg.get_policy(), out / "policy.onnx", info.contract)  # pyright: ignore[reportArgumentType]
-            _report_health(env)
+    try:
+        with make_backend(info.backend, scene, info.num_envs, device=device) as backend:
+            resets = ResetDistribution(inputs.bank, inputs.robot, names, config.task.reset, backend.device)
+            env = ManipulationEnv(backend, config.task, resets, seed=seed)
+            runner = TrainingRunner(env, config, out)
+            if resume:
+                runner.load_checkpoint(latest_checkpoint(out))
+                if processes.is_main:
+                    print(f"continuing after iteration {runner.iteration}", flush=True)
+            runner.learn(config.iterations, init_at_random_ep_len=config.random_episode_start)
+            if processes.is_main:
+                export_onnx(runner.alg.get_policy(), out / "policy.onnx", info.contract)  # pyright: ignore[reportArgumentType]
+    finally:
+        leave()
 
 
 def default_device(backend: str) -> str:
@@ -117,7 +136,8 @@ def resumed(out: Path, *, iterations: int | None) -> RunInfo:
     info = read_run(out)
     if iterations is not None and iterations != info.config.iterations:
         info = replace(info, config=replace(info.config, iterations=iterations))
-        write_run(out, info)
+        if Processes.of_environment().is_main:
+            write_run(out, info)
     return info
 
 
@@ -149,10 +169,3 @@ def ensure_policy(out: Path) -> Path:
     actor.load_state_dict(read_checkpoint(checkpoint)["actor_state_dict"])
     export_onnx(actor, policy, info.contract)
     return policy
-
-
-def _report_health(env: ManipulationEnv) -> None:
-    """Say how many worlds were ended for a reason that is not the policy's."""
-    nonfinite, overflow = int(env.nonfinite_count), int(env.overflow_count)
-    if nonfinite or overflow:
-        print(f"health: {nonfinite} times a world was not finite and was ended; {overflow} control steps dropped contacts or constraints")

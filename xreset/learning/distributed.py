@@ -1,0 +1,78 @@
+"""The processes that train together, as ``torchrun`` starts them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from xreset.errors import RunError
+
+SEED_STRIDE = 7919
+"""Between the seeds of two processes: each simulates other episodes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Processes:
+    """This process among those that train together."""
+
+    rank: int = 0
+    local_rank: int = 0
+    """Number among the processes of this machine: its GPU."""
+    count: int = 1
+
+    @classmethod
+    def of_environment(cls) -> Processes:
+        """What ``torchrun`` has put into the environment; one process without it.
+
+        Raises:
+            RunError: the variables contradict one another.
+        """
+        rank, local_rank, count = (
+            int(os.environ.get(name, default)) for name, default in (("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1))
+        )
+        if not 0 <= local_rank <= rank < count:
+            raise RunError(f"RANK={rank}, LOCAL_RANK={local_rank}, WORLD_SIZE={count} contradict one another; start with torchrun.")
+        return cls(rank=rank, local_rank=local_rank, count=count)
+
+    @property
+    def is_main(self) -> bool:
+        """Whether this one writes the run's files."""
+        return self.rank == 0
+
+    def device(self, wanted: str) -> str:
+        """The device of this process: with several processes, each has its own GPU."""
+        return f"cuda:{self.local_rank}" if wanted.startswith("cuda") and self.count > 1 else wanted
+
+    def seed(self, seed: int) -> int:
+        """The seed of this process."""
+        return seed + SEED_STRIDE * self.rank
+
+    def join(self, device: str) -> None:
+        """Make the process group that models are averaged in: NCCL for GPUs, Gloo for CPUs. Does nothing for one process."""
+        if self.count > 1 and not torch.distributed.is_initialized():
+            kind = "nccl" if device.startswith("cuda") else "gloo"
+            torch.distributed.init_process_group(backend=kind, rank=self.rank, world_size=self.count)
+
+    def sum(self, values: torch.Tensor) -> torch.Tensor:
+        """The sum of a tensor over all processes."""
+        if self.count > 1:
+            values = values.clone()
+            torch.distributed.all_reduce(values)
+        return values
+
+    def gather(self, value: Any) -> list[Any]:
+        """Every process's value, by rank; only the main process needs the answer, so the others get an empty list."""
+        if self.count == 1:
+            return [value]
+        gathered = [None] * self.count if self.is_main else None
+        torch.distributed.gather_object(value, gathered)
+        return gathered or []
+
+
+def leave() -> None:
+    """End the process group, if there is one."""
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()

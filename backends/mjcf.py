@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from xreset.backends.base import KnownDifference
 from xreset.backends.rigid import Body, Inertia, Mechanism, mechanism, object_inertia
 from xreset.errors import ObjectError, XResetError
 from xreset.spec import GRAVITY, Geometry, ObjectSpec, SceneSpec
@@ -51,6 +52,20 @@ _GEOM_TYPES = {
 }
 _PARKED_SIZE = 1e-6
 _PARKED_POS = (0.0, 0.0, 1e3)  # in the object's frame: out of everything's reach wherever the object is
+
+
+KNOWN_DIFFERENCES = tuple(
+    KnownDifference(
+        check="slope",
+        measure=f"acceleration, mu {mu}, {degrees} degrees",
+        bound=1.5,
+        reason="the convex contact model lifts what slides, by mu times speed times the contact's time constant, so it patters; an error "
+        "of the drag counts twenty times here, and on average the drag is right",
+    )
+    for mu in (0.5, 0.8, 1.2)
+    for degrees in (0, 45)
+)
+"""What both MuJoCo backends cannot do: at mu = 1.2 and 0.5 m/s, a 40 mm high box was seen to hop by 3.6 mm."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from typing import ClassVar, get_args
 
 import numpy as np
 
-from xreset.backends.base import Capability, unavailable
+from xreset.backends.base import Capability, KnownDifference, unavailable
 from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import Inertia
 from xreset.spec import SceneSpec
@@ -21,7 +21,7 @@ try:
 except ImportError as error:
     raise unavailable("mujoco", "mujoco", error) from error
 
-from xreset.backends.mjcf import MIN_FRICTION, SceneModel, compile_scene
+from xreset.backends.mjcf import KNOWN_DIFFERENCES, MIN_FRICTION, SceneModel, compile_scene
 
 _FULL = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
 """The engine's warnings that contacts or constraints have found no room."""
@@ -169,6 +169,7 @@ class MujocoBackend(PoolBackend):
 
     name: ClassVar[str] = "mujoco"
     capabilities: ClassVar[frozenset[Capability]] = frozenset(get_args(Capability))
+    known_differences: ClassVar[tuple[KnownDifference, ...]] = KNOWN_DIFFERENCES
     world_class: ClassVar[type[World]] = MujocoWorld
 
     @classmethod

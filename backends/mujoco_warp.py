@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.base import Backend, Capability, Contacts, Health, Links, MassProperties, State, unavailable
+from xreset.backends.base import Backend, Capability, Contacts, Health, KnownDifference, Links, MassProperties, State, unavailable
 from xreset.backends.pool import initial_state
 from xreset.errors import BackendUnavailableError, XResetError
 from xreset.rotations import quat_to_matrix
@@ -26,7 +26,7 @@ except ImportError as error:
     raise unavailable("mujoco_warp", "mujoco-warp", error) from error
 
 from xreset.backends import mujoco_warp_kernels as kernels
-from xreset.backends.mjcf import MIN_FRICTION, compile_scene
+from xreset.backends.mjcf import KNOWN_DIFFERENCES, MIN_FRICTION, compile_scene
 
 wp.config.log_level = wp.LOG_WARNING  # else a line for each of some hundred kernels; what a user needs to know is announced below
 
@@ -57,6 +57,7 @@ class MujocoWarpBackend(Backend):
 
     name: ClassVar[str] = "mujoco-warp"
     capabilities: ClassVar[frozenset[Capability]] = frozenset(get_args(Capability))
+    known_differences: ClassVar[tuple[KnownDifference, ...]] = KNOWN_DIFFERENCES
 
     def __init__(
         self,

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.toy_robot import toy_hand_arm
 from xreset.backends.base import Backend
-from xreset.backends.conformance.contact_checks import _grasp
+from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench, snapshot
 from xreset.backends.conformance.scene import gripper, objects, scene
 from xreset.backends.mjcf import OBJECT, OTHER_LINK, TABLE, SceneModel, compile_scene
@@ -245,7 +245,7 @@ class BothBackends(unittest.TestCase):
 
     def test_a_grasp_holds_for_two_seconds(self):
         """Grasps have changed between versions of MuJoCo-Warp."""
-        state, _ = _grasp(self.bench)
+        state, _ = grasp(self.bench)
         for backend in self.both():
             with self.subTest(backend=backend.name):
                 backend.set_state(state)
@@ -257,7 +257,7 @@ class BothBackends(unittest.TestCase):
                 self.assertFalse(bool(backend.health().nonfinite.any()))
 
     def test_held_forces_agree(self):
-        state, _ = _grasp(self.bench)
+        state, _ = grasp(self.bench)
         for backend in self.both():
             backend.set_state(state)
             backend.step(60)
@@ -267,7 +267,7 @@ class BothBackends(unittest.TestCase):
 
     def test_readings_are_those_of_a_plain_computation(self):
         """The engine's sensors against loops over links and contacts: while a grasped box is swung about, and right after a set."""
-        state, _ = _grasp(self.bench)
+        state, _ = grasp(self.bench)
         moving = replace(state, joint_vel=state.joint_vel + 0.3, object_angvel=state.object_angvel + torch.tensor([0.5, -1.0, 2.0]))
         touched = set()
         for steps in (0, 1, 5, 30):

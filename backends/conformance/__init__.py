@@ -14,7 +14,15 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from xreset.backends.base import KnownDifference
-from xreset.backends.conformance import contact_checks, motion_checks, robot_checks, state_checks
+from xreset.backends.conformance import (
+    contact_checks,
+    friction_checks,
+    grasp_checks,
+    motion_checks,
+    robot_checks,
+    state_checks,
+    world_checks,
+)
 from xreset.backends.conformance.harness import Bench, MakeBackend
 from xreset.backends.conformance.results import SCHEMA, Check, CheckResult, Measure, Skipped, Verdict, judge
 from xreset.backends.conformance.scene import scene
@@ -22,8 +30,15 @@ from xreset.errors import BackendUnavailableError, CapabilityError
 from xreset.spec import RobotSpec
 
 CHECKS: tuple[Check, ...] = (
-    *state_checks.CHECKS, *robot_checks.CHECKS, *motion_checks.CHECKS, *contact_checks.CHECKS, *state_checks.LAST,
-)  # fmt: skip
+    *state_checks.CHECKS,
+    *world_checks.CHECKS,
+    *robot_checks.CHECKS,
+    *motion_checks.CHECKS,
+    *contact_checks.CHECKS,
+    *friction_checks.CHECKS,
+    *grasp_checks.CHECKS,
+    *world_checks.LAST,
+)
 """All checks, in the order in which they run."""
 
 __all__ = ["CHECKS", "SCHEMA", "Check", "CheckResult", "MakeBackend", "Measure", "run"]

@@ -16,6 +16,7 @@ from xreset.backends.conformance.results import Measure, Skipped
 from xreset.backends.conformance.scene import gripper
 from xreset.backends.pool import initial_state
 from xreset.kinematics import Kinematics
+from xreset.rotations import quat_normalize
 from xreset.spec import SceneSpec
 
 
@@ -152,14 +153,46 @@ def rotation_angle(a: Tensor, b: Tensor) -> Tensor:
     return 2.0 * torch.atan2(vector.norm(dim=-1), (a.double() * b.double()).sum(-1).abs())
 
 
-def compare_states(found: State, expected: State, tolerances: Mapping[str, tuple[float, str]]) -> list[Measure]:
-    """A measure for each field; quaternions are the same with the opposite sign."""
+def random_state(bench: Bench, scene: SceneSpec, num_worlds: int, seed: int, device: torch.device | str = "cpu") -> State:
+    """[N] states with every field away from its default: joints well within their limits, the object in the air, spinning."""
+    random = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return 2.0 * torch.rand(*shape, generator=random) - 1.0
+
+    joints = Kinematics(scene.robot)
+    home = torch.as_tensor(scene.robot.home, dtype=torch.float64)
+    lower, upper = joints.lower.clamp_min(-3.0), joints.upper.clamp_max(3.0)
+    reach = 0.3 * (upper - lower)
+    count = len(home)
+    pos = (home + reach * uniform(num_worlds, count)).clamp(lower + 0.1 * reach, upper - 0.1 * reach)
+    return State(
+        joint_pos=pos.float(),
+        joint_vel=0.5 * uniform(num_worlds, count),
+        joint_target=(pos + 0.2 * reach * uniform(num_worlds, count)).float(),
+        object_pos=torch.tensor([*bench.place, 1.5]) + 0.05 * uniform(num_worlds, 3),
+        object_quat=quat_normalize(uniform(num_worlds, 4)),
+        object_linvel=uniform(num_worlds, 3),
+        object_angvel=4.0 * uniform(num_worlds, 3),
+    ).to(device)
+
+
+def small_motion(kinematics: Kinematics) -> Tensor:
+    """[J] a small way for each joint, towards the middle of its range."""
+    home = torch.as_tensor(kinematics.robot.home, dtype=torch.float64)
+    lower, upper = kinematics.lower.clamp_min(-3.0), kinematics.upper.clamp_max(3.0)
+    step = 0.05 * (upper - lower)
+    return torch.where(home > (lower + upper) / 2, -step, step).float()
+
+
+def compare_states(found: State, expected: State, tolerances: Mapping[str, tuple[float, str]], of: str = "") -> list[Measure]:
+    """A measure for each field, named after what it is a state ``of``; quaternions are the same with the opposite sign."""
     measures = []
     for name, (tolerance, unit) in tolerances.items():
         a, b = getattr(found, name).cpu(), getattr(expected, name).cpu()
         if name == "object_quat":
             a = torch.where((a * b).sum(-1, keepdim=True) < 0, -a, a)
-        measures.append(Measure(what=name, measured=largest(a - b), tolerance=tolerance, unit=unit))
+        measures.append(Measure(what=f"{of} {name}".strip(), measured=largest(a - b), tolerance=tolerance, unit=unit))
     return measures
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -79,6 +80,25 @@ def objects() -> tuple[ObjectSpec, ...]:
     )
 
 
+@cache
+def flat_objects() -> tuple[ObjectSpec, ...]:
+    """A box, a hull of the same shape, two hulls side by side, and a cylinder: all rest 20 mm above the table and are 40 mm high."""
+    half = (0.05, 0.06, 0.02)
+    side = (half[0] / 2, half[1], half[2])
+    return (
+        _object("box", 0.4, (_shape("box", half, (0, 0, 0)),)),
+        _object("hull", 0.4, (_shape("hull", half, (0, 0, 0)),)),
+        _object("two hulls", 0.4, tuple(_shape("hull", side, (x, 0, 0)) for x in (side[0], -side[0]))),
+        _object("cylinder", 0.4, (_shape("cylinder", (0.06, 0.02), (0, 0, 0)),)),
+    )
+
+
+@cache
+def ball() -> ObjectSpec:
+    """A ball of 30 mm radius."""
+    return replace(_object("ball", 0.4, (_shape("sphere", (0.03,), (0, 0, 0)),)), inertia=8e-4 * np.eye(3))
+
+
 def scene(robot: RobotSpec | None = None) -> SceneSpec:
     """The suite's scene: its own robot or another one, and its three objects."""
     return SceneSpec(robot=robot or gripper(), objects=objects(), friction=PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002))
@@ -106,7 +126,7 @@ def _shape(kind: str, size: tuple[float, ...], pos: tuple[float, float, float], 
     return Shape(geometry=geometry, T_body_shape=T)
 
 
-def _object(name: str, mass: float, pieces: tuple[Shape, ...], *, shift: tuple[float, float, float], twist: float) -> ObjectSpec:
+def _object(name: str, mass: float, pieces: tuple[Shape, ...], *, shift: Sequence[float] = (0, 0, 0), twist: float = 0.0) -> ObjectSpec:
     """An object with the inertia of its shape at even density, then its centre of mass shifted and its principal axes turned."""
     mesh = trimesh.util.concatenate([_mesh(piece) for piece in pieces])
     R = Rotation.from_euler("xyz", (twist, -twist, twist)).as_matrix()
@@ -125,6 +145,8 @@ def _mesh(shape: Shape) -> trimesh.Trimesh:
     geometry = shape.geometry
     if geometry.kind == "box":
         mesh = trimesh.creation.box(extents=2.0 * np.array(geometry.size))
+    elif geometry.kind == "sphere":
+        mesh = trimesh.creation.icosphere(radius=geometry.size[0])
     elif geometry.kind == "cylinder":
         mesh = trimesh.creation.cylinder(radius=geometry.size[0], height=2.0 * geometry.size[1], sections=32)
     else:

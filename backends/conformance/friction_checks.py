@@ -1,0 +1,140 @@
+"""Checks of friction on the table, with Coulomb's law: coefficients are those of the pair, in every direction, sliding and at rest."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from xreset.backends.conformance.harness import Bench, largest, replace_fields, snapshot, start_state
+from xreset.backends.conformance.results import Check, Measure
+from xreset.backends.conformance.scene import ball, flat_objects
+from xreset.spec import GRAVITY
+
+_COEFFICIENTS = (0.2, 0.5, 0.8, 1.2)
+_DEGREES = (0, 45)
+_DISTANCE = 0.2  # m that every object slides
+_CASES = [(mu, degrees) for mu in _COEFFICIENTS for degrees in _DEGREES]
+
+
+def sliding_distance(bench: Bench) -> list[Measure]:
+    """Push boxes off at the speed with which Coulomb friction stops them after 0.2 m, over several coefficients, along and across.
+
+    v^2 / (2 mu g) is the way to stop.
+    """
+    shapes = flat_objects()[:3]
+    scene = replace(bench.scene, objects=shapes)
+    which = torch.arange(len(shapes)).repeat(len(_CASES))
+    mu, direction = _cases(bench, len(shapes))
+    start = bench.placed(start_state(scene, which))
+    speed = (2.0 * mu * GRAVITY * _DISTANCE).sqrt()
+    with bench.other(scene, len(which), which) as backend:
+        backend.set_friction(_pairs(bench, mu).to(backend.device))
+        backend.set_state(replace_fields(start, object_linvel=speed[:, None] * direction).to(backend.device))
+        backend.step(round(1.0 / scene.timestep))
+        way = ((snapshot(backend.state()).object_pos - start.object_pos) * direction).sum(-1)
+    off = (way / _DISTANCE - 1.0).abs().view(len(_CASES), len(shapes))
+    worst = off.nan_to_num(torch.inf).argmax(dim=1).tolist()
+    return [
+        Measure(what=f"mu {mu}, {degrees} degrees", measured=float(off[i, worst[i]]), tolerance=0.06, unit="of v^2 / (2 mu g)",
+                where=shapes[worst[i]].name)
+        for i, (mu, degrees) in enumerate(_CASES)
+    ]  # fmt: skip
+
+
+def slope(bench: Bench) -> list[Measure]:
+    """Load a box sideways, as a slope does, with 0.95 and 1.05 of mu m g: it must stay, and slide with 0.05 mu g, in every direction."""
+    box = flat_objects()[0]
+    scene = replace(bench.scene, objects=(box,))
+    mu, direction = _cases(bench, 2)  # two worlds a case: one below the cone, one beyond it
+    ratio = torch.tensor([0.95, 1.05]).repeat(len(_CASES))
+    n = len(mu)
+    which = torch.zeros(n, dtype=torch.long)
+    start = bench.placed(start_state(scene, which))
+    with bench.other(scene, n, which) as backend:
+        backend.set_friction(_pairs(bench, mu).to(backend.device))
+        backend.set_state(start.to(backend.device))
+        backend.step(round(0.25 / scene.timestep))
+        force = (ratio * mu * box.mass * GRAVITY)[:, None] * direction
+        backend.set_object_wrench(force.to(backend.device), torch.zeros(n, 3, device=backend.device))
+        backend.step(round(0.25 / scene.timestep))
+        first = snapshot(backend.state())
+        duration = round(0.5 / scene.timestep) * scene.timestep
+        backend.step(round(0.5 / scene.timestep))
+        last = snapshot(backend.state())
+    creep = (last.object_pos - first.object_pos).norm(dim=-1) / duration
+    acceleration = ((last.object_linvel - first.object_linvel) * direction).sum(-1) / duration
+    off = (acceleration / (0.05 * mu * GRAVITY) - 1.0).abs()
+    measures = []
+    for i, (value, degrees) in enumerate(_CASES):
+        case = f"mu {value}, {degrees} degrees"
+        measures.append(Measure(what=f"creep, {case}", measured=float(creep[2 * i]), tolerance=5e-4, unit="m/s"))
+        measures.append(Measure(what=f"acceleration, {case}", measured=float(off[2 * i + 1]), tolerance=1 / 3, unit="of 0.05 mu g"))
+    return measures
+
+
+def torsional_friction(bench: Bench) -> list[Measure]:
+    """Spin a ball on the table, with two coefficients of sliding friction: torsional friction brakes it with the same torque in both.
+
+    I domega/dt = -t m g, with t the torsional friction, a length.
+    """
+    thing = ball()
+    scene = replace(bench.scene, objects=(thing,))
+    which = torch.zeros(2, dtype=torch.long)
+    start = replace_fields(bench.placed(start_state(scene, which)), object_angvel=torch.tensor([0.0, 0.0, 10.0]))
+    steps = round(0.8 / scene.timestep)  # long enough for what a contact that patters takes and gives to even out
+    with bench.other(scene, 2, which) as backend:
+        backend.set_friction(_pairs(bench, torch.tensor([0.3, 1.0])).to(backend.device))
+        backend.set_state(start.to(backend.device))
+        backend.step(steps)
+        lost = 10.0 - snapshot(backend.state()).object_angvel[:, 2]
+    expected = scene.friction.torsional * thing.mass * GRAVITY / float(thing.inertia[2, 2]) * steps * scene.timestep
+    return [Measure(what="spin lost", measured=largest(lost / expected - 1.0), tolerance=0.01, unit="of t m g / I")]
+
+
+def _cases(bench: Bench, each: int) -> tuple[Tensor, Tensor]:
+    """Coefficient [N] and direction [N, 3], towards the table's middle, of the worlds, ``each`` of them a case."""
+    (x, y), (px, py) = bench.scene.table.center, bench.place
+    mu = torch.tensor([mu for mu, _ in _CASES]).repeat_interleave(each)
+    angle = torch.tensor([math.radians(degrees) for _, degrees in _CASES]).repeat_interleave(each)
+    towards = torch.tensor([math.copysign(1.0, x - px), math.copysign(1.0, y - py), 0.0])
+    return mu, torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), dim=1) * towards
+
+
+def _pairs(bench: Bench, table: Tensor) -> Tensor:
+    """[N, 3] friction of the pairs, that of the table given."""
+    friction = bench.scene.friction
+    return torch.stack((torch.full_like(table, friction.tip), torch.full_like(table, friction.link), table), dim=1)
+
+
+CHECKS = (
+    Check(
+        name="sliding_distance",
+        group="contact",
+        statement="sliding objects stop after v^2 / (2 mu g), with mu that of the pair, from 0.2 to 1.2, along the axes and diagonally",
+        cause="friction is combined (product, average) from coefficients not solved for the pair, shared by all worlds, or a pyramid's",
+        run=sliding_distance,
+        capabilities=("friction",),
+        own_robot_only=True,
+    ),
+    Check(
+        name="slope",
+        group="contact",
+        statement="an object stays on a slope of 0.95 of the friction cone and slides down one of 1.05",
+        cause="friction is regularised so that objects creep, is a pyramid, or is shared by all worlds or lost with the state",
+        run=slope,
+        capabilities=("friction", "object_wrench"),
+        own_robot_only=True,
+    ),
+    Check(
+        name="torsional_friction",
+        group="contact",
+        statement="torsional friction brakes a spinning ball as stated for the pair, whatever its sliding friction",
+        cause="torsional friction is missing, is multiplied by the sliding friction, or comes from the size of a contact patch",
+        run=torsional_friction,
+        capabilities=("friction",),
+        own_robot_only=True,
+    ),
+)

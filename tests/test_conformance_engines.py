@@ -1,0 +1,88 @@
+"""Every engine that can be used here keeps the contracts, with the suite's own robot and with one from outside."""
+
+from __future__ import annotations
+
+import unittest
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from xreset.backends import backend_names, backend_status, make_backend
+from xreset.backends.conformance import CHECKS, CheckResult, run
+from xreset.robots.dynamics import drive_inertia
+from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
+
+
+def make_local(name: str):
+    """A maker of the backend with its worlds in this process, where it has a choice."""
+    options = {"workers": 0} if name in ("mujoco", "pybullet", "sapien") else {}
+    return lambda scene, num_worlds, *, object_index=None: make_backend(name, scene, num_worlds, object_index=object_index, **options)
+
+
+def explain(result: CheckResult) -> str:
+    wrong = "; ".join(f"{m.what} {m.measured:.3g} > {m.tolerance:.3g} {m.unit} {m.where}" for m in result.measures if m.verdict == "failed")
+    return f"{result.name}: {result.check.statement}: {result.problem or wrong}"
+
+
+@cache
+def panda() -> RobotSpec:
+    """The Franka Panda of the package ``pybullet_data``, standing beside the table, with critically damped drives."""
+    import pybullet_data
+
+    home = (0.0, -0.6, 0.0, -2.2, 0.0, 1.6, 0.8)
+    stiffness, effort = (1500.0,) * 4 + (300.0,) * 3, (87.0,) * 4 + (12.0,) * 3
+    arm = [
+        JointSpec(name=f"panda_joint{i + 1}", group="arm", home=q, drive=DriveSpec(kp=kp, kd=0.0, effort=limit, armature=0.1))
+        for i, (q, kp, limit) in enumerate(zip(home, stiffness, effort, strict=True))
+    ]
+    jaw = JointSpec(name="panda_finger_joint1", group="hand", home=0.02, drive=DriveSpec(kp=1000.0, kd=0.0, effort=20.0))
+    robot = RobotSpec(
+        name="panda",
+        urdf=Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf",
+        joints=(*arm, jaw),
+        mimics=(MimicSpec(joint="panda_finger_joint2", source="panda_finger_joint1"),),
+        base_pos=(0.57, -0.35, 0.0),
+        base_quat=(0.70710678, 0.0, 0.0, 0.70710678),
+        palm="panda_grasptarget",
+        fingertips=(
+            FingertipSpec(name="thumb", link="panda_leftfinger", contact_links=("panda_leftfinger",), keypoint="thumb4"),
+            FingertipSpec(name="index", link="panda_rightfinger", contact_links=("panda_rightfinger",), keypoint="index4"),
+        ),
+        keypoints=(KeypointSpec(keypoint="wrist", link="panda_hand"),),
+        hand_root="panda_hand",
+        table_exclude=("panda_link0",),
+    )
+    inertia = drive_inertia(robot, robot.home)
+    return replace(
+        robot,
+        joints=tuple(
+            replace(joint, drive=replace(joint.drive, kd=2.0 * float(np.sqrt(joint.drive.kp * felt))))
+            for joint, felt in zip(robot.joints, inertia, strict=True)
+        ),
+    )
+
+
+class EveryBackend(unittest.TestCase):
+    def backends(self) -> Iterator[str]:
+        for name in backend_names():
+            status = backend_status(name)
+            with self.subTest(backend=name):
+                if status.reason is not None:
+                    self.skipTest(f"{name}: {status.reason}")
+                yield name
+
+    def test_every_available_backend_passes(self):
+        for name in self.backends():
+            results = run(make_local(name))
+            self.assertEqual([r.name for r in results], [c.name for c in CHECKS])
+            self.assertEqual([explain(r) for r in results if r.verdict not in ("passed", "known difference")], [])
+
+    def test_a_robot_from_outside(self):
+        for name in self.backends():
+            results = run(make_local(name), robot=panda())
+            self.assertEqual({r.verdict for r in results if r.check.own_robot_only}, {"skipped"})
+            wrong = [r for r in results if r.verdict != "passed" and not r.check.own_robot_only]
+            self.assertEqual([explain(r) for r in wrong], [])

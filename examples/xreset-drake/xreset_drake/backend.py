@@ -1,0 +1,260 @@
+"""Drake (discrete MultibodyPlant with hydroelastic contact) on the CPU, in double precision.
+
+What differs from Drake's defaults, and why:
+
+- Gravity is off for the object, whose weight is applied as a force: so it can have a gravity fraction. It is off for the robot if that is
+  compensated.
+- Friction of a pair is the *harmonic mean* of its two coefficients; the object's own is fixed, and the others are solved for.
+- The drives are Drake's own PD controllers, which its solver treats implicitly, effort limits included. Armature is the rotor's inertia.
+- Drake ends the process, or raises, where a number is not finite. Such a state never reaches it: see :attr:`DrakeWorld._lost`.
+
+Drake's poses and velocities are those of the interface already: of the body's origin, in the world frame.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Collection, Mapping
+from importlib.metadata import version
+from typing import get_args
+
+import numpy as np
+
+from xreset.backends.base import Capability, KnownDifference
+from xreset.backends.pool import PoolBackend, World
+from xreset.backends.rigid import Inertia, mechanism, nearer, object_inertia, principal
+from xreset.errors import BackendUnavailableError, XResetError
+from xreset.spec import GRAVITY, SceneSpec
+
+try:
+    from pydrake.common.value import Value
+    from pydrake.geometry import AddContactMaterial, ProximityProperties, RoleAssign
+    from pydrake.multibody.math import SpatialForce
+    from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialForce
+    from pydrake.systems.analysis import Simulator
+    from pydrake.systems.framework import Context
+except ImportError as error:
+    raise BackendUnavailableError(f"pydrake cannot be imported ({error}). Install it with: pip install drake") from error
+
+from xreset_drake.model import OBJECT_FRICTION, DrakeModel, DrakeSettings, build_model, friction_of_other, spatial_inertia
+
+_DEFAULTS = DrakeSettings()
+
+
+class DrakeWorld(World):
+    """One world of Drake: a diagram and a context of its own."""
+
+    def __init__(self, scene: SceneSpec, object_index: int, *, settings: DrakeSettings = _DEFAULTS) -> None:
+        """See :class:`World`."""
+        robot, thing = mechanism(scene.robot), scene.objects[object_index]
+        self._inertia = object_inertia(thing)
+        self._at = at = build_model(scene, robot, thing, self._inertia, settings)
+        self._internal_steps, self._dt = settings.internal_steps, scene.timestep / settings.internal_steps
+        self._tips = len(scene.robot.fingertips)
+        mimics = scene.robot.mimics
+        self._source = np.array([scene.robot.joint_names.index(mimic.source) for mimic in mimics], dtype=int)
+        self._multiplier = np.array([mimic.multiplier for mimic in mimics])
+        self._offset = np.array([mimic.offset for mimic in mimics])
+        self._brake = _Brake(scene)
+
+        self._simulator = Simulator(at.diagram)
+        self._root = self._simulator.get_mutable_context()
+        self._context = at.plant.GetMyMutableContextFromRoot(self._root)
+        self._geometry = at.scene_graph.GetMyMutableContextFromRoot(self._root)
+        self._sizes = at.plant.num_positions(), at.plant.num_velocities()
+        self._object_q = at.object.floating_positions_start()
+        self._object_v = at.object.floating_velocities_start_in_v()
+
+        self._lost: np.ndarray | None = None
+        """Positions and velocities that are not finite, and that Drake therefore has not been given."""
+        self._target = scene.robot.home
+        self._quat = np.array([1.0, 0.0, 0.0, 0.0])
+        self._mass, self._fraction = self._inertia.mass, 1.0
+        self._force, self._torque = np.zeros(3), np.zeros(3)
+        self._steps = 0
+        self._friction: dict[str, float] = {}
+        self._set_friction({"object": OBJECT_FRICTION})
+        self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """See :meth:`World.set_state`. Drake's state is all that its solver remembers: nothing else has to be forgotten."""
+        at, i, j = self._at, self._object_q, self._object_v
+        q, v = (np.zeros(size) for size in self._sizes)
+        q[at.joint_position], v[at.joint_velocity] = state["joint_pos"], state["joint_vel"]
+        q[at.mimic_position] = self._multiplier * state["joint_pos"][self._source] + self._offset
+        v[at.mimic_velocity] = self._multiplier * state["joint_vel"][self._source]
+        self._quat = state["object_quat"] / np.linalg.norm(state["object_quat"])
+        q[i : i + 4], q[i + 4 : i + 7] = self._quat, state["object_pos"]
+        v[j : j + 3], v[j + 3 : j + 6] = state["object_angvel"], state["object_linvel"]
+        values = np.concatenate((q, v))
+        self._lost = None if np.isfinite(values).all() else values
+        if self._lost is None:
+            at.plant.SetPositionsAndVelocities(self._context, values)
+        self.set_joint_targets(state["joint_target"])
+        self._force, self._torque = np.zeros(3), np.zeros(3)
+        self._steps = 0
+        self._root.SetTime(0.0)
+        self._simulator.Initialize()
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """See :meth:`World.get_state`."""
+        at, i, j = self._at, self._object_q, self._object_v
+        q, v = self._positions_and_velocities()
+        self._quat = nearer(q[i : i + 4], self._quat)
+        return {
+            "joint_pos": q[at.joint_position],
+            "joint_vel": v[at.joint_velocity],
+            "joint_target": self._target,
+            "object_pos": q[i + 4 : i + 7],
+            "object_quat": self._quat,
+            "object_linvel": v[j + 3 : j + 6],
+            "object_angvel": v[j : j + 3],
+        }
+
+    def set_joint_targets(self, targets: np.ndarray) -> None:
+        """See :meth:`World.set_joint_targets`."""
+        self._target = np.array(targets)
+        desired = np.zeros(2 * len(targets))  # positions, then velocities
+        desired[self._at.joint_actuator] = targets
+        self._at.plant.get_desired_state_input_port(self._at.robot).FixValue(self._context, desired)
+
+    def step(self, n: int) -> None:
+        """See :meth:`World.step`."""
+        if self._lost is not None:
+            return
+        at = self._at
+        load = ExternallyAppliedSpatialForce()
+        load.body_index, load.p_BoBq_B = at.object.index(), self._inertia.com
+        load.F_Bq_W = SpatialForce(self._torque, self._force - np.array([0.0, 0.0, self._mass * GRAVITY * self._fraction]))
+        at.plant.get_applied_spatial_force_input_port().FixValue(self._context, Value[list[ExternallyAppliedSpatialForce]]([load]))
+        for count in [1] * (n * self._internal_steps) if self._brake.needed else [n * self._internal_steps]:
+            if self._brake.needed:
+                self._brake.apply(at, self._context, self._target, self._dt)
+            self._steps += count
+            try:
+                self._simulator.AdvanceTo(self._steps * self._dt)
+            except RuntimeError as error:  # its way to say that numbers have grown beyond all bounds
+                warnings.warn(f"Drake gives up on a world, which counts as not finite from now on: {error}", stacklevel=2)
+                self._lost = np.full(sum(self._sizes), np.nan)
+                return
+
+    def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """See :meth:`World.links`."""
+        frames = self._at.links
+        if self._lost is not None:
+            return tuple(np.full((len(frames), size), np.nan) for size in (3, 4, 3, 3))
+        poses = [frame.CalcPoseInWorld(self._context) for frame in frames]
+        motions = [frame.CalcSpatialVelocityInWorld(self._context) for frame in frames]
+        return (
+            np.array([pose.translation() for pose in poses]),
+            np.array([pose.rotation().ToQuaternion().wxyz() for pose in poses]),
+            np.array([motion.translational() for motion in motions]),
+            np.array([motion.rotational() for motion in motions]),
+        )
+
+    def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See :meth:`World.contacts`: of the last internal step, which is what Drake's output ports report."""
+        tip_force, tip_touch, table_force = np.zeros((self._tips, 3)), np.zeros(self._tips, dtype=bool), np.zeros(3)
+        if self._steps == 0 or self._lost is not None:
+            return tip_force, tip_touch, table_force
+        results = self._at.plant.get_contact_results_output_port().Eval(self._context)
+        for contact in map(results.hydroelastic_contact_info, range(results.num_hydroelastic_contacts())):
+            patch, force = contact.contact_surface(), contact.F_Ac_W().translational()  # on the first of the two geometries
+            first, second = self._at.surfaces[patch.id_M()], self._at.surfaces[patch.id_N()]
+            if second.role == "object":
+                first, second, force = second, first, -force
+            if first.role != "object":
+                continue
+            if second.role == "table":
+                table_force += force
+            elif second.tip is not None:
+                tip_force[second.tip] += force
+                tip_touch[second.tip] |= bool(force.any())
+        return tip_force, tip_touch, table_force
+
+    def health(self) -> tuple[bool, bool]:
+        """See :meth:`World.health`. Drake allocates contacts as it needs them: none is ever dropped."""
+        return not all(np.isfinite(values).all() for values in self._positions_and_velocities()), False
+
+    def mass_properties(self) -> list[Inertia]:
+        """See :meth:`World.mass_properties`."""
+        found = []
+        for body in (*self._at.moving, self._at.object):
+            about_origin = body.CalcSpatialInertiaInBodyFrame(self._context)
+            com = about_origin.get_com()
+            central = about_origin.Shift(com).CalcRotationalInertia().CopyToFullMatrix3()
+            found.append(principal(about_origin.get_mass(), com, central, XResetError, f"Drake's body {body.name()!r}"))
+        return found
+
+    def set_object_mass(self, mass: float) -> None:
+        """See :meth:`World.set_object_mass`."""
+        nominal = self._inertia
+        scaled = Inertia(mass=mass, com=nominal.com, quat=nominal.quat, moments=nominal.moments * (mass / nominal.mass))
+        self._mass = mass
+        self._at.object.SetSpatialInertiaInBodyFrame(self._context, spatial_inertia(scaled))
+
+    def set_friction(self, friction: np.ndarray) -> None:
+        """See :meth:`World.set_friction`."""
+        self._set_friction({role: friction_of_other(float(mu)) for role, mu in zip(("tip", "link", "table"), friction, strict=True)})
+
+    def set_object_gravity(self, fraction: float) -> None:
+        """See :meth:`World.set_object_gravity`."""
+        self._fraction = fraction
+
+    def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
+        """See :meth:`World.set_object_wrench`."""
+        self._force, self._torque = force, torque
+
+    def _positions_and_velocities(self) -> tuple[np.ndarray, np.ndarray]:
+        values = self._at.plant.GetPositionsAndVelocities(self._context) if self._lost is None else self._lost
+        return values[: self._sizes[0]], values[self._sizes[0] :]
+
+    def _set_friction(self, coefficients: Mapping[str, float]) -> None:
+        """Give the geometries of some roles a coefficient of their own. Drake rebuilds what has changed, so only that is touched."""
+        changed: Collection[str] = {role for role, mu in coefficients.items() if self._friction.get(role) != mu}
+        self._friction |= coefficients
+        at = self._at
+        for geometry, surface in at.surfaces.items():
+            if surface.role in changed:
+                properties = ProximityProperties(at.properties[geometry])
+                mu = self._friction[surface.role]
+                AddContactMaterial(properties, friction=CoulombFriction(mu, mu))
+                at.scene_graph.AssignRole(self._geometry, at.plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
+
+
+class DrakeBackend(PoolBackend):
+    """N worlds of Drake; the keyword ``settings`` takes :class:`DrakeSettings`."""
+
+    name = "drake"
+    capabilities = frozenset(get_args(Capability))
+    known_differences: tuple[KnownDifference, ...] = ()
+    world_class = DrakeWorld
+
+    @classmethod
+    def engine_version(cls) -> str:
+        """See :meth:`Backend.engine_version`."""
+        return version("drake")
+
+
+class _Brake:
+    """Dry friction of the joints, which Drake lacks, as a torque.
+
+    It is what would bring the joint to rest within the step, as far as the friction loss allows; contacts are not foreseen.
+    """
+
+    def __init__(self, scene: SceneSpec) -> None:
+        drives = [joint.drive for joint in scene.robot.joints]
+        self._kp, self._kd, self._effort, self._loss = (
+            np.array([getattr(drive, field) for drive in drives]) for field in ("kp", "kd", "effort", "friction_loss")
+        )
+        self.needed = bool(self._loss.any())
+
+    def apply(self, at: DrakeModel, context: Context, target: np.ndarray, dt: float) -> None:
+        """Set the torques of one step."""
+        plant, joints = at.plant, at.joint_velocity
+        position, velocity = plant.GetPositions(context)[at.joint_position], plant.GetVelocities(context)[joints]
+        drive = np.clip(self._kp * (target - position) - self._kd * velocity, -self._effort, self._effort)
+        felt = 1.0 / np.diag(np.linalg.inv(plant.CalcMassMatrix(context)))[joints]
+        torque = np.zeros(plant.num_velocities())
+        torque[joints] = np.clip(-felt * velocity / dt - drive, -self._loss, self._loss)
+        plant.get_applied_generalized_force_input_port().FixValue(context, torque)

@@ -93,6 +93,7 @@ def place(
         search: ranges and effort.
     """
     import shlex
+    from dataclasses import fields
 
     import numpy as np
     from rich.console import Console
@@ -134,6 +135,9 @@ def place(
     if write:
         given = [] if objects is None else ["--objects", objects.name]
         command = ["xreset", "robots", "place", spec.name, "--demos", demos.name, *given, "--max-per-object", str(max_per_object)]
+        for field in fields(search):
+            if (value := getattr(search, field.name)) != field.default:
+                command += [f"--search.{field.name}", *map(str, value if isinstance(value, tuple) else (value,))]
         write_placement(robot_folder(robot) / DESCRIPTION, spec, found, shlex.join(command))
         console.print(f"wrote {robot_folder(robot) / DESCRIPTION}", highlight=False)
 

@@ -52,9 +52,8 @@ def run(options: Options, console: Console) -> None:
     within = _follows(track(model, alone, replace(SOLVED, table_depth=1e9, self_depth=1e9), config)[1], 1e9)[:, 0]
     console.print(f"wrist above the table in {len(free)} annotated frames")
     console.print(f"followed to 5 mm and 5 degrees: {_share(solved)}; and free of table and self: {_share(free)}")
-    console.print(
-        f"within reach by 16 restarts on each of {len(chosen)} frames: {_share(within)}; of these followed and free: {_share(free[chosen][within])}"
-    )
+    console.print(f"within reach by 16 restarts on each of {len(chosen)} frames: {_share(within)}")
+    console.print(f"of these followed and free: {_share(free[chosen][within])}")
 
 
 def _follows(found: Measures, depth: float) -> torch.Tensor:

@@ -166,6 +166,18 @@ class SettingOneWorldBrakesTheOthers(MujocoWorld):
             other._data.qvel[:] *= 0.9
 
 
+@breaks("masked_set")
+class MaskIgnored(MujocoBackend):
+    def set_where(self, mask, **values):
+        super().set_where(mask | True, **values)
+
+
+@breaks("masked_set")
+class MaskedValuesInTheOrderOfTheMask(MujocoBackend):
+    def set_where(self, mask, *, state, **values):
+        super().set_where(mask, state=state[mask.long().argsort(descending=True)], **values)
+
+
 @breaks("twins", "repeatable")
 class SharedRandomStream(MujocoWorld):
     random: ClassVar = np.random.default_rng(0)

@@ -84,6 +84,35 @@ def selected_worlds(bench: Bench) -> list[Measure]:
     ]
 
 
+def masked_set(bench: Bench) -> list[Measure]:
+    """Set state, mass, friction and gravity of the worlds of a mask in the middle of a motion: as the single setters do."""
+    chosen = [3, 1]
+    new = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=11)
+    mass = torch.tensor([thing.mass for thing in bench.objects]) * torch.tensor([2.0, 0.5, 1.5, 0.7])
+    friction = torch.tensor([[0.8, 0.4, 0.3], [0.7, 0.5, 0.9], [0.6, 0.3, 0.45], [0.9, 0.6, 0.2]])
+    gravity = torch.tensor([0.9, 0.5, 0.1, 0.0])
+
+    def run(masked: bool) -> State:
+        backend = bench.altered()
+        backend.set_state(random_state(bench, bench.scene, bench.NUM_WORLDS, seed=12).to(backend.device))
+        backend.step(4)
+        values = [value.float().to(backend.device) for value in (friction, mass, gravity)]
+        if masked:
+            mask = torch.zeros(bench.NUM_WORLDS, dtype=torch.bool, device=backend.device)
+            mask[chosen] = True
+            backend.set_where(mask, state=new.to(backend.device), friction=values[0], object_mass=values[1], object_gravity=values[2])
+        else:
+            worlds = torch.tensor(chosen, device=backend.device)
+            backend.set_friction(values[0][worlds], worlds)
+            backend.set_object_mass(values[1][worlds], worlds)
+            backend.set_object_gravity(values[2][worlds], worlds)
+            backend.set_state(new[chosen].to(backend.device), worlds)
+        backend.step(12)
+        return snapshot(backend.state())
+
+    return compare_states(run(masked=True), run(masked=False), _SAME)
+
+
 def worlds_independent(bench: Bench) -> list[Measure]:
     """Run twice, the second time with one world quite different: the others must not notice."""
 
@@ -216,6 +245,14 @@ CHECKS = (
         statement="setting some worlds gives each its state and leaves the others alone",
         cause="indices are sorted or ignored; or setting some worlds resets something of all",
         run=selected_worlds,
+    ),
+    Check(
+        name="masked_set",
+        group="worlds",
+        statement="setting the worlds of a mask does what the single setters do for those worlds, and nothing to the others",
+        cause="values are taken in the order of the mask instead of the worlds; the mask is ignored; derived quantities are left out",
+        run=masked_set,
+        capabilities=("object_mass", "friction", "object_gravity"),
     ),
     Check(
         name="worlds_independent",

@@ -10,8 +10,11 @@ import tyro
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from torch import Tensor
 
+    from xreset.backends.base import Backend
     from xreset.backends.conformance import CheckResult, MakeBackend, Measure
+    from xreset.spec import SceneSpec
 
 
 def conformance(
@@ -98,9 +101,20 @@ def _usable(console: Console) -> list[str]:
 
 
 def _maker(name: str, device: str) -> MakeBackend:
+    """Builds worlds on the device; a few of them, for one check only, run in this process sooner than processes start."""
     from xreset.backends import make_backend
+    from xreset.backends.conformance.harness import Bench
+    from xreset.backends.pool import PoolBackend
+    from xreset.backends.registry import backend_class
 
-    return lambda scene, num_worlds, *, object_index=None: make_backend(name, scene, num_worlds, object_index=object_index, device=device)
+    pooled = issubclass(backend_class(name), PoolBackend)
+
+    def make(scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None) -> Backend:
+        here = pooled and num_worlds != Bench.NUM_WORLDS and num_worlds <= 24
+        options = {"workers": 0} if here else {}
+        return make_backend(name, scene, num_worlds, object_index=object_index, device=device, **options)
+
+    return make
 
 
 _STYLE = {"passed": "green", "known difference": "cyan", "failed": "bold red", "unsupported": "yellow", "skipped": "dim"}

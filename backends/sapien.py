@@ -13,6 +13,7 @@ What differs from SAPIEN's defaults, and why:
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,14 +25,13 @@ import numpy as np
 from xreset.backends.base import Capability, KnownDifference, unavailable
 from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import (
+    Arms,
     Inertia,
     Mechanism,
     TrackedFrames,
-    conjugate,
     cross,
     matrix_to_quat,
     mechanism,
-    multiply,
     nearer,
     object_inertia,
     rotate,
@@ -76,6 +76,9 @@ class SapienWorld(World):
         self._renew_scene()
         self._joints = _Joints(self._bodies, robot, scene.timestep)
         self._frames = TrackedFrames(robot)
+        self._tracked = [self._bodies[i] for i in self._frames.bodies]
+        self._arm = Arms(self._inertia.com[None])
+        self._axes = Arms(np.array([rotate(self._inertia.quat, axis) for axis in np.eye(3)]))
         self._mass, self._moments, self._fraction = self._inertia.mass, self._inertia.moments, 1.0
         self._force, self._torque = np.zeros(3), np.zeros(3)
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
@@ -96,7 +99,7 @@ class SapienWorld(World):
 
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
-        pose = self._object.entity.pose
+        pose = self._object.entity_pose
         self._quat = nearer(pose.q.astype(np.float64), self._quat)
         omega = self._object.angular_velocity.astype(np.float64)
         position, velocity = self._joints.read()
@@ -104,9 +107,9 @@ class SapienWorld(World):
             "joint_pos": position,
             "joint_vel": velocity,
             "joint_target": self._joints.target,
-            "object_pos": pose.p.astype(np.float64),
+            "object_pos": pose.p,
             "object_quat": self._quat,
-            "object_linvel": self._object.linear_velocity - cross(omega, rotate(self._quat, self._inertia.com)),
+            "object_linvel": self._object.linear_velocity - cross(omega, self._arm.turned(self._quat)[0]),
             "object_angvel": omega,
         }
 
@@ -118,23 +121,22 @@ class SapienWorld(World):
         """See :meth:`World.step`."""
         body = self._object
         force = self._force - np.array([0.0, 0.0, self._mass * GRAVITY * self._fraction])
-        for _ in range(n):
+        for remaining in reversed(range(n)):
             self._joints.brake()
             body.add_force_torque(force, self._torque)
-            start = _Motion(body.linear_velocity, body.angular_velocity, multiply(body.entity_pose.q, self._inertia.quat))
+            if not remaining:
+                start = _Motion(body.linear_velocity, body.angular_velocity, body.entity_pose.q)
+                self._last_step = start, force, self._torque
             self._system.step()
-        self._last_step = start, force, self._torque
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.links`."""
-        bodies = [self._bodies[i] for i in self._frames.bodies]
-        poses = [body.entity_pose for body in bodies]
-        return self._frames.locate(
-            np.array([pose.p for pose in poses], dtype=np.float64),
-            np.array([pose.q for pose in poses], dtype=np.float64),
-            np.array([body.linear_velocity for body in bodies], dtype=np.float64),
-            np.array([body.angular_velocity for body in bodies], dtype=np.float64),
-        )
+        parts = []
+        for body in self._tracked:
+            pose = body.entity_pose
+            parts += (pose.p, pose.q, body.linear_velocity, body.angular_velocity)
+        rows = np.concatenate(parts, dtype=np.float64).reshape(-1, 13)
+        return self._frames.locate(rows[:, :3], rows[:, 3:7], rows[:, 7:10], rows[:, 10:])
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.contacts`."""
@@ -144,7 +146,8 @@ class SapienWorld(World):
             return tip_force, tip_touch, table_force
         surfaces, points, normal_forces = self._contact_points()
         if surfaces:
-            arms = points - self._center_of_mass()
+            pose = self._object.entity_pose
+            arms = points - (pose.p + self._arm.turned(pose.q)[0])
             limits = np.array([self._pair_friction[surface.role] for surface in surfaces])
             missing = self._missing_wrench(*self._last_step, arms, normal_forces)
             for surface, force in zip(surfaces, normal_forces + _friction(arms, normal_forces, limits, *missing), strict=True):
@@ -157,8 +160,9 @@ class SapienWorld(World):
 
     def health(self) -> tuple[bool, bool]:
         """See :meth:`World.health`. PhysX allocates contacts as it needs them: none is ever dropped."""
-        pose = self._object.entity.pose
-        return not all(np.isfinite(x).all() for x in (pose.p, pose.q, self._object.linear_velocity, *self._joints.read())), False
+        pose = self._object.entity_pose
+        read = (pose.p, pose.q, self._object.linear_velocity, self._object.angular_velocity, *self._joints.read())
+        return not math.isfinite(sum(x.dot(x) for x in read)), False  # one bad number spoils the sum; cheaper than looking at each
 
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`."""
@@ -292,7 +296,7 @@ class SapienWorld(World):
 
     def _contact_points(self) -> tuple[list[_Surface], np.ndarray, np.ndarray]:
         """What pressed on the object in the last step: surfaces, points [n, 3], normal forces on the object [n, 3]."""
-        surfaces, points, forces = [], [], []
+        surfaces, points, impulses = [], [], []
         for contact in self._system.get_contacts():
             first, second = contact.bodies
             if self._object not in (first, second):
@@ -300,27 +304,22 @@ class SapienWorld(World):
             sign = 1.0 if first == self._object else -1.0  # an impulse acts on the first body
             surface = self._surfaces[contact.shapes[1 if first == self._object else 0]]
             for point in contact.points:
-                if point.impulse.any():
+                x, y, z = point.impulse.tolist()
+                if x or y or z:
                     surfaces.append(surface)
-                    points.append(point.position)
-                    forces.append(sign * point.impulse / self._dt)
-        return surfaces, np.array(points, dtype=np.float64), np.array(forces, dtype=np.float64)
+                    points.append(point.position.tolist())
+                    impulses.append((sign * x, sign * y, sign * z))
+        return surfaces, np.array(points), np.array(impulses) / self._dt
 
     def _missing_wrench(
         self, start: _Motion, force: np.ndarray, torque: np.ndarray, arms: np.ndarray, contact_forces: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Force and torque [3] about the centre of mass that the object's change of momentum shows beyond the forces given."""
+        axes, omega = self._axes.turned(start.quat), start.angvel.astype(np.float64)
+        inertia = (axes.T * self._moments) @ axes
         gained = self._mass * (self._object.linear_velocity - start.linvel) / self._dt
-        turned = self._angular_momentum(self._object.angular_velocity - start.angvel, start.principal) / self._dt
-        gyroscopic = cross(start.angvel, self._angular_momentum(start.angvel, start.principal))
-        return gained - force - contact_forces.sum(axis=0), turned + gyroscopic - torque - cross(arms, contact_forces).sum(axis=0)
-
-    def _center_of_mass(self) -> np.ndarray:
-        pose = self._object.entity.pose
-        return pose.p + rotate(pose.q, self._inertia.com)
-
-    def _angular_momentum(self, omega: np.ndarray, principal: np.ndarray) -> np.ndarray:
-        return rotate(principal, self._moments * rotate(conjugate(principal), omega))
+        turned = inertia @ (self._object.angular_velocity - omega) / self._dt + cross(omega, inertia @ omega)
+        return gained - force - contact_forces.sum(axis=0), turned - torque - cross(arms, contact_forces).sum(axis=0)
 
 
 KNOWN_DIFFERENCES = tuple(
@@ -359,8 +358,8 @@ class _Motion(NamedTuple):
     """[3] velocity of the centre of mass."""
     angvel: np.ndarray
     """[3]"""
-    principal: np.ndarray
-    """[4] orientation of the principal axes in the world."""
+    quat: np.ndarray
+    """[4] orientation."""
 
 
 class _Surface(NamedTuple):
@@ -384,16 +383,13 @@ def _friction(arms: np.ndarray, normal_forces: np.ndarray, coefficients: np.ndar
         force: [3] N.
         torque: [3] N m, about the centre of mass.
     """
-    limits = np.linalg.norm(normal_forces, axis=1)
+    limits = np.sqrt((normal_forces * normal_forces).sum(axis=1))
     normals = normal_forces / limits[:, None]
-    capacity = limits * coefficients
-    side = cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
-    side /= np.linalg.norm(side, axis=1)[:, None]
-    tangents = np.concatenate([side, cross(normals, side)])  # [2 n, 3]
-    capacity, arms = np.tile(capacity, 2)[:, None], np.tile(arms, (2, 1))
-    columns = np.concatenate([tangents, cross(arms, tangents) / _ARM], axis=1) * capacity
-    shares, *_ = np.linalg.lstsq(columns.T, np.concatenate([force, torque / _ARM]), rcond=1e-6)
-    return (shares[:, None] * capacity * tangents).reshape(2, -1, 3).sum(axis=0)
+    # Row j of contact i: its force if its share is 1 along j; what is not tangential is taken away.
+    forces = (limits * coefficients)[:, None, None] * (np.eye(3) - normals[:, :, None] * normals[:, None, :])
+    wrenches = np.concatenate([forces, cross(arms[:, None], forces) / _ARM], axis=2).reshape(-1, 6)
+    shares, *_ = np.linalg.lstsq(wrenches.T, np.concatenate([force, torque / _ARM]), rcond=1e-6)
+    return (shares.reshape(-1, 1, 3) @ forces)[:, 0]
 
 
 _ARM = 1.0
@@ -433,7 +429,8 @@ class _Joints:
             np.array([getattr(joint.drive, field) for joint in spec.joints])
             for field in ("kp", "kd", "effort", "armature", "friction_loss")
         )
-        if self._loss.any():
+        self._brakes = bool(self._loss.any())
+        if self._brakes:
             from xreset.robots.dynamics import mass_matrix
 
             self._felt = 1.0 / np.diag(np.linalg.inv(mass_matrix(spec, spec.home) + np.diag(self._armature)))
@@ -462,7 +459,7 @@ class _Joints:
 
         It is what would bring the joint to rest within the step, as far as the friction loss allows; contacts are not foreseen.
         """
-        if not self._loss.any():
+        if not self._brakes:
             return
         position, velocity = self.read()
         drive = np.clip(self._kp * (self.target - position) - self._kd * velocity, -self._effort, self._effort)

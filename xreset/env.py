@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from xreset.capture import GraphRunner
+from xreset.faults import FaultRecorder
 from xreset.objects import surface_points
 from xreset.rotations import quat_rotate_inverse
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
@@ -60,7 +61,8 @@ class ManipulationEnv:
         goal_pos, goal_quat: [N, 3], [N, 4] goal of each world.
         sequence: [N] demonstration of each world.
         gravity_fraction: [N]
-        nonfinite_count, overflow_count: [] worlds that were ended because a number was not finite; that dropped contacts.
+        nonfinite_count, overflow_count: [] times that a world was ended because a number was not finite; because it dropped contacts.
+        faults: the last of those worlds, before and after the step in which they broke.
     """
 
     def __init__(self, backend: Backend, task: TaskConfig, resets: ResetDistribution, *, seed: int = 0) -> None:
@@ -122,6 +124,12 @@ class ManipulationEnv:
             sequence=zeros(dtype=torch.long),
         )
         self._friction, self._mass = zeros(3), zeros()
+        # What is kept of a step in case that it breaks a world.
+        state = backend.state()
+        self._before = {f.name: getattr(state, f.name).clone() for f in fields(state)}
+        self._faulty = zeros(dtype=torch.bool)
+        self._worlds = torch.arange(n, device=self.device)
+        self.faults = FaultRecorder({name: tuple(value.shape[1:]) for name, value in self._fault_values(state).items()}, self.device)
         self._log_names: tuple[str, ...] = ()
         self._log_values = torch.zeros(0, device=self.device)
         self._observations = TensorDict({}, batch_size=[n], device=self.device)
@@ -150,17 +158,18 @@ class ManipulationEnv:
 
         Returns:
             Observations (of the new episode where one has begun), reward [N], done [N] (0 or 1), extras with ``time_outs`` [N] (ended
-            without failing: the value is to be bootstrapped) and ``log``.
+            without failing: the value is to be bootstrapped), ``faulty`` [N] bool (ended because the simulation failed: nothing is to be
+            learned from this step) and ``log``.
         """
         self._move(action)
         self._graphs.run(self._judge)
-        reward, done, time_out = self._reward.clone(), self._fresh.long(), self._time_out.float()
+        reward, done, time_out, faulty = self._reward.clone(), self._fresh.long(), self._time_out.float(), self._faulty.clone()
         log = dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True))
         if self._graphs.active or bool(self._fresh.any()):
             self._graphs.run(self._draw)
             self._begin()
         self._graphs.run(self._observe)
-        return self.get_observations(), reward, done, {"time_outs": time_out, "log": log}
+        return self.get_observations(), reward, done, {"time_outs": time_out, "faulty": faulty, "log": log}
 
     # Stepping and resetting --------------------------------------------------------------------------------------------------------
 
@@ -217,16 +226,21 @@ class ManipulationEnv:
 
     def _aim(self) -> None:
         """From the action to the drives' targets."""
+        state = self.backend.state()
+        for name, value in self._before.items():
+            value.copy_(getattr(state, name))
         self._action.clamp_(-1.0, 1.0)
-        self._target.copy_(self.actions.targets(self._action, self._target, self.backend.state().joint_pos))
+        self._target.copy_(self.actions.targets(self._action, self._target, state.joint_pos))
 
     def _judge(self) -> tuple[Reading, Reward]:
         """What the step has brought: reward, ends of episodes, numbers to log."""
         reading = self._read()
-        # The worlds that broke say nothing true any more: they end, teach nothing (reward 0, bootstrapped like a time-out) and are counted.
+        # What failed in the simulation ends, is counted and kept, and is not learned from. Numbers that are not finite say nothing at all.
         broken = reading.health.nonfinite
+        self._faulty.copy_(broken | reading.health.overflow)
         self.nonfinite_count += broken.sum()
-        self.overflow_count += reading.health.overflow.sum()
+        self.overflow_count += (reading.health.overflow & ~broken).sum()
+        self.faults.record(self._faulty, self._fault_values(reading.state))
         lost = out_of_bounds(reading.state.object_pos, self.backend.scene.table, self.task.termination) & ~broken
         reach = reading.tip_distance.mean(dim=-1)
         self._best_reach.copy_(torch.where(broken, self._best_reach, torch.minimum(self._best_reach, reach)))
@@ -248,7 +262,7 @@ class ManipulationEnv:
         self._reward.copy_(torch.where(broken, 0.0, reward.total))
         self._previous_action.copy_(self._action)
         self._episode_length += 1
-        time_out = (self._episode_length >= self.max_episode_length) | broken
+        time_out = (self._episode_length >= self.max_episode_length) | self._faulty
         self._time_out.copy_(time_out & ~lost)
         self._fresh.copy_(lost | time_out)
         log = self._log(reward, self._fresh, sound=~broken)
@@ -258,6 +272,22 @@ class ManipulationEnv:
         self._log_values.copy_(values)
         return reading, reward
 
+    def _fault_values(self, after: State) -> dict[str, Tensor]:
+        """What is kept of a world that breaks: name -> [N, ...]."""
+        return {
+            "world": self._worlds,
+            "object_index": self.backend.object_index,
+            "sequence": self.sequence,
+            "from_bank": self.from_bank,
+            "episode_step": self._episode_length,
+            "gravity_fraction": self.gravity_fraction,
+            "friction": self._friction,
+            "object_mass": self._mass,
+            "target": self._target,
+            **{f"before_{name}": value for name, value in self._before.items()},
+            **{f"after_{name}": getattr(after, name) for name in self._before},
+        }
+
     def _draw(self, from_distribution: bool = True) -> None:
         """Draw how every world would begin anew, so that nothing waits for their number, and let the fresh ones take it over."""
         fresh, start = self._fresh, self._start
@@ -265,9 +295,11 @@ class ManipulationEnv:
             drawn = self.resets.sample(self.backend.object_index, self.generator)
             for f in fields(Reset):
                 getattr(start, f.name).copy_(getattr(drawn, f.name))
-        self._friction.copy_(sample_friction(self.num_envs, self.task.randomization, self.generator))
-        self._mass.copy_(self._nominal_mass * sample_mass_scale(self.num_envs, self.task.randomization, self.generator))
+        friction = sample_friction(self.num_envs, self.task.randomization, self.generator)
+        mass = self._nominal_mass * sample_mass_scale(self.num_envs, self.task.randomization, self.generator)
         for new, old in (
+            (friction, self._friction),
+            (mass, self._mass),
             (start.goal_pos, self.goal_pos),
             (start.goal_quat, self.goal_quat),
             (start.gravity_fraction, self.gravity_fraction),

@@ -73,6 +73,25 @@ class SequencePpo(PPO):
                 model.reset(hidden_state=(torch.zeros_like(h), torch.zeros_like(c)))
         return super().act(obs)
 
+    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
+        """Record one environment step, and which worlds' part of it is not to be learned from (``extras["faulty"]`` [N] bool)."""
+        step = self.storage.step
+        if not step:
+            self._faulty = torch.zeros(self.storage.num_transitions_per_env, *dones.shape, dtype=torch.bool, device=self.device)
+        if "faulty" in extras:
+            self._faulty[step] = extras["faulty"]
+        super().process_env_step(obs, rewards, dones, extras)
+
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Returns and advantages; those of faulty steps are the value itself and zero, so that neither loss has a gradient there.
+
+        A faulty step is the last of its episode: with the value as its reward, its error is zero, whatever the simulation said.
+        """
+        storage, faulty = self.storage, self._faulty[..., None]
+        storage.rewards = torch.where(faulty, storage.values, storage.rewards)
+        super().compute_returns(obs)
+        storage.advantages = torch.where(faulty, 0.0, storage.advantages)
+
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> PPO:
         """Build models, storage and algorithm from the runner's configuration."""

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from rich.console import Console
@@ -21,6 +21,7 @@ from xreset.errors import RunError
 from xreset.files import atomic_write
 from xreset.learning.config import TrainConfig, rsl_rl_config
 from xreset.learning.distributed import Processes
+from xreset.learning.faults import FaultBudget, FaultCounts, dump_faults, too_many_faults
 
 
 class TrainingRunner(OnPolicyRunner):
@@ -35,6 +36,7 @@ class TrainingRunner(OnPolicyRunner):
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0
+        self._faults_seen = torch.zeros(2, dtype=torch.long, device=self.device)
 
     def _configure_multi_gpu(self) -> None:
         """What rsl-rl's runner does here, for CPUs too."""
@@ -60,6 +62,7 @@ class TrainingRunner(OnPolicyRunner):
         obs = env.get_observations()
         log = _Log(self.folder, env.num_envs, str(env.device), num_learning_iterations) if self.processes.is_main else None
         saved_at = self.iteration
+        budget = FaultBudget(horizon * env.num_envs * self.gpu_world_size)
         with _stop_on_interrupt() as stop:
             while self.iteration < num_learning_iterations and not stop:
                 start = time.perf_counter()
@@ -70,6 +73,7 @@ class TrainingRunner(OnPolicyRunner):
                         if log is not None:
                             log.add(reward, done, extras["log"])
                     self._check_finite(obs)
+                    self._check_faults(budget)
                     collected = time.perf_counter()
                     alg.compute_returns(obs)
                 losses = alg.update()
@@ -128,6 +132,17 @@ class TrainingRunner(OnPolicyRunner):
             torch.cuda.set_rng_state(state["cuda"].cpu())
         if state["env"] is not None and state["env"].shape == self.env.rng_state().shape:  # pyright: ignore[reportAttributeAccessIssue]
             self.env.set_rng_state(state["env"])  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _check_faults(self, budget: FaultBudget) -> None:
+        """End the run, leaving the broken worlds in ``faults.npz``, if there are too many; every process comes to the same conclusion."""
+        env = cast(ManipulationEnv, self.env)
+        total = torch.stack((env.nonfinite_count, env.overflow_count))
+        nonfinite, overflow = self.processes.sum(total - self._faults_seen).tolist()
+        self._faults_seen = total
+        if problem := budget.add(FaultCounts(nonfinite=nonfinite, overflow=overflow)):
+            path = self.folder / (f"faults-{self.processes.rank}.npz" if self.is_distributed else "faults.npz")
+            dump_faults(path, env, self.train_config, iteration=self.iteration)
+            raise too_many_faults(problem, path, self.folder)
 
     def _check_finite(self, obs: Any) -> None:
         """One look per iteration: what is not finite here comes from a world whose health said that it was sound."""

@@ -1,0 +1,81 @@
+"""When a training has too many broken worlds to go on, and what it leaves behind for whoever looks into it."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from xreset.env import ManipulationEnv
+from xreset.errors import RunError
+from xreset.files import write_npz
+from xreset.learning.config import TrainConfig
+
+MAX_SHARE = 1e-3
+"""Largest share of world-steps that may break; the run ends beyond it."""
+WINDOW = 200
+"""Iterations over which that share is taken. The first ones may spend the whole window's allowance: few worlds break one by one."""
+
+SCHEMA = "xreset-faults/1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FaultCounts:
+    """Worlds that were ended in some steps."""
+
+    nonfinite: int
+    """Because a position or velocity was not finite."""
+    overflow: int
+    """Because contacts or constraints were dropped for want of room."""
+
+
+class FaultBudget:
+    """The faults of the last :data:`WINDOW` iterations."""
+
+    def __init__(self, steps_per_iteration: int) -> None:
+        """Start with none; ``steps_per_iteration`` is the number of world-steps of an iteration, over all processes."""
+        self.allowed = MAX_SHARE * WINDOW * steps_per_iteration
+        self._window_steps = WINDOW * steps_per_iteration
+        self._recent: deque[FaultCounts] = deque(maxlen=WINDOW)
+
+    def add(self, counts: FaultCounts) -> str | None:
+        """Take an iteration's faults into account; returns what is wrong if they are too many."""
+        self._recent.append(counts)
+        nonfinite, overflow = sum(c.nonfinite for c in self._recent), sum(c.overflow for c in self._recent)
+        if nonfinite + overflow <= self.allowed:
+            return None
+        return (
+            f"{nonfinite} worlds were not finite and {overflow} dropped contacts or constraints in the last {len(self._recent)} "
+            f"iterations, more than {MAX_SHARE:.1%} of the {self._window_steps} world-steps of {WINDOW} iterations"
+        )
+
+
+def dump_faults(path: Path, env: ManipulationEnv, config: TrainConfig, *, iteration: int) -> None:
+    """Write the last broken worlds of an environment.
+
+    Args:
+        path: npz file: arrays [F, ...] of :attr:`ManipulationEnv.faults`, ``joint_names``, ``object_names`` and ``iteration``; the
+            configuration is in its ``meta``.
+        env: the environment.
+        config: what the run was started with.
+        iteration: the iteration under way.
+    """
+    scene = env.backend.scene
+    names = {
+        "robot": np.array(scene.robot.name),
+        "joint_names": np.array(scene.robot.joint_names),
+        "object_names": np.array([spec.name for spec in scene.objects]),
+        "backend": np.array(env.backend.name),
+        "iteration": np.array(iteration),
+    }
+    write_npz(path, SCHEMA, env.faults.arrays() | names, config=asdict(config))
+
+
+def too_many_faults(problem: str, path: Path, folder: Path) -> RunError:
+    """The error that ends a run."""
+    return RunError(
+        f"the run ends: {problem}. Their states before and after the step, and the drives' targets, are in {path}. Look for what they have "
+        f"in common (object, reset, gravity fraction); the last checkpoint is sound: xreset train --out {folder} --resume"
+    )

@@ -37,7 +37,8 @@ _HIT_OBJECT, _HIT_TABLE, _HIT_SELF = 1, 2, 4
 _IMPRATIO = 10.0
 _SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
 _SOLIMP_MIMIC = (0.99, 0.999, 0.001, 0.5, 2.0)
-_TIME_CONSTANT_STEPS = 2.016  # solref time constant in timesteps; MuJoCo's own minimum is 2
+MIN_TIME_CONSTANT_STEPS = 2.0
+"""MuJoCo's smallest time constant of contacts and other constraints, in timesteps."""
 _CONDIM = 4
 _ROLLING = 1e-4  # MuJoCo wants a positive number although condim 4 does not use it
 _ARENA = 16 << 20  # bytes for contacts and constraints of one MjData
@@ -66,6 +67,22 @@ KNOWN_DIFFERENCES = tuple(
     for degrees in (0, 45)
 )
 """What both MuJoCo backends cannot do: at mu = 1.2 and 0.5 m/s, a 40 mm high box was seen to hop by 3.6 mm."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MujocoSettings:
+    """Dials of both MuJoCo backends."""
+
+    time_constant_steps: float = 2.016
+    """Time constant of contacts (``solref``) in timesteps: as stiff as the timestep allows, with a hair's breadth for rounding."""
+
+    def __post_init__(self) -> None:
+        """Refuse what MuJoCo would silently raise to its minimum."""
+        if not self.time_constant_steps >= MIN_TIME_CONSTANT_STEPS:
+            raise ValueError(f"time_constant_steps is {self.time_constant_steps}, expected at least {MIN_TIME_CONSTANT_STEPS}")
+
+
+_DEFAULTS = MujocoSettings()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +137,14 @@ class SceneModel:
         return np.select([self.geom_role >= 0, self.geom_role == OTHER_LINK, self.geom_role == TABLE], [0, 1, 2], default=3)
 
 
-def compile_scene(scene: SceneSpec, object_index: int, *, slots_for: Sequence[int] = (), sensors: bool = False) -> SceneModel:
+def compile_scene(
+    scene: SceneSpec,
+    object_index: int,
+    *,
+    slots_for: Sequence[int] = (),
+    sensors: bool = False,
+    settings: MujocoSettings = _DEFAULTS,
+) -> SceneModel:
     """The model of a scene that holds ``scene.objects[object_index]``.
 
     Args:
@@ -131,6 +155,7 @@ def compile_scene(scene: SceneSpec, object_index: int, *, slots_for: Sequence[in
         sensors: let the engine itself compute what a backend reports. ``sensordata`` then holds, one behind the other, of the tracked
             links the positions [K, 3], orientations [K, 4], velocities [K, 3] and angular velocities [K, 3]; then the force of the
             object on the table [3] and on each fingertip geom [S, 3].
+        settings: dials.
 
     Raises:
         RobotError: the robot cannot be simulated.
@@ -138,7 +163,7 @@ def compile_scene(scene: SceneSpec, object_index: int, *, slots_for: Sequence[in
     """
     robot = mechanism(scene.robot)
     spec = _empty_spec(scene)
-    roles = _add_robot(spec, scene, robot)
+    roles = _add_robot(spec, scene, robot, settings)
     spec.worldbody.add_geom(
         name="table",
         type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -146,10 +171,10 @@ def compile_scene(scene: SceneSpec, object_index: int, *, slots_for: Sequence[in
         pos=(*scene.table.center, -scene.table.half_size[2]),
         contype=0,
         conaffinity=_HIT_OBJECT | _HIT_TABLE,
-        **_contact(scene.friction.table, scene),
+        **_contact(scene.friction.table, scene, settings),
     )
     roles["table"] = TABLE
-    parked = _add_object(spec, scene, object_index, slots_for)
+    parked = _add_object(spec, scene, object_index, slots_for, settings)
     _add_drives(spec, scene)
     sensed = _add_sensors(spec, robot, roles) if sensors else []
     try:
@@ -180,15 +205,15 @@ def _empty_spec(scene: SceneSpec) -> mujoco.MjSpec:
     return spec
 
 
-def _solref(scene: SceneSpec) -> tuple[float, float]:
-    return (_TIME_CONSTANT_STEPS * scene.timestep, 1.0)
+def _solref(scene: SceneSpec, settings: MujocoSettings = _DEFAULTS) -> tuple[float, float]:
+    return (settings.time_constant_steps * scene.timestep, 1.0)
 
 
-def _contact(friction: float, scene: SceneSpec) -> dict:
+def _contact(friction: float, scene: SceneSpec, settings: MujocoSettings) -> dict:
     """Contact attributes of a geom."""
     return {
         "friction": (max(friction, MIN_FRICTION), scene.friction.torsional, _ROLLING),
-        "solref": _solref(scene),
+        "solref": _solref(scene, settings),
         "solimp": _SOLIMP,
         "condim": _CONDIM,
     }
@@ -197,7 +222,7 @@ def _contact(friction: float, scene: SceneSpec) -> dict:
 # Robot ---------------------------------------------------------------------------------------------------------------------------------
 
 
-def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism) -> dict[str, int]:
+def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, settings: MujocoSettings) -> dict[str, int]:
     """Add bodies, joints and geoms; returns the role of each geom by name."""
     description = robot.robot
     added: list[mujoco.MjsBody] = []
@@ -231,7 +256,7 @@ def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism) -> dict[
                 contype=self_bit | table_bit,
                 conaffinity=_HIT_OBJECT | self_bit,
                 **_geometry(shape.geometry, mesh),
-                **_contact(scene.friction.link if role == OTHER_LINK else scene.friction.tip, scene),
+                **_contact(scene.friction.link if role == OTHER_LINK else scene.friction.tip, scene, settings),
             )
             if self_bit:
                 geoms[-1].append((name, link))
@@ -317,7 +342,7 @@ def _padded(values: Sequence[float], length: int = mujoco.mjNGAIN) -> np.ndarray
 # Object --------------------------------------------------------------------------------------------------------------------------------
 
 
-def _add_object(spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Sequence[int]) -> set[str]:
+def _add_object(spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Sequence[int], settings: MujocoSettings) -> set[str]:
     """Add the object and empty slots; returns the names of the geoms that are parked."""
     thing = scene.objects[index]
     held = sorted({*slots_for, index})
@@ -330,7 +355,7 @@ def _add_object(spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Se
     _set_inertia(body, object_inertia(thing))
     body.add_joint(name="object", type=mujoco.mjtJoint.mjJNT_FREE, align=mujoco.mjtAlignFree.mjALIGNFREE_FALSE)
     parked = set()
-    common = {"contype": _HIT_OBJECT, "conaffinity": 0, **_contact(0.0, scene)}
+    common = {"contype": _HIT_OBJECT, "conaffinity": 0, **_contact(0.0, scene, settings)}
     spare = next((name for names in meshes.values() for name in names), "")
     for kind in _KINDS:
         pieces = [piece for piece in thing.pieces if piece.geometry.kind == kind]

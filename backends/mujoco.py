@@ -21,20 +21,23 @@ try:
 except ImportError as error:
     raise unavailable("mujoco", "mujoco", error) from error
 
-from xreset.backends.mjcf import KNOWN_DIFFERENCES, MIN_FRICTION, SceneModel, compile_scene
+from xreset.backends.mjcf import KNOWN_DIFFERENCES, MIN_FRICTION, MujocoSettings, SceneModel, compile_scene
 
 _FULL = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
 """The engine's warnings that contacts or constraints have found no room."""
 
 
+_DEFAULTS = MujocoSettings()
+
+
 class MujocoWorld(World):
     """One world in MuJoCo."""
 
-    def __init__(self, scene: SceneSpec, object_index: int) -> None:
+    def __init__(self, scene: SceneSpec, object_index: int, *, settings: MujocoSettings = _DEFAULTS) -> None:
         """See :class:`World`."""
         if mujoco.get_mju_user_warning() is None:  # the default writes a log file into the current folder
             mujoco.set_mju_user_warning(lambda _: None)
-        self._at: SceneModel = _compiled(_Same(scene), object_index)
+        self._at: SceneModel = _compiled(_Same(scene), object_index, settings)
         self._model = copy(self._at.model)  # each world has parameters of its own
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world must be seen, not silently put back
         self._data = mujoco.MjData(self._model)
@@ -165,7 +168,7 @@ class MujocoWorld(World):
 
 
 class MujocoBackend(PoolBackend):
-    """MuJoCo on the CPU, worlds in a pool of processes."""
+    """MuJoCo on the CPU, worlds in a pool of processes; the keyword ``settings`` takes :class:`MujocoSettings`."""
 
     name: ClassVar[str] = "mujoco"
     capabilities: ClassVar[frozenset[Capability]] = frozenset(get_args(Capability))
@@ -195,8 +198,8 @@ class _Same:
 
 
 @lru_cache(maxsize=32)
-def _compiled(key: _Same, object_index: int) -> SceneModel:
-    return compile_scene(key.scene, object_index, sensors=True)
+def _compiled(key: _Same, object_index: int, settings: MujocoSettings) -> SceneModel:
+    return compile_scene(key.scene, object_index, sensors=True, settings=settings)
 
 
 # Quaternions (numpy) -------------------------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ except ImportError as error:
     raise unavailable("mujoco_warp", "mujoco-warp", error) from error
 
 from xreset.backends import mujoco_warp_kernels as kernels
-from xreset.backends.mjcf import KNOWN_DIFFERENCES, MIN_FRICTION, compile_scene
+from xreset.backends.mjcf import KNOWN_DIFFERENCES, MIN_FRICTION, MujocoSettings, compile_scene
 
 wp.config.log_level = wp.LOG_WARNING  # else a line for each of some hundred kernels; what a user needs to know is announced below
 
@@ -70,6 +70,7 @@ class MujocoWarpBackend(Backend):
         convex_contacts_per_world: int = 32,
         constraints_per_world: int = 220,
         solver_iterations: int = 30,
+        settings: MujocoSettings | None = None,
     ) -> None:
         """Build the worlds, compile the kernels and capture the CUDA graphs.
 
@@ -83,6 +84,7 @@ class MujocoWarpBackend(Backend):
             convex_contacts_per_world: likewise, pairs of a type that overlap and need the general convex algorithm.
             constraints_per_world: rows of constraints (4 a contact, 1 a dry friction, joint limit or mimic joint) in any one world.
             solver_iterations: most Newton iterations; worlds that have converged stop earlier.
+            settings: further dials.
 
         Raises:
             BackendUnavailableError: there is no such device.
@@ -92,7 +94,7 @@ class MujocoWarpBackend(Backend):
         self._warp_device = wp.device_from_torch(self.device)
         self._streams: dict[int, Any] = {}
         held = self.object_index.unique().tolist()
-        scenes = {i: compile_scene(scene, i, slots_for=held) for i in held}
+        scenes = {i: compile_scene(scene, i, slots_for=held, settings=settings or MujocoSettings()) for i in held}
         at = max(scenes.values(), key=lambda s: s.model.nC)  # the mass matrix with the fullest structure has room for every object's
         at.model.opt.iterations = solver_iterations
         self._at = at

@@ -416,14 +416,26 @@ class _WorldFailure(Exception):
 _MOVING = frozenset(("build", "set_state", "step"))
 """Commands after which a world reports something else than before."""
 
+_GIVEN = {
+    "build": STATE_FIELDS,
+    "set_state": STATE_FIELDS,
+    "step": ("joint_target", "wrench"),
+    "set_object_mass": ("object_mass",),
+    "set_friction": ("friction",),
+    "set_object_gravity": ("object_gravity",),
+}
+"""Arrays that a command's worlds are given, in double precision."""
+
 
 class _Local:
     """The worlds of one job in this process."""
 
     def __init__(self, job: _Job, arrays: Mapping[str, np.ndarray]) -> None:
         self._job = job
-        self._arrays = arrays
-        self._numbers = range(job.first, job.first + len(job.object_index))
+        mine = slice(job.first, job.first + len(job.object_index))
+        self._arrays = {name: array[mine] for name, array in arrays.items()}
+        """Of the worlds of this job."""
+        self._given: dict[str, np.ndarray] = {}
         self._worlds: list[World] = []
 
     def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> None:
@@ -431,61 +443,59 @@ class _Local:
 
         All worlds act before any is published: engine and Python code take turns in the processor's caches once, not once per world.
         """
-        numbers = self._numbers if worlds is None else worlds.tolist()
-        number, action = self._job.first, getattr(self, f"_{method}")
+        rows = range(len(self._job.object_index)) if worlds is None else (worlds - self._job.first).tolist()
+        self._given = {name: self._arrays[name].astype(np.float64) for name in _GIVEN.get(method, ())}
+        row, action = 0, getattr(self, f"_{method}")
         try:
-            for number in numbers:
-                action(number, argument)
+            for row in rows:
+                action(row, argument)
             if method in _MOVING:
-                for number in numbers:
-                    self._publish(number)
+                for row in rows:
+                    self._publish(row)
         except XResetError as error:
-            raise _WorldFailure(number, type(error), str(error), traceback.format_exc()) from error
+            raise _WorldFailure(self._job.first + row, type(error), str(error), traceback.format_exc()) from error
         except Exception as error:
-            raise _WorldFailure(number, None, f"{type(error).__name__}: {error}", traceback.format_exc()) from error
+            text = f"{type(error).__name__}: {error}"
+            raise _WorldFailure(self._job.first + row, None, text, traceback.format_exc()) from error
 
     def close(self) -> None:
         """Close the worlds."""
         while self._worlds:
             self._worlds.pop().close()
 
-    def _world(self, i: int) -> World:
-        return self._worlds[i - self._job.first]
-
     def _build(self, i: int, _) -> None:
         job = self._job
-        self._worlds.append(job.world_class(job.scene, job.object_index[i - job.first], **job.options))
+        self._worlds.append(job.world_class(job.scene, job.object_index[i], **job.options))
         self._set_state(i, _)
 
     def _set_state(self, i: int, _) -> None:
-        self._world(i).set_state({name: self._arrays[name][i].astype(np.float64) for name in STATE_FIELDS})
+        self._worlds[i].set_state({name: self._given[name][i] for name in STATE_FIELDS})
         self._arrays["nonfinite"][i] = self._arrays["overflow"][i] = False
 
     def _step(self, i: int, n: int) -> None:
         if self._arrays["nonfinite"][i]:
             return
-        world = self._world(i)
-        world.set_joint_targets(self._arrays["joint_target"][i].astype(np.float64))
-        wrench = self._arrays["wrench"][i].astype(np.float64)
+        world, wrench = self._worlds[i], self._given["wrench"][i]
+        world.set_joint_targets(self._given["joint_target"][i])
         world.set_object_wrench(wrench[:3], wrench[3:])
         world.step(n)
 
     def _mass_properties(self, i: int, _) -> None:
-        for k, body in enumerate(self._world(i).mass_properties()):
+        for k, body in enumerate(self._worlds[i].mass_properties()):
             self._arrays["body_mass"][i, k], self._arrays["body_com"][i, k] = body.mass, body.com
             self._arrays["body_inertia"][i, k] = body.matrix
 
     def _set_object_mass(self, i: int, _) -> None:
-        self._world(i).set_object_mass(float(self._arrays["object_mass"][i]))
+        self._worlds[i].set_object_mass(float(self._given["object_mass"][i]))
 
     def _set_friction(self, i: int, _) -> None:
-        self._world(i).set_friction(self._arrays["friction"][i].astype(np.float64))
+        self._worlds[i].set_friction(self._given["friction"][i])
 
     def _set_object_gravity(self, i: int, _) -> None:
-        self._world(i).set_object_gravity(float(self._arrays["object_gravity"][i]))
+        self._worlds[i].set_object_gravity(float(self._given["object_gravity"][i]))
 
     def _publish(self, i: int) -> None:
-        world, arrays = self._world(i), self._arrays
+        world, arrays = self._worlds[i], self._arrays
         if arrays["nonfinite"][i]:  # nothing has moved since that was said
             return
         for name, value in world.get_state().items():

@@ -31,7 +31,11 @@ _DEFAULTS = MujocoSettings()
 
 
 class MujocoWorld(World):
-    """One world in MuJoCo."""
+    """One world in MuJoCo.
+
+    The engine's step has two halves: what follows from positions and velocities (``mj_step1``: kinematics, contacts), and forces and
+    motion (``mj_step2``). The first half of the next step is always done in advance, so links are up to date at no cost.
+    """
 
     def __init__(self, scene: SceneSpec, object_index: int, *, settings: MujocoSettings = _DEFAULTS) -> None:
         """See :class:`World`."""
@@ -45,8 +49,8 @@ class MujocoWorld(World):
         self._silent = self._option.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR
         self._sensing = self._option.disableflags
         self._option.disableflags = self._silent  # sensors are read once per step(), not computed in each physics step
-        self._stepped = False
-        self._overflows_before = 0
+        self._stale = False  # whether a parameter has changed since the first half of the next step was done
+        self._overflowed, self._overflows = False, 0
 
         # Views of the engine's own memory, which stays where it is: making one costs as much as reading it.
         data, links = self._data, len(self._at.link_body)
@@ -64,7 +68,7 @@ class MujocoWorld(World):
         """See :meth:`World.set_state`."""
         at, data = self._at, self._data
         mujoco.mj_resetData(self._model, data)
-        self._stepped, self._overflows_before = False, 0
+        self._overflowed, self._overflows = False, 0
         q, v = data.qpos, data.qvel
         q[at.joint_qpos] = state["joint_pos"]
         v[at.joint_dof] = state["joint_vel"]
@@ -76,7 +80,7 @@ class MujocoWorld(World):
         q[at.object_qpos + 3 : at.object_qpos + 7] = quat
         v[at.object_dof : at.object_dof + 3] = state["object_linvel"]
         v[at.object_dof + 3 : at.object_dof + 6] = _rotate_inverse(quat, state["object_angvel"])
-        self._update_kinematics()
+        self._begin_next_step()
 
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
@@ -98,13 +102,16 @@ class MujocoWorld(World):
 
     def step(self, n: int) -> None:
         """See :meth:`World.step`."""
-        self._overflows_before = self._overflows()
-        mujoco.mj_step(self._model, self._data, n)
-        self._stepped = True
-        self._update_kinematics()
+        if self._stale:
+            mujoco.mj_step1(self._model, self._data)
+        mujoco.mj_step2(self._model, self._data)
+        if n > 1:
+            mujoco.mj_step(self._model, self._data, n - 1)
+        before, self._overflows = self._overflows, sum(warning.number for warning in self._full)
+        self._overflowed = self._overflows > before
         self._option.disableflags = self._sensing
-        mujoco.mj_sensorAcc(self._model, self._data)
-        self._option.disableflags = self._silent
+        mujoco.mj_sensorAcc(self._model, self._data)  # while the contacts are those of the last step
+        self._begin_next_step()
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.links`."""
@@ -118,9 +125,9 @@ class MujocoWorld(World):
 
     def health(self) -> tuple[bool, bool]:
         """See :meth:`World.health`."""
-        (q_ones, v_ones), overflows = self._ones, self._overflows()
+        q_ones, v_ones = self._ones
         finite = math.isfinite(self._qpos.dot(q_ones) + self._qvel.dot(v_ones))  # one bad number spoils a sum; cheaper than looking at each
-        return not finite, overflows > self._overflows_before
+        return not finite, self._overflowed
 
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`."""
@@ -138,33 +145,29 @@ class MujocoWorld(World):
         model.body_inertia[body] = ratio * nominal.body_inertia[body]
         model.body_invweight0[body] = nominal.body_invweight0[body] / ratio  # of a free body: the inverse of mass and inertia
         model.dof_invweight0[dofs] = nominal.dof_invweight0[dofs] / ratio
+        self._stale = True
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
         pairs = np.maximum((*friction, 0.0), MIN_FRICTION)
         self._model.geom_friction[:, 0] = pairs[self._at.friction_column]
+        self._stale = True
 
     def set_object_gravity(self, fraction: float) -> None:
         """See :meth:`World.set_object_gravity`."""
         self._model.body_gravcomp[self._at.object_body] = 1.0 - fraction
+        self._stale = True
 
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
         """See :meth:`World.set_object_wrench`."""
         self._wrench[:3], self._wrench[3:] = force, torque
 
-    def _overflows(self) -> int:
-        """How often contacts or constraints have found no room so far."""
-        return sum(warning.number for warning in self._full)
-
-    def _update_kinematics(self) -> None:
-        """Bring link poses and velocities up to date with qpos and qvel; contact forces stay those of the last step."""
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_comPos(self._model, self._data)
-        mujoco.mj_comVel(self._model, self._data)
+    def _begin_next_step(self) -> None:
+        """Do the first half of the next step, and read the links; contact forces stay those of the last step."""
         self._option.disableflags = self._sensing
-        mujoco.mj_sensorPos(self._model, self._data)
-        mujoco.mj_sensorVel(self._model, self._data)
+        mujoco.mj_step1(self._model, self._data)
         self._option.disableflags = self._silent
+        self._stale = False
 
 
 class MujocoBackend(PoolBackend):

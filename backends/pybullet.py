@@ -13,10 +13,11 @@ What differs from PyBullet's defaults, and why:
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
@@ -26,6 +27,7 @@ import numpy as np
 from xreset.backends.base import Capability, unavailable
 from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import (
+    Arms,
     Inertia,
     Mechanism,
     TrackedFrames,
@@ -96,6 +98,8 @@ class PybulletWorld(World):
 
         self._drives = _Drives(p, self._client, self._robot.body, robot, dt, settings)
         self._frames = TrackedFrames(robot)
+        self._arm = Arms(self._inertia.com[None])
+        self._from_principal = np.array([multiply(unit, conjugate(self._inertia.quat)) for unit in np.eye(4)])  # this product as a matrix
         self._mass, self._fraction = self._inertia.mass, 1.0
         self._force, self._torque = np.zeros(3), np.zeros(3)
         self._torsional = scene.friction.torsional
@@ -124,8 +128,8 @@ class PybulletWorld(World):
         p, client = self._p, self._client
         com, turn = p.getBasePositionAndOrientation(self._object.body, physicsClientId=client)
         linear, angular = (np.array(v) for v in p.getBaseVelocity(self._object.body, physicsClientId=client))
-        self._quat = nearer(multiply(_wxyz(turn), conjugate(self._inertia.quat)), self._quat)
-        arm = rotate(self._quat, self._inertia.com)
+        self._quat = nearer(_wxyz(turn) @ self._from_principal, self._quat)
+        arm = self._arm.turned(self._quat)[0]
         position, velocity = self._drives.read()
         return {
             "joint_pos": position[self._drives.driven],
@@ -145,7 +149,7 @@ class PybulletWorld(World):
         """See :meth:`World.step`."""
         p, client = self._p, self._client
         weight = np.array([0.0, 0.0, self._mass * (-GRAVITY * self._fraction - self._world_gravity)])
-        force = weight + self._force
+        force = (weight + self._force).tolist()
         turned = bool(self._torque.any())
         for _ in range(n * self._internal_steps):
             self._drives.apply()
@@ -161,8 +165,8 @@ class PybulletWorld(World):
         states = self._p.getLinkStates(
             self._robot.body, self._frames.bodies, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=self._client
         )
-        pos, xyzw, velocity, omega = (np.array([state[i] for state in states]) for i in (4, 5, 6, 7))
-        return self._frames.locate(pos, xyzw[:, [3, 0, 1, 2]], velocity, omega)
+        rows = np.array([state[4] + state[5] + state[6] + state[7] for state in states])
+        return self._frames.locate(rows[:, :3], rows[:, [6, 3, 4, 5]], rows[:, 7:10], rows[:, 10:])
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.contacts`: of the last internal step."""
@@ -186,14 +190,18 @@ class PybulletWorld(World):
 
     def health(self) -> tuple[bool, bool]:
         """See :meth:`World.health`. Bullet allocates contacts as it needs them: none is ever dropped."""
-        values = [*self._p.getBasePositionAndOrientation(self._object.body, physicsClientId=self._client)[0]]
-        return not bool(np.isfinite(values).all() and all(np.isfinite(x).all() for x in self._drives.read())), False
+        position, _ = self._p.getBasePositionAndOrientation(self._object.body, physicsClientId=self._client)
+        joints = sum(x.dot(x) for x in self._drives.read())  # one bad number spoils a sum; cheaper than looking at each
+        return not math.isfinite(sum(position) + joints), False
 
     def mass_properties(self) -> list[Inertia]:
-        """See :meth:`World.mass_properties`."""
+        """See :meth:`World.mass_properties`. The object is loaded in the frame of its inertia."""
         moving = [(self._robot.body, link) for link in range(1, len(self._mechanism.bodies))]
         infos = [self._p.getDynamicsInfo(*place, physicsClientId=self._client) for place in (*moving, (self._object.body, -1))]
-        return [Inertia(mass=i[0], com=np.array(i[3]), quat=_wxyz(i[4]), moments=np.array(i[2])) for i in infos]
+        found = [Inertia(mass=i[0], com=np.array(i[3]), quat=_wxyz(i[4]), moments=np.array(i[2])) for i in infos]
+        thing, own = found[-1], self._inertia
+        in_mesh = replace(thing, com=own.com + rotate(own.quat, thing.com), quat=multiply(own.quat, thing.quat))
+        return [*found[:-1], in_mesh]
 
     def set_object_mass(self, mass: float) -> None:
         """See :meth:`World.set_object_mass`."""
@@ -234,7 +242,10 @@ class PybulletWorld(World):
     def _load_rigid(
         self, groups: list[tuple[Shape, ...]], inertia: Inertia | None, pos: tuple[float, float, float], folder: Path
     ) -> _Model:
-        """Load a single body; fixed if it has no inertia."""
+        """Load a single body, in the frame of its inertia; fixed if it has none."""
+        if inertia is not None:
+            T = np.linalg.inv(_inertial_frame(inertia))
+            groups = [tuple(replace(shape, T_body_shape=T @ shape.T_body_shape) for shape in group) for group in groups]
         parts = [_Part(body=0, link="", shapes=group) for group in groups]
         urdf = _rigid_urdf(parts, inertia or _WEIGHTLESS, folder)
         return _Model(self._load(urdf, pos=pos, quat=(1.0, 0.0, 0.0, 0.0), fixed=inertia is None), -1, parts)
@@ -334,6 +345,7 @@ class _Drives:
         self._kp, self._kd, self._effort, self._armature, self._loss = (
             np.array([getattr(drive, field) for drive in drives]) for field in ("kp", "kd", "effort", "armature", "friction_loss")
         )
+        self._brakes = bool(self._loss.any())
 
         self.reset(spec.home, np.zeros(len(drives)), spec.home)
         M = self._mass_matrix(spec.home)
@@ -372,28 +384,32 @@ class _Drives:
         dt, driven = self._dt, self.driven
         wanted = self._kp * (self.target - q[driven]) - self._kd * v[driven]
         tau = np.zeros(len(q))
-        tau[driven] = np.clip(wanted, -self._effort, self._effort)
+        tau[driven] = np.minimum(np.maximum(wanted, -self._effort), self._effort)  # np.clip takes three times as long
         if len(self._mimic):
             lag = self._multiplier * q[driven[self._source]] + self._offset - q[self._mimic]
             rate = self._J @ v
             tau -= self._J.T @ (self._stiffness * (lag + dt * rate) + self._damping * rate)
-        bias = np.array(self._p.calculateInverseDynamics(self._body, list(q), list(v), [0.0] * len(q), physicsClientId=self._client))
+        bias = np.array(
+            self._p.calculateInverseDynamics(self._body, q.tolist(), v.tolist(), [0.0] * len(q), physicsClientId=self._client)
+        )
         net = tau - bias
         if self._last_step is not None:
             last_velocity, last_net = self._last_step
             net += self._M @ (v - last_velocity) / dt - last_net
         saturated = np.abs(wanted) > self._effort
-        if self._mass_matrix_age == 0 or not np.array_equal(saturated, self._saturated):
+        if self._mass_matrix_age == 0 or saturated.tobytes() != self._saturated.tobytes():
             self._factorise(q, saturated)
         self._mass_matrix_age = (self._mass_matrix_age + 1) % self._mass_matrix_steps
-        if self._loss.any():
+        if self._brakes:
             stopping = -(v / dt + self._inverse @ net)[driven] / np.diag(self._inverse)[driven]
             brake = np.clip(stopping, -self._loss, self._loss)
             tau[driven] += brake
             net[driven] += brake
         tau -= self._added @ (self._inverse @ net)
         self._last_step = v, tau - bias
-        self._p.setJointMotorControlArray(self._body, self._links, self._p.TORQUE_CONTROL, forces=tau, physicsClientId=self._client)
+        self._p.setJointMotorControlArray(
+            self._body, self._links, self._p.TORQUE_CONTROL, forces=tau.tolist(), physicsClientId=self._client
+        )
 
     def _all(self, actuated: np.ndarray, offset: np.ndarray) -> np.ndarray:
         values = np.zeros(len(self._links))
@@ -402,7 +418,7 @@ class _Drives:
         return values
 
     def _mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        return np.array(self._p.calculateMassMatrix(self._body, list(q), physicsClientId=self._client))
+        return np.array(self._p.calculateMassMatrix(self._body, q.tolist(), physicsClientId=self._client))
 
     def _factorise(self, q: np.ndarray, saturated: np.ndarray) -> None:
         """Invert M + B; a drive at its effort limit has no damping left to be implicit in."""
@@ -450,6 +466,11 @@ class _Model:
     def links(self) -> list[tuple[int, _Part]]:
         """Bullet's link number and description of every part."""
         return list(enumerate(self.parts, start=self.first))
+
+
+# Bullet inflates a hull by a margin of 1 mm against anything round. The margin can be removed from the base of a body only, and only where
+# the base has a single hull in the frame of its inertia; else Bullet wraps the hull, and sets the wrap's margin instead. So objects are
+# loaded in the frame of their inertia. What remains inflated: an object's further hulls against round links, and a robot's hulls.
 
 
 def _groups(shapes: Sequence[Shape]) -> list[tuple[Shape, ...]]:
@@ -502,7 +523,8 @@ def _robot_urdf(robot: Mechanism, parts: Sequence[_Part], folder: Path) -> Path:
 
 
 def _rigid_urdf(parts: Sequence[_Part], inertia: Inertia, folder: Path) -> Path:
-    text = []
+    """Of a body whose shapes are in the frame of its inertia."""
+    text, inertia = [], replace(inertia, com=_WEIGHTLESS.com, quat=_WEIGHTLESS.quat)
     for i, part in enumerate(parts):
         text.append(_link_text(f"link{i}", _WEIGHTLESS if i else inertia, part.shapes, folder))
         text.append(_fixed_joint_text(i, "link0") if i else "")
@@ -519,23 +541,23 @@ def _write(path: Path, text: Sequence[str]) -> Path:
 
 
 def _link_text(name: str, inertia: Inertia, shapes: Sequence[Shape], folder: Path) -> str:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = _matrix(inertia.quat), inertia.com
     x, y, z = (float(m) for m in inertia.moments)
     text = [
-        f'<link name="{name}"><inertial>{_origin(T)}<mass value="{inertia.mass!r}"/>'
+        f'<link name="{name}"><inertial>{_origin(_inertial_frame(inertia))}<mass value="{inertia.mass!r}"/>'
         f'<inertia ixx="{x!r}" iyy="{y!r}" izz="{z!r}" ixy="0" ixz="0" iyz="0"/></inertial>'
     ]
     for i, shape in enumerate(shapes):
         geometry = _geometry_text(shape, folder / f"{name}_{i}.obj")
-        text.append(f"<collision>{_origin(shape.T_body_shape)}<geometry>{geometry}</geometry></collision>")
+        origin = _origin(np.eye(4) if shape.geometry.kind == "hull" else shape.T_body_shape)  # a hull's vertices are moved instead
+        text.append(f"<collision>{origin}<geometry>{geometry}</geometry></collision>")
     return "".join([*text, "</link>"])
 
 
 def _geometry_text(shape: Shape, mesh: Path) -> str:
     geometry = shape.geometry
     if geometry.vertices is not None and geometry.faces is not None:
-        lines = [f"v {_numbers(v)}" for v in geometry.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in geometry.faces]
+        vertices = geometry.vertices @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
+        lines = [f"v {_numbers(v)}" for v in vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in geometry.faces]
         mesh.write_text("\n".join(lines) + "\n")
         return f'<mesh filename="{mesh.name}"/>'
     if geometry.kind == "box":
@@ -555,6 +577,13 @@ def _origin(T: np.ndarray) -> str:
 
 def _numbers(values: Any) -> str:
     return " ".join(repr(float(value)) for value in values)
+
+
+def _inertial_frame(inertia: Inertia) -> np.ndarray:
+    """[4, 4] pose of the centre of mass and the principal axes in the body's frame."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = _matrix(inertia.quat), inertia.com
+    return T
 
 
 def _matrix(quat: np.ndarray) -> np.ndarray:

@@ -50,6 +50,7 @@ def moved(geometry: Geometry, *pos: float) -> Shape:
 FLAT = (
     body("box", Geometry(kind="box", size=(0.05, 0.06, 0.02))),
     body("hull", hull_box(0.05, 0.06, 0.02)),
+    body("hull with a low centre of mass", hull_box(0.05, 0.06, 0.02), com=(0.0, 0.0, -0.005)),
     body("two hulls", moved(hull_box(0.025, 0.06, 0.02), 0.025, 0.0, 0.0), moved(hull_box(0.025, 0.06, 0.02), -0.025, 0.0, 0.0)),
     body("cylinder", Geometry(kind="cylinder", size=(0.06, 0.02))),
 )

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import sys
 import unittest
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
-from tests.engine_checks import EngineChecks
-from xreset.backends.conformance.scene import gripper, scene
+from tests.engine_checks import EngineChecks, hull_box
+from xreset.backends.conformance.scene import gripper, objects, scene
 from xreset.backends.pybullet import PybulletBackend, PybulletSettings, PybulletWorld, _origin
+from xreset.backends.rigid import mechanism
 from xreset.errors import BackendUnavailableError, ObjectError
 from xreset.robots.dynamics import mass_matrix
+from xreset.spec import Geometry, Shape
 
 
 class PybulletTest(EngineChecks, unittest.TestCase):
@@ -39,9 +43,34 @@ class PybulletTest(EngineChecks, unittest.TestCase):
             rpy = [float(x) for x in _origin(T).split('rpy="')[1].split('"')[0].split()]
             np.testing.assert_allclose(Rotation.from_euler("xyz", rpy).as_matrix(), T[:3, :3], atol=1e-7)
 
-    def test_an_impossible_object_is_refused(self):
-        from dataclasses import replace
+    def test_a_hull_touches_where_it_is(self):
+        """Round pads hold a box and its hull, whose centres of mass are off their frames, with the same opening."""
 
+        def rounded(pad: Shape) -> Shape:
+            return replace(pad, geometry=Geometry(kind="sphere", size=(min(pad.geometry.size),))) if pad.geometry.kind == "box" else pad
+
+        def round_pads(robot):
+            made = mechanism(robot)
+            bodies = [replace(b, shapes=tuple(replace(s, shape=rounded(s.shape)) for s in b.shapes)) for b in made.bodies]
+            return replace(made, bodies=tuple(bodies))
+
+        def opening(geometry: Geometry) -> float:
+            held = replace(brick, pieces=(replace(brick.pieces[0], geometry=geometry),))
+            with (
+                mock.patch("xreset.backends.pybullet.mechanism", round_pads),
+                mock.patch("tests.engine_checks.scene", lambda: replace(scene(), objects=(held,))),
+            ):
+                backend, _ = self.grasp()
+            backend.set_object_gravity(torch.zeros(1))
+            backend.step(240)
+            return float(backend.state().joint_pos[0, gripper().joint_names.index("jaw_a_slide")])
+
+        brick = objects()[0]
+        self.assertGreater(float(np.abs(brick.com).max()), 0.0)
+        box = brick.pieces[0].geometry
+        self.assertAlmostEqual(opening(box), opening(hull_box(*box.size)), delta=5e-5)
+
+    def test_an_impossible_object_is_refused(self):
         bad = replace(scene().objects[0], inertia=np.diag([1e-4, 1e-4, 1e-3]))
         with self.assertRaisesRegex(ObjectError, "'brick' has principal moments"):
             PybulletBackend(replace(scene(), objects=(bad,)), 1)

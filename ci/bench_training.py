@@ -1,0 +1,109 @@
+"""training: environment steps per second of a training on mujoco-warp, and where its time goes.
+
+raw       the captured graph of the engine's own step, as many times as a control step has physics steps
+env       ManipulationEnv.step with random actions, resets from home and bank included; beside it the share of raw
+rollout   env and the policy, the value and the storage
+update    the rest of a PPO iteration: all epochs over the rollout
+train     whole iterations
+The worlds start from a bank of retargeted synthetic demonstrations, or from --resets. --precision as in training.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+from benchlib import OBJECT, Options, rate, run_time, seconds_of
+from rich.console import Console
+from rich.table import Table
+
+from xreset.backends import backend_status, make_backend
+from xreset.env import ManipulationEnv, make_scene
+from xreset.learning.config import PpoConfig, TrainConfig
+from xreset.learning.runner import TrainingRunner
+from xreset.learning.train import load_inputs
+from xreset.task.resets import ResetDistribution
+
+
+def add_arguments(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--resets", type=Path, help="reset bank (default: one of a synthetic soup-can demonstration)")
+    group.add_argument("--objects", type=Path, help="folder of real meshes")
+    group.add_argument("--precision", default="bfloat16", choices=["float32", "tf32", "bfloat16"])
+    group.add_argument("--iterations", type=int, default=5, help="PPO iterations to time")
+
+
+def run(options: Options, console: Console) -> None:
+    reason = backend_status("mujoco-warp").reason
+    if reason is not None:
+        console.print(f"training: left out. {reason}")
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        resets = options.extra["resets"] or _synthetic_bank(options.robot, Path(folder))
+        inputs = load_inputs(options.robot, resets, options.extra["objects"])
+        config = TrainConfig(ppo=PpoConfig(precision=options.extra["precision"]))
+        scene = make_scene(inputs.robot, inputs.objects, config.task)
+        names = tuple(o.name for o in inputs.objects)
+        with make_backend("mujoco-warp", scene, options.num_envs, device=options.device) as backend:
+            env = ManipulationEnv(
+                backend, config.task, ResetDistribution(inputs.bank, inputs.robot, names, config.task.reset, backend.device)
+            )
+            console.print(_measure(env, config, options, Path(folder)))
+
+
+def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder: Path) -> Table:
+    n, device = env.num_envs, options.device
+    env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=env.max_episode_length)
+
+    def act() -> torch.Tensor:
+        return 2.0 * torch.rand(n, env.num_actions, device=env.device) - 1.0
+
+    for _ in range(20):
+        env.step(act())
+    backend = env.backend
+    with backend._on_stream():
+        raw = rate(lambda: [backend._run("step") for _ in range(backend.scene.substeps)], options.seconds, device)
+    stepped = rate(lambda: env.step(act()), options.seconds, device)
+    runner = TrainingRunner(env, config, folder / "run")
+    runner.learn(2, init_at_random_ep_len=True)
+    alg, horizon = runner.alg, config.ppo.horizon
+    obs = env.get_observations()
+
+    def roll_out() -> None:
+        nonlocal obs
+        alg.storage.clear()
+        with torch.no_grad():
+            for _ in range(horizon):
+                obs, reward, done, extras = env.step(alg.act(obs))
+                alg.process_env_step(obs, reward, done, extras)
+            alg.compute_returns(obs)
+
+    collect, learn = [], []
+    for _ in range(options.extra["iterations"]):
+        collect.append(seconds_of(roll_out, device))
+        learn.append(seconds_of(alg.update, device))
+    runner.elapsed, before = 0.0, runner.env_steps
+    runner.learn(runner.iteration + options.extra["iterations"])
+    trained = (runner.env_steps - before) / runner.elapsed
+    rolled, updated = (horizon / sorted(times)[len(times) // 2] for times in (collect, learn))
+
+    table = Table("", "env steps/s", "ms per control step", "", title=f"training: {n} worlds, {options.robot}, {config.ppo.precision}")
+    note = {"env": f"{stepped / raw:.2f} of raw", "train": f"{int(env.nonfinite_count)} not finite, {int(env.overflow_count)} overflows"}
+    steps = {"raw": raw, "env": stepped, "rollout": rolled, "update": updated, "train": trained / n}
+    for name, per_second in steps.items():
+        table.add_row(name, f"{per_second * n:,.0f}", f"{1e3 / per_second:.2f}", note.get(name, ""))
+    return table
+
+
+def _synthetic_bank(robot: str, folder: Path) -> Path:
+    """A bank made of one synthetic demonstration, by the commands that a user would type."""
+    demos, moved, bank = (folder / name for name in ("demos.npz", "retargeted.npz", "resets.npz"))
+    for command in (
+        ["demos", "synth", "--objects", OBJECT, "--per-object", "1", "--out", demos],
+        ["retarget", demos, "--robot", robot, "--out", moved],
+        ["resets", moved, "--backend", "mujoco", "--out", bank],
+    ):
+        run_time([sys.executable, "-m", "xreset", *map(str, command)])
+    return bank

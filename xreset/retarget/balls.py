@@ -6,8 +6,9 @@ shapes, whose edges and corners balls of radius 0 stand for; what they miss is f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import product
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,21 +16,60 @@ from torch import Tensor
 
 from xreset.kinematics import Kinematics
 from xreset.retarget.collision import SelfCollision, support_points
-from xreset.spec import Geometry, RobotSpec
+from xreset.spec import Geometry, RobotSpec, Shape
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spans:
+    """Groups of consecutive rows of a table (G in number)."""
+
+    start: Tensor
+    """[G] first row of each group."""
+    count: Tensor
+    """[G] number of its rows."""
+
+    def members(self, groups: Tensor) -> tuple[Tensor, Tensor]:
+        """All rows of some groups [C]: for each row, the place [A] in ``groups`` that asks for it, ascending, and the row [A] itself."""
+        counts = self.count[groups]
+        asking = torch.repeat_interleave(torch.arange(len(groups), device=groups.device), counts)
+        within = torch.arange(len(asking), device=groups.device) - (counts.cumsum(0) - counts)[asking]
+        return asking, self.start[groups][asking] + within
 
 
 @dataclass(frozen=True, kw_only=True)
 class Balls:
-    """Balls fixed to the links of a hand (Q in number)."""
+    """Balls fixed to the links of a hand: Q balls on G links, which R pairs of balls on H pairs of links must not overlap."""
 
     links: tuple[str, ...]
-    """Link of each ball."""
+    """The links that carry balls (length G)."""
+    spans: Spans
+    """[G] the balls of each link."""
+    link: Tensor
+    """[Q] each ball's link, as an index of ``links``; ascending."""
     centers: Tensor
     """[Q, 3] in the link's frame."""
     radii: Tensor
     """[Q]"""
+    bound_centers: Tensor
+    """[G, 3] centre, in the link's frame, of a ball about all of the link's balls."""
+    bound_radii: Tensor
+    """[G]"""
+    link_pairs: Tensor
+    """[H, 2] pairs of links, as indices of ``links``."""
+    pair_spans: Spans
+    """[H] the pairs of balls of each pair of links."""
     pairs: Tensor
     """[R, 2] balls, of a radius above 0, that must not overlap each other."""
+
+    def to(self, device: torch.device | str) -> Balls:
+        """The same on another device."""
+
+        def moved(value: Any) -> Any:
+            if isinstance(value, Spans):
+                return Spans(start=value.start.to(device), count=value.count.to(device))
+            return value.to(device) if isinstance(value, Tensor) else value
+
+        return Balls(**{f.name: moved(getattr(self, f.name)) for f in fields(self)})
 
 
 def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> Balls:
@@ -44,22 +84,39 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
     centers: list[np.ndarray] = []
     radii: list[np.ndarray] = []
     for name in hand.link_names:
-        for shape in hand.tree.link(name).collisions:
-            inner, radius = inscribed_balls(shape.geometry)
-            points = np.concatenate((inner, sharp_points(shape.geometry, radius)))
-            centers.append(points @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3])
-            links += [name] * len(points)
-            radii.append(np.where(np.arange(len(points)) < len(inner), radius, 0.0))
-    radius = np.concatenate(radii) if radii else np.zeros(0)
-    index = np.where(radius > 0, np.array([hand.link_index(name) for name in links], dtype=np.int64), -1)
-    pairs = [
-        np.stack(np.meshgrid(np.flatnonzero(index == a), np.flatnonzero(index == b)), -1).reshape(-1, 2) for a, b in collision.link_pairs
-    ]
+        shapes = hand.tree.link(name).collisions
+        if not shapes:
+            continue
+        links.append(name)
+        parts = [_shape_balls(shape) for shape in shapes]
+        centers.append(np.concatenate([points for points, _ in parts]))
+        radii.append(np.concatenate([radius for _, radius in parts]))
+    counts = np.array([len(part) for part in radii], dtype=np.int64)
+    owner = np.repeat(np.arange(len(links)), counts)
+    radius = np.concatenate([np.zeros(0), *radii])
+    middles = np.array([(part.max(axis=0) + part.min(axis=0)) / 2 for part in centers]).reshape(-1, 3)
+    reach = np.array([(np.linalg.norm(c - m, axis=1) + r).max() for c, m, r in zip(centers, middles, radii, strict=True)])
+
+    link_pairs, pairs = [], []
+    for names in ((hand.link_names[a], hand.link_names[b]) for a, b in collision.link_pairs):
+        if not set(names) <= set(links):
+            continue
+        a, b = (links.index(name) for name in names)
+        meeting = np.stack(np.meshgrid(*(np.flatnonzero((owner == g) & (radius > 0)) for g in (a, b))), -1).reshape(-1, 2)
+        if len(meeting):
+            link_pairs.append((a, b))
+            pairs.append(meeting)
     return Balls(
         links=tuple(links),
-        centers=torch.as_tensor(np.concatenate(centers) if centers else np.zeros((0, 3))),
+        spans=_spans(counts),
+        link=torch.as_tensor(owner),
+        centers=torch.as_tensor(np.concatenate([np.zeros((0, 3)), *centers])),
         radii=torch.as_tensor(radius),
-        pairs=torch.as_tensor(np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.int64)),
+        bound_centers=torch.as_tensor(middles),
+        bound_radii=torch.as_tensor(reach),
+        link_pairs=torch.as_tensor(np.array(link_pairs, dtype=np.int64).reshape(-1, 2)),
+        pair_spans=_spans(np.array([len(part) for part in pairs], dtype=np.int64)),
+        pairs=torch.as_tensor(np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])),
     )
 
 
@@ -104,6 +161,18 @@ def sharp_points(geometry: Geometry, spacing: float) -> np.ndarray:
             edge[:, axis] = along
             edges.append(edge)
     return np.unique(np.concatenate(edges), axis=0)
+
+
+def _shape_balls(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Centres [n, 3] in the link's frame and radii [n] of the balls of one shape."""
+    inner, radius = inscribed_balls(shape.geometry)
+    sharp = sharp_points(shape.geometry, radius)
+    points = np.concatenate((inner, sharp)) @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
+    return points, np.concatenate((np.full(len(inner), radius), np.zeros(len(sharp))))
+
+
+def _spans(counts: np.ndarray) -> Spans:
+    return Spans(start=torch.as_tensor(np.cumsum(counts) - counts), count=torch.as_tensor(counts))
 
 
 def _grid(half: tuple[float, ...], radius: float) -> np.ndarray:

@@ -35,13 +35,33 @@ class Bodies:
     """[B, L, 3, n] angular velocity per variable."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Pads:
+    """The shapes that fingertips touch with, of the E mapped fingertips that have any."""
+
+    keypoint: Tensor
+    """[E] index of the fingertip's keypoint among the mapped ones."""
+    balls: Tensor
+    """[E, W] its balls; shorter lists repeat their first."""
+
+
 class HandModel:
     """A robot's hand as a floating tree, and which of its links follow which human keypoints."""
 
-    def __init__(self, robot: RobotSpec, table: TableSpec | None = None) -> None:
-        """Raises ``RobotError`` where the description does not allow retargeting: the message says which entry is wrong."""
+    def __init__(self, robot: RobotSpec, table: TableSpec | None = None, *, device: torch.device | str = "cpu") -> None:
+        """Prepare the hand.
+
+        Args:
+            robot: the robot.
+            table: that the hand stays above; default: the project's.
+            device: of all tensors.
+
+        Raises:
+            RobotError: the description does not allow retargeting; the message says which entry is wrong.
+        """
         self.robot = robot
-        self.kinematics = Kinematics(robot, root=robot.hand_root)
+        self.kinematics = Kinematics(robot, root=robot.hand_root, device=device)
+        self.device = self.kinematics.device
         if not np.array_equal(self.kinematics.joint_indices, robot.hand_indices):
             below, group = self.kinematics.joint_names, [robot.joint_names[i] for i in robot.hand_indices]
             raise RobotError(
@@ -63,21 +83,38 @@ class HandModel:
         self.keypoint_indices = np.array([KEYPOINTS.index(name) for name in self.names])
         """[P] indices into the 21 human keypoints."""
         tips = {tip.keypoint for tip in robot.fingertips}
-        self.is_tip = np.array([name in tips for name in self.names])
+        self.is_tip = torch.tensor([name in tips for name in self.names], device=self.device)
         """[P] whether a fingertip follows the keypoint."""
-        self.pairs = torch.tensor(keypoint_pairs(self.names, self.links))
+        self.pairs = torch.tensor(keypoint_pairs(self.names, self.links), device=self.device)
         """[C, 2] pairs of mapped keypoints whose difference is matched."""
-        self.home = torch.as_tensor(robot.home[robot.hand_indices])
+        self.home = torch.as_tensor(robot.home[robot.hand_indices], device=self.device)
         """[J] home configuration of the hand."""
-
-        collision = SelfCollision(robot, self.kinematics, only=robot.self_collision_links)
-        self.balls = hand_balls(robot, self.kinematics, collision)
-        """What keeps the hand out of the object, the table and itself."""
         self.table = table or TableSpec()
+
+        on_cpu = self.kinematics if self.device.type == "cpu" else Kinematics(robot, root=robot.hand_root)  # as coal wants it
+        collision = SelfCollision(robot, on_cpu, only=robot.self_collision_links)
+        self.balls = hand_balls(robot, on_cpu, collision).to(self.device)
+        """What keeps the hand out of the object, the table and itself."""
         self._bodies = tuple(dict.fromkeys((*self.links, *self.balls.links)))
-        self._keypoint_bodies = [self._bodies.index(link) for link in self.links]
-        self.ball_links = torch.tensor([self._bodies.index(link) for link in self.balls.links], dtype=torch.long)
-        """[Q] index of each ball's link among the bodies."""
+        self._keypoint_bodies = torch.tensor([self._bodies.index(link) for link in self.links], device=self.device)
+        self.group_body = torch.tensor([self._bodies.index(link) for link in self.balls.links], dtype=torch.long, device=self.device)
+        """[G] index among the bodies of each link with balls."""
+        self.pads = self._tip_pads()
+        """Balls that fingertips touch with."""
+
+    def _tip_pads(self) -> Pads:
+        """The balls of the links whose contact counts as a mapped fingertip's."""
+        tips = [tip for tip in self.robot.fingertips if tip.keypoint in self.names]
+        owner = [self.balls.links[i] for i in self.balls.link.tolist()]
+        solid = (self.balls.radii > 0).tolist()
+        balls = [[q for q, name in enumerate(owner) if name in tip.contact_links and solid[q]] for tip in tips]
+        kept = [(self.names.index(tip.keypoint), mine) for tip, mine in zip(tips, balls, strict=True) if mine]
+        width = max((len(mine) for _, mine in kept), default=0)
+        padded = [mine + mine[:1] * (width - len(mine)) for _, mine in kept]  # a ball twice changes no minimum
+        return Pads(
+            keypoint=torch.tensor([k for k, _ in kept], dtype=torch.long, device=self.device),
+            balls=torch.tensor(padded, dtype=torch.long, device=self.device).view(len(kept), width),
+        )
 
     def keypoints(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Tensor:
         """[..., P, 3] positions of the keypoint links."""
@@ -89,7 +126,7 @@ class HandModel:
         Variables: joints, then translation of the root, then rotation of the root about its origin (both along the world's axes).
         """
         links = self.kinematics.jacobian(joints, self._bodies, base=_pose(root_pos, root_quat))
-        identity = torch.eye(3, dtype=links.pos.dtype).expand(*links.pos.shape[:-1], 3, 3)
+        identity = torch.eye(3, dtype=links.pos.dtype, device=links.pos.device).expand(*links.pos.shape[:-1], 3, 3)
         turn = torch.linalg.cross(identity, (links.pos - root_pos[:, None])[..., None, :])  # row i: e_i x r
         return Bodies(
             pos=links.pos,
@@ -102,19 +139,24 @@ class HandModel:
         """Keypoints [B, P, 3] and their Jacobian [B, P, 3, n]."""
         return bodies.pos[:, self._keypoint_bodies], bodies.linear[:, self._keypoint_bodies]
 
-    def ball_slope(self, bodies: Bodies, frame: Tensor, ball: Tensor, centers: Tensor, direction: Tensor) -> Tensor:
+    def ball_centers(self, bodies: Bodies, frame: Tensor, ball: Tensor) -> Tensor:
+        """[..., 3] centres in the world of balls [...] in frames [...]."""
+        body = self.group_body[self.balls.link[ball]]
+        return bodies.pos[frame, body] + (bodies.rot[frame, body] @ self.balls.centers[ball][..., None])[..., 0]
+
+    def ball_slope(self, bodies: Bodies, frame: Tensor, ball: Tensor, center: Tensor, direction: Tensor) -> Tensor:
         """[A, n] how the centre of a ball moves along a direction: n . (v + w x r) = n . v + (r x n) . w.
 
         Args:
             bodies: the hand.
             frame: [A]
             ball: [A]
-            centers: [B, Q, 3] of all balls.
+            center: [A, 3] of those balls.
             direction: [A, 3] unit vectors n.
         """
-        link = self.ball_links[ball]
-        lever = torch.linalg.cross(centers[frame, ball] - bodies.pos[frame, link], direction)
-        along = direction[:, None] @ bodies.linear[frame, link] + lever[:, None] @ bodies.angular[frame, link]
+        body = self.group_body[self.balls.link[ball]]
+        lever = torch.linalg.cross(center - bodies.pos[frame, body], direction)
+        along = direction[:, None] @ bodies.linear[frame, body] + lever[:, None] @ bodies.angular[frame, body]
         return along[:, 0]
 
 

@@ -15,8 +15,10 @@ from xreset.demos.align import grounded, levelled
 from xreset.demos.archive import Demos
 from xreset.errors import DemoError
 from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
+from xreset.retarget.fields import DistanceFields
 from xreset.retarget.file import SCHEMA, Retargeted, read_retargeted, write_retargeted
-from xreset.retarget.hand import HandConfig, HandTargets, retarget_hand
+from xreset.retarget.hand import HandTargets, retarget_hand
+from xreset.retarget.hand_config import HandConfig
 from xreset.retarget.hand_model import HandModel
 from xreset.retarget.partial import Batch, Partial, run_key
 from xreset.retarget.surface import Surface, keypoint_contacts
@@ -218,7 +220,8 @@ def _hand_targets(
         in_contact=padded(touches[:, hand.keypoint_indices]),
         object_pos=padded(demos.object_pos.astype(np.float64)),
         object_quat=padded(demos.object_quat_wxyz.astype(np.float64)),
-        surfaces=tuple(surfaces[name] for name in demos.object_name[list(sequences)].tolist()),
+        object_index=torch.tensor([list(surfaces).index(name) for name in demos.object_name[list(sequences)].tolist()]),
+        fields=DistanceFields.join([surface.field for surface in surfaces.values()]),
     )
 
 
@@ -260,7 +263,7 @@ def _arm_targets(hand: HandModel, arm: ArmModel, targets: HandTargets, config: H
         root_quat=motion.root_quat,
         hand_joints=motion.joints,
         annotated=targets.annotated,
-        hand_error=(motion.keypoints - targets.keypoints)[:, :, torch.as_tensor(hand.is_tip)].norm(dim=-1).mean(-1),
+        hand_error=(motion.keypoints - targets.keypoints)[:, :, hand.is_tip].norm(dim=-1).mean(-1),
         hand_clearance=arm.hand_clearance(motion.joints),
     )
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from xreset.objects.geometry import surface_of
+from xreset.retarget.fields import DistanceFields
 from xreset.spec import ObjectSpec
 
 _SAMPLE_SPACING = 0.003
@@ -57,8 +58,16 @@ class Surface:
         distance, _ = self._tree.query(nodes)
         near = distance < 2 * _GRID_SPACING + _SAMPLE_SPACING  # beyond, the nearest sample is near enough
         distance[near] = self.nearest(nodes[near])[1]
-        self.distance = torch.as_tensor(np.where(inside.reshape(-1), -distance, distance).reshape(counts))
-        """[X, Y, Z] signed distance at the grid's nodes [m], negative inside."""
+        self.field = DistanceFields(
+            values=torch.as_tensor(np.where(inside.reshape(-1), -distance, distance)),
+            start=torch.zeros(1, dtype=torch.long),
+            counts=torch.as_tensor(counts)[None],
+            origin=torch.as_tensor(self._origin)[None],
+            low=torch.as_tensor(self.low)[None],
+            high=torch.as_tensor(self.high)[None],
+            spacing=_GRID_SPACING,
+        )
+        """Signed distances on the grid."""
 
     def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nearest surface points [N, 3] of points [N, 3], exact on the triangles of the nearest samples, and the distances [N] to them."""
@@ -74,31 +83,8 @@ class Surface:
         return candidates[rows, best], distances[rows, best]
 
     def signed_distance(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance [N] and its gradient [N, 3] at points [N, 3]: trilinear interpolation of the grid.
-
-        Beyond the grid, the distance to the grid is added to the value of the nearest point in it.
-        """
-        counts = torch.tensor(self.distance.shape)
-        unclamped = (points - torch.as_tensor(self._origin)) / _GRID_SPACING
-        x = torch.minimum(unclamped.clamp_min(0.0), counts - 1.0001)
-        beyond = unclamped - x
-        excess = beyond.norm(dim=-1)
-        cell = x.floor().long()
-        f = x - cell
-        corner = [cell[:, 0, None] + torch.tensor([0, 0, 0, 0, 1, 1, 1, 1]), cell[:, 1, None] + torch.tensor([0, 0, 1, 1, 0, 0, 1, 1])]
-        v = self.distance[corner[0], corner[1], cell[:, 2, None] + torch.tensor([0, 1, 0, 1, 0, 1, 0, 1])].view(-1, 2, 2, 2)
-        fx, fy, fz = (f[:, i].view(-1, *[1] * (2 - i)) for i in range(3))
-        slope_x = v[:, 1] - v[:, 0]
-        along_x = v[:, 0] + fx * slope_x  # [N, 2, 2]
-        slope_y = along_x[:, 1] - along_x[:, 0]
-        along_y = along_x[:, 0] + fy * slope_y  # [N, 2]
-        slope_z = along_y[:, 1] - along_y[:, 0]
-        slope_x = slope_x[:, 0] + fy * (slope_x[:, 1] - slope_x[:, 0])
-        gradient = torch.stack(
-            (slope_x[:, 0] + fz * (slope_x[:, 1] - slope_x[:, 0]), slope_y[:, 0] + fz * (slope_y[:, 1] - slope_y[:, 0]), slope_z), dim=-1
-        )
-        gradient = torch.where(beyond == 0, gradient / _GRID_SPACING, beyond / excess[:, None].clamp_min(1e-12))
-        return along_y[:, 0] + fz * slope_z + excess * _GRID_SPACING, gradient
+        """Signed distance [N] and its gradient [N, 3] at points [N, 3], by interpolation (``DistanceFields.signed_distance``)."""
+        return self.field.signed_distance(points, torch.zeros(len(points), dtype=torch.long))
 
     def _at_nodes(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
         index = np.clip(np.rint((points - self._origin) / _GRID_SPACING).astype(int), 0, np.array(values.shape) - 1)

@@ -1,9 +1,10 @@
 """The cost of one frame of hand retargeting, term by term (the paper, appendix D.b).
 
-Each term takes the robot's keypoints and their Jacobian and returns residuals and the residuals' Jacobian; a frame's cost is the sum of
-squared residuals. Lengths are divided by a length scale, so that they compare with the radians of the other terms.
+Every term is a function of points: of the robot's keypoints, or of the vectors between them. It returns its cost, half its gradient and
+half its Gauss-Newton Hessian by each point; the chain rule through the hand's kinematics comes after (``cost``). Lengths are divided by a
+length scale, so that they compare with the radians of the other terms.
 
-Shape letters: B frames, P mapped keypoints, C pairs of them, n variables.
+Shape letters: B frames, K points.
 """
 
 from __future__ import annotations
@@ -16,101 +17,83 @@ from torch import Tensor
 _TINY = 1e-9
 
 
-class Residual(NamedTuple):
-    """Weighted residuals and their Jacobian."""
+class Term(NamedTuple):
+    """A cost and how it changes with its points."""
 
-    value: Tensor
-    """[B, R]"""
-    jacobian: Tensor
-    """[B, R, n]"""
+    cost: Tensor
+    """[B]"""
+    gradient: Tensor
+    """[B, K, 3] half the gradient."""
+    curvature: Tensor
+    """[B, K, 3, 3] half the Gauss-Newton Hessian: symmetric, not negative."""
 
-
-def bone_lengths(x: Tensor, J: Tensor, target: Tensor, pairs: Tensor, weight: Tensor) -> Residual:
-    """Difference of the vectors between keypoints: r = sqrt(w) ((x_b - x_a) - (h_b - h_a)), for every pair (a, b).
-
-    Args:
-        x: [B, P, 3] robot keypoints, in units of the length scale.
-        J: [B, P, 3, n] their Jacobian.
-        target: [B, P, 3] human keypoints h, in the same units.
-        pairs: [C, 2] indices a, b.
-        weight: [B, C] w.
-    """
-    a, b = pairs.unbind(1)
-    value = (x[:, b] - x[:, a]) - (target[:, b] - target[:, a])
-    return _weighted(value, J[:, b] - J[:, a], weight)
+    def __add__(self, other: Term) -> Term:  # type: ignore[override]
+        """The sum of two terms of the same points."""
+        return Term(self.cost + other.cost, self.gradient + other.gradient, self.curvature + other.curvature)
 
 
-def bone_directions(x: Tensor, J: Tensor, target: Tensor, pairs: Tensor, weight: Tensor) -> Residual:
-    """Difference of the directions between keypoints: r = sqrt(w) (u - v), u and v the unit vectors of x_b - x_a and h_b - h_a.
-
-    |u - v|^2 = 2 (1 - cos of the angle between them). du = (I - u u^T) dx / |x_b - x_a|. Arguments as in :func:`bone_lengths`.
-    """
-    a, b = pairs.unbind(1)
-    d, h = x[:, b] - x[:, a], target[:, b] - target[:, a]
-    length = d.norm(dim=-1, keepdim=True).clamp_min(_TINY)
-    u, v = d / length, h / h.norm(dim=-1, keepdim=True).clamp_min(_TINY)
-    dJ = (J[:, b] - J[:, a]) / length[..., None]
-    dJ = dJ - u[..., None] * (u[..., None, :] @ dJ)
-    return _weighted(u - v, dJ, weight)
-
-
-def global_alignment(x: Tensor, J: Tensor, target: Tensor, weight: Tensor) -> Residual:
-    """Difference of the keypoints themselves: r = sqrt(w) (x - h). Arguments as in :func:`bone_lengths`; weight [B, P]."""
-    return _weighted(x - target, J, weight)
-
-
-def contact(x: Tensor, J: Tensor, contact_point: Tensor, weight: Tensor, margin: float, knee: float) -> Residual:
-    """The paper's contact term, w [|c - x| - margin]_+, as iteratively reweighted least squares.
-
-    The square of r = s e, with e = [|c - x| - margin]_+ and s^2 = w / (2 max(e, knee)) held constant, has the gradient of that cost where
-    e > knee; below it is quadratic, because there the L1 cost has no second derivative.
+def difference(x: Tensor, target: Tensor, weight: Tensor) -> Term:
+    """E = w |x - h|^2 for every point: positions against positions, or vectors between keypoints against those of the human hand.
 
     Args:
-        x: [B, P, 3] robot contact points.
-        J: [B, P, 3, n]
-        contact_point: [B, P, 3] object contact points c; anything finite where the weight is 0.
-        weight: [B, P] w, 0 where a keypoint is not in contact.
+        x: [B, K, 3] the robot's, in units of the length scale.
+        target: [B, K, 3] the human's, h, in the same units.
+        weight: [B, K] w.
+    """
+    off, w = x - target, weight[..., None]
+    identity = torch.eye(3, dtype=x.dtype, device=x.device)
+    return Term((weight * off.square().sum(-1)).sum(-1), w * off, w[..., None] * identity)
+
+
+def direction(x: Tensor, target: Tensor, weight: Tensor) -> Term:
+    """E = w |u - v|^2 with u = x / |x| and v = h / |h|: twice w (1 - cosine) of the angle between two vectors.
+
+    du = (I - u u^T) dx / |x|. Arguments as in :func:`difference`.
+    """
+    length = x.norm(dim=-1, keepdim=True).clamp_min(_TINY)
+    u, v = x / length, target / target.norm(dim=-1, keepdim=True).clamp_min(_TINY)
+    w = weight[..., None]
+    across = torch.eye(3, dtype=x.dtype, device=x.device) - u[..., :, None] * u[..., None, :]
+    gradient = w / length * (u * (u * v).sum(-1, keepdim=True) - v)
+    return Term((weight * (u - v).square().sum(-1)).sum(-1), gradient, (w / length.square())[..., None] * across)
+
+
+def contact(x: Tensor, contact_point: Tensor, weight: Tensor, margin: float, knee: float) -> Term:
+    """The paper's contact term, E = w [|c - x| - margin]_+, with its corner rounded, as iteratively reweighted least squares.
+
+    With e = [|c - x| - margin]_+ the cost is Huber's: w e^2 / (2 knee) below the knee, w (e - knee / 2) above. Its curvature is that of
+    s^2 e^2 with s^2 = w / (2 max(e, knee)) held constant, because above the knee the L1 cost has no second derivative.
+
+    Args:
+        x: [B, K, 3] robot contact points.
+        contact_point: [B, K, 3] object contact points c; anything finite where the weight is 0.
+        weight: [B, K] w, 0 where a keypoint is not in contact.
         margin: distance that costs nothing, in units of the length scale.
         knee: excess below which the cost is quadratic.
     """
     gap = x - contact_point
     distance = gap.norm(dim=-1).clamp_min(_TINY)
     excess = (distance - margin).clamp_min(0.0)
-    scale = (weight / (2.0 * excess.clamp_min(knee))).sqrt() * (excess > 0)
-    direction = gap / distance[..., None]
-    return Residual(scale * excess, scale[..., None] * (direction[..., None, :] @ J)[..., 0, :])
+    cost = weight * torch.where(excess < knee, excess**2 / (2.0 * knee), excess - knee / 2.0)
+    pull = weight / (2.0 * excess.clamp_min(knee)) * (excess > 0)
+    n = gap / distance[..., None]
+    return Term(cost.sum(-1), (pull * excess)[..., None] * n, pull[..., None, None] * n[..., :, None] * n[..., None, :])
 
 
-def contact_cost(x: Tensor, contact_point: Tensor, weight: Tensor, margin: float, knee: float) -> Tensor:
-    """[B] the cost whose gradient :func:`contact` has, as a sum over contacts of Huber's function.
+def change(d: Tensor, weight: Tensor, limit: Tensor, excess_weight: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Change of variables between neighbouring frames: E = w d^2 + W [|d| - limit]_+^2.
 
-    It is w e^2 / (2 knee) below the knee and w (e - knee / 2) above: the paper's L1 cost with its corner rounded.
-    """
-    excess = ((x - contact_point).norm(dim=-1) - margin).clamp_min(0.0)
-    return (weight * torch.where(excess < knee, excess**2 / (2.0 * knee), excess - knee / 2.0)).sum(-1)
-
-
-def clearance(distance: Tensor, J: Tensor, frame: Tensor, frames: int, weight: float, least: float) -> Residual:
-    """What keeps bodies apart: r = sqrt(w) [least - d]_+ for every distance d, in units of the length scale.
+    The first part is the paper's smoothness; the second is a wall that the first, spread over a trajectory, is too soft to be.
 
     Args:
-        distance: [A] signed distances.
-        J: [A, n] their derivatives.
-        frame: [A] the frame of each, ascending.
-        frames: B.
-        weight: w.
-        least: distance from which on there is no cost.
+        d: [..., n] changes.
+        weight: [n] w.
+        limit: [n] largest change without further cost; infinite where there is none.
+        excess_weight: W.
+
+    Returns:
+        [...] cost, [..., n] half the gradient, [..., n] half the Gauss-Newton Hessian's diagonal.
     """
-    value = weight**0.5 * (least - distance).clamp_min(0.0)
-    count = torch.bincount(frame, minlength=frames)
-    slot = torch.arange(len(frame)) - (count.cumsum(0) - count)[frame]  # place among the frame's own, so that rows stay dense and few
-    width = int(count.max()) if len(frame) else 0
-    values, rows = J.new_zeros(frames, width), J.new_zeros(frames, width, J.shape[-1])
-    values[frame, slot] = value
-    rows[frame, slot] = -(weight**0.5) * (distance < least).to(J.dtype)[:, None] * J
-    return Residual(values, rows)
-
-
-def _weighted(value: Tensor, J: Tensor, weight: Tensor) -> Residual:
-    scale = weight.sqrt()[..., None]
-    return Residual((scale * value).flatten(1), (scale[..., None] * J).flatten(1, 2))
+    excess = (d.abs() - limit).clamp_min(0.0)
+    cost = (weight * d.square() + excess_weight * excess.square()).sum(-1)
+    return cost, weight * d + excess_weight * excess * d.sign(), weight + excess_weight * (excess > 0)

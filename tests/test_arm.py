@@ -11,7 +11,8 @@ import torch
 
 from xreset import robots
 from xreset.errors import RobotError
-from xreset.retarget.arm import ArmModel, ArmTargets
+from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
+from xreset.retarget.validity import Thresholds, classify
 from xreset.robots import load, registry
 from xreset.robots.placement import Finalist, PlaceConfig, Placement, Reach, Search, write_placement
 from xreset.rotations import matrix_to_quat, quat_multiply
@@ -129,6 +130,42 @@ class PlaceTest(unittest.TestCase):
         frames = placing.single_frames([dataclasses.replace(path, hand_error=error, annotated=annotated)], 0.03)
         self.assertEqual(frames.root_pos.shape, (38, 1, 3))
         torch.testing.assert_close(frames.root_pos[3], self.wrists.root_pos[4])
+
+
+class DirectionTest(unittest.TestCase):
+    """Motions that the arm can follow from one of their ends, and not from the other."""
+
+    @classmethod
+    def setUpClass(cls):
+        robot = robots.load("openarm")
+        cls.model = ArmModel(robot)
+        start = torch.as_tensor(robot.home)
+        goal = start.clone()
+        goal[cls.model.arm] += torch.tensor([0.9, -0.5, 0.6, 0.7, -1.2, 0.5, 0.6], dtype=start.dtype)
+        way = torch.linspace(0, 1, 16, dtype=start.dtype)[:, None]
+        joints = start + way * (goal - start)
+        joints[:, cls.model.arm] = joints[:, cls.model.arm].clamp(cls.model.lower, cls.model.upper)
+        root = cls.model.kinematics.link_poses(joints, [robot.hand_root])[:, 0]
+        pos, quat = root[:, :3, 3].clone(), matrix_to_quat(root[:, :3, :3])
+        pos[:6] += torch.tensor([0.0, 1.0, -1.5], dtype=start.dtype)  # out of reach, where the arm gets stuck at its limits
+        quat[:6] = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=start.dtype)
+        cls.targets = ArmTargets(
+            root_pos=pos[None],
+            root_quat=quat[None],
+            hand_joints=joints[None, :, robot.hand_indices],
+            annotated=torch.ones(1, 16, dtype=torch.bool),
+            hand_error=torch.zeros(1, 16, dtype=start.dtype),
+            hand_clearance=torch.ones(1, 16, dtype=start.dtype),
+        )
+
+    def valid(self, targets: ArmTargets) -> int:
+        thresholds = Thresholds(table_depth=1e9, self_depth=1e9)
+        _, measures = track(self.model, targets, thresholds, ArmConfig(restarts=4, branches=1, collision_weight=0.0))
+        return int((classify(measures, thresholds) == 0).sum())
+
+    def test_both_ends_are_tried(self):
+        self.assertGreaterEqual(self.valid(self.targets), 8)  # forwards alone: none
+        self.assertGreaterEqual(self.valid(ArmTargets(**{name: value.flip(1) for name, value in vars(self.targets).items()})), 8)
 
 
 class WritePlacementTest(unittest.TestCase):

@@ -3,7 +3,8 @@
     q_t = argmin  50 |p(q) - p_t|^2 + 10 d_R(R(q), R_t)^2 + lambda_s |q - q_{t-1}|^2 + E_coll(q),   within the joint limits,
 
 by Levenberg-Marquardt with projected steps, frame after frame, batched over sequences. The first frame starts from random restarts; the
-best few distinct solutions are all followed, and the one with most valid frames wins: the first frame cannot tell which branch lasts.
+best few distinct solutions are all followed, and the one with most valid frames wins: the first frame cannot tell which branch lasts. The
+same is tried backwards from the last frame where a frame fails: the branch that reaches the goal may look worse than others at the start.
 
 E_coll = w sum of [margin - distance]_+^2 over the lowest points of the links (table) and, where a path without it collides, over the
 pairs of shapes that coal finds near each other.
@@ -55,16 +56,16 @@ class ArmConfig:
     self_margin: float = 0.010
     """Distance that the robot's links keep from each other [m]."""
     restarts: int = 32
-    """Random starts of the first frame (the first of them is the home configuration)."""
+    """Random starts of the first and of the last frame (the first of them is the home configuration)."""
     branches: int = 4
-    """Distinct solutions of the first frame that are followed; the one that home leads to is always among them."""
+    """Distinct solutions of the first and of the last frame that are followed; the one that home leads to is always among them."""
     detour_cost: float = 1.0
     """Valid frames that a path is worth less for each rad^2 of its mean squared distance from home. A policy starts at home: states in
     another branch of the arm's solutions are of no use to it, because the way there leads through half a turn of the shoulder."""
     first_iterations: int = 60
-    """Most steps for the first frame."""
+    """Most steps for the frame that a path starts from."""
     iterations: int = 12
-    """Most steps for a later frame."""
+    """Most steps for every other frame."""
     seed: int = 0
     """Of the restarts."""
 
@@ -189,26 +190,23 @@ def track(
         [S, T, n] arm joints, and what was measured of every frame ([S, T] each).
     """
     config = config or ArmConfig()
-    sequences = len(targets.annotated)
     support = model.hand_support(targets.hand_joints)
     report = progress or (lambda _: None)
 
-    starts = _first_frames(model, targets, support, config)  # [S, K, n]
-    branches = starts.shape[1]
-    wide = torch.arange(sequences).repeat_interleave(branches)
-    many = _take(targets, wide)
-    paths = _follow(model, many, support[wide], starts.flatten(0, 1), config, None, lambda done: report(0.5 * done))
-    valid = (classify(measure(model, many, paths), thresholds) == 0).sum(1)
-    home = torch.as_tensor(model.robot.home[model.robot.arm_indices])
-    detour = (paths - home).square().sum(-1).mean(1)
-    score = valid - config.detour_cost * detour
-    joints = paths[torch.arange(sequences) * branches + score.view(sequences, branches).argmax(dim=1)]
+    joints, worth = _best_path(model, targets, support, thresholds, config, lambda done: report(0.4 * done))
+    reason = classify(measure(model, targets, joints), thresholds)
+    failing = (reason > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
+    if len(failing):
+        part = ArmTargets(**{name: value[failing].flip(1) for name, value in vars(targets).items()})
+        back, other = _best_path(model, part, support[failing].flip(1), thresholds, config, lambda done: report(0.4 + 0.4 * done))
+        better = other > worth[failing]
+        joints[failing[better]] = back[better].flip(1)
 
     reason = classify(measure(model, targets, joints), thresholds)
     repair = (reason == REASONS.index("self collision")).any(dim=1).nonzero()[:, 0]
     if len(repair):
         part = _take(targets, repair)
-        apart = _follow(model, part, support[repair], joints[repair, 0], config, model.arm_collision, lambda done: report(0.5 + 0.5 * done))
+        apart = _follow(model, part, support[repair], joints[repair, 0], config, model.arm_collision, lambda done: report(0.8 + 0.2 * done))
         better = (classify(measure(model, part, apart), thresholds) == 0).sum(1) > (reason[repair] == 0).sum(1)
         joints[repair[better]] = apart[better]
     report(1.0)
@@ -259,6 +257,27 @@ def _frame(targets: ArmTargets, support: Tensor, t: int, previous: Tensor | None
         hand_joints=targets.hand_joints[:, t],
         previous=previous,
     )
+
+
+def _best_path(
+    model: ArmModel,
+    targets: ArmTargets,
+    support: Tensor,
+    thresholds: Thresholds,
+    config: ArmConfig,
+    progress: Callable[[float], None],
+) -> tuple[Tensor, Tensor]:
+    """[S, T, n] of the paths from distinct solutions of the first frame the one that is worth most, and its worth [S]: see the config."""
+    sequences = len(targets.annotated)
+    starts = _first_frames(model, targets, support, config)  # [S, K, n]
+    wide = torch.arange(sequences).repeat_interleave(starts.shape[1])
+    many = _take(targets, wide)
+    paths = _follow(model, many, support[wide], starts.flatten(0, 1), config, None, progress)
+    valid = (classify(measure(model, many, paths), thresholds) == 0).sum(1)
+    home = torch.as_tensor(model.robot.home[model.robot.arm_indices])
+    worth = (valid - config.detour_cost * (paths - home).square().sum(-1).mean(1)).view(sequences, -1)
+    best, branch = worth.max(dim=1)
+    return paths.view(sequences, -1, *paths.shape[1:])[torch.arange(sequences), branch], best
 
 
 def _first_frames(model: ArmModel, targets: ArmTargets, support: Tensor, config: ArmConfig) -> Tensor:

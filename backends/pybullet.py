@@ -99,7 +99,7 @@ class PybulletWorld(World):
         self._drives = _Drives(p, self._client, self._robot.body, robot, dt, settings)
         self._frames = TrackedFrames(robot)
         self._arm = Arms(self._inertia.com[None])
-        self._from_principal = np.array([multiply(unit, conjugate(self._inertia.quat)) for unit in np.eye(4)])  # this product as a matrix
+        self._from_principal = conjugate(self._inertia.quat)
         self._mass, self._fraction = self._inertia.mass, 1.0
         self._force, self._torque = np.zeros(3), np.zeros(3)
         self._torsional = scene.friction.torsional
@@ -128,7 +128,7 @@ class PybulletWorld(World):
         p, client = self._p, self._client
         com, turn = p.getBasePositionAndOrientation(self._object.body, physicsClientId=client)
         linear, angular = (np.array(v) for v in p.getBaseVelocity(self._object.body, physicsClientId=client))
-        self._quat = nearer(_wxyz(turn) @ self._from_principal, self._quat)
+        self._quat = nearer(multiply(_wxyz(turn), self._from_principal), self._quat)
         arm = self._arm.turned(self._quat)[0]
         position, velocity = self._drives.read()
         return {
@@ -389,9 +389,7 @@ class _Drives:
             lag = self._multiplier * q[driven[self._source]] + self._offset - q[self._mimic]
             rate = self._J @ v
             tau -= self._J.T @ (self._stiffness * (lag + dt * rate) + self._damping * rate)
-        bias = np.array(
-            self._p.calculateInverseDynamics(self._body, q.tolist(), v.tolist(), [0.0] * len(q), physicsClientId=self._client)
-        )
+        bias = np.array(self._p.calculateInverseDynamics(self._body, q.tolist(), v.tolist(), [0.0] * len(q), physicsClientId=self._client))
         net = tau - bias
         if self._last_step is not None:
             last_velocity, last_net = self._last_step

@@ -10,16 +10,20 @@ import numpy as np
 import torch
 
 from xreset.backends import make_backend
+from xreset.backends.base import Backend
 from xreset.env import ManipulationEnv, make_scene
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
 from xreset.objects import keypoints
 from xreset.policy import Policy
 from xreset.resets.bank import ResetBank
 from xreset.schedule import schedule
-from xreset.spec import ObjectSpec, RobotSpec
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task.config import TaskConfig
 from xreset.task.resets import Reset, ResetDistribution
 from xreset.task.terminations import out_of_bounds
+
+MakeBackend = Callable[[SceneSpec, int, torch.Tensor], Backend]
+"""Builds worlds of a scene: how many, and which object each holds [N]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,9 +90,11 @@ def roll_out(
     device: str = "cpu",
     trace_interval: float = 0.05,
     metrics: MetricsConfig | None = None,
+    only: np.ndarray | None = None,
+    make: MakeBackend | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Rollouts:
-    """Run every demonstration ``repetitions`` times.
+    """Run demonstrations ``repetitions`` times each.
 
     Args:
         policy: what acts.
@@ -103,12 +109,15 @@ def roll_out(
         device: of GPU engines.
         trace_interval: time between the states of a trace [s].
         metrics: thresholds.
+        only: indices of the demonstrations to run; None: all.
+        make: builds the worlds, of an engine that is not as it is registered; None: the registered engine, on the device.
         progress: called with (control steps done, control steps in all).
     """
     names = tuple(o.name for o in objects)
-    sequences = np.repeat(np.arange(len(demos.sequence_name)), repetitions)
-    repetition = np.tile(np.arange(repetitions), len(demos.sequence_name))
-    object_of = np.array([names.index(name) for name in demos.sequence_object])[sequences]
+    chosen = np.arange(len(demos.sequence_name)) if only is None else np.asarray(only)
+    sequences = np.repeat(chosen, repetitions)
+    repetition = np.tile(np.arange(repetitions), len(chosen))
+    object_of = np.array([names.index(name) for name in demos.sequence_object[sequences]])
     plan = schedule(object_of, num_envs)
     first_of_object = {int(np.flatnonzero(object_of == i)[0]) for i in np.unique(object_of)}
     scene = make_scene(robot, objects, task)
@@ -116,7 +125,11 @@ def roll_out(
     traces: list[Trace] = []
     steps, spent = 0, 0.0
     worlds = torch.as_tensor(plan.object_index)
-    with make_backend(backend_name, scene, len(worlds), object_index=worlds, device=device) as backend:
+    if make is None:
+        backend = make_backend(backend_name, scene, len(worlds), object_index=worlds, device=device)
+    else:
+        backend = make(scene, len(worlds), worlds)
+    with backend:
         on_cpu = ResetDistribution(demos, robot, names, task.reset)
         resets = on_cpu if backend.device.type == "cpu" else ResetDistribution(demos, robot, names, task.reset, backend.device)
         env = ManipulationEnv(backend, task, resets, seed=seed)

@@ -107,8 +107,8 @@ def differences(
     joint = (found.joint_pos[:, world] - reference.joint_pos[:, reference_world]).abs().double().numpy()
     position = (found.object_pos[:, world] - reference.object_pos[:, reference_world]).double().norm(dim=-1).numpy()
     angle = quat_angle(found.object_quat[:, world].double(), reference.object_quat[:, reference_world].double()).numpy()
-    sound = np.isfinite(np.column_stack((joint, position, angle, force, other_force))).all(axis=1)
-    steps = len(sound) if sound.all() else int(np.argmin(sound))
+    broken = np.flatnonzero(~np.isfinite(np.column_stack((joint, position, angle, force, other_force))).all(axis=1))
+    steps = int(broken[0]) if len(broken) else len(joint)
     return Differences(
         time=(np.arange(steps) + 1) * dt,
         joint=joint[:steps],
@@ -144,15 +144,15 @@ def worst(several: Sequence[tuple[Parting, ...]]) -> tuple[Parting, ...]:
     out = []
     for same in zip(*several, strict=True):
         first = min(same, key=lambda p: math.inf if p.time is None else p.time)
-        most = max(same, key=lambda p: p.largest)
+        most = max(same, key=lambda p: p.largest / p.threshold)
         out.append(
             Parting(
                 quantity=first.quantity,
-                unit=first.unit,
-                threshold=first.threshold,
+                unit=most.unit,
+                threshold=most.threshold,
                 time=first.time,
                 where=first.where,
-                end=max(p.end for p in same),
+                end=max(p.end for p in same if p.unit == most.unit),
                 largest=most.largest,
                 largest_time=most.largest_time,
                 largest_where=most.largest_where,
@@ -167,7 +167,7 @@ def first_of(found: Sequence[Parting]) -> Parting | None:
     return min(parted, key=lambda p: p.time or 0.0, default=None)
 
 
-def _plain(quantity: str, unit: str, time: np.ndarray, value: np.ndarray, threshold: float, where: Sequence[str] | None = None) -> Parting:
+def _plain(quantity: str, unit: str, time: np.ndarray, value: np.ndarray, threshold: float, where: list[str] | None = None) -> Parting:
     beyond = np.flatnonzero(value >= threshold)
     first, most = (int(beyond[0]) if len(beyond) else None), int(value.argmax())
     return Parting(
@@ -175,11 +175,11 @@ def _plain(quantity: str, unit: str, time: np.ndarray, value: np.ndarray, thresh
         unit=unit,
         threshold=threshold,
         time=None if first is None else float(time[first]),
-        where=where[first] if where and first is not None else "",
+        where="" if where is None or first is None else where[first],
         end=float(value[-1]),
         largest=float(value[most]),
         largest_time=float(time[most]),
-        largest_where=where[most] if where else "",
+        largest_where="" if where is None else where[most],
     )
 
 
@@ -197,7 +197,7 @@ def _joints(d: Differences, names: Sequence[str], limit: np.ndarray, thresholds:
         unit="rad" if limit[joint] == thresholds.joint else "m",
         threshold=float(limit[joint]),
         time=None if first is None else float(d.time[first]),
-        where="" if first is None else names[which[first]],
+        where="" if first is None else names[int(which[first])],
         end=float(d.joint[-1, same_kind].max()),
         largest=float(d.joint[most, joint]),
         largest_time=float(d.time[most]),
@@ -216,7 +216,7 @@ def _contacts(d: Differences, fingers: Sequence[str], thresholds: Thresholds) ->
 
     def describe(step: int) -> str:
         parts = []
-        for i in np.flatnonzero(other[step]):
+        for i in np.flatnonzero(other[step]).tolist():
             parts.append(f"{fingers[i]} touches" if d.touch[step, i] else f"{fingers[i]} does not touch")
         return ", ".join(parts)
 

@@ -15,6 +15,7 @@ COMMANDS: dict[str, str] = {
     "robots": "List robots, and check one.",
     "backends": "List physics engines and whether they can be used here.",
     "conformance": "Test that a physics engine keeps the interface's contracts.",
+    "engines": "Make the support matrix: what every engine can do and how far they agree, from measured results.",
     "parity": "Measure how far physics engines agree on grasps.",
     "retarget": "Turn human demonstrations into robot trajectories.",
     "resets": "Try retargeted states in physics and keep the stable ones.",
@@ -22,6 +23,7 @@ COMMANDS: dict[str, str] = {
     "train": "Train a policy.",
     "eval": "Evaluate a policy, or a baseline, in one or several engines.",
     "trace": "Replay one action sequence in several engines, and see when, where and by how much they part.",
+    "attribute": "Tell which physical difference between two engines costs a policy its skill.",
     "report": "Make a self-contained HTML page of a run's evaluations.",
 }
 """Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``: a function, or a dictionary of sub-commands."""

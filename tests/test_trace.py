@@ -1,0 +1,318 @@
+"""Replays in several engines: partings of constructed recordings, altered engines found at the right place, files, refusals."""
+
+import contextlib
+import io
+import json
+import math
+import tempfile
+import unittest
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests import toy_grasp
+from tests.data import data_dir
+from xreset.backends.base import State
+from xreset.backends.parity.recording import Recording
+from xreset.backends.parity.trials import engine
+from xreset.cli import main
+from xreset.errors import FileFormatError, XResetError
+from xreset.eval.trace import Actions, Parting, Thresholds, read_actions, trace, write_actions
+from xreset.eval.trace.film import write_strip
+from xreset.eval.trace.partings import differences, first_of, partings
+from xreset.eval.trace.plot import write_plot
+from xreset.eval.trace.replay import TraceResult, write_trace
+from xreset.eval.trace.table import rich_table, sentences
+from xreset.files import read_json, read_npz
+from xreset.rotations import quat_from_axis_angle
+from xreset.spec import PairFriction
+
+DT = 1 / 60
+
+
+def grasp_actions(steps: int = 60) -> Actions:
+    """The toy grasp: close and lift."""
+    return Actions(
+        robot=toy_grasp.robot(),
+        object=toy_grasp.brick(),
+        label="toy grasp",
+        timestep=1 / 240,
+        substeps=4,
+        friction=toy_grasp.FRICTION,
+        start=toy_grasp.start(),
+        joint_target=torch.as_tensor(np.stack([toy_grasp.targets(i) for i in range(steps)]), dtype=torch.float32),
+        phases=(("close", 0.0), ("lift", 0.25), ("hold", 0.75)),
+    )
+
+
+def wave_actions() -> Actions:
+    """Every joint but the jaws steps at once, far from the object, which lies on the table."""
+    actions = grasp_actions(30)
+    home = torch.as_tensor(actions.robot.home, dtype=torch.float32)
+    step = torch.tensor([0.02 if "jaw" not in name else 0.0 for name in actions.robot.joint_names])
+    start = replace(actions.start, object_pos=torch.tensor([[0.9, 0.5, 0.02]]), object_quat=torch.tensor([[1.0, 0, 0, 0]]))
+    return replace(actions, start=start, joint_target=(home + step).expand(30, -1).clone(), phases=())
+
+
+def recording(joint=None, pos=None, quat=None, force=None, steps: int = 20) -> Recording:
+    """One world of the toy robot with two fingers; what is not given stands still and touches nothing."""
+    joints = len(toy_grasp.robot().joints)
+    zero3 = torch.zeros(steps, 1, 3)
+    start = toy_grasp.start()
+    return Recording(
+        start=start,
+        joint_pos=torch.zeros(steps, 1, joints) if joint is None else joint,
+        joint_target=torch.zeros(steps, 1, joints),
+        object_pos=zero3 if pos is None else pos,
+        object_quat=torch.tensor([1.0, 0, 0, 0]).expand(steps, 1, 4) if quat is None else quat,
+        palm_pos=zero3,
+        palm_quat=torch.tensor([1.0, 0, 0, 0]).expand(steps, 1, 4),
+        tip_force=torch.zeros(steps, 1, 2, 3) if force is None else force,
+        tip_touch=torch.zeros(steps, 1, 2, dtype=torch.bool),
+        broken=torch.tensor([False]),
+    )
+
+
+def compare(found: Recording, reference: Recording, **thresholds: float) -> dict[str, Parting]:
+    t = Thresholds(**thresholds)
+    return {p.quantity: p for p in partings(differences(found, reference, DT, t), toy_grasp.robot(), t)}
+
+
+class PartingsTest(unittest.TestCase):
+    def test_equal_recordings_never_part(self):
+        for p in compare(recording(), recording()).values():
+            self.assertEqual((p.time, p.where, p.end, p.largest), (None, "", 0.0, 0.0))
+
+    def test_a_joint_is_named_with_time_and_size(self):
+        joint = torch.zeros(20, 1, 5)
+        joint[7:, 0, 3] = 0.03  # turn
+        joint[12, 0, 1] = 0.05  # swing, for one step
+        p = compare(recording(joint=joint), recording())["joints"]
+        self.assertEqual((p.where, p.unit, p.largest_where), ("turn", "rad", "swing"))
+        self.assertAlmostEqual(p.time or 0.0, 8 * DT)
+        self.assertAlmostEqual(p.largest_time, 13 * DT)
+        self.assertAlmostEqual(p.end, 0.03, places=6)
+        self.assertAlmostEqual(p.largest, 0.05, places=6)
+
+    def test_a_prismatic_joint_has_its_own_threshold(self):
+        joint = torch.zeros(20, 1, 5)
+        joint[5:, 0, 0] = 0.003  # lift
+        p = compare(recording(joint=joint), recording())["joints"]
+        self.assertEqual((p.where, p.unit, p.threshold), ("lift", "m", 0.002))
+        self.assertIsNone(compare(recording(joint=joint), recording(), travel=0.004)["joints"].time)
+
+    def test_position_and_orientation(self):
+        pos, quat = torch.zeros(20, 1, 3), torch.tensor([1.0, 0, 0, 0]).repeat(20, 1, 1)
+        pos[10:, 0, 1] = 0.006
+        quat[15:] = -quat_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(6)]))  # the sign of a quaternion means nothing
+        found = compare(recording(pos=pos, quat=quat), recording())
+        self.assertAlmostEqual(found["object position"].time or 0.0, 11 * DT)
+        self.assertAlmostEqual(found["object position"].end, 0.006, places=6)
+        self.assertAlmostEqual(found["object orientation"].time or 0.0, 16 * DT)
+        self.assertAlmostEqual(math.degrees(found["object orientation"].end), 6.0, places=3)
+
+    def test_contacts_must_differ_for_a_while_and_name_the_finger(self):
+        force, other = torch.zeros(20, 1, 2, 3), torch.zeros(20, 1, 2, 3)
+        force[4, 0, 0] = torch.tensor([0.0, 0.0, 3.0])  # the thumb flickers: one step, not averaged
+        other[9:, 0, 1, 0] = 1.0  # the index finger touches in the reference only
+        p = compare(recording(force=force), recording(force=other), window=DT)["contacts"]
+        self.assertEqual(p.where, "index does not touch")
+        self.assertAlmostEqual(p.time or 0.0, 10 * DT)
+        self.assertIsNone(compare(recording(force=force), recording(), window=DT)["contacts"].time)
+
+    def test_forces_are_averaged_and_their_direction_does_not_count(self):
+        force, other = torch.zeros(20, 1, 2, 3), torch.zeros(20, 1, 2, 3)
+        force[:, 0, 0, 2], other[:, 0, 0, 0] = 5.0, 5.0
+        force[10, 0, 1, 2] = 5.0  # one step of 5 N is 5 / 3 N over 50 ms
+        p = compare(recording(force=force), recording(force=other))["contact force"]
+        self.assertIsNone(p.time)
+        self.assertAlmostEqual(p.largest, 5 / 3, places=5)
+        self.assertEqual(p.largest_where, "index")
+
+    def test_what_is_not_finite_ends_the_comparison(self):
+        pos = torch.zeros(20, 1, 3)
+        pos[8:] = math.nan
+        d = differences(recording(pos=pos), recording(), DT, Thresholds())
+        self.assertEqual(len(d.time), 8)
+        self.assertEqual(
+            partings(differences(recording(pos=pos * math.nan), recording(), DT, Thresholds()), toy_grasp.robot(), Thresholds()), ()
+        )
+
+
+class TraceTest(unittest.TestCase):
+    """Engines with a deliberate mistake, compared with MuJoCo as it is."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.mujoco = engine("mujoco", workers=0)
+
+    def run_against(self, actions: Actions, name: str, change, **options) -> TraceResult:
+        return trace(actions, self.mujoco, [toy_grasp.with_scene(self.mujoco, name, change)], perturbed=2, **options)
+
+    def test_the_same_engine_does_not_part(self):
+        result = self.run_against(grasp_actions(), "same", lambda scene: scene)
+        self.assertIsNone(first_of(result.engines[0].partings))
+        self.assertTrue(all(p.largest < 1e-12 for p in result.engines[0].partings))
+        self.assertGreater(max(p.largest for p in result.noise), 0.0)
+        self.assertIn("same stays with mujoco", next(iter(sentences(result))))
+        self.assertAlmostEqual(result.reference.lifted, toy_grasp.RAISED, delta=0.01)
+
+    def test_half_a_drives_gain_is_found_in_its_joint_at_once(self):
+        result = self.run_against(
+            wave_actions(), "weak", lambda scene: toy_grasp.with_drive(scene, "turn", kp=0.5), thresholds=Thresholds(joint=0.002)
+        )
+        found = {p.quantity: p for p in result.engines[0].partings}
+        self.assertEqual((found["joints"].where, found["joints"].largest_where), ("turn", "turn"))
+        self.assertLess(found["joints"].time or math.inf, 0.1)
+        self.assertFalse(result.within_noise(found["joints"]))
+        for quantity in ("object position", "object orientation", "contacts", "contact force"):
+            self.assertIsNone(found[quantity].time, quantity)
+
+    def test_half_the_friction_is_found_in_the_object_and_not_in_the_joints(self):
+        result = self.run_against(grasp_actions(), "slippery", lambda scene: toy_grasp.with_tip_friction(scene, 0.5))
+        found = {p.quantity: p for p in result.engines[0].partings}
+        first = first_of(result.engines[0].partings)
+        assert first is not None
+        self.assertEqual(first.quantity, "object position")
+        self.assertGreater(found["object position"].end, 0.02)
+        self.assertLess(result.engines[0].lifted, 0.0)
+        self.assertLess(found["joints"].time or math.inf, math.inf)  # once the brick has gone, the jaws close further
+        self.assertGreater(found["joints"].time or 0.0, first.time or 0.0)
+        self.assertIn("slippery parts first in object position", next(iter(sentences(result))))
+
+    def test_the_noise_floor_is_measured_and_repeatable(self):
+        one, two = (trace(grasp_actions(), self.mujoco, [], perturbed=3, perturbation=1e-4) for _ in range(2))
+        self.assertEqual(one.noise, two.noise)
+        self.assertEqual(len(one.noise_differences), 3)
+        small = trace(grasp_actions(), self.mujoco, [], perturbed=3, perturbation=1e-6)
+        for large, less in zip(one.noise[:3], small.noise[:3], strict=True):
+            self.assertGreater(large.largest, 3 * less.largest, large.quantity)
+
+    def test_an_engine_that_breaks_is_compared_until_it_does(self):
+        def broken(scene, num_worlds, object_index):
+            backend = self.mujoco.make(scene, num_worlds, object_index)
+            inner, count = backend.step, [0]
+
+            def step(substeps=None):
+                count[0] += 1
+                inner(substeps)
+                if count[0] == 20:
+                    values = {name: value.clone() for name, value in vars(backend.state()).items()}
+                    backend.set_state(State(**values | {"object_pos": torch.full((num_worlds, 3), math.nan)}))
+
+            backend.step = step
+            return backend
+
+        result = trace(grasp_actions(), self.mujoco, [replace(self.mujoco, name="broken", make=broken)], perturbed=1)
+        self.assertEqual(len(result.engines[0].differences.time), 19)
+        self.assertIn("broken is no longer finite after 0.317 s", next(iter(sentences(result))))
+        self.assertIsNone(result.as_dict()["engines"][0]["lifted_m"])
+        json.dumps(result.as_dict(), allow_nan=False)
+        with self.assertRaisesRegex(XResetError, "the reference 'broken' is not finite after 0.317 s"):
+            trace(grasp_actions(), replace(self.mujoco, name="broken", make=broken), [])
+
+    def test_files_table_and_pictures(self):
+        result = self.run_against(grasp_actions(), "slippery", lambda scene: toy_grasp.with_tip_friction(scene, 0.5))
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder)
+            write_trace(out, result)
+            write_plot(out / "trace.png", result)
+            write_strip(out / "strip.png", result, count=2)
+            for name in ("trace.png", "strip.png"):
+                self.assertEqual((out / name).read_bytes()[:8], b"\x89PNG\r\n\x1a\n")
+            data = read_json(out / "trace.json", "xreset-partings/1")
+            self.assertEqual((data["reference"], data["engines"][0]["parts_first"]), ("mujoco", "object position"))
+            self.assertEqual([p["quantity"] for p in data["noise"]["partings"]], [p.quantity for p in result.noise])
+            replays = read_npz(out / "replays.npz", "xreset-replays/1", {}, what="replays")
+            self.assertEqual(replays["engine"].tolist(), ["mujoco", "slippery"])
+            self.assertEqual(replays["object_pos"].shape, (2, 60, 3))
+            np.testing.assert_array_equal(replays["joint_target"], result.actions.joint_target.numpy())
+        from rich.console import Console
+
+        with io.StringIO() as sink:
+            Console(width=120, file=sink).print(rich_table(result))
+            for expected in ("slippery", "object position", "(from 5 mm)", "2 starts moved by 1e-06", "lift"):
+                self.assertIn(expected, sink.getvalue())
+
+
+class ActionsTest(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.path = Path(folder.name) / "actions.npz"
+        self.actions = replace(grasp_actions(), friction=PairFriction(tip=0.7, link=0.4, table=0.3))
+        write_actions(self.path, self.actions)
+
+    def test_round_trip(self):
+        found = read_actions(self.path, self.actions.robot, lambda _: self.actions.object)
+        for name in ("label", "timestep", "substeps", "friction", "phases"):
+            self.assertEqual(getattr(found, name), getattr(self.actions, name), name)
+        torch.testing.assert_close(found.joint_target, self.actions.joint_target, rtol=0, atol=0)
+        for name, value in vars(self.actions.start).items():
+            torch.testing.assert_close(getattr(found.start, name), value, rtol=0, atol=0)
+
+    def test_refusals(self):
+        robot, thing = self.actions.robot, self.actions.object
+        with self.assertRaisesRegex(FileFormatError, "for another version of 'conformance-gripper'"):
+            read_actions(self.path, replace(robot, base_pos=(0.0, 0.0, 0.2)), lambda _: thing)
+        with self.assertRaisesRegex(FileFormatError, "another geometry of brick"):
+            read_actions(self.path, robot, lambda _: replace(thing, source="0" * 64))
+        write_actions(self.path, replace(self.actions, joint_target=self.actions.joint_target * math.nan))
+        with self.assertRaisesRegex(FileFormatError, "'joint_target' holds non-finite numbers"):
+            read_actions(self.path, robot, lambda _: thing)
+
+
+class CommandTest(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name)
+
+    def refuse(self, *arguments: str) -> str:
+        with contextlib.redirect_stderr(io.StringIO()) as text, self.assertRaises(SystemExit) as stopped:
+            main(["trace", *arguments])
+        self.assertEqual(stopped.exception.code, 1)
+        return text.getvalue()
+
+    def test_bad_input(self):
+        missing = str(self.folder / "none.npz")
+        self.assertIn("there is no", self.refuse(missing))
+        self.assertIn("thresholds must be above 0", self.refuse(missing, "--force-threshold", "0"))
+        self.assertIn("count from 0", self.refuse(missing, "--episode", "-1"))
+        self.assertIn("there is no backend 'havok'", self.refuse(missing, "--backend", "havok"))
+        wrong = self.folder / "wrong.npz"
+        np.savez(wrong, schema="xreset-replays/1")
+        self.assertIn("expected 'xreset-demos/1'", self.refuse(str(wrong)))
+        self.assertIn("needs --robot", self.refuse(str(wrong), "--policy", "ik"))
+
+
+class RealGraspTest(unittest.TestCase):
+    """The open-loop grasp and lift of a demonstrated grasp, from the file to the pictures."""
+
+    def test_a_demonstrated_grasp_is_lifted(self):
+        from xreset import robots
+        from xreset.backends.parity.grasps import Frames, find_grasps
+        from xreset.demos.archive import read_demos
+        from xreset.eval.trace import grasp_and_lift
+        from xreset.objects import load_objects
+        from xreset.retarget.pipeline import retarget
+
+        folder = data_dir()
+        robot = robots.load("ur7e-sharpa")
+        (can,) = load_objects(["005_tomato_soup_can"], folder / "ycb")
+        demos = read_demos(folder / "dexycb_right_9x20.npz")
+        first = int(np.flatnonzero(np.asarray(demos.object_name) == can.name)[0])
+        data = retarget(demos.select(indices=[first]), robot, [can])
+        actions = grasp_and_lift(robot, can, find_grasps(Frames.of_retargeted(data), robot, (can,), 1, where="table"))
+        result = trace(actions, engine("mujoco", workers=0), [engine("sapien")], perturbed=1)
+        self.assertGreater(result.reference.lifted, 0.07)
+        self.assertGreater(result.engines[0].lifted, 0.07)
+        self.assertEqual(actions.phase_at(1.5), "lift")
+        position = next(p for p in result.engines[0].partings if p.quantity == "object position")
+        self.assertLess(position.largest, 0.01)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,113 @@
+"""A grasp for tests: the conformance suite's gripper with its jaws just around a brick in the air. It closes and lifts; how hard it presses
+decides whether half the friction, or half the drive's stiffness, is still enough."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from tests.toy_bank import toy_bank
+from xreset.backends.base import State
+from xreset.backends.conformance.scene import gripper, objects
+from xreset.backends.parity.episodes import at_rest
+from xreset.backends.parity.trials import Engine
+from xreset.kinematics import Kinematics
+from xreset.resets.bank import ResetBank
+from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
+
+FRICTION = PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002)
+OPEN, CLOSED = 0.0201, 0.0141
+"""Positions and targets [m] of a jaw: each finger then presses with 2.5 N, and 0.9 of that, twice, is 1.8 times the brick's weight."""
+RAISED = 0.04
+"""How far the lift goes [m]."""
+
+
+def robot() -> RobotSpec:
+    """The gripper, at home with its jaws around the brick."""
+    spec = gripper()
+    return replace(spec, joints=tuple(replace(j, home=OPEN) if j.name == "jaw_a_slide" else j for j in spec.joints))
+
+
+def brick() -> ObjectSpec:
+    return objects()[0]
+
+
+def brick_pose() -> tuple[np.ndarray, np.ndarray]:
+    """Where the brick is, between the pads of the robot at home: position [3], quaternion [4]."""
+    spec = robot()
+    T = Kinematics(spec).link_poses(torch.as_tensor(spec.home), ["wrist"])[0].numpy()
+    T_wrist_box = np.eye(4)
+    T_wrist_box[2, 3] = 0.075
+    T = T @ T_wrist_box @ np.linalg.inv(brick().pieces[0].T_body_shape)
+    return T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+
+
+def start() -> State:
+    """[1] the robot at home, the brick between its jaws, everything at rest."""
+    pos, quat = brick_pose()
+    return at_rest(torch.as_tensor(robot().home)[None], torch.as_tensor(pos)[None], torch.as_tensor(quat)[None])
+
+
+def targets(step: int) -> np.ndarray:
+    """[J] what the drives are told: close at once, and lift from step 15 to 45."""
+    spec = robot()
+    wanted = spec.home.copy()
+    wanted[spec.joint_names.index("jaw_a_slide")] = CLOSED
+    wanted[spec.joint_names.index("lift")] += RAISED * np.clip((step - 15) / 30, 0, 1)
+    return wanted
+
+
+def bank() -> ResetBank:
+    """Three demonstrations whose starts are millimetres apart, and whose goals are where the lift ends."""
+    pos, quat = brick_pose()
+    start_pos = pos + np.array([[0, 0, -1e-3], [0, 0, 0], [0, 0, 1e-3]])
+    return toy_bank(
+        robot(),
+        object_name=np.full(6, "brick"),
+        sequence_object=np.full(3, "brick"),
+        object_names=("brick",),
+        object_sources=("stand-in",),
+        start_pos=start_pos.astype(np.float32),
+        start_quat_wxyz=np.tile(quat, (3, 1)).astype(np.float32),
+        goal_pos=(start_pos + np.array([0, 0, RAISED])).astype(np.float32),
+        goal_quat_wxyz=np.tile(quat, (3, 1)).astype(np.float32),
+    )
+
+
+class OpenLoop:
+    """The policy that gives :func:`targets`."""
+
+    name = "open-loop"
+
+    def begin(self, env) -> None:
+        self._env, self._step = env, 0
+
+    def act(self, observations) -> torch.Tensor:
+        wanted = torch.as_tensor(targets(self._step), dtype=torch.float32).expand(self._env.num_envs, -1)
+        self._step += 1
+        return self._env.actions.action_for(wanted, self._env.joint_target)
+
+
+def with_scene(base: Engine, name: str, change) -> Engine:
+    """The engine under another name, whose worlds are of ``change(scene)``: a deliberate mistake."""
+
+    def make(scene: SceneSpec, num_worlds: int, object_index: torch.Tensor):
+        return base.make(change(scene), num_worlds, object_index)
+
+    return replace(base, name=name, make=make)
+
+
+def with_drive(scene: SceneSpec, joint: str, **factors: float) -> SceneSpec:
+    """The scene with a joint's drive changed by factors."""
+    joints = tuple(
+        replace(j, drive=replace(j.drive, **{name: getattr(j.drive, name) * x for name, x in factors.items()})) if j.name == joint else j
+        for j in scene.robot.joints
+    )
+    return replace(scene, robot=replace(scene.robot, joints=joints))
+
+
+def with_tip_friction(scene: SceneSpec, factor: float) -> SceneSpec:
+    return replace(scene, friction=replace(scene.friction, tip=scene.friction.tip * factor))

@@ -91,6 +91,7 @@ class TwoProcesses(unittest.TestCase):
                 torch.testing.assert_close(value, after["start_actor"][name], rtol=0, atol=0, msg=name)
             for name in ("env", "torch"):
                 self.assertTrue(torch.equal(before["random"][name], after["start_random"][name]), name)
+            torch.testing.assert_close(before["object_pos"], after["start_object_pos"], rtol=0, atol=1e-6)
         self.assertEqual(len(read_checkpoint(latest_checkpoint(self.out))["random"]), 2)
 
 

@@ -3,22 +3,27 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 import tempfile
 import threading
 import time
 import unittest
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import torch
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from xreset import robots
+from xreset.backends import make_backend
 from xreset.errors import FileFormatError, RunError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
-from xreset.learning.runner import read_checkpoint
+from xreset.learning.runner import _stop_on_interrupt, read_checkpoint
 from xreset.learning.train import ensure_policy, load_inputs, resumed, start_run, train
 from xreset.policy import OnnxPolicy, check_contract
 from xreset.resets.bank import write_bank
@@ -36,6 +41,13 @@ CONFIG = TrainConfig(
     iterations=2,
     save_interval=1,
 )
+
+
+def train_only(*args, **options) -> None:
+    """Training without what takes longer than all the rest here: processes for the engine, and the export at the end."""
+    in_this_process = mock.patch("xreset.learning.train.make_backend", partial(make_backend, workers=0))
+    with in_this_process, mock.patch("xreset.learning.train.export_onnx"):
+        train(*args, **options)
 
 
 class TrainingTest(unittest.TestCase):
@@ -78,26 +90,85 @@ class TrainingTest(unittest.TestCase):
 
     def test_the_same_seed_gives_the_same_policy(self):
         again = self.folder / "again"
-        train(again, self.start(again))
+        train_only(again, self.start(again))
         one, two = (read_checkpoint(latest_checkpoint(run))["actor_state_dict"] for run in (self.out, again))
         for name, value in one.items():
             torch.testing.assert_close(value, two[name], msg=name)
         other = self.folder / "other"
-        train(other, self.start(other, seed=4))
+        train_only(other, self.start(other, seed=4))
         changed = read_checkpoint(latest_checkpoint(other))["actor_state_dict"]
         self.assertTrue(any(not torch.equal(value, changed[name]) for name, value in one.items()))
 
     def test_resume_continues_where_it_stopped(self):
         out = self.folder / "resumed"
-        train(out, self.start(out))
+        train_only(out, self.start(out))
         before = read_checkpoint(latest_checkpoint(out))
-        train(out, resumed(out, iterations=3), resume=True)
+        train_only(out, resumed(out, iterations=3), resume=True)
         after = read_checkpoint(latest_checkpoint(out))
         self.assertEqual((after["iteration"], after["env_steps"]), (3, 3 * 8 * 4))
         self.assertGreater(after["elapsed"], before["elapsed"])
         self.assertEqual(read_run(out).config.iterations, 3)
         steps = [int(s["step"]) for s in after["optimizer_state_dict"]["state"].values()]
         self.assertEqual(set(steps), {3 * 2 * 2})  # iterations x epochs x minibatches: the optimiser was not started anew
+
+    def test_resume_goes_on_in_the_middle_of_episodes(self):
+        """Two iterations and one more are three in one go, up to the engine's warm start and the single precision of the saved state."""
+        config = replace(CONFIG, iterations=3)
+        runs = whole, parts, worldless = [self.folder / name for name in ("whole", "parts", "worldless")]
+        train_only(whole, self.start(whole, config=config))
+        for run in (parts, worldless):
+            train_only(run, self.start(run, config=replace(config, iterations=2)))
+        (worldless / "worlds.pt").write_bytes(b"damaged")
+        for run in (parts, worldless):
+            train_only(run, resumed(run, iterations=3), resume=True)
+
+        one, two, _ = (read_checkpoint(latest_checkpoint(run)) for run in runs)
+        for name, value in one["actor_state_dict"].items():
+            torch.testing.assert_close(two["actor_state_dict"][name], value, rtol=1e-3, atol=3e-3, msg=name)
+        self.assertEqual((two["iteration"], two["learning_rate"]), (3, one["learning_rate"]))
+
+        worlds = [torch.load(run / "worlds.pt", weights_only=True) for run in runs]
+        self.assertEqual([content["iteration"] for content in worlds], [3, 3, 3])
+        one, two, other = (content["processes"][0]["env"] for content in worlds)
+        self.assertTrue(torch.equal(one["env._episode_length"], two["env._episode_length"]))
+        self.assertFalse(torch.equal(one["env._episode_length"], other["env._episode_length"]))  # new episodes, at random times
+        for name, atol in (("state.joint_pos", 2e-3), ("state.object_pos", 1e-4), ("env._cloud", 1e-4), ("env.goal_pos", 0.0)):
+            torch.testing.assert_close(two[name], one[name], rtol=0, atol=atol, msg=name)
+        one, two, _ = (content["log"] for content in worlds)
+        torch.testing.assert_close(two["lengths"], one["lengths"])
+        self.assertEqual(len(two["recent"]), 3)
+
+    def test_a_killed_run_loses_no_more_than_the_last_save_interval(self):
+        out = self.folder / "killed"
+        small = ["--config.task.observation.cloud-points", "16", "--config.task.distance-points", "64", "--config.model.pointnet", "8", "6"]
+        small += ["--config.model.lstm", "12", "--config.model.mlp", "16", "--config.ppo.minibatch-size", "32"]
+        new = ["--robot", "openarm", "--resets", str(self.bank), "--backend", "mujoco", "--device", "cpu", "--num-envs", "8"]
+        command = [sys.executable, "-m", "xreset", "train", "--out", str(out), *new, "--config.save-interval", "2", *small]
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True) as process:
+            self.addCleanup(process.kill)
+            end = time.monotonic() + 120
+            while len(checkpoints(out)) < 3 and process.poll() is None and time.monotonic() < end:
+                time.sleep(0.02)
+            os.killpg(process.pid, signal.SIGKILL)  # the engine's workers too
+        self.assertEqual(process.returncode, -signal.SIGKILL)
+        newest = read_checkpoint(latest_checkpoint(out))  # whole, however the run ended
+        self.assertGreaterEqual(newest["iteration"], 6)
+        self.assertEqual(newest["env_steps"], newest["iteration"] * 16 * 8)
+        train(out, resumed(out, iterations=newest["iteration"] + 1), resume=True)
+        content = read_checkpoint(latest_checkpoint(out))
+        self.assertEqual((content["iteration"], content["env_steps"]), (newest["iteration"] + 1, newest["env_steps"] + 16 * 8))
+        self.assertTrue((out / "policy.onnx").is_file())
+
+    def test_the_same_ctrl_c_told_twice_is_one(self):
+        with _stop_on_interrupt() as stop:
+            self.assertFalse(stop)
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGTERM)
+            self.assertEqual(len(stop), 2)
+            stop[0] -= 60.0
+            with self.assertRaises(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(1.0)
 
     def test_ctrl_c_ends_after_an_iteration_with_a_checkpoint_and_a_policy(self):
         out = self.folder / "stopped"
@@ -142,7 +213,7 @@ class TrainingTest(unittest.TestCase):
         info = self.start(out, resets=bank)
         write_bank(bank, toy_bank(self.robot, post_contact=np.zeros(6, dtype=bool)), config={}, inputs={})
         with self.assertRaisesRegex(RunError, "not the file that this run was started with"):
-            train(out, info)
+            train_only(out, info)
 
     def test_a_bank_for_another_robot_is_refused(self):
         with self.assertRaisesRegex(FileFormatError, "reset bank for the robot 'openarm'"):

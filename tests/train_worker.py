@@ -13,7 +13,11 @@ def run(folder: Path, arguments: list[str]) -> None:
     learn = TrainingRunner.learn
 
     def learn_and_tell(runner: TrainingRunner, *args, **options) -> None:
-        begin = {"start_actor": {k: v.clone() for k, v in runner.alg.actor.state_dict().items()}, "start_random": runner._random_state()}
+        begin = {
+            "start_actor": {k: v.clone() for k, v in runner.alg.actor.state_dict().items()},
+            "start_random": runner._random_state(),
+            "start_object_pos": runner.env.backend.state().object_pos.clone(),
+        }
         learn(runner, *args, **options)
         end = {
             "actor": runner.alg.actor.state_dict(),

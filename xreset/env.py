@@ -31,6 +31,13 @@ if TYPE_CHECKING:
     from xreset.backends.base import Backend, Contacts, Health, Links, State
 
 
+_LASTING = (
+    "goal_pos", "goal_quat", "gravity_fraction", "sequence", "from_bank", "_episode_length", "_target", "_previous_action", "_best_reach",
+    "_reward", "_cloud", "_friction", "_mass",
+)  # fmt: skip
+"""What an environment keeps of each world from step to step, besides the engine's state."""
+
+
 def make_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
     """The scene that a task is played in."""
     return SceneSpec(robot=robot, objects=objects, timestep=task.timestep, substeps=task.substeps)
@@ -215,6 +222,35 @@ class ManipulationEnv:
     def set_rng_state(self, state: Tensor) -> None:
         """Continue with the random numbers of a checkpoint."""
         self.generator.set_state(state.cpu())
+
+    def snapshot(self) -> dict[str, Tensor]:
+        """All that the worlds' futures depend on besides random numbers and an engine's warm start, on the CPU: for :meth:`restore`."""
+        state = self.backend.state()
+        values = {f"state.{f.name}": getattr(state, f.name) for f in fields(state)}
+        values |= {f"env.{name}": getattr(self, name) for name in _LASTING}
+        values |= {f"observed.{name}": self._observations[name] for name in set(self._observations.keys())}
+        return {name: value.to("cpu", copy=True) for name, value in values.items()}
+
+    def restore(self, snapshot: dict[str, Tensor]) -> bool:
+        """Go on from a snapshot; False, and nothing is changed, if it is of another number of worlds or of another task."""
+        from xreset.backends.base import State
+
+        if {name: value.shape for name, value in snapshot.items()} != {name: value.shape for name, value in self.snapshot().items()}:
+            return False
+        for name in _LASTING:
+            getattr(self, name).copy_(snapshot[f"env.{name}"])
+        self._fresh.fill_(True)
+        self.backend.set_where(
+            self._fresh,
+            state=State(**{f.name: snapshot[f"state.{f.name}"].to(self.device) for f in fields(State)}),
+            friction=self._friction,
+            object_mass=self._mass,
+            object_gravity=self.gravity_fraction,
+        )
+        self._fresh.zero_()
+        for name in set(self._observations.keys()):
+            self._observations[name].copy_(snapshot[f"observed.{name}"])
+        return True
 
     # Parts -------------------------------------------------------------------------------------------------------------------------
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import pickle
 import signal
 import time
 from collections import deque
@@ -36,6 +37,8 @@ class TrainingRunner(OnPolicyRunner):
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0
+        self._log_state: dict[str, Any] | None = None
+        self._worlds_continue = False
         self._faults_seen = torch.zeros(2, dtype=torch.long, device=self.device)
 
     def _configure_multi_gpu(self) -> None:
@@ -54,17 +57,19 @@ class TrainingRunner(OnPolicyRunner):
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train until ``num_learning_iterations`` iterations are done in all; returns early, checkpoint written, after Ctrl-C."""
         env, alg, horizon = self.env, self.alg, self.cfg["num_steps_per_env"]
-        if init_at_random_ep_len:
+        if init_at_random_ep_len and not self._worlds_continue:
             env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
         alg.train_mode()
         if self.is_distributed:
             alg.broadcast_parameters()
         obs = env.get_observations()
         log = _Log(self.folder, env.num_envs, str(env.device), num_learning_iterations) if self.processes.is_main else None
+        if log is not None and self._log_state is not None:
+            log.restore(self._log_state)
         saved_at = self.iteration
         budget = FaultBudget(horizon * env.num_envs * self.gpu_world_size)
         with _stop_on_interrupt() as stop:
-            while self.iteration < num_learning_iterations and not stop:
+            while self.iteration < num_learning_iterations and not self._agreed(bool(stop)):
                 start = time.perf_counter()
                 with torch.no_grad():
                     for _ in range(horizon):
@@ -84,18 +89,29 @@ class TrainingRunner(OnPolicyRunner):
                 if log is not None:
                     log.write(self, losses, collect=collected - start, learn=now - collected)
                 if self.iteration % self.train_config.save_interval == 0:
-                    self.save_checkpoint()
+                    self.save_checkpoint(log)
                     saved_at = self.iteration
         if self.iteration != saved_at or not self.iteration:
-            self.save_checkpoint()
+            self.save_checkpoint(log)
         if log is not None:
             log.close(stopped=bool(stop))
 
-    def save_checkpoint(self) -> None:
-        """Write ``checkpoints/ITERATION.pt`` whole or not at all. The main process writes; all must call it."""
+    def _agreed(self, stop: bool) -> bool:
+        """Whether any process is to stop: then all do, after the same iteration."""
+        return bool(self.processes.sum(torch.tensor(int(stop), device=self.device)))
+
+    def save_checkpoint(self, log: _Log | None = None) -> None:
+        """Write ``checkpoints/ITERATION.pt`` and ``worlds.pt``, each whole or not at all. The main process writes; all must call it.
+
+        ``worlds.pt`` holds the worlds, the models' memories of them and the running means of the log: with it a run goes on in the middle
+        of its episodes. Only the newest is kept, because nothing else needs it.
+        """
+        worlds = self.processes.gather(self._worlds_state())
         random = self.processes.gather(self._random_state())
         if not self.processes.is_main:
             return
+        state = {"iteration": self.iteration, "processes": worlds, "log": None if log is None else log.state()}
+        _write(self.folder / "worlds.pt", state)
         content = self.alg.save() | {
             "iteration": self.iteration,
             "env_steps": self.env_steps,
@@ -103,19 +119,38 @@ class TrainingRunner(OnPolicyRunner):
             "learning_rate": self.alg.learning_rate,
             "random": random,
         }
-        buffer = io.BytesIO()
-        torch.save(content, buffer)
-        with atomic_write(self.folder / "checkpoints" / f"{self.iteration:06d}.pt") as file:
-            file.write(buffer.getbuffer())
+        _write(self.folder / "checkpoints" / f"{self.iteration:06d}.pt", content)
 
     def load_checkpoint(self, path: Path) -> None:
-        """Continue from a checkpoint: models, optimiser, learning rate, counters and random state."""
+        """Continue from a checkpoint: models, optimiser, learning rate, counters and random state; the worlds too if ``worlds.pt`` fits."""
         content = read_checkpoint(path, self.device)
         self.alg.load(content, None, strict=True)
         self.alg.learning_rate = content["learning_rate"]
         self.iteration, self.env_steps, self.elapsed = content["iteration"], content["env_steps"], content["elapsed"]
         if self.processes.rank < len(content["random"]):
             self._set_random_state(content["random"][self.processes.rank])
+
+        self._continue_worlds()
+
+    def _worlds_state(self) -> dict[str, Any]:
+        """Of the worlds of this process, and of the models' memories of them."""
+        memories = {"actor": self.alg.actor.get_hidden_state(), "critic": self.alg.critic.get_hidden_state()}
+        return {"env": cast(ManipulationEnv, self.env).snapshot(), "memories": memories}
+
+    def _continue_worlds(self) -> None:
+        """Go on in the middle of episodes, if ``worlds.pt`` fits; otherwise the episodes begin anew."""
+        try:
+            content = torch.load(self.folder / "worlds.pt", map_location=self.device, weights_only=True)
+        except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):  # none, or damaged: episodes are easily begun anew
+            return
+        if content["iteration"] != self.iteration or self.processes.rank >= len(content["processes"]):
+            return
+        mine = content["processes"][self.processes.rank]
+        if not cast(ManipulationEnv, self.env).restore(mine["env"]):
+            return
+        self._worlds_continue, self._log_state = True, content["log"]
+        for name, model in (("actor", self.alg.actor), ("critic", self.alg.critic)):
+            model.reset(hidden_state=mine["memories"][name])
 
     def _random_state(self) -> dict[str, Tensor | None]:
         """Of the numbers that this process draws."""
@@ -155,6 +190,13 @@ class TrainingRunner(OnPolicyRunner):
                     f"at iteration {self.iteration}. "
                     f"Continue from the last checkpoint: xreset train --out {self.folder} --resume"
                 )
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    with atomic_write(path) as file:
+        file.write(buffer.getbuffer())
 
 
 def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str, Any]:
@@ -224,6 +266,15 @@ class _Log:
         self._sums = values if self._sums is None else self._sums + values
         self._steps += 1
 
+    def state(self) -> dict[str, Any]:
+        """The running means, for :meth:`restore`."""
+        return {"returns": self._returns, "lengths": self._lengths, "recent": list(self._recent)}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on with the running means of a checkpoint of the same number of worlds."""
+        self._returns, self._lengths = state["returns"].clone(), state["lengths"].clone()
+        self._recent.extend(state["recent"])
+
     def write(self, runner: TrainingRunner, losses: dict[str, float], *, collect: float, learn: float) -> None:
         it, alg = runner.iteration, runner.alg
         assert self._sums is not None, "an iteration has at least one step"
@@ -261,15 +312,22 @@ class _Log:
             self._console.print("stopped after the current iteration; a checkpoint is written.")
 
 
-@contextmanager
-def _stop_on_interrupt() -> Iterator[list[int]]:
-    """The first Ctrl-C (or SIGTERM) puts an entry into the list that is yielded; a second one interrupts at once."""
-    requests: list[int] = []
+_SAME_REQUEST = 2.0
+"""[s] within which signals are one request."""
 
-    def ask(number: int, _frame: Any) -> None:
-        if requests:
+
+@contextmanager
+def _stop_on_interrupt() -> Iterator[list[float]]:
+    """The first Ctrl-C (or SIGTERM) puts an entry into the list that is yielded; another one, later than a moment, interrupts at once.
+
+    Within that moment it is the same one: under torchrun a process gets Ctrl-C from the terminal, and from torchrun as well.
+    """
+    requests: list[float] = []
+
+    def ask(_number: int, _frame: Any) -> None:
+        if requests and time.monotonic() - requests[0] > _SAME_REQUEST:
             raise KeyboardInterrupt
-        requests.append(number)
+        requests.append(time.monotonic())
 
     try:
         before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}

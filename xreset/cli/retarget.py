@@ -30,7 +30,7 @@ def retarget(
         objects: Folder of real meshes; default: the built-in stand-ins.
         max_per_object: Only the first so many sequences of each object.
         restart: Begin anew, whatever an earlier run has finished.
-        picture: PNG to write: one grasp per object, the human keypoints over it.
+        picture: PNG to write: first contact, mid-lift and goal for each object, the human keypoints over the robot.
     """
     from dataclasses import asdict
 
@@ -78,9 +78,11 @@ def retarget(
 
     if picture is not None:
         from xreset.render import write_png
-        from xreset.retarget.picture import grasp_sheet
+        from xreset.view.load import load_view
+        from xreset.view.sheet import draw_sheet, moment_tiles
 
-        write_png(picture, grasp_sheet(result, pipeline.rest_on_table(chosen, list(specs.values())), spec, list(specs.values())))
+        shown = load_view(out, demos=demos, robot=robot, objects=objects)
+        write_png(picture, draw_sheet(shown, moment_tiles(shown)))
 
     rows = result.accounts()
     write_accounts(accounts_path(out), of="frames", rows=rows)

@@ -70,6 +70,9 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
     found += _topic("drives", _drives(spec), _drive_summary(spec))
     found += _topic("frames", _frames(spec), "the palm looks along the fingers")
     found += _home(spec)
+    if spec.placement is not None:
+        stated = f"reaches {spec.placement.reached:.1%} and follows {spec.placement.followed:.1%} of {spec.placement.frames} frames"
+        found.append(Finding("ok", "placement", f"{stated}, says {DESCRIPTION}: {spec.placement.command}"))
     return spec, found
 
 

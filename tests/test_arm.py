@@ -14,6 +14,7 @@ from xreset.errors import RobotError
 from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robots import load, registry
+from xreset.robots.check import check_description
 from xreset.robots.placement import Finalist, PlaceConfig, Placement, Reach, Search, write_placement
 from xreset.rotations import matrix_to_quat, quat_multiply
 
@@ -199,7 +200,8 @@ class WritePlacementTest(unittest.TestCase):
             self.file.read_text().replace("[base]", "[base]\nplacement = { reached = 0.5, followed = 0.4, frames = 3, command = 'x' }", 1)
         )
         self.assertEqual(load(self.folder).fingerprint, stated)
-        self.assertEqual(load(self.folder).placement.frames, 3)
+        findings = [finding.message for finding in check_description(self.folder)[1] if finding.topic == "placement"]
+        self.assertEqual(findings, ["reaches 50.0% and follows 40.0% of 3 frames, says robot.toml: x"])
 
     def test_refusals(self):
         robot = load(self.folder)

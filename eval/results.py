@@ -28,6 +28,7 @@ _TRACE_FIELDS = {
     "goal_quat_wxyz": Field(("K", 4), "f"),
     "object_name": Field(("K",), "U"),
     "sequence_index": Field(("K",), "i"),
+    "joint_target": Field(("K", "C", "J"), "f", required=False),
 }
 
 
@@ -72,6 +73,8 @@ def write_results(folder: Path, summary: dict[str, Any], rollouts: Rollouts, joi
     name = summary["backend"]
     write_json(folder / f"{name}.episodes.json", {"schema": EPISODES_SCHEMA, "episodes": [asdict(e) for e in rollouts.episodes]})
     traces = rollouts.traces
+    recorded = [t.joint_target for t in traces if t.joint_target is not None]
+    targets = np.stack(recorded) if len(recorded) == len(traces) else None
     write_npz(
         folder / f"{name}.trace.npz",
         TRACE_SCHEMA,
@@ -85,6 +88,7 @@ def write_results(folder: Path, summary: dict[str, Any], rollouts: Rollouts, joi
             "goal_quat_wxyz": np.stack([t.goal_quat for t in traces]),
             "object_name": np.array([t.object for t in traces]),
             "sequence_index": np.array([t.sequence for t in traces]),
+            **({} if targets is None else {"joint_target": targets}),
         },
     )
     write_json(folder / f"{name}.json", summary)
@@ -129,6 +133,7 @@ def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tup
             joint_pos=a["joint_pos"][i],
             object_pos=a["object_pos"][i],
             object_quat=a["object_quat_wxyz"][i],
+            joint_target=a["joint_target"][i] if "joint_target" in a else None,
         )
         for i in range(len(a["object_name"]))
     )

@@ -51,7 +51,7 @@ class Episode:
 
 @dataclass(frozen=True, kw_only=True)
 class Trace:
-    """States of one episode, for pictures."""
+    """States of one episode, for pictures, and what the drives were told, for replays."""
 
     sequence: int
     object: str
@@ -63,6 +63,8 @@ class Trace:
     """[T, J]"""
     object_pos: np.ndarray
     object_quat: np.ndarray
+    joint_target: np.ndarray | None = None
+    """[C, J] of every control step; None in files that are older than this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,6 +147,7 @@ def roll_out(
             for step in range(env.max_episode_length):
                 before = time.perf_counter()
                 reading, _ = env.advance(policy.act(env.get_observations()))
+                recorder.add_targets(env.joint_target)
                 result.update(reading, out_of_bounds(reading.state.object_pos, scene.table, task.termination))
                 spent += time.perf_counter() - before
                 if (step + 1) % every == 0:
@@ -189,13 +192,17 @@ class _Recorder:
     """States of some worlds over an episode."""
 
     def __init__(self, worlds: list[int]) -> None:
-        self._worlds, self._time, self._frames = worlds, [], []
+        self._worlds, self._time, self._frames, self._targets = worlds, [], [], []
 
     def add(self, time: float, reading) -> None:
         if self._worlds:
             s = reading.state
             self._time.append(time)
             self._frames.append([x[self._worlds].cpu().numpy().copy() for x in (s.joint_pos, s.object_pos, s.object_quat)])
+
+    def add_targets(self, targets: torch.Tensor) -> None:
+        if self._worlds:
+            self._targets.append(targets[self._worlds].cpu().numpy().copy())
 
     def traces(self, env: ManipulationEnv, names: tuple[str, ...]) -> list[Trace]:
         out = []
@@ -211,6 +218,7 @@ class _Recorder:
                     joint_pos=joint_pos,
                     object_pos=object_pos,
                     object_quat=object_quat,
+                    joint_target=np.stack([targets[i] for targets in self._targets]),
                 )
             )
         return out

@@ -18,16 +18,21 @@ from xreset.backends.base import State
 from xreset.backends.parity.recording import Recording
 from xreset.backends.parity.trials import engine
 from xreset.cli import main
-from xreset.errors import FileFormatError, XResetError
-from xreset.eval.trace import Actions, Parting, Thresholds, read_actions, trace, write_actions
+from xreset.errors import DemoError, FileFormatError, XResetError
+from xreset.eval.results import write_results
+from xreset.eval.rollout import roll_out
+from xreset.eval.trace import Actions, Parting, Thresholds, play_policy, read_actions, trace, write_actions
+from xreset.eval.trace.actions import recorded_actions
 from xreset.eval.trace.film import write_strip
 from xreset.eval.trace.partings import differences, first_of, partings
 from xreset.eval.trace.plot import write_plot
 from xreset.eval.trace.replay import TraceResult, write_trace
+from xreset.eval.trace.sources import from_file
 from xreset.eval.trace.table import rich_table, sentences
 from xreset.files import read_json, read_npz
 from xreset.rotations import quat_from_axis_angle
 from xreset.spec import PairFriction
+from xreset.task.config import RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
 
 DT = 1 / 60
 
@@ -262,6 +267,60 @@ class ActionsTest(unittest.TestCase):
         write_actions(self.path, replace(self.actions, joint_target=self.actions.joint_target * math.nan))
         with self.assertRaisesRegex(FileFormatError, "'joint_target' holds non-finite numbers"):
             read_actions(self.path, robot, lambda _: thing)
+
+
+class EvaluationTest(unittest.TestCase):
+    """Actions that an evaluation has recorded."""
+
+    @classmethod
+    def setUpClass(cls):
+        task = TaskConfig(
+            reset=ResetConfig(demo_probability=0.0, home_gravity_std=0.0, spawn_xy=0.0, spawn_yaw=0.0, home_noise=False),
+            randomization=RandomizationConfig(enabled=False),
+            termination=TerminationConfig(episode_seconds=0.7),
+        )
+        arguments = (toy_grasp.robot(), (toy_grasp.brick(),), toy_grasp.bank(), task)
+        cls.rollouts = roll_out(toy_grasp.OpenLoop(), "mujoco", *arguments, repetitions=1, seed=0, num_envs=1, only=np.array([1]))
+        cls.played = play_policy(toy_grasp.OpenLoop(), engine("mujoco"), *arguments[:1], arguments[1][0], *arguments[2:], sequence=1)
+
+    def test_a_replay_in_the_same_engine_is_the_episode(self):
+        (episode,) = self.rollouts.traces
+        actions = recorded_actions(toy_grasp.robot(), toy_grasp.brick(), episode, label="episode")
+        self.assertEqual(len(actions.joint_target), 42)
+        replayed = trace(actions, engine("mujoco"), [], perturbed=0).reference.recording
+        every = 3  # control steps of 1/60 s between recorded states
+        np.testing.assert_allclose(replayed.object_pos[every - 1 :: every, 0].numpy(), episode.object_pos[1:], atol=1e-6)
+        np.testing.assert_allclose(replayed.joint_pos[every - 1 :: every, 0].numpy(), episode.joint_pos[1:], atol=1e-6)
+
+    def test_a_policy_that_plays_gives_the_same_actions(self):
+        (episode,) = self.rollouts.traces
+        np.testing.assert_array_equal(self.played.joint_target.numpy(), episode.joint_target)
+        self.assertIn("open-loop in mujoco, demo_b", self.played.label)
+
+    def test_another_control_rate_is_refused(self):
+        (episode,) = self.rollouts.traces
+        with self.assertRaisesRegex(FileFormatError, "another control rate"):
+            recorded_actions(toy_grasp.robot(), toy_grasp.brick(), replace(episode, time=2 * episode.time), label="episode")
+
+    def test_from_files(self):
+        from tests.toy_results import toy_rollouts, toy_summary
+        from xreset import robots
+
+        robot = robots.load("openarm")
+        with tempfile.TemporaryDirectory() as folder:
+            rollouts = toy_rollouts(robot.home)
+            summary = toy_summary("sapien", rollouts, robot="openarm")
+            write_results(Path(folder), summary, rollouts, robot.joint_names)
+            path = Path(folder) / "sapien.trace.npz"
+            actions = from_file(path, object_name="010_potted_meat_can", episode=0, robot=None, objects=None)
+            self.assertEqual((actions.object.name, actions.label), ("010_potted_meat_can", "zero in sapien, demonstration 1"))
+            np.testing.assert_allclose(actions.joint_target.numpy(), rollouts.traces[1].joint_target, atol=1e-6)
+            with self.assertRaisesRegex(DemoError, "has no mug; it has 005_tomato_soup_can, 010_potted_meat_can"):
+                from_file(path, object_name="mug", episode=0, robot=None, objects=None)
+            old = replace(rollouts, traces=tuple(replace(t, joint_target=None) for t in rollouts.traces))
+            write_results(Path(folder), summary, old, robot.joint_names)
+            with self.assertRaisesRegex(FileFormatError, "states without the actions"):
+                from_file(path, object_name=None, episode=0, robot=None, objects=None)
 
 
 class CommandTest(unittest.TestCase):

@@ -38,6 +38,7 @@ def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
             joint_pos=joints + 0.01 * sequence * time[:, None],
             object_pos=path,
             object_quat=np.tile([1.0, 0, 0, 0], (5, 1)),
+            joint_target=joints + 0.01 * np.arange(12)[:, None],
         )
 
     episodes = (

@@ -11,10 +11,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from xreset.backends.parity.trials import Engine
-from xreset.env import make_scene
 from xreset.errors import XResetError
 from xreset.eval.attribute.alteration import Alteration, altered_engine
 from xreset.eval.attribute.dials import NO_CONTACT_DIAL, contact_dial
@@ -22,11 +20,11 @@ from xreset.eval.attribute.probes import Measured, measure
 from xreset.eval.attribute.properties import PROPERTIES, Property
 from xreset.eval.rollout import Episode, roll_out
 from xreset.eval.stats import bootstrap_ci95
+from xreset.eval.trace.actions import evaluation_scene
 from xreset.policy import Policy
 from xreset.resets.bank import ResetBank
-from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
+from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.config import TaskConfig
-from xreset.task.randomization import sample_friction
 
 SCHEMA = "xreset-attribution/1"
 
@@ -180,7 +178,7 @@ def attribute(
     if unknown := sorted(set(only) - set(known)):
         raise XResetError(f"there is no property {', '.join(unknown)}; there are {', '.join(known)}.")
     objects = tuple(objects)
-    scene = _nominal_scene(robot, objects, task)
+    scene = evaluation_scene(robot, objects, task)
     progress(f"measuring {a.name}", 0, 0)
     measured_a = measure(a, scene)
     progress(f"measuring {b.name}", 0, 0)
@@ -214,14 +212,6 @@ def attribute(
         rows.append(run("all", f"all {changed} at once", a, _allowed(everything, a)))
     rows.append(run("other", b.name, b, Alteration()))
     return Attribution(a=a.name, b=b.name, measured_a=measured_a, measured_b=measured_b, rows=tuple(rows), skipped=tuple(skipped))
-
-
-def _nominal_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
-    """The scene with the friction of an evaluation."""
-    scene = make_scene(robot, objects, task)
-    still = replace(task.randomization, enabled=False)
-    tip, link, table = sample_friction(1, still, torch.Generator())[0].tolist()
-    return replace(scene, friction=PairFriction(tip=tip, link=link, table=table, torsional=scene.friction.torsional))
 
 
 def _allowed(alteration: Alteration, engine: Engine) -> Alteration:

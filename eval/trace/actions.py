@@ -7,7 +7,7 @@ Actions are kept as joint targets, not as a policy's outputs: what a policy's ou
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from xreset.backends.parity.episodes import Episode, Motion
     from xreset.backends.parity.grasps import Grasps
     from xreset.backends.parity.trials import Engine
+    from xreset.eval.rollout import Trace
     from xreset.policy import Policy
     from xreset.resets.bank import ResetBank
     from xreset.task.config import TaskConfig
@@ -143,12 +144,11 @@ def play_policy(
         seed: of the perturbations.
         progress: called with (control steps done, control steps in all).
     """
-    from xreset.env import ManipulationEnv, make_scene, rest_state
+    from xreset.env import ManipulationEnv, rest_state
     from xreset.eval.rollout import episode_starts
-    from xreset.task.randomization import sample_friction
     from xreset.task.resets import ResetDistribution
 
-    scene = make_scene(robot, (thing,), task)
+    scene = evaluation_scene(robot, (thing,), task)
     on_cpu = ResetDistribution(demos, robot, (thing.name,), task.reset)
     start = episode_starts(on_cpu, np.array([sequence]), np.array([repetition]), seed)
     with engine.make(scene, 1, torch.zeros(1, dtype=torch.long)) as backend:
@@ -161,17 +161,63 @@ def play_policy(
             env.advance(policy.act(env.get_observations()))
             targets.append(env.joint_target[0].cpu().clone())
             progress(step + 1, env.max_episode_length)
-    tip, link, table = sample_friction(1, task.randomization, torch.Generator())[0].tolist()
     return Actions(
         robot=robot,
         object=thing,
         label=f"{policy.name} in {engine.name}, {demos.sequence_name[sequence]} (perturbation {repetition}, seed {seed})",
         timestep=scene.timestep,
         substeps=scene.substeps,
-        friction=PairFriction(tip=tip, link=link, table=table, torsional=scene.friction.torsional),
+        friction=scene.friction,
         start=rest_state(start.joint_pos, start.object_pos, start.object_quat),
         joint_target=torch.stack(targets),
     )
+
+
+def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label: str) -> Actions:
+    """The actions of an episode that an evaluation has recorded; it has begun at rest, with the physics of an evaluation.
+
+    Args:
+        robot: the robot.
+        thing: the object.
+        trace: the episode, with its joint targets.
+        label: what it is, for people.
+
+    Raises:
+        FileFormatError: the episode was not played at the control rate of the default task.
+    """
+    from xreset.env import rest_state
+    from xreset.task.config import TaskConfig
+
+    assert trace.joint_target is not None, "the trace holds no actions"
+    first = (torch.as_tensor(x[:1], dtype=torch.float32) for x in (trace.joint_pos, trace.object_pos, trace.object_quat))
+    scene = evaluation_scene(robot, (thing,), TaskConfig())
+    interval, length = float(trace.time[1] - trace.time[0]), len(trace.joint_target) * scene.control_dt
+    if not trace.time[-1] <= length + 1e-6 < trace.time[-1] + interval + 1e-6:
+        raise FileFormatError(
+            f"{len(trace.joint_target)} actions at {1 / scene.control_dt:.0f} Hz last {length:.2f} s, but the episode lasts "
+            f"{trace.time[-1]:.2f} s: it was played at another control rate. Give --policy instead, which knows its own."
+        )
+    return Actions(
+        robot=robot,
+        object=thing,
+        label=label,
+        timestep=scene.timestep,
+        substeps=scene.substeps,
+        friction=scene.friction,
+        start=rest_state(*first),
+        joint_target=torch.as_tensor(trace.joint_target, dtype=torch.float32),
+    )
+
+
+def evaluation_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
+    """The scene of a task with the pair friction of an evaluation, which draws none at random."""
+    from xreset.env import make_scene
+    from xreset.task.randomization import sample_friction
+
+    scene = make_scene(robot, objects, task)
+    nominal = replace(task.randomization, enabled=False)
+    tip, link, table = sample_friction(1, nominal, torch.Generator())[0].tolist()
+    return replace(scene, friction=replace(scene.friction, tip=tip, link=link, table=table))
 
 
 def write_actions(path: str | Path, actions: Actions) -> None:

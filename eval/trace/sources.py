@@ -12,9 +12,11 @@ from xreset import robots
 from xreset.demos.archive import SCHEMA_NAME as DEMOS
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.eval.evaluate import load_motion, resolve
+from xreset.eval.results import SCHEMA as EVALUATION
+from xreset.eval.results import TRACE_SCHEMA, read_traces
 from xreset.eval.trace.actions import SCHEMA as ACTIONS
-from xreset.eval.trace.actions import Actions, grasp_and_lift, play_policy, read_actions, robot_of
-from xreset.files import npz_schema
+from xreset.eval.trace.actions import Actions, grasp_and_lift, play_policy, read_actions, recorded_actions, robot_of
+from xreset.files import npz_schema, read_json
 from xreset.objects import load_object, load_objects
 from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import read_bank
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def from_file(source: Path, *, object_name: str | None, episode: int, robot: str | None, objects: Path | None) -> Actions:
-    """An open-loop grasp and lift of demonstrations, retargeted trajectories or a reset bank; or recorded actions.
+    """An open-loop grasp and lift of demonstrations, retargeted trajectories or a reset bank; or recorded actions, also of an evaluation.
 
     Args:
         source: the file.
@@ -53,10 +55,12 @@ def from_file(source: Path, *, object_name: str | None, episode: int, robot: str
         _, trajectories = load_motion(source, spec, objects, trajectories=True)
         assert trajectories is not None
         frames = Frames.of_retargeted(trajectories)
+    elif schema == TRACE_SCHEMA:
+        return _from_evaluation(source, object_name, robot, objects)
     else:
         raise FileFormatError(
             f"{source} states schema {schema!r}, expected {DEMOS!r} (xreset demos), {RETARGETED!r} (xreset retarget), {BANK!r} "
-            f"(xreset resets) or {ACTIONS!r} (xreset trace)."
+            f"(xreset resets), {TRACE_SCHEMA!r} (xreset eval) or {ACTIONS!r} (xreset trace)."
         )
     name = _object(source, object_name, dict.fromkeys(frames.object_name.tolist()))
     thing = load_object(name, objects)
@@ -113,6 +117,20 @@ def from_policy(
         seed=seed,
         progress=progress,
     )
+
+
+def _from_evaluation(source: Path, object_name: str | None, robot: str | None, objects: Path | None) -> Actions:
+    """The actions of a recorded episode: an evaluation records the first of each object."""
+    name = source.name.removesuffix(".trace.npz")
+    summary = read_json(source.with_name(f"{name}.json"), EVALUATION)
+    spec = robots.load(robot or str(summary["robot"]))
+    traces = {t.object: t for t in read_traces(source.parent, name, spec.joint_names)}
+    found = traces[_object(source, object_name, list(traces))]
+    if found.joint_target is None:
+        raise FileFormatError(f"{source} holds states without the actions that led to them. Evaluate again.")
+    folder = objects or (Path(summary["objects_folder"]) if summary["objects_folder"] else None)
+    thing = load_object(found.object, folder)
+    return recorded_actions(spec, thing, found, label=f"{summary['policy']} in {name}, demonstration {found.sequence}")
 
 
 def _robot_of_retargeted(source: Path, schema: str) -> str:

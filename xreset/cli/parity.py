@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -45,6 +46,7 @@ def parity(
     from rich.console import Console
     from rich.progress import Progress
 
+    from xreset import __version__
     from xreset.backends.parity.compare import REFERENCE, compare
     from xreset.backends.parity.load import load_frames
     from xreset.backends.parity.trials import engine
@@ -71,7 +73,8 @@ def parity(
         if tested.broken:
             console.print(f"{tested.engine.name}: {tested.broken} worlds were not finite or dropped contacts", style="bold red")
     if json is not None:
-        write_json(json, result.as_dict() | {"inputs": {"motion": file_hash(motion)}})
+        command = _command(motion, robot, objects, only, backend, grasps, device)
+        write_json(json, result.as_dict() | {"xreset_version": __version__, "command": command, "inputs": {"motion": file_hash(motion)}})
         console.print(f"wrote {json}", markup=False)
     missed = [f"{tested.engine.name}: {metric.name}" for tested in result.engines for metric in tested.metrics if not metric.ok]
     console.print(
@@ -79,6 +82,26 @@ def parity(
     )
     if missed:
         raise SystemExit(1)
+
+
+def _command(
+    motion: Path,
+    robot: str | None,
+    objects: Path | None,
+    only: tuple[str, ...],
+    backends: tuple[str, ...],
+    grasps: int,
+    device: str,
+) -> str:
+    """What to type to get the same numbers, with the names of files and folders but not where they lie."""
+    words = ["xreset", "parity", motion.name]
+    words += [] if robot is None else ["--robot", robot]
+    words += [] if objects is None else ["--objects", objects.name]
+    words += [word for name in only for word in ("--only", name)]
+    words += [word for name in backends for word in ("--backend", name)]
+    words += ["--grasps", str(grasps)]
+    words += [] if device == "cpu" else ["--device", device]
+    return shlex.join(words)
 
 
 def _usable(console, reference: str) -> list[str]:

@@ -21,7 +21,7 @@ from xreset.retarget import pipeline as pipeline_module
 from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, measure, track
 from xreset.retarget.balls import inscribed_balls, sharp_points
 from xreset.retarget.chain import solve_chain
-from xreset.retarget.clearance import Distances, Objects, too_near
+from xreset.retarget.clearance import Distances, Objects, not_touching, too_near
 from xreset.retarget.collision import SelfCollision, height_above_table, support_points
 from xreset.retarget.cost import system
 from xreset.retarget.file import Retargeted, read_retargeted, write_retargeted
@@ -274,18 +274,76 @@ class HandTest(unittest.TestCase):
         self.assertLess(quat_angle(found.root_quat, self.root_quat).max().item(), 5e-3)
 
     def test_moves_with_the_scene(self):
+        """A rigid motion of everything moves the hand with it: object and contacts too, far above the table, which does not move."""
         turn = quat_from_axis_angle(torch.tensor([0.4, 0.2, -1.0], dtype=FLOAT))
         shift = torch.tensor([0.3, -0.1, 0.2], dtype=FLOAT)
-        contact = self.targets(contact_points=self.keypoints + 0.02, in_contact=torch.ones(self.keypoints.shape[:3], dtype=torch.bool))
-        moved = dataclasses.replace(
-            contact,
-            keypoints=quat_rotate(turn, contact.keypoints) + shift,
-            contact_points=quat_rotate(turn, contact.contact_points) + shift,
+        up = torch.tensor([0.0, 0.0, 2.0], dtype=FLOAT)
+        here = self.targets(
+            keypoints=self.keypoints + up,
+            contact_points=self.keypoints + up + 0.02,
+            in_contact=torch.ones(self.keypoints.shape[:3], dtype=torch.bool),
+            object_pos=self.keypoints[:, :, self.model.names.index("index4")] + up + 0.03,
         )
-        config = HandConfig(iterations=80, tolerance=1e-10)
-        here, there = retarget_hand(self.model, contact, config), retarget_hand(self.model, moved, config)
-        torch.testing.assert_close(here.joints, there.joints, atol=1e-3, rtol=0)
-        torch.testing.assert_close(quat_rotate(turn, here.root_pos) + shift, there.root_pos, atol=1e-4, rtol=0)
+        there = dataclasses.replace(
+            here,
+            keypoints=quat_rotate(turn, here.keypoints) + shift,
+            contact_points=quat_rotate(turn, here.contact_points) + shift,
+            object_pos=quat_rotate(turn, here.object_pos) + shift,
+            object_quat=quat_multiply(turn.expand_as(here.object_quat), here.object_quat),
+        )
+        config = HandConfig(touch_weight=50.0)
+        still, moved = retarget_hand(self.model, here, config), retarget_hand(self.model, there, config)
+        torch.testing.assert_close(still.cost, moved.cost, atol=0, rtol=1e-6)
+        torch.testing.assert_close(still.joints, moved.joints, atol=1e-6, rtol=0)
+        torch.testing.assert_close(quat_rotate(turn, still.root_pos) + shift, moved.root_pos, atol=1e-6, rtol=0)
+
+    def test_order_and_company_of_sequences_do_not_matter(self):
+        object_pos = self.keypoints[:, :, self.model.names.index("index4")] + 0.01
+        targets = self.targets(object_pos=object_pos)
+        together = retarget_hand(self.model, targets)
+        order = torch.tensor([2, 0, 1])
+        permuted = retarget_hand(self.model, targets.select(order))
+        torch.testing.assert_close(permuted.joints, together.joints[order], atol=1e-9, rtol=0)
+        for i in range(3):
+            alone = retarget_hand(self.model, targets.select(torch.tensor([i])))
+            torch.testing.assert_close(alone.joints[0], together.joints[i], atol=1e-9, rtol=0)
+
+    def test_joints_do_not_jump(self):
+        """Keypoints that jump to another posture in one frame: the wall spreads the change over several."""
+        swapped = torch.cat((self.keypoints[:, :6], self.keypoints[:, -1:].expand(-1, 6, -1, -1)), dim=1)
+        jumps = []
+        for weight in (0.0, 1000.0):
+            joints = retarget_hand(self.model, self.targets(keypoints=swapped), HandConfig(jump_weight=weight)).joints
+            jumps.append(joints.diff(dim=1).abs().max().item())
+        self.assertGreater(jumps[0], 0.25)
+        self.assertLess(jumps[1], 0.2)
+
+    def test_fingertips_that_should_touch_reach_the_object(self):
+        tip = self.model.names.index("index4")
+        mask = torch.zeros(self.keypoints.shape[:3], dtype=torch.bool)
+        mask[:, :, tip] = True
+        away = torch.tensor([0.0, 0.0, 1.0], dtype=FLOAT)
+        targets = self.targets(in_contact=mask, contact_points=self.keypoints, object_pos=self.keypoints[:, :, tip] + 0.075 * away)
+        gaps = []
+        for weight in (0.0, 500.0):
+            motion = retarget_hand(self.model, targets, HandConfig(touch_weight=weight))
+            state = HandState(motion.joints, motion.root_pos, motion.root_quat)
+            bodies = self.model.bodies(*(value.flatten(0, 1) for value in vars(state).values()))
+            objects = Objects.at(
+                targets.object_pos.flatten(0, 1), targets.object_quat.flatten(0, 1), torch.zeros(36, dtype=torch.long), targets.fields
+            )
+            touching = targets.in_contact.flatten(0, 1)[:, self.model.pads.keypoint]
+            far = not_touching(self.model, bodies, objects, touching, 0.0)
+            gaps.append(far.value.sum().item() / 36)
+        self.assertGreater(gaps[0], 0.005)
+        self.assertLess(gaps[1], 0.5 * gaps[0])
+
+    @unittest.skipUnless(torch.cuda.is_available(), "needs a CUDA device")
+    def test_a_gpu_finds_the_same_motion(self):
+        targets = self.targets(object_pos=self.keypoints[:, :, self.model.names.index("index4")] + 0.01)
+        cpu, gpu = (retarget_hand(HandModel(self.robot, device=device), targets) for device in ("cpu", "cuda"))
+        torch.testing.assert_close(gpu.cost, cpu.cost, atol=0, rtol=1e-6)
+        torch.testing.assert_close(gpu.joints, cpu.joints, atol=1e-4, rtol=0)
 
     def test_frames_without_annotation_do_not_matter_and_are_bridged(self):
         annotated = torch.ones(3, 12, dtype=torch.bool)
@@ -639,14 +697,15 @@ class StopAndContinueTest(unittest.TestCase):
 
     def test_the_objects_count(self):
         keys = {
-            run_key(self.demos, self.robot, objects, self.CONFIG, size)
-            for objects, size in (
-                (self.objects, 1),
-                (self.objects, 2),
-                ([dataclasses.replace(self.objects[0], pieces=self.objects[0].pieces * 2)], 1),
+            run_key(self.demos, self.robot, objects, self.CONFIG, size, device)
+            for objects, size, device in (
+                (self.objects, 1, "cpu"),
+                (self.objects, 2, "cpu"),
+                (self.objects, 1, "cuda"),
+                ([dataclasses.replace(self.objects[0], pieces=self.objects[0].pieces * 2)], 1, "cpu"),
             )
         }
-        self.assertEqual(len(keys), 3)
+        self.assertEqual(len(keys), 4)
 
     def test_a_damaged_batch_is_made_again(self):
         self.stopped()

@@ -2,7 +2,7 @@
 
 The variables of a frame are the hand's joints and the pose of the link that carries the hand; the cost is that of ``cost``. It is
 minimised by Levenberg-Marquardt with analytic Jacobians and exact joint limits (projected steps). Neighbouring frames couple through the
-changes between them alone, so each step solves a block-tridiagonal system. All of it runs on the device that the targets are on.
+changes between them alone, so each step solves a block-tridiagonal system. All of it runs on the hand model's device.
 
 Shape letters: S sequences padded to T frames, P mapped keypoints, J hand joints, n = J + 6.
 """
@@ -43,6 +43,10 @@ class HandMotion:
     cost: Tensor
     """[S] final cost."""
 
+    def to(self, device: torch.device | str) -> HandMotion:
+        """The same on another device."""
+        return HandMotion(**{name: value.to(device) for name, value in vars(self).items()})
+
 
 def retarget_hand(
     model: HandModel, targets: HandTargets, config: HandConfig | None = None, progress: Callable[[float], None] | None = None
@@ -50,12 +54,16 @@ def retarget_hand(
     """Hand motions that minimise the cost; sequences are independent of one another.
 
     Args:
-        model: the hand, on the targets' device.
+        model: the hand; its device does the work.
         targets: what to follow; a sequence must have at least one annotated frame.
         config: weights.
         progress: called with the fraction of iterations that is done.
+
+    Returns:
+        The motions, on the targets' device.
     """
-    config = config or HandConfig()
+    config, home = config or HandConfig(), targets.keypoints.device
+    targets = targets.to(model.device)
     sequences, frames = targets.annotated.shape
     root_pos, root_quat = _align_root(model, targets)
     state = HandState(model.kinematics.clamp(model.home).expand(sequences, frames, -1), root_pos, root_quat)
@@ -67,7 +75,7 @@ def retarget_hand(
         before = sum(earlier.iterations for earlier in stages[:number])
         state, cost = _minimise(model, targets, stage, state, lambda n, before=before: progress((before + n) / steps) if progress else None)
     keypoints = model.keypoints(state.joints, state.root_pos, state.root_quat)
-    return HandMotion(joints=state.joints, root_pos=state.root_pos, root_quat=state.root_quat, keypoints=keypoints, cost=cost)
+    return HandMotion(joints=state.joints, root_pos=state.root_pos, root_quat=state.root_quat, keypoints=keypoints, cost=cost).to(home)
 
 
 def _minimise(
@@ -139,13 +147,18 @@ def _retract(model: HandModel, state: HandState, step: Tensor) -> HandState:
 
 
 def _limited_step(model: HandModel, state: HandState, here: System, damping: Tensor) -> Tensor:
-    """[S, T, n] Levenberg-Marquardt step in which joints at a limit stay there if the cost pulls them outwards (Bertsekas' projection)."""
+    """[S, T, n] Levenberg-Marquardt step in which joints at a limit stay there if the cost pulls them outwards (Bertsekas' projection).
+
+    The damping of the root knows no direction, so that the step turns with the scene.
+    """
     joints = state.joints
     count = joints.shape[-1]
     pull = here.gradient[..., :count]
     outward = ((joints <= model.kinematics.lower) & (pull > 0)) | ((joints >= model.kinematics.upper) & (pull < 0))
     free = torch.ones_like(here.gradient)
     free[..., :count] = (~outward).to(free.dtype)
-    ridge = damping[:, None, None] * here.diagonal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6) * free + (1.0 - free)
+    size = here.diagonal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6)
+    root = size[..., count:].unflatten(-1, (2, 3)).mean(-1, keepdim=True).expand(-1, -1, -1, 3).flatten(-2)  # the same in all directions
+    ridge = damping[:, None, None] * torch.cat((size[..., :count], root), dim=-1) * free + (1.0 - free)
     H = here.diagonal * free[..., :, None] * free[..., None, :] + torch.diag_embed(ridge)
     return solve_chain(H, here.coupling * free[:, 1:] * free[:, :-1], -here.gradient * free)

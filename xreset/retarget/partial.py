@@ -85,7 +85,7 @@ def discard(folder: Path) -> None:
         folder.rmdir()
 
 
-def run_key(demos: Demos, robot: RobotSpec, objects: Sequence[ObjectSpec], config: Any, sequences_per_batch: int) -> str:
+def run_key(demos: Demos, robot: RobotSpec, objects: Sequence[ObjectSpec], config: Any, sequences_per_batch: int, device: str) -> str:
     """SHA-256 over everything that a run's result depends on.
 
     Args:
@@ -94,9 +94,10 @@ def run_key(demos: Demos, robot: RobotSpec, objects: Sequence[ObjectSpec], confi
         objects: the objects that the demonstrations name; of these, only the collision pieces are looked at.
         config: dataclass of JSON-able values.
         sequences_per_batch: decides which sequences a batch holds.
+        device: rounds in its own way.
     """
     digest = hashlib.sha256()
-    stated = [__version__, robot.fingerprint, asdict(config), sequences_per_batch, float(demos.fps)]
+    stated = [__version__, robot.fingerprint, asdict(config), sequences_per_batch, device, float(demos.fps)]
     digest.update(json.dumps(stated, sort_keys=True).encode())
     arrays = {f.name: getattr(demos, f.name) for f in fields(demos)}
     for spec in sorted(objects, key=lambda o: o.name):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -17,7 +17,7 @@ from xreset.errors import DemoError
 from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
 from xreset.retarget.fields import DistanceFields
 from xreset.retarget.file import SCHEMA, Retargeted, read_retargeted, write_retargeted
-from xreset.retarget.hand import HandTargets, retarget_hand
+from xreset.retarget.hand import HandMotion, HandTargets, retarget_hand
 from xreset.retarget.hand_config import HandConfig
 from xreset.retarget.hand_model import HandModel
 from xreset.retarget.partial import Batch, Partial, run_key
@@ -69,6 +69,7 @@ def retarget(
     progress: Callable[[float, int], None] = lambda done, total: None,
     partial: Path | None = None,
     timing: Timing | None = None,
+    device: str = "cpu",
 ) -> Retargeted:
     """Retarget demonstrations; sequences are independent of one another, and the result depends on nothing but the arguments.
 
@@ -83,6 +84,7 @@ def retarget(
         progress: called with (sequences done, sequences in all).
         partial: folder for what is finished, made when needed; batches in it that other arguments made are not used.
         timing: to add the time spent to.
+        device: where hand retargeting runs; the arm runs on the CPU.
 
     Returns:
         Trajectories of every sequence; a sequence whose hand was never annotated stays at home, without a valid frame.
@@ -94,13 +96,13 @@ def retarget(
     config = config or RetargetConfig()
     by_name = _by_name(demos, objects)
     demos = rest_on_table(demos, objects)
-    hand, arm = HandModel(robot), ArmModel(robot)
+    hand, arm = HandModel(robot, device=device), ArmModel(robot)
     surfaces = {name: Surface(spec) for name, spec in by_name.items()}
 
     touched, touches = _contacts(demos, surfaces, config.contact_distance)
     kept = None
     if partial is not None:
-        kept = Partial(partial, run_key(demos, robot, list(by_name.values()), config, _SEQUENCES_PER_BATCH))
+        kept = Partial(partial, run_key(demos, robot, list(by_name.values()), config, _SEQUENCES_PER_BATCH, device))
     joint_pos = np.tile(robot.home, (demos.num_frames, 1))
     reason = np.full(demos.num_frames, REASONS.index("not annotated"), dtype=np.int32)
     hand_error, wrist_error = np.full(demos.num_frames, np.inf), np.full(demos.num_frames, np.inf)
@@ -153,6 +155,33 @@ def retarget(
     )
 
 
+def hand_motions(
+    demos: Demos,
+    robot: RobotSpec,
+    objects: Sequence[ObjectSpec],
+    config: RetargetConfig | None = None,
+    *,
+    device: str = "cpu",
+    progress: Callable[[float, int], None] = lambda done, total: None,
+) -> Iterator[tuple[list[int], HandTargets, HandMotion]]:
+    """Hand retargeting alone, in batches: which sequences, what the hand was to follow, what it does. Arguments as in :func:`retarget`."""
+    config = config or RetargetConfig()
+    by_name = _by_name(demos, objects)
+    demos = rest_on_table(demos, objects)
+    hand = HandModel(robot, device=device)
+    surfaces = {name: Surface(spec) for name, spec in by_name.items()}
+    touched, touches = _contacts(demos, surfaces, config.contact_distance)
+    todo = [i for i in range(demos.num_sequences) if demos.hand_valid[demos.frames(i)].any()]
+    for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
+        sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
+        targets = _hand_targets(demos, hand, sequences, surfaces, touched, touches)
+
+        def report(share: float, start: int = begin, size: int = len(sequences)) -> None:
+            progress(start + share * size, len(todo))
+
+        yield sequences, targets, retarget_hand(hand, targets, config.hand, report)
+
+
 def wrist_paths(
     demos: Demos,
     robot: RobotSpec,
@@ -161,24 +190,10 @@ def wrist_paths(
     *,
     progress: Callable[[float, int], None] = lambda done, total: None,
 ) -> list[ArmTargets]:
-    """Hand retargeting alone: what it asks of the arm, in batches of sequences. Arguments and errors as in :func:`retarget`."""
-    config = config or RetargetConfig()
-    by_name = _by_name(demos, objects)
-    demos = rest_on_table(demos, objects)
+    """What hand retargeting asks of the arm, in batches of sequences. Arguments and errors as in :func:`retarget`."""
     hand, arm = HandModel(robot), ArmModel(robot)
-    surfaces = {name: Surface(spec) for name, spec in by_name.items()}
-    touched, touches = _contacts(demos, surfaces, config.contact_distance)
-    todo = [i for i in range(demos.num_sequences) if demos.hand_valid[demos.frames(i)].any()]
-    paths = []
-    for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
-        sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
-        targets = _hand_targets(demos, hand, sequences, surfaces, touched, touches)
-
-        def report(share: float, start: int = begin, size: int = len(sequences)) -> None:
-            progress(start + share * size, len(todo))
-
-        paths.append(_arm_targets(hand, arm, targets, config.hand, report))
-    return paths
+    motions = hand_motions(demos, robot, objects, config, progress=progress)
+    return [_arm_targets(hand, arm, targets, motion) for _, targets, motion in motions]
 
 
 def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpec]:
@@ -237,7 +252,8 @@ def _solve(
 ) -> Batch:
     """Hand, arm and validity of some sequences; ``targets`` are theirs."""
     started = perf_counter()
-    arm_targets = _arm_targets(hand, arm, targets, config.hand, lambda share: progress(0.5 * share))
+    motion = retarget_hand(hand, targets, config.hand, lambda share: progress(0.5 * share))
+    arm_targets = _arm_targets(hand, arm, targets, motion)
     between = perf_counter()
     joints, measures = track(arm, arm_targets, config.thresholds, config.arm, lambda share: progress(0.5 + 0.5 * share))
     timing.hand += between - started
@@ -255,15 +271,14 @@ def _solve(
     )
 
 
-def _arm_targets(hand: HandModel, arm: ArmModel, targets: HandTargets, config: HandConfig, progress: Callable[[float], None]) -> ArmTargets:
-    """What hand retargeting asks of the arm."""
-    motion = retarget_hand(hand, targets, config, progress)
+def _arm_targets(hand: HandModel, arm: ArmModel, targets: HandTargets, motion: HandMotion) -> ArmTargets:
+    """What a hand's motion asks of the arm."""
     return ArmTargets(
         root_pos=motion.root_pos,
         root_quat=motion.root_quat,
         hand_joints=motion.joints,
         annotated=targets.annotated,
-        hand_error=(motion.keypoints - targets.keypoints)[:, :, hand.is_tip].norm(dim=-1).mean(-1),
+        hand_error=(motion.keypoints - targets.keypoints)[:, :, hand.is_tip.cpu()].norm(dim=-1).mean(-1),
         hand_clearance=arm.hand_clearance(motion.joints),
     )
 

@@ -92,7 +92,7 @@ def _delay(a: float, b: float, engine: str, scene: SceneSpec) -> Change:
 PROPERTIES = (
     Property(name="tip friction", field="tip_friction", unit="", scale=1.0, resolution=0.03, what_if=Alteration(tip_friction=0.8)),
     Property(name="link friction", field="link_friction", unit="", scale=1.0, resolution=0.03, what_if=Alteration(link_friction=0.8)),
-    Property(name="table friction", field="table_friction", unit="", scale=1.0, resolution=0.06, what_if=Alteration(table_friction=0.8)),
+    Property(name="table friction", field="table_friction", unit="", scale=1.0, resolution=0.03, what_if=Alteration(table_friction=0.8)),
     Property(name="object mass", field="mass", unit="", scale=1.0, resolution=0.005, what_if=Alteration(mass=1.2)),
     Property(name="object inertia", field="inertia", unit="", scale=1.0, resolution=0.02, what_if=Alteration(inertia=1.2)),
     Property(name="arm stiffness", field="arm_stiffness", unit="", scale=1.0, resolution=0.02, what_if=Alteration(arm_stiffness=0.8)),

@@ -49,13 +49,19 @@ def backend_class(name: str) -> type[Backend]:
     if name not in entries:
         known = ", ".join(sorted(entries)) or "none (is xreset installed? run: pip install -e .)"
         raise BackendUnavailableError(f"there is no backend {name!r}; there are {known}.")
+    what = f"the backend {name!r} ({entries[name].value})"
     try:
-        return entries[name].load()
+        cls = entries[name].load()
     except XResetError:
         raise
     except Exception as error:
         trace = traceback.format_exc(limit=-2)
-        raise BackendUnavailableError(f"the backend {name!r} ({entries[name].value}) does not load: {error}\n{trace}") from error
+        raise BackendUnavailableError(f"{what} does not load: {error}\n{trace}") from error
+    from xreset.backends.base import Backend
+
+    if not (isinstance(cls, type) and issubclass(cls, Backend)):
+        raise BackendUnavailableError(f"{what} is {cls!r}, expected a class that inherits from xreset.backends.base.Backend.")
+    return cls
 
 
 def make_backend(name: str, scene: SceneSpec, num_worlds: int, **options: Any) -> Backend:
@@ -72,4 +78,6 @@ def backend_status(name: str) -> BackendStatus:
         version = cls.engine_version()
     except BackendUnavailableError as error:
         return BackendStatus(name, None, "-", str(error))
+    except Exception as error:  # a plugin's defect must not hide the other engines
+        return BackendStatus(name, None, "-", f"its engine_version() fails: {type(error).__name__}: {error}")
     return BackendStatus(name, version, ", ".join(cls.devices()), None)

@@ -222,30 +222,27 @@ class DrakeWorld(World):
                 at.scene_graph.AssignRole(self._geometry, at.plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
 
+_DAMPED = "drives are integrated by implicit Euler steps, which damp: the difference shrinks with the step"
+_ROCKING = "a brick that is laid on its edge rocks for a second, because contacts dissipate little; then the force is right to 0.1 %"
+_PITCHING = "friction tilts an object on the compliant table and lags behind its normal force, so that a fast one chatters"
+
 _KNOWN_DIFFERENCES = (
+    KnownDifference(check="joint_tracking", measure="arm, sine, rms", bound=0.003, reason=_DAMPED),
+    KnownDifference(check="joint_tracking", measure="hand, sine, rms", bound=0.003, reason=_DAMPED),
+    KnownDifference(check="effort_limit", measure="hand, weak step, peak", bound=0.014, reason=_DAMPED),
+    KnownDifference(check="resting_on_a_side", measure="vertical force", bound=0.15, reason=_ROCKING),
+    KnownDifference(check="resting_on_a_side", measure="horizontal force", bound=0.3, reason=_ROCKING),
+    KnownDifference(check="rest_and_bounce", measure="bounce", bound=0.004, reason="more dissipation would stop sliding objects too early"),
     *(
-        KnownDifference(check=check, measure=measure, bound=bound, reason="drives are integrated by implicit Euler steps, which damp")
-        for check, measure, bound in (
-            ("joint_tracking", "hand, sine, rms", 0.003),
-            ("effort_limit", "hand, weak step, peak", 0.014),
-        )
+        KnownDifference(check="sliding_distance", measure=f"mu {mu}, {degrees} degrees", bound=bound, reason=_PITCHING)
+        for mu, bound in ((0.5, 0.15), (0.8, 0.3), (1.2, 0.8))
+        for degrees in (0, 45)
     ),
-    *(
-        KnownDifference(
-            check=check, measure=measure, bound=bound, reason="objects hop on their leading edge: the compliant table gives way under it"
-        )
-        for check, measure, bound in (
-            ("sliding_distance", "mu 1.2, 0 degrees", 0.5),
-            ("sliding_distance", "mu 1.2, 45 degrees", 0.5),
-            ("slope", "acceleration, mu 0.8, 0 degrees", 0.6),
-            ("slope", "acceleration, mu 1.2, 0 degrees", 1.0),
-            ("slope", "acceleration, mu 1.2, 45 degrees", 1.0),
-        )
-    ),
+    KnownDifference(check="slope", measure="acceleration, mu 1.2, 0 degrees", bound=1.5, reason=_PITCHING),
     KnownDifference(
         check="torsional_friction",
         measure="spin lost",
-        bound=0.6,
+        bound=0.5,
         reason="torsional friction comes from the size of the contact patch, and not from the scene's figure",
     ),
 )

@@ -38,8 +38,8 @@ OFFSETS = np.array([0, FRAMES, 2 * FRAMES], dtype=np.int32)
 
 
 def toy_demos() -> Demos:
-    """Two demonstrations; the hand is far off in frames 0 and 1, at the object's side in 2, not annotated in 3."""
-    pos = np.tile([0.5, 0.3, 0.1], (2 * FRAMES, 1))
+    """Two demonstrations, the can 6 mm above the table; the hand is far off in frames 0 and 1, at the object's side in 2, unknown in 3."""
+    pos = np.tile([0.5, 0.3, 0.065], (2 * FRAMES, 1))
     keypoints = pos[:, None] + np.full((1, 21, 3), [0.03, 0, 0])
     keypoints[FRAMES:, :, 1] += 0.01
     keypoints[[0, 1, 4, 5], :, 2] += 0.3

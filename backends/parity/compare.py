@@ -17,8 +17,9 @@ from xreset.backends.parity.metrics import (
     outcome_metric,
     palm_distance,
     palm_metric,
+    path_difference,
+    path_metrics,
     press_metrics,
-    trajectory_metrics,
 )
 from xreset.backends.parity.recording import Recording
 from xreset.backends.parity.trials import (
@@ -166,7 +167,7 @@ def compare(
     lift = config.motion.height
     firm = torch.stack([carried(recording, lift) for recording in holds[reference.name]]).all(0)
     paths: dict[str, Recording] = {}
-    if len(stepwise) > 1:
+    if len(stepwise) > 1 and bool(firm.any()):
         held = common[firm.nonzero()[: config.path_grasps, 0]]
         for e in stepwise:
             report(f"{e.name}: following {len(held.label)} objects")
@@ -192,8 +193,9 @@ def compare(
                 )
             )
             recordings = {"closing": mine.whole} | {f"hold {mu:g}": r for mu, r in zip(config.frictions, holds[e.name], strict=True)}
-        if e.name in paths:
-            metrics += trajectory_metrics(paths[e.name], paths[reference.name])
+        if e.path:
+            nothing = torch.zeros(0, 0)
+            metrics += path_metrics(*(path_difference(paths[e.name], paths[reference.name]) if paths else (nothing, nothing)))
         everything = [*recordings.values(), *([closings[e.name].press] if e.grasps else []), *([paths[e.name]] if e.name in paths else [])]
         return EngineParity(
             engine=e,

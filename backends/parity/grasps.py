@@ -6,7 +6,7 @@ Shape letters: F frames, G grasps, J joints, E fingertips.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -14,6 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from xreset.backends.pool import lowest_point
 from xreset.errors import DemoError
 from xreset.kinematics import Kinematics
 from xreset.resets.bank import ResetBank
@@ -26,6 +27,8 @@ REST_DISTANCE, REST_ANGLE = 0.010, np.radians(10.0)
 """How far [m, rad] an object may be from where it started and still count as at rest on the table."""
 LIFTED = 0.030
 """How far [m] an object must be above where it started to count as lifted."""
+CLEARANCE = 0.0005
+"""Height [m] of an object over the table, at least: demonstrated poses may be sunk into it, and engines throw such objects up."""
 NEAR = 0.025
 """A fingertip nearer than this [m] to the object's collision surface may touch it once the hand closes."""
 
@@ -135,6 +138,10 @@ def find_grasps(frames: Frames, robot: RobotSpec, objects: Sequence[ObjectSpec],
     rows = np.flatnonzero(fits & np.isin(frames.object_name, names))
     rows = rows[_at_hand(frames, rows, robot, objects)]
     rows = rows[_turns(frames, rows, last_first=where == "table")[:count]]
+    object_index = [names.index(name) for name in frames.object_name[rows].tolist()]
+    object_pos = frames.object_pos[rows].astype(np.float64)
+    lowest = [_lowest(objects[i], quat) for i, quat in zip(object_index, frames.object_quat[rows], strict=True)]
+    object_pos[:, 2] = np.maximum(object_pos[:, 2], CLEARANCE - np.array(lowest))
     if not len(rows) and where == "table":
         raise DemoError(
             f"no grasp was found in {len(frames.frame)} frames after first contact: in none does an object of "
@@ -143,11 +150,18 @@ def find_grasps(frames: Frames, robot: RobotSpec, objects: Sequence[ObjectSpec],
         )
     return Grasps(
         label=tuple(f"{frames.sequence_name[row]}:{frames.frame[row]}" for row in rows),
-        object_index=torch.tensor([names.index(name) for name in frames.object_name[rows].tolist()], dtype=torch.long),
+        object_index=torch.tensor(object_index, dtype=torch.long),
         joint_pos=torch.as_tensor(frames.joint_pos[rows], dtype=torch.float64),
-        object_pos=torch.as_tensor(frames.object_pos[rows], dtype=torch.float64),
+        object_pos=torch.as_tensor(object_pos),
         object_quat=torch.as_tensor(frames.object_quat[rows], dtype=torch.float64),
     )
+
+
+def _lowest(thing: ObjectSpec, quat: np.ndarray) -> float:
+    """Smallest z of the collision pieces, relative to the mesh frame's origin, when the object is turned so [m]."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(quat, scalar_first=True).as_matrix()
+    return lowest_point([replace(piece, T_body_shape=T @ piece.T_body_shape) for piece in thing.pieces])
 
 
 def _at_hand(frames: Frames, rows: np.ndarray, robot: RobotSpec, objects: Sequence[ObjectSpec]) -> np.ndarray:

@@ -141,10 +141,15 @@ def palm_distance(found: Recording, reference: Recording, points: Tensor) -> Ten
     return (found.in_palm(-1, points) - reference.in_palm(-1, points)).norm(dim=-1).mean(-1)
 
 
-def trajectory_metrics(found: Recording, reference: Recording) -> list[Metric]:
-    """Paths of worlds in contact: meaningful between engines that solve the same equations only, for long contact is chaotic."""
+def path_difference(found: Recording, reference: Recording) -> tuple[Tensor, Tensor]:
+    """After each step, the joint that differs most [T, G] (rad, m) and the distance between the objects' origins [T, G] (m)."""
     joints = (found.joint_pos - reference.joint_pos).abs().amax(-1)
-    thing = 1e3 * (found.object_pos - reference.object_pos).norm(dim=-1)
+    return joints, (found.object_pos - reference.object_pos).norm(dim=-1)
+
+
+def path_metrics(joints: Tensor, distance: Tensor) -> list[Metric]:
+    """The differences [T, G] of paths in contact: between engines that solve the same equations only, for long contact is chaotic."""
+    thing = 1e3 * distance
     what = "over all control steps and grasps"
     return [
         Metric(

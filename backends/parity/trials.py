@@ -148,7 +148,7 @@ def common_states(
 ) -> CommonStates:
     """States that favour no engine: some as demonstrations show them in the air, the others from the closings of all engines in turn.
 
-    A closing counts if the thumb and another fingertip touch the object when the hand has closed.
+    A closing counts if a fingertip touches the object when the hand has closed.
 
     Args:
         robot: the robot.
@@ -167,8 +167,7 @@ def common_states(
     names = list(closings)
     for g in range(len(table)):
         for name in names[g % len(names) :] + names[: g % len(names)]:
-            touch = closings[name].tip_touch[last, g]
-            if len(labels) < count and touch[0] and touch[1:].any():
+            if len(labels) < count and closings[name].tip_touch[last, g].any():
                 labels.append(f"{table.label[g]} closed in {name}")
                 states.append(closings[name].state_after(last)[torch.tensor([g])])
                 index.append(table.object_index[[g]])

@@ -1,4 +1,4 @@
-"""``xreset demos``: import, synth, info."""
+"""``xreset demos``: import, synth, mirror, info."""
 
 from __future__ import annotations
 
@@ -68,6 +68,40 @@ def synth(
     _print_summary(demos, out)
 
 
+def mirror(
+    file: Annotated[Path, tyro.conf.Positional],
+    *,
+    out: Path,
+    objects: Path | None = None,
+    tolerance: float = 0.004,
+) -> None:
+    """Reflect demonstrations of left hands, so that a right-handed robot can train on them.
+
+    Only objects that are their own mirror image within the tolerance can be reflected; the others are left out, and the table says so.
+
+    Args:
+        file: Archive with left hands.
+        out: Archive to write.
+        objects: Folder of real meshes; default: the built-in stand-ins.
+        tolerance: Largest distance between an object's surface and its reflection, over 95 % of it [m].
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from xreset.demos import demo_objects, mirrored, read_demos, symmetry, write_demos
+    from xreset.files import file_hash
+
+    demos = read_demos(file).select(sides=["left"])
+    symmetries = {name: symmetry(spec) for name, spec in demo_objects(demos, objects).items()}
+    table = Table("object", "off its reflection [mm]", "mirrored")
+    for name, found in sorted(symmetries.items()):
+        table.add_row(name, f"{1e3 * found.deviation:.1f}", "yes" if found.deviation <= tolerance else "no: not symmetric enough")
+    Console().print(table)
+    result = mirrored(demos, symmetries, tolerance=tolerance)
+    write_demos(out, result, config={"mirrored": True, "tolerance": tolerance}, inputs={"demos": file_hash(file)})
+    _print_summary(result, out)
+
+
 def info(file: Annotated[Path, tyro.conf.Positional]) -> None:
     """Say what an archive of demonstrations contains, object by object.
 
@@ -124,4 +158,4 @@ def _print_summary(demos: Demos, path: Path) -> None:
     )
 
 
-COMMAND = {"import": import_, "synth": synth, "info": info}
+COMMAND = {"import": import_, "synth": synth, "mirror": mirror, "info": info}

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from xreset.retarget.hand_config import HandConfig
+
 
 def retarget(
     demos: Annotated[Path, tyro.conf.Positional],
@@ -18,6 +20,8 @@ def retarget(
     max_per_object: int | None = None,
     restart: bool = False,
     picture: Path | None = None,
+    device: str = "cpu",
+    hand: HandConfig = HandConfig(),  # noqa: B008 (frozen)
 ) -> None:
     """Turn human demonstrations into robot trajectories.
 
@@ -30,6 +34,8 @@ def retarget(
         objects: Folder of real meshes; default: the built-in stand-ins.
         max_per_object: Only the first so many sequences of each object.
         restart: Begin anew, whatever an earlier run has finished.
+        device: Where hand retargeting runs: cpu or cuda. The arm runs on the CPU.
+        hand: Weights of hand retargeting.
         picture: PNG to write: first contact, mid-lift and goal for each object, the human keypoints over the robot.
     """
     from dataclasses import asdict
@@ -53,7 +59,7 @@ def retarget(
     if max_per_object is not None:
         chosen = chosen.select(max_per_object=max_per_object)
     specs = demo_objects(chosen, objects)
-    config, timing = pipeline.RetargetConfig(), pipeline.Timing()
+    config, timing = pipeline.RetargetConfig(hand=hand), pipeline.Timing()
     partial = out.with_name(f"{out.name}.partial")
     if restart:
         discard(partial)
@@ -63,6 +69,7 @@ def retarget(
             result = pipeline.retarget(
                 chosen, spec, list(specs.values()), config,
                 progress=lambda done, total: bar.update(task, completed=done, total=total), partial=partial, timing=timing,
+                device=device,
             )  # fmt: skip
     except KeyboardInterrupt:
         if partial.is_dir():

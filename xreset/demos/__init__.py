@@ -10,6 +10,20 @@
 from xreset.demos.align import grounded, levelled
 from xreset.demos.archive import Demos, concatenate, demo_objects, read_demos, write_demos
 from xreset.demos.dexycb import read_dexycb
+from xreset.demos.mirror import Symmetry, mirrored, symmetry
 from xreset.demos.synth import synthesize
 
-__all__ = ["Demos", "concatenate", "demo_objects", "grounded", "levelled", "read_demos", "read_dexycb", "synthesize", "write_demos"]
+__all__ = [
+    "Demos",
+    "Symmetry",
+    "concatenate",
+    "demo_objects",
+    "grounded",
+    "levelled",
+    "mirrored",
+    "read_demos",
+    "read_dexycb",
+    "symmetry",
+    "synthesize",
+    "write_demos",
+]

@@ -69,6 +69,11 @@ class Surface:
         )
         """Signed distances on the grid."""
 
+    def samples(self, count: int) -> np.ndarray:
+        """[N, 3] at most ``count`` points, evenly drawn from the samples of the surface."""
+        points = np.asarray(self._tree.data)
+        return points[:: -(-len(points) // count)]
+
     def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nearest surface points [N, 3] of points [N, 3], exact on the triangles of the nearest samples, and the distances [N] to them."""
         import trimesh

@@ -48,11 +48,15 @@ class InTheBrowser(unittest.TestCase):
         self.browser.problems.clear()
         self.addCleanup(self.browser.open, "about:blank")  # first: a page without its server is a problem
         self.browser.open(page.url)
-        self.until(lambda: self.exists(INPUT.format(label="sequence")) and "1 of" in self.text(), "the controls", seconds=60)
+        self.until(lambda: self.exists(INPUT.format(label="sequence")) and "1 of" in self.text(), "the controls")
         return page
 
-    def until(self, condition, what: str, seconds: float = 20.0):
-        wait_until(condition, what, seconds)
+    def until(self, condition, what: str):
+        """Wait; long, because frames drawn without a GPU can take seconds where other work has the cores."""
+        try:
+            wait_until(condition, what, seconds=60)
+        except AssertionError as error:
+            raise AssertionError(f"{error}; the page says: {self.text()!r}") from None
 
     def exists(self, element: str) -> bool:
         return self.browser.evaluate(f"(() => {{ try {{ return !!{element} }} catch {{ return false }} }})()")

@@ -104,16 +104,22 @@ def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) 
         )
     text = path.read_text()
     text = re.sub(r"^placement *=.*\n", "", text, flags=re.MULTILINE)
-    pos, quat = (", ".join(f"{v:.4f}" for v in values) for values in (search.best.placement.pos, search.best.placement.quat))
     quoted = command.replace("\\", "\\\\").replace('"', '\\"')
     figures = f"reached = {search.best.reach.reached:.3f}, followed = {search.best.followed:.3f}, frames = {search.frames}"
-    entry = f'placement = {{ {figures}, command = "{quoted}" }}'
-    edits = [(r"^pos *=.*$", f"pos = [{pos}]"), (r"^quat *=.*$", f"quat = [{quat}]\n{entry}")]
-    for name, value in zip((robot.joint_names[i] for i in robot.arm_indices), search.home, strict=True):
-        edits.append((rf'(name *= *"{re.escape(name)}".*?\bhome *= *)[-+.\deE]+', rf"\g<1>{value:.3f}"))
+    edits = [(r"^(quat *=.*)$", rf'\g<1>\nplacement = {{ {figures}, command = "{_literal(quoted)}" }}')]
+    if search.best.placement != search.own.placement:  # else not a digit may change: it would be another robot
+        pos, quat = (", ".join(f"{v:.8g}" for v in values) for values in (search.best.placement.pos, search.best.placement.quat))
+        edits = [(r"^pos *=.*$", f"pos = [{pos}]"), (r"^quat *=.*$", f"quat = [{quat}]"), *edits]
+        for name, value in zip((robot.joint_names[i] for i in robot.arm_indices), search.home, strict=True):
+            edits.append((rf'(name *= *"{re.escape(name)}".*?\bhome *= *)[-+.\deE]+', rf"\g<1>{value:.3f}"))
     for pattern, new in edits:
         text, count = re.subn(pattern, new, text, count=1, flags=re.MULTILINE)
         if not count:
             raise RobotError(f"{path} has no line like {pattern!r} to put the placement into; edit it by hand: {new}")
     with atomic_write(path, "w") as file:
         file.write(text)
+
+
+def _literal(text: str) -> str:
+    """The text as a replacement of ``re.sub``, which would take a backslash for the beginning of a group."""
+    return text.replace("\\", "\\\\")

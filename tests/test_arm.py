@@ -179,7 +179,12 @@ class WritePlacementTest(unittest.TestCase):
         best = Finalist(
             placement=Placement(pos=(0.1, 0.2, 0.3), quat=(0.6, 0.0, 0.8, 0.0)), reach=Reach(reached=0.9123, dexterity=0.5), followed=0.8765
         )
-        self.found = Search(best=best, own=best, home=np.linspace(-0.3, 0.4, 7), frames=321)
+        own = Finalist(
+            placement=Placement(pos=(0.45, 0.60, 0.55), quat=(0.38268343, 0.92387953, 0.0, 0.0)),
+            reach=Reach(reached=0.8, dexterity=0.5),
+            followed=0.75,
+        )
+        self.found = Search(best=best, own=own, home=np.linspace(-0.3, 0.4, 7), frames=321)
 
     def test_the_description_reads_back(self):
         before = load(self.folder)
@@ -192,6 +197,15 @@ class WritePlacementTest(unittest.TestCase):
             self.assertEqual((after.placement.reached, after.placement.followed, after.placement.frames), (0.912, 0.876, 321))
             self.assertIn('"my demos.npz"', after.placement.command)
         self.assertEqual([joint.drive for joint in after.joints], [joint.drive for joint in before.joints])
+
+    def test_where_the_own_placement_is_best_only_its_figure_is_written(self):
+        before, text = load(self.folder), self.file.read_text()
+        write_placement(self.file, before, dataclasses.replace(self.found, best=self.found.own), r"a \\g<1> \b")
+        after = load(self.folder)
+        self.assertEqual(after.fingerprint, before.fingerprint)
+        self.assertEqual((after.placement.followed, after.placement.command), (0.75, r"a \\g<1> \b"))
+        without = "".join(line for line in self.file.read_text().splitlines(keepends=True) if not line.startswith("placement"))
+        self.assertEqual(without, "".join(line for line in text.splitlines(keepends=True) if not line.startswith("placement")))
 
     def test_the_figure_is_no_part_of_the_fingerprint(self):
         before = load(self.folder)

@@ -195,6 +195,14 @@ class TraceTest(unittest.TestCase):
         for large, less in zip(one.noise[:3], small.noise[:3], strict=True):
             self.assertGreater(large.largest, 3 * less.largest, large.quantity)
 
+    def test_noise_excuses_only_what_it_does_itself_by_then(self):
+        result = self.run_against(grasp_actions(), "slippery", lambda scene: toy_grasp.with_tip_friction(scene, 0.5))
+        position = next(p for p in result.engines[0].partings if p.quantity == "object position")
+        for time, size, excused in ((-0.01, 1.0, True), (0.01, 1.0, False), (-0.01, 0.5, False), (None, 1.0, False)):
+            at = None if time is None else (position.time or 0.0) + time
+            noise = replace(position, time=at, largest=position.largest * size)
+            self.assertEqual(replace(result, noise=(noise,)).within_noise(position), excused, (time, size))
+
     def test_an_engine_that_breaks_is_compared_until_it_does(self):
         def broken(scene, num_worlds, object_index):
             backend = self.mujoco.make(scene, num_worlds, object_index)

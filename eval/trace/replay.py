@@ -55,8 +55,14 @@ class TraceResult:
     """Size of the perturbations [m, rad]."""
 
     def within_noise(self, parting: Parting) -> bool:
-        """Whether the reference, from a start that differs by next to nothing, gets as far away from itself."""
-        return any(n.quantity == parting.quantity and n.unit == parting.unit and parting.largest <= n.largest for n in self.noise)
+        """Whether the reference, from a start that differs by next to nothing, parts from itself no later and gets as far."""
+        return any(
+            n.quantity == parting.quantity
+            and n.unit == parting.unit
+            and parting.largest <= n.largest
+            and (parting.time is None or (n.time is not None and n.time <= parting.time))
+            for n in self.noise
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-able content."""

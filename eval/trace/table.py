@@ -17,10 +17,8 @@ _SHOWN = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "N": ("N", 1.0), "fingers": ("
 
 def shown(parting: Parting, value: float) -> str:
     """A difference in the unit in which it is read best."""
-    if parting.quantity == "object orientation":
-        return f"{math.degrees(value):.2g} deg"
-    unit, scale = _SHOWN[parting.unit]
-    return f"{value * scale:.0f} {unit}" if parting.unit == "fingers" else f"{value * scale:.2g} {unit}"
+    unit, scale = ("deg", math.degrees(1.0)) if parting.quantity == "object orientation" else _SHOWN[parting.unit]
+    return f"{float(f'{value * scale:.2g}'):g} {unit}"  # two digits, without an exponent
 
 
 def rich_table(result: TraceResult) -> Table:

@@ -140,7 +140,7 @@ class DocsTest(unittest.TestCase):
     def test_the_page_names_engines_versions_and_commands(self):
         text = (DOCS / "engines.md").read_text()
         for engine in ("mujoco", "mujoco-warp", "pybullet", "sapien", "drake"):
-            self.assertRegex(text, rf"\| {engine} \d+\.\d+[\d.]* with [\w-]+ on \w+", engine)
+            self.assertRegex(text, rf"[|;] {engine} \d+\.\d+[\d.]* with [\w-]+ on \w+", engine)
             self.assertRegex(text, rf"`xreset conformance [^`]*--backend {engine}\b", engine)
         self.assertIn("## Known differences", text)
 

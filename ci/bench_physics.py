@@ -3,8 +3,9 @@
 bare      the time within the engine's own step function alone; of mujoco-warp its physics kernels (on a GPU: the captured graph)
 raw       the loop that one would write directly against the engine, on one core, over as many worlds: targets set, every physics step with
           the object's weight and the drives that the engine lacks, joints and object read once per control step
+forces    the same, and the contact forces on the object are read, too; for PhysX that means to work out friction, which it does not tell
 processes the backend: targets set and one control step, all readings (links, contact forces, health) published; beside it the share of
-          raw that each of its processes reaches
+          raw and of forces that each of its processes reaches
 
 Everything runs in turns within one go, and shares are medians over turns; they mean something only while nothing else runs.
 """
@@ -46,16 +47,15 @@ def run(options: Options, console: Console) -> None:
     grasp = held_grasp(robot, scene.objects)
     grasp = State(**{f.name: getattr(grasp, f.name).expand(options.num_envs, -1).contiguous() for f in fields(State)})
     pools = sorted({1, min(2, usable_cores()), min(usable_cores(), options.num_envs)})
-    columns = ["engine", "device", "bare", "raw", *(f"{n} process{'es' * (n > 1)} (of raw)" for n in pools), "held"]
+    columns = ["engine", "device", "bare", "raw", "forces", *(f"{n} process{'es' * (n > 1)} (of raw, of forces)" for n in pools), "held"]
     table = Table(*columns, title=f"physics: control steps per second, {options.robot}, {options.num_envs} worlds")
     for name, device in engines(options, console):
         if issubclass(backend_class(name), PoolBackend):
             table.add_row(name, device, *_pooled(name, scene, grasp, pools, options.seconds))
         else:
             bare, wrapped, held = _batched(name, scene, grasp, device, options.seconds)
-            table.add_row(
-                name, device, f"{bare:,.0f}", "", f"{wrapped:,.0f} ({wrapped / bare:.2f} of bare)", *[""] * (len(pools) - 1), held
-            )
+            cells = ["", "", f"{wrapped:,.0f} ({wrapped / bare:.2f} of bare)", *[""] * (len(pools) - 1)]
+            table.add_row(name, device, f"{bare:,.0f}", *cells, held)
     console.print(table)
 
 
@@ -84,10 +84,13 @@ def _pooled(name: str, scene: SceneSpec, grasp: State, pools: list[int], seconds
     backends = [make_backend(name, scene, n, workers=workers) for workers in pools]
     rates: list[list[float]] = []
     try:
-        loops = [_LOOPS.get(name, _world_loop)(world, grasp.joint_target[i].double().numpy(), scene) for i, world in enumerate(worlds)]
+        loops = [
+            [_LOOPS.get(name, _world_loop)(world, grasp.joint_target[i].double().numpy(), scene, forces) for i, world in enumerate(worlds)]
+            for forces in (False, True)
+        ]
 
-        def raw() -> None:
-            for loop in loops:
+        def raw(forces: bool = False) -> None:
+            for loop in loops[forces]:
                 loop()
 
         end = time.perf_counter() + seconds * (2 + len(pools))
@@ -99,14 +102,16 @@ def _pooled(name: str, scene: SceneSpec, grasp: State, pools: list[int], seconds
                     raw()
                 for backend in backends:
                     _start(backend, grasp)
-            turn = [_seconds_within(*_step_function(name, worlds[0]), lambda: _repeat(raw)), seconds_of(lambda: _repeat(raw))]
+            turn = [_seconds_within(*_step_function(name, worlds[0]), lambda: _repeat(raw))]
+            turn += [seconds_of(lambda: _repeat(raw)), seconds_of(lambda: _repeat(lambda: raw(forces=True)))]
             turn += [seconds_of(lambda b=backend: _repeat(lambda: _control_step(b, grasp))) for backend in backends]
             rates.append([n * _BURST / spent for spent in turn])
         measured = np.array(rates)
-        shares = np.median(measured[:, 2:] / measured[:, 1:2], axis=0) / pools
-        bare, plain, *wrapped = np.median(measured, axis=0)
-        cells = [f"{value:,.0f} ({share:.2f})" for value, share in zip(wrapped, shares, strict=True)]
-        return [f"{bare:,.0f}", f"{plain:,.0f}", *cells, _held(backends[-1], grasp)]
+        shares = [np.median(measured[:, 3:] / measured[:, [i]], axis=0) / pools for i in (1, 2)]
+        rate_of = np.median(measured, axis=0)
+        plain = [f"{value:,.0f}" for value in rate_of[:3]]
+        wrapped = [f"{value:,.0f} ({a:.2f}, {b:.2f})" for value, a, b in zip(rate_of[3:], *shares, strict=True)]
+        return [*plain, *wrapped, _held(backends[-1], grasp)]
     finally:
         for thing in (*worlds, *backends):
             thing.close()
@@ -146,7 +151,7 @@ def _seconds_within(owner: Any, name: str, action: Callable[[], object]) -> floa
 # The loops that a user would write --------------------------------------------------------------------------------------------------------
 
 
-def _mujoco_loop(world: Any, targets: np.ndarray, scene: SceneSpec) -> Callable[[], object]:
+def _mujoco_loop(world: Any, targets: np.ndarray, scene: SceneSpec, forces: bool) -> Callable[[], object]:
     import mujoco
 
     model, data = world._model, world._data
@@ -154,12 +159,16 @@ def _mujoco_loop(world: Any, targets: np.ndarray, scene: SceneSpec) -> Callable[
     def loop() -> object:
         data.ctrl[:] = targets
         mujoco.mj_step(model, data, scene.substeps)
-        return data.qpos.copy(), data.qvel.copy()
+        if forces:
+            world._option.disableflags = world._sensing
+            mujoco.mj_sensorAcc(model, data)
+            world._option.disableflags = world._silent
+        return data.qpos.copy(), data.qvel.copy(), world.contacts() if forces else None
 
     return loop
 
 
-def _pybullet_loop(world: Any, targets: np.ndarray, scene: SceneSpec) -> Callable[[], object]:
+def _pybullet_loop(world: Any, targets: np.ndarray, scene: SceneSpec, forces: bool) -> Callable[[], object]:
     p, client, drives = world._p, world._client, world._drives
     robot, thing, joints = world._robot.body, world._object.body, drives._links
     weight = [0.0, 0.0, -GRAVITY * scene.objects[0].mass]
@@ -174,12 +183,16 @@ def _pybullet_loop(world: Any, targets: np.ndarray, scene: SceneSpec) -> Callabl
         states = p.getJointStates(robot, joints, physicsClientId=client)
         joint_pos, joint_vel = np.array([s[0] for s in states]), np.array([s[1] for s in states])
         pose = p.getBasePositionAndOrientation(thing, physicsClientId=client)
-        return joint_pos, joint_vel, pose, p.getBaseVelocity(thing, physicsClientId=client)
+        world._fresh = False
+        velocity = p.getBaseVelocity(thing, physicsClientId=client)
+        return joint_pos, joint_vel, pose, velocity, world.contacts() if forces else None
 
     return loop
 
 
-def _sapien_loop(world: Any, targets: np.ndarray, scene: SceneSpec) -> Callable[[], object]:
+def _sapien_loop(world: Any, targets: np.ndarray, scene: SceneSpec, forces: bool) -> Callable[[], object]:
+    from xreset.backends.sapien import _Motion
+
     thing, joints = world._object, world._joints
     articulation, drives, brakes = joints._articulation, joints._drives, joints._loss.any()
     weight, nothing = np.array([0.0, 0.0, -GRAVITY * scene.objects[0].mass]), np.zeros(3)
@@ -187,29 +200,33 @@ def _sapien_loop(world: Any, targets: np.ndarray, scene: SceneSpec) -> Callable[
     def loop() -> object:
         for joint, target in zip(drives, targets, strict=True):
             joint.set_drive_target(target)
-        for _ in range(scene.substeps):
+        for remaining in reversed(range(scene.substeps)):
             if brakes:
                 joints.brake()
             thing.add_force_torque(weight, nothing)
+            if forces and not remaining:
+                start = _Motion(thing.linear_velocity, thing.angular_velocity, thing.entity_pose.q)
+                world._last_step = start, weight, nothing
             world._system.step()  # set_state makes a new one
         pose = thing.entity_pose
-        return articulation.qpos, articulation.qvel, pose.p, pose.q, thing.linear_velocity, thing.angular_velocity
+        read = articulation.qpos, articulation.qvel, pose.p, pose.q, thing.linear_velocity, thing.angular_velocity
+        return read, world.contacts() if forces else None
 
     return loop
 
 
-def _world_loop(world: World, targets: np.ndarray, scene: SceneSpec) -> Callable[[], object]:
+def _world_loop(world: World, targets: np.ndarray, scene: SceneSpec, forces: bool) -> Callable[[], object]:
     """Of an engine that is not known here."""
 
     def loop() -> object:
         world.set_joint_targets(targets)
         world.step(scene.substeps)
-        return world.get_state()
+        return world.get_state(), world.contacts() if forces else None
 
     return loop
 
 
-_LOOPS: dict[str, Callable[[Any, np.ndarray, SceneSpec], Callable[[], object]]] = {
+_LOOPS: dict[str, Callable[[Any, np.ndarray, SceneSpec, bool], Callable[[], object]]] = {
     "mujoco": _mujoco_loop,
     "pybullet": _pybullet_loop,
     "sapien": _sapien_loop,

@@ -571,6 +571,7 @@ class Harness(unittest.TestCase):
             self.assertIn("no check failed", out.getvalue())
             data = json.loads(file.read_text())
             self.assertEqual(data["schema"], "xreset-conformance/2")
+            self.assertEqual(data["command"], "xreset conformance --backend mujoco --check free_fall")
             self.assertEqual([c["verdict"] for c in data["runs"][0]["checks"]], ["passed"])
             broken = Measure(what="x", measured=float("nan"), tolerance=1.0)
             check = next(check for check in CHECKS if check.name == "free_fall")

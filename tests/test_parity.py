@@ -488,7 +488,7 @@ class Command(unittest.TestCase):
                 mock.patch("xreset.backends.parity.trials.engine", lambda name, made=made, **_: made),
                 mock.patch("xreset.backends.parity.compare.engine", lambda name: good),
             ):
-                text, found = self.run_command(path, "--backend", "pybullet", "--grasps", 3, "--json", out)
+                text, found = self.run_command(path, "--backend", "pybullet", "--grasps", 2, "--json", out)
             self.assertEqual(found, code)
             self.assertIn("press, fingertip", text)
             self.assertIn("missed: pybullet: press, total" if code else "all targets met", text)
@@ -503,7 +503,7 @@ class Command(unittest.TestCase):
             ("for the robot 'ur7e-sharpa'", [path, "--robot", "openarm"]),
         ):
             with self.subTest(said):
-                text, code = self.run_command(*words)
+                text, code = self.run_command(*words, "--backend", "mujoco")
                 self.assertEqual(code, 1)
                 self.assertIn("xreset parity:", text)
                 self.assertIn(said, text)

@@ -4,6 +4,7 @@ from xreset.retarget.pipeline import retarget, write_retargeted
 trajectories = retarget(demos, robot, objects)      # hand, then arm, then validity of every frame
 trajectories.joint_pos[trajectories.valid]          # robot states that may become resets
 
-Modules: ``pipeline`` (the whole), ``hand`` with ``hand_model``, ``terms``, ``balls`` and ``chain``, ``arm`` with ``collision``,
-``surface`` (the object), ``validity``, ``file``, ``partial`` (stop and continue), ``picture``.
+Modules: ``pipeline`` (the whole); ``hand`` (the solver) with ``hand_config``, ``problem``, ``hand_model``, ``cost``, ``terms``,
+``clearance``, ``balls`` and ``chain``; ``arm`` with ``collision``; ``surface`` and ``fields`` (the object); ``validity``, ``file``,
+``partial`` (stop and continue), ``picture``.
 """

@@ -747,7 +747,7 @@ class StopAndContinueTest(unittest.TestCase):
             with (
                 contextlib.redirect_stdout(text),
                 mock.patch.object(pipeline_module, "_solve", counted),
-                mock.patch.object(pipeline_module, "RetargetConfig", lambda: self.CONFIG),
+                mock.patch.object(pipeline_module, "RetargetConfig", lambda **_: self.CONFIG),
                 contextlib.ExitStack() as stack,
             ):
                 if stop_in is not None:

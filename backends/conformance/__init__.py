@@ -104,7 +104,7 @@ def _run_one(check: Check, bench: Bench) -> CheckResult:
 
 
 def _lacking(check: Check, bench: Bench) -> set[str]:
-    return set(check.capabilities) - bench.backend().capabilities
+    return {*check.capabilities} - {*bench.backend().capabilities}
 
 
 def _known(check: Check, measure: Measure, bench: Bench) -> KnownDifference | None:

@@ -88,12 +88,13 @@ def run_lstm(lstm: nn.LSTM, x: Tensor, keep: Tensor, state: LstmState, *, bfloat
         return torch.cat(out), (h, c)
     low = torch.bfloat16 if bfloat16 else x.dtype
     padding = (0, -x.shape[-1] % 8)
-    inputs = nn.functional.linear(nn.functional.pad(x, padding).to(low), nn.functional.pad(lstm.weight_ih_l0, padding).to(low)).to(x.dtype)
-    recurrent = lstm.weight_hh_l0.to(low)
+    weight, recurrent, bias, recurrent_bias = lstm.all_weights[0]
+    inputs = nn.functional.linear(nn.functional.pad(x, padding).to(low), nn.functional.pad(weight, padding).to(low)).to(x.dtype)
+    recurrent = recurrent.to(low)
     h, c = h[0], c[0]
     for step, kept in zip(inputs, keep.to(h.dtype)[..., None], strict=True):
         gates = nn.functional.linear((h * kept).to(low), recurrent).to(x.dtype)
-        h, c, _ = torch.ops.aten._thnn_fused_lstm_cell(step, gates, c * kept, lstm.bias_ih_l0, lstm.bias_hh_l0)
+        h, c, _ = torch.ops.aten._thnn_fused_lstm_cell(step, gates, c * kept, bias, recurrent_bias)
         out.append(h)
     return torch.stack(out), (h[None], c[None])
 
@@ -189,16 +190,15 @@ class PointNetLstmModel(MLPModel):
 
     def _embed(self, cloud: Tensor) -> Tensor:
         """[N, H, embedding] embeddings of the histories [N, H, P, 3] that an environment shows in a rollout."""
-        if not self.reuse_embeddings:
-            return self.trunk.pointnet(cloud)
-        if self._embeddings is None:
-            self._embeddings = self.trunk.pointnet(cloud)
+        known, began = self._embeddings, self._began
+        if known is None or not self.reuse_embeddings:
+            embeddings = self.trunk.pointnet(cloud)
         else:
             newest = self.trunk.pointnet(cloud[:, -1:])
-            shifted = torch.cat((self._embeddings[:, 1:], newest), dim=1)
-            self._embeddings = shifted if self._began is None else torch.where(self._began[:, None, None], newest, shifted)
-        self._began = None
-        return self._embeddings
+            shifted = torch.cat((known[:, 1:], newest), dim=1)
+            embeddings = shifted if began is None else torch.where(began[:, None, None], newest, shifted)
+        self._embeddings, self._began = embeddings, None
+        return embeddings
 
     def reset(self, dones: Tensor | None = None, hidden_state: HiddenState = None) -> None:
         """Forget everything, take over a state, or zero the state of worlds whose episode has ended ([N] bool or 0/1)."""

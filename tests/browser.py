@@ -106,11 +106,19 @@ class Browser:
         self.send("Input.insertText", text=text)
 
     def click(self, element: str) -> None:
-        """Click the middle of the element that a JavaScript expression gives."""
-        x, y = self.evaluate(
+        """Click the middle of the element that a JavaScript expression gives, once it stays where it is and nothing covers it."""
+        at = (
             f"(e => {{ e.scrollIntoView({{block: 'center'}}); const r = e.getBoundingClientRect();"
-            f" return [r.x + r.width / 2, r.y + r.height / 2]; }})({element})"
+            " const x = r.x + r.width / 2, y = r.y + r.height / 2, top = document.elementFromPoint(x, y);"
+            f" return [x, y, !!top && (e.contains(top) || top.contains(e))]; }})({element})"
         )
+
+        def still() -> list[float] | None:
+            first = self.evaluate(at)
+            time.sleep(0.1)
+            return first if first[2] and self.evaluate(at) == first else None
+
+        x, y, _ = wait_until(still, f"{element} to stay where it is")
         for kind in ("mousePressed", "mouseReleased"):
             self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
 

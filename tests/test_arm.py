@@ -210,9 +210,9 @@ class WritePlacementTest(unittest.TestCase):
     def test_the_figure_is_no_part_of_the_fingerprint(self):
         before = load(self.folder)
         stated = dataclasses.replace(before, placement=None).fingerprint
-        self.file.write_text(
-            self.file.read_text().replace("[base]", "[base]\nplacement = { reached = 0.5, followed = 0.4, frames = 3, command = 'x' }", 1)
-        )
+        lines = [line for line in self.file.read_text().splitlines() if not line.startswith("placement")]
+        lines.insert(lines.index("[base]") + 1, "placement = { reached = 0.5, followed = 0.4, frames = 3, command = 'x' }")
+        self.file.write_text("\n".join(lines))
         self.assertEqual(load(self.folder).fingerprint, stated)
         findings = [finding.message for finding in check_description(self.folder)[1] if finding.topic == "placement"]
         self.assertEqual(findings, ["reaches 50.0% and follows 40.0% of 3 frames, says robot.toml: x"])

@@ -71,7 +71,7 @@ def draw_stages(ax: Axes, summaries: Summaries) -> None:
         ax.bar_label(bars, fmt="%.0f", fontsize="small", padding=1)
     ax.set_xticks(range(len(STAGES)), [label for _, label in STAGES])
     _percent(ax, "y")
-    ax.set_ylabel("episodes that reach the stage")
+    ax.set_ylabel("episodes")
 
 
 def draw_objects(ax: Axes, summaries: Summaries) -> None:

@@ -64,6 +64,7 @@ def parity(
             motion, robot=robot, objects_folder=objects, only=only,
             progress=lambda doing, done, total: bar.update(task, description=doing, completed=done, total=total),
         )  # fmt: skip
+        inputs = {"motion": file_hash(motion)}  # now: after minutes of work the file may be another, or gone
         result = compare(
             spec, loaded, frames, engines, grasps=grasps,
             progress=lambda doing, done, total: bar.update(task, description=doing, completed=done, total=total),
@@ -74,7 +75,7 @@ def parity(
             console.print(f"{tested.engine.name}: {tested.broken} worlds were not finite or dropped contacts", style="bold red")
     if json is not None:
         command = _command(motion, robot, objects, only, backend, grasps, device)
-        write_json(json, result.as_dict() | {"xreset_version": __version__, "command": command, "inputs": {"motion": file_hash(motion)}})
+        write_json(json, result.as_dict() | {"xreset_version": __version__, "command": command, "inputs": inputs})
         console.print(f"wrote {json}", markup=False)
     missed = [f"{tested.engine.name}: {metric.name}" for tested in result.engines for metric in tested.metrics if not metric.ok]
     console.print(

@@ -7,6 +7,9 @@ the points that were the maximum of a channel: no other point has a gradient.
 Letters: F clouds, P points, A, B, C widths of the three layers. :class:`xreset.learning.model.PointNet` is the reference.
 """
 
+# Triton takes plain numbers for its constants; a type checker sees the kernels' own declarations.
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 import functools

@@ -1,7 +1,7 @@
 """The cost of hand retargeting over whole trajectories, and its Gauss-Newton approximation.
 
     sum over frames of  bone vectors and directions + keypoints + contact + clearance (+ touch)
-    + sum over neighbouring frames of  joint and root smoothness, and a wall against joint jumps
+    + sum over neighbouring frames of  joint and root smoothness, and a wall against joint jumps (+ hold)
 
 Shape letters: S sequences padded to T frames, B frames of a chunk, P mapped keypoints, C pairs of keypoints, n = J + 6 variables.
 """
@@ -17,6 +17,7 @@ from xreset.retarget import terms
 from xreset.retarget.clearance import Distances, Objects, not_touching, too_near
 from xreset.retarget.hand_config import HandConfig
 from xreset.retarget.hand_model import HandModel
+from xreset.retarget.hold import hold
 from xreset.retarget.problem import HandState, HandTargets
 from xreset.rotations import quat_conjugate, quat_multiply, quat_to_axis_angle
 
@@ -56,10 +57,15 @@ def system(model: HandModel, targets: HandTargets, config: HandConfig, state: Ha
             whole[part] = value.view(whole[part].shape)
 
     change, gradient_by_change, curvature = terms.change(_changes(state), *_change_weights(model, config))
+    by_later, by_earlier = gradient_by_change, -gradient_by_change
+    if config.hold_weight:
+        held = hold(targets, model.tip_joints, state, config.hold_weight, config.length_scale)
+        change, curvature = change + held.cost, curvature + held.curvature
+        by_later, by_earlier = by_later + held.later, by_earlier + held.earlier
     diagonal.diagonal(dim1=-2, dim2=-1)[:, 1:] += curvature
     diagonal.diagonal(dim1=-2, dim2=-1)[:, :-1] += curvature
-    gradient[:, 1:] += gradient_by_change
-    gradient[:, :-1] -= gradient_by_change
+    gradient[:, 1:] += by_later
+    gradient[:, :-1] += by_earlier
     return System(cost=cost.sum(1) + change.sum(1), diagonal=diagonal, coupling=-curvature, gradient=gradient)
 
 

@@ -21,6 +21,7 @@ from xreset.retarget.cost import System, system
 from xreset.retarget.hand_config import HandConfig
 from xreset.retarget.hand_model import HandModel
 from xreset.retarget.problem import HandState, HandTargets
+from xreset.retarget.scale import hand_scale, resized
 from xreset.rotations import matrix_to_quat, quat_from_axis_angle, quat_multiply, quat_normalize
 
 __all__ = ["HandConfig", "HandMotion", "HandTargets", "retarget_hand"]
@@ -64,6 +65,9 @@ def retarget_hand(
     """
     config, home = config or HandConfig(), targets.keypoints.device
     targets = targets.to(model.device)
+    if config.user_scale:
+        scale = hand_scale(model, targets.keypoints, targets.annotated)
+        targets = replace(targets, keypoints=resized(targets.keypoints, scale, model.names))
     sequences, frames = targets.annotated.shape
     root_pos, root_quat = _align_root(model, targets)
     state = HandState(model.kinematics.clamp(model.home).expand(sequences, frames, -1), root_pos, root_quat)
@@ -114,9 +118,7 @@ def _chosen(first: Tensor, yes: _Batch, no: _Batch) -> _Batch:
 
 def _align_root(model: HandModel, targets: HandTargets) -> tuple[Tensor, Tensor]:
     """First guess of the root: the rigid motion that carries the hand's keypoints at home onto the human's (Kabsch's method)."""
-    human = targets.keypoints
-    identity = human.new_tensor([1.0, 0, 0, 0])
-    at_home = model.keypoints(model.kinematics.clamp(model.home), human.new_zeros(3), identity)  # [P, 3]
+    human, at_home = targets.keypoints, model.at_home
     centre_home, centre_human = at_home.mean(0), human.mean(-2, keepdim=True)
     U, _, Vt = torch.linalg.svd((human - centre_human).mT @ (at_home - centre_home))
     flip = human.new_ones(*U.shape[:-2], 3)

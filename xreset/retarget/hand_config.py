@@ -37,6 +37,11 @@ class HandConfig:
     """Distance from the object to a fingertip's shape, beyond ``touch_gap``, where the human's touches (not the paper's); 0: off."""
     touch_gap: float = 0.001
     """Distance between a fingertip's shape and the object that counts as touching [m]."""
+    user_scale: bool = False
+    """Whether each user's hand is first enlarged (or shrunk) to the robot's size, every finger about its own tip (not the paper's)."""
+    hold_weight: float = 0.0
+    """Change between neighbouring frames of the posture of fingers that touch in both, and of the hand's pose as the grasped object sees
+    it (not the paper's); 0: off."""
     length_scale: float = 0.10
     """Length that counts as much as one radian [m]: about a finger's length."""
     clearance_growth: tuple[float, ...] = (0.01, 0.1)

@@ -89,6 +89,12 @@ class HandModel:
         """[C, 2] pairs of mapped keypoints whose difference is matched."""
         self.home = torch.as_tensor(robot.home[robot.hand_indices], device=self.device)
         """[J] home configuration of the hand."""
+        upright = self.home.new_tensor([1.0, 0.0, 0.0, 0.0])
+        self.at_home = self.keypoints(self.kinematics.clamp(self.home), self.home.new_zeros(3), upright)
+        """[P, 3] keypoints at home, in the root's frame."""
+        moves = self.kinematics.jacobian(self.home, self.links)
+        self.tip_joints = ((moves.linear != 0) | (moves.angular != 0)).any(dim=-2) & self.is_tip[:, None]
+        """[P, J] joints that move each fingertip; none for other keypoints."""
         self.table = table or TableSpec()
 
         on_cpu = self.kinematics if self.device.type == "cpu" else Kinematics(robot, root=robot.hand_root)  # as coal wants it
@@ -166,13 +172,18 @@ def keypoint_pairs(names: Sequence[str], links: Sequence[str]) -> list[tuple[int
     Works for any subset of the 21 keypoints; pairs on one and the same link say nothing and are left out.
     """
     wrist = [i for i, name in enumerate(names) if name == "wrist"]
-    fingers = [sorted((i for i, name in enumerate(names) if name.startswith(finger)), key=lambda i: names[i]) for finger in FINGERS]
+    fingers = finger_keypoints(names)
     pairs = [pair for finger in fingers for pair in pairwise(wrist + finger)]
     thumb, others = fingers[0], [finger for finger in fingers[1:] if finger]
     for left, right in pairwise(others):
         pairs += [(left[0], right[0]), (left[-1], right[-1])]
     pairs += [(thumb[-1], finger[-1]) for finger in others if thumb]
     return [(a, b) for a, b in dict.fromkeys(pairs) if links[a] != links[b]]
+
+
+def finger_keypoints(names: Sequence[str]) -> list[list[int]]:
+    """Indices of each finger's mapped keypoints, thumb first, from base to tip; empty for a finger that has none."""
+    return [sorted((i for i, name in enumerate(names) if name.startswith(finger)), key=lambda i: names[i]) for finger in FINGERS]
 
 
 def _pose(pos: Tensor, quat: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ from xreset.eval.results import summarize, write_results
 from xreset.eval.rollout import roll_out
 from xreset.files import file_hash, npz_schema
 from xreset.objects import load_objects
+from xreset.policies import shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
 from xreset.resets.bank import ResetBank, check_robot
 from xreset.retarget.pipeline import SCHEMA as RETARGETED
@@ -49,7 +50,9 @@ class Subject:
 
 
 def resolve(policy: str, robot: str | None, seed: int) -> Subject:
-    """Find out what ``RUN | POLICY.onnx | zero | random | ik`` means.
+    """Find out what ``RUN | POLICY.onnx | NAME | zero | random | ik`` means, where NAME is a policy that ships with xreset.
+
+    What lies at a path wins over a shipped policy of that name.
 
     Raises:
         PolicyError: there is no such policy, or it does not fit the robot.
@@ -65,7 +68,7 @@ def resolve(policy: str, robot: str | None, seed: int) -> Subject:
         }
         folder = Path("runs") / f"{policy}-{spec.name}" / "eval"
         return Subject(policy=makers[policy], label=policy, robot=spec, task=TaskConfig(), folder=folder, objects_folder=None, inputs={})
-    path = Path(policy)
+    path, ours = Path(policy), shipped()
     objects_folder = None
     if path.is_dir():
         from xreset.learning.run import read_run
@@ -74,10 +77,13 @@ def resolve(policy: str, robot: str | None, seed: int) -> Subject:
         run = read_run(path)
         file, folder, objects_folder, robot = ensure_policy(path), path / "eval", run.objects, robot or run.robot
         label = path.name
-    elif path.suffix == ".onnx":
+    elif path.suffix == ".onnx" or path.exists():
         file, folder, label = path, path.parent / "eval", path.stem
+    elif policy in ours:
+        file, folder, label = ours[policy], Path("runs") / policy / "eval", policy
     else:
-        raise PolicyError(f"there is no policy {policy!r}: expected a run folder, a .onnx file, or one of {', '.join(BASELINES)}.")
+        known = ", ".join(BASELINES) + (f", or a policy that ships with xreset: {', '.join(ours)}" if ours else "")
+        raise PolicyError(f"there is no policy {policy!r}: expected a run folder, a .onnx file, or one of {known}. Check the name or path.")
     contract = OnnxPolicy(file).contract
     spec = robots.load(robot or contract["robot"])
     task = from_dict(TaskConfig, contract["task"], f"{file}: task")

@@ -15,6 +15,7 @@ import torch
 
 from xreset.files import atomic_write
 from xreset.learning.model import PointNetLstmModel
+from xreset.learning.shrink import drop_exporter_notes
 
 INPUTS = ("flat", "cloud", "h_in", "c_in")
 OUTPUTS = ("actions", "h_out", "c_out")
@@ -56,6 +57,7 @@ def export_onnx(actor: PointNetLstmModel, path: str | Path, contract: dict[str, 
                 verbose=False,
             )
         model = onnx.load(str(file))
+    drop_exporter_notes(model)
     entry = model.metadata_props.add()
     entry.key, entry.value = METADATA_KEY, json.dumps(contract, sort_keys=True)
     with atomic_write(path) as out:

@@ -1,0 +1,188 @@
+"""Policies as files: stored in half the size, and found by the name under which they ship."""
+
+import contextlib
+import json
+import os
+import tempfile
+import unittest
+from importlib.util import find_spec
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, numpy_helper
+from tensordict import TensorDict
+
+from tests.test_cli import run
+from tests.toy_bank import SOUP
+from xreset import policies, robots
+from xreset.demos import synthesize, write_demos
+from xreset.errors import PolicyError
+from xreset.eval.evaluate import resolve
+from xreset.eval.trace.sources import from_policy
+from xreset.learning.export import export_onnx
+from xreset.learning.model import PointNetLstmModel
+from xreset.learning.shrink import shrink
+from xreset.policy import OnnxPolicy, policy_contract
+from xreset.task.config import ObservationConfig, TaskConfig, TerminationConfig
+
+TASK = TaskConfig(
+    observation=ObservationConfig(cloud_history=2, cloud_points=8), termination=TerminationConfig(episode_seconds=0.5), distance_points=32
+)
+GROUPS = {"actor": ["policy", "proprio", "perception"]}
+
+
+class WithPolicy(unittest.TestCase):
+    """An untrained policy of the OpenArm, exported once, in a folder of its own."""
+
+    @classmethod
+    def setUpClass(cls):
+        folder = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(folder.cleanup)
+        cls.folder = Path(folder.name)
+        cls.robot = robots.load("openarm")
+        cls.contract = policy_contract(cls.robot, TASK, (SOUP,))
+        torch.manual_seed(0)
+        cls.model = PointNetLstmModel(
+            cls.observations(2), GROUPS, "actor", len(cls.robot.joints), hidden_dims=[128, 64], pointnet_dims=[64, 32], lstm_dim=128,
+            distribution_cfg={"class_name": "GaussianDistribution", "std_type": "log"},
+        )  # fmt: skip
+        cls.model.update_normalization(cls.observations(50, seed=9))
+        cls.file = cls.folder / "exported.onnx"
+        export_onnx(cls.model, cls.file, cls.contract)
+
+    @classmethod
+    def observations(cls, batch: int, seed: int = 0) -> TensorDict:
+        g = torch.Generator().manual_seed(seed)
+        widths = {group: (sum(terms.values()),) for group, terms in cls.contract["observation_layout"].items()}
+        widths["perception"] = (TASK.observation.cloud_history, TASK.observation.cloud_points, 3)
+        return TensorDict({k: torch.randn(batch, *w, generator=g) for k, w in widths.items()}, batch_size=[batch])
+
+
+class ShrinkTest(WithPolicy):
+    @classmethod
+    def setUpClass(cls):
+        super().setUpClass()
+        cls.small = cls.folder / "small.onnx"
+        shrink(cls.file, cls.small)
+
+    def test_half_the_size_and_the_same_contract(self):
+        self.assertLess(self.small.stat().st_size, 0.56 * self.file.stat().st_size)
+        one, two = OnnxPolicy(self.file), OnnxPolicy(self.small)
+        self.assertEqual((two.contract, two.name), (json.loads(json.dumps(self.contract)), "small"))
+        for side in ("get_inputs", "get_outputs"):
+            found = [[(v.name, v.type, v.shape) for v in getattr(p._session, side)()] for p in (one, two)]
+            self.assertEqual(found[0], found[1])
+
+    def test_matrices_alone_are_rounded(self):
+        model = onnx.load(str(self.small))
+        onnx.checker.check_model(model, full_check=True)
+        kept = {w.name: w for w in onnx.load(str(self.file)).graph.initializer}
+        halved = 0
+        for weights in model.graph.initializer:
+            exact = kept[weights.name.removesuffix("_float16")]
+            matrix = exact.data_type == TensorProto.FLOAT and len(exact.dims) == 2 and min(exact.dims) > 1
+            self.assertEqual(weights.data_type, TensorProto.FLOAT16 if matrix else exact.data_type, weights.name)
+            rounded = numpy_helper.to_array(exact).astype(np.float16) if matrix else numpy_helper.to_array(exact)
+            np.testing.assert_array_equal(numpy_helper.to_array(weights), rounded)
+            halved += matrix
+        self.assertEqual(halved, 2 + 2 + 3)  # PointNet, LSTM, MLP
+
+    def test_it_computes_in_float32_what_the_rounded_weights_say(self):
+        """The same as the trained network with rounded matrices, to the accuracy of float32; not the same as with its own."""
+        small, exact = OnnxPolicy(self.small), {k: v.clone() for k, v in self.model.state_dict().items()}
+        self.addCleanup(self.model.load_state_dict, exact)
+        rounded = {k: v.half().float() if "weight" in k and v.dim() == 2 else v for k, v in exact.items()}
+        self.model.load_state_dict(rounded)
+        self.model.reset()
+        full, apart = OnnxPolicy(self.file), []
+        with torch.no_grad():
+            for t in range(50):
+                obs = self.observations(4, seed=t)
+                found = small.act(obs)
+                torch.testing.assert_close(found, self.model(obs).clamp(-1, 1), atol=1e-5, rtol=0)
+                apart.append(float((found - full.act(obs)).abs().max()))
+        self.assertTrue(1e-5 < max(apart) < 2e-3, max(apart))
+
+    def test_nothing_of_the_exporting_machine_is_in_the_files(self):
+        for file in (self.file, self.small):
+            self.assertNotIn(b".py", file.read_bytes())
+
+    def test_refusals(self):
+        out = self.folder / "none.onnx"
+        with self.assertRaisesRegex(PolicyError, "no weight matrix in float32: it was shrunk before"):
+            shrink(self.small, out)
+        with self.assertRaisesRegex(PolicyError, "no policy file"):
+            shrink(self.folder / "missing.onnx", out)
+        model = onnx.load(str(self.file))
+        weights = next(w for w in model.graph.initializer if w.name == "mlp.0.weight")
+        weights.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weights) * 1e6, weights.name))
+        large = self.folder / "large.onnx"
+        large.write_bytes(model.SerializeToString())
+        with self.assertRaisesRegex(PolicyError, r"weights up to \S+ in mlp\.0\.weight, and float16 ends at 65504"):
+            shrink(large, out)
+        self.assertFalse(out.exists())
+
+    def test_the_command_says_both_sizes_and_may_replace_its_input(self):
+        file = self.folder / "mine.onnx"
+        file.write_bytes(self.file.read_bytes())
+        code, out, _ = run("policies", "shrink", str(file), str(file))
+        self.assertEqual(code, 0)
+        self.assertRegex(out, r"mine\.onnx: 0\.\d\d MB, was 0\.\d\d MB")
+        self.assertEqual(file.read_bytes(), self.small.read_bytes())
+
+
+class ShippedTest(WithPolicy):
+    def setUp(self):
+        """A folder of shipped policies with one in it, and another folder to work in."""
+        here = tempfile.TemporaryDirectory()
+        self.addCleanup(here.cleanup)
+        self.enterContext(contextlib.chdir(here.name))
+        ours = Path(here.name) / "site"
+        ours.mkdir()
+        (ours / "skilled.onnx").write_bytes(self.file.read_bytes())
+        self.enterContext(mock.patch.object(policies, "FOLDER", ours))
+        self.enterContext(mock.patch.dict(os.environ, {"COLUMNS": "200"}))
+
+    def test_a_name_means_the_shipped_file(self):
+        self.assertEqual(list(policies.shipped()), ["skilled"])
+        subject = resolve("skilled", None, 0)
+        self.assertEqual((subject.label, subject.robot.name, subject.folder), ("skilled", "openarm", Path("runs/skilled/eval")))
+        self.assertEqual(subject.task, TASK)
+        self.assertEqual(subject.inputs, resolve(str(self.file), None, 0).inputs)
+
+    def test_what_lies_at_a_path_wins(self):
+        Path("skilled").write_text("mine")
+        with self.assertRaisesRegex(PolicyError, "skilled cannot be read as an ONNX policy"):
+            resolve("skilled", None, 0)
+
+    def test_an_unknown_name_lists_those_that_ship(self):
+        expected = "no policy 'skiled': expected a run folder, a .onnx file, or one of zero, random, ik"
+        for command in (("eval",), ("attribute", "--towards", "pybullet")):
+            code, _, err = run(command[0], "skiled", "--demos", "x.npz", *command[1:])
+            self.assertEqual(code, 1)
+            self.assertIn(f"{expected}, or a policy that ships with xreset: skilled. Check the name or path.", err)
+        next(policies.FOLDER.iterdir()).unlink()
+        with self.assertRaisesRegex(PolicyError, f"{expected}. Check"):
+            resolve("skiled", None, 0)
+
+    @unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
+    def test_it_is_evaluated_traced_and_reported_by_name(self):
+        write_demos("demos.npz", synthesize([SOUP], 1))
+        self.assertEqual(run("eval", "skilled", "--demos", "demos.npz", "--episodes", "1")[0], 0)
+        self.assertEqual(json.loads(Path("runs/skilled/eval/mujoco.json").read_text())["policy"], "skilled")
+        code, out, err = run("report", "skilled")
+        self.assertEqual((code, err), (0, ""))
+        self.assertTrue(Path("runs/skilled/report/index.html").is_file(), out)
+        with mock.patch("xreset.eval.trace.sources.play_policy") as play:
+            from_policy(
+                "skilled", Path("demos.npz"), mock.Mock(), object_name=None, episode=0, repetition=0, robot=None, objects=None, seed=0,
+                progress=lambda done, total: None,
+            )  # fmt: skip
+        self.assertEqual(play.call_args.args[0].name, "skilled")
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,27 @@
+"""``xreset policies``: exported policies as files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def shrink(policy: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, tyro.conf.Positional]) -> None:
+    """Store a policy's weights in float16, which halves the file; they are computed with in float32 as before.
+
+    Args:
+        policy: Exported policy (.onnx).
+        out: File to write.
+    """
+    from rich.console import Console
+
+    from xreset.learning.shrink import shrink as write_shrunk
+
+    before = policy.stat().st_size if policy.is_file() else 0
+    write_shrunk(policy, out)
+    Console().print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, was {before / 1e6:.2f} MB", markup=False, highlight=False, soft_wrap=True)
+
+
+COMMAND = {"shrink": shrink}

@@ -27,8 +27,10 @@ except ImportError as error:
 
 from xreset.backends import mujoco_warp_kernels as kernels
 from xreset.backends.mjcf import KNOWN_DIFFERENCES, MIN_FRICTION, MujocoSettings, compile_scene
+from xreset.backends.mujoco_warp_depth import correct_depths
 
 wp.config.log_level = wp.LOG_WARNING  # else a line for each of some hundred kernels; what a user needs to know is announced below
+correct_depths()
 
 _SET_PER_WORLD = (
     "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "body_gravcomp", "geom_friction",

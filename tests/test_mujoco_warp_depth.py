@@ -1,0 +1,68 @@
+"""Contacts of MuJoCo-Warp against MuJoCo's: as many, and as deep, where shapes lie across an edge."""
+
+from __future__ import annotations
+
+import unittest
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import trimesh
+import warp as wp
+
+from xreset.backends.mujoco_warp import MujocoWarpBackend
+
+WORLDS = 200
+
+
+def across_an_edge() -> mujoco.MjModel:
+    """A free capsule, and a can as a mesh of 24 faces around, whose edges it can lie across."""
+    can = trimesh.creation.cylinder(0.033, 0.1, sections=24)
+    spec = mujoco.MjSpec()
+    spec.add_mesh(
+        name="can", uservert=can.vertices.ravel(), userface=can.faces.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    )
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="can")
+    body = spec.worldbody.add_body()
+    body.add_freejoint()
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=(0.009, 0.02, 0.0), mass=0.1)
+    return spec.compile()
+
+
+def poses(rng: np.random.Generator) -> np.ndarray:
+    """[N, 7] the capsule beside the can, up to 1 mm deep and inclined by some hundredths, as fingertips are."""
+    out = np.zeros((WORLDS, 7), dtype=np.float32)
+    azimuth, radius = rng.uniform(0, 2 * np.pi, WORLDS), 0.033 + 0.009 - rng.uniform(0.0, 1e-3, WORLDS)
+    out[:, 0], out[:, 1] = radius * np.cos(azimuth), radius * np.sin(azimuth)
+    out[:, 2] = rng.uniform(-0.03, 0.03, WORLDS)
+    out[:, 3] = 1.0
+    out[:, 4:] = rng.uniform(-0.04, 0.04, (WORLDS, 3))
+    out[:, 3:] /= np.linalg.norm(out[:, 3:], axis=1, keepdims=True)
+    return out
+
+
+class Depth(unittest.TestCase):
+    def test_contacts_that_were_clipped_to_one_are_as_deep_as_in_mujoco(self):
+        self.assertIn("cpu", MujocoWarpBackend.devices())  # the backend is loaded: tested is the engine as it leaves it
+        model, qpos = across_an_edge(), poses(np.random.default_rng(0))
+        with wp.ScopedDevice("cpu"):
+            m, d = mjw.put_model(model), mjw.make_data(model, nworld=WORLDS, nconmax=8, njmax=32)
+            d.qpos = wp.array(qpos, dtype=float)
+            for stage in (mjw.kinematics, mjw.com_pos, mjw.collision):
+                stage(m, d)
+        found = int(d.nacon.numpy()[0])
+        world, dist = d.contact.worldid.numpy()[:found], d.contact.dist.numpy()[:found]
+
+        data, elsewhere = mujoco.MjData(model), 0
+        for i in range(WORLDS):
+            data.qpos[:] = qpos[i]
+            mujoco.mj_forward(model, data)
+            expected = np.sort(data.contact.dist)
+            np.testing.assert_allclose(np.sort(dist[world == i]), expected, atol=2e-6, err_msg=f"pose {qpos[i]}")
+            deepest = mujoco.mj_geomDistance(model, data, 0, 1, 1.0, None)
+            elsewhere += len(expected) == 1 and expected[0] > deepest + 2e-5
+        self.assertGreater(elsewhere, 10, "the deepest point must often be elsewhere, or this shows nothing")
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -34,7 +34,7 @@ class MujocoWorld(World):
     """One world in MuJoCo.
 
     The engine's step has two halves: what follows from positions and velocities (``mj_step1``: kinematics, contacts), and forces and
-    motion (``mj_step2``). The first half of the next step is always done in advance, so links are up to date at no cost.
+    motion (``mj_step2``). When links are asked for, the first half of the next step is done in advance, so they are up to date at no cost.
     """
 
     def __init__(self, scene: SceneSpec, object_index: int, *, settings: MujocoSettings = _DEFAULTS) -> None:
@@ -48,14 +48,18 @@ class MujocoWorld(World):
         self._option = self._model.opt
         self._silent = self._option.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR
         self._sensing = self._option.disableflags
-        self._option.disableflags = self._silent  # sensors are read once per step(), not computed in each physics step
-        self._stale = False  # whether a parameter has changed since the first half of the next step was done
+        self._option.disableflags = self._silent  # sensors are read when they are asked for, not computed in each physics step
+        self._ahead = False  # whether the first half of the next step is done, with the present parameters
+        self._links_sensed = self._contacts_sensed = False
         self._overflowed, self._overflows = False, 0
 
         # Views of the engine's own memory, which stays where it is: making one costs as much as reading it.
         data, links = self._data, len(self._at.link_body)
         self._ctrl, self._qpos, self._qvel = data.ctrl, data.qpos, data.qvel
-        self._wrench = data.xfrc_applied[self._at.object_body]
+        at, q, v = self._at, self._qpos, self._qvel
+        self._wrench = data.xfrc_applied[at.object_body]
+        self._object_pos, self._object_quat = q[at.object_qpos : at.object_qpos + 3], q[at.object_qpos + 3 : at.object_qpos + 7]
+        self._object_linvel, self._object_spin = v[at.object_dof : at.object_dof + 3], v[at.object_dof + 3 : at.object_dof + 6]
         sizes = np.cumsum((3 * links, 4 * links, 3 * links, 3 * links, 3))
         pos, quat, linvel, angvel, self._table_force, tip_forces = np.split(data.sensordata, sizes)
         self._links = pos.reshape(-1, 3), quat.reshape(-1, 4), linvel.reshape(-1, 3), angvel.reshape(-1, 3)
@@ -80,20 +84,19 @@ class MujocoWorld(World):
         q[at.object_qpos + 3 : at.object_qpos + 7] = quat
         v[at.object_dof : at.object_dof + 3] = state["object_linvel"]
         v[at.object_dof + 3 : at.object_dof + 6] = _rotate_inverse(quat, state["object_angvel"])
-        self._begin_next_step()
+        self._ahead, self._links_sensed = False, False
+        self._contacts_sensed = True  # resetting has made them zero
 
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
-        at, q, v = self._at, self._qpos, self._qvel
-        quat = q[at.object_qpos + 3 : at.object_qpos + 7].copy()
         return {
-            "joint_pos": q[at.joint_qpos],
-            "joint_vel": v[at.joint_dof],
-            "joint_target": self._ctrl.copy(),
-            "object_pos": q[at.object_qpos : at.object_qpos + 3].copy(),
-            "object_quat": quat,
-            "object_linvel": v[at.object_dof : at.object_dof + 3].copy(),
-            "object_angvel": _rotate(quat, v[at.object_dof + 3 : at.object_dof + 6]),  # a free joint's is in the body's frame
+            "joint_pos": self._qpos.take(self._at.joint_qpos),
+            "joint_vel": self._qvel.take(self._at.joint_dof),
+            "joint_target": self._ctrl,
+            "object_pos": self._object_pos,
+            "object_quat": self._object_quat,
+            "object_linvel": self._object_linvel,
+            "object_angvel": _rotate(self._object_quat, self._object_spin),  # a free joint's is in the body's frame
         }
 
     def set_joint_targets(self, targets: np.ndarray) -> None:
@@ -102,23 +105,26 @@ class MujocoWorld(World):
 
     def step(self, n: int) -> None:
         """See :meth:`World.step`."""
-        if self._stale:
-            mujoco.mj_step1(self._model, self._data)
-        mujoco.mj_step2(self._model, self._data)
-        if n > 1:
-            mujoco.mj_step(self._model, self._data, n - 1)
+        if self._ahead:
+            mujoco.mj_step2(self._model, self._data)
+            n -= 1
+        if n:
+            mujoco.mj_step(self._model, self._data, n)
+        self._ahead = self._links_sensed = self._contacts_sensed = False
         before, self._overflows = self._overflows, sum(warning.number for warning in self._full)
         self._overflowed = self._overflows > before
-        self._option.disableflags = self._sensing
-        mujoco.mj_sensorAcc(self._model, self._data)  # while the contacts are those of the last step
-        self._begin_next_step()
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.links`."""
+        if not self._links_sensed:
+            self._sense_contacts()  # while the engine's contacts are those of the last step
+            self._begin_next_step()
+            self._links_sensed = True
         return self._links
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.contacts`."""
+        self._sense_contacts()
         tip_force = self._sum_by_tip @ self._geom_forces
         # A contact in which no force acts is no touch.
         return tip_force, tip_force.any(axis=1), -self._table_force
@@ -145,29 +151,36 @@ class MujocoWorld(World):
         model.body_inertia[body] = ratio * nominal.body_inertia[body]
         model.body_invweight0[body] = nominal.body_invweight0[body] / ratio  # of a free body: the inverse of mass and inertia
         model.dof_invweight0[dofs] = nominal.dof_invweight0[dofs] / ratio
-        self._stale = True
+        self._ahead = False
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
         pairs = np.maximum((*friction, 0.0), MIN_FRICTION)
         self._model.geom_friction[:, 0] = pairs[self._at.friction_column]
-        self._stale = True
+        self._ahead = False
 
     def set_object_gravity(self, fraction: float) -> None:
         """See :meth:`World.set_object_gravity`."""
         self._model.body_gravcomp[self._at.object_body] = 1.0 - fraction
-        self._stale = True
+        self._ahead = False
 
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
         """See :meth:`World.set_object_wrench`."""
         self._wrench[:3], self._wrench[3:] = force, torque
 
     def _begin_next_step(self) -> None:
-        """Do the first half of the next step, and read the links; contact forces stay those of the last step."""
+        """Do the first half of the next step, which also senses the links; what was sensed of contacts stays that of the last step."""
         self._option.disableflags = self._sensing
         mujoco.mj_step1(self._model, self._data)
         self._option.disableflags = self._silent
-        self._stale = False
+        self._ahead = True
+
+    def _sense_contacts(self) -> None:
+        if not self._contacts_sensed:
+            self._option.disableflags = self._sensing
+            mujoco.mj_sensorAcc(self._model, self._data)
+            self._option.disableflags = self._silent
+            self._contacts_sensed = True
 
 
 class MujocoBackend(PoolBackend):

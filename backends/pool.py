@@ -43,7 +43,8 @@ class World(ABC):
     """One world of a scene in one process. Arrays are numpy float64; conventions are those of :class:`~xreset.backends.base.Backend`.
 
     The state is undefined until :meth:`set_state`, which the pool calls first. A world that reports a non-finite state is not stepped
-    again before its state is set.
+    again before its state is set. :meth:`links` and :meth:`contacts` are called where somebody wants them, in any order, and before a
+    parameter changes.
     """
 
     @abstractmethod
@@ -56,7 +57,10 @@ class World(ABC):
 
     @abstractmethod
     def get_state(self) -> dict[str, np.ndarray]:
-        """Every field of :class:`~xreset.backends.base.State`."""
+        """Every field of :class:`~xreset.backends.base.State`.
+
+        They may be views of the engine's memory, which the next call that changes the world overwrites.
+        """
 
     @abstractmethod
     def set_joint_targets(self, targets: np.ndarray) -> None:
@@ -112,7 +116,9 @@ class PoolBackend(Backend):
     """N worlds of a CPU engine, spread over worker processes.
 
     A subclass sets ``name``, ``capabilities`` and ``world_class`` and says its engine's version. Getters return views of shared memory.
-    One :meth:`step` is one round trip to each worker, after which every getter is free.
+
+    One :meth:`step` is one round trip to each worker, after which state and health are there. Links and contacts cost time to read, so a
+    step brings those that were asked for after the step before; asked for anew, they take a round trip of their own, once.
     """
 
     world_class: ClassVar[type[World]]
@@ -164,6 +170,7 @@ class PoolBackend(Backend):
             self._team = _Team(jobs, layout)
             self._arrays = self._team.arrays
         self._close = weakref.finalize(self, self._team.close)  # also runs when the interpreter exits
+        self._present = self._asked = _READINGS
 
         views = {name: torch.from_numpy(array) for name, array in self._arrays.items()}
         self._state = State(**{name: views[name] for name in STATE_FIELDS})
@@ -174,7 +181,7 @@ class PoolBackend(Backend):
             for name, value in initial_state(scene, index).items():
                 self._arrays[name][i] = value
         try:
-            self._command("build")
+            self._command("build", readings=_READINGS)
         except BaseException:
             self.close()
             raise
@@ -186,7 +193,7 @@ class PoolBackend(Backend):
         for name, value in values.items():
             self._arrays[name][index] = value
         self._arrays["wrench"][index] = 0.0
-        self._command("set_state", index)
+        self._move("set_state", index, readings=self._present)
 
     def state(self) -> State:
         """See :meth:`Backend.state`: views of shared memory."""
@@ -203,16 +210,17 @@ class PoolBackend(Backend):
         substeps = self.scene.substeps if substeps is None else substeps
         if substeps < 1:
             raise ValueError(f"substeps is {substeps}, expected at least 1")
-        self._command("step", argument=substeps)
+        asked, self._asked = self._asked, frozenset[str]()
+        self._move("step", argument=substeps, readings=asked)
 
     def links(self) -> Links:
         """See :meth:`Backend.links`: views of shared memory."""
-        self._must_be_open()
+        self._ask(frozenset(("links",)))
         return self._links
 
     def contacts(self) -> Contacts:
         """See :meth:`Backend.contacts`: views of shared memory."""
-        self._must_be_open()
+        self._ask(frozenset(("contacts",)))
         return self._contacts
 
     def health(self) -> Health:
@@ -256,8 +264,27 @@ class PoolBackend(Backend):
 
     def _set_parameter(self, name: str, value: Tensor, worlds: Tensor | None) -> None:
         index = self._selected(worlds)
-        self._arrays[name][index] = self._checked(name, value, len(index))
+        given = self._checked(name, value, len(index))
+        self._bring(_READINGS)  # they are of the last step, and an engine may work them out from its parameters
+        self._arrays[name][index] = given
         self._command(f"set_{name}", index)
+
+    def _move(self, method: str, worlds: np.ndarray | None = None, argument: Any = None, *, readings: frozenset[str]) -> None:
+        """Run a command that changes what worlds report; these readings are present afterwards."""
+        self._present = frozenset[str]()
+        self._command(method, worlds, argument, readings)
+        self._present = readings
+
+    def _ask(self, readings: frozenset[str]) -> None:
+        """Have readings present, after the next step too."""
+        self._must_be_open()
+        self._bring(readings)
+        self._asked |= readings
+
+    def _bring(self, readings: frozenset[str]) -> None:
+        if missing := readings - self._present:
+            self._command("read", readings=missing)
+            self._present |= missing
 
     def _selected(self, worlds: Tensor | None) -> np.ndarray:
         if worlds is None:
@@ -274,10 +301,10 @@ class PoolBackend(Backend):
             raise ValueError(f"{name} has shape {array.shape}, expected {expected}")
         return array
 
-    def _command(self, method: str, worlds: np.ndarray | None = None, argument: Any = None) -> None:
+    def _command(self, method: str, worlds: np.ndarray | None = None, argument: Any = None, readings: frozenset[str] = frozenset()) -> None:
         self._must_be_open()
         try:
-            self._team.command(method, worlds, argument)
+            self._team.command(method, worlds, argument, readings)
         except _WorldFailure as failure:
             if failure.kind is not None:
                 raise failure.kind(f"world {failure.world}: {failure.message}") from failure
@@ -416,6 +443,9 @@ class _WorldFailure(Exception):
 _MOVING = frozenset(("build", "set_state", "step"))
 """Commands after which a world reports something else than before."""
 
+_READINGS = frozenset(("links", "contacts"))
+"""What is read from a world only where somebody wants it."""
+
 _GIVEN = {
     "build": STATE_FIELDS,
     "set_state": STATE_FIELDS,
@@ -438,8 +468,8 @@ class _Local:
         self._given: dict[str, np.ndarray] = {}
         self._worlds: list[World] = []
 
-    def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> None:
-        """Run one of the methods below for the given worlds (all if None), and publish what they then report.
+    def command(self, method: str, worlds: np.ndarray | None, argument: Any, readings: frozenset[str]) -> None:
+        """Run one of the methods below for the given worlds (all if None), and publish what they then report, and the readings.
 
         All worlds act before any is published: engine and Python code take turns in the processor's caches once, not once per world.
         """
@@ -449,9 +479,13 @@ class _Local:
         try:
             for row in rows:
                 action(row, argument)
-            if method in _MOVING:
-                for row in rows:
+            for row in rows:
+                if method in _MOVING:
                     self._publish(row)
+                if "links" in readings:
+                    self._publish_links(row)
+                if "contacts" in readings:
+                    self._publish_contacts(row)
         except XResetError as error:
             raise _WorldFailure(self._job.first + row, type(error), str(error), traceback.format_exc()) from error
         except Exception as error:
@@ -480,6 +514,9 @@ class _Local:
         world.set_object_wrench(wrench[:3], wrench[3:])
         world.step(n)
 
+    def _read(self, i: int, _) -> None:
+        """Nothing moves: the readings alone are published."""
+
     def _mass_properties(self, i: int, _) -> None:
         for k, body in enumerate(self._worlds[i].mass_properties()):
             self._arrays["body_mass"][i, k], self._arrays["body_com"][i, k] = body.mass, body.com
@@ -500,13 +537,19 @@ class _Local:
             return
         for name, value in world.get_state().items():
             arrays[name][i] = value
-        arrays["link_pos"][i], arrays["link_quat"][i], arrays["link_linvel"][i], arrays["link_angvel"][i] = world.links()
-        arrays["tip_force"][i], arrays["tip_touch"][i], arrays["table_force"][i] = world.contacts()
         nonfinite, overflow = world.health()
         if nonfinite:
             arrays["nonfinite"][i] = True
         if overflow:
             arrays["overflow"][i] = True
+
+    def _publish_links(self, i: int) -> None:
+        arrays = self._arrays
+        arrays["link_pos"][i], arrays["link_quat"][i], arrays["link_linvel"][i], arrays["link_angvel"][i] = self._worlds[i].links()
+
+    def _publish_contacts(self, i: int) -> None:
+        arrays = self._arrays
+        arrays["tip_force"][i], arrays["tip_touch"][i], arrays["table_force"][i] = self._worlds[i].contacts()
 
 
 # Worker processes ----------------------------------------------------------------------------------------------------------------------
@@ -537,7 +580,7 @@ class _Team:
             self.arrays = _map(path, layout)
             self._workers += [_Worker(job) for job in jobs]  # they start while others are still being asked
             for worker in self._workers:
-                worker.send((path, layout, worker.job))
+                worker.send(pickle.dumps((path, layout, worker.job)))
             for worker in self._workers:
                 worker.receive("start")
         except BaseException:
@@ -546,13 +589,13 @@ class _Team:
         finally:
             os.unlink(path)
 
-    def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> None:
+    def command(self, method: str, worlds: np.ndarray | None, argument: Any, readings: frozenset[str]) -> None:
         """Have all workers concerned run it at the same time, and wait for all of them."""
-        asked = []
+        asked, to_all = [], pickle.dumps((method, None, argument, readings))
         for worker in self._workers:
             mine = None if worlds is None else worlds[(worlds >= worker.first) & (worlds < worker.stop)]
             if mine is None or mine.size:
-                worker.send((method, mine, argument))
+                worker.send(to_all if mine is None else pickle.dumps((method, mine, argument, readings)))
                 asked.append(worker)
         failures = []
         for worker in asked:
@@ -590,11 +633,11 @@ class _Worker:
             start_new_session=True,  # Ctrl-C is for the parent, which then hangs up
         )
 
-    def send(self, message: Any) -> None:
-        """Send a message; a dead worker is noticed at the reply."""
+    def send(self, message: bytes) -> None:
+        """Send a pickled message; a dead worker is noticed at the reply."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.write(pickle.dumps(message))
+            self._process.stdin.write(message)
             self._process.stdin.flush()
 
     def receive(self, doing: str) -> None:

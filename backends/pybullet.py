@@ -107,6 +107,7 @@ class PybulletWorld(World):
         self._fresh = True
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
         self._clean = p.saveState(physicsClientId=self._client)
+        self._seen: dict[str, np.ndarray] | None = None  # what get_state has read, until something moves
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """See :meth:`World.set_state`."""
@@ -121,10 +122,15 @@ class PybulletWorld(World):
         omega = state["object_angvel"]
         p.resetBaseVelocity(self._object.body, state["object_linvel"] + cross(omega, arm), omega, physicsClientId=client)
         self._force, self._torque = np.zeros(3), np.zeros(3)
-        self._fresh = True
+        self._fresh, self._seen = True, None
 
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
+        if self._seen is None:
+            self._seen = self._look()
+        return {**self._seen, "joint_target": self._drives.target}
+
+    def _look(self) -> dict[str, np.ndarray]:
         p, client = self._p, self._client
         com, turn = p.getBasePositionAndOrientation(self._object.body, physicsClientId=client)
         linear, angular = (np.array(v) for v in p.getBaseVelocity(self._object.body, physicsClientId=client))
@@ -134,7 +140,6 @@ class PybulletWorld(World):
         return {
             "joint_pos": position[self._drives.driven],
             "joint_vel": velocity[self._drives.driven],
-            "joint_target": self._drives.target,
             "object_pos": np.array(com) - arm,
             "object_quat": self._quat,
             "object_linvel": linear - cross(angular, arm),
@@ -158,7 +163,7 @@ class PybulletWorld(World):
             if turned:
                 p.applyExternalTorque(self._object.body, -1, self._torque, p.WORLD_FRAME, physicsClientId=client)
             p.stepSimulation(physicsClientId=client)
-        self._fresh = False
+        self._fresh, self._seen = False, None
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.links`."""
@@ -190,9 +195,8 @@ class PybulletWorld(World):
 
     def health(self) -> tuple[bool, bool]:
         """See :meth:`World.health`. Bullet allocates contacts as it needs them: none is ever dropped."""
-        position, _ = self._p.getBasePositionAndOrientation(self._object.body, physicsClientId=self._client)
-        joints = sum(x.dot(x) for x in self._drives.read())  # one bad number spoils a sum; cheaper than looking at each
-        return not math.isfinite(sum(position) + joints), False
+        read = self.get_state().values()
+        return not math.isfinite(sum(x.dot(x) for x in read)), False  # one bad number spoils the sum; cheaper than looking at each
 
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`. The object is loaded in the frame of its inertia."""

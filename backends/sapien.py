@@ -84,6 +84,7 @@ class SapienWorld(World):
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
         self._last_step: tuple[_Motion, np.ndarray, np.ndarray] | None = None
+        self._seen: dict[str, np.ndarray] | None = None  # what get_state has read, until something moves
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """See :meth:`World.set_state`."""
@@ -95,10 +96,15 @@ class SapienWorld(World):
         self._object.linear_velocity = state["object_linvel"] + cross(omega, rotate(self._quat, self._inertia.com))
         self._object.angular_velocity = omega
         self._force, self._torque = np.zeros(3), np.zeros(3)
-        self._last_step = None
+        self._last_step = self._seen = None
 
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
+        if self._seen is None:
+            self._seen = self._look()
+        return {**self._seen, "joint_target": self._joints.target}
+
+    def _look(self) -> dict[str, np.ndarray]:
         pose = self._object.entity_pose
         self._quat = nearer(pose.q.astype(np.float64), self._quat)
         omega = self._object.angular_velocity.astype(np.float64)
@@ -106,7 +112,6 @@ class SapienWorld(World):
         return {
             "joint_pos": position,
             "joint_vel": velocity,
-            "joint_target": self._joints.target,
             "object_pos": pose.p,
             "object_quat": self._quat,
             "object_linvel": self._object.linear_velocity - cross(omega, self._arm.turned(self._quat)[0]),
@@ -119,7 +124,7 @@ class SapienWorld(World):
 
     def step(self, n: int) -> None:
         """See :meth:`World.step`."""
-        body = self._object
+        body, self._seen = self._object, None
         force = self._force - np.array([0.0, 0.0, self._mass * GRAVITY * self._fraction])
         for remaining in reversed(range(n)):
             self._joints.brake()
@@ -160,8 +165,7 @@ class SapienWorld(World):
 
     def health(self) -> tuple[bool, bool]:
         """See :meth:`World.health`. PhysX allocates contacts as it needs them: none is ever dropped."""
-        pose = self._object.entity_pose
-        read = (pose.p, pose.q, self._object.linear_velocity, self._object.angular_velocity, *self._joints.read())
+        read = self.get_state().values()
         return not math.isfinite(sum(x.dot(x) for x in read)), False  # one bad number spoils the sum; cheaper than looking at each
 
     def mass_properties(self) -> list[Inertia]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import unittest
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from unittest import mock
 
@@ -283,7 +283,7 @@ class BothBackends(unittest.TestCase):
             with mock.patch.object(mujoco, "mj_sensorAcc", sense_and_look):
                 for _ in range(steps):
                     self.c.step()
-            links, contacts = self.c.links(), self.c.contacts()
+                links, contacts = self.c.links(), self.c.contacts()
             for i in range(4):
                 pos, rotation, linvel, angvel = plain_links(worlds(self.c)[i])
                 np.testing.assert_allclose(links.pos[i], pos, atol=1e-6)
@@ -297,6 +297,27 @@ class BothBackends(unittest.TestCase):
                 self.assertEqual(contacts.tip_touch[i].tolist(), touch)
                 touched |= {("tip", tip) for tip in np.flatnonzero(touch)} | ({("table",)} if table_force.any() else set())
         self.assertEqual(touched, {("tip", 0), ("tip", 1), ("table",)}, "nothing was compared")
+
+    def test_looking_changes_no_motion(self):
+        """Links take the first half of the next step in advance: whoever looks must end up where one goes who does not."""
+        state, _ = grasp(self.bench)
+        friction = torch.tensor([[self.scene.friction.tip, self.scene.friction.link, self.scene.friction.table]]).expand(4, 3)
+        self.addCleanup(self.c.set_friction, friction)
+        for looks in ((), ("links",), ("contacts", "links"), ("links", "contacts")):
+            ends = []
+            for seen in (looks, ()):
+                self.c.set_friction(friction)
+                self.c.set_state(state)
+                for step in range(6):
+                    self.c.step(1 + step % 2)
+                    for look in seen:
+                        getattr(self.c, look)()
+                    self.c.set_friction(friction * (1.0 + 0.1 * (step % 2)))
+                ends.append((self.c.state(), self.c.links(), self.c.contacts()))
+                ends[-1] = [getattr(part, f.name).clone() for part in ends[-1] for f in fields(part)]
+            for a, b in zip(*ends, strict=True):
+                torch.testing.assert_close(a, b, rtol=0, atol=0)
+        self.assertTrue(bool(self.c.contacts().tip_touch.any()), "nothing was touched")
 
     def test_sensors_change_no_motion(self):
         plain, sensing = compile_scene(self.scene, 0).model, compile_scene(self.scene, 0, sensors=True).model

@@ -33,6 +33,7 @@ class ToyWorld(World):
         self.friction = np.zeros(3)
         self.force = np.zeros(3)
         self.contact = np.zeros(3)
+        self.looks: list[str] = []
 
     def set_state(self, state):
         self.state = {name: value.copy() for name, value in state.items()}
@@ -57,11 +58,18 @@ class ToyWorld(World):
         self.contact = np.array([0.0, 0.0, float(n)])
 
     def links(self):
+        self.looks.append("links")
         k = len(self.scene.robot.tracked_links)
         quat = np.tile([1.0, 0.0, 0.0, 0.0], (k, 1))
-        return np.full((k, 3), self.state["joint_pos"][0]), quat, np.full((k, 3), 2.0), np.full((k, 3), float(self.object_index))
+        return (
+            np.full((k, 3), self.state["joint_pos"][0]),
+            quat,
+            np.full((k, 3), self.friction[0]),
+            np.full((k, 3), float(self.object_index)),
+        )
 
     def contacts(self):
+        self.looks.append("contacts")
         return np.tile(self.contact, (2, 1)), np.array([self.contact[2] > 0, False]), -self.contact
 
     def health(self):
@@ -166,6 +174,40 @@ class PoolTest(unittest.TestCase):
             self.assertEqual(pool.contacts().tip_touch.tolist(), [[True, False]] * 5)
             pool.set_state(random_state(1, 2), torch.tensor([3]))
             self.assertEqual(pool.contacts().table_force[:, 2].tolist(), [-3.0, -3.0, -3.0, 0.0, -3.0])
+
+    def test_links_and_contacts_are_read_where_somebody_wants_them(self):
+        with ToyBackend(toy_scene(), 1, workers=0) as pool:
+            looks = pool._team._worlds[0].looks
+
+            def seen(action) -> list[str]:
+                looks.clear()
+                action()
+                return sorted(looks)
+
+            pool.step()
+            self.assertEqual(seen(pool.step), [])
+            self.assertEqual(seen(pool.contacts), ["contacts"])
+            self.assertEqual(seen(pool.contacts), [])
+            self.assertEqual(seen(pool.step), ["contacts"])
+            self.assertEqual(seen(pool.contacts), [])
+            self.assertEqual(seen(pool.links), ["links"])
+            self.assertEqual(seen(pool.step), ["contacts", "links"])
+            self.assertEqual(seen(lambda: pool.set_state(random_state(1, 0))), ["contacts", "links"])
+            self.assertEqual(seen(pool.step), [])
+
+    def test_readings_nobody_asked_for_in_time_are_those_of_the_last_step(self):
+        for pool in self.each():
+            pool.set_friction(torch.full((5, 3), 0.25))
+            pool.step(1)
+            pool.step(2)  # brings nothing: nobody has looked
+            pool.set_friction(torch.full((2, 3), 0.75), torch.tensor([1, 4]))
+            self.assertEqual(pool.links().linvel[:, 0, 0].tolist(), [0.25] * 5)
+            pool.step(1)
+            self.assertEqual(pool.links().linvel[:, 0, 0].tolist(), [0.25, 0.75, 0.25, 0.25, 0.75])
+            pool.step(1)
+            pool.step(4)
+            pool.set_state(random_state(1, 2), torch.tensor([3]))
+            self.assertEqual(pool.contacts().table_force[:, 2].tolist(), [-4.0, -4.0, -4.0, 0.0, -4.0])
 
     def test_setting_a_state_ends_the_wrench(self):
         for pool in self.each():

@@ -80,7 +80,7 @@ def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: Pl
     """What the robot reaches of wrist poses [F, 1, ...] from a placement."""
     model = ArmModel(replace(robot, base_pos=placement.pos, base_quat=placement.quat))
     thresholds = Thresholds(hand_error=np.inf, wrist_position=config.position, wrist_orientation=np.radians(config.orientation))
-    joints, measures = track(model, wrists, thresholds, ArmConfig(restarts=4, branches=2, first_iterations=40))
+    joints, measures = track(model, wrists, thresholds, ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0))
     reached = (classify(measures, thresholds) == 0)[:, 0]
     if not bool(reached.any()):
         return Reach(reached=0.0, dexterity=0.0)
@@ -123,7 +123,7 @@ def _draws(
                 else:
                     spread = (high - low) / 4 * _SHRINK**number
                     drawn = centres[random.integers(len(centres))] + spread * random.standard_normal(6)
-                drawn[:3], drawn[4] = np.clip(drawn[:3], low[:3], high[:3]), np.clip(drawn[4], *tilt)
+                drawn[:3], drawn[4] = np.clip(drawn[:3], low[:3], high[:3]), np.clip(drawn[4], tilt[0], tilt[1])
                 if not len(avoid) or np.linalg.norm(avoid - drawn[:3], axis=1).min() >= config.clear:
                     break
             yield _placement(drawn)

@@ -4,6 +4,7 @@ import dataclasses
 import shutil
 import tempfile
 import unittest
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from xreset import robots
 from xreset.errors import RobotError
 from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
+from xreset.retarget.splice import splice, spread_over
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robots import load, registry
 from xreset.robots.check import check_description
@@ -167,6 +169,68 @@ class DirectionTest(unittest.TestCase):
     def test_both_ends_are_tried(self):
         self.assertGreaterEqual(self.valid(self.targets), 8)  # forwards alone: none
         self.assertGreaterEqual(self.valid(ArmTargets(**{name: value.flip(1) for name, value in vars(self.targets).items()})), 8)
+
+    def test_frames_between_two_bad_ends_are_found_from_the_middle(self):
+        back = self.targets.root_pos.shape[1]
+        pieces = (self.targets, ArmTargets(**{name: value.flip(1) for name, value in vars(self.targets).items()}))
+        both = ArmTargets(**{name: torch.cat((getattr(pieces[0], name), getattr(pieces[1], name)), dim=1) for name in vars(self.targets)})
+        thresholds = Thresholds(table_depth=1e9, self_depth=1e9)
+        valid = []
+        for reseeds in (0, 2):
+            config = ArmConfig(restarts=4, branches=1, collision_weight=0.0, reseeds=reseeds)
+            _, measures = track(self.model, both, thresholds, config)
+            valid.append(classify(measures, thresholds) == 0)
+        self.assertEqual(int(valid[0].sum()), 0)
+        self.assertGreaterEqual(int(valid[1].sum()), 16)
+        self.assertTrue(bool(valid[1][0, back - 4 : back + 4].all()))
+
+
+class SpliceTest(unittest.TestCase):
+    """Two paths of one joint: one is good early, the other late."""
+
+    def spliced(self, distance: float, **changes) -> list[float]:
+        paths = torch.zeros(1, 2, 6, 1, dtype=torch.float64)
+        paths[0, 1] = distance
+        worth = torch.tensor([[[1.0, 1, 1, 0, 0, 0], [0, 0, 0, 1, 1, 1]]], dtype=torch.float64)
+        annotated = torch.ones(1, 6, dtype=torch.bool)
+        arguments = {"worth": worth, "cost": torch.zeros_like(worth), "annotated": annotated, "jump": 0.35, "switch_cost": 0.5}
+        return splice(paths, **(arguments | changes))[0, :, 0].tolist()
+
+    def test_each_path_is_followed_where_it_is_good(self):
+        self.assertEqual(self.spliced(0.2), [0, 0, 0, 0.2, 0.2, 0.2])
+
+    def test_a_jump_is_worth_nothing_but_allows_the_rest(self):
+        self.assertIn(self.spliced(1.0), ([0, 0, 0, 1, 1, 1], [0, 0, 1, 1, 1, 1]))
+        self.assertEqual(len(set(self.spliced(1.0, switch_cost=2.5))), 1)
+
+    def test_cost_counts_in_every_frame(self):
+        cost = torch.zeros(1, 2, 6, dtype=torch.float64)
+        cost[0, 1] = 0.9  # following the second one for three frames brings 3, and costs 2.7 and the switch
+        self.assertEqual(self.spliced(0.2, cost=cost), [0.0] * 6)
+
+    def test_against_all_combinations(self):
+        generator = torch.Generator().manual_seed(0)
+        paths = torch.rand(3, 3, 5, 2, generator=generator, dtype=torch.float64)
+        worth = (torch.rand(3, 3, 5, generator=generator, dtype=torch.float64) > 0.5).double()
+        cost = 0.3 * torch.rand(3, 3, 5, generator=generator, dtype=torch.float64)
+        annotated = torch.rand(3, 5, generator=generator) > 0.3
+        found = splice(paths, worth=worth, cost=cost, annotated=annotated, jump=0.5, switch_cost=0.2)
+        for s in range(3):
+            best, way = -np.inf, ()
+            for chosen in product(range(3), repeat=5):
+                value = 0.0
+                for t, k in enumerate(chosen):
+                    jumps = t > 0 and bool(annotated[s, t - 1] & ((paths[s, k, t] - paths[s, chosen[t - 1], t - 1]).abs().max() > 0.5))
+                    value += float(worth[s, k, t]) * (not jumps) - float(cost[s, k, t]) - 0.2 * (t > 0 and chosen[t - 1] != k)
+                if value > best:
+                    best, way = value, chosen
+            torch.testing.assert_close(found[s], torch.stack([paths[s, k, t] for t, k in enumerate(way)]), atol=0, rtol=0)
+
+    def test_chosen_frames_are_spread_over_those_that_are_set(self):
+        flags = torch.zeros(3, 20, dtype=torch.bool)
+        flags[0, 4:14], flags[2, 7] = True, True
+        rows, frames = spread_over(flags, 2)
+        self.assertEqual((rows.tolist(), frames.tolist()), ([0, 0, 2], [6, 11, 7]))
 
 
 class WritePlacementTest(unittest.TestCase):

@@ -5,6 +5,7 @@
 by Levenberg-Marquardt with projected steps, frame after frame, batched over sequences. The first frame starts from random restarts; the
 best few distinct solutions are all followed, and the one with most valid frames wins: the first frame cannot tell which branch lasts. The
 same is tried backwards from the last frame where a frame fails: the branch that reaches the goal may look worse than others at the start.
+Where the wrist is still missed, some of those frames are solved afresh and followed both ways, and all paths become one (`splice`).
 
 E_coll = w sum of [margin - distance]_+^2 over the lowest points of the links (table) and, where a path without it collides, over the
 pairs of shapes that coal finds near each other.
@@ -15,7 +16,7 @@ Shape letters: S sequences, T frames, B batch (sequences or branches), n arm joi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -23,6 +24,7 @@ from torch import Tensor
 from xreset.errors import RobotError
 from xreset.kinematics import Kinematics
 from xreset.retarget.collision import SelfCollision, height_above_table, table_points
+from xreset.retarget.splice import splice, spread_over
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
 from xreset.rotations import matrix_to_quat, quat_angle, quat_conjugate, quat_multiply, quat_to_axis_angle
 from xreset.spec import RobotSpec, TableSpec
@@ -37,6 +39,8 @@ _DISTINCT = 0.5
 """Solutions of the first frame differ if a joint differs by this much [rad or m]."""
 _CONVERGED = 1e-5
 """Steps smaller than this end the iteration [rad or m]."""
+_MISSED = tuple(REASONS.index(name) for name in ("joint limit", "wrist position", "wrist orientation"))
+"""The reasons of frames whose wrist is not where it should be."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +66,10 @@ class ArmConfig:
     detour_cost: float = 1.0
     """Valid frames that a path is worth less for each rad^2 of its mean squared distance from home. A policy starts at home: states in
     another branch of the arm's solutions are of no use to it, because the way there leads through half a turn of the shoulder."""
+    reseeds: int = 2
+    """Frames of a sequence, of those whose wrist is still missed, that are solved like a first frame and followed both ways; 0: none."""
+    switch_cost: float = 0.5
+    """Valid frames that each change from one of the followed paths to another must bring."""
     first_iterations: int = 60
     """Most steps for the frame that a path starts from."""
     iterations: int = 12
@@ -193,12 +201,16 @@ def track(
     support = model.hand_support(targets.hand_joints)
     report = progress or (lambda _: None)
 
-    joints, worth = _best_path(model, targets, support, thresholds, config, lambda done: report(0.4 * done))
+    forwards = _branches(model, targets, support, config, lambda done: report(0.3 * done))
+    joints, worth = _best(model, targets, forwards, thresholds, config)
     reason = classify(measure(model, targets, joints), thresholds)
     failing = (reason > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
+    paths = forwards.repeat(1, 2, 1, 1)  # [S, 2K, T, n] those of the first frame, then those of the last frame where there are any
     if len(failing):
         part = ArmTargets(**{name: value[failing].flip(1) for name, value in vars(targets).items()})
-        back, other = _best_path(model, part, support[failing].flip(1), thresholds, config, lambda done: report(0.4 + 0.4 * done))
+        backwards = _branches(model, part, support[failing].flip(1), config, lambda done: report(0.3 + 0.3 * done))
+        paths[failing, forwards.shape[1] :] = backwards.flip(2)
+        back, other = _best(model, part, backwards, thresholds, config)
         better = other > worth[failing]
         joints[failing[better]] = back[better].flip(1)
 
@@ -206,9 +218,19 @@ def track(
     repair = (reason == REASONS.index("self collision")).any(dim=1).nonzero()[:, 0]
     if len(repair):
         part = _take(targets, repair)
-        apart = _follow(model, part, support[repair], joints[repair, 0], config, model.arm_collision, lambda done: report(0.8 + 0.2 * done))
+        apart = _follow(model, part, support[repair], joints[repair, 0], config, model.arm_collision, lambda done: report(0.6 + 0.1 * done))
         better = (classify(measure(model, part, apart), thresholds) == 0).sum(1) > (reason[repair] == 0).sum(1)
         joints[repair[better]] = apart[better]
+
+    reason = classify(measure(model, targets, joints), thresholds)
+    missed = torch.isin(reason, torch.tensor(_MISSED))
+    mend = missed.any(dim=1).nonzero()[:, 0]
+    if len(mend) and config.reseeds:
+        part = _take(targets, mend)
+        known = torch.cat((joints[mend, None], paths[mend]), dim=1)
+        mended = _mend(model, part, support[mend], known, missed[mend], thresholds, config, lambda done: report(0.7 + 0.3 * done))
+        better = (classify(measure(model, part, mended), thresholds) == 0).sum(1) > (reason[mend] == 0).sum(1)
+        joints[mend[better]] = mended[better]
     report(1.0)
     return joints, measure(model, targets, joints)
 
@@ -259,31 +281,103 @@ def _frame(targets: ArmTargets, support: Tensor, t: int, previous: Tensor | None
     )
 
 
-def _best_path(
+def _branches(model: ArmModel, targets: ArmTargets, support: Tensor, config: ArmConfig, progress: Callable[[float], None]) -> Tensor:
+    """[S, K, T, n] the paths from distinct solutions of the first frame."""
+    starts = _first_frames(model, targets, support, config)  # [S, K, n]
+    wide = torch.arange(len(starts)).repeat_interleave(starts.shape[1])
+    paths = _follow(model, _take(targets, wide), support[wide], starts.flatten(0, 1), config, None, progress)
+    return paths.view(*starts.shape[:2], *paths.shape[1:])
+
+
+def _best(model: ArmModel, targets: ArmTargets, paths: Tensor, thresholds: Thresholds, config: ArmConfig) -> tuple[Tensor, Tensor]:
+    """[S, T, n] of the paths [S, K, T, n] the one that is worth most, and its worth [S]: see the config."""
+    sequences, branches = paths.shape[:2]
+    many, flat = _take(targets, torch.arange(sequences).repeat_interleave(branches)), paths.flatten(0, 1)
+    valid = (classify(measure(model, many, flat), thresholds) == 0).sum(1)
+    worth = (valid - config.detour_cost * (flat - _home(model)).square().sum(-1).mean(1)).view(sequences, -1)
+    best, branch = worth.max(dim=1)
+    return paths[torch.arange(sequences), branch], best
+
+
+def _mend(
     model: ArmModel,
     targets: ArmTargets,
     support: Tensor,
+    known: Tensor,
+    missed: Tensor,
+    thresholds: Thresholds,
+    config: ArmConfig,
+    progress: Callable[[float], None],
+) -> Tensor:
+    """[S, T, n] the best that can be put together from pieces of the ``known`` paths [S, K, T, n] and of new ones.
+
+    The new ones lead both ways from some of the frames that are ``missed`` [S, T], solved afresh: a path from either end may be stuck at a
+    limit there, on the wrong side of the arm's null space.
+    """
+    owner, paths = _reseeded(model, targets, support, missed, thresholds, config, progress)
+    count = torch.bincount(owner, minlength=len(known))
+    column = torch.arange(len(owner)) - (count.cumsum(0) - count)[owner]
+    new = known[:, :1].repeat(1, int(count.max()), 1, 1)  # sequences with fewer new paths than others repeat a known one
+    new[owner, column] = paths
+    known = torch.cat((known, new), dim=1)
+
+    sequences, branches, frames, _ = known.shape
+    measures = measure(model, _take(targets, torch.arange(sequences).repeat_interleave(branches)), known.flatten(0, 1))
+    valid = classify(replace(measures, arm_jump=torch.zeros_like(measures.arm_jump)), thresholds) == 0
+    detour = config.detour_cost * (known - _home(model)).square().sum(-1) * targets.annotated[:, None]
+    return splice(
+        known,
+        worth=valid.view(sequences, branches, frames).to(known.dtype),
+        cost=detour / targets.annotated.sum(1)[:, None, None],
+        annotated=targets.annotated,
+        jump=thresholds.arm_jump,
+        switch_cost=config.switch_cost,
+    )
+
+
+def _reseeded(
+    model: ArmModel,
+    targets: ArmTargets,
+    support: Tensor,
+    missed: Tensor,
     thresholds: Thresholds,
     config: ArmConfig,
     progress: Callable[[float], None],
 ) -> tuple[Tensor, Tensor]:
-    """[S, T, n] of the paths from distinct solutions of the first frame the one that is worth most, and its worth [S]: see the config."""
-    sequences = len(targets.annotated)
-    starts = _first_frames(model, targets, support, config)  # [S, K, n]
-    wide = torch.arange(sequences).repeat_interleave(starts.shape[1])
-    many = _take(targets, wide)
-    paths = _follow(model, many, support[wide], starts.flatten(0, 1), config, None, progress)
-    valid = (classify(measure(model, many, paths), thresholds) == 0).sum(1)
-    home = torch.as_tensor(model.robot.home[model.robot.arm_indices])
-    worth = (valid - config.detour_cost * (paths - home).square().sum(-1).mean(1)).view(sequences, -1)
-    best, branch = worth.max(dim=1)
-    return paths.view(sequences, -1, *paths.shape[1:])[torch.arange(sequences), branch], best
+    """[C, T, n] paths both ways from distinct solutions of missed frames [S, T] that can be solved, and their sequences [C], ascending."""
+    owner, seed = spread_over(missed, config.reseeds)
+    alone = ArmTargets(**{name: value[owner, seed][:, None] for name, value in vars(targets).items()})
+    starts = _first_frames(model, alone, support[owner, seed][:, None], config)  # [C, K, n]
+    wide = torch.arange(len(owner)).repeat_interleave(starts.shape[1])
+    solved = classify(measure(model, _take(alone, wide), starts.flatten(0, 1)[:, None]), thresholds)[:, 0] == 0
+    repeated = torch.zeros(starts.shape[:2], dtype=torch.bool)
+    repeated[:, 1:] = (starts[:, 1:] == starts[:, :-1]).all(-1)
+    wide, start = wide[solved & ~repeated.flatten()], starts.flatten(0, 1)[solved & ~repeated.flatten()]
+    owner, seed = owner[wide], seed[wide]
+
+    frames = targets.annotated.shape[1]
+    if not len(seed):
+        return owner, start.new_zeros(0, frames, start.shape[1])
+    steps = torch.arange(int(torch.maximum(seed, frames - 1 - seed).max()) + 1)
+    both = torch.cat((seed[:, None] + steps, seed[:, None] - steps)).clamp(0, frames - 1)  # [2C, N] frames in the order of following
+    rows = owner.repeat(2)[:, None]
+    part = ArmTargets(**{name: value[rows, both] for name, value in vars(targets).items()})
+    followed = _follow(model, part, support[rows, both], start.repeat(2, 1), config, None, progress)
+    paths = start.new_zeros(len(owner), frames, start.shape[1])
+    row = torch.arange(len(owner)).repeat(2)
+    for step in reversed(steps.tolist()):  # the first visit of a frame is the one that stays
+        paths[row, both[:, step]] = followed[:, step]
+    return owner, paths
+
+
+def _home(model: ArmModel) -> Tensor:
+    return torch.as_tensor(model.robot.home[model.robot.arm_indices])
 
 
 def _first_frames(model: ArmModel, targets: ArmTargets, support: Tensor, config: ArmConfig) -> Tensor:
     """[S, K, n] distinct solutions of the first frame: the one that home leads to, then the best others."""
     sequences, restarts = len(targets.annotated), config.restarts
-    home = torch.as_tensor(model.robot.home[model.robot.arm_indices])
+    home = _home(model)
     generator = torch.Generator().manual_seed(config.seed)
     spread = torch.rand(restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0  # every sequence gets the same
     spread[0] = 0.0

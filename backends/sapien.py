@@ -426,6 +426,7 @@ class _Joints:
         for mimic in spec.mimics:
             _couple(articulation, joints, mimic)
 
+        self._set_target = [joint.set_drive_target for joint in self._drives]
         self.target = spec.home
         """[J] drive targets."""
         self._dt = dt
@@ -455,8 +456,8 @@ class _Joints:
     def set_targets(self, targets: np.ndarray) -> None:
         """Set the drive targets [J]."""
         self.target = targets
-        for joint, target in zip(self._drives, targets, strict=True):
-            joint.set_drive_target(target)
+        for set_target, target in zip(self._set_target, targets.tolist(), strict=True):
+            set_target(target)
 
     def brake(self) -> None:
         """Apply dry friction for one step: PhysX's joint friction is no torque, so it is a torque here.

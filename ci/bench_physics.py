@@ -1,25 +1,31 @@
-"""physics: control steps per second of each engine while a grasp is held, bare, in a plain loop and behind the interface.
+"""physics: a user's own loop against each engine and the same work behind the interface, side by side, while a grasp is held.
 
+raw       the loop that one would write directly against the engine, in one process, over as many worlds: drive targets set, every physics
+          step with the object's weight and the drives that the engine lacks, and then the readings taken, once per control step
+processes the backend with that many worker processes: targets set, one control step, the same readings (and health) published
 bare      the time within the engine's own step function alone; of mujoco-warp its physics kernels (on a GPU: the captured graph)
-raw       the loop that one would write directly against the engine, on one core, over as many worlds: targets set, every physics step with
-          the object's weight and the drives that the engine lacks, joints and object read once per control step
-forces    the same, and the contact forces on the object are read, too; for PhysX that means to work out friction, which it does not tell
-processes the backend: targets set and one control step, all readings (links, contact forces, health) published; beside it the share of
-          raw and of forces that each of its processes reaches
 
-Everything runs in turns within one go, and shares are medians over turns; they mean something only while nothing else runs.
+Two kinds of readings. "state": positions and velocities of joints and object. "all": also poses and velocities of palm and fingertips, as
+the engine has them (of MuJoCo from before its last physics step, where the backend's are of now), and the contact forces on the object;
+PhysX does not tell friction, so both work it out.
+
+Raw and bare are control steps per second of CPU time, the processes per second of wall time. "of raw" is the CPU time of the raw loop
+through that of all processes of the backend, this one included; in brackets the same by the wall clock, per process. Contenders take turns
+in slices of some hundredths of a second, every other time in reverse, each slice after a control step that is not counted; ratios are of
+slices of one turn, and figures are medians over turns. So the CPU's share bears other programs on the machine; the wall clock does not.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import fields
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any, Literal
 from unittest import mock
 
 import numpy as np
-from benchlib import OBJECT, Options, engines, held_grasp, rate, seconds_of
+from benchlib import OBJECT, Options, engines, held_grasp, rate
 from rich.console import Console
 from rich.table import Table
 
@@ -33,10 +39,12 @@ from xreset.objects import load_objects
 from xreset.spec import GRAVITY, SceneSpec
 from xreset.task.config import TaskConfig
 
-_BURST = 10
-"""Control steps between two looks at the clock."""
-_TURNS = 6
-"""Turns after which the grasp starts anew: in minutes any object creeps out of a hand."""
+Readings = Literal["state", "all"]
+
+_SLICE = 0.04
+"""Seconds that a slice of the raw loop takes."""
+_HOLD = 120
+"""Control steps, about, after which the grasp starts anew: in minutes any object creeps out of a hand."""
 _SETTLE = 20
 """Control steps before the clock runs: the hand closes."""
 
@@ -47,15 +55,17 @@ def run(options: Options, console: Console) -> None:
     grasp = held_grasp(robot, scene.objects)
     grasp = State(**{f.name: getattr(grasp, f.name).expand(options.num_envs, -1).contiguous() for f in fields(State)})
     pools = sorted({1, min(2, usable_cores()), min(usable_cores(), options.num_envs)})
-    columns = ["engine", "device", "bare", "raw", "forces", *(f"{n} process{'es' * (n > 1)} (of raw, of forces)" for n in pools), "held"]
+    processes = [column for n in pools for column in (f"{n} process{'es' * (n > 1)}", "of raw")]
+    columns = ["engine", "device", "readings", "bare", "raw", *processes, "held"]
     table = Table(*columns, title=f"physics: control steps per second, {options.robot}, {options.num_envs} worlds")
     for name, device in engines(options, console):
         if issubclass(backend_class(name), PoolBackend):
-            table.add_row(name, device, *_pooled(name, scene, grasp, pools, options.seconds))
+            for cells in _pooled(name, scene, grasp, pools, options.seconds):
+                table.add_row(name, device, *cells)
         else:
             bare, wrapped, held = _batched(name, scene, grasp, device, options.seconds)
-            cells = ["", "", f"{wrapped:,.0f} ({wrapped / bare:.2f} of bare)", *[""] * (len(pools) - 1)]
-            table.add_row(name, device, f"{bare:,.0f}", *cells, held)
+            cells = ["all", f"{bare:,.0f}", "", f"{wrapped:,.0f}", f"{wrapped / bare:.2f} of bare", *["", ""] * (len(pools) - 1)]
+            table.add_row(name, device, *cells, held)
     console.print(table)
 
 
@@ -73,45 +83,68 @@ def _batched(name: str, scene: SceneSpec, grasp: State, device: str, seconds: fl
         with backend._on_stream():  # pyright: ignore[reportAttributeAccessIssue]
             bare = rate(lambda: [backend._run("step") for _ in range(scene.substeps)], seconds, device)  # pyright: ignore[reportAttributeAccessIssue]
         _start(backend, grasp)
-        wrapped = rate(lambda: _control_step(backend, grasp), seconds, device)
+        wrapped = rate(lambda: _control_step(backend, grasp, "all"), seconds, device)
         return bare * backend.num_worlds, wrapped * backend.num_worlds, _held(backend, grasp)
 
 
-def _pooled(name: str, scene: SceneSpec, grasp: State, pools: list[int], seconds: float) -> list[str]:
-    """Cells of the table for an engine that runs a world at a time."""
+@dataclass(frozen=True)
+class _Spent:
+    """What a slice took, per control step of all worlds."""
+
+    wall: float
+    """[s]"""
+    cpu: float
+    """[s] of all processes."""
+
+
+def _pooled(name: str, scene: SceneSpec, grasp: State, pools: Sequence[int], seconds: float) -> list[list[str]]:
+    """Rows of the table for an engine that runs a world at a time, one for each kind of readings."""
     n = len(grasp.joint_pos)
+    kinds: tuple[Readings, ...] = ("state", "all")
     worlds = [backend_class(name).world_class(scene, 0) for _ in range(n)]
-    backends = [make_backend(name, scene, n, workers=workers) for workers in pools]
-    rates: list[list[float]] = []
+    backends: list[PoolBackend] = []
     try:
-        loops = [
-            [_LOOPS.get(name, _world_loop)(world, grasp.joint_target[i].double().numpy(), scene, forces) for i, world in enumerate(worlds)]
-            for forces in (False, True)
-        ]
+        backends += [make_backend(name, scene, n, workers=workers) for workers in pools]  # pyright: ignore[reportArgumentType]
+        loop = _LOOPS.get(name, _world_loop)
+        targets = grasp.joint_target.double().numpy()
+        raw = {kind: [loop(world, targets[i], scene, kind) for i, world in enumerate(worlds)] for kind in kinds}
 
-        def raw(forces: bool = False) -> None:
-            for loop in loops[forces]:
-                loop()
+        def start() -> None:
+            for i, world in enumerate(worlds):
+                world.set_state({f.name: getattr(grasp, f.name)[i].double().numpy() for f in fields(State)})
+            for _ in range(_SETTLE):
+                _each(raw["state"])
+            for backend in backends:
+                _start(backend, grasp)
 
-        end = time.perf_counter() + seconds * (2 + len(pools))
-        while len(rates) < 3 or time.perf_counter() < end:
-            if len(rates) % _TURNS == 0:
-                for i, world in enumerate(worlds):
-                    world.set_state({f.name: getattr(grasp, f.name)[i].double().numpy() for f in fields(State)})
-                for _ in range(_SETTLE):
-                    raw()
-                for backend in backends:
-                    _start(backend, grasp)
-            turn = [_seconds_within(*_step_function(name, worlds[0]), lambda: _repeat(raw))]
-            turn += [seconds_of(lambda: _repeat(raw)), seconds_of(lambda: _repeat(lambda: raw(forces=True)))]
-            turn += [seconds_of(lambda b=backend: _repeat(lambda: _control_step(b, grasp))) for backend in backends]
-            rates.append([n * _BURST / spent for spent in turn])
-        measured = np.array(rates)
-        shares = [np.median(measured[:, 3:] / measured[:, [i]], axis=0) / pools for i in (1, 2)]
-        rate_of = np.median(measured, axis=0)
-        plain = [f"{value:,.0f}" for value in rate_of[:3]]
-        wrapped = [f"{value:,.0f} ({a:.2f}, {b:.2f})" for value, a, b in zip(rate_of[3:], *shares, strict=True)]
-        return [*plain, *wrapped, _held(backends[-1], grasp)]
+        start()
+        steps = max(1, round(_SLICE / _spent(partial(_each, raw["state"]), 3, ()).wall))
+        contenders: dict[tuple[int | str, Readings], Callable[[], _Spent]] = {
+            ("bare", "state"): partial(_within, _step_function(name, worlds[0]), partial(_each, raw["state"]), steps)
+        }
+        for kind in kinds:
+            contenders["raw", kind] = partial(_spent, partial(_each, raw[kind]), steps, ())
+            for workers, backend in zip(pools, backends, strict=True):
+                contenders[workers, kind] = partial(_spent, partial(_control_step, backend, grasp, kind), steps, _process_ids(backend))
+        turns: list[dict[Any, _Spent]] = []
+        end = time.perf_counter() + seconds * len(contenders)
+        while len(turns) < 3 or time.perf_counter() < end:
+            if turns and len(turns) % max(1, _HOLD // (3 * steps)) == 0:
+                start()
+            order = list(contenders) if len(turns) % 2 else list(reversed(contenders))
+            turns.append({who: contenders[who]() for who in order})
+        held = _held(backends[-1], grasp)
+
+        def cells(kind: Readings) -> list[str]:
+            row = [kind, f"{n / _median(t['bare', kind].cpu for t in turns):,.0f}" if ("bare", kind) in contenders else ""]
+            row.append(f"{n / _median(t['raw', kind].cpu for t in turns):,.0f}")
+            for workers in pools:
+                cpu = _median(t["raw", kind].cpu / t[workers, kind].cpu for t in turns)
+                wall = _median(t["raw", kind].wall / t[workers, kind].wall for t in turns) / workers
+                row += [f"{n / _median(t[workers, kind].wall for t in turns):,.0f}", f"{cpu:.2f} ({wall:.2f})"]
+            return [*row, held]
+
+        return [cells(kind) for kind in kinds]
     finally:
         for thing in (*worlds, *backends):
             thing.close()
@@ -123,53 +156,83 @@ def _start(backend: Backend, grasp: State) -> None:
         backend.step()
 
 
-def _control_step(backend: Backend, grasp: State) -> None:
+def _control_step(backend: Backend, grasp: State, kind: Readings) -> object:
     backend.set_joint_targets(grasp.joint_target)
     backend.step()
+    read = backend.state(), backend.health()
+    return (*read, backend.links(), backend.contacts()) if kind == "all" else read
 
 
-def _repeat(step: Callable[[], object]) -> None:
-    for _ in range(_BURST):
+def _each(loops: Sequence[Callable[[], object]]) -> None:
+    for loop in loops:
+        loop()
+
+
+def _median(values: Iterable[float]) -> float:
+    return float(np.median(list(values)))
+
+
+def _process_ids(backend: PoolBackend) -> tuple[int, ...]:
+    return tuple(worker._process.pid for worker in getattr(backend._team, "_workers", ()))
+
+
+def _cpu_time(processes: Sequence[int]) -> float:
+    """CPU time that this process and others have taken [s]; the clocks are those of Linux' clock_getcpuclockid(3)."""
+    return time.process_time() + sum(time.clock_gettime(~process << 3 | 2) for process in processes)
+
+
+def _spent(step: Callable[[], object], steps: int, processes: Sequence[int]) -> _Spent:
+    """What a control step takes on average of some, after one that is not counted."""
+    step()
+    cpu, wall = _cpu_time(processes), time.perf_counter()
+    for _ in range(steps):
         step()
+    return _Spent((time.perf_counter() - wall) / steps, (_cpu_time(processes) - cpu) / steps)
 
 
-def _seconds_within(owner: Any, name: str, action: Callable[[], object]) -> float:
-    """Time that an action spends within ``owner.name``."""
-    inner, spent = getattr(owner, name), 0.0
+def _within(function: tuple[object, str], step: Callable[[], object], steps: int) -> _Spent:
+    """What of that passes within the function ``(owner, name)``."""
+    inner, wall, cpu = getattr(*function), 0.0, 0.0
 
     def timed(*arguments, **keywords) -> None:
-        nonlocal spent
-        start = time.perf_counter()
+        nonlocal wall, cpu
+        start = time.perf_counter(), time.process_time()
         inner(*arguments, **keywords)
-        spent += time.perf_counter() - start
+        wall, cpu = wall + time.perf_counter() - start[0], cpu + time.process_time() - start[1]
 
-    with mock.patch.object(owner, name, timed):
-        action()
-    return spent
+    with mock.patch.object(*function, timed):
+        for _ in range(steps):
+            step()
+    return _Spent(wall / steps, cpu / steps)
 
 
 # The loops that a user would write --------------------------------------------------------------------------------------------------------
 
 
-def _mujoco_loop(world: Any, targets: np.ndarray, scene: SceneSpec, forces: bool) -> Callable[[], object]:
+def _mujoco_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings) -> Callable[[], object]:
     import mujoco
 
-    model, data = world._model, world._data
+    model, data, bodies = world._model, world._data, world._at.link_body
 
     def loop() -> object:
         data.ctrl[:] = targets
         mujoco.mj_step(model, data, scene.substeps)
-        if forces:
-            world._option.disableflags = world._sensing
-            mujoco.mj_sensorAcc(model, data)
-            world._option.disableflags = world._silent
-        return data.qpos.copy(), data.qvel.copy(), world.contacts() if forces else None
+        state = data.qpos.copy(), data.qvel.copy()
+        if kind == "state":
+            return state
+        velocities = np.zeros((len(bodies), 6))
+        for body, velocity in zip(bodies, velocities, strict=True):
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
+        world._option.disableflags = world._sensing
+        mujoco.mj_sensorAcc(model, data)
+        world._option.disableflags = world._silent
+        return state, data.xpos[bodies], data.xquat[bodies], velocities, world.contacts()
 
     return loop
 
 
-def _pybullet_loop(world: Any, targets: np.ndarray, scene: SceneSpec, forces: bool) -> Callable[[], object]:
-    p, client, drives = world._p, world._client, world._drives
+def _pybullet_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings) -> Callable[[], object]:
+    p, client, drives, tracked = world._p, world._client, world._drives, world._frames.bodies
     robot, thing, joints = world._robot.body, world._object.body, drives._links
     weight = [0.0, 0.0, -GRAVITY * scene.objects[0].mass]
 
@@ -183,19 +246,26 @@ def _pybullet_loop(world: Any, targets: np.ndarray, scene: SceneSpec, forces: bo
         states = p.getJointStates(robot, joints, physicsClientId=client)
         joint_pos, joint_vel = np.array([s[0] for s in states]), np.array([s[1] for s in states])
         pose = p.getBasePositionAndOrientation(thing, physicsClientId=client)
+        state = joint_pos, joint_vel, pose, p.getBaseVelocity(thing, physicsClientId=client)
+        if kind == "state":
+            return state
+        links = p.getLinkStates(robot, tracked, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=client)
         world._fresh = False
-        velocity = p.getBaseVelocity(thing, physicsClientId=client)
-        return joint_pos, joint_vel, pose, velocity, world.contacts() if forces else None
+        return state, np.array([s[4] + s[5] + s[6] + s[7] for s in links]), world.contacts()
 
     return loop
 
 
-def _sapien_loop(world: Any, targets: np.ndarray, scene: SceneSpec, forces: bool) -> Callable[[], object]:
+def _sapien_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings) -> Callable[[], object]:
     from xreset.backends.sapien import _Motion
 
-    thing, joints = world._object, world._joints
+    thing, joints, tracked = world._object, world._joints, world._tracked
     articulation, drives, brakes = joints._articulation, joints._drives, joints._loss.any()
     weight, nothing = np.array([0.0, 0.0, -GRAVITY * scene.objects[0].mass]), np.zeros(3)
+
+    def motion(body: Any) -> tuple[np.ndarray, ...]:
+        pose = body.entity_pose
+        return pose.p, pose.q, body.linear_velocity, body.angular_velocity
 
     def loop() -> object:
         for joint, target in zip(drives, targets, strict=True):
@@ -204,29 +274,28 @@ def _sapien_loop(world: Any, targets: np.ndarray, scene: SceneSpec, forces: bool
             if brakes:
                 joints.brake()
             thing.add_force_torque(weight, nothing)
-            if forces and not remaining:
+            if kind == "all" and not remaining:
                 start = _Motion(thing.linear_velocity, thing.angular_velocity, thing.entity_pose.q)
                 world._last_step = start, weight, nothing
             world._system.step()  # set_state makes a new one
-        pose = thing.entity_pose
-        read = articulation.qpos, articulation.qvel, pose.p, pose.q, thing.linear_velocity, thing.angular_velocity
-        return read, world.contacts() if forces else None
+        state = articulation.qpos, articulation.qvel, *motion(thing)
+        return state if kind == "state" else (state, [motion(body) for body in tracked], world.contacts())
 
     return loop
 
 
-def _world_loop(world: World, targets: np.ndarray, scene: SceneSpec, forces: bool) -> Callable[[], object]:
+def _world_loop(world: World, targets: np.ndarray, scene: SceneSpec, kind: Readings) -> Callable[[], object]:
     """Of an engine that is not known here."""
 
     def loop() -> object:
         world.set_joint_targets(targets)
         world.step(scene.substeps)
-        return world.get_state(), world.contacts() if forces else None
+        return world.get_state() if kind == "state" else (world.get_state(), world.links(), world.contacts())
 
     return loop
 
 
-_LOOPS: dict[str, Callable[[Any, np.ndarray, SceneSpec, bool], Callable[[], object]]] = {
+_LOOPS: dict[str, Callable[[Any, np.ndarray, SceneSpec, Readings], Callable[[], object]]] = {
     "mujoco": _mujoco_loop,
     "pybullet": _pybullet_loop,
     "sapien": _sapien_loop,

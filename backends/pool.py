@@ -295,7 +295,7 @@ class PoolBackend(Backend):
         return index
 
     def _checked(self, name: str, value: Tensor, rows: int) -> np.ndarray:
-        array = torch.as_tensor(value).detach().cpu().numpy()
+        array = torch.as_tensor(value).numpy(force=True)
         expected = (rows, *self._arrays[name].shape[1:])
         if array.shape != expected:
             raise ValueError(f"{name} has shape {array.shape}, expected {expected}")
@@ -555,6 +555,8 @@ class _Local:
 # Worker processes ----------------------------------------------------------------------------------------------------------------------
 
 _BOOT = "import sys; sys.path[:] = {path!r}; from xreset.backends.pool import serve; serve()"
+_DONE, _FAILED = b"+", b"-"
+"""How a worker's reply begins; an exception follows a failure."""
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -641,14 +643,15 @@ class _Worker:
             self._process.stdin.flush()
 
     def receive(self, doing: str) -> None:
-        """Wait for the reply: None, or an exception to raise."""
+        """Wait for the reply, and raise what it says has gone wrong."""
         assert self._process.stdout is not None
+        if self._process.stdout.read(len(_DONE)) == _DONE:
+            return
         try:
-            reply = pickle.load(self._process.stdout)
+            failure = pickle.load(self._process.stdout)
         except (EOFError, pickle.UnpicklingError) as error:
             raise XResetError(self._obituary(doing)) from error
-        if reply is not None:
-            raise reply
+        raise failure
 
     def hang_up(self) -> None:
         """Close the worker's input."""
@@ -695,7 +698,7 @@ def serve() -> None:
             error = failure
         except Exception:
             error = XResetError(f"a worker process failed:\n{traceback.format_exc()}")
-        replies.write(pickle.dumps(error))
+        replies.write(_DONE if error is None else _FAILED + pickle.dumps(error))
         replies.flush()
         return result
 

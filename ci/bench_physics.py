@@ -220,13 +220,10 @@ def _mujoco_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readin
         state = data.qpos.copy(), data.qvel.copy()
         if kind == "state":
             return state
-        velocities = np.zeros((len(bodies), 6))
-        for body, velocity in zip(bodies, velocities, strict=True):
-            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
         world._option.disableflags = world._sensing
         mujoco.mj_sensorAcc(model, data)
         world._option.disableflags = world._silent
-        return state, data.xpos[bodies], data.xquat[bodies], velocities, world.contacts()
+        return state, data.xpos[bodies], data.xquat[bodies], data.cvel[bodies], world.contacts()
 
     return loop
 

@@ -400,7 +400,7 @@ class Synthetic(unittest.TestCase):
         for i in range(self.demos.num_sequences):
             with self.subTest(str(self.demos.sequence_name[i])):
                 one = self.demos.select(indices=[i])
-                lifted = int(np.argmax(one.object_pos[:, 2] > one.object_pos[0, 2] + 1e-4))
+                lifted = int(np.argmax(one.object_pos[:, 2] > one.object_pos[0, 2] + 1e-6))
                 yield one, self.objects[str(one.object_name[0])], lifted
 
     def in_object(self, demos, points):

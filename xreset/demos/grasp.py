@@ -33,7 +33,7 @@ _CURL = np.array([0.0, 0.25, 0.25] * 4 + [0.0] * 5)  # of a grasping hand, beyon
 _GRID = 0.012  # spacing of the centres that are tried [m]
 _SIDE_TILTS = (0.6, 0.4, 0.15)  # how steeply a hand comes down from the side [rad]: the first is the most natural
 _TILT_COST = 2.0  # of being less steep [1/rad]
-_LOW_OBJECT = 0.06  # objects up to this height are grasped from above [m]
+_LOW_OBJECT = 0.07  # objects up to this height are grasped from above [m]
 
 
 @dataclass(frozen=True, kw_only=True)

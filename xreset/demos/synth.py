@@ -27,7 +27,10 @@ WORKSPACE = ((0.42, 0.72), (0.12, 0.40))
 CLOSING_AZIMUTH = (np.radians(25.0), np.radians(80.0))
 """Direction from a right hand's fingers to its thumb, as an angle about z: people at +y hold objects so. A left hand's is mirrored in x."""
 
-_REST_UP = {"035_power_drill": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))}  # mesh directions that may point up at the start; else z
+_REST_UP = {  # mesh directions that may point up at the start; else z
+    "005_tomato_soup_can": ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),  # 9 of 20 lie in DexYCB
+    "035_power_drill": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+}
 _NEAR_BEST = 1.0  # planning costs within this of the best are as good
 _TRIES = 12
 _GRASP_TRIES = 5

@@ -21,7 +21,7 @@ COMMANDS: dict[str, str] = {
     "resets": "Try retargeted states in physics and keep the stable ones.",
     "view": "Look at demonstrations, robot trajectories or a reset bank in a browser, or as pictures.",
     "train": "Train a policy.",
-    "policies": "Make exported policies smaller.",
+    "policies": "List the policies that ship with xreset, and make exported ones smaller.",
     "eval": "Evaluate a policy, or a baseline, in one or several engines.",
     "trace": "Replay one action sequence in several engines, and see when, where and by how much they part.",
     "attribute": "Tell which physical difference between two engines costs a policy its skill.",

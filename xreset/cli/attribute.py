@@ -33,7 +33,8 @@ def attribute(
     with all of them at once, and in the other engine: the same episodes from the same starts.
 
     Args:
-        policy: Run folder, exported policy (.onnx), or a baseline: zero, random, ik (open-loop kinematic retargeting).
+        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or a baseline: zero,
+            random, ik (open-loop kinematic retargeting).
         demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the path of ik.
         towards: Engine towards which the properties are changed, usually the one in which the policy does worse.
         backend: Engine in which they are changed.

@@ -24,7 +24,8 @@ def evaluate(
     """Evaluate a policy, or a baseline, in one or several engines.
 
     Args:
-        policy: Run folder, exported policy (.onnx), or a baseline: zero, random, ik (open-loop kinematic retargeting).
+        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or a baseline: zero,
+            random, ik (open-loop kinematic retargeting).
         backend: Physics engine; give it again for more engines. Default: mujoco.
         demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the path of ik.
         episodes: Episodes per demonstration, each with another perturbation of robot and object.
@@ -33,7 +34,8 @@ def evaluate(
         objects: Folder of real meshes; default: what the policy was trained with, else the stand-ins.
         num_envs: Worlds at a time.
         device: Where GPU engines run: cpu or cuda.
-        out: Folder for the results; default: eval/ in the run folder or beside the policy, runs/BASELINE-ROBOT/eval for a baseline.
+        out: Folder for the results; default: eval/ in the run folder or beside the policy; runs/NAME/eval for a policy that ships with
+            xreset, runs/BASELINE-ROBOT/eval for a baseline.
     """
     from rich.console import Console
     from rich.progress import Progress

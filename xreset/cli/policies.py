@@ -1,4 +1,4 @@
-"""``xreset policies``: exported policies as files."""
+"""``xreset policies``: those that ship with xreset, and exported ones as files."""
 
 from __future__ import annotations
 
@@ -6,6 +6,21 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+
+def list_() -> None:
+    """List the policies that ship with xreset; wherever a policy is asked for, their names will do."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from xreset.policies import shipped
+    from xreset.policy import OnnxPolicy
+
+    table = Table("policy", "robot", "objects", "MB")
+    for name, file in shipped().items():
+        contract = OnnxPolicy(file).contract
+        table.add_row(name, contract["robot"], ", ".join(contract["objects"]), f"{file.stat().st_size / 1e6:.1f}")
+    Console().print(table)
 
 
 def shrink(policy: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, tyro.conf.Positional]) -> None:
@@ -24,4 +39,4 @@ def shrink(policy: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, t
     Console().print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, was {before / 1e6:.2f} MB", markup=False, highlight=False, soft_wrap=True)
 
 
-COMMAND = {"shrink": shrink}
+COMMAND = {"list": list_, "shrink": shrink}

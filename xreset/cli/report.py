@@ -14,7 +14,7 @@ def report(
     """Make a self-contained HTML page of a run's evaluations, and one picture.
 
     Args:
-        run: Run folder, or a folder of results (of a baseline, for example).
+        run: Run folder, a folder of results (of a baseline, for example), or name of a policy that ships with xreset: its runs/NAME.
         out: Folder for index.html and overview.png; default: report/ in the run folder.
         robot: Name or folder of the robot, for the clips; default: as the results name it.
         objects: Folder of real meshes, for the clips; default: as the results name it.

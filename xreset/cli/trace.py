@@ -45,7 +45,8 @@ def trace(
             recorded episode. An actions.npz of this command: the same once more.
         backend: Engine to compare with the reference; give it again for several. Default: all that can be used here.
         reference: Engine that the others are compared with, and in which a policy plays.
-        policy: Run folder, exported policy (.onnx), or a baseline (zero, random, ik) that plays in the reference; its actions are replayed.
+        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset, or a baseline (zero, random, ik) that plays in
+            the reference; its actions are replayed.
         object: Object, if the source has several; default: the first.
         episode: Which of the object's grasps, demonstrations or recorded episodes.
         repetition: With --policy: which perturbation of the demonstration's start.

@@ -1,0 +1,86 @@
+"""Every policy that ships with xreset fits the robots, observations and objects of this version, and still has its skill."""
+
+import json
+import subprocess
+import sys
+import tempfile
+import unittest
+from importlib.util import find_spec
+from pathlib import Path
+
+from xreset import robots
+from xreset.demos import synthesize, write_demos
+from xreset.eval.evaluate import BASELINES, evaluate, resolve
+from xreset.objects import object_names
+from xreset.policies import shipped
+from xreset.policy import OnnxPolicy, check_contract
+from xreset.task.config import TaskConfig
+
+LARGEST = 5e6
+"""What a policy may add to every download [bytes]."""
+FLOOR = 0.6
+"""Mean task progress of the episodes below; an object that is grasped and lifted makes 0.66."""
+
+ABSENT = ("rsl_rl", "onnx", "onnxscript", "tensorboard", "warp", "mujoco_warp", "mujoco", "pybullet", "sapien", "coal", "viser")
+ACT = """
+import json, sys
+sys.modules.update(dict.fromkeys(sys.argv[2].split(",")))
+import torch
+from xreset.policy import OnnxPolicy
+policy = OnnxPolicy(sys.argv[1])
+widths = {group: sum(terms.values()) for group, terms in policy.contract["observation_layout"].items()}
+o = policy.contract["task"]["observation"]
+seen = {group: torch.zeros(3, widths[group]) for group in ("policy", "proprio")}
+actions = policy.act(seen | {"perception": torch.zeros(3, o["cloud_history"], o["cloud_points"], 3)})
+print(json.dumps([list(actions.shape), bool(actions.isfinite().all())]))
+"""
+
+
+class ShippedPolicyTest(unittest.TestCase):
+    def setUp(self):
+        self.assertTrue(shipped(), "no policy ships: is package data missing?")
+
+    def test_it_acts_without_engines_and_training(self):
+        for name, file in shipped().items():
+            with self.subTest(name):
+                command = [sys.executable, "-c", ACT, str(file), ",".join(ABSENT)]
+                out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+                self.assertEqual(json.loads(out), [[3, len(OnnxPolicy(file).contract["joint_names"])], True])
+
+    def test_it_fits_its_robot_and_the_observations_of_today(self):
+        for name, file in shipped().items():
+            with self.subTest(name):
+                contract = OnnxPolicy(file).contract
+                check_contract(name, contract, robots.load(contract["robot"]), TaskConfig())
+                resolve(name, None, 0)  # reads its task, too
+
+    def test_the_file_is_small_and_tells_nothing_of_where_it_was_made(self):
+        for name, file in shipped().items():
+            with self.subTest(name):
+                content = file.read_bytes()
+                self.assertLess(len(content), LARGEST)
+                self.assertNotIn(b".py", content)
+                self.assertNotIn(name, BASELINES)
+
+    def test_its_objects_have_stand_ins(self):
+        for name, file in shipped().items():
+            with self.subTest(name):
+                self.assertLessEqual(set(OnnxPolicy(file).contract["objects"]), set(object_names()))
+
+    @unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
+    def test_it_still_grasps_and_lifts(self):
+        for name, file in shipped().items():
+            with self.subTest(name):
+                with tempfile.TemporaryDirectory() as folder:
+                    demos = Path(folder) / "demos.npz"
+                    write_demos(demos, synthesize(OnnxPolicy(file).contract["objects"][:1], 2))
+                    (result,) = evaluate(
+                        resolve(name, None, 0), ["mujoco"], demos, episodes=1, seed=0, num_envs=2, device="cpu", objects_folder=None,
+                        out=Path(folder),
+                    )  # fmt: skip
+                self.assertEqual(result["episodes"], 2)
+                self.assertGreaterEqual(result["task_progress"]["mean"], FLOOR)
+
+
+if __name__ == "__main__":
+    unittest.main()

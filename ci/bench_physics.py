@@ -13,6 +13,9 @@ Raw and bare are control steps per second of CPU time, the processes per second 
 through that of all processes of the backend, this one included; in brackets the same by the wall clock, per process. Contenders take turns
 in slices of some hundredths of a second, every other time in reverse, each slice after a control step that is not counted; ratios are of
 slices of one turn, and figures are medians over turns. So the CPU's share bears other programs on the machine; the wall clock does not.
+
+By default there are 64 worlds, as many as `xreset eval`, `attribute` and `resets` run at a time. To wake a process costs the same whatever
+it then has to do, as much as half a world of MuJoCo, so what the pool loses shows more, the fewer worlds there are: see --num-envs 8.
 """
 
 from __future__ import annotations
@@ -38,6 +41,9 @@ from xreset.env import make_scene
 from xreset.objects import load_objects
 from xreset.spec import GRAVITY, SceneSpec
 from xreset.task.config import TaskConfig
+
+NUM_ENVS = 64
+"""Worlds, unless told otherwise: the docstring above says why."""
 
 Readings = Literal["state", "all"]
 

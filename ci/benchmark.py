@@ -1,7 +1,8 @@
 """Speed on the machine at hand. Compare figures of one run only, and believe them only if nothing else ran meanwhile.
 
-A section is a module ci/bench_NAME.py: its docstring says what it measures, run(options, console) prints it, and add_arguments(group), if
-there is one, adds options. ci/benchlib.py holds what sections share.
+A section is a module ci/bench_NAME.py: its docstring says what it measures, run(options, console) prints it; add_arguments(group), if there
+is one, adds options, and NUM_ENVS, if there is one, is how many worlds it has where --num-envs is not given. ci/benchlib.py holds what
+sections share.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import platform
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -17,6 +19,9 @@ from benchlib import Options
 from rich.console import Console
 
 from xreset.backends.pool import usable_cores
+
+_NUM_ENVS = 8
+"""Worlds of a section that does not say otherwise."""
 
 
 def sections() -> dict[str, ModuleType]:
@@ -29,13 +34,14 @@ def main() -> None:
     known = sections()
     parser = argparse.ArgumentParser(
         prog="ci/benchmark",
-        description="\n".join([__doc__, *(module.__doc__ or "" for module in known.values())]),
+        description="\n".join([__doc__ or "", *(module.__doc__ or "" for module in known.values())]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("sections", nargs="*", metavar="section", help=f"what to measure: {', '.join(known)} (default: all)")
     parser.add_argument("--robot", default="ur7e-sharpa")
     parser.add_argument("--backend", action="append", default=[], help="engine; again for more (default: all)")
-    parser.add_argument("--num-envs", type=int, default=8, help="worlds")
+    own = ", ".join(f"{name} {module.NUM_ENVS}" for name, module in known.items() if hasattr(module, "NUM_ENVS"))
+    parser.add_argument("--num-envs", type=int, help=f"worlds (default: {_NUM_ENVS}; {own})")
     parser.add_argument("--device", default="cpu", help="for the engines that can: cuda")
     parser.add_argument("--seconds", type=float, default=3.0, help="per measurement")
     for name, module in known.items():
@@ -46,13 +52,15 @@ def main() -> None:
     if unknown := set(chosen) - set(known):
         parser.error(f"there is no section {', '.join(sorted(unknown))}; there are {', '.join(known)}")
 
-    common = {name: arguments.pop(name) for name in ("robot", "num_envs", "device", "seconds")}
-    options = Options(**common, backends=tuple(arguments.pop("backend")), extra=arguments)
+    num_envs = arguments.pop("num_envs")
+    common = {name: arguments.pop(name) for name in ("robot", "device", "seconds")}
+    options = Options(**common, num_envs=_NUM_ENVS, backends=tuple(arguments.pop("backend")), extra=arguments)
     console = Console(width=160)
     gpu = f", {torch.cuda.get_device_name()}" if options.device.startswith("cuda") else ""
     console.print(f"{platform.machine()}, {usable_cores()} cores{gpu}")
     for name in chosen:
-        known[name].run(options, console)
+        worlds = getattr(known[name], "NUM_ENVS", _NUM_ENVS) if num_envs is None else num_envs
+        known[name].run(replace(options, num_envs=worlds), console)
 
 
 if __name__ == "__main__":

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 from xreset.backends.base import Capability
 from xreset.backends.conformance.results import SCHEMA as CONFORMANCE
 from xreset.backends.parity.compare import SCHEMA as PARITY
 from xreset.errors import FileFormatError, XResetError
 from xreset.files import read_json
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -49,11 +51,11 @@ class Checks:
 
     robot: str
     results: dict[Column, dict[str, dict[str, Any]]]
-    """Of each engine, its checks by name, as in the file."""
+    """Of each engine on each device, its checks by name, as in the file."""
 
     @property
     def columns(self) -> list[Column]:
-        """The engines, in the order of the files."""
+        """The engines, each one's devices side by side."""
         return list(self.results)
 
     @property
@@ -103,7 +105,14 @@ def read(paths: Iterable[Path]) -> Results:
             raise FileFormatError(f"{path} is no complete {schema}: {type(error).__name__} {error}. Make it again.") from error
     if not results.sources:
         raise XResetError("there is nothing to make a page of. Give files that `xreset conformance` or `xreset parity` wrote with --json.")
-    return results
+    checks = {robot: Checks(robot, _side_by_side(found.results)) for robot, found in results.checks.items()}
+    return replace(results, checks=checks, capabilities=_side_by_side(results.capabilities))
+
+
+def _side_by_side(columns: Mapping[Column, _T]) -> dict[Column, _T]:
+    """Engines in the order of the files, and each one's versions and devices next to each other, whatever files they came in."""
+    engines = list(dict.fromkeys(column.engine for column in columns))
+    return {column: columns[column] for column in sorted(columns, key=lambda column: engines.index(column.engine))}
 
 
 def _add_conformance(results: Results, name: str, data: Mapping[str, Any]) -> None:
@@ -118,11 +127,16 @@ def _add_conformance(results: Results, name: str, data: Mapping[str, Any]) -> No
 
 
 def _add_parity(results: Results, name: str, data: Mapping[str, Any]) -> None:
-    engines = ", ".join(f"{e['backend']} {e['version']}" for e in data["engines"])
-    covers = f"grasps of {data['robot']}: {engines} against {data['reference']['backend']} {data['reference']['version']}"
+    engines = ", ".join(_column(engine).title for engine in data["engines"])
+    covers = f"grasps of {data['robot']}: {engines} against {_column(data['reference']).title}"
     source = Source(name, data.get("command", ""), data.get("xreset_version", ""), covers)
     results.sources.append(source)
     results.parities.append(Parity(source, data))
+
+
+def _column(engine: Mapping[str, Any]) -> Column:
+    """Of an engine as in the file of a comparison."""
+    return Column(engine["backend"], engine["version"], engine["device"])
 
 
 # The page --------------------------------------------------------------------------------------------------------------------------------
@@ -135,7 +149,7 @@ def page(results: Results) -> str:
         "Made by `xreset engines` from the results of the commands below; do not edit it, run them again.",
         "Every check states what must hold, and compares with something independent of the engine: the URDF's kinematics, equations of "
         "motion, m g, or MuJoCo, the reference. What cannot agree is declared by the engine's backend with a bound and a reason, is still "
-        "measured, and fails beyond the bound.",
+        "measured, and fails beyond the bound. Where no device is named, the engine ran on the CPU.",
         *_commands(results),
         *_capabilities(results),
     ]
@@ -227,14 +241,15 @@ def _parity(parity: Parity) -> list[str]:
         found = [next((m for m in engine["metrics"] if m["metric"] == name), None) for engine in columns]
         cells = [_NONE if m is None else _missed(m, f"{_amount(m['measured'], m)} ({m['n']})") for m in found]
         rows.append([metric["claim"], f"{metric['sense']} {_amount(metric['target'], metric)}", *cells])
-    reference, objects = data["reference"], ", ".join(thing["name"] for thing in data["objects"])
+    objects = ", ".join(thing["name"] for thing in data["objects"])
     text = (
-        f"{len(data['grasps']['closing'])} closings and {len(data['grasps']['hold'])} holds of {objects}, against {reference['backend']} "
-        f"{reference['version']}. In brackets: how many numbers it is taken over. *{data['floor']['backend']}* shows how far two honest "
-        f"solutions of the same equations differ. Made by `{parity.source.command or parity.source.name}`."
+        f"{len(data['grasps']['closing'])} closings and {len(data['grasps']['hold'])} holds of {objects}, against "
+        f"{_column(data['reference']).title}. In brackets: how many numbers it is taken over. *{data['floor']['backend']}* shows how far "
+        f"two honest solutions of the same equations differ. Made by `{parity.source.command or parity.source.name}`."
     )
-    titles = [Column(engine["backend"], engine["version"], engine["device"]).title for engine in columns]
-    return [f"## Agreement on grasps: {data['robot']}", text, _table(["what is compared", "target", *titles], rows)]
+    titles = [_column(engine).title for engine in columns]
+    heading = f"## Agreement on grasps: {data['robot']} in {' and '.join(titles[1:])}"
+    return [heading, text, _table(["what is compared", "target", *titles], rows)]
 
 
 def _missed(metric: Mapping[str, Any], text: str) -> str:

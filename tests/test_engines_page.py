@@ -89,6 +89,19 @@ class PageTest(unittest.TestCase):
         self.assertIn(f"| check | what must hold | mujoco {version} | mujoco-warp {version}, cuda |", text)
         self.assertEqual(self.row(text, "object mass"), ["object mass", "yes", "no"])
 
+    def test_devices_of_an_engine_stand_side_by_side_whatever_the_order_of_the_files(self):
+        slower = self.changed(engine="mujoco-warp", device="cuda", capabilities=["friction"])
+        [fall] = [check for check in slower["runs"][0]["checks"] if check["check"] == "free_fall"]
+        for measure in fall["measures"]:
+            measure["measured"] = 0.5 * measure["tolerance"]
+        text = self.page_of(CONFORMANCE, self.changed(engine="mujoco-warp"), self.changed(engine="sapien"), slower)
+        version = CONFORMANCE["runs"][0]["engine_version"]
+        columns = f"mujoco {version} | mujoco-warp {version} | mujoco-warp {version}, cuda | sapien {version} |"
+        self.assertIn(f"| check | what must hold | {columns}", text)
+        self.assertIn(f"| check | measure | tolerance | {columns}", text)
+        self.assertEqual([cell == "0.50" for cell in self.row(text, "`free_fall`")[2:]], [False, False, True, False])
+        self.assertEqual(self.row(text, "object mass"), ["object mass", "yes", "yes", "no", "yes"])
+
     def test_robots_have_tables_of_their_own(self):
         text = self.page_of(CONFORMANCE, self.changed(robot="openarm"))
         self.assertIn("## Conformance with openarm", text)
@@ -124,6 +137,14 @@ class PageTest(unittest.TestCase):
         self.assertEqual(self.row(text, "same outcome"), ["same outcome", "at least 0.8", "-", "**missed: not measured (0)**"])
         self.assertIn("12 closings and 24 holds of 005_tomato_soup_can, against mujoco 4.0.0", text)
         self.assertIn(GRASPS["command"], text)
+
+    def test_grasps_name_engine_and_device(self):
+        data = copy.deepcopy(GRASPS)
+        data["engines"][0] |= {"backend": "mujoco-warp", "version": "4.0.0", "device": "cuda"}
+        text = self.page_of(GRASPS, data)
+        self.assertIn("## Agreement on grasps: ur7e-sharpa in sapien 3.0.3\n", text)
+        self.assertIn("## Agreement on grasps: ur7e-sharpa in mujoco-warp 4.0.0, cuda\n", text)
+        self.assertIn("| grasps of ur7e-sharpa: mujoco-warp 4.0.0, cuda against mujoco 4.0.0 |", text)
 
     def test_wrong_files(self):
         for data, message in (

@@ -163,6 +163,9 @@ class DocsTest(unittest.TestCase):
         for engine in ("mujoco", "mujoco-warp", "pybullet", "sapien", "drake"):
             self.assertRegex(text, rf"[|;] {engine} \d+\.\d+[\d.]* with [\w-]+ on \w+", engine)
             self.assertRegex(text, rf"`xreset conformance [^`]*--backend {engine}\b", engine)
+        for robot in ("conformance-gripper", "ur7e-sharpa", "openarm"):
+            for device in ("cpu", "cuda"):
+                self.assertRegex(text, rf"\bmujoco-warp [\d.]+ with {robot} on {device}\b")
         self.assertIn("## Known differences", text)
 
     def test_no_engine_fails_on_the_page(self):

@@ -53,8 +53,8 @@ def place(
     if not len(wrists.annotated):
         raise RobotError(f"robot {robot.name!r}: there is no frame to reach; hand retargeting followed none within its threshold.")
     random = np.random.default_rng(config.seed)
-    order = random.permutation(len(wrists.annotated))
-    tried, kept = _chosen(wrists, order[: config.frames]), _chosen(wrists, order[config.frames :][: config.final_frames])
+    order = torch.as_tensor(random.permutation(len(wrists.annotated)))
+    tried, kept = wrists.select(order[: config.frames]), wrists.select(order[config.frames :][: config.final_frames])
     if not len(kept.annotated):
         kept = tried
     own = Placement(pos=robot.base_pos, quat=robot.base_quat)
@@ -143,10 +143,6 @@ def _parameters(placement: Placement) -> np.ndarray:
     azimuth = np.arctan2(R[1, 2], R[0, 2]) if np.sin(tilt) > 1e-6 else 0.0
     back = Rotation.from_euler("ZY", (azimuth, tilt)).inv().as_matrix() @ R
     return np.array([*placement.pos, *np.degrees((azimuth, tilt, np.arctan2(back[1, 0], back[0, 0])))])
-
-
-def _chosen(wrists: ArmTargets, frames: np.ndarray) -> ArmTargets:
-    return ArmTargets(**{name: value[torch.as_tensor(frames)] for name, value in vars(wrists).items()})
 
 
 def _home(robot: RobotSpec, placement: Placement) -> np.ndarray | None:

@@ -110,7 +110,7 @@ class PlaceTest(unittest.TestCase):
         torch.testing.assert_close(ArmModel(moved).kinematics.link_poses(q, ["palm"]), before, atol=5e-3, rtol=0)
 
     def test_nothing_to_reach_is_an_error(self):
-        none = ArmTargets(**{name: value[:0] for name, value in vars(self.wrists).items()})
+        none = self.wrists.select(torch.arange(0))
         with self.assertRaisesRegex(RobotError, "no frame to reach"):
             placing.place(self.robot, [none], np.zeros((0, 3)), CONFIG)
 
@@ -168,11 +168,11 @@ class DirectionTest(unittest.TestCase):
 
     def test_both_ends_are_tried(self):
         self.assertGreaterEqual(self.valid(self.targets), 8)  # forwards alone: none
-        self.assertGreaterEqual(self.valid(ArmTargets(**{name: value.flip(1) for name, value in vars(self.targets).items()})), 8)
+        self.assertGreaterEqual(self.valid(self.targets.reversed()), 8)
 
     def test_frames_between_two_bad_ends_are_found_from_the_middle(self):
         back = self.targets.root_pos.shape[1]
-        pieces = (self.targets, ArmTargets(**{name: value.flip(1) for name, value in vars(self.targets).items()}))
+        pieces = (self.targets, self.targets.reversed())
         both = ArmTargets(**{name: torch.cat((getattr(pieces[0], name), getattr(pieces[1], name)), dim=1) for name in vars(self.targets)})
         thresholds = Thresholds(table_depth=1e9, self_depth=1e9)
         valid = []

@@ -40,9 +40,10 @@ class LightnessTest(unittest.TestCase):
     def test_help_loads_nothing_heavy(self):
         self.assertFalse(modules_after("from xreset.cli import main; main(['--help'])") & set(HEAVY))
 
-    def test_help_of_train_loads_no_torch_and_no_engine(self):
-        code = "from xreset.cli import main\ntry: main(['train', '--help'])\nexcept SystemExit: pass\npass"
-        self.assertFalse(modules_after(code) & {"torch", "warp", "mujoco", "mujoco_warp", "pybullet", "sapien", "rsl_rl"})
+    def test_help_of_commands_with_a_configuration_loads_no_torch_and_no_engine(self):
+        for command in ("train", "retarget"):
+            code = f"from xreset.cli import main\ntry: main(['{command}', '--help'])\nexcept SystemExit: pass\npass"
+            self.assertFalse(modules_after(code) & {"torch", "warp", "mujoco", "mujoco_warp", "pybullet", "sapien", "rsl_rl"}, command)
 
 
 class UsageTest(unittest.TestCase):

@@ -11,12 +11,14 @@ import numpy as np
 import torch
 
 from tests.data import data_dir
+from tests.test_cli import run
 from tests.toy_robot import toy_hand_arm
 from xreset import robots
 from xreset.demos import demo_objects, read_demos, synthesize, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError
 from xreset.kinematics import Kinematics
 from xreset.objects.geometry import box, surface_of
+from xreset.retarget import arm_solver
 from xreset.retarget import pipeline as pipeline_module
 from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, measure, track
 from xreset.retarget.balls import inscribed_balls, sharp_points
@@ -402,6 +404,29 @@ class HandTest(unittest.TestCase):
             HandModel(dataclasses.replace(self.robot, keypoints=self.robot.keypoints[:2]))
 
 
+class ConfigTest(unittest.TestCase):
+    def test_numbers_out_of_range_are_refused_by_name(self):
+        for config, name, values in (
+            (HandConfig, "hold_weight", (-1.0, np.nan, np.inf)),
+            (HandConfig, "contact_knee", (0.0, np.nan)),
+            (HandConfig, "object_clearance", (np.nan, -np.inf)),
+            (HandConfig, "clearance_growth", ((0.1, np.nan),)),
+            (ArmConfig, "reseeds", (-1,)),
+            (ArmConfig, "restarts", (0,)),
+            (ArmConfig, "position_weight", (-50.0, np.nan)),
+        ):
+            for value in values:
+                with self.subTest(name=name, value=value), self.assertRaisesRegex(ValueError, f"^{name} is .*, expected"):
+                    config(**{name: value})
+        HandConfig(object_clearance=-0.001, jump_limit=np.inf)  # deeper than the surface; no limit
+
+    def test_the_command_line_says_so_too(self):
+        for option, value, said in (("--hand.hold-weight", "nan", "hold_weight is nan"), ("--arm.reseeds", "-1", "reseeds is -1")):
+            code, out, err = run("retarget", "demos.npz", "--robot", "openarm", "--out", "out.npz", option, value)
+            self.assertEqual(code, 2)
+            self.assertIn(said, out + err)
+
+
 class ArmTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
@@ -462,14 +487,18 @@ class ArmTest(unittest.TestCase):
 
     def test_self_collision_costs_and_its_gradient_parts_the_links(self):
         """The arm folded onto itself: a small step against the gradient must raise the clearance."""
-        from xreset.retarget import arm as arm_module
-
         folded = torch.as_tensor(self.robot.home[self.robot.arm_indices]).clone()[None]
         folded[0, self.robot.joint_names.index("elbow_joint")] = 2.95
         targets = self.along(folded)
-        frame = arm_module._frame(targets, self.model.hand_support(targets.hand_joints), 0, None)
-        plain = arm_module._system(self.model, frame, folded, self.config, None)
-        full = arm_module._system(self.model, frame, folded, self.config, self.model.arm_collision)
+        frame = arm_solver.Frame(
+            pos=targets.root_pos[:, 0],
+            quat=targets.root_quat[:, 0],
+            support=self.model.hand_support(targets.hand_joints)[:, 0],
+            hand_joints=targets.hand_joints[:, 0],
+            previous=None,
+        )
+        plain = arm_solver.system(self.model, frame, folded, self.config, self_collision=False)
+        full = arm_solver.system(self.model, frame, folded, self.config, self_collision=True)
         self.assertGreater((full.cost - plain.cost).item(), 0.1)
         push = full.gradient - plain.gradient
         step = 1e-6
@@ -478,8 +507,8 @@ class ArmTest(unittest.TestCase):
             shift = torch.zeros_like(folded)
             shift[0, k] = step
             costs = [
-                arm_module._system(self.model, frame, folded + sign * shift, self.config, self.model.arm_collision).cost
-                - arm_module._system(self.model, frame, folded + sign * shift, self.config, None).cost
+                arm_solver.system(self.model, frame, folded + sign * shift, self.config, self_collision=True).cost
+                - arm_solver.system(self.model, frame, folded + sign * shift, self.config, self_collision=False).cost
                 for sign in (1.0, -1.0)
             ]
             slopes.append(((costs[0] - costs[1]) / (4 * step)).item())

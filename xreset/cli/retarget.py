@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from xreset.retarget.arm_config import ArmConfig
 from xreset.retarget.hand_config import HandConfig
 
 
@@ -22,6 +23,7 @@ def retarget(
     picture: Path | None = None,
     device: str = "cpu",
     hand: HandConfig = HandConfig(),  # noqa: B008 (frozen)
+    arm: ArmConfig = ArmConfig(),  # noqa: B008
 ) -> None:
     """Turn human demonstrations into robot trajectories.
 
@@ -36,6 +38,7 @@ def retarget(
         restart: Begin anew, whatever an earlier run has finished.
         device: Where hand retargeting runs: cpu or cuda. The arm runs on the CPU.
         hand: Weights of hand retargeting.
+        arm: Weights and effort of the arm's inverse kinematics.
         picture: PNG to write: first contact, mid-lift and goal for each object, the human keypoints over the robot.
     """
     from dataclasses import asdict
@@ -59,7 +62,7 @@ def retarget(
     if max_per_object is not None:
         chosen = chosen.select(max_per_object=max_per_object)
     specs = demo_objects(chosen, objects)
-    config, timing = pipeline.RetargetConfig(hand=hand), pipeline.Timing()
+    config, timing = pipeline.RetargetConfig(hand=hand, arm=arm), pipeline.Timing()
     partial = out.with_name(f"{out.name}.partial")
     if restart:
         discard(partial)

@@ -5,6 +5,7 @@ trajectories = retarget(demos, robot, objects)      # hand, then arm, then valid
 trajectories.joint_pos[trajectories.valid]          # robot states that may become resets
 
 Modules: ``pipeline`` (the whole); ``hand`` (the solver) with ``hand_config``, ``problem``, ``hand_model``, ``cost``, ``terms``,
-``clearance``, ``balls``, ``chain``, ``hold`` (grasps that are held) and ``scale`` (the user's size); ``arm`` with ``collision`` and
-``splice``; ``surface`` and ``fields`` (the object); ``validity``, ``file``, ``partial`` (stop and continue).
+``clearance``, ``balls``, ``chain``, ``hold`` (grasps that are held) and ``scale`` (the user's size); ``arm`` with ``arm_config``,
+``arm_model``, ``arm_solver`` (one frame), ``arm_paths`` (over time), ``splice`` and ``collision``; ``surface`` and ``fields`` (the object);
+``validity``, ``file``, ``partial`` (stop and continue).
 """

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
+
+from xreset.retarget.checks import check_numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +58,14 @@ class HandConfig:
     """A sequence is done when a step lowers its cost by less than this fraction."""
 
     def __post_init__(self) -> None:
-        if not (self.smoothness_weight > 0 and self.length_scale > 0 and self.jump_limit > 0):
-            raise ValueError(
-                f"smoothness_weight ({self.smoothness_weight}), length_scale ({self.length_scale}) and jump_limit ({self.jump_limit}) must "
-                "be positive"
-            )
+        check_numbers(
+            self,
+            positive=("smoothness_weight", "contact_knee", "jump_limit", "length_scale"),
+            not_negative=(
+                "local_weight", "global_weight", "tip_factor", "contact_weight", "contact_margin", "clearance_weight", "jump_weight",
+                "touch_weight", "hold_weight", "growth_iterations", "iterations", "tolerance",
+            ),
+            finite=("object_clearance", "self_depth", "touch_gap"),
+        )  # fmt: skip
+        if not all(0 <= share < inf for share in self.clearance_growth):
+            raise ValueError(f"clearance_growth is {self.clearance_growth}, expected finite numbers, 0 or more")

@@ -1,0 +1,29 @@
+"""Numbers of a configuration that make no sense are refused when it is made, not met as NaN some minutes later."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import inf, isfinite
+
+
+def check_numbers(config: object, *, positive: Iterable[str] = (), not_negative: Iterable[str] = (), finite: Iterable[str] = ()) -> None:
+    """Refuse fields that are out of range.
+
+    Args:
+        config: any dataclass.
+        positive: fields that must be above 0; infinity will do, where it means that there is no limit.
+        not_negative: fields that must be finite and at least 0.
+        finite: fields that must be finite.
+
+    Raises:
+        ValueError: says which field is what, and what was expected. NaN is never in range.
+    """
+    for name in positive:
+        if not 0 < getattr(config, name) <= inf:
+            raise ValueError(f"{name} is {getattr(config, name)}, expected a number above 0")
+    for name in not_negative:
+        if not 0 <= getattr(config, name) < inf:
+            raise ValueError(f"{name} is {getattr(config, name)}, expected a finite number, 0 or more")
+    for name in finite:
+        if not isfinite(getattr(config, name)):
+            raise ValueError(f"{name} is {getattr(config, name)}, expected a finite number")

@@ -12,7 +12,7 @@ from unittest import mock
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto, numpy_helper
+from onnx import TensorProto, helper, numpy_helper
 from tensordict import TensorDict
 
 from tests.test_cli import run
@@ -123,7 +123,32 @@ class ShrinkTest(WithPolicy):
         large.write_bytes(model.SerializeToString())
         with self.assertRaisesRegex(PolicyError, r"weights up to \S+ in mlp\.0\.weight, float16 ends at 65504"):
             shrink(large, out)
+        weights.CopyFrom(numpy_helper.from_array(np.full(tuple(weights.dims), np.nan, dtype=np.float32), weights.name))
+        large.write_bytes(model.SerializeToString())
+        with self.assertRaisesRegex(PolicyError, r"weights in mlp\.0\.weight that are NaN or infinite"):
+            shrink(large, out)
         self.assertFalse(out.exists())
+
+    def test_a_damaged_contract_or_another_graph_is_refused(self):
+        model, damaged = onnx.load(str(self.file)), self.folder / "damaged.onnx"
+        entry = next(e for e in model.metadata_props if e.key == "xreset")
+        contract = entry.value
+        for text, said in (("{nope", "no JSON"), ("[]", r"contract \[\], expected a JSON object"), ("{}", "policy schema None")):
+            entry.value = text
+            damaged.write_bytes(model.SerializeToString())
+            with self.subTest(text), self.assertRaisesRegex(PolicyError, said):
+                OnnxPolicy(damaged)
+        graph = helper.make_graph(
+            [helper.make_node("Identity", ["x"], ["y"])],
+            "identity",
+            [helper.make_tensor_value_info("x", TensorProto.FLOAT, [2])],
+            [helper.make_tensor_value_info("y", TensorProto.FLOAT, [2])],
+        )
+        other = helper.make_model(graph, opset_imports=model.opset_import, ir_version=model.ir_version)
+        helper.set_model_props(other, {"xreset": contract})
+        damaged.write_bytes(other.SerializeToString())
+        with self.assertRaisesRegex(PolicyError, "takes the inputs x; a policy takes flat, cloud, h_in, c_in"):
+            OnnxPolicy(damaged)
 
     def test_the_command_says_both_sizes_and_may_replace_its_input(self):
         file = self.folder / "mine.onnx"

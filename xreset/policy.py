@@ -26,6 +26,12 @@ if TYPE_CHECKING:
     from xreset.env import ManipulationEnv
 
 SCHEMA = "xreset-policy/1"
+METADATA_KEY = "xreset"
+"""Key of the ONNX metadata entry that holds the contract as JSON."""
+INPUTS = ("flat", "cloud", "h_in", "c_in")
+"""Of the ONNX graph: the observation's groups ``policy`` and ``proprio`` side by side, its point clouds, and the LSTM's state."""
+OUTPUTS = ("actions", "h_out", "c_out")
+"""Of the ONNX graph: actions, and the LSTM's next state."""
 
 
 class Policy(Protocol):
@@ -64,8 +70,7 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
         PolicyError: names the first thing that differs.
     """
     here = policy_contract(robot, task, ())
-    if contract.get("schema") != SCHEMA:
-        raise PolicyError(f"{source} has policy schema {contract.get('schema')!r}, expected {SCHEMA!r}. Export it again.")
+    _check_schema(source, contract)
     for key, what in (("robot", "robot"), ("joint_names", "joint order"), ("fingertip_names", "fingertips")):
         if contract[key] != here[key]:
             raise PolicyError(
@@ -86,6 +91,24 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
         )
     if abs(contract["control_dt"] - here["control_dt"]) > 1e-9:
         raise PolicyError(f"{source} acts every {contract['control_dt']:.6f} s, here a control step lasts {here['control_dt']:.6f} s.")
+
+
+def _check_schema(source: str, contract: dict[str, Any]) -> None:
+    if contract.get("schema") != SCHEMA:
+        raise PolicyError(f"{source} has policy schema {contract.get('schema')!r}, expected {SCHEMA!r}. Export it again.")
+
+
+def _read_contract(path: Path, metadata: dict[str, str]) -> dict[str, Any]:
+    if METADATA_KEY not in metadata:
+        raise PolicyError(f"{path} is an ONNX file without xreset's contract: it was not exported by xreset.")
+    try:
+        contract = json.loads(metadata[METADATA_KEY])
+    except ValueError as error:
+        raise PolicyError(f"{path} holds a contract that is no JSON ({error}). Export it again.") from error
+    if not isinstance(contract, dict):
+        raise PolicyError(f"{path} holds the contract {contract!r}, expected a JSON object. Export it again.")
+    _check_schema(str(path), contract)
+    return contract
 
 
 class OnnxPolicy:
@@ -110,10 +133,10 @@ class OnnxPolicy:
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:
             raise PolicyError(f"{path} cannot be read as an ONNX policy: {error}") from error
-        metadata = self._session.get_modelmeta().custom_metadata_map
-        if "xreset" not in metadata:
-            raise PolicyError(f"{path} is an ONNX file without xreset's contract: it was not exported by xreset.")
-        self.contract: dict[str, Any] = json.loads(metadata["xreset"])
+        self.contract = _read_contract(path, self._session.get_modelmeta().custom_metadata_map)
+        inputs = tuple(given.name for given in self._session.get_inputs())
+        if inputs != INPUTS:
+            raise PolicyError(f"{path} takes the inputs {', '.join(inputs)}; a policy takes {', '.join(INPUTS)}. Export it again.")
         self.name = path.stem if path.stem != "policy" else path.resolve().parent.name
         self._lstm_dim = int(self._session.get_inputs()[2].shape[2])
         self._state: list[np.ndarray] | None = None

@@ -34,7 +34,7 @@ def shrink(policy: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, t
 
     from xreset.learning.shrink import shrink as write_shrunk
 
-    before = policy.stat().st_size if policy.is_file() else 0
+    before = policy.stat().st_size if policy.is_file() else 0  # now, for the output may replace it; of what is no file, shrinking complains
     write_shrunk(policy, out)
     Console().print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, was {before / 1e6:.2f} MB", markup=False, highlight=False, soft_wrap=True)
 

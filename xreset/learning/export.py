@@ -16,11 +16,7 @@ import torch
 from xreset.files import atomic_write
 from xreset.learning.model import PointNetLstmModel
 from xreset.learning.shrink import drop_exporter_notes
-
-INPUTS = ("flat", "cloud", "h_in", "c_in")
-OUTPUTS = ("actions", "h_out", "c_out")
-METADATA_KEY = "xreset"
-"""Key of the ONNX metadata entry that holds the contract as JSON."""
+from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS
 
 
 def export_onnx(actor: PointNetLstmModel, path: str | Path, contract: dict[str, Any]) -> None:

@@ -31,6 +31,7 @@ def shrink(source: str | Path, path: str | Path) -> None:
 
     Raises:
         PolicyError: the source is missing, damaged or no policy, holds no float32 matrix, or one that float16 cannot hold.
+        XResetError: the file cannot be written.
     """
     OnnxPolicy(source)  # says what is wrong with a file that is none
     try:
@@ -53,7 +54,7 @@ def halve_matrices(model: ModelProto, source: str) -> int:
         source: where it comes from, for messages.
 
     Raises:
-        PolicyError: a weight is not finite in float16.
+        PolicyError: a weight is not finite, or too large for float16.
     """
     from onnx import TensorProto, helper, numpy_helper
 
@@ -62,6 +63,10 @@ def halve_matrices(model: ModelProto, source: str) -> int:
         if weights.data_type != TensorProto.FLOAT or len(weights.dims) != 2 or min(weights.dims) == 1:
             continue
         name, exact = weights.name, numpy_helper.to_array(weights)
+        if not np.isfinite(exact).all():
+            raise PolicyError(
+                f"{source} has weights in {name} that are NaN or infinite: its training has diverged. Use an earlier checkpoint."
+            )
         with np.errstate(over="ignore"):
             rounded = exact.astype(np.float16)
         if not np.isfinite(rounded).all():

@@ -34,7 +34,8 @@ class MujocoWorld(World):
     """One world in MuJoCo.
 
     The engine's step has two halves: what follows from positions and velocities (``mj_step1``: kinematics, contacts), and forces and
-    motion (``mj_step2``). When links are asked for, the first half of the next step is done in advance, so they are up to date at no cost.
+    motion (``mj_step2``). When links are asked for, the first half of the next step is done in advance: they are then up to date, and
+    nothing is done twice, unless a parameter changes before that step.
     """
 
     def __init__(self, scene: SceneSpec, object_index: int, *, settings: MujocoSettings = _DEFAULTS) -> None:
@@ -176,6 +177,7 @@ class MujocoWorld(World):
         self._ahead = True
 
     def _sense_contacts(self) -> None:
+        """Sense the contact forces of the last step, before the first half of the next one replaces the engine's contacts."""
         if not self._contacts_sensed:
             self._option.disableflags = self._sensing
             mujoco.mj_sensorAcc(self._model, self._data)

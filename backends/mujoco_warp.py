@@ -27,10 +27,16 @@ except ImportError as error:
 
 from xreset.backends import mujoco_warp_kernels as kernels
 from xreset.backends.mjcf import KNOWN_DIFFERENCES, MIN_FRICTION, MujocoSettings, compile_scene
-from xreset.backends.mujoco_warp_depth import correct_depths
 
 wp.config.log_level = wp.LOG_WARNING  # else a line for each of some hundred kernels; what a user needs to know is announced below
-correct_depths()
+
+_WRONG_DEPTHS = ("4.0.0",)
+"""Versions of MuJoCo-Warp that were seen to take the wrong depth of some contacts. Others are left as they are, and their private modules
+unread; ``tests/test_mujoco_warp_depth.py`` says whether they need it too."""
+if mjw.__version__ in _WRONG_DEPTHS:
+    from xreset.backends.mujoco_warp_depth import correct_depths
+
+    correct_depths()
 
 _SET_PER_WORLD = (
     "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "body_gravcomp", "geom_friction",

@@ -7,7 +7,8 @@ of such a contact from that corner. MuJoCo-Warp takes its place, and the depth o
 one step; with the corner's depth the joints of those five follow MuJoCo's to 1.6e-5 rad (median over a second) instead of 6.9e-4.
 
 No setting changes it, and the step offers no place between collision and constraints where the corner's depth is still known. So the
-engine's function is wrapped, before any kernel is made of it.
+engine's function is wrapped, before any kernel is made of it. This module reads the engine's private modules: import it only with a version
+that is known to need it.
 """
 
 # Warp compiles these functions from their source; to a type checker of Python they make no sense.
@@ -15,15 +16,11 @@ engine's function is wrapped, before any kernel is made of it.
 
 from __future__ import annotations
 
-import mujoco_warp as mjw
 import warp as wp
 from mujoco_warp._src import collision_convex
 from mujoco_warp._src.collision_core import Geom
 from mujoco_warp._src.collision_gjk import multicontact
 from mujoco_warp._src.types import mat43
-
-AFFECTED = ("4.0.0",)
-"""Versions of MuJoCo-Warp that were seen to take the wrong depth. Others are left as they are; tests say whether they need it."""
 
 _APART = wp.constant(1e6)
 """Distance [m] at which no contact is written."""
@@ -64,6 +61,5 @@ def multicontact_with_depth(
 
 
 def correct_depths() -> None:
-    """Have the engine's collision use :func:`multicontact_with_depth`, in versions that need it. Kernels made before keep the fault."""
-    if mjw.__version__ in AFFECTED:
-        collision_convex.multicontact = multicontact_with_depth
+    """Have the engine's collision use :func:`multicontact_with_depth`. Kernels made before keep the fault."""
+    collision_convex.multicontact = multicontact_with_depth

@@ -43,8 +43,8 @@ class World(ABC):
     """One world of a scene in one process. Arrays are numpy float64; conventions are those of :class:`~xreset.backends.base.Backend`.
 
     The state is undefined until :meth:`set_state`, which the pool calls first. A world that reports a non-finite state is not stepped
-    again before its state is set. :meth:`links` and :meth:`contacts` are called where somebody wants them, in any order, and before a
-    parameter changes.
+    again before its state is set. :meth:`links` and :meth:`contacts` are called only where somebody wants them, in any order, once or
+    often: they must move nothing, and speak of the last step. No parameter changes between that step and the call.
     """
 
     @abstractmethod
@@ -170,7 +170,10 @@ class PoolBackend(Backend):
             self._team = _Team(jobs, layout)
             self._arrays = self._team.arrays
         self._close = weakref.finalize(self, self._team.close)  # also runs when the interpreter exits
-        self._present = self._asked = _READINGS
+        self._present = _READINGS
+        """Readings that are up to date in the shared arrays."""
+        self._asked = _READINGS
+        """Readings that somebody has asked for since the last step: the next step brings them."""
 
         views = {name: torch.from_numpy(array) for name, array in self._arrays.items()}
         self._state = State(**{name: views[name] for name in STATE_FIELDS})

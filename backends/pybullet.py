@@ -131,6 +131,7 @@ class PybulletWorld(World):
         return {**self._seen, "joint_target": self._drives.target}
 
     def _look(self) -> dict[str, np.ndarray]:
+        """The state but for the drive targets, which may change while nothing moves."""
         p, client = self._p, self._client
         com, turn = p.getBasePositionAndOrientation(self._object.body, physicsClientId=client)
         linear, angular = (np.array(v) for v in p.getBaseVelocity(self._object.body, physicsClientId=client))

@@ -105,6 +105,7 @@ class SapienWorld(World):
         return {**self._seen, "joint_target": self._joints.target}
 
     def _look(self) -> dict[str, np.ndarray]:
+        """The state but for the drive targets, which may change while nothing moves."""
         pose = self._object.entity_pose
         self._quat = nearer(pose.q.astype(np.float64), self._quat)
         omega = self._object.angular_velocity.astype(np.float64)

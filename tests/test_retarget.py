@@ -1,6 +1,7 @@
 import contextlib
 import dataclasses
 import io
+import json
 import tempfile
 import unittest
 from pathlib import Path
@@ -656,7 +657,17 @@ class PipelineTest(unittest.TestCase):
         write_demos(self.folder / "demos.npz", self.demos.select(indices=[0]))
         text = io.StringIO()
         with contextlib.redirect_stdout(text):
-            command(self.folder / "demos.npz", robot="openarm", out=self.folder / "jaws.npz", picture=self.folder / "jaws.png")
+            command(
+                self.folder / "demos.npz",
+                robot="openarm",
+                out=self.folder / "jaws.npz",
+                picture=self.folder / "jaws.png",
+                hand=HandConfig(tolerance=0.002),
+                arm=ArmConfig(restarts=8),
+            )
+        with np.load(self.folder / "jaws.npz") as file:
+            used = json.loads(str(file["meta"]))["config"]["retarget"]
+        self.assertEqual((used["hand"]["tolerance"], used["arm"]["restarts"]), (0.002, 8))
         result = read_retargeted(self.folder / "jaws.npz")
         self.assertEqual(result.robot, "openarm")
         self.assertIn("005_toma", text.getvalue())

@@ -47,7 +47,7 @@ def hold(targets: HandTargets, tip_joints: Tensor, state: HandState, weight: flo
         tip_joints: [P, J] bool: which joints move each fingertip; none for other keypoints.
         state: the hand's motion.
         weight: w of joints [1 / rad^2 or 1 / m^2] and of the root's orientation; that of its position is w / ``length_scale``^2.
-        length_scale: [m]
+        length_scale: length that counts as much as one radian [m].
     """
     touches = targets.in_contact & targets.annotated[..., None] & tip_joints.any(dim=-1)
     stays = touches[:, 1:] & touches[:, :-1]

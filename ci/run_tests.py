@@ -6,6 +6,7 @@ usage: run_tests.py [-v] [MODULE ...]      (default: every tests/test_*.py)
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import time
 import unittest
@@ -40,6 +41,8 @@ class Result(unittest.TextTestResult):
 
 
 def main() -> int:
+    # What a script starts in the background ignores Ctrl-C, and so would every process that a test starts and interrupts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     arguments = sys.argv[1:]
     verbosity = 2 if "-v" in arguments else 1
     names = [a for a in arguments if not a.startswith("-")]

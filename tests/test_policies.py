@@ -133,7 +133,13 @@ class ShrinkTest(WithPolicy):
         model, damaged = onnx.load(str(self.file)), self.folder / "damaged.onnx"
         entry = next(e for e in model.metadata_props if e.key == "xreset")
         contract = entry.value
-        for text, said in (("{nope", "no JSON"), ("[]", r"contract \[\], expected a JSON object"), ("{}", "policy schema None")):
+        partial = json.dumps({name: value for name, value in json.loads(contract).items() if name != "robot"} | {"task": []})
+        for text, said in (
+            ("{nope", "no JSON"),
+            ("[]", r"contract \[\], expected a JSON object"),
+            ("{}", "policy schema None"),
+            (partial, "in which robot, task is missing or of another type"),
+        ):
             entry.value = text
             damaged.write_bytes(model.SerializeToString())
             with self.subTest(text), self.assertRaisesRegex(PolicyError, said):

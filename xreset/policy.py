@@ -93,9 +93,18 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
         raise PolicyError(f"{source} acts every {contract['control_dt']:.6f} s, here a control step lasts {here['control_dt']:.6f} s.")
 
 
+_ENTRIES: dict[str, type | tuple[type, ...]] = {
+    "robot": str, "robot_fingerprint": str, "joint_names": list, "fingertip_names": list, "objects": list, "observation_layout": dict,
+    "control_dt": (int, float), "task": dict,
+}  # fmt: skip
+
+
 def _check_schema(source: str, contract: dict[str, Any]) -> None:
     if contract.get("schema") != SCHEMA:
         raise PolicyError(f"{source} has policy schema {contract.get('schema')!r}, expected {SCHEMA!r}. Export it again.")
+    wrong = [name for name, kind in _ENTRIES.items() if not isinstance(contract.get(name), kind)]
+    if wrong:
+        raise PolicyError(f"{source} states a contract in which {', '.join(wrong)} is missing or of another type. Export it again.")
 
 
 def _read_contract(path: Path, metadata: dict[str, str]) -> dict[str, Any]:

@@ -9,12 +9,13 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 
+from xreset import robots
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig, rsl_rl_config
 from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel, embed_sequences
 from xreset.learning.ppo import SequencePpo, SequenceStorage
-from xreset.policy import OnnxPolicy
+from xreset.policy import OnnxPolicy, policy_contract
 from xreset.task.config import ObservationConfig, TaskConfig
 from xreset.typed import from_dict
 
@@ -196,8 +197,8 @@ class ExportTest(unittest.TestCase):
         cls.file = Path(folder.name) / "policy.onnx"
         cls.model = make_model()
         cls.model.update_normalization(observations(50, seed=9))
-        task = {"observation": {"cloud_history": 5, "cloud_points": 10}}
-        export_onnx(cls.model, cls.file, {"schema": "xreset-policy/1", "task": task})
+        task = TaskConfig(observation=ObservationConfig(cloud_points=10))
+        export_onnx(cls.model, cls.file, policy_contract(robots.load("openarm"), task, ()))
 
     def test_exported_equals_eager_over_50_steps(self):
         policy = OnnxPolicy(self.file)

@@ -19,7 +19,7 @@ from xreset.eval.results import summarize, write_results
 from xreset.eval.rollout import roll_out
 from xreset.files import file_hash, npz_schema
 from xreset.objects import load_objects
-from xreset.policies import shipped
+from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
 from xreset.resets.bank import ResetBank, check_robot
 from xreset.retarget.pipeline import SCHEMA as RETARGETED
@@ -80,7 +80,7 @@ def resolve(policy: str, robot: str | None, seed: int) -> Subject:
     elif path.suffix == ".onnx" or path.exists():
         file, folder, label = path, path.parent / "eval", path.stem
     elif policy in ours:
-        file, folder, label = ours[policy], Path("runs") / policy / "eval", policy
+        file, folder, label = ours[policy], results_folder(policy) / "eval", policy
     else:
         known = ", ".join(BASELINES) + (f", or a policy that ships with xreset: {', '.join(ours)}" if ours else "")
         raise PolicyError(f"there is no policy {policy!r}: expected a run folder, a .onnx file, or one of {known}. Check the name or path.")

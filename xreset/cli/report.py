@@ -24,10 +24,10 @@ def report(
 
     from xreset.eval.report import make_report
     from xreset.eval.table import rich_table
-    from xreset.policies import shipped
+    from xreset.policies import results_folder, shipped
 
     if not run.exists() and str(run) in shipped():
-        run = Path("runs") / run  # where xreset eval puts a shipped policy's results
+        run = results_folder(str(run))
     console = Console()
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("drawing clips", total=None)

@@ -11,3 +11,8 @@ FOLDER = Path(__file__).parent
 def shipped() -> dict[str, Path]:
     """Name -> file of every policy that ships with this installation, in order of name."""
     return {file.stem: file for file in sorted(FOLDER.glob("*.onnx"))}
+
+
+def results_folder(name: str) -> Path:
+    """Where the results of a shipped policy go by default, as a run's lie in its run folder."""
+    return Path("runs") / name

@@ -35,9 +35,7 @@ SMALL = [
 class TwoProcesses(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.folder = Path(folder.name)
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         robot = robots.load("openarm")
         cls.bank = cls.folder / "bank.npz"
         write_bank(cls.bank, toy_bank(robot, joint_pos=np.tile(robot.home, (6, 1)).astype(np.float32)), config={}, inputs={})

@@ -57,9 +57,7 @@ class BreakableBackend(MujocoBackend):
 class WithEnv(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.robot = toy_hand_arm(Path(folder.name))
+        cls.robot = toy_hand_arm(Path(cls.enterClassContext(tempfile.TemporaryDirectory())))
         cls.objects = load_objects((SOUP, SPAM))
         cls.bank = toy_bank(cls.robot)
 

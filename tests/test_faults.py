@@ -126,9 +126,7 @@ class Budget(unittest.TestCase):
 class WithEnv(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.folder = Path(folder.name)
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         cls.robot = toy_hand_arm(cls.folder)
         cls.objects = load_objects((SOUP, SPAM))
         home = np.tile(cls.robot.home, (6, 1)).astype(np.float32)

@@ -11,7 +11,7 @@ import torch
 import tyro
 
 from tests.test_retarget import FAR_OBJECT, FLOAT
-from tests.toy_robot import toy_hand_arm
+from tests.toy_robot import toy_hand_arm, toy_motion
 from xreset import robots
 from xreset.retarget import cost, hand
 from xreset.retarget.cost import system
@@ -32,18 +32,10 @@ class Scene(unittest.TestCase):
 
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.robot = toy_hand_arm(Path(folder.name))
+        cls.robot = toy_hand_arm(Path(cls.enterClassContext(tempfile.TemporaryDirectory())))
         cls.model = HandModel(cls.robot)
         cls.generator = torch.Generator().manual_seed(3)
-        low, high = cls.model.kinematics.lower, cls.model.kinematics.upper
-        ends = low + (high - low) * (0.2 + 0.6 * torch.rand(2, S, 1, len(low), dtype=FLOAT, generator=cls.generator))
-        share = torch.linspace(0, 1, T, dtype=FLOAT)[:, None]
-        joints = ends[0] + (ends[1] - ends[0]) * share
-        root_pos = torch.tensor([0.2, 0.3, 1.0], dtype=FLOAT) + share * torch.tensor([0.1, -0.2, 0.1], dtype=FLOAT)
-        root_quat = quat_from_axis_angle(torch.randn(S, 1, 3, dtype=FLOAT, generator=cls.generator) + 0.6 * share)
-        cls.state = HandState(joints=joints, root_pos=root_pos.expand(S, T, 3), root_quat=root_quat)
+        cls.state = toy_motion(cls.model, cls.generator, margin=0.2, turn=0.6)
         cls.keypoints = cls.model.keypoints(**vars(cls.state))
         cls.tips = [cls.model.names.index(name) for name in ("thumb4", "index4")]
 

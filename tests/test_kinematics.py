@@ -13,9 +13,7 @@ from xreset.kinematics import Kinematics
 class KinematicsTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.folder = Path(folder.name)
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         cls.robot = toy_hand_arm(cls.folder)
         cls.kinematics = Kinematics(cls.robot)
         generator = torch.Generator().manual_seed(0)

@@ -39,9 +39,7 @@ class WithPolicy(unittest.TestCase):
 
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.folder = Path(folder.name)
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         cls.robot = robots.load("openarm")
         cls.contract = policy_contract(cls.robot, TASK, (SOUP,))
         torch.manual_seed(0)

@@ -13,7 +13,7 @@ import torch
 
 from tests.data import data_dir
 from tests.test_cli import run
-from tests.toy_robot import toy_hand_arm
+from tests.toy_robot import toy_hand_arm, toy_motion
 from xreset import robots
 from xreset.demos import demo_objects, read_demos, synthesize, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError
@@ -197,18 +197,10 @@ class CollisionTest(unittest.TestCase):
 class HandTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.robot = toy_hand_arm(Path(folder.name))
+        cls.robot = toy_hand_arm(Path(cls.enterClassContext(tempfile.TemporaryDirectory())))
         cls.model = HandModel(cls.robot)
-        generator = torch.Generator().manual_seed(1)
-        low, high = cls.model.kinematics.lower, cls.model.kinematics.upper
-        ends = low + (high - low) * (0.1 + 0.8 * torch.rand(2, 3, 1, len(low), dtype=FLOAT, generator=generator))
-        share = torch.linspace(0, 1, 12, dtype=FLOAT)[:, None]
-        cls.joints = ends[0] + (ends[1] - ends[0]) * share
-        cls.root_pos = torch.tensor([0.2, 0.3, 1.0], dtype=FLOAT) + share * torch.tensor([0.1, -0.2, 0.1], dtype=FLOAT)
-        cls.root_pos = cls.root_pos.expand(3, 12, 3)
-        cls.root_quat = quat_from_axis_angle(torch.randn(3, 1, 3, dtype=FLOAT, generator=generator) + 0.3 * share)
+        motion = toy_motion(cls.model, torch.Generator().manual_seed(1), margin=0.1, turn=0.3)
+        cls.joints, cls.root_pos, cls.root_quat = motion.joints, motion.root_pos, motion.root_quat
         cls.keypoints = cls.model.keypoints(cls.joints, cls.root_pos, cls.root_quat)
         cls.seen = [name for name in cls.model.kinematics.joint_names if name != "jaw_a"]  # no keypoint follows the jaws
         cls.columns = [cls.model.kinematics.joint_names.index(name) for name in cls.seen]
@@ -561,9 +553,7 @@ class ValidityTest(unittest.TestCase):
 class PipelineTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.folder = Path(folder.name)
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         cls.robot = robots.load("ur7e-sharpa")
         demos = synthesize(["soup"], per_object=2, seed=0)
         valid = demos.hand_valid.copy()

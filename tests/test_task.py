@@ -47,9 +47,7 @@ def turned(degrees: float, axis=(0.0, 0.0, 1.0)) -> torch.Tensor:
 class WithRobot(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.robot = toy_hand_arm(Path(folder.name))
+        cls.robot = toy_hand_arm(Path(cls.enterClassContext(tempfile.TemporaryDirectory())))
 
 
 class RewardTest(unittest.TestCase):

@@ -42,9 +42,7 @@ class ThirdHandTest(unittest.TestCase):
                 importlib.import_module(engine)
             except ImportError as error:
                 raise unittest.SkipTest(str(error)) from error
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.folder = Path(folder.name)
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         allegro_plugin.write_plugin(cls.folder / "site")
         sys.path.insert(0, str(cls.folder / "site"))
         cls.addClassCleanup(sys.path.remove, str(cls.folder / "site"))

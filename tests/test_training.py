@@ -53,9 +53,7 @@ def train_only(*args, **options) -> None:
 class TrainingTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.folder = Path(folder.name)
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         cls.robot = robots.load("openarm")
         home = np.tile(cls.robot.home, (6, 1)).astype(np.float32)
         cls.bank = cls.folder / "bank.npz"

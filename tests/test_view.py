@@ -74,9 +74,7 @@ def toy_retargeted(robot) -> Retargeted:
 class WithFiles(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        folder = tempfile.TemporaryDirectory()
-        cls.addClassCleanup(folder.cleanup)
-        cls.folder = Path(folder.name)
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         cls.robot = robots.load("openarm")
         cls.demos, cls.retargeted, cls.bank = (cls.folder / f"{name}.npz" for name in ("demos", "retargeted", "bank"))
         write_demos(cls.demos, toy_demos())

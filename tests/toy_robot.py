@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import torch
+
+from xreset.rotations import quat_from_axis_angle
 from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
+
+if TYPE_CHECKING:
+    from xreset.retarget.hand_model import HandModel
+    from xreset.retarget.problem import HandState
 
 _JOINTS = (
     # name, type, parent, child, xyz, rpy, axis, lower, upper
@@ -69,3 +77,16 @@ def toy_hand_arm(folder: Path) -> RobotSpec:
         ),
         hand_root="palm",
     )
+
+
+def toy_motion(model: HandModel, generator: torch.Generator, *, margin: float, turn: float) -> HandState:
+    """Three motions of 12 frames: joints between two postures that keep a share ``margin`` of their range from the limits, the root along
+    a line and turning by ``turn`` [rad] about each axis."""
+    from xreset.retarget.problem import HandState
+
+    low, high = model.kinematics.lower, model.kinematics.upper
+    share = torch.linspace(0, 1, 12, dtype=low.dtype)[:, None]
+    ends = low + (high - low) * (margin + (1.0 - 2.0 * margin) * torch.rand(2, 3, 1, len(low), dtype=low.dtype, generator=generator))
+    line = low.new_tensor([0.2, 0.3, 1.0]) + share * low.new_tensor([0.1, -0.2, 0.1])
+    root_quat = quat_from_axis_angle(torch.randn(3, 1, 3, dtype=low.dtype, generator=generator) + turn * share)
+    return HandState(joints=ends[0] + (ends[1] - ends[0]) * share, root_pos=line.expand(3, 12, 3), root_quat=root_quat)

@@ -1,6 +1,8 @@
 """training: environment steps per second of a training on mujoco-warp, and where its time goes.
 
-raw       the captured graph of the engine's own step, as many times as a control step has physics steps
+raw       the captured graph of the engine's own step, as many times as a control step has physics steps, timed inside the steps of env: how
+          long a step takes depends on what the worlds are doing, so it is timed in the same worlds at the same moments; beside it the
+          rate that the same graph reaches in worlds left to themselves, their targets constant
 env       ManipulationEnv.step with random actions, resets from home and bank included; beside it the share of raw
 rollout   env and the policy, the value and the storage
 update    the rest of a PPO iteration: all epochs over the rollout
@@ -13,8 +15,11 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+import time
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import torch
 from benchlib import OBJECT, Options, rate, run_time, seconds_of
 from rich.console import Console
@@ -62,10 +67,11 @@ def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder
 
     for _ in range(20):
         env.step(act())
+    raw, stepped = _physics_and_env(env, act, options)
     backend = env.backend
     with backend._on_stream():
-        raw = rate(lambda: [backend._run("step") for _ in range(backend.scene.substeps)], options.seconds, device)
-    stepped = rate(lambda: env.step(act()), options.seconds, device)
+        still = rate(lambda: [backend._run("step") for _ in range(backend.scene.substeps)], options.seconds, device)
+    env.reset()
     runner = TrainingRunner(env, config, folder / "run")
     runner.learn(2, init_at_random_ep_len=True)
     alg, horizon = runner.alg, config.ppo.horizon
@@ -90,11 +96,43 @@ def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder
     rolled, updated = (horizon / sorted(times)[len(times) // 2] for times in (collect, learn))
 
     table = Table("", "env steps/s", "ms per control step", "", title=f"training: {n} worlds, {options.robot}, {config.ppo.precision}")
-    note = {"env": f"{stepped / raw:.2f} of raw", "train": f"{int(env.nonfinite_count)} not finite, {int(env.overflow_count)} overflows"}
+    note = {"raw": f"{still * n:,.0f} with constant targets", "env": f"{stepped / raw:.2f} of raw", "train": f"{int(env.nonfinite_count)} not finite, {int(env.overflow_count)} overflows"}
     steps = {"raw": raw, "env": stepped, "rollout": rolled, "update": updated, "train": trained / n}
     for name, per_second in steps.items():
         table.add_row(name, f"{per_second * n:,.0f}", f"{1e3 / per_second:.2f}", note.get(name, ""))
     return table
+
+
+def _physics_and_env(env: ManipulationEnv, act: Callable[[], torch.Tensor], options: Options) -> tuple[float, float]:
+    """Control steps per second of the engine's own steps, and of the environment's steps that they are part of."""
+    backend, run, marks = env.backend, env.backend._run, []
+
+    def mark() -> None:
+        if env.device.type == "cuda":
+            event = torch.cuda.Event(enable_timing=True)
+            event.record()
+            marks.append(event)
+        else:
+            marks.append(time.perf_counter())
+
+    def watched(name: str) -> None:
+        """Marks the first and the last of a control step's physics steps."""
+        steps = counts[name] = counts.get(name, 0) + 1
+        if name == "step" and steps % backend.scene.substeps == 1 % backend.scene.substeps:
+            mark()
+        run(name)
+        if name == "step" and steps % backend.scene.substeps == 0:
+            mark()
+
+    counts: dict[str, int] = {}
+    backend._run = watched
+    try:
+        stepped = rate(lambda: env.step(act()), options.seconds, options.device)
+    finally:
+        del backend._run
+    ends = zip(marks[::2], marks[1::2], strict=True)
+    seconds = [start.elapsed_time(end) / 1e3 if env.device.type == "cuda" else end - start for start, end in ends]
+    return 1 / float(np.median(seconds)), stepped
 
 
 def _synthetic_bank(robot: str, folder: Path) -> Path:

@@ -301,10 +301,9 @@ class ManipulationEnv:
         time_out = (self._episode_length >= self.max_episode_length) | self._faulty
         self._time_out.copy_(time_out & ~lost)
         self._fresh.copy_(lost | time_out)
-        log = self._log(reward, self._fresh, sound=~broken)
-        values = torch.stack(list(log.values()))
+        names, values = self._log(reward, self._fresh, sound=~broken)
         if not self._log_names:
-            self._log_names, self._log_values = tuple(log), torch.zeros_like(values)
+            self._log_names, self._log_values = names, torch.zeros_like(values)
         self._log_values.copy_(values)
         return reading, reward
 
@@ -410,22 +409,25 @@ class ManipulationEnv:
                 self._observations[name] = torch.zeros_like(value)
             self._observations[name].copy_(value)
 
-    def _log(self, reward: Reward, done: Tensor, sound: Tensor) -> dict[str, Tensor]:
-        """Means over worlds of this step, by name; scalars on the device, so that nothing waits for them.
+    def _log(self, reward: Reward, done: Tensor, sound: Tensor) -> tuple[tuple[str, ...], Tensor]:
+        """Names and values [K] of what there is to say about this step: means over worlds, on the device, so that nothing waits for them.
 
         Reward terms are means over the worlds that are ``sound`` [N]: the others' say nothing, and are counted.
         """
-        log = {f"reward/{name}": _mean_where(value, sound) for name, value in reward.terms.items()}
-        log |= {
-            "task/grasped": reward.grasped.float().mean(),
-            "task/success": reward.success.float().mean(),
-            "task/grasped_from_home": _mean_where(reward.grasped, ~self.from_bank),
-            "task/success_from_home": _mean_where(reward.success, ~self.from_bank),
-            "episode/ended": done.float().mean(),
-            "health/nonfinite_total": self.nonfinite_count.float(),
-            "health/overflow_total": self.overflow_count.float(),
+        all_worlds, from_home = torch.ones_like(sound), ~self.from_bank
+        rows = {f"reward/{name}": (value, sound) for name, value in reward.terms.items()}
+        rows |= {
+            "task/grasped": (reward.grasped, all_worlds),
+            "task/success": (reward.success, all_worlds),
+            "task/grasped_from_home": (reward.grasped, from_home),
+            "task/success_from_home": (reward.success, from_home),
+            "episode/ended": (done, all_worlds),
         }
-        return log
+        values = torch.stack([value.float() for value, _ in rows.values()])
+        masks = torch.stack([mask for _, mask in rows.values()])
+        means = torch.where(masks, values, 0).sum(dim=-1) / masks.sum(dim=-1).clamp_min(1)
+        counts = torch.stack((self.nonfinite_count, self.overflow_count)).float()
+        return (*rows, "health/nonfinite_total", "health/overflow_total"), torch.cat((means, counts))
 
 
 def rest_state(joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor) -> State:
@@ -442,11 +444,6 @@ def rest_state(joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor) -> St
         object_linvel=zero,
         object_angvel=zero,
     )
-
-
-def _mean_where(values: Tensor, mask: Tensor) -> Tensor:
-    """[] mean of numbers or bools [N] over the worlds of a mask; 0 if there are none."""
-    return torch.where(mask, values, 0).sum() / mask.sum().clamp_min(1)
 
 
 __all__ = ["ManipulationEnv", "Reading", "make_scene", "rest_state"]

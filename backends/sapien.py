@@ -49,7 +49,7 @@ class SapienSettings:
     """Substeps of the TGS solver. With 10, objects creep out of grasps by centimetres in seconds; 40 is no better and twice as slow."""
     velocity_iterations: int = 1
     """Sweeps of the solver over velocities."""
-    contact_offset: float = 0.002
+    contact_offset: float = 0.001
     """Distance [m] at which contacts are generated."""
 
 

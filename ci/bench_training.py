@@ -96,7 +96,11 @@ def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder
     rolled, updated = (horizon / sorted(times)[len(times) // 2] for times in (collect, learn))
 
     table = Table("", "env steps/s", "ms per control step", "", title=f"training: {n} worlds, {options.robot}, {config.ppo.precision}")
-    note = {"raw": f"{still * n:,.0f} with constant targets", "env": f"{stepped / raw:.2f} of raw", "train": f"{int(env.nonfinite_count)} not finite, {int(env.overflow_count)} overflows"}
+    note = {
+        "raw": f"{still * n:,.0f} with constant targets",
+        "env": f"{stepped / raw:.2f} of raw",
+        "train": f"{int(env.nonfinite_count)} not finite, {int(env.overflow_count)} overflows",
+    }
     steps = {"raw": raw, "env": stepped, "rollout": rolled, "update": updated, "train": trained / n}
     for name, per_second in steps.items():
         table.add_row(name, f"{per_second * n:,.0f}", f"{1e3 / per_second:.2f}", note.get(name, ""))

@@ -3,7 +3,7 @@
 import json
 import tempfile
 import unittest
-from dataclasses import replace
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -16,7 +16,7 @@ from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel, embed_sequences
 from xreset.learning.ppo import SequencePpo, SequenceStorage
 from xreset.policy import OnnxPolicy, policy_contract
-from xreset.task.config import ObservationConfig, TaskConfig
+from xreset.task.config import ObservationConfig, RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
 from xreset.typed import from_dict
 
 N, T, L, A = 3, 8, 4, 5
@@ -228,14 +228,10 @@ class ExportTest(unittest.TestCase):
 
 class ConfigTest(unittest.TestCase):
     def test_round_trip_through_json(self):
-        from dataclasses import asdict
-
         config = TrainConfig(task=TaskConfig(observation=ObservationConfig(cloud_history=3)), iterations=7)
         self.assertEqual(from_dict(TrainConfig, json.loads(json.dumps(asdict(config)))), config)
 
     def test_an_unknown_entry_is_an_error(self):
-        from dataclasses import asdict
-
         data = asdict(TrainConfig())
         data["task"]["reward"]["bonus"] = 1.0
         with self.assertRaisesRegex(FileFormatError, r"task\.reward.*unknown: bonus"):
@@ -246,10 +242,28 @@ class ConfigTest(unittest.TestCase):
         self.assertEqual(cfg["algorithm"]["num_mini_batches"], 2)
         self.assertEqual((cfg["num_steps_per_env"], cfg["algorithm"]["sequence_length"]), (16, 4))
 
-    def test_a_sequence_length_that_does_not_divide_the_horizon(self):
-        config = TrainConfig()
-        with self.assertRaisesRegex(ValueError, "does not divide"):
-            rsl_rl_config(replace(config, ppo=replace(config.ppo, sequence_length=5)), 8)
+    def test_numbers_that_make_no_sense_are_refused(self):
+        for make, problem in (
+            (lambda: PpoConfig(sequence_length=5), "sequence_length is 5, expected a divisor of the horizon, which is 16"),
+            (lambda: PpoConfig(discount=1.01), "discount is 1.01, expected a number from 0 to 1"),
+            (lambda: PpoConfig(entropy=float("nan")), "entropy is nan"),
+            (lambda: ModelConfig(initial_std=0.0), "initial_std is 0.0, expected a number above 0"),
+            (lambda: ModelConfig(initial_hand_std=-1.0), "initial_hand_std is -1.0"),
+            (lambda: ModelConfig(mlp=(64, 0)), "mlp is .*expected one width or more"),
+            (lambda: TrainConfig(save_interval=0), "save_interval is 0"),
+            (lambda: ResetConfig(demo_probability=50.0), "demo_probability is 50.0, expected a number from 0 to 1"),
+            (lambda: RandomizationConfig(friction=(1.0, 0.5)), "friction is 1.0 to 0.5, expected two finite numbers"),
+            (lambda: TerminationConfig(object_low=2.0), "object_low is 2.0, expected less than object_high, which is 1.0"),
+            (lambda: TaskConfig(substeps=0), "substeps is 0"),
+        ):
+            with self.subTest(problem), self.assertRaisesRegex(ValueError, problem):
+                make()
+
+    def test_a_file_with_such_a_number_names_it(self):
+        data = asdict(TrainConfig())
+        data["task"]["reset"]["demo_probability"] = 50.0
+        with self.assertRaisesRegex(FileFormatError, r"task\.reset.*demo_probability is 50.0"):
+            from_dict(TrainConfig, data)
 
     def test_a_folder_without_a_run(self):
         from xreset.learning.run import read_run

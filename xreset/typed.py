@@ -16,7 +16,7 @@ def from_dict(cls: type[T], data: Any, where: str = "configuration") -> T:
     """Build a dataclass from nested dictionaries as :func:`dataclasses.asdict` and JSON make them.
 
     Raises:
-        FileFormatError: names the entry that is unknown, missing or of the wrong type.
+        FileFormatError: names the entry that is unknown, missing, of the wrong type or out of range.
     """
     if not isinstance(data, dict):
         raise FileFormatError(f"{where} is {data!r}, expected an object with the entries of {cls.__name__}.")
@@ -26,7 +26,11 @@ def from_dict(cls: type[T], data: Any, where: str = "configuration") -> T:
     if unknown or missing:
         problems = [f"unknown: {', '.join(unknown)}"] * bool(unknown) + [f"missing: {', '.join(missing)}"] * bool(missing)
         raise FileFormatError(f"{where} does not fit {cls.__name__} ({'; '.join(problems)}). Was it written by another version of xreset?")
-    return cls(**{name: _value(hints[name], value, f"{where}.{name}") for name, value in data.items()})
+    values = {name: _value(hints[name], value, f"{where}.{name}") for name, value in data.items()}
+    try:
+        return cls(**values)
+    except ValueError as error:
+        raise FileFormatError(f"{where}: {error}.") from error
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from xreset.learning.config import TrainConfig
@@ -17,6 +18,7 @@ def train(
     device: str | None = None,
     num_envs: int = 4096,
     iterations: int | None = None,
+    minutes: float = math.inf,
     seed: int = 0,
     resume: bool = False,
     config: TrainConfig = TrainConfig(),  # noqa: B008 (frozen)
@@ -32,6 +34,8 @@ def train(
         device: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
         num_envs: Worlds to simulate (per GPU).
         iterations: Iterations in all; default: the configuration's.
+        minutes: Most time to train now, on a machine that is lent for so long: then the run stops as with Ctrl-C, and --resume goes on.
+            Compiling kernels is not counted.
         seed: Seed of every random number.
         resume: Continue the run in --out from its newest checkpoint.
         config: Task, model and algorithm.
@@ -41,8 +45,10 @@ def train(
     from xreset.errors import RunError
     from xreset.learning import train as training
 
+    if not minutes > 0:
+        raise RunError(f"--minutes is {minutes}, expected more than 0.")
     if resume:
-        training.train(out, training.resumed(out, iterations=iterations), resume=True)
+        training.train(out, training.resumed(out, iterations=iterations), resume=True, seconds=60 * minutes)
         return
     if robot is None or resets is None:
         raise RunError("a new run needs --robot and --resets; --resume continues the run in --out.")
@@ -58,7 +64,7 @@ def train(
         config=config,
         out=out,
     )
-    training.train(out, info, inputs)
+    training.train(out, info, inputs, seconds=60 * minutes)
 
 
 COMMAND = train

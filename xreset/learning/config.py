@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from xreset.checks import check_numbers
 from xreset.task.config import TaskConfig
 
 
@@ -20,8 +21,19 @@ class ModelConfig:
     activation: str = "elu"
     initial_std: float = 1.0
     """Initial standard deviation of the Gaussian policy. Its logarithm does not depend on the state and is learned. Not in the paper."""
+    initial_hand_std: float | None = None
+    """The same for the hand's joints, whose actions are absolute: 0.3 shakes each by a third of half its range, and grasps fall apart.
+    None: ``initial_std``."""
     normalize_observations: bool = True
     """Running normalisation of the flat observations (not of the clouds). Not in the paper; its library's usual setting."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("lstm", "initial_std"))
+        if self.initial_hand_std is not None:
+            check_numbers(self, positive=("initial_hand_std",))
+        for name in ("pointnet", "mlp"):
+            if not getattr(self, name) or min(getattr(self, name)) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected one width or more, each above 0")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +62,16 @@ class PpoConfig:
     """Arithmetic of matrix products on a GPU. ``bfloat16``: factors of point-cloud encoder and LSTM in bfloat16 (sums in float32), all else
     in TF32. The CPU and the exported policy use float32. Not in the paper."""
 
+    def __post_init__(self) -> None:
+        check_numbers(
+            self,
+            positive=("horizon", "sequence_length", "mini_epochs", "minibatch_size", "learning_rate", "desired_kl", "clip", "grad_norm"),
+            not_negative=("entropy", "value_loss"),
+            share=("discount", "gae_lambda"),
+        )
+        if self.horizon % self.sequence_length:
+            raise ValueError(f"sequence_length is {self.sequence_length}, expected a divisor of the horizon, which is {self.horizon}")
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
@@ -64,12 +86,13 @@ class TrainConfig:
     random_episode_start: bool = True
     """Start the first episodes at random times, so that worlds do not end in step."""
 
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("iterations", "save_interval"))
+
 
 def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
     """The nested dictionary that rsl-rl's runner takes."""
     m, p = config.model, config.ppo
-    if p.horizon % p.sequence_length:
-        raise ValueError(f"sequence_length {p.sequence_length} does not divide the horizon {p.horizon}")
     network: dict[str, Any] = {
         "class_name": "xreset.learning.model:PointNetLstmModel",
         "hidden_dims": list(m.mlp),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import pickle
 import signal
 import time
@@ -34,6 +35,9 @@ class TrainingRunner(OnPolicyRunner):
         self.train_config = config
         torch.set_float32_matmul_precision("highest" if config.ppo.precision == "float32" else "high")
         super().__init__(env, rsl_rl_config(config, env.num_envs), log_dir=None, device=str(env.device))  # pyright: ignore[reportArgumentType]
+        if config.model.initial_hand_std is not None:
+            log_std = cast(torch.nn.Parameter, self.alg.get_policy().distribution.log_std_param)  # pyright: ignore[reportOptionalMemberAccess]
+            log_std.data[~env.actions.is_arm] = math.log(config.model.initial_hand_std)
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0
@@ -54,8 +58,14 @@ class TrainingRunner(OnPolicyRunner):
         ranks = {"global_rank": self.gpu_global_rank, "local_rank": self.gpu_local_rank, "world_size": self.gpu_world_size}
         self.cfg["multi_gpu"] = ranks if self.is_distributed else None
 
-    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
-        """Train until ``num_learning_iterations`` iterations are done in all; returns early, checkpoint written, after Ctrl-C."""
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False, *, seconds: float = math.inf) -> None:
+        """Train until ``num_learning_iterations`` iterations are done in all; returns early, checkpoint written, after Ctrl-C.
+
+        Args:
+            num_learning_iterations: iterations in all, those of a resumed run included.
+            init_at_random_ep_len: start the first episodes at random times.
+            seconds: most time to spend here; the iteration that is under way then is finished.
+        """
         env, alg, horizon = self.env, self.alg, self.cfg["num_steps_per_env"]
         if init_at_random_ep_len and not self._worlds_continue:
             env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
@@ -68,8 +78,9 @@ class TrainingRunner(OnPolicyRunner):
             log.restore(self._log_state)
         saved_at = self.iteration
         budget = FaultBudget(horizon * env.num_envs * self.gpu_world_size)
+        end = time.perf_counter() + seconds
         with _stop_on_interrupt() as stop:
-            while self.iteration < num_learning_iterations and not self._agreed(bool(stop)):
+            while self.iteration < num_learning_iterations and not self._agreed(bool(stop) or time.perf_counter() > end):
                 start = time.perf_counter()
                 with torch.no_grad():
                     for _ in range(horizon):
@@ -94,7 +105,7 @@ class TrainingRunner(OnPolicyRunner):
         if self.iteration != saved_at or not self.iteration:
             self.save_checkpoint(log)
         if log is not None:
-            log.close(stopped=bool(stop))
+            log.close(stopped=self.iteration < num_learning_iterations)
 
     def _agreed(self, stop: bool) -> bool:
         """Whether any process is to stop: then all do, after the same iteration."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -89,7 +90,7 @@ def start_run(
     return info
 
 
-def train(out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: bool = False) -> None:
+def train(out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: bool = False, seconds: float = math.inf) -> None:
     """Train a run that :func:`start_run` has set up, or continue it; export the policy at the end.
 
     With ``torchrun``, every process simulates ``num_envs`` worlds of its own, each on its own GPU, or all on the CPU.
@@ -99,6 +100,7 @@ def train(out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: 
         info: what is in its ``run.json``.
         inputs: the run's files, if they are loaded already.
         resume: continue from the newest checkpoint.
+        seconds: most time to spend on iterations.
     """
     processes = Processes.of_environment()
     device, seed = processes.device(info.device), processes.seed(info.seed)
@@ -119,7 +121,7 @@ def train(out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: 
                 runner.load_checkpoint(latest_checkpoint(out))
                 if processes.is_main:
                     print(f"continuing after iteration {runner.iteration}", flush=True)
-            runner.learn(config.iterations, init_at_random_ep_len=config.random_episode_start)
+            runner.learn(config.iterations, init_at_random_ep_len=config.random_episode_start, seconds=seconds)
             if processes.is_main:
                 export_onnx(runner.alg.get_policy(), out / "policy.onnx", info.contract)  # pyright: ignore[reportArgumentType]
     finally:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from xreset.retarget.checks import check_numbers
+from xreset.checks import check_numbers
 
 
 @dataclass(frozen=True, kw_only=True)

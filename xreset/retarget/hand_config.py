@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import inf
 
-from xreset.retarget.checks import check_numbers
+from xreset.checks import check_numbers
 
 
 @dataclass(frozen=True, kw_only=True)

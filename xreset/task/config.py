@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from xreset.checks import check_numbers
+
 
 @dataclass(frozen=True, kw_only=True)
 class ActionConfig:
@@ -18,6 +20,9 @@ class ActionConfig:
     """Farthest that an arm target may run ahead of the joint [rad], so that a blocked arm does not wind up. Not in the paper."""
     hand_smoothing: float = 1.0
     """Share of the new hand target that is taken per control step, in (0, 1]; 1 is the paper's plain absolute target."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("arm_step", "arm_lead", "hand_smoothing"), share=("hand_smoothing",))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +40,9 @@ class NoiseConfig:
     cloud: float = 0.002
     """[m], per point."""
 
+    def __post_init__(self) -> None:
+        check_numbers(self, not_negative=("joint_pos", "joint_vel", "object_pos", "object_rot", "cloud"))
+
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationConfig:
@@ -49,6 +57,9 @@ class ObservationConfig:
     joint_vel_scale: float = 0.1
     """Factor on joint velocities [s/rad]."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("cloud_points", "cloud_history"), not_negative=("contact_force_scale", "joint_vel_scale"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +89,14 @@ class RewardConfig:
     scale: float = 0.01
     """Factor on the total (Table VIII)."""
 
+    def __post_init__(self) -> None:
+        check_numbers(
+            self,
+            positive=("reach_width", "position_width", "rotation_width", "success_position", "success_rotation", "scale"),
+            not_negative=("contact_threshold",),
+            finite=("reach", "grasp", "position", "rotation", "success", "action", "action_rate", "out_of_bounds", "scale"),
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class TerminationConfig:
@@ -91,6 +110,11 @@ class TerminationConfig:
     """... or above this height [m]."""
     margin: float = 0.10
     """... or farther than this outside the table's edges [m]."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("episode_seconds",), finite=("episode_seconds", "object_low", "object_high", "margin"))
+        if not self.object_low < self.object_high:
+            raise ValueError(f"object_low is {self.object_low}, expected less than object_high, which is {self.object_high}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +138,9 @@ class ResetConfig:
     home_noise: bool = True
     """Home resets: joints start around home with the robot's ``home_std``."""
 
+    def __post_init__(self) -> None:
+        check_numbers(self, share=("demo_probability",), not_negative=("home_gravity_std", "home_gravity_clip", "spawn_xy", "spawn_yaw"))
+
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizationConfig:
@@ -133,6 +160,9 @@ class RandomizationConfig:
     mass_scale: tuple[float, float] = (0.7, 1.3)
     """Range of the factor on the object's mass."""
 
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("friction_buckets",), not_negative=("elastomer", "metal", "table"), ranges=("friction", "mass_scale"))
+
 
 @dataclass(frozen=True, kw_only=True)
 class TaskConfig:
@@ -150,6 +180,9 @@ class TaskConfig:
     """Physics steps per control step: control at 60 Hz. Not in the paper."""
     distance_points: int = 256
     """Surface points per object for fingertip distances."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("timestep", "substeps", "distance_points"), finite=("timestep",))
 
 
 def evaluation_task(task: TaskConfig) -> TaskConfig:

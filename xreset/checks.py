@@ -6,7 +6,15 @@ from collections.abc import Iterable
 from math import inf, isfinite
 
 
-def check_numbers(config: object, *, positive: Iterable[str] = (), not_negative: Iterable[str] = (), finite: Iterable[str] = ()) -> None:
+def check_numbers(
+    config: object,
+    *,
+    positive: Iterable[str] = (),
+    not_negative: Iterable[str] = (),
+    finite: Iterable[str] = (),
+    share: Iterable[str] = (),
+    ranges: Iterable[str] = (),
+) -> None:
     """Refuse fields that are out of range.
 
     Args:
@@ -14,6 +22,8 @@ def check_numbers(config: object, *, positive: Iterable[str] = (), not_negative:
         positive: fields that must be above 0; infinity will do, where it means that there is no limit.
         not_negative: fields that must be finite and at least 0.
         finite: fields that must be finite.
+        share: fields that must be between 0 and 1.
+        ranges: fields that hold two finite numbers, 0 or more, the lower one first.
 
     Raises:
         ValueError: says which field is what, and what was expected. NaN is never in range.
@@ -27,3 +37,10 @@ def check_numbers(config: object, *, positive: Iterable[str] = (), not_negative:
     for name in finite:
         if not isfinite(getattr(config, name)):
             raise ValueError(f"{name} is {getattr(config, name)}, expected a finite number")
+    for name in share:
+        if not 0 <= getattr(config, name) <= 1:
+            raise ValueError(f"{name} is {getattr(config, name)}, expected a number from 0 to 1")
+    for name in ranges:
+        low, high = getattr(config, name)
+        if not 0 <= low <= high < inf:
+            raise ValueError(f"{name} is {low} to {high}, expected two finite numbers, 0 or more, the lower one first")

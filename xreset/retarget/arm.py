@@ -21,7 +21,7 @@ from torch import Tensor
 
 from xreset.retarget.arm_config import ArmConfig
 from xreset.retarget.arm_model import ArmModel, ArmTargets, measure
-from xreset.retarget.arm_paths import ArmProblem, Progress, best, branches, follow, mend
+from xreset.retarget.arm_paths import ArmProblem, Paths, Progress, best, branches, follow, mend
 from xreset.retarget.validity import REASONS, Measures, Thresholds
 
 __all__ = ["ArmConfig", "ArmModel", "ArmTargets", "measure", "track"]
@@ -55,28 +55,40 @@ def track(
 
     forwards = branches(problem, lambda done: report(0.3 * done))
     joints, worth = best(problem, forwards)
-    paths = forwards.repeat(1, 2, 1, 1)  # [S, 2K, T, n] those of the first frame, then those of the last frame where there are any
     failing = (problem.reasons(joints) > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
     if len(failing):
-        turned = problem.select(failing).reversed()
-        backwards = branches(turned, lambda done: report(0.3 + 0.3 * done))
-        paths[failing, forwards.shape[1] :] = backwards.flip(2)
-        back, other = best(turned, backwards)
-        better = other > worth[failing]
-        joints[failing[better]] = back[better].flip(1)
+        joints[failing] = _rescued(problem.select(failing), forwards.select(failing), joints[failing], worth[failing], report)
+    report(1.0)
+    return joints, measure(model, targets, joints)
+
+
+def _rescued(problem: ArmProblem, forwards: Paths, joints: Tensor, worth: Tensor, report: Progress) -> Tensor:
+    """[S, T, n] better paths than ``joints`` [S, T, n], where there are any, of sequences with frames that fail.
+
+    Args:
+        problem: of these sequences.
+        forwards: their paths from the first frame.
+        joints: the best of those.
+        worth: [S] its worth.
+        report: called with the fraction that is done.
+    """
+    turned = problem.reversed()
+    backwards = branches(turned, lambda done: report(0.3 + 0.3 * done))
+    back, other = best(turned, backwards)
+    joints = torch.where((other > worth)[:, None, None], back.flip(1), joints)
+    paths = forwards.joined(backwards.reversed())
 
     def apart(part: ArmProblem, rows: Tensor, _: Tensor) -> Tensor:
         return follow(part, joints[rows, 0], lambda done: report(0.6 + 0.1 * done), self_collision=True)
 
     def mended(part: ArmProblem, rows: Tensor, missed: Tensor) -> Tensor:
-        known = torch.cat((joints[rows, None], paths[rows]), dim=1)
-        return mend(part, known, missed, lambda done: report(0.7 + 0.3 * done))
+        present = part.examined(joints[rows, None])  # it may have been followed anew
+        return mend(part, present.joined(paths.select(rows)), missed, lambda done: report(0.7 + 0.3 * done))
 
     _improve(problem, joints, ("self collision",), apart)
     if problem.config.reseeds:
         _improve(problem, joints, _MISSED, mended)
-    report(1.0)
-    return joints, measure(model, targets, joints)
+    return joints
 
 
 def _improve(problem: ArmProblem, joints: Tensor, reasons: Sequence[str], again: Callable[[ArmProblem, Tensor, Tensor], Tensor]) -> None:

@@ -116,19 +116,22 @@ def measure(model: ArmModel, targets: ArmTargets, joints: Tensor) -> Measures:
         link = poses[:, model.kinematics.link_index(model.carriers[carrier])]
         heights.append(height_above_table(_place(link, points), radii, model.table))
     apart = torch.as_tensor(model.arm_collision.clearance(poses.numpy(), _SELF_SEARCH)).view(sequences, frames)
-    jump = torch.zeros(sequences, frames, dtype=joints.dtype)
-    jump[:, 1:] = joints.diff(dim=1).abs().amax(-1)
-    jump[:, 1:][~targets.annotated[:, :-1]] = 0.0
     return Measures(
         annotated=targets.annotated,
         hand_error=targets.hand_error,
         wrist_position=(root[:, :3, 3].view(sequences, frames, 3) - targets.root_pos).norm(dim=-1),
         wrist_orientation=quat_angle(quat.view(sequences, frames, 4), targets.root_quat),
         at_limit=((joints <= model.lower + _AT_LIMIT) | (joints >= model.upper - _AT_LIMIT)).any(-1),
-        arm_jump=jump,
+        arm_jump=arm_jump(joints, targets.annotated),
         table_clearance=torch.cat(heights, dim=1).amin(1).view(sequences, frames),
         self_clearance=torch.minimum(apart, targets.hand_clearance),
     )
+
+
+def arm_jump(joints: Tensor, annotated: Tensor) -> Tensor:
+    """[..., T] largest change of a joint since the frame before, along paths [..., T, n]; 0 where that is not annotated [..., T]."""
+    change = joints.diff(dim=-2).abs().amax(-1).masked_fill(~annotated[..., :-1], 0.0)
+    return torch.cat((torch.zeros_like(joints[..., :1, 0]), change), dim=-1)
 
 
 def _place(T: Tensor, points: Tensor) -> Tensor:

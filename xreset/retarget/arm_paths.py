@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from xreset.retarget.arm_config import ArmConfig
-from xreset.retarget.arm_model import ArmModel, ArmTargets, measure
+from xreset.retarget.arm_model import ArmModel, ArmTargets, arm_jump, measure
 from xreset.retarget.arm_solver import Frame, solve, system
 from xreset.retarget.splice import splice, spread_over
 from xreset.retarget.validity import Thresholds, classify
@@ -24,6 +24,29 @@ _HOME_BIAS = 1e-3
 """Preference among solutions of the first frame for those near home [1/rad^2]."""
 _DISTINCT = 0.5
 """Solutions of the first frame differ if a joint differs by this much [rad or m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Paths:
+    """Paths of the arm's joints, and what has been found of their frames."""
+
+    joints: Tensor
+    """[S, K, T, n]"""
+    sound: Tensor
+    """[S, K, T] bool: valid if the joints do not jump there. Whether they do depends on the frame before, and so on the direction and on
+    where paths are spliced; all else holds wherever the frame ends up, and is measured once."""
+
+    def select(self, rows: Tensor) -> Paths:
+        """Those of some sequences."""
+        return Paths(joints=self.joints[rows], sound=self.sound[rows])
+
+    def reversed(self) -> Paths:
+        """The same from the last frame to the first."""
+        return Paths(joints=self.joints.flip(2), sound=self.sound.flip(2))
+
+    def joined(self, other: Paths) -> Paths:
+        """These, then the other's, of the same sequences."""
+        return Paths(joints=torch.cat((self.joints, other.joints), dim=1), sound=torch.cat((self.sound, other.sound), dim=1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +76,12 @@ class ArmProblem:
         """[S, T] why frames of the paths [S, T, n] are invalid, 0 where they are valid: see :func:`~xreset.retarget.validity.classify`."""
         return classify(measure(self.model, self.targets, joints), self.thresholds)
 
+    def examined(self, joints: Tensor) -> Paths:
+        """The paths [S, K, T, n], with what is found of their frames."""
+        measures = measure(self.model, self.repeated(joints.shape[1]).targets, joints.flatten(0, 1))
+        unjumped = replace(measures, arm_jump=torch.zeros_like(measures.arm_jump))
+        return Paths(joints=joints, sound=(classify(unjumped, self.thresholds) == 0).view(joints.shape[:3]))
+
 
 def follow(problem: ArmProblem, start: Tensor, progress: Progress, *, self_collision: bool = False) -> Tensor:
     """[S, T, n] joints along the path, every frame warm-started from the one before; the first from ``start`` [S, n]."""
@@ -65,49 +94,43 @@ def follow(problem: ArmProblem, start: Tensor, progress: Progress, *, self_colli
     return torch.stack(path, dim=1)
 
 
-def branches(problem: ArmProblem, progress: Progress) -> Tensor:
-    """[S, K, T, n] the paths from distinct solutions of the first frame."""
+def branches(problem: ArmProblem, progress: Progress) -> Paths:
+    """The paths from distinct solutions of the first frame."""
     starts = _first_frames(problem)  # [S, K, n]
     paths = follow(problem.repeated(starts.shape[1]), starts.flatten(0, 1), progress)
-    return paths.view(*starts.shape[:2], *paths.shape[1:])
+    return problem.examined(paths.view(*starts.shape[:2], *paths.shape[1:]))
 
 
-def best(problem: ArmProblem, paths: Tensor) -> tuple[Tensor, Tensor]:
-    """[S, T, n] of the paths [S, K, T, n] the one that is worth most, and its worth [S]: see the config."""
-    sequences, number = paths.shape[:2]
-    flat = paths.flatten(0, 1)
-    valid = (problem.repeated(number).reasons(flat) == 0).sum(1)
-    detour = (flat - problem.model.home).square().sum(-1).mean(1)
-    worth = (valid - problem.config.detour_cost * detour).view(sequences, -1)
-    most, which = worth.max(dim=1)
-    return paths[torch.arange(sequences), which], most
+def best(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
+    """[S, T, n] of the paths the one that is worth most, and its worth [S]: see the config."""
+    jump = arm_jump(paths.joints, problem.targets.annotated[:, None])
+    valid = (paths.sound & (jump <= problem.thresholds.arm_jump)).sum(-1)
+    detour = (paths.joints - problem.model.home).square().sum(-1).mean(-1)
+    most, which = (valid - problem.config.detour_cost * detour).max(dim=1)
+    return paths.joints[torch.arange(len(which)), which], most
 
 
-def mend(problem: ArmProblem, known: Tensor, missed: Tensor, progress: Progress) -> Tensor:
-    """[S, T, n] the best that can be put together from pieces of the ``known`` paths [S, K, T, n] and of new ones.
+def mend(problem: ArmProblem, known: Paths, missed: Tensor, progress: Progress) -> Tensor:
+    """[S, T, n] the best that can be put together from pieces of the ``known`` paths and of new ones.
 
     The new ones lead both ways from some of the frames that are ``missed`` [S, T], solved afresh: a path from either end may be stuck at a
     limit there, on the wrong side of the arm's null space.
     """
     owner, paths = _reseeded(problem, missed, progress)
-    count = torch.bincount(owner, minlength=len(known))
+    count = torch.bincount(owner, minlength=len(missed))
     column = torch.arange(len(owner)) - (count.cumsum(0) - count)[owner]
-    new = known[:, :1].repeat(1, int(count.max()), 1, 1)  # sequences with fewer new paths than others repeat a known one
+    new = known.joints[:, :1].repeat(1, int(count.max()), 1, 1)  # sequences with fewer new paths than others repeat a known one
     new[owner, column] = paths
-    known = torch.cat((known, new), dim=1)
+    known = known.joined(problem.examined(new))
 
-    targets, thresholds = problem.targets, problem.thresholds
-    sequences, number, frames, _ = known.shape
-    measures = measure(problem.model, problem.repeated(number).targets, known.flatten(0, 1))
-    unjumped = replace(measures, arm_jump=torch.zeros_like(measures.arm_jump))  # whether joints jump depends on where paths are spliced
-    valid = classify(unjumped, thresholds) == 0
-    detour = problem.config.detour_cost * (known - problem.model.home).square().sum(-1) * targets.annotated[:, None]
+    annotated = problem.targets.annotated
+    detour = problem.config.detour_cost * (known.joints - problem.model.home).square().sum(-1) * annotated[:, None]
     return splice(
-        known,
-        worth=valid.view(sequences, number, frames).to(known.dtype),
-        cost=detour / targets.annotated.sum(1)[:, None, None],
-        annotated=targets.annotated,
-        jump=thresholds.arm_jump,
+        known.joints,
+        worth=known.sound.to(known.joints.dtype),
+        cost=detour / annotated.sum(1)[:, None, None],
+        annotated=annotated,
+        jump=problem.thresholds.arm_jump,
         switch_cost=problem.config.switch_cost,
     )
 

@@ -106,9 +106,7 @@ def system(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, *, self_
         jacobians.append(row[:, None, None] * lift[:, None])
     r, J = torch.cat(residuals, dim=1), torch.cat(jacobians, dim=1)
     system = System(cost=r.square().sum(1), hessian=J.mT @ J, gradient=(J.mT @ r[..., None])[..., 0])
-    if self_collision:
-        _add_self_collision(system, model, full, carriers.pos, linear, angular, config)
-    return system
+    return _with_self_collision(system, model, full, carriers.pos, linear, angular, config) if self_collision else system
 
 
 def _intrusion(distance: Tensor, margin: float, weight: float) -> tuple[Tensor, Tensor]:
@@ -117,10 +115,10 @@ def _intrusion(distance: Tensor, margin: float, weight: float) -> tuple[Tensor, 
     return scale * (margin - distance.clamp_max(margin)), -scale
 
 
-def _add_self_collision(
+def _with_self_collision(
     system: System, model: ArmModel, full: Tensor, origins: Tensor, linear: Tensor, angular: Tensor, config: ArmConfig
-) -> None:
-    """Add w [margin - d]_+^2 of every pair of near shapes, in place; d changes by n . (v_b - v_a) at the nearest points.
+) -> System:
+    """Add w [margin - d]_+^2 of every pair of near shapes; d changes by n . (v_b - v_a) at the nearest points.
 
     Args:
         system: to add to.
@@ -142,6 +140,8 @@ def _add_self_collision(
         approach += sign * (normal[:, None] @ velocity)[:, 0]
     value, scale = _intrusion(torch.as_tensor(near.distance), config.self_margin, config.collision_weight)
     rows = scale[:, None] * approach
-    system.cost.index_add_(0, batch, value.square())
-    system.hessian.index_add_(0, batch, rows[:, :, None] * rows[:, None, :])
-    system.gradient.index_add_(0, batch, rows * value[:, None])
+    return System(
+        cost=system.cost.index_add(0, batch, value.square()),
+        hessian=system.hessian.index_add(0, batch, rows[:, :, None] * rows[:, None, :]),
+        gradient=system.gradient.index_add(0, batch, rows * value[:, None]),
+    )

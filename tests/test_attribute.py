@@ -19,7 +19,7 @@ from xreset.errors import CapabilityError, XResetError
 from xreset.eval.attribute import PROPERTIES, Alteration, Attribution, Measured, altered_engine, attribute, measure
 from xreset.eval.attribute.experiment import Row
 from xreset.eval.attribute.plot import write_plot
-from xreset.eval.attribute.table import not_tried, rich_table, verdict
+from xreset.eval.attribute.table import amount, label, not_tried, rich_table, verdict
 from xreset.eval.rollout import Episode
 from xreset.spec import SceneSpec
 from xreset.task.config import RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
@@ -34,8 +34,8 @@ TASK = TaskConfig(
 )
 
 STATED = Measured(
-    tip_friction=0.9, link_friction=0.5, table_friction=0.6, mass=1.0, inertia=1.0, arm_stiffness=1.0, arm_damping=1.0, hand_stiffness=1.0,
-    hand_damping=1.0, timestep=1 / 240, contact_give=5e-5, delay=0.0,
+    tip_friction=0.9, link_friction=0.5, table_friction=0.6, torsional_friction=0.002, patch_torsional_friction=1.0, mass=1.0, inertia=1.0,
+    arm_stiffness=1.0, arm_damping=1.0, hand_stiffness=1.0, hand_damping=1.0, timestep=1 / 240, contact_give=5e-5, delay=0.0,
 )  # fmt: skip
 
 
@@ -56,13 +56,13 @@ class ProbesTest(unittest.TestCase):
 
     def test_everything_that_is_altered_is_measured(self):
         alteration = Alteration(
-            tip_friction=0.5, link_friction=1.2, table_friction=0.8, mass=1.3, inertia=0.7, arm_stiffness=0.8, arm_damping=1.2,
-            hand_stiffness=0.5, hand_damping=0.9, timestep=0.5, delay=1,
+            tip_friction=0.5, link_friction=1.2, table_friction=0.8, torsional_friction=1.5, mass=1.3, inertia=0.7, arm_stiffness=0.8,
+            arm_damping=1.2, hand_stiffness=0.5, hand_damping=0.9, timestep=0.5, delay=1,
         )  # fmt: skip
         found = measure(altered_engine(mujoco(), alteration), SCENE)
         self.assert_measured(
-            found, tip_friction=0.45, link_friction=0.6, table_friction=0.48, mass=1.3, inertia=0.7, arm_stiffness=0.8, arm_damping=1.2,
-            hand_stiffness=0.5, hand_damping=0.9, timestep=1 / 480, delay=1.0,
+            found, tip_friction=0.45, link_friction=0.6, table_friction=0.48, torsional_friction=0.003, mass=1.3, inertia=0.7,
+            arm_stiffness=0.8, arm_damping=1.2, hand_stiffness=0.5, hand_damping=0.9, timestep=1 / 480, delay=1.0,
         )  # fmt: skip
 
     def test_a_softer_contact_gives_more(self):
@@ -71,7 +71,22 @@ class ProbesTest(unittest.TestCase):
         self.assertTrue(3.0 < soft.contact_give / hard.contact_give < 4.1, (hard.contact_give, soft.contact_give))
 
     def test_engines_that_step_finer_are_seen(self):
-        self.assertAlmostEqual(measure(engine("pybullet", workers=0), SCENE).timestep, 1 / 480, delta=1e-5)
+        found = measure(engine("pybullet", workers=0), SCENE)
+        self.assertAlmostEqual(found.timestep, 1 / 480, delta=1e-5)
+        self.assertAlmostEqual(found.torsional_friction, 0.002, delta=2e-5)
+        self.assertAlmostEqual(found.patch_torsional_friction, 1.0, delta=0.01)
+
+    def test_an_engine_that_lets_friction_act_at_two_points_is_seen(self):
+        """PhysX: half of the load at each of two points 2 mm apart, so sliding friction with a lever of 1 mm, and no torsional friction."""
+        for factor in (1.0, 2.0):
+            found = measure(altered_engine(engine("sapien", workers=0), Alteration(torsional_friction=factor)), SCENE)
+            self.assertAlmostEqual(found.torsional_friction, factor * 0.002, delta=2e-5)
+            self.assertAlmostEqual(found.patch_torsional_friction * found.torsional_friction, 0.6 * 0.001, delta=2e-5)
+
+    def test_no_torsional_friction_is_measured_as_none(self):
+        found = measure(altered_engine(mujoco(), Alteration(torsional_friction=0.0)), SCENE)
+        self.assertAlmostEqual(found.torsional_friction, 0.0, delta=2e-5)
+        self.assertTrue(math.isnan(found.patch_torsional_friction))
 
 
 class AlteredBackendTest(unittest.TestCase):
@@ -135,12 +150,20 @@ class PropertiesTest(unittest.TestCase):
     def test_equal_values_are_not_tried(self):
         for p in PROPERTIES:
             self.assertEqual(p.change(STATED, STATED, "mujoco", SCENE), "the same in both, as far as is measured", p.name)
-            self.assertNotEqual(p.what_if, Alteration(), p.name)
+            self.assertNotIn(Alteration(), p.what_if, p.name)
 
     def test_a_factor_leads_to_the_other_value(self):
         self.assertEqual(self.change("tip friction", tip_friction=0.45), Alteration(tip_friction=0.5))
         self.assertEqual(self.change("hand damping", hand_damping=1.5), Alteration(hand_damping=1.5))
         self.assertEqual(self.change("latency", delay=2.0), Alteration(delay=2))
+
+    def test_torsional_friction_may_vanish_but_not_come_from_nothing(self):
+        self.assertEqual(self.change("torsional friction", torsional_friction=0.0), Alteration(torsional_friction=0.0))
+        none = replace(STATED, torsional_friction=0.0)
+        self.assertIn("nothing times any factor", self.change("torsional friction", a=none, torsional_friction=0.002))
+        self.assertEqual(self.change("patch torsional friction", patch_torsional_friction=0.3), Alteration(torsional_friction=0.3))
+        left = replace(STATED, patch_torsional_friction=0.3)
+        self.assertIn("not changeable in sapien", self.change("patch torsional friction", "sapien", a=left, patch_torsional_friction=1.0))
 
     def test_a_finer_timestep_leaves_contacts_as_they_are(self):
         self.assertEqual(self.change("timestep", timestep=1 / 480), Alteration(timestep=0.5, contact_time=2.0))
@@ -196,6 +219,30 @@ class AttributeTest(unittest.TestCase):
         self.assertIn("nothing to attribute", verdict(found))
         self.assertIn("not tried: object mass (1 in mujoco, 1 in same): not asked for", list(not_tried(found)))
 
+    def test_torsional_friction_is_tried_without_and_with_more_of_it(self):
+        found = self.attribute(replace(mujoco(), name="same"), only=["torsional friction"], what_if=True)
+        tried = [(row.name, row.alteration, amount(row)) for row in found.rows if row.kind == "what if"]
+        name = "torsional friction"
+        self.assertEqual(tried, [(name, Alteration(torsional_friction=0.0), "none"), (name, Alteration(torsional_friction=2.0), "x 2")])
+
+    def test_a_change_that_goes_too_far_is_told_from_the_others(self):
+        b = replace(altered_engine(engine("sapien", workers=0), Alteration(table_friction=0.7, mass=1.1)), name="sapien")
+        found = self.attribute(b, only=["table friction", "patch torsional friction", "object mass"])
+        kinds = [(row.kind, row.name) for row in found.rows]
+        self.assertEqual(
+            kinds,
+            [
+                ("as it is", "mujoco"),
+                ("towards", "table friction"),
+                ("at most", "patch torsional friction"),
+                ("towards", "object mass"),
+                ("all", "all 2 at once"),
+                ("other", "sapien"),
+            ],
+        )
+        self.assertAlmostEqual(found.rows[2].alteration.torsional_friction, 0.7 * 0.7 / 2, delta=0.01)
+        self.assertEqual(found.rows[4].alteration.torsional_friction, 1.0)
+
     def test_an_unknown_property_is_refused(self):
         with self.assertRaisesRegex(XResetError, "there is no property colour; there are tip friction, .*latency"):
             self.attribute(mujoco(), only=["colour"])
@@ -229,6 +276,16 @@ class OutcomeTest(unittest.TestCase):
         self.assertAlmostEqual(found.share(found.rows[1]), 0.5)
         self.assertAlmostEqual(found.share(found.rows[3]), -1.0)
         self.assertEqual(found.costs(), found.rows[2])
+
+    def test_a_bound_is_named_only_where_nothing_else_matters(self):
+        ends = row("as it is", "mujoco", *[0.66] * 8), row("other", "sapien", *[0.33] * 8)
+        bound = row("at most", "patch torsional friction", *[0.0] * 8)
+        found = self.found(ends[0], bound, row("towards", "tip friction", *[0.33] * 6, *[0.66] * 2), ends[1])
+        self.assertEqual(found.costs(), found.rows[2])
+        found = self.found(ends[0], bound, ends[1])
+        self.assertEqual(found.costs(), bound)
+        self.assertIn("'patch torsional friction' may bring about 200% of it, at most (changed in every contact", verdict(found))
+        self.assertEqual(label(bound), "patch torsional friction (at most)")
 
     def test_a_difference_of_one_demonstration_among_many_does_not_matter(self):
         found = self.found(row("as it is", "mujoco", *[0.66] * 8), row("other", "sapien", 0.33, 0.33, *[0.66] * 6))

@@ -25,6 +25,8 @@ class Alteration:
     """Factor on the pair friction of object and other links."""
     table_friction: float = 1.0
     """Factor on the pair friction of object and table."""
+    torsional_friction: float = 1.0
+    """Factor on the torsional friction of every pair; 0: none."""
     mass: float = 1.0
     """Factor on the object's mass; its inertia scales with it."""
     inertia: float = 1.0
@@ -62,6 +64,7 @@ class Alteration:
                 tip=friction.tip * self.tip_friction,
                 link=friction.link * self.link_friction,
                 table=friction.table * self.table_friction,
+                torsional=friction.torsional * self.torsional_friction,
             ),
             timestep=scene.control_dt / substeps,
             substeps=substeps,

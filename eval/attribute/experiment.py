@@ -17,7 +17,7 @@ from xreset.errors import XResetError
 from xreset.eval.attribute.alteration import Alteration, altered_engine
 from xreset.eval.attribute.dials import NO_CONTACT_DIAL, contact_dial
 from xreset.eval.attribute.probes import Measured, measure
-from xreset.eval.attribute.properties import PROPERTIES, Property
+from xreset.eval.attribute.properties import PROPERTIES
 from xreset.eval.rollout import Episode, roll_out
 from xreset.eval.stats import bootstrap_ci95
 from xreset.eval.trace.actions import evaluation_scene
@@ -28,7 +28,7 @@ from xreset.task.config import TaskConfig
 
 SCHEMA = "xreset-attribution/1"
 
-Kind = Literal["as it is", "towards", "all", "what if", "other"]
+Kind = Literal["as it is", "towards", "at most", "all", "what if", "other"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,8 @@ class Row:
     """One run of the policy."""
 
     kind: Kind
-    """A as it is; with one property changed towards B; with all of these; with a change of a usual size; B as it is."""
+    """A as it is; with one property changed towards B; with one changed farther than that, for want of a finer dial; with all
+    of the former; with a change of a usual size; B as it is."""
     name: str
     """Property, or engine."""
     alteration: Alteration
@@ -88,11 +89,14 @@ class Attribution:
         return self.difference(row)[0] / whole if self.matters(self.rows[-1]) else math.nan
 
     def costs(self) -> Row | None:
-        """The property that, changed towards B, brings A nearest to B, of those that matter; None if there is none."""
+        """The property that, changed towards B, brings about most of the difference, of those that matter; None if there is none.
+
+        One whose cost is but a bound is named only where no other matters.
+        """
         if not self.matters(self.rows[-1]):
             return None
-        found = [row for row in self.rows if row.kind == "towards" and self.matters(row) and self.share(row) > 0]
-        return max(found, key=self.share, default=None)
+        found = [row for row in self.rows if row.kind in ("towards", "at most") and self.matters(row) and self.share(row) > 0]
+        return max(found, key=lambda row: (row.kind == "towards", self.share(row)), default=None)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-able content."""
@@ -168,7 +172,7 @@ def attribute(
         num_envs: worlds at a time.
         sequences: indices of the demonstrations to play; None: all.
         only: names of the properties to try; empty: all.
-        what_if: also try the properties in which A and B do not differ, with a change of a usual size each.
+        what_if: also try the properties in which A and B do not differ, with changes of a usual size.
         progress: called with (name of the run, control steps done, control steps in all).
 
     Raises:
@@ -200,14 +204,16 @@ def attribute(
             continue
         change = p.change(measured_a, measured_b, a.name, scene)
         if isinstance(change, Alteration):
-            rows.append(run("towards", p.name, a, change))
-            everything, changed = everything.and_(change), changed + 1
+            rows.append(run("at most" if p.at_most else "towards", p.name, a, change))
+            if not p.at_most:
+                everything, changed = everything.and_(change), changed + 1
             continue
         skipped.append(Skipped(name=p.name, reason=change))
-        if what_if and (reason := _no_what_if(p, a)) is None:
-            rows.append(run("what if", p.name, a, p.what_if))
-        elif what_if:
-            skipped.append(Skipped(name=f"{p.name}, what if", reason=reason or ""))
+        for usual in p.what_if if what_if else ():
+            if (reason := _no_dial(usual, a)) is None:
+                rows.append(run("what if", p.name, a, usual))
+            else:
+                skipped.append(Skipped(name=f"{p.name}, what if", reason=reason))
     if changed > 1:
         rows.append(run("all", f"all {changed} at once", a, _allowed(everything, a)))
     rows.append(run("other", b.name, b, Alteration()))
@@ -220,9 +226,9 @@ def _allowed(alteration: Alteration, engine: Engine) -> Alteration:
     return alteration if dial is None else replace(alteration, contact_time=max(alteration.contact_time, dial.smallest))
 
 
-def _no_what_if(p: Property, engine: Engine) -> str | None:
-    """Why a property cannot be changed at all; None if it can."""
-    if p.what_if.contact_time == 1.0 or contact_dial(engine.name) is not None:
+def _no_dial(alteration: Alteration, engine: Engine) -> str | None:
+    """Why an engine cannot be changed like this; None if it can."""
+    if alteration.contact_time == 1.0 or contact_dial(engine.name) is not None:
         return None
     return f"not changeable in {engine.name}: {NO_CONTACT_DIAL.get(engine.name, 'no dial of its contacts is known')}"
 

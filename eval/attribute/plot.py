@@ -6,12 +6,12 @@ import io
 from pathlib import Path
 
 from xreset.eval.attribute.experiment import Attribution
-from xreset.eval.attribute.table import label
+from xreset.eval.attribute.table import amount, label
 from xreset.eval.report.plots import COLORS, figure_style
 from xreset.eval.stats import bootstrap_ci95
 from xreset.files import atomic_write
 
-_COLOR = {"as it is": COLORS[0], "towards": COLORS[4], "all": COLORS[2], "what if": COLORS[7], "other": COLORS[1]}
+_COLOR = {"as it is": COLORS[0], "towards": COLORS[4], "at most": COLORS[5], "all": COLORS[2], "what if": COLORS[7], "other": COLORS[1]}
 
 
 def write_plot(path: Path, found: Attribution, title: str) -> None:
@@ -27,7 +27,8 @@ def write_plot(path: Path, found: Attribution, title: str) -> None:
             d, _ = found.difference(row)
             text = f"{mean:.0f} %" if row.kind == "as it is" else f"{mean:.0f} % ({100 * d:+.1f})"
             ax.text(high + 1.5, y, text, va="center", fontweight="bold" if found.matters(row) else "normal")
-        ax.set_yticks(range(len(found.rows)), [label(row) for row in found.rows])
+        labels = [f"{label(row)}, {amount(row)}" if row.kind == "what if" else label(row) for row in found.rows]
+        ax.set_yticks(range(len(labels)), labels)
         ax.invert_yaxis()
         for row in (found.rows[0], found.rows[-1]):
             ax.axvline(100 * row.score().mean(), color=_COLOR[row.kind], linestyle="--", linewidth=0.9)

@@ -1,4 +1,4 @@
-"""What physics an engine really has, measured through the interface: seven short experiments, all at once, each in a world of its own.
+"""What physics an engine really has, measured through the interface: eight short experiments, all at once, each in a world of its own.
 
 Nothing here knows any engine, so plugins and altered engines are measured alike. Gravity is off except where an object rests on the table.
 """
@@ -34,6 +34,11 @@ class Measured:
     """Pair friction of object and another link."""
     table_friction: float
     """Pair friction of object and table."""
+    torsional_friction: float
+    """Torsional friction of object and table, where they touch in one point [m]; NaN where it stops the object at once."""
+    patch_torsional_friction: float
+    """Share of it that is left where a second point, 2 mm beside the one that presses, comes as near as 0.5 mm to the table; NaN where
+    there is none to begin with."""
     mass: float
     """Share of the object's mass."""
     inertia: float
@@ -65,6 +70,10 @@ _SETTLE = 0.25  # [s] before loads and pulls
 _TIME = 0.40  # [s] of all
 _PULL_WINDOW = (0.05, 0.12)  # [s] after the pull begins
 _PUSH_STEPS = 24  # physics steps of constant force on the free object
+_TOP_HEIGHT, _TOP_RADIUS = 0.04, 0.02  # [m] of a cone that stands on its point
+_TOP_INERTIA = (1.0, 1.0, 1e-3)  # [kg m^2]: it can hardly fall, and turns easily
+_SECOND_POINT = (2e-3, 0.0, 5e-4)  # [m]; PhysX takes two that are less than 1 mm apart for one
+_LEAST_TORSION = 1e-4  # [m] below which torsional friction counts as none
 
 
 def measure(engine: Engine, scene: SceneSpec) -> Measured:
@@ -73,6 +82,9 @@ def measure(engine: Engine, scene: SceneSpec) -> Measured:
     - A slab slides over the table from 0.5 m/s, along x and along the diagonal: its way d tells the friction,
       (v0^2 - v1^2) / (2 g (d + v0 h / 2)) with h the step of the integration. (Its deceleration does not tell it: MuJoCo's contacts lift
       what slides, so it patters.)
+    - A top that can hardly fall spins on its point: what it loses, I dw, tells the torsional friction, I dw / int(N) dt with the load's
+      impulse from the momentum (contacts may patter). A second one has another point beside the first that does not reach the table: there
+      some engines let sliding friction act at both points, instead of torsional friction at one.
     - A slab at rest is loaded with ten times its weight: how much it gives.
     - A paddle that can hardly turn is pressed onto a fingertip, and onto the farthest other link, with 3 N and then pulled sideways with
       three times what friction should carry: the friction is the ratio of the impulses that were missing along and across.
@@ -94,6 +106,10 @@ def measure(engine: Engine, scene: SceneSpec) -> Measured:
     return bench.evaluate(log)
 
 
+_SLABS, _TOPS = ("slide x", "slide xy", "load"), ("one point", "two points")
+"""Worlds in which an object rests on the table."""
+
+
 class _Bench:
     """The worlds of the experiments."""
 
@@ -101,10 +117,11 @@ class _Bench:
         robot, thing = scene.robot, scene.objects[0]
         slab = _block("slab", inertia=_SLAB_MASS / 3 * (sum(h * h for h in _SLAB_HALF) - np.square(_SLAB_HALF)))
         paddle = _block("paddle", inertia=np.ones(3))
-        self.scene = replace(scene, objects=(slab, paddle, thing))
+        tops = _top("top", ((0.0, 0.0, 0.0),)), _top("top with two points", ((0.0, 0.0, 0.0), _SECOND_POINT))
+        self.scene = replace(scene, objects=(slab, paddle, thing, *tops))
         self._thing, self._robot = thing, robot
-        self._names = ("slide x", "slide xy", "load", "tip", "link", "force", "torque x", "torque y", "torque z", "drives")
-        objects = (0, 0, 0, 1, 1, 2, 2, 2, 2, 2)
+        self._names = (*_SLABS, *_TOPS, "tip", "link", "force", "torque x", "torque y", "torque z", "drives")
+        objects = (0, 0, 0, 3, 4, 1, 1, 2, 2, 2, 2, 2)
         self.count, self.object_index = len(objects), torch.tensor(objects)
         self._presses = {"tip": _reachable(scene, tip=True), "link": _reachable(scene, tip=False)}
         self._dt = scene.timestep
@@ -116,7 +133,7 @@ class _Bench:
         """Play all experiments; returns what the worlds did: [T, N, ...] after each physics step, the start first."""
         start = self._start()
         n, device = self.count, backend.device
-        grounded = torch.tensor([name in ("slide x", "slide xy", "load") for name in self._names])
+        grounded = torch.tensor([name in _SLABS + _TOPS for name in self._names])
         backend.set_object_gravity(grounded.float().to(device))
         backend.set_state(start.to(device))
         targets = start.joint_target.clone()
@@ -163,13 +180,17 @@ class _Bench:
             turned = quat_rotate_inverse(log["object_quat"][_PUSH_STEPS, at[name]], log["object_angvel"][_PUSH_STEPS, at[name]]).numpy()
             shares.append(self._push_torque(i) * t / float(turned @ self._axes[i]) / self._principal(i))
         stiffness, damping, delay = self._drives(log["joint_pos"][:, -1].numpy(), log["joint_vel"][:, -1].numpy())
+        inertia = float(np.median(shares)) / mass
+        point, patch = (inertia * self._torsion(log, at[name]) for name in _TOPS)
         arm, hand = self._robot.arm_indices, self._robot.hand_indices
         return Measured(
             tip_friction=pulled("tip"),
             link_friction=pulled("link"),
             table_friction=sum(slides) / len(slides),
+            torsional_friction=point,
+            patch_torsional_friction=patch / point if point > _LEAST_TORSION else float("nan"),
             mass=mass,
-            inertia=float(np.median(shares)) / mass,
+            inertia=inertia,
             arm_stiffness=_median(stiffness[arm]),
             arm_damping=_median(damping[arm]),
             hand_stiffness=_median(stiffness[hand]),
@@ -185,14 +206,29 @@ class _Bench:
         way = (log["object_pos"][-1, world, :2] - log["object_pos"][0, world, :2]).norm()
         return float((_SPEED**2 - end**2) / (2 * GRAVITY * (way + _SPEED * step / 2)))
 
+    def _torsion(self, log: dict[str, Tensor], world: int) -> float:
+        """Torsional friction [m] from the spin that a top has lost, if its inertia at its mass is as stated.
+
+        It is measured while the top has half of its spin. What takes that in one step cannot be measured.
+        """
+        spin = log["object_angvel"][:, world, 2]
+        steps = int((spin > spin[0] / 2).long().cumprod(0).sum()) - 1
+        if steps < 1:
+            return float("nan")
+        load = GRAVITY * steps * self._dt + float(log["object_linvel"][steps, world, 2])  # its impulse, for the mass
+        return _TOP_INERTIA[2] / _SLAB_MASS * float(spin[0] - spin[steps]) / load
+
     # What is done to the worlds ----------------------------------------------------------------------------------------------------------
 
     def _start(self) -> State:
         rows = [initial_state(self.scene, int(i)) for i in self.object_index]
         far = np.array([*self._place, 0.6])
         for name, row in zip(self._names, rows, strict=True):
-            if name in ("slide x", "slide xy", "load"):
+            if name in _SLABS:
                 row["object_pos"] = np.array([*self._place, _SLAB_HALF[2]])
+            elif name in _TOPS:
+                row["object_pos"] = np.array([*self._place, 0.0])
+                row["object_angvel"] = np.array([0.0, 0.0, self._spin()])
             elif name in self._presses:
                 point, normal, _ = self._presses[name]
                 row["object_pos"] = point + (_SLAB_HALF[2] + 5e-4) * normal
@@ -223,6 +259,10 @@ class _Bench:
     def _pull(self, name: str) -> float:
         friction = self.scene.friction
         return _PULL * _PRESS * max(friction.tip if name == "tip" else friction.link, 0.1)
+
+    def _spin(self) -> float:
+        """[rad/s] four times what the stated torsional friction takes; not so much that a contact patters."""
+        return 4.0 * max(self.scene.friction.torsional, 1e-3) * _SLAB_MASS * GRAVITY / _TOP_INERTIA[2] * _TIME
 
     def _push_force(self) -> float:
         return 2.0 * self._thing.mass  # 2 m/s^2
@@ -291,6 +331,29 @@ def _block(name: str, *, inertia: np.ndarray) -> ObjectSpec:
         inertia=np.diag(inertia),
         vertices=corners,
         faces=np.array(faces),
+    )
+
+
+def _top(name: str, points: Sequence[Sequence[float]]) -> ObjectSpec:
+    """A cone upside down, with these points [m] at its lower end; the mesh's origin is on the floor, and so is the centre of mass."""
+    from scipy.spatial import ConvexHull
+
+    angle = np.arange(8) * np.pi / 4
+    rim = np.stack((_TOP_RADIUS * np.cos(angle), _TOP_RADIUS * np.sin(angle), np.full(8, _TOP_HEIGHT)), axis=1)
+    vertices = np.concatenate((np.array(points), rim))
+    hull = ConvexHull(vertices)
+    faces = hull.simplices.copy()
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
+    faces[inward] = faces[inward, ::-1]
+    return ObjectSpec(
+        name=name,
+        pieces=(Shape(geometry=Geometry(kind="hull", vertices=vertices, faces=faces)),),
+        mass=_SLAB_MASS,
+        com=np.zeros(3),
+        inertia=np.diag(_TOP_INERTIA),
+        vertices=vertices,
+        faces=faces,
     )
 
 

@@ -28,10 +28,12 @@ class Property:
     resolution: float
     """Differences below this are not told apart: a share of the larger value, for ``absolute`` a number in the measured unit."""
     absolute: bool = False
-    what_if: Alteration
-    """A change of a usual size, to see how much the skill depends on the property."""
+    what_if: tuple[Alteration, ...]
+    """Changes of a usual size, to see how much the skill depends on the property; none where another property has them."""
     towards: Callable[[float, float, str, SceneSpec], Change] | None = None
     """From the values in A and B, A's name and the scene to the change; None: the ratio B / A as the factor ``field``."""
+    at_most: str = ""
+    """Why the change that there is goes farther than B does, so that its cost is a bound; empty: it does not."""
 
     def value(self, measured: Measured) -> float:
         """Its value in an engine; NaN if it could not be measured."""
@@ -83,6 +85,19 @@ def _contact_give(a: float, b: float, engine: str, scene: SceneSpec) -> Change:
     return Alteration(contact_time=factor)
 
 
+def _torsion(a: float, b: float, engine: str, scene: SceneSpec) -> Change:
+    """Unlike other factors this one may be 0."""
+    if a <= 0:
+        return f"not changeable in {engine}: it has none, and nothing times any factor is nothing"
+    return Alteration(torsional_friction=max(b, 0.0) / a)
+
+
+def _patch_torsion(a: float, b: float, engine: str, scene: SceneSpec) -> Change:
+    if b > a:
+        return f"not changeable in {engine}: what it leaves out beside a second point, no friction of the scene brings back"
+    return Alteration(torsional_friction=max(b, 0.0) / a)
+
+
 def _delay(a: float, b: float, engine: str, scene: SceneSpec) -> Change:
     if b < a:
         return f"not changeable in {engine}: targets that come late cannot be made to come earlier"
@@ -90,16 +105,39 @@ def _delay(a: float, b: float, engine: str, scene: SceneSpec) -> Change:
 
 
 PROPERTIES = (
-    Property(name="tip friction", field="tip_friction", unit="", scale=1.0, resolution=0.03, what_if=Alteration(tip_friction=0.8)),
-    Property(name="link friction", field="link_friction", unit="", scale=1.0, resolution=0.03, what_if=Alteration(link_friction=0.8)),
-    Property(name="table friction", field="table_friction", unit="", scale=1.0, resolution=0.03, what_if=Alteration(table_friction=0.8)),
-    Property(name="object mass", field="mass", unit="", scale=1.0, resolution=0.005, what_if=Alteration(mass=1.2)),
-    Property(name="object inertia", field="inertia", unit="", scale=1.0, resolution=0.02, what_if=Alteration(inertia=1.2)),
-    Property(name="arm stiffness", field="arm_stiffness", unit="", scale=1.0, resolution=0.02, what_if=Alteration(arm_stiffness=0.8)),
-    Property(name="arm damping", field="arm_damping", unit="", scale=1.0, resolution=0.02, what_if=Alteration(arm_damping=0.8)),
-    Property(name="hand stiffness", field="hand_stiffness", unit="", scale=1.0, resolution=0.03, what_if=Alteration(hand_stiffness=0.8)),
-    Property(name="hand damping", field="hand_damping", unit="", scale=1.0, resolution=0.02, what_if=Alteration(hand_damping=0.8)),
-    Property(name="timestep", field="timestep", unit="ms", scale=1e3, resolution=0.05, what_if=Alteration(timestep=0.5), towards=_timestep),
+    Property(name="tip friction", field="tip_friction", unit="", scale=1.0, resolution=0.03, what_if=(Alteration(tip_friction=0.8),)),
+    Property(name="link friction", field="link_friction", unit="", scale=1.0, resolution=0.03, what_if=(Alteration(link_friction=0.8),)),
+    Property(name="table friction", field="table_friction", unit="", scale=1.0, resolution=0.03, what_if=(Alteration(table_friction=0.8),)),
+    Property(
+        name="torsional friction",
+        field="torsional_friction",
+        unit="mm",
+        scale=1e3,
+        resolution=5e-5,
+        absolute=True,
+        what_if=(Alteration(torsional_friction=0.0), Alteration(torsional_friction=2.0)),
+        towards=_torsion,
+    ),
+    Property(
+        name="patch torsional friction",
+        field="patch_torsional_friction",
+        unit="",
+        scale=1.0,
+        resolution=0.05,
+        absolute=True,
+        what_if=(),
+        towards=_patch_torsion,
+        at_most="changed in every contact, where the engines differ only beside a second point",
+    ),
+    Property(name="object mass", field="mass", unit="", scale=1.0, resolution=0.005, what_if=(Alteration(mass=1.2),)),
+    Property(name="object inertia", field="inertia", unit="", scale=1.0, resolution=0.02, what_if=(Alteration(inertia=1.2),)),
+    Property(name="arm stiffness", field="arm_stiffness", unit="", scale=1.0, resolution=0.02, what_if=(Alteration(arm_stiffness=0.8),)),
+    Property(name="arm damping", field="arm_damping", unit="", scale=1.0, resolution=0.02, what_if=(Alteration(arm_damping=0.8),)),
+    Property(name="hand stiffness", field="hand_stiffness", unit="", scale=1.0, resolution=0.03, what_if=(Alteration(hand_stiffness=0.8),)),
+    Property(name="hand damping", field="hand_damping", unit="", scale=1.0, resolution=0.02, what_if=(Alteration(hand_damping=0.8),)),
+    Property(
+        name="timestep", field="timestep", unit="ms", scale=1e3, resolution=0.05, what_if=(Alteration(timestep=0.5),), towards=_timestep
+    ),
     Property(
         name="contact softness",
         field="contact_give",
@@ -107,7 +145,7 @@ PROPERTIES = (
         scale=1e3,
         resolution=2e-5,
         absolute=True,
-        what_if=Alteration(contact_time=1.5),
+        what_if=(Alteration(contact_time=1.5),),
         towards=_contact_give,
     ),
     Property(
@@ -117,7 +155,7 @@ PROPERTIES = (
         scale=1.0,
         resolution=0.5,
         absolute=True,
-        what_if=Alteration(delay=1),
+        what_if=(Alteration(delay=1),),
         towards=_delay,
     ),
 )

@@ -64,6 +64,8 @@ def verdict(found: Attribution) -> str:
     if row is None:
         return f"{found.b} differs from {found.a} by {size}, and none of the properties that could be changed explains it."
     best = f"{row.name!r} alone brings about {found.share(row):.0%} of it"
+    if row.kind == "at most":
+        best = f"{row.name!r} may bring about {found.share(row):.0%} of it, at most ({_BY_NAME[row.name].at_most})"
     together = next((r for r in found.rows if r.kind == "all"), None)
     rest = "" if together is None else f", {together.name} {found.share(together):.0%}"
     return f"{found.b} differs from {found.a} by {size}; {best}{rest}."
@@ -71,7 +73,15 @@ def verdict(found: Attribution) -> str:
 
 def label(row: Row) -> str:
     """Name of a run."""
-    return f"{row.name} (what if)" if row.kind == "what if" else row.name
+    return f"{row.name} ({row.kind})" if row.kind in ("what if", "at most") else row.name
+
+
+def amount(row: Row) -> str:
+    """By how much a run's physics was changed."""
+    changed = {name: value for name, value in vars(row.alteration).items() if value != (0 if name == "delay" else 1.0)}
+    return ", ".join(
+        f"{value:+d} control step" if name == "delay" else f"x {value:g}" if value else "none" for name, value in changed.items()
+    )
 
 
 def _value(p: Property, measured: Measured) -> str:
@@ -84,7 +94,6 @@ def _change(row: Row, found: Attribution) -> str:
     p = _BY_NAME.get(row.name)
     if p is None:
         return ""
-    if row.kind == "towards":
+    if row.kind in ("towards", "at most"):
         return f"{p.value(found.measured_a) * p.scale:.3g} -> {_value(p, found.measured_b)}"
-    changed = {name: value for name, value in vars(row.alteration).items() if value != (0 if name == "delay" else 1.0)}
-    return ", ".join(f"{value:+d} control step" if name == "delay" else f"x {value:g}" for name, value in changed.items())
+    return amount(row)

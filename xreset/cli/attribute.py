@@ -28,9 +28,9 @@ def attribute(
 ) -> None:
     """Tell which physical difference between two engines costs a policy its skill.
 
-    Both engines are measured, through the interface alone: friction, object mass and inertia, drive stiffness and damping, timestep,
-    contact softness, latency. Then the policy plays in one engine, in that engine with one property at a time changed to the other's value,
-    with all of them at once, and in the other engine: the same episodes from the same starts.
+    Both engines are measured, through the interface alone: sliding and torsional friction, object mass and inertia, drive stiffness and
+    damping, timestep, contact softness, latency. Then the policy plays in one engine, in that engine with one property at a time changed to
+    the other's value, with all of them at once, and in the other engine: the same episodes from the same starts.
 
     Args:
         policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or a baseline: zero,
@@ -39,7 +39,7 @@ def attribute(
         towards: Engine towards which the properties are changed, usually the one in which the policy does worse.
         backend: Engine in which they are changed.
         only: Property to try; give it again for several. Default: all in which the engines differ.
-        what_if: Also try the properties in which they do not differ, each with a change of a usual size.
+        what_if: Also try the properties in which they do not differ, with changes of a usual size.
         object: Object to play with; give it again for several. Default: all.
         max_demos: Demonstrations to play at most, spread over all.
         episodes: Episodes per demonstration.

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from xreset.errors import FileFormatError, RunError
+from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.results import read_episodes, read_results
 from xreset.eval.rollout import Episode
 from xreset.files import read_json
@@ -21,6 +22,18 @@ CURVES = {
     "task/success": "worlds at the goal",
 }
 """TensorBoard tag -> what it shows."""
+
+
+ASPECTS: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "policy": lambda s: s["policy"],
+    "robot": lambda s: s["robot"],
+    "policy file": lambda s: s["inputs"].get("policy", "")[:12],
+    "demonstrations": lambda s: s["inputs"].get("demos", "")[:12],
+    "object meshes": lambda s: s["objects_folder"] or "stand-ins",
+    "number of episodes": lambda s: s["episodes"],
+    "seed": lambda s: s["seed"],
+}
+"""What was evaluated, and how, from ``BACKEND.json``: results that differ in any of it cannot be compared as if they did not."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,10 +83,8 @@ def collect(folder: Path) -> ReportData:
         RunError: the folder does not exist or holds no results.
         FileFormatError: a file is damaged or of another version.
     """
-    if not folder.is_dir():
-        raise RunError(f"there is no folder {folder}. Give a run folder, or a folder that xreset eval wrote results into.")
     is_run = (folder / "run.json").is_file()
-    results = folder / "eval" if (folder / "eval").is_dir() or is_run else folder
+    results = results_in(folder)
     summaries = tuple(read_results(results))
     if not summaries:
         policy = str(folder) if is_run else "POLICY"
@@ -90,7 +101,7 @@ def collect(folder: Path) -> ReportData:
         except FileFormatError as error:  # results outlive a change of the training's configuration
             notes.append(f"The training is not described here: {error}")
     return ReportData(
-        name=(folder.resolve().parent if folder.resolve().name == "eval" else folder.resolve()).name,
+        name=name_of(folder),
         results=results,
         summaries=summaries,
         episodes={s["backend"]: read_episodes(results, s["backend"]) for s in summaries},
@@ -101,18 +112,27 @@ def collect(folder: Path) -> ReportData:
     )
 
 
+def results_in(folder: Path) -> Path:
+    """Where the results of a run folder, or of a folder of results, lie; there may be none yet.
+
+    Raises:
+        RunError: the folder does not exist.
+    """
+    if not folder.is_dir():
+        raise RunError(f"there is no folder {folder}. Give a run folder, or a folder that xreset eval wrote results into.")
+    return folder / "eval" if (folder / "eval").is_dir() or (folder / "run.json").is_file() else folder
+
+
+def name_of(folder: Path) -> str:
+    """What a run, or the owner of a folder of results, is called."""
+    whole = folder.resolve()
+    return (whole.parent if whole.name == "eval" else whole).name
+
+
 def differences(summaries: tuple[dict[str, Any], ...]) -> list[str]:
     """What makes engines' results incomparable: sentences, none if all were evaluated alike."""
     notes = []
-    for what, get in (
-        ("policy", lambda s: s["policy"]),
-        ("robot", lambda s: s["robot"]),
-        ("policy file", lambda s: s["inputs"].get("policy", "")[:12]),
-        ("demonstrations", lambda s: s["inputs"].get("demos", "")[:12]),
-        ("object meshes", lambda s: s["objects_folder"] or "stand-ins"),
-        ("number of episodes", lambda s: s["episodes"]),
-        ("seed", lambda s: s["seed"]),
-    ):
+    for what, get in ASPECTS.items():
         values = {s["backend"]: get(s) for s in summaries}
         if len(set(values.values())) > 1:
             listing = ", ".join(f"{engine}: {value}" for engine, value in values.items())
@@ -121,22 +141,34 @@ def differences(summaries: tuple[dict[str, Any], ...]) -> list[str]:
 
 
 def read_curves(folder: Path) -> tuple[tuple[Curve, ...], str | None]:
-    """Learning curves from TensorBoard's event files in a folder, and a note if they are there but cannot be read."""
+    """The learning curves of :data:`CURVES` in a folder, and a note if they are there but cannot be read."""
+    try:
+        scalars = read_scalars(folder)
+    except XResetError as error:
+        return (), str(error)
+    return tuple(replace(scalars[tag], label=label) for tag, label in CURVES.items() if tag in scalars), None
+
+
+def read_scalars(folder: Path) -> dict[str, Curve]:
+    """Everything that TensorBoard's event files in a folder hold, by tag, which is its label too; empty if there are no event files.
+
+    Raises:
+        XResetError: there are event files, and TensorBoard, which reads them, cannot be imported.
+    """
     if not any(folder.glob("events.out.tfevents.*")):
-        return (), None
+        return {}
     try:
         from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
     except ImportError as error:
-        return (), f"Learning curves need TensorBoard, which cannot be imported ({error}). Install it with: pip install 'xreset[train]'"
+        raise XResetError(
+            f"Learning curves need TensorBoard, which cannot be imported ({error}). Install it with: pip install 'xreset[train]'"
+        ) from error
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
-    known = set(events.Tags()["scalars"])
-    curves = []
-    for tag, label in CURVES.items():
-        if tag in known:
-            latest = {
-                e.step: e.value for e in events.Scalars(tag)
-            }  # a resumed run repeats the steps after its checkpoint: the later ones count
-            steps = sorted(latest)
-            curves.append(Curve(label=label, iteration=np.array(steps), value=np.array([latest[step] for step in steps])))
-    return tuple(curves), None
+    curves = {}
+    for tag in events.Tags()["scalars"]:
+        # a resumed run repeats the steps after its checkpoint: the later ones count
+        latest = {e.step: e.value for e in events.Scalars(tag)}
+        steps = sorted(latest)
+        curves[tag] = Curve(label=tag, iteration=np.array(steps), value=np.array([latest[step] for step in steps]))
+    return curves

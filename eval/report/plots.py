@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d3b", "#666666")
 """Colour of each engine, in their order: Okabe and Ito's palette, told apart with colour-blind eyes and on light and dark ground."""
 STAGES = (("approach_rate", "approach"), ("grasp_rate", "grasp"), ("reorient_rate", "reorient"))
-_INK = "#010203"
-"""Stands for the text colour in an SVG; replaced by ``currentColor``."""
+INK = "#010203"
+"""Text colour; in an SVG it is replaced by ``currentColor``."""
 
 Summaries = Sequence[dict[str, Any]]
 
@@ -53,11 +53,11 @@ def draw_progress(ax: Axes, summaries: Summaries) -> None:
     for i, s in enumerate(summaries):
         mean, (low, high) = s["task_progress"]["mean"], s["task_progress"]["ci95"]
         ax.barh(i, 100 * mean, color=COLORS[i % len(COLORS)], height=0.62)
-        ax.errorbar(100 * mean, i, xerr=[[100 * max(mean - low, 0)], [100 * max(high - mean, 0)]], color=_INK, capsize=3, linewidth=1.2)
+        ax.errorbar(100 * mean, i, xerr=[[100 * max(mean - low, 0)], [100 * max(high - mean, 0)]], color=INK, capsize=3, linewidth=1.2)
         ax.text(100 * high + 2, i, f"{mean:.0%}", va="center")
     ax.set_yticks(range(len(summaries)), [s["backend"] for s in summaries])
     ax.invert_yaxis()
-    _percent(ax, "x")
+    percent_axis(ax, "x")
     ax.set_xlim(0, 112)
     ax.set_xlabel("task progress, 95 % interval")
 
@@ -70,7 +70,7 @@ def draw_stages(ax: Axes, summaries: Summaries) -> None:
         bars = ax.bar(at, [100 * s[key] for key, _ in STAGES], width=0.9 * width, color=COLORS[i % len(COLORS)], label=s["backend"])
         ax.bar_label(bars, fmt="%.0f", fontsize="small", padding=1)
     ax.set_xticks(range(len(STAGES)), [label for _, label in STAGES])
-    _percent(ax, "y")
+    percent_axis(ax, "y")
     ax.set_ylabel("episodes")
 
 
@@ -84,7 +84,7 @@ def draw_objects(ax: Axes, summaries: Summaries) -> None:
         ax.scatter(*zip(*rows, strict=True), s=34, color=COLORS[i % len(COLORS)], label=s["backend"], zorder=3, clip_on=False)
     ax.set_yticks(range(len(names)), [short_name(name) for name in names])
     ax.set_ylim(len(names) - 0.5, -0.5)
-    _percent(ax, "x")
+    percent_axis(ax, "x")
     ax.set_xlabel("task progress")
 
 
@@ -92,9 +92,14 @@ def draw_curve(ax: Axes, curve: Curve) -> None:
     """One learning curve."""
     percent = curve.label.startswith("worlds")
     ax.plot(curve.iteration, curve.value * (100 if percent else 1), color=COLORS[0], linewidth=1.6, marker="o" * (len(curve.value) < 10))
-    ax.set_title(curve.label, fontsize="medium", loc="left")
-    ax.set_xlabel("iteration")
-    ax.grid(axis="y", color=_INK, alpha=0.12)
+    curve_axes(ax, curve.label, "iteration", percent=percent)
+
+
+def curve_axes(ax: Axes, title: str, x: str, *, percent: bool) -> None:
+    """Title, horizontal axis and grid of learning curves; ``percent``: the values are percentages, so that zero is worth seeing."""
+    ax.set_title(title, fontsize="medium", loc="left")
+    ax.set_xlabel(x)
+    ax.grid(axis="y", color=INK, alpha=0.12)
     if percent:
         ax.yaxis.set_major_formatter(lambda value, _: f"{value:g} %")
         ax.set_ylim(bottom=0)
@@ -117,7 +122,7 @@ def svg(draw: Callable[[Figure], None], size: tuple[float, float], *, salt: str)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = buffer.getvalue()
-    text = text[text.index("<svg") :].replace(_INK, "currentColor")
+    text = text[text.index("<svg") :].replace(INK, "currentColor")
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     used = set(re.findall(r"#([\w.-]+)", text))
     text = re.sub(r' id="([\w.-]+)"', lambda m: m[0] if m[1] in used else "", text)
@@ -186,8 +191,13 @@ def write_overview(path: Path, title: str, summaries: Summaries, clips: Sequence
         left, right = parts[0].subplots(1, 2)
         draw_progress(left, summaries)
         draw_stages(right, summaries)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=120)
+        write_png(path, figure)
+
+
+def write_png(path: Path, figure: Figure) -> None:
+    """Write a figure as PNG; within its :func:`figure_style`, which holds while it is drawn."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
     with atomic_write(path) as file:
         file.write(buffer.getbuffer())
 
@@ -196,12 +206,13 @@ def _index(summaries: Summaries, engine: str) -> int:
     return [s["backend"] for s in summaries].index(engine) % len(COLORS)
 
 
-def _percent(ax: Axes, which: str) -> None:
+def percent_axis(ax: Axes, which: str) -> None:
+    """Make an axis, ``x`` or ``y``, go from 0 to 100 percent, with lines across."""
     axis = ax.xaxis if which == "x" else ax.yaxis
     (ax.set_xlim if which == "x" else ax.set_ylim)(0, 104)
     axis.set_ticks(range(0, 101, 25))
     axis.set_major_formatter(lambda value, _: f"{value:.0f} %")
-    ax.grid(axis="x" if which == "x" else "y", color=_INK, alpha=0.12)
+    ax.grid(axis="x" if which == "x" else "y", color=INK, alpha=0.12)
 
 
 @contextmanager
@@ -220,6 +231,6 @@ def figure_style(style: dict[str, Any]) -> Iterator[type[Figure]]:
         "axes.spines.right": False,
         "axes.axisbelow": True,
     }
-    base |= dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), _INK)
+    base |= dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK)
     with matplotlib.rc_context(base | style):  # pyright: ignore[reportArgumentType]
         yield Figure

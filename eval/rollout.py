@@ -73,7 +73,7 @@ class Rollouts:
 
     episodes: tuple[Episode, ...]
     traces: tuple[Trace, ...]
-    """The first episode of each object."""
+    """The first episode of each demonstration."""
     control_steps_per_second: float
     """World steps per second of wall time, policy and observations included."""
 
@@ -121,7 +121,7 @@ def roll_out(
     repetition = np.tile(np.arange(repetitions), len(chosen))
     object_of = np.array([names.index(name) for name in demos.sequence_object[sequences]])
     plan = schedule(object_of, num_envs)
-    first_of_object = {int(np.flatnonzero(object_of == i)[0]) for i in np.unique(object_of)}
+    recorded = np.flatnonzero(repetition == 0)
     scene = make_scene(robot, objects, task)
     found: dict[int, Episode] = {}
     traces: list[Trace] = []
@@ -142,7 +142,7 @@ def roll_out(
             policy.begin(env)
             reading = env.reading()
             result = EpisodeMetrics(reading, env.goal_pos, env.goal_quat, points, metrics or MetricsConfig())
-            recorder = _Recorder([int(w) for w in np.flatnonzero(fresh & np.isin(items, list(first_of_object)))])
+            recorder = _Recorder([int(w) for w in np.flatnonzero(fresh & np.isin(items, recorded))])
             recorder.add(0.0, reading)
             for step in range(env.max_episode_length):
                 before = time.perf_counter()

@@ -277,7 +277,7 @@ class RolloutTest(WithEnv):
         self.assertEqual([(e.sequence, e.repetition) for e in found.episodes], [(s, r) for s in range(3) for r in range(2)])
         self.assertEqual([e.object for e in found.episodes], [SOUP, SOUP, SPAM, SPAM, SOUP, SOUP])
         self.assertEqual(found.episodes[2].sequence_name, "demo_b")
-        self.assertEqual([(t.sequence, t.object) for t in found.traces], [(0, SOUP), (1, SPAM)])
+        self.assertEqual([(t.sequence, t.object) for t in found.traces], [(0, SOUP), (1, SPAM), (2, SOUP)])
         trace = found.traces[0]
         self.assertEqual((trace.joint_pos.shape, trace.object_pos.shape), ((11, 7), (11, 3)))
         np.testing.assert_allclose(np.diff(trace.time), 0.05)

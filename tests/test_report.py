@@ -21,6 +21,7 @@ from xreset.errors import FileFormatError, RunError
 from xreset.eval.report import make_report, plots
 from xreset.eval.report.clips import Clip, camera_for, choose_sequence, draw_clip, encode_mp4, recorded_episode
 from xreset.eval.report.data import Curve, collect, differences, read_curves
+from xreset.eval.report.failures import Strip, choose_failures, count_failures, draw_strip
 from xreset.eval.report.page import headline, page
 from xreset.eval.results import write_results
 from xreset.eval.table import rich_table
@@ -201,6 +202,47 @@ class ClipTest(InFolder):
         np.testing.assert_allclose(found, colors, atol=12)
 
 
+class FailureTest(InFolder):
+    def episodes(self, *progress: float):
+        first = toy_rollouts().episodes[0]
+        return tuple(
+            replace(first, sequence=i, task_progress=p, reorient=p == 1.0, reorientation_progress=0.1 * i) for i, p in enumerate(progress)
+        )
+
+    def traces(self, *objects: str):
+        return tuple(replace(toy_rollouts().traces[0], sequence=i, object=name) for i, name in enumerate(objects))
+
+    def test_the_worst_come_first_and_what_reached_its_goal_does_not_come(self):
+        chosen = choose_failures(self.episodes(0.66, 1.0, 0.33, 0.66), self.traces(*[SOUP] * 4), 3)
+        self.assertEqual([t.sequence for t in chosen], [2, 0, 3])
+        self.assertEqual(choose_failures(self.episodes(1.0), self.traces(SOUP), 3), [])
+
+    def test_objects_take_turns(self):
+        episodes, traces = self.episodes(0.0, 0.0, 0.0, 0.66), self.traces(SOUP, SOUP, SOUP, SPAM)
+        self.assertEqual([t.sequence for t in choose_failures(episodes, traces, 2)], [0, 3])
+        self.assertEqual([t.sequence for t in choose_failures(episodes, traces, 4)], [0, 1, 2, 3])
+
+    def test_every_episode_that_missed_its_goal_is_counted_once(self):
+        at_goal, near, lifted, broken = toy_rollouts().episodes
+        counts = count_failures((at_goal, near, near, lifted, replace(at_goal, reorient=False), broken))
+        self.assertEqual(list(counts.values()), [1, 2, 1, 1])
+
+    def test_a_strip_shows_the_object_rise_and_leaves_out_what_is_not_finite(self):
+        self.folder.mkdir(exist_ok=True)
+        robot = toy_hand_arm(self.folder)
+        rollouts = toy_rollouts(robot.home)
+        trace = replace(rollouts.traces[0], object_pos=rollouts.traces[0].object_pos.copy())
+        trace.object_pos[-1] = np.nan
+        strip = draw_strip(rollouts.episodes[0], trace, robot, load_object(SOUP))
+        self.assertEqual(strip.picture.shape, (180, 6 * 240, 3))
+        self.assertEqual(strip.times[0], 0.0)
+        self.assertAlmostEqual(strip.times[-1], 0.2)
+        first, middle, last = (strip.picture[:, 240 * i : 240 * (i + 1)].astype(int) for i in (0, 3, 5))
+        height = [np.argwhere((f[..., 0] > 180) & (f[..., 2] < 100)).mean(axis=0)[0] for f in (first, middle)]
+        self.assertLess(height[1], height[0] - 2)
+        self.assertEqual(np.unique(last).tolist(), [128])
+
+
 class PlotTest(unittest.TestCase):
     def test_progress_by_object_weighs_demonstrations_by_their_episodes(self):
         rows = [
@@ -243,6 +285,8 @@ class PageTest(InFolder):
         frames = np.zeros((2, 48, 64, 3), dtype=np.uint8)
         episode = toy_rollouts().episodes[0]
         cls.clips = [Clip(engine=name, episode=episode, frames=frames, fps=10.0, finite=name != "sapien") for name in ENGINES]
+        missed = toy_rollouts().episodes[2]
+        cls.strips = [Strip(episode=missed, picture=np.zeros((18, 144, 3), dtype=np.uint8), times=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))]
 
     def data(self, **changes):
         self.write()
@@ -251,7 +295,7 @@ class PageTest(InFolder):
         return replace(collect(self.folder), curves=curves, **changes)
 
     def test_needs_nothing_from_outside(self):
-        text = page(self.data(), self.clips)
+        text = page(self.data(), self.clips, self.strips)
         outline = Outline(text)
         for tag, attributes in outline.tags:
             for name in ("src", "href", "xlink:href", "poster", "srcset", "action", "data"):
@@ -266,7 +310,7 @@ class PageTest(InFolder):
         self.assertIn("default-src 'none'", policy)
 
     def test_is_well_formed_and_its_identifiers_are_unique(self):
-        outline = Outline(page(self.data(), self.clips))
+        outline = Outline(page(self.data(), self.clips, self.strips))
         self.assertEqual(outline.open, [])
         names = [a["id"] for _, a in outline.tags if "id" in a]
         self.assertEqual(len(names), len(set(names)))
@@ -274,20 +318,25 @@ class PageTest(InFolder):
         self.assertLessEqual(targets, set(names))
 
     def test_says_in_words_what_it_shows(self):
-        outline = Outline(page(self.data(), self.clips))
+        outline = Outline(page(self.data(), self.clips, self.strips))
         self.assertEqual(len(outline.of("video")), 4)
         for tag in ("video", "svg"):
             for attributes in outline.of(tag):
                 self.assertGreater(len(attributes.get("aria-label") or ""), 20, tag)
         self.assertIn("object at its goal", outline.of("video")[0]["aria-label"])
         self.assertIn("stopped being finite", outline.of("video")[3]["aria-label"])
+        (strip,) = outline.of("img")
+        self.assertRegex(strip["alt"], "at 0.0, 1.0, .* 5.0 s: .*demo_1: grasped and lifted, 50% of the way")
+        self.assertIn(
+            "Of 4 episodes in mujoco: 1 never near the object; 1 near it, but no grasp; 1 grasped, never at the goal.", outline.text
+        )
         charts = " ".join(a["aria-label"] for a in outline.of("svg"))
         self.assertIn("mujoco-warp approach 75%, grasp 50%, reorient 25%", charts)
         self.assertEqual(outline.of("html")[0]["lang"], "en")
         self.assertEqual(len(outline.of("caption")), 2)
 
     def test_states_the_results_and_their_origin(self):
-        text = Outline(page(self.data(), self.clips)).text
+        text = Outline(page(self.data(), self.clips, self.strips)).text
         for expected in (
             "zero on toy", "mujoco-warp 4.0.0 on cuda, 4,096 worlds", "50 of 500 iterations, seed 7", "49.8%", "33.0 to 66.5%", "37.5%",
             "tomato soup can", "demo_1", "4 in each engine: 2 demonstrations, 2 starts each", "trained here",
@@ -323,7 +372,7 @@ class PageTest(InFolder):
         self.assertIn("40% in each of the 4 engines", headline(replace(data, summaries=tuple(made[0] | {"backend": n} for n in ENGINES))))
 
     def test_the_same_results_give_the_same_page(self):
-        self.assertEqual(page(self.data(), self.clips), page(self.data(), self.clips))
+        self.assertEqual(page(self.data(), self.clips, self.strips), page(self.data(), self.clips, self.strips))
 
 
 class CommandTest(InFolder):

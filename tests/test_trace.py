@@ -323,6 +323,14 @@ class EvaluationTest(unittest.TestCase):
             actions = from_file(path, object_name="010_potted_meat_can", episode=0, robot=None, objects=None)
             self.assertEqual((actions.object.name, actions.label), ("010_potted_meat_can", "zero in sapien, demonstration 1"))
             np.testing.assert_allclose(actions.joint_target.numpy(), rollouts.traces[1].joint_target, atol=1e-6)
+            with self.assertRaisesRegex(DemoError, "records 1 episodes of 010_potted_meat_can, so --episode is at most 0"):
+                from_file(path, object_name="010_potted_meat_can", episode=1, robot=None, objects=None)
+            soup = replace(rollouts, traces=tuple(replace(t, object="005_tomato_soup_can") for t in rollouts.traces))
+            write_results(Path(folder), summary, soup, robot.joint_names)
+            for episode in (0, 1):
+                label = from_file(path, object_name=None, episode=episode, robot=None, objects=None).label
+                self.assertEqual(label, f"zero in sapien, demonstration {episode}")
+            write_results(Path(folder), summary, rollouts, robot.joint_names)
             with self.assertRaisesRegex(DemoError, "has no mug; it has 005_tomato_soup_can, 010_potted_meat_can"):
                 from_file(path, object_name="mug", episode=0, robot=None, objects=None)
             old = replace(rollouts, traces=tuple(replace(t, joint_target=None) for t in rollouts.traces))

@@ -182,6 +182,12 @@ def pose_matrix(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 def write_png(path: str | Path, picture: np.ndarray) -> None:
     """Write an [H, W, 3] uint8 picture as PNG; ``XResetError`` if it cannot be written."""
+    with atomic_write(path) as file:
+        file.write(encode_png(picture))
+
+
+def encode_png(picture: np.ndarray) -> bytes:
+    """An [H, W, 3] uint8 picture as PNG."""
     height, width, _ = picture.shape
 
     def chunk(kind: bytes, data: bytes) -> bytes:
@@ -189,8 +195,7 @@ def write_png(path: str | Path, picture: np.ndarray) -> None:
 
     rows = np.concatenate((np.zeros((height, 1), np.uint8), picture.reshape(height, width * 3)), axis=1)  # 0: no filter
     header = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes((8, 2, 0, 0, 0))  # 8 bits, RGB
-    with atomic_write(path) as file:
-        file.write(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6)) + chunk(b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6)) + chunk(b"IEND", b"")
 
 
 def tinted(color: np.ndarray, tint: Color) -> np.ndarray:

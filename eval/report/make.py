@@ -10,6 +10,7 @@ from typing import Any
 from xreset.errors import XResetError
 from xreset.eval.report.clips import Clip, camera_for, choose_sequence, draw_clip, recorded_episode
 from xreset.eval.report.data import ReportData, collect
+from xreset.eval.report.failures import Strip, choose_failures, draw_strip
 from xreset.eval.report.page import headline, page
 from xreset.eval.report.plots import short_name, write_overview
 from xreset.eval.results import read_traces
@@ -45,7 +46,7 @@ def make_report(
         out: where to; default: ``report`` in the folder.
         robot: name or folder of the robot, for the clips; default: as the run and the results name it.
         objects: folder of meshes, for the clips; default: as the results name it.
-        progress: called with (clips drawn, clips in all).
+        progress: called with (clips and strips drawn, all of them).
 
     Raises:
         RunError: there are no results.
@@ -54,12 +55,13 @@ def make_report(
     """
     out = folder / "report" if out is None else out
     data = collect(folder)
+    clips, strips = [], []
     try:
-        clips = _draw_clips(data, robot, objects, progress)
+        clips, strips = _draw(data, robot, objects, progress)
     except XResetError as error:  # numbers are worth a page without films; the page says why
-        clips, data = [], replace(data, notes=(*data.notes, f"There are no clips: {error}"))
+        data = replace(data, notes=(*data.notes, f"There are no clips: {error}"))
     html, overview = out / "index.html", out / "overview.png"
-    content = page(data, clips)
+    content = page(data, clips, strips)
     first = data.summaries[0]
     shown = clips[0].episode if clips else None
     caption = f"{short_name(shown.object)}: middle and end of the same episode in each engine" if shown else ""
@@ -69,7 +71,14 @@ def make_report(
     return Report(html=html, overview=overview, summaries=data.summaries, headline=headline(data), notes=data.notes)
 
 
-def _draw_clips(data: ReportData, robot: str | None, objects: Path | None, progress: Callable[[int, int], None]) -> list[Clip]:
+_FAILURES = 4
+"""Most failures that the page shows."""
+
+
+def _draw(
+    data: ReportData, robot: str | None, objects: Path | None, progress: Callable[[int, int], None]
+) -> tuple[list[Clip], list[Strip]]:
+    """One episode in every engine, and the first engine's failures."""
     from xreset import robots
     from xreset.objects import load_object
 
@@ -80,12 +89,17 @@ def _draw_clips(data: ReportData, robot: str | None, objects: Path | None, progr
     if sequence is None:
         raise XResetError("no demonstration was recorded in every engine. Evaluate all engines in one command.")
     traces = {engine: next(t for t in found if t.sequence == sequence) for engine, found in recorded.items()}
+    episodes = data.episodes[data.engines[0]]
+    missed = choose_failures(episodes, recorded[data.engines[0]], _FAILURES)
     meshes = objects or (Path(first["objects_folder"]) if first["objects_folder"] else None)
     obj = load_object(next(iter(traces.values())).object, meshes)
     camera = camera_for(list(traces.values()))
-    clips = []
-    for number, (engine, trace) in enumerate(traces.items()):
-        progress(number, len(traces))
+    clips, strips, total = [], [], len(traces) + len(missed)
+    for engine, trace in traces.items():
+        progress(len(clips), total)
         clips.append(draw_clip(engine, recorded_episode(data.episodes[engine], sequence), trace, spec, obj, camera))
-    progress(len(traces), len(traces))
-    return clips
+    for trace in missed:
+        progress(len(clips) + len(strips), total)
+        strips.append(draw_strip(recorded_episode(episodes, trace.sequence), trace, spec, load_object(trace.object, meshes)))
+    progress(total, total)
+    return clips, strips

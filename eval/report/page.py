@@ -11,6 +11,9 @@ from xreset import __version__
 from xreset.eval.report import plots
 from xreset.eval.report.clips import Clip, encode_mp4
 from xreset.eval.report.data import ReportData
+from xreset.eval.report.failures import Strip, count_failures
+from xreset.eval.rollout import Episode
+from xreset.render import encode_png
 
 _CSS = """
 :root { color-scheme: light dark; --ground: #fbfbf9; --card: #fff; --text: #1c2024; --soft: #5c6670; --line: #dfe3e6; --accent: #0072b2; }
@@ -45,7 +48,8 @@ small { color: var(--soft); font-weight: 400; }
 .grid { display: grid; gap: 1.25rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 240px), 1fr)); }
 .wide { grid-template-columns: repeat(auto-fit, minmax(min(100%, 400px), 1fr)); }
 figure { margin: 0; background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: .8rem; }
-figure svg, figure video { display: block; width: 100%; height: auto; }
+figure svg, figure video, figure img { display: block; width: 100%; height: auto; }
+.strips { display: grid; gap: 1rem; }
 video { border-radius: 4px; background: #e8edf3; }
 figcaption { margin-top: .5rem; }
 figcaption b { color: var(--text); }
@@ -75,14 +79,15 @@ the rest of the row means little.</p>
 """
 
 
-def page(data: ReportData, clips: Sequence[Clip]) -> str:
-    """The whole page; clips may be empty."""
+def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) -> str:
+    """The whole page; clips and strips (of the first engine's failures) may be empty."""
     s = data.summaries[0]
     title = f"{s['policy']} on {s['robot']}"
     sections = [
         _header(title, data),
         _matrix(data),
         _clips(data, clips),
+        _failures(data, strips),
         _plots(data),
         _training(data),
         _demonstrations(data),
@@ -171,7 +176,7 @@ def _clips(data: ReportData, clips: Sequence[Clip]) -> str:
     for clip in clips:
         i = data.engines.index(clip.engine)
         still = "" if clip.finite else "; the state stopped being finite, and the film stands still from there"
-        outcome = f"{outcome_of(clip)}{still}"
+        outcome = f"{outcome_of(clip.episode)}{still}"
         alt = f"Film of the episode in {clip.engine}: {outcome}"
         film = base64.b64encode(encode_mp4(clip.frames, clip.fps)).decode()
         figures.append(
@@ -181,17 +186,40 @@ def _clips(data: ReportData, clips: Sequence[Clip]) -> str:
         )
     text = (
         f"<p>The same episode everywhere: {escape(plots.short_name(episode.object))}, demonstration "
-        f"<code>{escape(episode.sequence_name)}</code>, from the same start. Of the recorded episodes (the first of each object) it went "
-        'best. The translucent object is the goal.</p><p><button id="together" type="button">Play all from the start</button></p>'
+        f"<code>{escape(episode.sequence_name)}</code>, from the same start. Of the recorded episodes (the first of each demonstration) it "
+        "went best. The translucent object is the goal.</p>"
+        '<p><button id="together" type="button">Play all from the start</button></p>'
     )
     return _section("One episode in each engine", f'{text}<div class="grid">{"".join(figures)}</div>')
 
 
-def outcome_of(clip: Clip) -> str:
-    """What the episode reached, in words."""
-    e = clip.episode
+def outcome_of(e: Episode) -> str:
+    """What an episode reached, in words."""
     stage = "object at its goal" if e.reorient else "grasped and lifted" if e.grasp else "approached" if e.approach else "no stage reached"
     return f"{stage}, {e.reorientation_progress:.0%} of the way to the goal"
+
+
+def _failures(data: ReportData, strips: Sequence[Strip]) -> str:
+    engine = data.engines[0]
+    missing = {what: count for what, count in count_failures(data.episodes[engine]).items() if count}
+    if not missing:
+        return ""
+    total = len(data.episodes[engine])
+    counts = "; ".join(f"{count} {escape(what)}" for what, count in missing.items())
+    text = f"<p>Of {total} episodes in {escape(engine)}: {counts}.</p>"
+    if strips:
+        text += "<p>The recorded episodes (the first of each demonstration) that got least far. The translucent object is the goal.</p>"
+    figures = []
+    for strip in strips:
+        e, times = strip.episode, ", ".join(f"{t:.1f}" for t in strip.times)
+        where = f"{plots.short_name(e.object)}, demonstration {e.sequence_name}"
+        image = base64.b64encode(encode_png(strip.picture)).decode()
+        figures.append(
+            f'<figure><img alt="{escape(f"Pictures of an episode at {times} s: {where}: {outcome_of(e)}")}" '
+            f'width="{strip.picture.shape[1]}" height="{strip.picture.shape[0]}" src="data:image/png;base64,{image}">'
+            f"<figcaption><b>{escape(outcome_of(e))}</b>: {escape(where)}; at {times} s</figcaption></figure>"
+        )
+    return _section("What goes wrong", f'{text}<div class="strips">{"".join(figures)}</div>')
 
 
 def _plots(data: ReportData) -> str:

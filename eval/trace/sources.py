@@ -56,7 +56,7 @@ def from_file(source: Path, *, object_name: str | None, episode: int, robot: str
         assert trajectories is not None
         frames = Frames.of_retargeted(trajectories)
     elif schema == TRACE_SCHEMA:
-        return _from_evaluation(source, object_name, robot, objects)
+        return _from_evaluation(source, object_name, episode, robot, objects)
     else:
         raise FileFormatError(
             f"{source} states schema {schema!r}, expected {DEMOS!r} (xreset demos), {RETARGETED!r} (xreset retarget), {BANK!r} "
@@ -119,13 +119,17 @@ def from_policy(
     )
 
 
-def _from_evaluation(source: Path, object_name: str | None, robot: str | None, objects: Path | None) -> Actions:
-    """The actions of a recorded episode: an evaluation records the first of each object."""
+def _from_evaluation(source: Path, object_name: str | None, episode: int, robot: str | None, objects: Path | None) -> Actions:
+    """The actions of a recorded episode: an evaluation records the first of each demonstration."""
     name = source.name.removesuffix(".trace.npz")
     summary = read_json(source.with_name(f"{name}.json"), EVALUATION)
     spec = robots.load(robot or str(summary["robot"]))
-    traces = {t.object: t for t in read_traces(source.parent, name, spec.joint_names)}
-    found = traces[_object(source, object_name, list(traces))]
+    traces = read_traces(source.parent, name, spec.joint_names)
+    chosen = _object(source, object_name, dict.fromkeys(t.object for t in traces))
+    mine = [t for t in traces if t.object == chosen]
+    if episode >= len(mine):
+        raise DemoError(f"{source} records {len(mine)} episodes of {chosen}, so --episode is at most {len(mine) - 1}.")
+    found = mine[episode]
     if found.joint_target is None:
         raise FileFormatError(f"{source} holds states without the actions that led to them. Evaluate again.")
     folder = objects or (Path(summary["objects_folder"]) if summary["objects_folder"] else None)

@@ -28,3 +28,40 @@ def bootstrap_ci95(values: np.ndarray, groups: np.ndarray | None = None, *, draw
         means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
     return float(low), float(high)
+
+
+def crossed_bootstrap_ci95(
+    values: np.ndarray, runs: np.ndarray, groups: np.ndarray, *, draws: int = 2000, seed: int = 0
+) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of the mean over trainings that were evaluated on the same demonstrations.
+
+    Trainings and demonstrations are both drawn with replacement, each without regard to the other, and an episode counts as often as its
+    training was drawn times as often as its demonstration was (the "pigeonhole bootstrap" of Owen, Annals of Applied Statistics 1, 2007).
+    It is thus about what another training seed and other demonstrations would give. Like every bootstrap over few, it is too narrow if
+    there are few trainings: the spread between n of them appears smaller by sqrt((n - 1) / n), 0.71 for two and 0.82 for three. With a
+    single one it is :func:`bootstrap_ci95`, which cannot know of other seeds.
+
+    Args:
+        values: [E] one value per episode.
+        runs: [E] training of each episode.
+        groups: [E] demonstration of each episode; every training has episodes of every one.
+        draws: resamples.
+        seed: of the resampling: the same values give the same interval.
+
+    Raises:
+        ValueError: a training has no episode of some demonstration.
+    """
+    run_names, run = np.unique(runs, return_inverse=True)
+    group_names, group = np.unique(groups, return_inverse=True)
+    if len(run_names) == 1:
+        return bootstrap_ci95(values, groups, draws=draws, seed=seed)
+    sums, counts = np.zeros((2, len(run_names), len(group_names)))
+    np.add.at(sums, (run, group), values)
+    np.add.at(counts, (run, group), 1)
+    if (counts == 0).any():
+        raise ValueError("every training needs episodes of every demonstration")
+    rng = np.random.default_rng(seed)
+    run_times, group_times = (rng.multinomial(n, np.full(n, 1 / n), size=draws) for n in counts.shape)
+    means = ((run_times @ sums) * group_times).sum(axis=1) / ((run_times @ counts) * group_times).sum(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)

@@ -25,6 +25,7 @@ COMMANDS: dict[str, str] = {
     "eval": "Evaluate a policy, or a baseline, in one or several engines.",
     "trace": "Replay one action sequence in several engines, and see when, where and by how much they part.",
     "attribute": "Tell which physical difference between two engines costs a policy its skill.",
+    "compare": "Put several trainings side by side: curves, results in every engine, and what differs between them.",
     "report": "Make a self-contained HTML page of a run's evaluations.",
 }
 """Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``: a function, or a dictionary of sub-commands."""

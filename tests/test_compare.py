@@ -1,0 +1,553 @@
+"""Several trainings side by side: what is read, what is taken together, what is unfair, and what is written."""
+
+import io
+import json
+import tempfile
+import unittest
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from tests.toy_results import toy_rollouts, toy_summary
+from xreset.cli import main
+from xreset.errors import FileFormatError, RunError, XResetError
+from xreset.eval.compare import compare
+from xreset.eval.compare.data import read_training, read_trainings
+from xreset.eval.compare.groups import grouped
+from xreset.eval.compare.make import choose_curves
+from xreset.eval.compare.progress import Line, amounts, line, processes
+from xreset.eval.compare.score import score
+from xreset.eval.compare.table import escape
+from xreset.eval.report import plots as report_plots
+from xreset.eval.report.data import Curve
+from xreset.eval.results import write_results
+from xreset.eval.rollout import Rollouts
+from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95
+from xreset.learning.config import TrainConfig
+from xreset.learning.run import RunInfo, write_run
+from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
+
+ENGINES = ("mujoco", "mujoco-warp", "pybullet", "sapien")
+WORLDS, HORIZON = 64, 16
+STEPS = WORLDS * HORIZON
+"""Environment steps of an iteration of one process."""
+
+
+def rollouts_with(*progress: float) -> Rollouts:
+    """The toy's four episodes with other task progress."""
+    base = toy_rollouts()
+    return replace(base, episodes=tuple(replace(e, task_progress=p) for e, p in zip(base.episodes, progress, strict=True)))
+
+
+def curves_of(seconds: tuple[float, ...], success: tuple[float, ...], first: int = 1, steps: float = STEPS) -> dict[str, Curve]:
+    """Scalars of a training whose iterations took that long and had ``steps`` each."""
+    iteration = np.arange(first, first + len(seconds))
+
+    def curve(tag: str, values) -> Curve:
+        return Curve(label=tag, iteration=iteration, value=np.array(values, dtype=float))
+
+    tags = {
+        "speed/collect_seconds": [0.75 * s for s in seconds],
+        "speed/learn_seconds": [0.25 * s for s in seconds],
+        "speed/env_steps_per_second": [steps / s for s in seconds],
+        "task/success": success,
+        "task/success_from_home": [0.5 * s for s in success],
+    }
+    return {tag: curve(tag, values) for tag, values in tags.items()}
+
+
+class InFolder(unittest.TestCase):
+    def setUp(self):
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+
+    def write_run(self, name: str, config: TrainConfig | None = None, **changes) -> Path:
+        info = {
+            "robot": "openarm", "resets": "resets.npz", "resets_hash": "ef" * 32, "objects": None, "backend": "mujoco-warp",
+            "backend_version": "4.0.0", "device": "cuda", "num_envs": WORLDS, "seed": 0, "config": config or TrainConfig(),
+            "contract": {"objects": ["005_tomato_soup_can"]},
+        }  # fmt: skip
+        write_run(self.folder / name, RunInfo(**(info | changes)))
+        return self.folder / name
+
+    def write_results(self, name: str, rollouts: Rollouts | None = None, engines=("mujoco",), **changes) -> Path:
+        rollouts = rollouts or toy_rollouts()
+        for engine in engines:
+            write_results(self.folder / name / "eval", toy_summary(engine, rollouts, **changes), rollouts, ("a", "b", "c"))
+        return self.folder / name
+
+    def write_curves(self, name: str, curves: dict[str, Curve]) -> Path:
+        from torch.utils.tensorboard import SummaryWriter
+
+        writer = SummaryWriter(log_dir=str(self.folder / name))
+        for tag, curve in curves.items():
+            for iteration, value in zip(curve.iteration.tolist(), curve.value.tolist(), strict=True):
+                writer.add_scalar(tag, value, iteration)
+        writer.close()
+        return self.folder / name
+
+    def training(self, name: str, curves: dict[str, Curve] | None = None):
+        """What lies in a folder, with curves that need not be written."""
+        return replace(read_training(name, self.folder / name), scalars=curves or {})
+
+    def compare(self, *names: str, **options):
+        return compare([str(self.folder / n) if "=" not in n else n for n in names], self.folder / "out", **options)
+
+
+class ReadTest(InFolder):
+    def test_labels(self):
+        a, b = (str(self.write_results(name)) for name in ("a", "b"))
+        self.assertEqual([t.label for t in read_trainings([a, f"X-RESET, 2={b}"])], ["a", "X-RESET, 2"])
+        self.assertEqual([t.label for t in read_trainings([f"{a}/eval"])], ["a"])
+        odd = str(self.write_results("p=0.5"))
+        self.assertEqual([t.label for t in read_trainings([odd])], ["p=0.5"], "a folder with = in its name is a folder")
+
+    def test_bad_arguments(self):
+        a = str(self.write_results("a"))
+        self.write_results("other/a")
+        for runs, message in (
+            ([], "nothing to compare"),
+            ([a, f"{self.folder}/other/a"], f"(?s)both be called 'a'.*a-1={a} a-2=.*other/a"),
+            ([f"x={a}", f"x={self.folder}/other/a"], "both be called 'x'"),
+            ([f"x={a}", f"y={a}/../a"], "'x' and 'y' are the same folder"),
+            ([f"={a}"], "a name is missing"),
+            (["x="], "a folder is missing"),
+            ([f"{self.folder}/nowhere"], "there is no folder .*nowhere"),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(RunError, message):
+                read_trainings(runs)
+
+    def test_a_folder_without_anything(self):
+        self.write_run("a")
+        with self.assertRaisesRegex(RunError, "neither learning curves .* nor evaluation results.*xreset eval .*/a"):
+            read_training("a", self.folder / "a")
+
+    def test_damaged_files(self):
+        a = self.write_results("a")
+        self.write_run("a")
+        files = ("run.json", "eval/mujoco.json", "eval/mujoco.episodes.json")
+        whole = {name: (a / name).read_text() for name in files}
+
+        def lacks(name: str, entry: str) -> str:
+            return json.dumps({k: v for k, v in json.loads(whole[name]).items() if k != entry})
+
+        for name, text, message in (
+            *((name, whole[name][:80], f"{name} is not valid JSON") for name in files),
+            ("eval/mujoco.json", lacks("eval/mujoco.json", "seed"), "lacks seed; it has schema, backend"),
+            ("run.json", lacks("run.json", "config"), "run.json lacks config"),
+            ("eval/mujoco.json", whole["eval/mujoco.json"].replace('"episodes": 4', '"episodes": 5'), "5 episodes, .* holds 4"),
+        ):
+            (a / name).write_text(text)
+            with self.subTest(message), self.assertRaisesRegex(FileFormatError, message):
+                read_training("a", a)
+            (a / name).write_text(whole[name])
+        read_training("a", a)
+        (a / "events.out.tfevents.1.x").write_bytes(b"no events")
+        with self.assertRaisesRegex(FileFormatError, "hold no learning curve.*Compare its evaluations alone: a=.*/eval"):
+            read_training("a", a)
+
+    def test_configurations_of_other_versions_are_read(self):
+        a = self.write_run("a")
+        self.write_results("a")
+        file = a / "run.json"
+        file.write_text(file.read_text().replace('"iterations"', '"cycles"'))
+        facts = read_training("a", a).facts
+        self.assertEqual(facts["cycles"].text, "10000")
+        self.assertNotIn("iterations", facts)
+        self.assertEqual(facts["task.randomization.friction"].text, "0.5, 1")
+
+
+class ProgressTest(InFolder):
+    def setUp(self):
+        super().setUp()
+        self.write_run("a")
+        self.write_results("a")
+
+    def test_minutes_and_steps_are_sums_over_iterations(self):
+        training = self.training("a", curves_of((60.0, 30.0, 30.0), (0.0, 0.1, 0.2)))
+        np.testing.assert_allclose(amounts(training, "minutes")[1], [1.0, 1.5, 2.0])
+        np.testing.assert_allclose(amounts(training, "steps")[1], [STEPS, 2 * STEPS, 3 * STEPS])
+        np.testing.assert_allclose(amounts(training, "iterations")[1], [1, 2, 3])
+        self.assertEqual(processes(training), 1)
+        self.assertEqual(processes(self.training("a", curves_of((1.0, 2.0), (0, 0), steps=3 * STEPS))), 3)
+
+    def test_an_iteration_that_was_not_logged_counts_as_the_next(self):
+        late = self.training("a", curves_of((60.0, 30.0), (0.0, 0.1), first=3))
+        np.testing.assert_allclose(amounts(late, "minutes")[1], [3.0, 3.5])
+
+    def test_without_speed_only_iterations_are_known(self):
+        curves = {k: v for k, v in curves_of((1.0,), (0.5,)).items() if k != "speed/learn_seconds"}
+        training = self.training("a", curves)
+        with self.assertRaisesRegex(RunError, "a did not log speed/learn_seconds.*--x iterations"):
+            line([training], "task/success", "minutes")
+        self.assertIsNotNone(line([training], "task/success", "iterations"))
+        self.assertIsNone(processes(training))
+
+    def test_mean_and_band_over_what_all_have(self):
+        a = self.training("a", curves_of((60.0,) * 4, (0.0, 0.2, 0.4, 0.6)))
+        b = self.training("a", curves_of((120.0,) * 3, (0.2, 0.6, 0.8)))
+        found = line([a, b], "task/success", "minutes")
+        assert found is not None
+        np.testing.assert_allclose(found.x, [2, 3, 4])  # the first has ended at 4 minutes, the second begins at 2
+        np.testing.assert_allclose(found.low, [0.2, 0.4, 0.6])
+        np.testing.assert_allclose(found.high, [0.2, 0.4, 0.6])
+        np.testing.assert_allclose(line([a, b], "task/success", "iterations").mean, [0.1, 0.4, 0.6], atol=1e-12)
+        self.assertIsNone(line([a, b], "task/other", "minutes"))
+
+    def test_one_training_is_drawn_as_it_is(self):
+        found = line([self.training("a", curves_of((30.0, 30.0), (0.1, 0.3)))], "task/success", "minutes")
+        for values in (found.mean, found.low, found.high):
+            np.testing.assert_allclose(values, [0.1, 0.3])
+        np.testing.assert_allclose(found.x, [0.5, 1.0])
+
+
+class GroupTest(InFolder):
+    def groups(self, *names: str) -> tuple[list[tuple[str, int]], str]:
+        groups, notes = grouped([self.training(name) for name in names])
+        return [(g.label, len(g.members)) for g in groups], " ".join(notes)
+
+    def run_and_results(self, name: str, results: dict | None = None, **changes) -> str:
+        self.write_run(name, **changes)
+        self.write_results(name, **(results or {}))
+        return name
+
+    def test_what_differs_in_the_seed_only_is_one(self):
+        names = [self.run_and_results(f"soup-seed{i}", seed=i, device=f"cuda:{i}", resets=f"/{i}/b.npz") for i in (1, 2, 10)]
+        other = self.run_and_results("fixed", config=TrainConfig(task=TaskConfig(reset=ResetConfig(random_gravity=False))))
+        bank = self.run_and_results("bank", seed=3, resets_hash="aa" * 32)
+        baseline = "ik"
+        self.write_results(baseline)
+        found = self.groups(names[0], other, names[1], bank, names[2], baseline)
+        self.assertEqual(found, ([("soup", 3), ("fixed", 1), ("bank", 1), ("ik", 1)], ""))
+
+    def test_names_of_groups(self):
+        for names, expected in (
+            (("X s0", "X s1"), "X"), (("run10", "run11"), "run"), (("first", "second"), "first + second"), (("seed0", "seed1"), "seed"),
+        ):  # fmt: skip
+            with self.subTest(expected):
+                found, _ = self.groups(*(self.run_and_results(name, seed=i) for i, name in enumerate(names)))
+                self.assertEqual(found, [(expected, 2)])
+
+    def test_groups_that_would_have_the_same_name_are_told_apart(self):
+        names = [self.run_and_results(f"s-{i}", seed=i, num_envs=WORLDS + i // 2) for i in range(4)]
+        self.assertEqual(self.groups(*names)[0], [("s-0 + s-1", 2), ("s-2 + s-3", 2)])
+
+    def test_repetitions_must_have_seeds_of_their_own_and_be_evaluated_alike(self):
+        self.run_and_results("a", seed=0)
+        for name, results, changes, reason in (
+            ("b", {}, {"seed": 0}, "a and b have the same seed, too"),
+            ("c", {"seed": 5}, {"seed": 1}, "evaluations of a and c in mujoco the seed differs"),
+            ("d", {"inputs": {"demos": "cd"}}, {"seed": 2}, "the demonstrations differs"),
+            ("e", {"backend_version": "5.0"}, {"seed": 3}, "different versions of mujoco"),
+        ):
+            self.run_and_results(name, results, **changes)
+            found, notes = self.groups("a", name)
+            self.assertEqual(found, [("a", 1), (name, 1)])
+            self.assertRegex(notes, f"a, {name} have the same configuration and are not taken together: .*{reason}")
+
+    def test_another_number_of_gpus_is_another_training(self):
+        self.run_and_results("a", seed=0)
+        self.run_and_results("b", seed=1)
+        one, three = (self.training(n, curves_of((1.0,), (0.0,), steps=s * STEPS)) for n, s in (("a", 1), ("b", 3)))
+        groups, notes = grouped([one, three])
+        self.assertEqual(len(groups), 2)
+        self.assertIn("a was trained with 1 processes and b with 3", notes[0])
+
+
+class ScoreTest(InFolder):
+    def group(self, *progress: tuple[float, ...], engines=("mujoco",)):
+        for i, values in enumerate(progress):
+            self.write_run(f"s-{i}", seed=i)
+            self.write_results(f"s-{i}", rollouts_with(*values), engines)
+        groups, _ = grouped([self.training(f"s-{i}") for i in range(len(progress))])
+        self.assertEqual(len(groups), 1)
+        return groups[0]
+
+    def test_one_training_has_the_figures_of_its_evaluation(self):
+        group = self.group((1.0, 0.33, 0.66, 0.0), engines=ENGINES)
+        summary = group.members[0].summaries["pybullet"]
+        found = score(group, "pybullet")
+        self.assertEqual(found.task_progress, summary["task_progress"]["mean"])
+        np.testing.assert_allclose(found.ci95, summary["task_progress"]["ci95"], atol=1e-6)
+        for ours, theirs in (
+            (found.approach, "approach_rate"), (found.grasp, "grasp_rate"), (found.reorient, "reorient_rate"),
+            (found.reorient_once, "reorient_once_rate"), (found.reorientation_progress, "reorientation_progress"),
+        ):  # fmt: skip
+            self.assertEqual(ours, summary[theirs], theirs)
+        self.assertEqual((found.nonfinite, found.overflow, found.episodes), (1, 1, 4))
+        self.assertIsNone(score(group, "other"))
+
+    def test_seeds_widen_the_interval(self):
+        alike = score(self.group((0.4, 0.6, 0.4, 0.6), (0.4, 0.6, 0.4, 0.6)), "mujoco")
+        self.assertEqual((alike.task_progress, alike.ci95), (0.5, (0.5, 0.5)), "neither seeds nor demonstrations differ")
+        apart = score(self.group((0.0, 0.2, 0.0, 0.2), (0.8, 1.0, 0.8, 1.0)), "mujoco")
+        np.testing.assert_allclose(apart.ci95, (0.1, 0.9), err_msg="one of the two seeds only is drawn in half of the resamples")
+        self.assertEqual({k: round(v, 9) for k, v in apart.each.items()}, {"s-0": 0.1, "s-1": 0.9})
+
+    def test_a_seed_that_was_not_evaluated_is_left_out(self):
+        group = self.group((1.0,) * 4, (0.0,) * 4)
+        bare = replace(group.members[1], summaries={}, episodes={})
+        self.assertEqual(score(replace(group, members=(group.members[0], bare)), "mujoco").each, {"s-0": 1.0})
+
+    def test_the_crossed_bootstrap_has_the_variance_of_its_design(self):
+        rng = np.random.default_rng(1)
+        of_run, of_demo = rng.normal(size=8), 2 * rng.normal(size=30)
+        values = (of_run[:, None] + of_demo).ravel()
+        runs, demos = np.repeat(np.arange(8), 30), np.tile(np.arange(30), 8)
+        low, high = crossed_bootstrap_ci95(values, runs, demos, draws=20000)
+        expected = 2 * 1.96 * np.sqrt(of_run.var() / 8 + of_demo.var() / 30)
+        self.assertAlmostEqual(high - low, expected, delta=0.05 * expected)
+        only = bootstrap_ci95(values, demos)
+        self.assertLess(only[1] - only[0], 0.95 * (high - low), "without the seeds it is narrower")
+
+    def test_the_crossed_bootstrap_of_one_training_is_the_usual_one(self):
+        values, demos = np.array([0.0, 1.0, 0.3, 0.4]), np.array([0, 0, 1, 1])
+        self.assertEqual(crossed_bootstrap_ci95(values, np.zeros(4), demos), bootstrap_ci95(values, demos))
+        with self.assertRaisesRegex(ValueError, "every demonstration"):
+            crossed_bootstrap_ci95(values, np.array([0, 0, 0, 1]), demos)
+
+
+class FairnessTest(InFolder):
+    def notes(self, *names: str) -> str:
+        return "\n".join(self.compare(*names).notes)
+
+    def test_alike(self):
+        for name, progress in (("a", 0.3), ("b", 0.6)):
+            self.write_run(name, TrainConfig(task=TaskConfig(reset=ResetConfig(demo_probability=progress))))
+            self.write_results(name, rollouts_with(progress, 0.33, 0.66, 0.0), inputs={"demos": "ab", "policy": name})
+        text = self.notes("a", "b")
+        self.assertNotIn("comparable", text)
+        self.assertIn("1 of 4 episodes of a in mujoco stopped being finite", text)
+        self.assertIn("1 of 4 episodes of b in mujoco dropped contacts", text)
+        self.assertIn("No learning curves: a, b.", text)
+
+    def test_what_makes_results_incomparable_is_said(self):
+        self.write_results("a", engines=("mujoco", "sapien"))
+        base = toy_rollouts()
+        renamed = tuple(replace(e, sequence_name=f"other_{e.sequence}") for e in base.episodes)
+        soups = tuple(replace(e, object="005_tomato_soup_can") for e in base.episodes)
+        for what, rollouts, changes, expected in (
+            ("seed", None, {"seed": 4}, r"not the same seed of the evaluation \(3: a; 4: seed\)"),
+            ("robot", None, {"robot": "other"}, r"not the same robot \(toy: a; other: robot\)"),
+            ("meshes", None, {"objects_folder": "/ycb"}, r"not the same object meshes \(stand-ins: a; /ycb: meshes\)\.\n"),
+            ("engine", None, {"backend_version": "5.1"}, r"(?s)version of mujoco \(4.0.0: a; 5.1: engine\).*version of sapien \("),
+            ("demos", replace(base, episodes=renamed), {"inputs": {"demos": "cd"}}, r"not the same demonstrations \(ab: a; cd: demos\)"),
+            ("file", None, {"inputs": {"demos": "cd"}}, r"files of demonstrations differ \(ab: a; cd: file\), .* same names"),
+            (
+                "objects",
+                replace(base, episodes=soups),
+                {},
+                r"not the same objects \(potted meat can, tomato soup can: a; tomato soup can: ob",
+            ),
+            ("fewer", replace(base, episodes=base.episodes[::2]), {}, r"not the same number of episodes \(4: a; 2: fewer\)"),
+        ):
+            with self.subTest(what):
+                self.write_results(what, rollouts, ("mujoco", "sapien"), **changes)
+                text = self.notes("a", what)
+                self.assertRegex(text, expected)
+                self.assertIn(escape(text.splitlines()[0]), (self.folder / "out" / "compare.md").read_text())
+
+    def test_engines_of_one_run_that_were_not_evaluated_alike(self):
+        self.write_results("a")
+        self.write_results("a", engines=("sapien",), seed=9)
+        self.write_results("b", engines=("mujoco", "sapien"))
+        self.assertRegex(self.notes("a", "b"), r"a: These results are not comparable: the seed differs \(mujoco: 3, sapien: 9\)")
+
+    def test_policies_that_play_another_task(self):
+        self.write_run("short", TrainConfig(task=TaskConfig(termination=TerminationConfig(episode_seconds=2.5))))
+        self.write_run("usual")
+        for name in ("short", "usual"):
+            self.write_results(name)
+        self.assertRegex(self.notes("short", "usual"), r"own task, whose task.termination.episode_seconds differs \(2.5: short; 5: usual\)")
+
+    def test_what_is_missing(self):
+        self.write_results("a", engines=("mujoco", "sapien"))
+        self.write_run("b")
+        self.write_results("b")
+        text = self.notes("a", "b")
+        self.assertIn("Not evaluated in sapien: b.", text)
+        self.assertIn("No run.json, so its configuration is not known: a.", text)
+
+
+class WrittenTest(InFolder):
+    def write_three(self):
+        for name, seed, gravity, success in (("x-s0", 0, True, 0.2), ("x-s1", 1, True, 0.4), ("fixed", 0, False, 0.1)):
+            self.write_run(name, TrainConfig(task=TaskConfig(reset=ResetConfig(random_gravity=gravity))), seed=seed)
+            self.write_results(name, rollouts_with(success, 0.33, 0.66, 0.0), ("mujoco", "sapien"))
+            self.write_curves(name, curves_of((60.0, 60.0), (0.0, success)))
+        self.write_results("ik")
+        return [str(self.folder / name) for name in ("x-s0", "x-s1", "fixed", "ik")]
+
+    def rows(self) -> dict[tuple[str, str], list[str]]:
+        """First two cells of every row of ``compare.md`` -> the others; an empty first cell repeats the one above."""
+        found, last = {}, ""
+        for text in (self.folder / "out" / "compare.md").read_text().splitlines():
+            if text.startswith("| "):
+                first, second, *others = (cell.strip() for cell in text.strip("|").split(" | "))
+                last = first or last
+                found[last, second] = others
+        return found
+
+    def test_the_page(self):
+        runs = self.write_three()
+        made = compare(runs, self.folder / "out")
+        rows = self.rows()
+        self.assertEqual(rows["", ""], ["mujoco 4.0.0", "sapien 4.0.0"])
+        mean = (0.2 + 0.4 + 2 * 0.99) / 8
+        cell = rows["x", "task progress (95 % interval)"][0]
+        self.assertTrue(cell.startswith(f"{100 * mean:.1f} % ("), cell)
+        self.assertEqual(rows["x", "task progress of each seed"], ["29.8, 34.8 %"] * 2)
+        self.assertEqual(rows["fixed", "approach / grasp / reorient"], ["75 / 50 / 25 %"] * 2)
+        self.assertEqual(rows["ik", "at the goal at any time; reorientation progress"], ["25 %; 37.5 %", "-"])
+        text = made.page.read_text()
+        self.assertRegex(text, r"x is 2 trainings that differ in the seed only \(x-s0, x-s1\)")
+        self.assertRegex(text, r"\| seed \| 0; 1 \| 0 \|")
+        self.assertRegex(text, r"\| task\.reset\.random\\_gravity \| True \| False \|")
+        self.assertRegex(text, r"\| minutes of training \| 2.0 \| 2.0 \|")
+        self.assertNotIn("num_envs", text.replace("\\", ""), "the same in all")
+        self.assertIn("![Learning curves and task progress](compare.png)", text)
+
+    def test_one_by_one(self):
+        runs = self.write_three()
+        made = compare(runs, self.folder / "out", apart=True)
+        self.assertEqual([g.label for g in made.groups], ["x-s0", "x-s1", "fixed", "ik"])
+        self.assertIn(("x-s1", "task progress (95 % interval)"), self.rows())
+
+    def test_a_picture_of_the_right_size_with_everything_and_with_less(self):
+        runs = self.write_three()
+        cases = (
+            ("all", runs, ()), ("one curve", runs, ("task/success",)), ("many", runs, ("task/success", "task/success_from_home", *SPEED)),
+            ("evaluations", runs[3:], ()),
+        )  # fmt: skip
+        heights = {}
+        for name, chosen, curves in cases:
+            made = compare(chosen, self.folder / name, curves=curves)
+            content = made.picture.read_bytes()
+            self.assertEqual(content[:8], b"\x89PNG\r\n\x1a\n")
+            width, heights[name] = (int.from_bytes(content[i : i + 4], "big") for i in (16, 20))
+            self.assertEqual(width, 1200)
+        self.assertLess(heights["evaluations"], heights["all"])
+        self.assertLess(heights["all"], heights["many"])
+
+    def test_curves_only(self):
+        self.write_curves("a", curves_of((60.0, 60.0), (0.0, 0.5)))
+        made = self.compare("a")
+        self.assertEqual(made.results.body, ())
+        self.assertIn("No evaluation results: a.", made.notes)
+        self.assertNotIn("## Evaluation", made.page.read_text())
+
+    def test_a_wrong_curve_names_those_that_exist(self):
+        self.write_three()
+        with self.assertRaisesRegex(RunError, r"no curve task/sucess; there are speed/.*task/success, task/success_from_home\. "):
+            self.compare("fixed", curves=["task/success", "task/sucess"])
+        self.assertFalse((self.folder / "out").exists(), "nothing is written")
+        with self.assertRaisesRegex(RunError, "no curve task/success; none of these runs has learning curves"):
+            self.compare("ik", curves=["task/success"])
+
+    def test_a_curve_that_only_some_have(self):
+        self.write_results("a")
+        curves = curves_of((1.0,), (0.5,))
+        whole, part = self.training("a", curves), self.training("a", {k: v for k, v in curves.items() if k != "task/success"})
+        self.assertEqual(choose_curves([whole, part], []), ("task/success", "task/success_from_home"))
+        with self.assertRaisesRegex(RunError, "no curve task/success;"):
+            choose_curves([part], [])
+
+    def test_nothing_is_half_written(self):
+        runs = self.write_three()
+        blocked = self.folder / "file"
+        blocked.write_text("")
+        with self.assertRaisesRegex(XResetError, "cannot write"):
+            compare(runs, blocked / "out")
+        self.assertEqual(blocked.read_text(), "")
+
+    def test_text_stays_text_in_markdown(self):
+        self.assertEqual(escape("a|b*c_d<e>\nf"), "a\\|b\\*c\\_d\\<e\\> f")
+
+
+SPEED = ("speed/collect_seconds", "speed/learn_seconds")
+
+
+class DrawTest(InFolder):
+    def draw(self, function, *arguments):
+        with report_plots.figure_style({}) as figure_class:
+            ax = figure_class().subplots()
+            function(ax, *arguments)
+        return ax
+
+    def test_lines_and_bands(self):
+        from matplotlib.collections import PolyCollection
+
+        from xreset.eval.compare.plot import draw_lines
+
+        x, mean = np.array([1e6, 3e6]), np.array([0.1, 0.3])
+        lines = {"a": Line(x=x, mean=mean, low=mean, high=mean), "c": Line(x=x, mean=mean, low=mean - 0.1, high=mean + 0.1)}
+        ax = self.draw(draw_lines, lines, "task/success", "steps", ["a", "b", "c"])
+        np.testing.assert_allclose(ax.lines[0].get_xydata(), [[1, 10], [3, 30]])
+        self.assertEqual([curve.get_color() for curve in ax.lines], [report_plots.COLORS[0], report_plots.COLORS[2]])
+        (band,) = (c for c in ax.collections if isinstance(c, PolyCollection))
+        np.testing.assert_allclose(band.get_datalim(ax.transData).intervaly, (0, 40), atol=1e-9)
+        self.assertEqual((ax.get_xlabel(), ax.get_title(loc="left")), ("million environment steps", "at the goal"))
+
+    def test_the_ninth_training_has_another_line_and_hatch(self):
+        from xreset.eval.compare.plot import draw_lines, draw_scores
+
+        values = np.array([0.1, 0.3])
+        names = [f"n{i}" for i in range(9)]
+        ax = self.draw(draw_lines, {n: Line(x=values, mean=values, low=values, high=values) for n in names}, "loss/value", "minutes", names)
+        self.assertEqual(ax.lines[0].get_color(), ax.lines[8].get_color())
+        self.assertNotEqual(ax.lines[0].get_linestyle(), ax.lines[8].get_linestyle())
+        self.write_results("a")
+        group = grouped([self.training("a")])[0][0]
+        found = {n: {"mujoco": score(group, "mujoco")} for n in names}
+        bars = self.draw(draw_scores, found, names).patches
+        self.assertEqual((bars[0].get_hatch() or "", bars[8].get_hatch()), ("", "///"))
+        edges = [(bar.get_x(), bar.get_x() + bar.get_width()) for bar in bars]
+        self.assertTrue(all(a[1] < b[0] for a, b in pairwise(edges)), "bars do not overlap")
+
+    def test_bars_are_as_long_as_the_results(self):
+        from xreset.eval.compare.plot import draw_scores
+
+        self.write_results("a", rollouts_with(1.0, 0.5, 0.5, 0.0), ("mujoco", "sapien"))
+        self.write_results("b", rollouts_with(0.2, 0.2, 0.2, 0.2), ("sapien",))
+        found = {n: {e: score(g, e) for e in g.members[0].episodes} for n in "ab" for g in grouped([self.training(n)])[0]}
+        ax = self.draw(draw_scores, found, ["a", "b"])
+        np.testing.assert_allclose([bar.get_height() for bar in ax.patches], [50, 50, 20])
+        self.assertEqual([label.get_text() for label in ax.get_xticklabels()], ["mujoco", "sapien"])
+        at = [bar.get_x() + bar.get_width() / 2 for bar in ax.patches]
+        self.assertTrue(at[0] < 0 and at[1] < 1 < at[2])
+
+
+class CommandTest(InFolder):
+    def run_command(self, *arguments: str) -> tuple[int, str]:
+        out = io.StringIO()
+        with redirect_stdout(out), redirect_stderr(out):
+            try:
+                main(["compare", *arguments])
+            except SystemExit as end:
+                return int(end.code or 0), out.getvalue()
+        return 0, out.getvalue()
+
+    def test_from_folders_to_picture_and_page(self):
+        for name, seed in (("a", 3), ("b", 4)):
+            self.write_run(name, num_envs=WORLDS + seed)
+            self.write_results(name, engines=ENGINES, seed=seed)
+        out = self.folder / "made"
+        code, printed = self.run_command(f"[one]={self.folder}/a", str(self.folder / "b"), "--out", str(out))
+        self.assertEqual(code, 0, printed)
+        for expected in (*ENGINES, "[one]", "49.8", "75/50/25", "num_envs", "67", "note: These results are not comparable", "compare.png"):
+            self.assertIn(expected, printed)
+        self.assertLessEqual(max(map(len, printed.split("picture:")[0].splitlines())), 80)
+        self.assertEqual(sorted(f.name for f in out.iterdir()), ["compare.md", "compare.png"])
+
+    def test_mistakes_are_one_line(self):
+        for arguments, message in (((), "there is nothing to compare"), ((str(self.folder / "x"),), "there is no folder")):
+            code, printed = self.run_command(*arguments)
+            self.assertEqual(code, 1)
+            self.assertRegex(printed.strip(), f"^xreset compare: {message}[^\n]*$")
+        self.assertEqual(self.run_command("a", "--x", "hours")[0], 2)
+
+
+if __name__ == "__main__":
+    unittest.main()

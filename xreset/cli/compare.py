@@ -1,0 +1,52 @@
+"""``xreset compare``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+def compare(
+    runs: Annotated[tuple[str, ...], tyro.conf.Positional],
+    *,
+    x: Literal["minutes", "steps", "iterations"] = "minutes",
+    curve: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    apart: bool = False,
+    out: Path = Path("runs/compare"),
+) -> None:
+    """Put several trainings side by side: learning curves, task progress in every engine, and what differs between their configurations.
+
+    Runs that differ in their seed only are one line with a band from the lowest to the highest, and one row of the table. What makes the
+    comparison unfair, such as other demonstrations or another version of an engine, is said.
+
+    Args:
+        runs: Run folders, folders of results (of a baseline, for example) or names of policies that ship with xreset; LABEL=FOLDER gives
+            one a name.
+        x: Horizontal axis of the curves: minutes of training as measured, environment steps or iterations.
+        curve: Learning curve to draw, as TensorBoard names it (task/grasped_from_home, episode/return, ...); give it again for more.
+            Default: task/success and task/success_from_home.
+        apart: Show also runs that differ in their seed only one by one.
+        out: Folder for compare.png and compare.md.
+    """
+    from rich.console import Console
+
+    from xreset.eval.compare import compare as make
+    from xreset.eval.compare.table import rich_different, rich_results
+
+    console = Console()
+    with console.status("reading"):
+        made = make(runs, out, x=x, curves=curve, apart=apart)
+    if made.results.body:
+        console.print(rich_results(made.results))
+    if made.different.body:
+        console.print(rich_different(made.different))
+    for caption in made.captions:
+        console.print(caption, markup=False, highlight=False)
+    for note in made.notes:
+        console.print(f"note: {note}", style="yellow", markup=False)
+    console.print(f"picture: {made.picture}\npage:    {made.page}", markup=False, soft_wrap=True)
+
+
+COMMAND = compare

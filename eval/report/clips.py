@@ -56,16 +56,21 @@ def recorded_episode(episodes: tuple[Episode, ...], sequence: int) -> Episode:
     return min((e for e in episodes if e.sequence == sequence), key=lambda e: e.repetition)
 
 
-def camera_for(traces: list[Trace]) -> Camera:
-    """A camera that shows the table between the object's start and its goal, and the hand above them."""
+def camera_for(traces: list[Trace], *, distance: float = 1.0) -> Camera:
+    """A camera that shows the table between the object's start and its goal, and the hand above them.
+
+    Args:
+        traces: all start and end alike; the first decides.
+        distance: factor on the camera's distance.
+    """
     from xreset.render import Camera
 
     start, goal = traces[0].object_pos[0].astype(float), traces[0].goal_pos.astype(float)
     center = (start + goal) / 2 + (0.0, 0.0, 0.06)
     default = Camera()
     away = np.subtract(default.eye, default.target)
-    distance = np.clip(0.75 + 1.2 * np.linalg.norm(goal - start), 0.85, 1.3)
-    eye = center + away / np.linalg.norm(away) * distance
+    meters = distance * np.clip(0.75 + 1.2 * np.linalg.norm(goal - start), 0.85, 1.3)
+    eye = center + away / np.linalg.norm(away) * meters
     return Camera(eye=tuple(eye.tolist()), target=tuple(center.tolist()), fov=default.fov)
 
 

@@ -62,7 +62,7 @@ def draw_strip(episode: Episode, trace: Trace, robot: RobotSpec, obj: ObjectSpec
     from xreset.render import Renderer, pose_matrix
     from xreset.spec import SceneSpec
 
-    renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=SIZE, camera=camera_for([trace]))
+    renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=SIZE, camera=camera_for([trace], distance=0.7))
     goal = pose_matrix(trace.goal_pos, trace.goal_quat)
     rows = np.linspace(0, len(trace.time) - 1, MOMENTS).round().astype(int)
     pictures = []

@@ -72,7 +72,7 @@ _PULL_WINDOW = (0.05, 0.12)  # [s] after the pull begins
 _PUSH_STEPS = 24  # physics steps of constant force on the free object
 _TOP_HEIGHT, _TOP_RADIUS = 0.04, 0.02  # [m] of a cone that stands on its point
 _TOP_INERTIA = (1.0, 1.0, 1e-3)  # [kg m^2]: it can hardly fall, and turns easily
-_SECOND_POINT = (2e-3, 0.0, 5e-4)  # [m]; PhysX takes two that are less than 1 mm apart for one
+_SECOND_POINT = (2e-3, 0.0, 5e-4)  # [m]; PhysX takes two that are 1 mm apart for one
 _LEAST_TORSION = 1e-4  # [m] below which torsional friction counts as none
 
 

@@ -1,5 +1,6 @@
 """Training from files to a policy on the MuJoCo C engine: run folder, resume, clean stop, export."""
 
+import io
 import json
 import os
 import signal
@@ -9,6 +10,7 @@ import tempfile
 import threading
 import time
 import unittest
+from contextlib import redirect_stderr
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +22,7 @@ import torch
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from xreset import robots
 from xreset.backends import make_backend
+from xreset.cli import main
 from xreset.errors import FileFormatError, RunError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
@@ -184,6 +187,27 @@ class TrainingTest(unittest.TestCase):
         self.assertGreater(content["iteration"], 0)
         self.assertEqual(latest_checkpoint(out).name, f"{content['iteration']:06d}.pt")
         self.assertTrue((out / "policy.onnx").is_file())
+
+    def test_a_configuration_starts_from_a_recipe_or_from_another_run(self):
+        def parsed(*arguments: str) -> TrainConfig:
+            with mock.patch("xreset.learning.train.load_inputs"), mock.patch("xreset.learning.train.train"):
+                with mock.patch("xreset.learning.train.start_run") as start:
+                    main(["train", "--robot", "openarm", "--resets", "bank.npz", "--out", "run", *arguments])
+                return start.call_args.kwargs["config"]
+
+        self.assertEqual(parsed(), TrainConfig())
+        minutes = parsed("--like", "minutes", "--config.ppo.entropy", "0.001")
+        self.assertEqual((minutes.ppo.desired_kl, minutes.ppo.entropy, minutes.model.initial_std), (0.02, 0.001, 0.3))
+        self.assertEqual(parsed(f"--like={self.out}", "--config.save-interval", "7"), replace(CONFIG, save_interval=7))
+        for arguments, problem in (
+            (("--like", "nothing"), "no recipe and no run folder 'nothing'. Recipes: paper, minutes"),
+            (("--like", str(self.folder)), "is not a run folder"),
+            (("--like", "minutes", "--resume"), "leave out --like"),
+            (("--minutes", "0"), "--minutes is 0.0, expected more than 0"),
+        ):
+            with self.subTest(arguments), redirect_stderr(io.StringIO()) as said, self.assertRaises(SystemExit):
+                parsed(*arguments)
+            self.assertRegex(said.getvalue(), problem)
 
     def test_a_run_ends_when_its_time_is_over_and_can_go_on(self):
         out = self.folder / "timed"

@@ -28,7 +28,8 @@ COMMANDS: dict[str, str] = {
     "compare": "Put several trainings side by side: curves, results in every engine, and what differs between them.",
     "report": "Make a self-contained HTML page of a run's evaluations.",
 }
-"""Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``: a function, or a dictionary of sub-commands."""
+"""Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``: a function, or a dictionary of sub-commands. It may have
+``command_for``: arguments -> such a function, where defaults depend on an argument."""
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -63,7 +64,8 @@ def main(argv: list[str] | None = None) -> None:
 def _run(name: str, arguments: list[str]) -> None:
     import tyro
 
-    command = import_module(f"xreset.cli.{name}").COMMAND
+    module = import_module(f"xreset.cli.{name}")
+    command = module.command_for(arguments) if hasattr(module, "command_for") else module.COMMAND
     program = f"xreset {name}"
     if isinstance(command, dict):
         tyro.extras.subcommand_cli_from_dict(command, prog=program, description=COMMANDS[name], args=arguments)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 from xreset.learning.config import TrainConfig
@@ -21,6 +23,7 @@ def train(
     minutes: float = math.inf,
     seed: int = 0,
     resume: bool = False,
+    like: str = "paper",
     config: TrainConfig = TrainConfig(),  # noqa: B008 (frozen)
 ) -> None:
     """Train a policy.
@@ -38,7 +41,8 @@ def train(
             Compiling kernels is not counted.
         seed: Seed of every random number.
         resume: Continue the run in --out from its newest checkpoint.
-        config: Task, model and algorithm.
+        like: Where the configuration starts from: a recipe (paper, minutes) or another run's folder. Flags change what they name.
+        config: Task, model and algorithm. The defaults shown are those of --like.
     """
     from dataclasses import replace
 
@@ -47,6 +51,8 @@ def train(
 
     if not minutes > 0:
         raise RunError(f"--minutes is {minutes}, expected more than 0.")
+    if resume and like != "paper":
+        raise RunError("--resume continues with the run's own configuration; leave out --like.")
     if resume:
         training.train(out, training.resumed(out, iterations=iterations), resume=True, seconds=60 * minutes)
         return
@@ -65,6 +71,17 @@ def train(
         out=out,
     )
     training.train(out, info, inputs, seconds=60 * minutes)
+
+
+def command_for(arguments: list[str]) -> Callable[..., None]:
+    """:func:`train` with the defaults that ``--like`` asks for, which have to be known before the other flags are read."""
+    from functools import partial
+
+    from xreset.learning.recipes import starting_config
+
+    given = [value for flag, value in pairwise([*arguments, ""]) if flag == "--like" and value]
+    given += [argument.partition("=")[2] for argument in arguments if argument.startswith("--like=")]
+    return partial(train, config=starting_config(given[-1])) if given else train
 
 
 COMMAND = train

@@ -1,0 +1,45 @@
+"""Named starting points for a training's configuration; flags change single numbers of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from xreset.errors import RunError
+from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
+from xreset.learning.run import read_run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """A configuration and what it is for."""
+
+    config: TrainConfig
+    about: str
+
+
+RECIPES: dict[str, Recipe] = {
+    "paper": Recipe(config=TrainConfig(), about="the paper's tables VIII and IX, for hours on several GPUs"),
+    "minutes": Recipe(
+        config=TrainConfig(model=ModelConfig(initial_std=0.3), ppo=PpoConfig(precision="bfloat16", desired_kl=0.02, entropy=0.0)),
+        about="what taught grasps in minutes on one GPU with --num-envs 8192 (docs/results.md)",
+    ),
+}
+"""Name -> recipe. ``minutes``: here the paper's entropy bonus of 0.005 makes the standard deviation grow; a small one that only
+shrinks, and steps of twice the size, learn in a fraction of the iterations."""
+
+
+def starting_config(like: str) -> TrainConfig:
+    """The configuration of a recipe, or of a run.
+
+    Args:
+        like: name of a recipe, or a run folder.
+
+    Raises:
+        RunError: it is neither.
+    """
+    if like in RECIPES:
+        return RECIPES[like].config
+    if not Path(like).exists():
+        raise RunError(f"there is no recipe and no run folder {like!r}. Recipes: {', '.join(RECIPES)}.")
+    return read_run(like).config

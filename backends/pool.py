@@ -12,6 +12,7 @@ Shape letters as in :mod:`xreset.backends.base`; arrays of one world have no lea
 from __future__ import annotations
 
 import contextlib
+import math
 import mmap
 import os
 import pickle
@@ -82,8 +83,11 @@ class World(ABC):
         """On the object in the last physics step: tip force (E, 3), tip touch (E,) bool, table force (3,). Zero right after set_state."""
 
     @abstractmethod
-    def health(self) -> tuple[bool, bool]:
-        """Whether, now, the state is not finite, and whether contacts overflowed in the last :meth:`step`."""
+    def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
+        """Whether the state is not finite, and whether contacts overflowed in the last :meth:`step`.
+
+        ``state`` is what :meth:`get_state` has just returned: nothing has to be read again. See :func:`is_finite`.
+        """
 
     def mass_properties(self) -> list[Inertia]:
         """What the engine itself holds: of each moving body of the robot, in the order of the mechanism, then of the object.
@@ -110,6 +114,11 @@ class World(ABC):
 
     def close(self) -> None:  # noqa: B027 (most engines need nothing)
         """Free what the engine holds."""
+
+
+def is_finite(state: Mapping[str, np.ndarray]) -> bool:
+    """Whether all numbers of a state are. One bad number spoils the sum, which costs less than looking at each."""
+    return math.isfinite(sum(x.dot(x) for x in state.values()))
 
 
 class PoolBackend(Backend):
@@ -538,9 +547,10 @@ class _Local:
         world, arrays = self._worlds[i], self._arrays
         if arrays["nonfinite"][i]:  # nothing has moved since that was said
             return
-        for name, value in world.get_state().items():
+        state = world.get_state()
+        for name, value in state.items():
             arrays[name][i] = value
-        nonfinite, overflow = world.health()
+        nonfinite, overflow = world.health(state)
         if nonfinite:
             arrays["nonfinite"][i] = True
         if overflow:

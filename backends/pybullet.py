@@ -13,7 +13,6 @@ What differs from PyBullet's defaults, and why:
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +24,7 @@ from typing import Any, get_args
 import numpy as np
 
 from xreset.backends.base import Capability, unavailable
-from xreset.backends.pool import PoolBackend, World
+from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.rigid import (
     Arms,
     Inertia,
@@ -107,7 +106,6 @@ class PybulletWorld(World):
         self._fresh = True
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
         self._clean = p.saveState(physicsClientId=self._client)
-        self._seen: dict[str, np.ndarray] | None = None  # what get_state has read, until something moves
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """See :meth:`World.set_state`."""
@@ -122,16 +120,10 @@ class PybulletWorld(World):
         omega = state["object_angvel"]
         p.resetBaseVelocity(self._object.body, state["object_linvel"] + cross(omega, arm), omega, physicsClientId=client)
         self._force, self._torque = np.zeros(3), np.zeros(3)
-        self._fresh, self._seen = True, None
+        self._fresh = True
 
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
-        if self._seen is None:
-            self._seen = self._look()
-        return {**self._seen, "joint_target": self._drives.target}
-
-    def _look(self) -> dict[str, np.ndarray]:
-        """The state but for the drive targets, which may change while nothing moves."""
         p, client = self._p, self._client
         com, turn = p.getBasePositionAndOrientation(self._object.body, physicsClientId=client)
         linear, angular = (np.array(v) for v in p.getBaseVelocity(self._object.body, physicsClientId=client))
@@ -141,6 +133,7 @@ class PybulletWorld(World):
         return {
             "joint_pos": position[self._drives.driven],
             "joint_vel": velocity[self._drives.driven],
+            "joint_target": self._drives.target,
             "object_pos": np.array(com) - arm,
             "object_quat": self._quat,
             "object_linvel": linear - cross(angular, arm),
@@ -164,7 +157,7 @@ class PybulletWorld(World):
             if turned:
                 p.applyExternalTorque(self._object.body, -1, self._torque, p.WORLD_FRAME, physicsClientId=client)
             p.stepSimulation(physicsClientId=client)
-        self._fresh, self._seen = False, None
+        self._fresh = False
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.links`."""
@@ -194,10 +187,9 @@ class PybulletWorld(World):
                 tip_touch[tip] = True
         return tip_force, tip_touch, table_force
 
-    def health(self) -> tuple[bool, bool]:
+    def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
         """See :meth:`World.health`. Bullet allocates contacts as it needs them: none is ever dropped."""
-        read = self.get_state().values()
-        return not math.isfinite(sum(x.dot(x) for x in read)), False  # one bad number spoils the sum; cheaper than looking at each
+        return not is_finite(state), False
 
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`. The object is loaded in the frame of its inertia."""

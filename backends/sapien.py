@@ -14,7 +14,6 @@ What differs from SAPIEN's defaults, and why:
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from xreset.backends.base import Capability, KnownDifference, unavailable
-from xreset.backends.pool import PoolBackend, World
+from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.rigid import (
     Arms,
     Inertia,
@@ -85,7 +84,6 @@ class SapienWorld(World):
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
         self._last_step: tuple[_Motion, np.ndarray, np.ndarray] | None = None
-        self._seen: dict[str, np.ndarray] | None = None  # what get_state has read, until something moves
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """See :meth:`World.set_state`."""
@@ -97,16 +95,10 @@ class SapienWorld(World):
         self._object.linear_velocity = state["object_linvel"] + cross(omega, rotate(self._quat, self._inertia.com))
         self._object.angular_velocity = omega
         self._force, self._torque = np.zeros(3), np.zeros(3)
-        self._last_step = self._seen = None
+        self._last_step = None
 
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
-        if self._seen is None:
-            self._seen = self._look()
-        return {**self._seen, "joint_target": self._joints.target}
-
-    def _look(self) -> dict[str, np.ndarray]:
-        """The state but for the drive targets, which may change while nothing moves."""
         pose = self._object.entity_pose
         self._quat = nearer(pose.q.astype(np.float64), self._quat)
         omega = self._object.angular_velocity.astype(np.float64)
@@ -114,6 +106,7 @@ class SapienWorld(World):
         return {
             "joint_pos": position,
             "joint_vel": velocity,
+            "joint_target": self._joints.target,
             "object_pos": pose.p,
             "object_quat": self._quat,
             "object_linvel": self._object.linear_velocity - cross(omega, self._arm.turned(self._quat)[0]),
@@ -126,7 +119,7 @@ class SapienWorld(World):
 
     def step(self, n: int) -> None:
         """See :meth:`World.step`."""
-        body, self._seen = self._object, None
+        body = self._object
         force = self._force - np.array([0.0, 0.0, self._mass * GRAVITY * self._fraction])
         for remaining in reversed(range(n)):
             self._joints.brake()
@@ -165,10 +158,9 @@ class SapienWorld(World):
                     tip_touch[surface.tip] = True
         return tip_force, tip_touch, table_force
 
-    def health(self) -> tuple[bool, bool]:
+    def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
         """See :meth:`World.health`. PhysX allocates contacts as it needs them: none is ever dropped."""
-        read = self.get_state().values()
-        return not math.isfinite(sum(x.dot(x) for x in read)), False  # one bad number spoils the sum; cheaper than looking at each
+        return not is_finite(state), False
 
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`."""

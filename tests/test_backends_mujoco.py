@@ -334,9 +334,9 @@ class BothBackends(unittest.TestCase):
         for bad in (np.nan, np.inf, -np.inf):
             for array in ("qpos", "qvel"):
                 world = MujocoWorld(self.scene, 0)
-                self.assertFalse(world.health()[0])
+                self.assertFalse(world.health(world.get_state())[0])
                 getattr(world._data, array)[[0, 3]] = bad, 1.0
-                self.assertTrue(world.health()[0], f"{bad} in {array}")
+                self.assertTrue(world.health(world.get_state())[0], f"{bad} in {array}")
 
     def test_bad_shapes_are_named(self):
         state = self.bench.start()

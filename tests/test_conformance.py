@@ -221,7 +221,7 @@ class ThirdObjectReplacedByTheFirst(MujocoWorld):
 
 @breaks("broken_world")
 class HiddenBrokenWorld(MujocoWorld):
-    def health(self):
+    def health(self, state):
         return False, False
 
 

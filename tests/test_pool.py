@@ -11,13 +11,14 @@ import textwrap
 import time
 import unittest
 from dataclasses import fields
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from xreset.backends.base import State
-from xreset.backends.pool import PoolBackend, World, initial_state, lowest_point
+from xreset.backends.pool import STATE_FIELDS, PoolBackend, World, initial_state, is_finite, lowest_point
 from xreset.errors import CapabilityError, RobotError, XResetError
 from xreset.spec import DriveSpec, FingertipSpec, Geometry, JointSpec, ObjectSpec, RobotSpec, SceneSpec, Shape
 
@@ -72,8 +73,8 @@ class ToyWorld(World):
         self.looks.append("contacts")
         return np.tile(self.contact, (2, 1)), np.array([self.contact[2] > 0, False]), -self.contact
 
-    def health(self):
-        return not np.isfinite(self.state["object_pos"]).all(), bool(self.state["joint_target"][0] == 5.0)
+    def health(self, state):
+        return not is_finite(state), bool(state["joint_target"][0] == 5.0)
 
     def set_object_mass(self, mass):
         self.mass = mass
@@ -226,6 +227,14 @@ class PoolTest(unittest.TestCase):
             pool.step(1)
             torch.testing.assert_close((pool.state().object_linvel - before)[:, 0], torch.tensor([0.125, 0.5, 1.0, 0.5, 0.25]))
             pool.set_object_mass(torch.tensor([1.0, 1.0]), torch.tensor([4, 0]))
+
+    def test_every_broken_number_of_a_state_is_noticed(self):
+        good = {name: getattr(random_state(1, 0), name)[0].numpy() for name in STATE_FIELDS}
+        self.assertTrue(is_finite(good))
+        for name, bad in product(STATE_FIELDS, (np.nan, np.inf, -np.inf)):
+            broken = good[name].copy()
+            broken[-1] = bad
+            self.assertFalse(is_finite({**good, name: broken}), f"{bad} in {name}")
 
     def test_health_sticks_until_the_state_is_set_and_a_broken_world_rests(self):
         for pool in self.each():

@@ -21,7 +21,7 @@ from typing import get_args
 import numpy as np
 
 from xreset.backends.base import Capability, KnownDifference
-from xreset.backends.pool import PoolBackend, World
+from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.rigid import Inertia, mechanism, nearer, object_inertia, principal
 from xreset.errors import BackendUnavailableError, XResetError
 from xreset.spec import GRAVITY, SceneSpec
@@ -99,7 +99,8 @@ class DrakeWorld(World):
     def get_state(self) -> dict[str, np.ndarray]:
         """See :meth:`World.get_state`."""
         at, i, j = self._at, self._object_q, self._object_v
-        q, v = self._positions_and_velocities()
+        values = at.plant.GetPositionsAndVelocities(self._context) if self._lost is None else self._lost
+        q, v = np.split(values, self._sizes[:1])
         self._quat = nearer(q[i : i + 4], self._quat)
         return {
             "joint_pos": q[at.joint_position],
@@ -172,9 +173,9 @@ class DrakeWorld(World):
                 tip_touch[second.tip] |= bool(force.any())
         return tip_force, tip_touch, table_force
 
-    def health(self) -> tuple[bool, bool]:
+    def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
         """See :meth:`World.health`. Drake allocates contacts as it needs them: none is ever dropped."""
-        return not all(np.isfinite(values).all() for values in self._positions_and_velocities()), False
+        return not is_finite(state), False
 
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`."""
@@ -204,10 +205,6 @@ class DrakeWorld(World):
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
         """See :meth:`World.set_object_wrench`."""
         self._force, self._torque = force, torque
-
-    def _positions_and_velocities(self) -> tuple[np.ndarray, np.ndarray]:
-        values = self._at.plant.GetPositionsAndVelocities(self._context) if self._lost is None else self._lost
-        return values[: self._sizes[0]], values[self._sizes[0] :]
 
     def _set_friction(self, coefficients: Mapping[str, float]) -> None:
         """Give the geometries of some roles a coefficient of their own. Drake rebuilds what has changed, so only that is touched."""

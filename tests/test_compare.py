@@ -22,7 +22,7 @@ from xreset.eval.compare.progress import Line, amounts, line, processes
 from xreset.eval.compare.score import score
 from xreset.eval.compare.table import escape
 from xreset.eval.report import plots as report_plots
-from xreset.eval.report.data import Curve
+from xreset.eval.report.data import Curve, read_curves
 from xreset.eval.results import write_results
 from xreset.eval.rollout import Rollouts
 from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95
@@ -147,6 +147,37 @@ class ReadTest(InFolder):
         (a / "events.out.tfevents.1.x").write_bytes(b"no events")
         with self.assertRaisesRegex(FileFormatError, "hold no learning curve.*Compare its evaluations alone: a=.*/eval"):
             read_training("a", a)
+
+    def test_event_files_that_are_not_whole(self):
+        a = self.write_curves("a", curves_of((1.0,) * 40, (0.5,) * 40))
+        (file,) = a.glob("events*")
+        whole = file.read_bytes()
+
+        def offset(record: int) -> int:
+            at = 0
+            for _ in range(record):
+                at += 16 + int.from_bytes(whole[at : at + 8], "little")
+            return at
+
+        middle, last = offset(100), offset(1 + 5 * 40 - 1)
+        file.write_bytes(whole[: last + 20])  # the training is still writing, or was killed
+        self.assertEqual(read_training("a", a).scalars["task/success"].iteration[-1], 40)
+        changed = bytes([whole[middle + 20] ^ 1])
+        for what, damaged in (
+            ("content", whole[: middle + 20] + changed + whole[middle + 21 :]),
+            ("length", whole[:middle] + b"\xff" * 8 + whole[middle + 8 :]),
+            ("zeros", whole[:middle] + bytes(300) + whole[middle + 300 :]),
+            ("bytes missing", whole[:middle] + whole[middle + 11 :]),
+        ):
+            file.write_bytes(damaged)
+            with (
+                self.subTest(what),
+                self.assertRaisesRegex(FileFormatError, f"{file.name} is damaged.* up to step 40 and no farther"),
+            ):
+                read_training("a", a)
+            curves, note = read_curves(a)
+            self.assertEqual(curves, ())
+            self.assertIn("is damaged", note or "")
 
     def test_configurations_of_other_versions_are_read(self):
         a = self.write_run("a")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from xreset.errors import FileFormatError, RunError, XResetError
+from xreset.eval.report.events import check_events
 from xreset.eval.results import read_episodes, read_results
 from xreset.eval.rollout import Episode
 from xreset.files import read_json
@@ -153,9 +154,11 @@ def read_scalars(folder: Path) -> dict[str, Curve]:
     """Everything that TensorBoard's event files in a folder hold, by tag, which is its label too; empty if there are no event files.
 
     Raises:
+        FileFormatError: an event file is damaged.
         XResetError: there are event files, and TensorBoard, which reads them, cannot be imported.
     """
-    if not any(folder.glob("events.out.tfevents.*")):
+    files = sorted(folder.glob("events.out.tfevents.*"))
+    if not files:
         return {}
     try:
         from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -163,12 +166,16 @@ def read_scalars(folder: Path) -> dict[str, Curve]:
         raise XResetError(
             f"Learning curves need TensorBoard, which cannot be imported ({error}). Install it with: pip install 'xreset[train]'"
         ) from error
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
-    events.Reload()
+    latest: dict[str, dict[int, float]] = {}
+    for file in files:
+        events = EventAccumulator(str(file), size_guidance={"scalars": 0})
+        events.Reload()
+        found = {tag: events.Scalars(tag) for tag in events.Tags()["scalars"]}
+        check_events(file, {tag: max(e.step for e in values) for tag, values in found.items()})
+        for tag, values in found.items():  # a resumed run repeats the steps after its checkpoint: the later ones count
+            latest.setdefault(tag, {}).update((e.step, e.value) for e in values)
     curves = {}
-    for tag in events.Tags()["scalars"]:
-        # a resumed run repeats the steps after its checkpoint: the later ones count
-        latest = {e.step: e.value for e in events.Scalars(tag)}
-        steps = sorted(latest)
-        curves[tag] = Curve(label=tag, iteration=np.array(steps), value=np.array([latest[step] for step in steps]))
+    for tag, values in latest.items():
+        steps = sorted(values)
+        curves[tag] = Curve(label=tag, iteration=np.array(steps), value=np.array([values[step] for step in steps]))
     return curves

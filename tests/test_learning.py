@@ -241,6 +241,8 @@ class ConfigTest(unittest.TestCase):
         cfg = rsl_rl_config(TrainConfig(), 4096)
         self.assertEqual(cfg["algorithm"]["num_mini_batches"], 2)
         self.assertEqual((cfg["num_steps_per_env"], cfg["algorithm"]["sequence_length"]), (16, 4))
+        free = rsl_rl_config(TrainConfig(ppo=PpoConfig(clip_values=False)), 4096)
+        self.assertEqual([c["algorithm"]["use_clipped_value_loss"] for c in (cfg, free)], [True, False])
 
     def test_numbers_that_make_no_sense_are_refused(self):
         for make, problem in (

@@ -58,8 +58,8 @@ class PpoConfig:
     value_loss: float = 1.0
     """Weight of the value loss. Not in the paper."""
     clip_values: bool = True
-    """Whether values, too, move by at most ``clip`` per iteration. Returns have a standard deviation of 6 in trained policies, so it takes a
-    critic some hundred iterations to learn that range. Not in the paper; its library's usual setting, there with normalised returns."""
+    """Whether values, too, move by at most ``clip`` per iteration. Returns of trained policies have a standard deviation of 6 to 9, so it
+    takes a critic some hundred iterations to learn that range. Not in the paper; a usual setting, where returns are normalised."""
     grad_norm: float = 1.0
     precision: Literal["float32", "tf32", "bfloat16"] = "tf32"
     """Arithmetic of matrix products on a GPU. ``bfloat16``: factors of point-cloud encoder and LSTM in bfloat16 (sums in float32), all else

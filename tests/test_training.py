@@ -200,7 +200,7 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual((minutes.ppo.desired_kl, minutes.ppo.entropy, minutes.model.initial_std), (0.02, 0.001, 0.3))
         self.assertEqual(parsed(f"--like={self.out}", "--config.save-interval", "7"), replace(CONFIG, save_interval=7))
         for arguments, problem in (
-            (("--like", "nothing"), "no recipe and no run folder 'nothing'. Recipes: paper, minutes"),
+            (("--like", "nothing"), "no recipe and no run folder 'nothing'. Recipes: paper, the paper's tables .*; minutes, what taught"),
             (("--like", str(self.folder)), "is not a run folder"),
             (("--like", "minutes", "--resume"), "leave out --like"),
             (("--minutes", "0"), "--minutes is 0.0, expected more than 0"),

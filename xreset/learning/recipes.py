@@ -41,5 +41,6 @@ def starting_config(like: str) -> TrainConfig:
     if like in RECIPES:
         return RECIPES[like].config
     if not Path(like).exists():
-        raise RunError(f"there is no recipe and no run folder {like!r}. Recipes: {', '.join(RECIPES)}.")
+        recipes = "; ".join(f"{name}, {recipe.about}" for name, recipe in RECIPES.items())
+        raise RunError(f"there is no recipe and no run folder {like!r}. Recipes: {recipes}.")
     return read_run(like).config

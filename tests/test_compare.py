@@ -1,18 +1,16 @@
 """Several trainings side by side: what is read, what is taken together, what is unfair, and what is written."""
 
-import io
 import json
 import tempfile
 import unittest
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from tests.test_cli import run
 from tests.toy_results import toy_rollouts, toy_summary
-from xreset.cli import main
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.compare import compare
 from xreset.eval.compare.data import read_training, read_trainings
@@ -552,13 +550,8 @@ class DrawTest(InFolder):
 
 class CommandTest(InFolder):
     def run_command(self, *arguments: str) -> tuple[int, str]:
-        out = io.StringIO()
-        with redirect_stdout(out), redirect_stderr(out):
-            try:
-                main(["compare", *arguments])
-            except SystemExit as end:
-                return int(end.code or 0), out.getvalue()
-        return 0, out.getvalue()
+        code, out, err = run("compare", *arguments)
+        return code, out + err
 
     def test_from_folders_to_picture_and_page(self):
         for name, seed in (("a", 3), ("b", 4)):

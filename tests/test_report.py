@@ -5,18 +5,17 @@ import re
 import subprocess
 import tempfile
 import unittest
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 
+from tests.test_cli import run
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_results import toy_rollouts, toy_summary
 from tests.toy_robot import toy_hand_arm
 from xreset import robots
-from xreset.cli import main
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.report import make_report, plots
 from xreset.eval.report.clips import Clip, camera_for, choose_sequence, draw_clip, encode_mp4, recorded_episode
@@ -214,13 +213,13 @@ class FailureTest(InFolder):
 
     def test_the_worst_come_first_and_what_reached_its_goal_does_not_come(self):
         chosen = choose_failures(self.episodes(0.66, 1.0, 0.33, 0.66), self.traces(*[SOUP] * 4), 3)
-        self.assertEqual([t.sequence for t in chosen], [2, 0, 3])
+        self.assertEqual([t.sequence for _, t in chosen], [2, 0, 3])
         self.assertEqual(choose_failures(self.episodes(1.0), self.traces(SOUP), 3), [])
 
     def test_objects_take_turns(self):
         episodes, traces = self.episodes(0.0, 0.0, 0.0, 0.66), self.traces(SOUP, SOUP, SOUP, SPAM)
-        self.assertEqual([t.sequence for t in choose_failures(episodes, traces, 2)], [0, 3])
-        self.assertEqual([t.sequence for t in choose_failures(episodes, traces, 4)], [0, 1, 2, 3])
+        self.assertEqual([t.sequence for _, t in choose_failures(episodes, traces, 2)], [0, 3])
+        self.assertEqual([t.sequence for _, t in choose_failures(episodes, traces, 4)], [0, 1, 2, 3])
 
     def test_every_episode_that_missed_its_goal_is_counted_once(self):
         at_goal, near, lifted, broken = toy_rollouts().episodes
@@ -377,13 +376,8 @@ class PageTest(InFolder):
 
 class CommandTest(InFolder):
     def run_command(self, *arguments: str) -> tuple[int, str]:
-        out = io.StringIO()
-        with redirect_stdout(out), redirect_stderr(out):
-            try:
-                main(["report", *arguments])
-            except SystemExit as end:
-                return int(end.code or 0), out.getvalue()
-        return 0, out.getvalue()
+        code, out, err = run("report", *arguments)
+        return code, out + err
 
     def test_from_results_to_page_and_picture(self):
         robot = robots.load("openarm")

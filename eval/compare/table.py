@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from xreset.errors import RunError
 from xreset.eval.compare.data import Fact, Training
 from xreset.eval.compare.groups import Group
-from xreset.eval.compare.progress import amounts, processes
+from xreset.eval.compare.progress import X, amounts, processes
 from xreset.eval.compare.score import Scores, engines_of
 
 if TYPE_CHECKING:
@@ -119,18 +119,17 @@ _ABSENT = Fact(None, "-")
 def _extent(columns: Sequence[Group]) -> Iterator[tuple[str, list[list[str]]]]:
     """How long was trained: name, and for each group the text of every training."""
 
-    def amount(member: Training, what: str) -> str:
+    def amount(member: Training, what: X) -> str:
         if not member.scalars:
             return "-"
-        if what == "iterations":
-            return f"{amounts(member, 'iterations')[1][-1]:,.0f}"
         try:
-            done = amounts(member, "minutes" if what == "minutes" else "steps")[1][-1]
+            done = amounts(member, what)[1][-1]
         except RunError:
             return "-"
-        return f"{done:.1f}" if what == "minutes" else f"{done / 1e6:.1f}"
+        return f"{done:,.0f}" if what == "iterations" else f"{done / 1e6 if what == 'steps' else done:.1f}"
 
-    for name, what in (("iterations trained", "iterations"), ("million environment steps", "steps"), ("minutes of training", "minutes")):
+    kinds: dict[str, X] = {"iterations trained": "iterations", "million environment steps": "steps", "minutes of training": "minutes"}
+    for name, what in kinds.items():
         cells = [[amount(m, what) for m in g.members] for g in columns]
         if any(cell != "-" for column in cells for cell in column):
             yield name, cells

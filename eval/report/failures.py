@@ -28,7 +28,7 @@ class Strip:
     """[MOMENTS] when each was taken [s]."""
 
 
-def choose_failures(episodes: Sequence[Episode], traces: Sequence[Trace], count: int) -> list[Trace]:
+def choose_failures(episodes: Sequence[Episode], traces: Sequence[Trace], count: int) -> list[tuple[Episode, Trace]]:
     """The recorded episodes of one engine that missed the goal, worst first, at most ``count``.
 
     Worst is the lowest stage, then the least of the way to the goal, then the lower index of the demonstration. Objects take turns, so that
@@ -41,10 +41,9 @@ def choose_failures(episodes: Sequence[Episode], traces: Sequence[Trace], count:
     seen: dict[str, int] = {}
     turns = []
     for place, (_, trace) in enumerate(missed):
-        turns.append((seen.setdefault(trace.object, 0), place, trace))
+        turns.append((seen.setdefault(trace.object, 0), place))
         seen[trace.object] += 1
-    chosen = sorted(turns, key=lambda turn: turn[:2])[:count]
-    return [trace for _, _, trace in sorted(chosen, key=lambda turn: turn[1])]
+    return [missed[place] for place in sorted(place for _, place in sorted(turns)[:count])]
 
 
 def count_failures(episodes: Sequence[Episode]) -> dict[str, int]:

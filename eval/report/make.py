@@ -89,17 +89,17 @@ def _draw(
     if sequence is None:
         raise XResetError("no demonstration was recorded in every engine. Evaluate all engines in one command.")
     traces = {engine: next(t for t in found if t.sequence == sequence) for engine, found in recorded.items()}
-    episodes = data.episodes[data.engines[0]]
-    missed = choose_failures(episodes, recorded[data.engines[0]], _FAILURES)
+    missed = choose_failures(data.episodes[data.engines[0]], recorded[data.engines[0]], _FAILURES)
     meshes = objects or (Path(first["objects_folder"]) if first["objects_folder"] else None)
-    obj = load_object(next(iter(traces.values())).object, meshes)
+    drawn = (*traces.values(), *(trace for _, trace in missed))
+    things = {name: load_object(name, meshes) for name in dict.fromkeys(trace.object for trace in drawn)}
     camera = camera_for(list(traces.values()))
     clips, strips, total = [], [], len(traces) + len(missed)
     for engine, trace in traces.items():
         progress(len(clips), total)
-        clips.append(draw_clip(engine, recorded_episode(data.episodes[engine], sequence), trace, spec, obj, camera))
-    for trace in missed:
+        clips.append(draw_clip(engine, recorded_episode(data.episodes[engine], sequence), trace, spec, things[trace.object], camera))
+    for episode, trace in missed:
         progress(len(clips) + len(strips), total)
-        strips.append(draw_strip(recorded_episode(episodes, trace.sequence), trace, spec, load_object(trace.object, meshes)))
+        strips.append(draw_strip(episode, trace, spec, things[trace.object]))
     progress(total, total)
     return clips, strips

@@ -28,8 +28,8 @@ COMMANDS: dict[str, str] = {
     "compare": "Put several trainings side by side: curves, results in every engine, and what differs between them.",
     "report": "Make a self-contained HTML page of a run's evaluations.",
 }
-"""Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``: a function, or a dictionary of sub-commands. It may have
-``command_for``: arguments -> such a function, where defaults depend on an argument."""
+"""Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``: a function, or a dictionary of sub-commands. One whose
+defaults depend on an argument has ``command_for`` instead: arguments -> such a function."""
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 
 from xreset.learning.config import TrainConfig
@@ -75,13 +74,12 @@ def train(
 
 def command_for(arguments: list[str]) -> Callable[..., None]:
     """:func:`train` with the defaults that ``--like`` asks for, which have to be known before the other flags are read."""
+    from argparse import ArgumentParser
     from functools import partial
 
     from xreset.learning.recipes import starting_config
 
-    given = [value for flag, value in pairwise([*arguments, ""]) if flag == "--like" and value]
-    given += [argument.partition("=")[2] for argument in arguments if argument.startswith("--like=")]
-    return partial(train, config=starting_config(given[-1])) if given else train
-
-
-COMMAND = train
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--like", nargs="?")  # a missing value is for the real parser to say
+    like = parser.parse_known_args(arguments)[0].like
+    return partial(train, config=starting_config(like)) if like else train

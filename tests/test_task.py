@@ -272,35 +272,6 @@ class ResetTest(WithRobot):
         reset = self.distribution(bank=empty, demo_probability=1.0).sample(torch.tensor([0, 1] * 100), generator())
         self.assertFalse(bool(reset.from_bank.any()))
 
-    def test_lead_ins_lie_between_home_and_a_state_before_contact(self):
-        bank, home = toy_bank(self.robot), torch.as_tensor(self.robot.home, dtype=torch.float32)
-        reset = self.distribution(demo_probability=0.3, lead_in_probability=0.5, home_noise=False).sample(self.SOUPS, generator())
-        state = ((reset.object_pos[:, 0] - 0.6) * 100).round().long().clamp(0, 5)
-        target = torch.as_tensor(bank.joint_pos)[state]
-        exact = reset.from_bank & (reset.joint_pos == target).all(dim=-1)
-        between = reset.from_bank & ~exact
-        self.assertAlmostEqual(float(exact.float().mean()), 0.3, delta=0.02)
-        self.assertAlmostEqual(float(between.float().mean()), 0.5, delta=0.02)
-        self.assertEqual(set(state[between].tolist()), {0, 4}, "only states before contact")
-        self.assertEqual(reset.sequence[between].tolist(), bank.sequence_index[state[between]].tolist())
-        span = target - home
-        along = ((reset.joint_pos - home) * span).sum(-1) / span.square().sum(-1)
-        torch.testing.assert_close(reset.joint_pos[between], (home + along[:, None] * span)[between])
-        self.assertTrue(0 <= float(along[between].min()) < 0.02 and 0.98 < float(along[between].max()) < 1)
-        self.assertAlmostEqual(float(along[between].mean()), 0.5, delta=0.02)
-        self.assertAlmostEqual(float(reset.gravity_fraction[between].mean()), 0.5, delta=0.02)
-        torch.testing.assert_close(reset.joint_pos[~reset.from_bank], home.expand(int((~reset.from_bank).sum()), -1))
-
-    def test_lead_ins_need_states_before_contact(self):
-        bank = replace(toy_bank(self.robot), post_contact=np.ones(6, dtype=bool))
-        with self.assertRaisesRegex(DemoError, "no state before first contact.*lead_in_probability to 0"):
-            self.distribution(bank=bank, lead_in_probability=0.1)
-        one = replace(bank, post_contact=np.array([True, True, True, False, True, True]))  # of the second object alone
-        reset = self.distribution(bank=one, demo_probability=0.0, lead_in_probability=1.0).sample(torch.tensor([0, 1] * 50), generator())
-        self.assertEqual(reset.from_bank.tolist(), [False, True] * 50)
-        with self.assertRaisesRegex(ValueError, "0.6 and lead_in_probability 0.5 are shares of the same resets"):
-            ResetConfig(demo_probability=0.6, lead_in_probability=0.5)
-
     def test_an_object_without_demonstration_is_an_error(self):
         with self.assertRaisesRegex(DemoError, "no demonstration of 011_banana; it has 005_tomato_soup_can, 010_potted_meat_can"):
             self.distribution((SOUP, "011_banana"))

@@ -123,9 +123,6 @@ class ResetConfig:
 
     demo_probability: float = 0.5
     """p: share of resets from the bank; 0 is X-Sim."""
-    lead_in_probability: float = 0.0
-    """Share of resets on the way from home to a bank state before first contact: the joints anywhere between the two, the object as in the
-    bank state. Not in the paper; it joins the two distributions where demonstrations begin far from the robot's home (docs/results.md)."""
     pre_contact_only: bool = False
     """Use only bank states before first contact."""
     random_gravity: bool = True
@@ -142,16 +139,7 @@ class ResetConfig:
     """Home resets: joints start around home with the robot's ``home_std``."""
 
     def __post_init__(self) -> None:
-        check_numbers(
-            self,
-            share=("demo_probability", "lead_in_probability"),
-            not_negative=("home_gravity_std", "home_gravity_clip", "spawn_xy", "spawn_yaw"),
-        )
-        if self.demo_probability + self.lead_in_probability > 1:
-            raise ValueError(
-                f"demo_probability {self.demo_probability} and lead_in_probability {self.lead_in_probability} are shares of the same "
-                "resets, expected a sum of at most 1; the rest starts from home"
-            )
+        check_numbers(self, share=("demo_probability",), not_negative=("home_gravity_std", "home_gravity_clip", "spawn_xy", "spawn_yaw"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,6 +193,6 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
     return replace(
         task,
         observation=replace(task.observation, noise=zero),
-        reset=replace(task.reset, demo_probability=0.0, lead_in_probability=0.0, home_gravity_std=0.0),
+        reset=replace(task.reset, demo_probability=0.0, home_gravity_std=0.0),
         randomization=replace(task.randomization, enabled=False),
     )

@@ -1,7 +1,7 @@
 """The reset distribution: home resets and bank resets, mixed (the paper's sections IV-B and appendix D.c, D.e).
 
 Home: robot near its home configuration, object at a demonstration's first pose, perturbed. Bank: a demonstrated hand-object state.
-Lead-in, if asked for: between home and a demonstrated state before contact. The goal is the last object pose of the same demonstration.
+The goal is the last object pose of the same demonstration.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Reset:
     gravity_fraction: Tensor
     """[M]"""
     from_bank: Tensor
-    """[M] bool: a bank state, or on the way to one."""
+    """[M] bool"""
     sequence: Tensor
     """[M] index of the demonstration."""
 
@@ -65,7 +65,7 @@ class ResetDistribution:
             device: where to draw.
 
         Raises:
-            DemoError: an object of the scene has no demonstration in the bank, or lead-ins are asked for and no state is before contact.
+            DemoError: an object of the scene has no demonstration in the bank.
         """
         self.config = config
         if config.pre_contact_only:
@@ -79,7 +79,7 @@ class ResetDistribution:
                 np.ascontiguousarray(array), dtype=torch.float32 if array.dtype.kind == "f" else torch.long, device=device
             )
 
-        # States, those before contact, and sequences, sorted by object: object o owns the rows first[o] : first[o] + count[o].
+        # States and sequences sorted by object: object o owns the rows first[o] : first[o] + count[o].
         number = {name: i for i, name in enumerate(object_names)}
         state_object = np.array([number.get(name, -1) for name in bank.object_name], dtype=np.int64)
         state_rows = np.flatnonzero(state_object >= 0)[np.argsort(state_object[state_object >= 0], kind="stable")]
@@ -91,14 +91,6 @@ class ResetDistribution:
             return tensor(np.cumsum(count) - count), tensor(count)
 
         self._state_first, self._state_count = ranges(state_object[state_rows])
-        before_contact = np.flatnonzero(~bank.post_contact[state_rows])
-        if config.lead_in_probability > 0 and not len(before_contact):
-            raise DemoError(
-                "the reset bank has no state before first contact, so nothing leads in from home. Set lead_in_probability to 0, or make "
-                "the bank from demonstrations whose approach can be retargeted."
-            )
-        self._approach_first, self._approach_count = ranges(state_object[state_rows[before_contact]])
-        self._approach_rows = tensor(before_contact)
         self._sequence_first, self._sequence_count = ranges(sequence_object[sequence_rows])
         self._joint_pos = tensor(bank.joint_pos[state_rows])
         self._object_pos = tensor(bank.object_pos[state_rows])
@@ -129,20 +121,13 @@ class ResetDistribution:
         uniform = torch.rand(m, 6, generator=generator, device=generator.device)
         count = self._state_count[object_index]
         from_bank = (uniform[:, 0] < c.demo_probability) & (count > 0)
-        row = self._state_first[object_index] + _below(uniform[:, 1], count)
+        row = self._state_first[object_index] + (uniform[:, 1] * count).long().clamp_max((count - 1).clamp_min(0))
+        row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
         sequence_count = self._sequence_count[object_index]
-        home = self.home(self._sequence_rows[self._sequence_first[object_index] + _below(uniform[:, 2], sequence_count)], generator)
+        pick = self._sequence_first[object_index] + torch.minimum((uniform[:, 2] * sequence_count).long(), sequence_count - 1)
+        home = self.home(self._sequence_rows[pick], generator)
         if not len(self._joint_pos):
             return home
-        along = torch.ones_like(uniform[:, 0])  # from home, 0, to the state, 1
-        if c.lead_in_probability > 0:
-            count = self._approach_count[object_index]
-            leads_in = (uniform[:, 0] >= 1.0 - c.lead_in_probability) & (count > 0)
-            approach = self._approach_first[object_index] + _below(uniform[:, 4], count)
-            row = torch.where(leads_in, self._approach_rows[torch.where(leads_in, approach, 0)], row)
-            along = torch.where(leads_in, uniform[:, 5], along)
-            from_bank |= leads_in
-        row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
         sequence = torch.where(from_bank, self._state_sequence[row], home.sequence)
 
         def mix(bank_value: Tensor, home_value: Tensor) -> Tensor:
@@ -150,7 +135,7 @@ class ResetDistribution:
 
         gravity = uniform[:, 3] if c.random_gravity else torch.ones_like(uniform[:, 3])
         return Reset(
-            joint_pos=mix(torch.lerp(home.joint_pos, self._joint_pos[row], along[:, None]), home.joint_pos),
+            joint_pos=mix(self._joint_pos[row], home.joint_pos),
             object_pos=mix(self._object_pos[row], home.object_pos),
             object_quat=mix(self._object_quat[row], home.object_quat),
             goal_pos=self._goal_pos[sequence],
@@ -179,8 +164,3 @@ class ResetDistribution:
             from_bank=torch.zeros(m, dtype=torch.bool, device=device),
             sequence=sequence,
         )
-
-
-def _below(uniform: Tensor, count: Tensor) -> Tensor:
-    """[M] whole numbers in 0 ... count - 1 from uniform ones in [0, 1); 0 where the count is 0."""
-    return torch.minimum((uniform * count).long(), count - 1).clamp_min(0)

@@ -272,6 +272,32 @@ class ResetTest(WithRobot):
         reset = self.distribution(bank=empty, demo_probability=1.0).sample(torch.tensor([0, 1] * 100), generator())
         self.assertFalse(bool(reset.from_bank.any()))
 
+    def test_frontier_resets_prefer_states_that_are_reached_now_and_then(self):
+        both = torch.tensor([0, 1] * 4000)
+        resets = self.distribution(demo_probability=1.0, frontier=0.75)
+        names = ((resets.sample(both, generator()).object_pos[:, 0] - 0.6) * 100).round().long()
+        resets.reached.copy_(torch.tensor([0.0, 0.5, 0.9, 1.0, 0.2, 0.1]))  # soup, soup, soup, soup, spam, spam: sorted by object
+        reset = resets.sample(both, generator())
+        chosen = reset.state
+        self.assertEqual(sorted(set(names.tolist())), [0, 1, 2, 3, 4, 5])
+        for first, weights in ((0, (0.01, 0.25, 0.09, 0.01)), (4, (0.16, 0.09))):  # a state never has less than the floor
+            share = torch.bincount(chosen[both == (first > 0)] - first, minlength=len(weights)) / 4000
+            weight = torch.tensor(weights)
+            torch.testing.assert_close(share, 0.25 / len(weights) + 0.75 * weight / weight.sum(), atol=0.03, rtol=0)
+        self.assertEqual(reset.sequence[both == 1].unique().tolist(), [1])
+
+    def test_what_became_of_an_episode_is_remembered_by_its_state(self):
+        resets = self.distribution(frontier=0.5, frontier_rate=0.1)
+        state = torch.tensor([0, 0, 0, 1, 2, -1, 3])
+        ended = torch.tensor([True, True, True, True, True, True, False])
+        reached = torch.tensor([True, True, False, False, True, True, True])
+        resets.learn(state, ended, reached)
+        three = 0.5 * 0.9**3 + (1 - 0.9**3) * 2 / 3
+        torch.testing.assert_close(resets.reached, torch.tensor([three, 0.45, 0.55, 0.5, 0.5, 0.5]))
+        for _ in range(100):
+            resets.learn(state, ended, reached)
+        torch.testing.assert_close(resets.reached, torch.tensor([2 / 3, 0.0, 1.0, 0.5, 0.5, 0.5]), atol=1e-4, rtol=0)
+
     def test_an_object_without_demonstration_is_an_error(self):
         with self.assertRaisesRegex(DemoError, "no demonstration of 011_banana; it has 005_tomato_soup_can, 010_potted_meat_can"):
             self.distribution((SOUP, "011_banana"))

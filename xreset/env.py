@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 
 _LASTING = (
-    "goal_pos", "goal_quat", "gravity_fraction", "sequence", "from_bank", "_episode_length", "_target", "_previous_action", "_best_reach",
-    "_reward", "_cloud", "_friction", "_mass",
+    "goal_pos", "goal_quat", "gravity_fraction", "sequence", "bank_state", "_episode_length", "_target", "_previous_action", "_best_reach",
+    "_reached", "_reward", "_cloud", "_friction", "_mass",
 )  # fmt: skip
 """What an environment keeps of each world from step to step, besides the engine's state."""
 
@@ -67,6 +67,7 @@ class ManipulationEnv:
         max_episode_length: control steps until the time limit.
         goal_pos, goal_quat: [N, 3], [N, 4] goal of each world.
         sequence: [N] demonstration of each world.
+        bank_state: [N] bank state that each world's episode began with, -1 for home.
         gravity_fraction: [N]
         nonfinite_count, overflow_count: [] times that a world was ended because a number was not finite; because it dropped contacts.
         faults: the last of those worlds, before and after the step in which they broke.
@@ -112,11 +113,12 @@ class ManipulationEnv:
         self._episode_length = zeros(dtype=torch.long)
         self.goal_pos, self.goal_quat = zeros(3), zeros(4)
         self.gravity_fraction, self.sequence = zeros(), zeros(dtype=torch.long)
-        self.from_bank = zeros(dtype=torch.bool)
+        self.bank_state = torch.full_like(self.sequence, -1)
         self.nonfinite_count, self.overflow_count = zeros(dtype=torch.long).sum(), zeros(dtype=torch.long).sum()
         self._action, self._previous_action = zeros(self.num_actions), zeros(self.num_actions)
         self._target = zeros(self.num_actions)
         self._best_reach, self._reward, self._time_out = zeros(), zeros(), zeros(dtype=torch.bool)
+        self._reached = zeros(dtype=torch.bool)
         self._cloud = zeros(task.observation.cloud_history, task.observation.cloud_points, 3)
         # What a step puts down for the next part of it: which worlds begin anew, how, and what there is to log.
         self._fresh = zeros(dtype=torch.bool)
@@ -127,7 +129,7 @@ class ManipulationEnv:
             goal_pos=zeros(3),
             goal_quat=zeros(4),
             gravity_fraction=zeros(),
-            from_bank=zeros(dtype=torch.bool),
+            state=torch.full_like(self.bank_state, -1),
             sequence=zeros(dtype=torch.long),
         )
         self._friction, self._mass = zeros(3), zeros()
@@ -152,6 +154,11 @@ class ManipulationEnv:
     @episode_length_buf.setter
     def episode_length_buf(self, value: Tensor) -> None:
         self._episode_length.copy_(value)
+
+    @property
+    def from_bank(self) -> Tensor:
+        """[N] bool: whether each world's episode began with a bank state."""
+        return self.bank_state >= 0
 
     def get_observations(self) -> TensorDict:
         """Observations of the present state, by group."""
@@ -229,6 +236,7 @@ class ManipulationEnv:
         values = {f"state.{f.name}": getattr(state, f.name) for f in fields(state)}
         values |= {f"env.{name}": getattr(self, name) for name in _LASTING}
         values |= {f"observed.{name}": self._observations[name] for name in set(self._observations.keys())}
+        values["resets.reached"] = self.resets.reached
         return {name: value.to("cpu", copy=True) for name, value in values.items()}
 
     def restore(self, snapshot: dict[str, Tensor]) -> bool:
@@ -250,6 +258,7 @@ class ManipulationEnv:
         self._fresh.zero_()
         for name in set(self._observations.keys()):
             self._observations[name].copy_(snapshot[f"observed.{name}"])
+        self.resets.reached.copy_(snapshot["resets.reached"])
         return True
 
     # Parts -------------------------------------------------------------------------------------------------------------------------
@@ -301,6 +310,9 @@ class ManipulationEnv:
         time_out = (self._episode_length >= self.max_episode_length) | self._faulty
         self._time_out.copy_(time_out & ~lost)
         self._fresh.copy_(lost | time_out)
+        self._reached |= reward.success
+        if self.resets.config.frontier > 0:
+            self.resets.learn(self.bank_state, self._fresh & ~self._faulty, self._reached)
         names, values = self._log(reward, self._fresh, sound=~broken)
         if not self._log_names:
             self._log_names, self._log_values = names, torch.zeros_like(values)
@@ -339,11 +351,11 @@ class ManipulationEnv:
             (start.goal_quat, self.goal_quat),
             (start.gravity_fraction, self.gravity_fraction),
             (start.sequence, self.sequence),
-            (start.from_bank, self.from_bank),
+            (start.state, self.bank_state),
             (start.joint_pos, self._target),
         ):
             old.copy_(torch.where(fresh.view(-1, *[1] * (old.ndim - 1)), new, old))
-        for cleared in (self._episode_length, self._previous_action, self._reward):
+        for cleared in (self._episode_length, self._previous_action, self._reward, self._reached):
             cleared.masked_fill_(fresh.view(-1, *[1] * (cleared.ndim - 1)), 0)
 
     def _begin(self) -> None:
@@ -426,8 +438,10 @@ class ManipulationEnv:
         values = torch.stack([value.float() for value, _ in rows.values()])
         masks = torch.stack([mask for _, mask in rows.values()])
         means = torch.where(masks, values, 0).sum(dim=-1) / masks.sum(dim=-1).clamp_min(1)
-        counts = torch.stack((self.nonfinite_count, self.overflow_count)).float()
-        return (*rows, "health/nonfinite_total", "health/overflow_total"), torch.cat((means, counts))
+        totals = {"health/nonfinite_total": self.nonfinite_count, "health/overflow_total": self.overflow_count}
+        if self.resets.config.frontier > 0:
+            totals["task/reached_from_bank"] = self.resets.reached.mean()
+        return (*rows, *totals), torch.cat((means, torch.stack([value.float() for value in totals.values()])))
 
 
 def rest_state(joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor) -> State:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import types
 import typing
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, TypeVar
 
 from xreset.errors import FileFormatError
@@ -15,14 +15,16 @@ T = TypeVar("T")
 def from_dict(cls: type[T], data: Any, where: str = "configuration") -> T:
     """Build a dataclass from nested dictionaries as :func:`dataclasses.asdict` and JSON make them.
 
+    What is missing takes its default, so that files stay readable when a field is added: its default must be what was done before.
+
     Raises:
         FileFormatError: names the entry that is unknown, missing, of the wrong type or out of range.
     """
     if not isinstance(data, dict):
         raise FileFormatError(f"{where} is {data!r}, expected an object with the entries of {cls.__name__}.")
     hints = typing.get_type_hints(cls)
-    names = {f.name for f in fields(cls)}  # pyright: ignore[reportArgumentType]
-    unknown, missing = sorted(set(data) - names), sorted(names - set(data))
+    needed = {f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(cls)}  # pyright: ignore[reportArgumentType]
+    unknown, missing = sorted(set(data) - set(needed)), sorted(name for name in needed if needed[name] and name not in data)
     if unknown or missing:
         problems = [f"unknown: {', '.join(unknown)}"] * bool(unknown) + [f"missing: {', '.join(missing)}"] * bool(missing)
         raise FileFormatError(f"{where} does not fit {cls.__name__} ({'; '.join(problems)}). Was it written by another version of xreset?")

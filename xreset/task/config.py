@@ -123,6 +123,12 @@ class ResetConfig:
 
     demo_probability: float = 0.5
     """p: share of resets from the bank; 0 is X-Sim."""
+    frontier: float = 0.0
+    """Share of bank resets drawn where the policy sometimes reaches the goal and sometimes does not: in proportion to s (1 - s), where s is the
+    share of recent episodes from a state that reached it. The others are drawn evenly, the paper's choice. That product is known as
+    learnability (Tzannetos et al. 2023, Proximal Curriculum; Rutherford et al. 2024, No Regrets)."""
+    frontier_rate: float = 0.1
+    """Weight of one episode in s."""
     pre_contact_only: bool = False
     """Use only bank states before first contact."""
     random_gravity: bool = True
@@ -139,7 +145,12 @@ class ResetConfig:
     """Home resets: joints start around home with the robot's ``home_std``."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, share=("demo_probability",), not_negative=("home_gravity_std", "home_gravity_clip", "spawn_xy", "spawn_yaw"))
+        check_numbers(
+            self,
+            positive=("frontier_rate",),
+            share=("demo_probability", "frontier", "frontier_rate"),
+            not_negative=("home_gravity_std", "home_gravity_clip", "spawn_xy", "spawn_yaw"),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,10 +34,15 @@ class Reset:
     goal_quat: Tensor
     gravity_fraction: Tensor
     """[M]"""
-    from_bank: Tensor
-    """[M] bool"""
+    state: Tensor
+    """[M] which of the distribution's bank states, -1 for home."""
     sequence: Tensor
     """[M] index of the demonstration."""
+
+    @property
+    def from_bank(self) -> Tensor:
+        """[M] bool"""
+        return self.state >= 0
 
     @classmethod
     def stack(cls, parts: Sequence[Self]) -> Self:
@@ -50,7 +55,15 @@ class Reset:
 
 
 class ResetDistribution:
-    """Draws resets for worlds of given objects from a bank; all tensors live on one device, nothing is copied per draw."""
+    """Draws resets for worlds of given objects from a bank; all tensors live on one device, nothing is copied per draw.
+
+    Attributes:
+        reached: [L] share of recent episodes from each bank state that reached the goal, 0.5 before the first (:meth:`learn`). States are
+            numbered as they are kept here, sorted by object.
+    """
+
+    FLOOR = 0.01
+    """Least weight of a state at the frontier, so that there is one while every state fails, or none does."""
 
     def __init__(
         self, bank: ResetBank, robot: RobotSpec, object_names: tuple[str, ...], config: ResetConfig, device: torch.device | str = "cpu"
@@ -102,6 +115,7 @@ class ResetDistribution:
         tree = robot_tree(robot)
         limits = np.array([(tree.joint(name).lower, tree.joint(name).upper) for name in robot.joint_names])
         self._lower, self._upper = tensor(limits[:, 0]), tensor(limits[:, 1])
+        self.reached = torch.full((len(state_rows),), 0.5, device=device)
         self._home = tensor(robot.home)
         self._home_std = tensor(np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints]))
 
@@ -122,6 +136,8 @@ class ResetDistribution:
         count = self._state_count[object_index]
         from_bank = (uniform[:, 0] < c.demo_probability) & (count > 0)
         row = self._state_first[object_index] + (uniform[:, 1] * count).long().clamp_max((count - 1).clamp_min(0))
+        if c.frontier > 0:
+            row = torch.where(uniform[:, 4] < c.frontier, self._at_frontier(object_index, uniform[:, 1]), row)
         row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
         sequence_count = self._sequence_count[object_index]
         pick = self._sequence_first[object_index] + torch.minimum((uniform[:, 2] * sequence_count).long(), sequence_count - 1)
@@ -141,7 +157,7 @@ class ResetDistribution:
             goal_pos=self._goal_pos[sequence],
             goal_quat=self._goal_quat[sequence],
             gravity_fraction=mix(gravity, home.gravity_fraction),
-            from_bank=from_bank,
+            state=torch.where(from_bank, row, -1),
             sequence=sequence,
         )
 
@@ -161,6 +177,31 @@ class ResetDistribution:
             goal_pos=self._goal_pos[sequence],
             goal_quat=self._goal_quat[sequence],
             gravity_fraction=gravity.clamp(1.0 - c.home_gravity_clip, 1.0 + c.home_gravity_clip),
-            from_bank=torch.zeros(m, dtype=torch.bool, device=device),
+            state=torch.full((m,), -1, device=device),
             sequence=sequence,
         )
+
+    def learn(self, state: Tensor, ended: Tensor, reached: Tensor) -> None:
+        """Take note of episodes that have ended; ``reached`` changes in place.
+
+        Args:
+            state: [M] the bank state that each episode began with, -1 for home.
+            ended: [M] bool, whether it has ended; the others are left out.
+            reached: [M] bool, whether it reached the goal.
+        """
+        told = ended & (state >= 0)
+        row = torch.where(told, state, 0)
+        episodes, hits = (
+            torch.zeros_like(self.reached).index_add_(0, row, what.to(self.reached.dtype)) for what in (told, told & reached)
+        )
+        fresh = 1.0 - (1.0 - self.config.frontier_rate) ** episodes
+        self.reached += fresh * (hits / episodes.clamp_min(1.0) - self.reached)
+
+    def _at_frontier(self, object_index: Tensor, uniform: Tensor) -> Tensor:
+        """[M] bank states of the given objects in proportion to s (1 - s), from uniform numbers in [0, 1)."""
+        weight = (self.reached * (1.0 - self.reached)).clamp_min(self.FLOOR)
+        total = torch.cat((weight.new_zeros(1), weight.double().cumsum(0)))
+        first, count = self._state_first[object_index], self._state_count[object_index]
+        low, high = total[first], total[first + count]
+        row = torch.searchsorted(total, low + uniform * (high - low), right=True) - 1
+        return torch.minimum(torch.maximum(row, first), first + (count - 1).clamp_min(0))

@@ -1,4 +1,4 @@
-"""Frozen dataclasses to JSON and back, strictly: an unknown or missing entry is an error, never ignored."""
+"""Frozen dataclasses to JSON and back, strictly: an unknown entry is an error, never ignored, and so is a missing one without default."""
 
 from __future__ import annotations
 

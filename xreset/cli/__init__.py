@@ -23,6 +23,7 @@ COMMANDS: dict[str, str] = {
     "train": "Train a policy.",
     "policies": "List the policies that ship with xreset, and make exported ones smaller.",
     "eval": "Evaluate a policy, or a baseline, in one or several engines.",
+    "frontier": "Tell from which demonstrated states a policy reaches the goal, and where its training is stuck.",
     "trace": "Replay one action sequence in several engines, and see when, where and by how much they part.",
     "attribute": "Tell which physical difference between two engines costs a policy its skill.",
     "compare": "Put several trainings side by side: curves, results in every engine, and what differs between them.",

@@ -204,6 +204,6 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
     return replace(
         task,
         observation=replace(task.observation, noise=zero),
-        reset=replace(task.reset, demo_probability=0.0, home_gravity_std=0.0),
+        reset=replace(task.reset, demo_probability=0.0, frontier=0.0, home_gravity_std=0.0),
         randomization=replace(task.randomization, enabled=False),
     )

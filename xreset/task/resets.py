@@ -54,6 +54,25 @@ class Reset:
         return type(self)(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
+def bank_starts(bank: ResetBank, rows: np.ndarray) -> Reset:
+    """Given states [M] of a bank, as they are, at full gravity; ``state`` counts the bank's own rows."""
+
+    def tensor(array: np.ndarray) -> Tensor:
+        return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)
+
+    sequence = bank.sequence_index[rows]
+    return Reset(
+        joint_pos=tensor(bank.joint_pos[rows]),
+        object_pos=tensor(bank.object_pos[rows]),
+        object_quat=tensor(bank.object_quat_wxyz[rows]),
+        goal_pos=tensor(bank.goal_pos[sequence]),
+        goal_quat=tensor(bank.goal_quat_wxyz[sequence]),
+        gravity_fraction=torch.ones(len(rows)),
+        state=torch.as_tensor(rows, dtype=torch.long),
+        sequence=torch.as_tensor(sequence, dtype=torch.long),
+    )
+
+
 class ResetDistribution:
     """Draws resets for worlds of given objects from a bank; all tensors live on one device, nothing is copied per draw.
 

@@ -1,0 +1,219 @@
+"""From which demonstrated states a policy reaches the goal: what it can do already, and where its training is stuck.
+
+Demonstrated states are the stages of the task from its end backwards: held at the goal, lifted, touched, approached. A policy learns them in
+about that order, so the first stage from which it fails is what training has to discover next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from xreset.backends import make_backend
+from xreset.backends.registry import backend_class
+from xreset.env import ManipulationEnv, make_scene
+from xreset.eval.evaluate import Subject
+from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
+from xreset.errors import DemoError
+from xreset.files import file_hash, write_json
+from xreset.objects import keypoints, load_objects
+from xreset.policy import Policy
+from xreset.resets.bank import ResetBank, check_objects, read_bank
+from xreset.schedule import schedule
+from xreset.spec import ObjectSpec, RobotSpec
+from xreset.task.config import TaskConfig, evaluation_task
+from xreset.task.resets import ResetDistribution, bank_starts
+from xreset.task.terminations import out_of_bounds
+
+SCHEMA = "xreset-frontier/1"
+
+NEAR = (0.20, 0.05, 0.02)
+"""Distances of the nearest fingertip from the object's surface that divide the approach [m]."""
+LIFT, HIGH = 0.01, 0.10
+"""Heights of the object's origin above the demonstration's start from which it counts as lifted, and as lifted high [m]."""
+STAGES = (
+    "hand over 20 cm away",
+    "hand 5 to 20 cm away",
+    "hand 2 to 5 cm away",
+    "hand under 2 cm away",
+    "lifted by 1 to 10 cm",
+    "lifted by over 10 cm",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tried:
+    """What became of one demonstrated state."""
+
+    state: int
+    """Its row in the bank."""
+    sequence_name: str
+    frame: int
+    object: str
+    stage: str
+    """One of :data:`STAGES`."""
+    reached: bool
+    """Whether the object was at the goal at any time."""
+    stayed: bool
+    """Whether it was there at the episode's end."""
+
+
+def stage_of(tip_distance: np.ndarray, lift: np.ndarray) -> np.ndarray:
+    """[M] index into :data:`STAGES`.
+
+    Args:
+        tip_distance: [M] distance of the nearest fingertip from the object's surface [m].
+        lift: [M] height of the object's origin above where the demonstration began [m].
+    """
+    on_table = sum((tip_distance <= edge).astype(int) for edge in NEAR)
+    return np.where(lift < LIFT, on_table, np.where(lift < HIGH, 4, 5))
+
+
+def try_policy(
+    policy: Policy,
+    backend_name: str,
+    robot: RobotSpec,
+    objects: tuple[ObjectSpec, ...],
+    bank: ResetBank,
+    task: TaskConfig,
+    rows: np.ndarray,
+    *,
+    num_envs: int,
+    device: str = "cpu",
+    metrics: MetricsConfig | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Tried]:
+    """Let a policy go on from states of a bank, at rest and at full gravity, for one episode each.
+
+    Args:
+        policy: what acts.
+        backend_name: engine.
+        robot: robot.
+        objects: objects of the bank's sequences.
+        bank: the states.
+        task: usually :func:`xreset.task.config.evaluation_task` of the policy's own.
+        rows: [M] states to try.
+        num_envs: worlds at a time.
+        device: of GPU engines.
+        metrics: thresholds.
+        progress: called with (control steps done, control steps in all).
+    """
+    names = tuple(o.name for o in objects)
+    plan = schedule(np.array([names.index(name) for name in bank.object_name[rows]]), num_envs)
+    worlds = torch.as_tensor(plan.object_index)
+    found: dict[int, Tried] = {}
+    scene = make_scene(robot, objects, task)
+    with make_backend(backend_name, scene, len(worlds), object_index=worlds, device=device) as backend:
+        env = ManipulationEnv(backend, task, ResetDistribution(bank, robot, names, task.reset, backend.device))
+        points = torch.stack([torch.as_tensor(keypoints(o), dtype=torch.float32) for o in objects]).to(backend.device)[backend.object_index]
+        for number, (items, fresh) in enumerate(plan):
+            chosen = rows[items]
+            env.reset(start=bank_starts(bank, chosen).to(backend.device))
+            policy.begin(env)
+            reading = env.reading()
+            lift = bank.object_pos[chosen, 2] - bank.start_pos[bank.sequence_index[chosen], 2]
+            stage = stage_of(reading.tip_distance.amin(dim=-1).cpu().numpy(), lift)
+            result = EpisodeMetrics(reading, env.goal_pos, env.goal_quat, points, metrics or MetricsConfig())
+            for step in range(env.max_episode_length):
+                reading, _ = env.advance(policy.act(env.get_observations()))
+                result.update(reading, out_of_bounds(reading.state.object_pos, scene.table, task.termination))
+                progress(number * env.max_episode_length + step + 1, len(plan.rounds) * env.max_episode_length)
+            for world in np.flatnonzero(fresh):
+                row = int(chosen[world])
+                found[row] = Tried(
+                    state=row,
+                    sequence_name=str(bank.sequence_name[bank.sequence_index[row]]),
+                    frame=int(bank.frame_index[row]),
+                    object=str(bank.object_name[row]),
+                    stage=STAGES[stage[world]],
+                    reached=bool(result.reorient_once[world]),
+                    stayed=bool(result.reorient[world]),
+                )
+    return [found[row] for row in sorted(found)]
+
+
+def by_stage(tried: list[Tried]) -> list[dict[str, Any]]:
+    """One entry per stage that has states: its name, how many were tried, and the shares that reached the goal and stayed there."""
+    out = []
+    for stage in STAGES:
+        mine = [t for t in tried if t.stage == stage]
+        if mine:
+            reached, stayed = (round(float(np.mean([getattr(t, what) for t in mine])), 6) for what in ("reached", "stayed"))
+            out.append({"stage": stage, "states": len(mine), "reached": reached, "stayed": stayed})
+    return out
+
+
+def frontier(
+    subject: Subject,
+    backends: list[str],
+    resets: Path,
+    *,
+    states: int,
+    seed: int,
+    num_envs: int,
+    device: str,
+    objects_folder: Path | None,
+    out: Path,
+    progress: Callable[[str, int, int], None] = lambda name, done, total: None,
+) -> list[dict[str, Any]]:
+    """Try states of a bank in each engine and write ``OUT/BACKEND.json``.
+
+    Args:
+        subject: what to try.
+        backends: engines; all are checked before the first rollout.
+        resets: reset bank.
+        states: how many to draw from it, without repetition; all if it has fewer.
+        seed: of the draw.
+        num_envs: worlds at a time.
+        device: where GPU engines run.
+        objects_folder: folder of meshes; None: the policy's own, or the stand-ins.
+        out: folder for the results.
+        progress: called with (engine, control steps done, control steps in all).
+
+    Returns:
+        What was written, in the order of ``backends``.
+
+    Raises:
+        DemoError: the bank holds no state.
+    """
+    versions = {name: backend_class(name).engine_version() for name in backends}
+    bank = read_bank(resets, robot=subject.robot)
+    if not bank.num_states:
+        raise DemoError(f"{resets} holds no state to try: every candidate was rejected. Look at its reasons (xreset resets).")
+    folder = objects_folder or (Path(subject.objects_folder) if subject.objects_folder else None)
+    objects = tuple(load_objects(sorted({*map(str, bank.sequence_object)}), folder))
+    check_objects(resets, bank, objects)
+    rows = np.sort(np.random.default_rng(seed).permutation(bank.num_states)[:states])
+    written = []
+    for name in backends:
+        tried = try_policy(
+            subject.policy(subject.robot, None),
+            name,
+            subject.robot,
+            objects,
+            bank,
+            evaluation_task(subject.task),
+            rows,
+            num_envs=num_envs,
+            device=device if "cuda" in backend_class(name).devices() else "cpu",
+            progress=lambda done, total, name=name: progress(name, done, total),
+        )
+        content = {
+            "schema": SCHEMA,
+            "backend": name,
+            "backend_version": versions[name],
+            "robot": subject.robot.name,
+            "policy": subject.label,
+            "seed": seed,
+            "inputs": subject.inputs | {"resets": file_hash(resets)},
+            "stages": by_stage(tried),
+            "tried": [asdict(t) for t in tried],
+        }
+        write_json(out / f"{name}.json", content)
+        written.append(content)
+    return written

@@ -1,0 +1,80 @@
+"""``xreset frontier``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def frontier(
+    policy: Annotated[str, tyro.conf.Positional],
+    *,
+    resets: Path,
+    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),  # a default would be appended to
+    states: int = 400,
+    seed: int = 0,
+    robot: str | None = None,
+    objects: Path | None = None,
+    num_envs: int = 64,
+    device: str = "cpu",
+    out: Path | None = None,
+) -> None:
+    """Tell from which demonstrated states a policy reaches the goal: what it can do, and where its training is stuck.
+
+    Args:
+        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or the baseline zero or
+            random.
+        resets: Reset bank (xreset resets) whose states are tried, at full gravity.
+        backend: Physics engine; give it again for more engines. Default: mujoco.
+        states: How many of its states are tried.
+        seed: Seed of their choice.
+        robot: Name or folder of the robot; default: the policy's.
+        objects: Folder of real meshes; default: what the policy was trained with, else the stand-ins.
+        num_envs: Worlds at a time.
+        device: Where GPU engines run: cpu or cuda.
+        out: Folder for the results; default: frontier/ in the run folder or beside the policy.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
+
+    from xreset.errors import PolicyError, XResetError
+    from xreset.eval.evaluate import resolve
+    from xreset.eval.frontier import frontier
+
+    if states < 1 or num_envs < 1:
+        raise XResetError(f"--states and --num-envs must be at least 1, found {states} and {num_envs}.")
+    if policy == "ik":
+        raise PolicyError("ik follows a demonstration from its beginning and cannot go on from a state. Give a policy, zero or random.")
+    backends = list(dict.fromkeys(backend)) or ["mujoco"]
+    console = Console()
+    subject = resolve(policy, robot, seed)
+    folder = out or subject.folder.parent / "frontier"
+    with Progress(console=console, transient=True) as bar:
+        tasks = {name: bar.add_task(name, total=None) for name in backends}
+        results = frontier(
+            subject,
+            backends,
+            resets,
+            states=states,
+            seed=seed,
+            num_envs=num_envs,
+            device=device,
+            objects_folder=objects,
+            out=folder,
+            progress=lambda name, done, total: bar.update(tasks[name], completed=done, total=total),
+        )
+    title = f"{subject.label} on {subject.robot.name}, from {len(results[0]['tried'])} demonstrated states\nat the goal at any time / at the end"
+    table = Table("the episode begins with", title=title, title_justify="left")
+    table.add_column("states", justify="right")
+    for result in results:
+        table.add_column(result["backend"], justify="right", no_wrap=True)
+    for rows in zip(*(result["stages"] for result in results), strict=True):
+        table.add_row(rows[0]["stage"], str(rows[0]["states"]), *(f"{row['reached']:.0%} / {row['stayed']:.0%}" for row in rows))
+    console.print(table)
+    console.print(f"results in {folder}")
+
+
+COMMAND = frontier

@@ -1,7 +1,7 @@
 """From which demonstrated states a policy reaches the goal: what it can do already, and where its training is stuck.
 
-Demonstrated states are the stages of the task from its end backwards: held at the goal, lifted, touched, approached. A policy learns them in
-about that order, so the first stage from which it fails is what training has to discover next.
+Demonstrated states are the stages of the task from its end backwards: held at the goal, lifted, touched, approached. A policy learns them
+in about that order, so the first stage from which it fails is what training has to discover next.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import torch
 from xreset.backends import make_backend
 from xreset.backends.registry import backend_class
 from xreset.env import ManipulationEnv, make_scene
+from xreset.errors import DemoError
 from xreset.eval.evaluate import Subject
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
-from xreset.errors import DemoError
 from xreset.files import file_hash, write_json
 from xreset.objects import keypoints, load_objects
 from xreset.policy import Policy

@@ -98,8 +98,10 @@ class FrontierTest(unittest.TestCase):
         self.assertEqual([t["state"] for t in tried], list(range(6)))
         self.assertEqual([t["object"] for t in tried], self.names)
         self.assertEqual([t["frame"] for t in tried], self.bank.frame_index.tolist())
-        self.assertEqual([t["reached"] for t in tried], [False, True, False, False, True, False], "it is there, or falls from there")
-        self.assertEqual([t["stayed"] for t in tried], [False, True, False, False, False, False], "at full gravity nothing stays in the air")
+        self.assertEqual([t["reached"] for t in tried], [False, True, False, False, True, False], "there, or falling from there")
+        self.assertEqual(
+            [t["stayed"] for t in tried], [False, True, False, False, False, False], "at full gravity nothing stays in the air"
+        )
         self.assertEqual(tried[4]["stage"], "lifted by over 10 cm")
         self.assertEqual(sum(row["states"] for row in result["stages"]), 6)
 
@@ -117,7 +119,10 @@ class FrontierTest(unittest.TestCase):
             self.run_frontier(empty)
 
     def test_the_command_refuses_what_cannot_go_on_from_a_state(self):
-        for arguments, words in ((("ik", "--robot", "ur7e-sharpa"), "cannot go on from a state"), (("zero", "--states", "0"), "at least 1")):
+        for arguments, words in (
+            (("ik", "--robot", "ur7e-sharpa"), "cannot go on from a state"),
+            (("zero", "--states", "0"), "at least 1"),
+        ):
             err = io.StringIO()
             with self.subTest(words), contextlib.redirect_stderr(err), self.assertRaises(SystemExit):
                 main(["frontier", *arguments, "--resets", str(self.resets)])

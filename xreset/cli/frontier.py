@@ -66,8 +66,8 @@ def frontier(
             out=folder,
             progress=lambda name, done, total: bar.update(tasks[name], completed=done, total=total),
         )
-    title = f"{subject.label} on {subject.robot.name}, from {len(results[0]['tried'])} demonstrated states\nat the goal at any time / at the end"
-    table = Table("the episode begins with", title=title, title_justify="left")
+    title = f"{subject.label} on {subject.robot.name}, from {len(results[0]['tried'])} demonstrated states"
+    table = Table("the episode begins with", title=f"{title}\nat the goal at any time / at the end", title_justify="left")
     table.add_column("states", justify="right")
     for result in results:
         table.add_column(result["backend"], justify="right", no_wrap=True)

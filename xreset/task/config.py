@@ -124,11 +124,11 @@ class ResetConfig:
     demo_probability: float = 0.5
     """p: share of resets from the bank; 0 is X-Sim."""
     frontier: float = 0.0
-    """Share of bank resets drawn where the policy sometimes reaches the goal and sometimes does not: in proportion to s (1 - s), where s is the
-    share of recent episodes from a state that reached it. The others are drawn evenly, the paper's choice. That product is known as
+    """Share of bank resets drawn where the policy sometimes reaches the goal and sometimes does not: in proportion to s (1 - s), s being
+    the share of recent episodes from a state that reached it. The others are drawn evenly, as in the paper. That product is known as
     learnability (Tzannetos et al. 2023, Proximal Curriculum; Rutherford et al. 2024, No Regrets)."""
     frontier_rate: float = 0.1
-    """Weight of one episode in s."""
+    """Weight of an episode in s."""
     pre_contact_only: bool = False
     """Use only bank states before first contact."""
     random_gravity: bool = True

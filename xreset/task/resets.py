@@ -210,9 +210,7 @@ class ResetDistribution:
         """
         told = ended & (state >= 0)
         row = torch.where(told, state, 0)
-        episodes, hits = (
-            torch.zeros_like(self.reached).index_add_(0, row, what.to(self.reached.dtype)) for what in (told, told & reached)
-        )
+        episodes, hits = (torch.zeros_like(self.reached).index_add_(0, row, what.to(self.reached.dtype)) for what in (told, told & reached))
         fresh = 1.0 - (1.0 - self.config.frontier_rate) ** episodes
         self.reached += fresh * (hits / episodes.clamp_min(1.0) - self.reached)
 

@@ -297,6 +297,8 @@ class ResetTest(WithRobot):
         for _ in range(100):
             resets.learn(state, ended, reached)
         torch.testing.assert_close(resets.reached, torch.tensor([2 / 3, 0.0, 1.0, 0.5, 0.5, 0.5]), atol=1e-4, rtol=0)
+        empty = self.distribution(bank=toy_bank(self.robot).select(sequences=np.zeros(3, dtype=bool)), frontier=0.5)
+        empty.learn(torch.full((7,), -1), ended, reached)
 
     def test_an_object_without_demonstration_is_an_error(self):
         with self.assertRaisesRegex(DemoError, "no demonstration of 011_banana; it has 005_tomato_soup_can, 010_potted_meat_can"):

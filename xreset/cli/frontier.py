@@ -42,7 +42,7 @@ def frontier(
 
     from xreset.errors import PolicyError, XResetError
     from xreset.eval.evaluate import resolve
-    from xreset.eval.frontier import frontier
+    from xreset.eval.frontier import STAGES, frontier
 
     if states < 1 or num_envs < 1:
         raise XResetError(f"--states and --num-envs must be at least 1, found {states} and {num_envs}.")
@@ -66,13 +66,14 @@ def frontier(
             out=folder,
             progress=lambda name, done, total: bar.update(tasks[name], completed=done, total=total),
         )
-    title = f"{subject.label} on {subject.robot.name}, from {len(results[0]['tried'])} demonstrated states"
-    table = Table("the episode begins with", title=f"{title}\nat the goal at any time / at the end", title_justify="left")
-    table.add_column("states", justify="right")
+    title = f"{subject.label} on {subject.robot.name} goes on from {len(results[0]['tried'])} demonstrated states:"
+    table = Table("the episode begins with", title=f"{title}\nof them, at the goal at any time / at the end", title_justify="left")
     for result in results:
         table.add_column(result["backend"], justify="right", no_wrap=True)
-    for rows in zip(*(result["stages"] for result in results), strict=True):
-        table.add_row(rows[0]["stage"], str(rows[0]["states"]), *(f"{row['reached']:.0%} / {row['stayed']:.0%}" for row in rows))
+    for stage in STAGES:  # (a state at the edge between two stages may count to another one in another engine)
+        rows = [next((row for row in result["stages"] if row["stage"] == stage), None) for result in results]
+        if any(rows):
+            table.add_row(stage, *(f"{row['states']}: {row['reached']:.0%} / {row['stayed']:.0%}" if row else "-" for row in rows))
     console.print(table)
     console.print(f"results in {folder}")
 

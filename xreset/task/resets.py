@@ -208,6 +208,8 @@ class ResetDistribution:
             ended: [M] bool, whether it has ended; the others are left out.
             reached: [M] bool, whether it reached the goal.
         """
+        if not len(self.reached):
+            return
         told = ended & (state >= 0)
         row = torch.where(told, state, 0)
         episodes, hits = (torch.zeros_like(self.reached).index_add_(0, row, what.to(self.reached.dtype)) for what in (told, told & reached))

@@ -48,6 +48,15 @@ class Subject:
     """Folder of meshes that it was trained with."""
     inputs: dict[str, str]
 
+    def meshes(self, given: Path | None) -> Path | None:
+        """The folder of meshes to use: the given one, else its own; None: the stand-ins."""
+        return given or (Path(self.objects_folder) if self.objects_folder else None)
+
+
+def device_of(backend: str, device: str) -> str:
+    """Where an engine runs, if those that can use a GPU run on ``device``."""
+    return device if "cuda" in backend_class(backend).devices() else "cpu"
+
 
 def resolve(policy: str, robot: str | None, seed: int) -> Subject:
     """Find out what ``RUN | POLICY.onnx | NAME | zero | random | ik`` means, where NAME is a policy that ships with xreset.
@@ -157,10 +166,10 @@ def evaluate(
         The summaries that were written, in the order of ``backends``.
     """
     versions = {name: backend_class(name).engine_version() for name in backends}
-    folder = objects_folder or (Path(subject.objects_folder) if subject.objects_folder else None)
+    folder = subject.meshes(objects_folder)
     bank, trajectories = load_motion(demos, subject.robot, folder, trajectories=subject.label == "ik")
     objects: tuple[ObjectSpec, ...] = tuple(load_objects(sorted({*map(str, bank.sequence_object)}), folder))
-    task = evaluation_task(subject.task)
+    task, inputs = evaluation_task(subject.task), subject.inputs | {"demos": file_hash(demos)}
     summaries = []
     for name in backends:
         rollouts = roll_out(
@@ -173,7 +182,7 @@ def evaluate(
             repetitions=episodes,
             seed=seed,
             num_envs=num_envs,
-            device=device if "cuda" in backend_class(name).devices() else "cpu",
+            device=device_of(name, device),
             progress=lambda done, total, name=name: progress(name, done, total),
         )
         summary = summarize(
@@ -184,7 +193,7 @@ def evaluate(
             policy=subject.label,
             seed=seed,
             repetitions=episodes,
-            inputs=subject.inputs | {"demos": file_hash(demos)},
+            inputs=inputs,
             objects_folder=str(folder) if folder else None,
         )
         write_results(out, summary, rollouts, subject.robot.joint_names)

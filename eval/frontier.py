@@ -16,19 +16,19 @@ import torch
 
 from xreset.backends import make_backend
 from xreset.backends.registry import backend_class
-from xreset.env import ManipulationEnv, make_scene
+from xreset.env import ManipulationEnv, Reading, make_scene
 from xreset.errors import DemoError
-from xreset.eval.evaluate import Subject
-from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
+from xreset.eval.evaluate import Subject, device_of
+from xreset.eval.metrics import MetricsConfig
+from xreset.eval.rollout import play, world_keypoints
 from xreset.files import file_hash, write_json
-from xreset.objects import keypoints, load_objects
+from xreset.objects import load_objects
 from xreset.policy import Policy
 from xreset.resets.bank import ResetBank, check_objects, read_bank
 from xreset.schedule import schedule
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
 from xreset.task.resets import ResetDistribution, bank_starts
-from xreset.task.terminations import out_of_bounds
 
 SCHEMA = "xreset-frontier/1"
 
@@ -85,7 +85,6 @@ def try_policy(
     *,
     num_envs: int,
     device: str = "cpu",
-    metrics: MetricsConfig | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Tried]:
     """Let a policy go on from states of a bank, at rest and at full gravity, for one episode each.
@@ -100,7 +99,6 @@ def try_policy(
         rows: [M] states to try.
         num_envs: worlds at a time.
         device: of GPU engines.
-        metrics: thresholds.
         progress: called with (control steps done, control steps in all).
     """
     names = tuple(o.name for o in objects)
@@ -110,19 +108,18 @@ def try_policy(
     scene = make_scene(robot, objects, task)
     with make_backend(backend_name, scene, len(worlds), object_index=worlds, device=device) as backend:
         env = ManipulationEnv(backend, task, ResetDistribution(bank, robot, names, task.reset, backend.device))
-        points = torch.stack([torch.as_tensor(keypoints(o), dtype=torch.float32) for o in objects]).to(backend.device)[backend.object_index]
+        points = world_keypoints(objects, backend)
         for number, (items, fresh) in enumerate(plan):
             chosen = rows[items]
             env.reset(start=bank_starts(bank, chosen).to(backend.device))
-            policy.begin(env)
-            reading = env.reading()
             lift = bank.object_pos[chosen, 2] - bank.start_pos[bank.sequence_index[chosen], 2]
-            stage = stage_of(reading.tip_distance.amin(dim=-1).cpu().numpy(), lift)
-            result = EpisodeMetrics(reading, env.goal_pos, env.goal_quat, points, metrics or MetricsConfig())
-            for step in range(env.max_episode_length):
-                reading, _ = env.advance(policy.act(env.get_observations()))
-                result.update(reading, out_of_bounds(reading.state.object_pos, scene.table, task.termination))
-                progress(number * env.max_episode_length + step + 1, len(plan.rounds) * env.max_episode_length)
+            stage = stage_of(env.reading().tip_distance.amin(dim=-1).cpu().numpy(), lift)
+
+            def look(step: int, _: Reading, number: int = number) -> None:
+                if step:
+                    progress(number * env.max_episode_length + step, len(plan.rounds) * env.max_episode_length)
+
+            result, _ = play(policy, env, points, MetricsConfig(), look)
             for world in np.flatnonzero(fresh):
                 row = int(chosen[world])
                 found[row] = Tried(
@@ -185,10 +182,10 @@ def frontier(
     bank = read_bank(resets, robot=subject.robot)
     if not bank.num_states:
         raise DemoError(f"{resets} holds no state to try: every candidate was rejected. Look at its reasons (xreset resets).")
-    folder = objects_folder or (Path(subject.objects_folder) if subject.objects_folder else None)
-    objects = tuple(load_objects(sorted({*map(str, bank.sequence_object)}), folder))
+    objects = tuple(load_objects(sorted({*map(str, bank.sequence_object)}), subject.meshes(objects_folder)))
     check_objects(resets, bank, objects)
     rows = np.sort(np.random.default_rng(seed).permutation(bank.num_states)[:states])
+    task, inputs = evaluation_task(subject.task), subject.inputs | {"resets": file_hash(resets)}
     written = []
     for name in backends:
         tried = try_policy(
@@ -197,10 +194,10 @@ def frontier(
             subject.robot,
             objects,
             bank,
-            evaluation_task(subject.task),
+            task,
             rows,
             num_envs=num_envs,
-            device=device if "cuda" in backend_class(name).devices() else "cpu",
+            device=device_of(name, device),
             progress=lambda done, total, name=name: progress(name, done, total),
         )
         content = {
@@ -210,7 +207,7 @@ def frontier(
             "robot": subject.robot.name,
             "policy": subject.label,
             "seed": seed,
-            "inputs": subject.inputs | {"resets": file_hash(resets)},
+            "inputs": inputs,
             "stages": by_stage(tried),
             "tried": [asdict(t) for t in tried],
         }

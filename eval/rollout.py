@@ -11,7 +11,7 @@ import torch
 
 from xreset.backends import make_backend
 from xreset.backends.base import Backend
-from xreset.env import ManipulationEnv, make_scene
+from xreset.env import ManipulationEnv, Reading, make_scene
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
 from xreset.objects import keypoints
 from xreset.policy import Policy
@@ -135,30 +135,62 @@ def roll_out(
         on_cpu = ResetDistribution(demos, robot, names, task.reset)
         resets = on_cpu if backend.device.type == "cpu" else ResetDistribution(demos, robot, names, task.reset, backend.device)
         env = ManipulationEnv(backend, task, resets, seed=seed)
-        points = torch.stack([torch.as_tensor(keypoints(o), dtype=torch.float32) for o in objects]).to(backend.device)[backend.object_index]
+        points = world_keypoints(objects, backend)
         every = max(1, round(trace_interval / scene.control_dt))
         for number, (items, fresh) in enumerate(plan):
             env.reset(start=episode_starts(on_cpu, sequences[items], repetition[items], seed).to(backend.device))
-            policy.begin(env)
-            reading = env.reading()
-            result = EpisodeMetrics(reading, env.goal_pos, env.goal_quat, points, metrics or MetricsConfig())
             recorder = _Recorder([int(w) for w in np.flatnonzero(fresh & np.isin(items, recorded))])
-            recorder.add(0.0, reading)
-            for step in range(env.max_episode_length):
-                before = time.perf_counter()
-                reading, _ = env.advance(policy.act(env.get_observations()))
-                recorder.add_targets(env.joint_target)
-                result.update(reading, out_of_bounds(reading.state.object_pos, scene.table, task.termination))
-                spent += time.perf_counter() - before
-                if (step + 1) % every == 0:
-                    recorder.add((step + 1) * scene.control_dt, reading)
-                progress(number * env.max_episode_length + step + 1, len(plan.rounds) * env.max_episode_length)
+
+            def look(step: int, reading: Reading, number: int = number, recorder: _Recorder = recorder) -> None:
+                if step:
+                    recorder.add_targets(env.joint_target)
+                if step % every == 0:
+                    recorder.add(step * scene.control_dt, reading)
+                if step:
+                    progress(number * env.max_episode_length + step, len(plan.rounds) * env.max_episode_length)
+
+            result, seconds = play(policy, env, points, metrics or MetricsConfig(), look)
+            spent += seconds
             steps += env.max_episode_length * backend.num_worlds
             traces += recorder.traces(env, names)
             for world in np.flatnonzero(fresh):
                 found[int(items[world])] = _episode(result, int(world), int(sequences[items[world]]), int(repetition[items[world]]), demos)
     episodes = tuple(found[i] for i in sorted(found))
     return Rollouts(episodes=episodes, traces=tuple(sorted(traces, key=lambda t: t.sequence)), control_steps_per_second=steps / spent)
+
+
+def world_keypoints(objects: tuple[ObjectSpec, ...], backend: Backend) -> torch.Tensor:
+    """[N, 4, 3] keypoints of each world's object, in its frame."""
+    points = torch.stack([torch.as_tensor(keypoints(o), dtype=torch.float32) for o in objects])
+    return points.to(backend.device)[backend.object_index]
+
+
+def play(
+    policy: Policy, env: ManipulationEnv, points: torch.Tensor, metrics: MetricsConfig, look: Callable[[int, Reading], None]
+) -> tuple[EpisodeMetrics, float]:
+    """One episode in every world, from where it is now.
+
+    Args:
+        policy: what acts; it begins anew.
+        env: the worlds, just reset.
+        points: [N, 4, 3] (:func:`world_keypoints`).
+        metrics: thresholds.
+        look: called with (steps done, reading), first at the start and then after every control step.
+
+    Returns:
+        What was reached, and the seconds that it took without ``look``.
+    """
+    policy.begin(env)
+    reading, spent = env.reading(), 0.0
+    result = EpisodeMetrics(reading, env.goal_pos, env.goal_quat, points, metrics)
+    look(0, reading)
+    for step in range(1, env.max_episode_length + 1):
+        before = time.perf_counter()
+        reading, _ = env.advance(policy.act(env.get_observations()))
+        result.update(reading, out_of_bounds(reading.state.object_pos, env.backend.scene.table, env.task.termination))
+        spent += time.perf_counter() - before
+        look(step, reading)
+    return result, spent
 
 
 def episode_starts(on_cpu: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int) -> Reset:

@@ -98,7 +98,7 @@ def from_policy(
         progress: called with (control steps done, control steps in all).
     """
     subject = resolve(policy, robot, seed)
-    folder = objects or (Path(subject.objects_folder) if subject.objects_folder else None)
+    folder = subject.meshes(objects)
     bank, trajectories = load_motion(demos, subject.robot, folder, trajectories=subject.label == "ik")
     name = _object(demos, object_name, dict.fromkeys(bank.sequence_object.tolist()))
     mine = np.flatnonzero(bank.sequence_object == name)

@@ -71,7 +71,7 @@ def attribute(
     console = Console()
     subject = resolve(policy, robot, seed)
     a, b = engine(backend, device=device), engine(towards, device=device)
-    folder = objects or (Path(subject.objects_folder) if subject.objects_folder else None)
+    folder = subject.meshes(objects)
     bank, trajectories = load_motion(demos, subject.robot, folder, trajectories=subject.label == "ik")
     there = sorted({*map(str, bank.sequence_object)})
     if unknown := sorted(set(object) - set(there)):

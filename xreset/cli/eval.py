@@ -38,8 +38,8 @@ def evaluate(
             xreset, runs/BASELINE-ROBOT/eval for a baseline.
     """
     from rich.console import Console
-    from rich.progress import Progress
 
+    from xreset.cli._bars import engine_bars
     from xreset.errors import XResetError
     from xreset.eval.evaluate import evaluate, resolve
     from xreset.eval.table import rich_table
@@ -50,8 +50,7 @@ def evaluate(
     console = Console()
     subject = resolve(policy, robot, seed)
     folder = out or subject.folder
-    with Progress(console=console, transient=True) as bar:
-        tasks = {name: bar.add_task(name, total=None) for name in backends}
+    with engine_bars(console, backends) as progress:
         summaries = evaluate(
             subject,
             backends,
@@ -62,7 +61,7 @@ def evaluate(
             device=device,
             objects_folder=objects,
             out=folder,
-            progress=lambda name, done, total: bar.update(tasks[name], completed=done, total=total),
+            progress=progress,
         )
     console.print(rich_table(summaries))
     console.print(f"results in {folder}")

@@ -37,9 +37,9 @@ def frontier(
         out: Folder for the results; default: frontier/ in the run folder or beside the policy.
     """
     from rich.console import Console
-    from rich.progress import Progress
     from rich.table import Table
 
+    from xreset.cli._bars import engine_bars
     from xreset.errors import PolicyError, XResetError
     from xreset.eval.evaluate import resolve
     from xreset.eval.frontier import STAGES, frontier
@@ -52,8 +52,7 @@ def frontier(
     console = Console()
     subject = resolve(policy, robot, seed)
     folder = out or subject.folder.parent / "frontier"
-    with Progress(console=console, transient=True) as bar:
-        tasks = {name: bar.add_task(name, total=None) for name in backends}
+    with engine_bars(console, backends) as progress:
         results = frontier(
             subject,
             backends,
@@ -64,7 +63,7 @@ def frontier(
             device=device,
             objects_folder=objects,
             out=folder,
-            progress=lambda name, done, total: bar.update(tasks[name], completed=done, total=total),
+            progress=progress,
         )
     title = f"{subject.label} on {subject.robot.name} goes on from {len(results[0]['tried'])} demonstrated states:"
     table = Table("the episode begins with", title=f"{title}\nof them, at the goal at any time / at the end", title_justify="left")

@@ -23,10 +23,11 @@ from tests.toy_bank import SOUP, SPAM, toy_bank
 from xreset import robots
 from xreset.backends import make_backend
 from xreset.cli import main
-from xreset.errors import FileFormatError, RunError
+from xreset.errors import FileFormatError, PolicyError, RunError
+from xreset.files import file_hash
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
-from xreset.learning.runner import _stop_on_interrupt, read_checkpoint
+from xreset.learning.runner import TrainingRunner, _stop_on_interrupt, read_checkpoint
 from xreset.learning.train import ensure_policy, load_inputs, resumed, start_run, train
 from xreset.policy import OnnxPolicy, check_contract
 from xreset.resets.bank import write_bank
@@ -203,11 +204,44 @@ class TrainingTest(unittest.TestCase):
             (("--like", "nothing"), "no recipe and no run folder 'nothing'. Recipes: paper, the paper's tables .*; minutes, what taught"),
             (("--like", str(self.folder)), "is not a run folder"),
             (("--like", "minutes", "--resume"), "leave out --like"),
+            (("--weights", str(self.out), "--resume"), "leave out --weights"),
             (("--minutes", "0"), "--minutes is 0.0, expected more than 0"),
         ):
             with self.subTest(arguments), redirect_stderr(io.StringIO()) as said, self.assertRaises(SystemExit):
                 parsed(*arguments)
             self.assertRegex(said.getvalue(), problem)
+
+    def test_a_run_begins_with_the_networks_of_another(self):
+        out, still = self.folder / "onwards", replace(CONFIG, ppo=replace(CONFIG.ppo, learning_rate=1e-12, schedule="fixed"), iterations=1)
+        info = self.start(out, config=still, weights=self.out)
+        given = latest_checkpoint(self.out)
+        self.assertEqual((info.weights, info.weights_hash), (str(given), file_hash(given)))
+        self.assertEqual(read_run(out), info)
+        train_only(out, info)
+        content, before = read_checkpoint(latest_checkpoint(out)), read_checkpoint(given)
+        self.assertEqual((content["iteration"], content["env_steps"]), (1, 8 * 4))  # counters begin anew
+        for networks in ("actor_state_dict", "critic_state_dict"):
+            for name, value in before[networks].items():
+                if "normalizer" not in name:  # which goes on to learn
+                    torch.testing.assert_close(content[networks][name], value, msg=name)
+        count = next(name for name in before["actor_state_dict"] if name.endswith("normalizer.count"))
+        self.assertEqual(int(content["actor_state_dict"][count]), int(before["actor_state_dict"][count]) + 8 * 4)
+
+    def test_an_adaptive_learning_rate_goes_on_with_the_networks(self):
+        runner = mock.Mock(device="cpu", train_config=CONFIG)
+        path = latest_checkpoint(self.out)
+        TrainingRunner.load_networks(runner, path)
+        self.assertEqual(runner.alg.learning_rate, read_checkpoint(path)["learning_rate"])
+
+    def test_networks_that_do_not_fit_are_refused(self):
+        with self.assertRaisesRegex(RunError, "is not a run folder"):
+            self.start(self.folder / "a", weights=self.folder)
+        task = replace(CONFIG.task, observation=replace(CONFIG.task.observation, cloud_history=3))
+        with self.assertRaisesRegex(PolicyError, "another observation layout"):
+            self.start(self.folder / "b", config=replace(CONFIG, task=task), weights=self.out)
+        with self.assertRaisesRegex(RunError, "'lstm': 12.*'lstm': 16.*--like"):
+            self.start(self.folder / "c", config=replace(CONFIG, model=replace(CONFIG.model, lstm=16)), weights=self.out)
+        self.assertFalse([name for name in "abc" if (self.folder / name).exists()])
 
     def test_a_run_ends_when_its_time_is_over_and_can_go_on(self):
         out = self.folder / "timed"

@@ -128,6 +128,7 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, Fact]:
         "objects": Fact(contract.get("objects"), ", ".join(map(short_name, contract.get("objects") or ())) or "-"),
         "meshes": Fact(meshes is None, "stand-ins" if meshes is None else str(meshes)),
         "bank": Fact(bank, f"{Path(run['resets']).name} ({bank[:8]})"),
+        "weights": Fact(run.get("weights_hash"), str(run.get("weights") or "new")),
         "backend": _fact(f"{run.get('backend')} {run.get('backend_version')}"),
         "device": Fact(device.partition(":")[0], device),
         "num_envs": _fact(run.get("num_envs")),

@@ -272,6 +272,8 @@ def _inputs(data: ReportData) -> str:
     lines = {f"SHA-256 of the {name}": value for s in data.summaries[:1] for name, value in s["inputs"].items()}
     if data.run is not None:
         lines |= {"Reset bank": data.run.resets, "SHA-256 of the reset bank": data.run.resets_hash}
+        if data.run.weights is not None:
+            lines |= {"Networks at the beginning": data.run.weights, "SHA-256 of these": str(data.run.weights_hash)}
     if not lines:
         return ""
     items = "".join(f"<div><dt>{escape(k)}</dt><dd><code>{escape(v)}</code></dd></div>" for k, v in lines.items())

@@ -23,6 +23,7 @@ def train(
     seed: int = 0,
     resume: bool = False,
     like: str = "paper",
+    weights: Path | None = None,
     config: TrainConfig = TrainConfig(),  # noqa: B008 (frozen)
 ) -> None:
     """Train a policy.
@@ -41,6 +42,7 @@ def train(
         seed: Seed of every random number.
         resume: Continue the run in --out from its newest checkpoint.
         like: Where the configuration starts from: a recipe (paper, minutes) or another run's folder. Flags change what they name.
+        weights: Another run's folder: begin with the networks of its newest checkpoint, standard deviation included, and not with new ones.
         config: Task, model and algorithm. The defaults shown are those of --like.
     """
     from dataclasses import replace
@@ -52,6 +54,8 @@ def train(
         raise RunError(f"--minutes is {minutes}, expected more than 0.")
     if resume and like != "paper":
         raise RunError("--resume continues with the run's own configuration; leave out --like.")
+    if resume and weights is not None:
+        raise RunError("--resume continues with the run's own networks; leave out --weights, or start another run with it.")
     if resume:
         training.train(out, training.resumed(out, iterations=iterations), resume=True, seconds=60 * minutes)
         return
@@ -68,6 +72,7 @@ def train(
         seed=seed,
         config=config,
         out=out,
+        weights=weights,
     )
     training.train(out, info, inputs, seconds=60 * minutes)
 

@@ -27,6 +27,11 @@ class ModelConfig:
     normalize_observations: bool = True
     """Running normalisation of the flat observations (not of the clouds). Not in the paper; its library's usual setting."""
 
+    @property
+    def layers(self) -> dict[str, Any]:
+        """What networks must share for one to take over the weights of the other."""
+        return {name: getattr(self, name) for name in ("pointnet", "lstm", "mlp", "activation", "normalize_observations")}
+
     def __post_init__(self) -> None:
         check_numbers(self, positive=("lstm", "initial_std"))
         if self.initial_hand_std is not None:

@@ -44,6 +44,10 @@ class RunInfo:
     config: TrainConfig
     contract: dict[str, Any]
     """:func:`xreset.policy.policy_contract`."""
+    weights: str | None = None
+    """Path of the checkpoint whose networks the training began with; None: new ones."""
+    weights_hash: str | None = None
+    """Its SHA-256."""
 
 
 def write_run(folder: Path, info: RunInfo) -> None:

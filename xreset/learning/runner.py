@@ -143,6 +143,16 @@ class TrainingRunner(OnPolicyRunner):
 
         self._continue_worlds()
 
+    def load_networks(self, path: Path) -> None:
+        """Begin with the actor and the critic of another run's checkpoint: weights, normalisation of observations, standard deviation.
+
+        A learning rate that adapts begins where it was there: a new run's would undo in one step what they have learned.
+        """
+        content = read_checkpoint(path, self.device)
+        self.alg.load(content, {"actor": True, "critic": True}, strict=True)
+        if self.train_config.ppo.schedule == "adaptive":
+            self.alg.learning_rate = content["learning_rate"]
+
     def _worlds_state(self) -> dict[str, Any]:
         """Of the worlds of this process, and of the models' memories of them."""
         memories = {"actor": self.alg.actor.get_hidden_state(), "critic": self.alg.critic.get_hidden_state()}

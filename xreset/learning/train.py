@@ -20,7 +20,7 @@ from xreset.learning.export import export_onnx
 from xreset.learning.run import RunInfo, latest_checkpoint, read_run, write_run
 from xreset.learning.runner import TrainingRunner
 from xreset.objects import load_objects
-from xreset.policy import policy_contract
+from xreset.policy import check_contract, policy_contract
 from xreset.resets.bank import ResetBank, check_objects, read_bank
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.resets import ResetDistribution
@@ -56,12 +56,24 @@ def load_inputs(robot: str, resets: str | Path, objects: str | Path | None) -> R
 
 
 def start_run(
-    inputs: RunInputs, *, backend: str, device: str, num_envs: int, seed: int, config: TrainConfig, out: Path,
+    inputs: RunInputs, *, backend: str, device: str, num_envs: int, seed: int, config: TrainConfig, out: Path, weights: Path | None = None,
 ) -> RunInfo:  # fmt: skip
     """Check everything that a training needs and write ``run.json`` (the main process only).
 
+    Args:
+        inputs: the run's files.
+        backend: engine.
+        device: where it and the networks run.
+        num_envs: worlds of each process.
+        seed: of every random number.
+        config: task, model and algorithm.
+        out: the run's folder.
+        weights: another run's folder, whose newest checkpoint gives the networks to begin with; None: new ones.
+
     Raises:
-        RunError: the folder holds a run already, or there is no state to reset to.
+        RunError: the folder holds a run already, there is no state to reset to, or ``weights`` is no run with a checkpoint of networks
+            like these.
+        PolicyError: ``weights`` is of another robot, or its policy observes something else.
     """
     main = Processes.of_environment().is_main
     if main and (out / "run.json").exists():
@@ -72,6 +84,16 @@ def start_run(
             f"{inputs.resets} holds no state to reset to: every candidate was rejected. Look at its reasons (xreset resets), "
             "or train without it: --config.task.reset.demo-probability 0"
         )
+    checkpoint = None
+    if weights is not None:
+        other = read_run(weights)
+        check_contract(str(weights), other.contract, inputs.robot, config.task)
+        if other.config.model.layers != config.model.layers:
+            raise RunError(
+                f"the networks of {weights} have the layers {other.config.model.layers}, this run's {config.model.layers}. "
+                f"Start from its configuration: --like {weights}"
+            )
+        checkpoint = latest_checkpoint(weights)
     info = RunInfo(
         robot=inputs.robot_name,
         resets=str(inputs.resets),
@@ -84,6 +106,8 @@ def start_run(
         seed=seed,
         config=config,
         contract=policy_contract(inputs.robot, config.task, tuple(o.name for o in inputs.objects)),
+        weights=str(checkpoint) if checkpoint else None,
+        weights_hash=file_hash(checkpoint) if checkpoint else None,
     )
     if main:
         write_run(out, info)
@@ -121,6 +145,8 @@ def train(out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: 
                 runner.load_checkpoint(latest_checkpoint(out))
                 if processes.is_main:
                     print(f"continuing after iteration {runner.iteration}", flush=True)
+            elif info.weights is not None:
+                runner.load_networks(Path(info.weights))
             runner.learn(config.iterations, init_at_random_ep_len=config.random_episode_start, seconds=seconds)
             if processes.is_main:
                 export_onnx(runner.alg.get_policy(), out / "policy.onnx", info.contract)  # pyright: ignore[reportArgumentType]

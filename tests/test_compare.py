@@ -391,6 +391,15 @@ class FairnessTest(InFolder):
             self.write_results(name)
         self.assertRegex(self.notes("short", "usual"), r"own task, whose task.termination.episode_seconds differs \(2.5: short; 5: usual\)")
 
+    def test_a_training_that_began_with_the_networks_of_another(self):
+        for name, weights in (("new", None), ("onwards", "runs/joint/checkpoints/000900.pt")):
+            self.write_run(name, weights=weights, weights_hash=weights and "ab" * 32)
+            self.write_results(name)
+        made = self.compare("new", "onwards")
+        expected = "onwards began with the networks of another training (runs/joint/checkpoints/000900.pt): "
+        self.assertEqual([note[: len(expected)] for note in made.notes if "networks" in note], [expected])
+        self.assertIn(["weights", "new", "runs/joint/checkpoints/000900.pt"], [list(row) for row in made.different.body])
+
     def test_what_is_missing(self):
         self.write_results("a", engines=("mujoco", "sapien"))
         self.write_run("b")

@@ -56,6 +56,15 @@ def notes(trainings: Sequence[Training]) -> tuple[str, ...]:
     return tuple(found)
 
 
+def begun(trainings: Sequence[Training]) -> tuple[str, ...]:
+    """Trainings whose curves are not all of their learning."""
+    return tuple(
+        f"{t.label} began with the networks of another training ({fact.text}): its minutes and steps are not all that its policy took."
+        for t in trainings
+        if (fact := t.facts.get("weights")) is not None and fact.value is not None
+    )
+
+
 def health(found: Scores) -> tuple[str, ...]:
     """Episodes in which an engine broke down."""
     return tuple(

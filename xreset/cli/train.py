@@ -42,8 +42,8 @@ def train(
         seed: Seed of every random number.
         resume: Continue the run in --out from its newest checkpoint.
         like: Where the configuration starts from: a recipe (paper, minutes) or another run's folder. Flags change what they name.
-        weights: Another run's folder: begin with the networks of its newest checkpoint, and not with new ones; with their standard deviation
-            and, where it adapts, their learning rate.
+        weights: Another run's folder: begin with the networks of its newest checkpoint, and not with new ones; with their standard
+            deviation and, where it adapts, their learning rate.
         config: Task, model and algorithm. The defaults shown are those of --like.
     """
     from dataclasses import replace

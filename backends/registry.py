@@ -64,6 +64,18 @@ def backend_class(name: str) -> type[Backend]:
     return cls
 
 
+def device_for(name: str, device: str) -> str:
+    """Where a backend runs, if those that can run on ``device`` are to run there: on it, or else on the CPU.
+
+    Raises:
+        BackendUnavailableError: no backend of that name, or nothing that could be a device.
+    """
+    kind = device.partition(":")[0]
+    if kind not in ("cpu", "cuda"):
+        raise BackendUnavailableError(f"there is no device {device!r}; expected cpu, cuda or one of several GPUs, such as cuda:1.")
+    return device if kind in backend_class(name).devices() else "cpu"
+
+
 def make_backend(name: str, scene: SceneSpec, num_worlds: int, **options: Any) -> Backend:
     """Build a backend by name; see :class:`xreset.backends.base.Backend` for the options."""
     cls = backend_class(name)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from xreset import robots
-from xreset.backends.registry import backend_class
+from xreset.backends.registry import backend_class, device_for
 from xreset.demos.archive import SCHEMA_NAME as DEMOS
 from xreset.demos.archive import demo_objects, read_demos
 from xreset.errors import FileFormatError, PolicyError
@@ -51,11 +51,6 @@ class Subject:
     def meshes(self, given: Path | None) -> Path | None:
         """The folder of meshes to use: the given one, else its own; None: the stand-ins."""
         return given or (Path(self.objects_folder) if self.objects_folder else None)
-
-
-def device_of(backend: str, device: str) -> str:
-    """Where an engine runs, if those that can use a GPU run on ``device``."""
-    return device if "cuda" in backend_class(backend).devices() else "cpu"
 
 
 def resolve(policy: str, robot: str | None, seed: int) -> Subject:
@@ -182,7 +177,7 @@ def evaluate(
             repetitions=episodes,
             seed=seed,
             num_envs=num_envs,
-            device=device_of(name, device),
+            device=device_for(name, device),
             progress=lambda done, total, name=name: progress(name, done, total),
         )
         summary = summarize(

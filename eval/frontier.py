@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from xreset.backends import make_backend
-from xreset.backends.registry import backend_class
+from xreset.backends.registry import backend_class, device_for
 from xreset.env import ManipulationEnv, Reading, make_scene
 from xreset.errors import DemoError
-from xreset.eval.evaluate import Subject, device_of
+from xreset.eval.evaluate import Subject
 from xreset.eval.metrics import MetricsConfig
 from xreset.eval.rollout import play, world_keypoints
 from xreset.files import file_hash, write_json
@@ -197,7 +197,7 @@ def frontier(
             task,
             rows,
             num_envs=num_envs,
-            device=device_of(name, device),
+            device=device_for(name, device),
             progress=lambda done, total, name=name: progress(name, done, total),
         )
         content = {

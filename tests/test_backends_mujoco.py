@@ -21,6 +21,7 @@ from xreset.backends.conformance.scene import gripper, objects, scene
 from xreset.backends.mjcf import OBJECT, OTHER_LINK, TABLE, SceneModel, compile_scene
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.mujoco_warp import MujocoWarpBackend, _differing_fields
+from xreset.backends.registry import device_for
 from xreset.errors import BackendUnavailableError, ObjectError, RobotError, XResetError
 from xreset.spec import FingertipSpec
 from xreset.urdf import robot_tree
@@ -403,6 +404,14 @@ class Limits(unittest.TestCase):
         self.assertEqual(MujocoWarpBackend.devices(), ["cpu"])
         with self.assertRaisesRegex(BackendUnavailableError, "cpu"):
             MujocoWarpBackend(scene(), 1, device="cuda")
+
+    def test_where_an_engine_runs(self):
+        with mock.patch.object(MujocoWarpBackend, "devices", return_value=["cuda", "cpu"]):
+            for device in ("cpu", "cuda", "cuda:1"):
+                self.assertEqual(device_for("mujoco-warp", device), device)
+                self.assertEqual(device_for("mujoco", device), "cpu")
+            with self.assertRaisesRegex(BackendUnavailableError, "no device 'gpu'; expected cpu, cuda"):
+                device_for("mujoco", "gpu")
 
 
 if __name__ == "__main__":

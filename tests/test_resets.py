@@ -152,7 +152,7 @@ class FilterTest(unittest.TestCase):
 
         with (
             mock.patch("xreset.resets.filter.make_backend", made),
-            mock.patch("xreset.resets.filter.backend_class", lambda name: Moves),
+            mock.patch("xreset.resets.filter.device_for", lambda name, device: device),
         ):
             bank = make_bank(self.retargeted(), self.robot, self.objects, ["mujoco", "moves"], num_envs=2)
         self.assertEqual(bank.backends, ("mujoco", "moves"))

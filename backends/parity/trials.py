@@ -17,7 +17,7 @@ from xreset.backends.base import Backend, State
 from xreset.backends.parity.episodes import Motion, closing_episode, holding_episode, lifting_episode, squeezing_state
 from xreset.backends.parity.grasps import Grasps
 from xreset.backends.parity.recording import Recording, play
-from xreset.backends.registry import backend_class, make_backend
+from xreset.backends.registry import backend_class, device_for, make_backend
 from xreset.spec import RobotSpec, SceneSpec
 
 MakeBackend = Callable[[SceneSpec, int, Tensor], Backend]
@@ -75,7 +75,7 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
     """
     cls = backend_class(name)
     version = cls.engine_version()
-    used = device if device.split(":")[0] in cls.devices() else "cpu"
+    used = device_for(name, device)
 
     def make(scene: SceneSpec, num_worlds: int, object_index: Tensor) -> Backend:
         return make_backend(name, scene, num_worlds, object_index=object_index, device=used, **options)

@@ -14,7 +14,7 @@ import torch
 
 from xreset.backends import make_backend
 from xreset.backends.base import Backend
-from xreset.backends.registry import backend_class
+from xreset.backends.registry import device_for
 from xreset.env import rest_state
 from xreset.errors import DemoError
 from xreset.resets.bank import ResetBank
@@ -121,8 +121,7 @@ def make_bank(
             break
         plan = schedule(object_of[left], num_envs)
         worlds = torch.as_tensor(plan.object_index)
-        kind = device if torch.device(device).type in backend_class(name).devices() else "cpu"
-        with make_backend(name, scene, len(worlds), object_index=worlds, device=kind) as backend:
+        with make_backend(name, scene, len(worlds), object_index=worlds, device=device_for(name, device)) as backend:
             tried = 0
             for items, fresh in plan:
                 rows = frames[left[items]]

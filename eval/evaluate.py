@@ -15,7 +15,7 @@ from xreset.demos.archive import SCHEMA_NAME as DEMOS
 from xreset.demos.archive import demo_objects, read_demos
 from xreset.errors import FileFormatError, PolicyError
 from xreset.eval.baselines import KinematicRetargeting
-from xreset.eval.results import summarize, write_results
+from xreset.eval.results import mesh_folder, summarize, write_results
 from xreset.eval.rollout import roll_out
 from xreset.files import file_hash, npz_schema
 from xreset.objects import load_objects
@@ -50,7 +50,7 @@ class Subject:
 
     def meshes(self, given: Path | None) -> Path | None:
         """The folder of meshes to use: the given one, else its own; None: the stand-ins."""
-        return given or (Path(self.objects_folder) if self.objects_folder else None)
+        return mesh_folder(given, self.objects_folder)
 
 
 def resolve(policy: str, robot: str | None, seed: int) -> Subject:

@@ -68,6 +68,11 @@ def summarize(
     }
 
 
+def mesh_folder(given: Path | None, recorded: str | None) -> Path | None:
+    """The folder of meshes to use: the given one, else the one that a run or its results name; None: the stand-ins."""
+    return given or (Path(recorded) if recorded else None)
+
+
 def write_results(folder: Path, summary: dict[str, Any], rollouts: Rollouts, joint_names: tuple[str, ...]) -> Path:
     """Write ``BACKEND.json``, ``BACKEND.episodes.json`` and ``BACKEND.trace.npz``; returns the first."""
     name = summary["backend"]

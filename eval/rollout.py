@@ -142,11 +142,10 @@ def roll_out(
             recorder = _Recorder([int(w) for w in np.flatnonzero(fresh & np.isin(items, recorded))])
 
             def look(step: int, reading: Reading, number: int = number, recorder: _Recorder = recorder) -> None:
-                if step:
-                    recorder.add_targets(env.joint_target)
                 if step % every == 0:
                     recorder.add(step * scene.control_dt, reading)
                 if step:
+                    recorder.add_targets(env.joint_target)
                     progress(number * env.max_episode_length + step, len(plan.rounds) * env.max_episode_length)
 
             result, seconds = play(policy, env, points, metrics or MetricsConfig(), look)
@@ -226,7 +225,7 @@ class _Recorder:
     def __init__(self, worlds: list[int]) -> None:
         self._worlds, self._time, self._frames, self._targets = worlds, [], [], []
 
-    def add(self, time: float, reading) -> None:
+    def add(self, time: float, reading: Reading) -> None:
         if self._worlds:
             s = reading.state
             self._time.append(time)

@@ -73,8 +73,7 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
     Raises:
         BackendUnavailableError: it cannot be used here.
     """
-    cls = backend_class(name)
-    version = cls.engine_version()
+    version = backend_class(name).engine_version()
     used = device_for(name, device)
 
     def make(scene: SceneSpec, num_worlds: int, object_index: Tensor) -> Backend:

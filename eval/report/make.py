@@ -13,7 +13,7 @@ from xreset.eval.report.data import ReportData, collect
 from xreset.eval.report.failures import Strip, choose_failures, draw_strip
 from xreset.eval.report.page import headline, page
 from xreset.eval.report.plots import short_name, write_overview
-from xreset.eval.results import read_traces
+from xreset.eval.results import mesh_folder, read_traces
 from xreset.files import atomic_write
 
 
@@ -90,7 +90,7 @@ def _draw(
         raise XResetError("no demonstration was recorded in every engine. Evaluate all engines in one command.")
     traces = {engine: next(t for t in found if t.sequence == sequence) for engine, found in recorded.items()}
     missed = choose_failures(data.episodes[data.engines[0]], recorded[data.engines[0]], _FAILURES)
-    meshes = objects or (Path(first["objects_folder"]) if first["objects_folder"] else None)
+    meshes = mesh_folder(objects, first["objects_folder"])
     drawn = (*traces.values(), *(trace for _, trace in missed))
     things = {name: load_object(name, meshes) for name in dict.fromkeys(trace.object for trace in drawn)}
     camera = camera_for(list(traces.values()))

@@ -13,7 +13,7 @@ from xreset.demos.archive import SCHEMA_NAME as DEMOS
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.eval.evaluate import load_motion, resolve
 from xreset.eval.results import SCHEMA as EVALUATION
-from xreset.eval.results import TRACE_SCHEMA, read_traces
+from xreset.eval.results import TRACE_SCHEMA, mesh_folder, read_traces
 from xreset.eval.trace.actions import SCHEMA as ACTIONS
 from xreset.eval.trace.actions import Actions, grasp_and_lift, play_policy, read_actions, recorded_actions, robot_of
 from xreset.files import npz_schema, read_json
@@ -132,7 +132,7 @@ def _from_evaluation(source: Path, object_name: str | None, episode: int, robot:
     found = mine[episode]
     if found.joint_target is None:
         raise FileFormatError(f"{source} holds states without the actions that led to them. Evaluate again.")
-    folder = objects or (Path(summary["objects_folder"]) if summary["objects_folder"] else None)
+    folder = mesh_folder(objects, summary["objects_folder"])
     thing = load_object(found.object, folder)
     return recorded_actions(spec, thing, found, label=f"{summary['policy']} in {name}, demonstration {found.sequence}")
 

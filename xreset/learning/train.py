@@ -10,7 +10,7 @@ import torch
 
 from xreset import robots
 from xreset.backends import make_backend
-from xreset.backends.registry import backend_class
+from xreset.backends.registry import backend_class, device_for
 from xreset.env import ManipulationEnv, make_scene
 from xreset.errors import RunError
 from xreset.files import file_hash
@@ -156,7 +156,7 @@ def train(out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: 
 
 def default_device(backend: str) -> str:
     """``cuda`` where there is a GPU that the engine can use, else ``cpu``."""
-    return "cuda" if "cuda" in backend_class(backend).devices() and torch.cuda.is_available() else "cpu"
+    return device_for(backend, "cuda" if torch.cuda.is_available() else "cpu")
 
 
 def resumed(out: Path, *, iterations: int | None) -> RunInfo:

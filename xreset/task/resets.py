@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -54,22 +55,23 @@ class Reset:
         return type(self)(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
+def _tensor(array: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
+    """Numbers in single precision, or 64-bit integers."""
+    return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32 if array.dtype.kind == "f" else torch.long, device=device)
+
+
 def bank_starts(bank: ResetBank, rows: np.ndarray) -> Reset:
     """Given states [M] of a bank, as they are, at full gravity; ``state`` counts the bank's own rows."""
-
-    def tensor(array: np.ndarray) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)
-
     sequence = bank.sequence_index[rows]
     return Reset(
-        joint_pos=tensor(bank.joint_pos[rows]),
-        object_pos=tensor(bank.object_pos[rows]),
-        object_quat=tensor(bank.object_quat_wxyz[rows]),
-        goal_pos=tensor(bank.goal_pos[sequence]),
-        goal_quat=tensor(bank.goal_quat_wxyz[sequence]),
+        joint_pos=_tensor(bank.joint_pos[rows]),
+        object_pos=_tensor(bank.object_pos[rows]),
+        object_quat=_tensor(bank.object_quat_wxyz[rows]),
+        goal_pos=_tensor(bank.goal_pos[sequence]),
+        goal_quat=_tensor(bank.goal_quat_wxyz[sequence]),
         gravity_fraction=torch.ones(len(rows)),
-        state=torch.as_tensor(rows, dtype=torch.long),
-        sequence=torch.as_tensor(sequence, dtype=torch.long),
+        state=_tensor(rows),
+        sequence=_tensor(sequence),
     )
 
 
@@ -106,10 +108,7 @@ class ResetDistribution:
         if missing:
             raise DemoError(f"the reset bank has no demonstration of {', '.join(missing)}; it has {', '.join(bank.object_names)}.")
 
-        def tensor(array: np.ndarray) -> Tensor:
-            return torch.as_tensor(
-                np.ascontiguousarray(array), dtype=torch.float32 if array.dtype.kind == "f" else torch.long, device=device
-            )
+        tensor = partial(_tensor, device=device)
 
         # States and sequences sorted by object: object o owns the rows first[o] : first[o] + count[o].
         number = {name: i for i, name in enumerate(object_names)}

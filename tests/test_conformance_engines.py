@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import unittest
 from dataclasses import replace
 from functools import cache
@@ -89,3 +92,18 @@ class EveryBackend(unittest.TestCase):
         own = [c.name for c in CHECKS if c.own_robot_only]
         results = run(make_local("mujoco"), robot=panda(), only=own)
         self.assertEqual([(r.name, r.verdict) for r in results], [(name, "skipped") for name in own])
+
+
+class AnyProcessor(unittest.TestCase):
+    """OpenBLAS chooses its matrix kernels by the processor, and each rounds in its own way: no verdict may hang on that."""
+
+    def test_set_as_built_with_the_kernels_of_several_processors(self):
+        if "openblas" not in np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"]:  # pyright: ignore[reportIndexIssue]
+            self.skipTest("numpy does not use OpenBLAS here, whose kernels this test chooses")
+        if (reason := backend_status("pybullet").reason) is not None:
+            self.skipTest(f"pybullet: {reason}")
+        command = [sys.executable, "-m", "xreset", "conformance", "--backend", "pybullet", "--check", "set_as_built"]
+        for kernel in ("Haswell", *["SkylakeX"] * ("avx512f" in Path("/proc/cpuinfo").read_text())):
+            with self.subTest(kernel=kernel):
+                done = subprocess.run(command, env=os.environ | {"OPENBLAS_CORETYPE": kernel}, capture_output=True, text=True, timeout=300)
+                self.assertEqual(done.returncode, 0, done.stdout + done.stderr)

@@ -127,7 +127,11 @@ def _shape(kind: str, size: tuple[float, ...], pos: tuple[float, float, float], 
 
 
 def _object(name: str, mass: float, pieces: tuple[Shape, ...], *, shift: Sequence[float] = (0, 0, 0), twist: float = 0.0) -> ObjectSpec:
-    """An object with the inertia of its shape at even density, then its centre of mass shifted and its principal axes turned."""
+    """An object with the inertia of its shape at even density, then its centre of mass shifted and its principal axes turned.
+
+    Its mass is a number of float32, as the interface to a backend has it: no rounding comes between a mass that is set and one built.
+    """
+    mass = float(np.float32(mass))
     mesh = trimesh.util.concatenate([_mesh(piece) for piece in pieces])
     R = Rotation.from_euler("xyz", (twist, -twist, twist)).as_matrix()
     return ObjectSpec(

@@ -91,7 +91,7 @@ class EpisodeMetrics:
         c, state, live = self._config, reading.state, ~self._ended
         self.approach |= live & (reading.tip_distance.amin(dim=-1) <= c.approach_distance)
         lifted = state.object_pos[:, 2] - self._start_height >= c.lift
-        self.grasp |= live & lifted & contact_gate(reading.contacts.tip_force.norm(dim=-1), c.contact_force)
+        self.grasp |= live & lifted & contact_gate(reading.contacts.tip_force, c.contact_force)
         near = (state.object_pos - self._goal_pos).norm(dim=-1) <= c.goal_distance
         at_goal = live & near & (quat_angle(state.object_quat, self._goal_quat) <= c.goal_angle)
         self.reorient = at_goal  # only the last look counts; a world that has ended early is not at its goal

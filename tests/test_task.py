@@ -56,7 +56,7 @@ class RewardTest(unittest.TestCase):
         x = {
             "tip_distance": torch.full((3,), 0.2),
             "best_reach": torch.tensor(0.2),
-            "tip_force": torch.zeros(3),
+            "tip_force": torch.zeros(3, 3),
             "object_pos": torch.tensor([0.5, 0.3, 0.1]),
             "object_quat": IDENTITY,
             "goal_pos": torch.tensor([0.5, 0.3, 0.1]),
@@ -67,7 +67,7 @@ class RewardTest(unittest.TestCase):
         } | changes
         return compute_reward(RewardInput(**{k: v[None] for k, v in x.items()}), config or RewardConfig())
 
-    PRESS = torch.tensor([1.0, 0.0, 1.0])
+    PRESS = torch.tensor([[0.6, 0.0, 0.8], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
     def assert_terms(self, reward, **expected: float):
         """The named terms have these values, every other term is zero, and the total is a hundredth of the sum."""
@@ -111,7 +111,7 @@ class RewardTest(unittest.TestCase):
         self.assertTrue(success(0.0195, 14.8))
         self.assertFalse(success(0.0205, 14.8))
         self.assertFalse(success(0.0195, 15.2))
-        self.assertFalse(success(0.0, 0.0, torch.zeros(3)))
+        self.assertFalse(success(0.0, 0.0, torch.zeros(3, 3)))
 
     def test_action_penalties(self):
         action, previous = torch.tensor([1.0, -0.5, 0, 0]), torch.tensor([1.0, 0.5, 0.2, 0])
@@ -127,7 +127,14 @@ class RewardTest(unittest.TestCase):
 
     def test_the_contact_gate_needs_the_thumb_and_another_finger(self):
         forces = torch.tensor([[1.0, 0, 0], [0, 1, 1], [1, 0, 1], [1, 1, 0], [0.09, 1, 1], [1, 0.1, 0.1], [0, 0, 0]])
+        forces = forces[..., None] * torch.tensor([0.6, 0.0, -0.8])
         self.assertEqual(contact_gate(forces, 0.1).tolist(), [False, False, True, True, False, False, False])
+
+    def test_an_opposing_gate_tells_a_squeeze_from_a_press(self):
+        down, left, right, none = [0.0, 0, -5], [-5.0, 0, -1], [5.0, 0, -1], [0.0, 0, 0]
+        hands = torch.tensor([[down, down, down], [left, right, none], [left, none, right], [left, left, down], [none, left, right]])
+        self.assertEqual(contact_gate(hands, 0.1).tolist(), [True, True, True, True, False])
+        self.assertEqual(contact_gate(hands, 0.1, opposing=True).tolist(), [False, True, True, False, False])
 
 
 class TerminationTest(unittest.TestCase):
@@ -179,6 +186,16 @@ class ActionTest(WithRobot):
         space, target = self.space(), torch.zeros(1, 7)
         sagging = torch.full((1, 7), -0.02)
         torch.testing.assert_close(space.targets(torch.zeros(1, 7), target, sagging)[:, :3], torch.zeros(1, 3))
+
+    def test_action_zero_may_be_home(self):
+        space, home = self.space(hand_zero="home"), torch.as_tensor(self.robot.home, dtype=torch.float32)
+        target = torch.zeros(1, 7)
+        for action, expected in ((0.0, home), (1.0, space.upper), (-1.0, space.lower), (0.5, (home + space.upper) / 2)):
+            found = space.targets(torch.full((1, 7), action), target, target)
+            torch.testing.assert_close(found[0, 3:], expected[3:], msg=f"action {action}")
+        wanted = space.lower + (space.upper - space.lower) * torch.rand(50, 7, generator=generator())
+        again = space.targets(space.action_for(wanted, wanted), wanted, wanted)
+        torch.testing.assert_close(again, wanted, atol=1e-5, rtol=0)
 
     def test_smoothing_takes_a_share_of_the_way(self):
         target = torch.zeros(1, 7)
@@ -393,7 +410,7 @@ class ObservationTest(unittest.TestCase):
         )  # fmt: skip
         self.config = ObservationConfig(noise=QUIET, contact_force_scale=0.1, joint_vel_scale=0.2)
         widths = obs.layout(self.J, self.E, self.config)
-        self.policy = self.split(obs.policy_group(self.x, QUIET, generator()), widths["policy"])
+        self.policy = self.split(obs.policy_group(self.x, self.config, generator()), widths["policy"])
         self.proprio = self.split(obs.proprio_group(self.x, self.config, generator()), widths["proprio"])
 
     def split(self, group: torch.Tensor, widths: dict[str, int]) -> dict[str, torch.Tensor]:
@@ -418,7 +435,7 @@ class ObservationTest(unittest.TestCase):
 
     def test_one_rotation_is_one_observation(self):
         negated = replace(self.x, object_quat=-self.x.object_quat, goal_quat=-self.x.goal_quat, palm_quat=-self.x.palm_quat)
-        torch.testing.assert_close(obs.policy_group(negated, QUIET, generator()), obs.policy_group(self.x, QUIET, generator()))
+        torch.testing.assert_close(obs.policy_group(negated, self.config, generator()), obs.policy_group(self.x, self.config, generator()))
         again = obs.proprio_group(negated, self.config, generator())
         torch.testing.assert_close(again, obs.proprio_group(self.x, self.config, generator()))
         for name, quat, own in (("object_quat", self.policy, self.x.object_quat), ("palm_quat", self.proprio, self.x.palm_quat)):
@@ -438,30 +455,46 @@ class ObservationTest(unittest.TestCase):
 
     def test_cloud(self):
         points = torch.randn(self.N, 10, 3, generator=generator(1))
-        cloud = obs.cloud_frame(points, self.x.object_pos, self.x.object_quat, 0.0, generator())
+        cloud = obs.cloud_frame(points, self.x.object_pos, self.x.object_quat, self.config, generator())
         self.assertEqual(tuple(cloud.shape), (self.N, 10, 3))
         expected = quat_rotate(self.x.object_quat[2], points[2, 7]) + self.x.object_pos[2]
         torch.testing.assert_close(cloud[2, 7], expected)
+
+        scaled = obs.cloud_frame(points, self.x.object_pos, self.x.object_quat, replace(self.config, cloud_scale=5.0), generator())
+        torch.testing.assert_close(scaled, 5.0 * cloud)
+
+    def test_rotations_as_columns_of_the_matrix(self):
+        c = replace(self.config, rotation="matrix")
+        widths = obs.layout(self.J, self.E, c)
+        x = replace(self.x, object_quat=turned(90)[None].expand(self.N, 4))
+        policy, proprio = obs.policy_group(x, c, generator()), obs.proprio_group(x, c, generator())
+        shown = self.split(policy, widths["policy"]) | self.split(proprio, widths["proprio"])
+        torch.testing.assert_close(shown["object_rotation"], torch.tensor([0.0, 1, 0, -1, 0, 0]).expand(self.N, 6))
+        first, second = shown["palm_rotation"].split(3, dim=-1)
+        torch.testing.assert_close(first, quat_rotate(x.palm_quat, torch.tensor([1.0, 0, 0]).expand(self.N, 3)))
+        torch.testing.assert_close(second, quat_rotate(x.palm_quat, torch.tensor([0.0, 1, 0]).expand(self.N, 3)))
+        negated = replace(x, object_quat=-x.object_quat, goal_quat=-x.goal_quat)
+        torch.testing.assert_close(obs.policy_group(negated, c, generator()), policy)
 
     def test_noise_has_the_configured_spread_and_touches_only_what_is_measured(self):
         many = 4000
         per_world = {k: v for k, v in vars(self.x).items() if k not in ("joint_lower", "joint_upper")}
         x = replace(self.x, **{k: v[:1].expand(many, *v.shape[1:]) for k, v in per_world.items()})
         noise = NoiseConfig(joint_pos=0.01, joint_vel=0.1, object_pos=0.02, object_rot=0.05, cloud=0.03)
-        policy = obs.policy_group(x, noise, generator()) - obs.policy_group(x, QUIET, generator())
+        c = replace(self.config, noise=noise)
+        policy = obs.policy_group(x, c, generator()) - obs.policy_group(x, self.config, generator())
         for i in range(3):
             self.assertAlmostEqual(float(policy[:, i].std()), 0.02, delta=0.002)
         self.assertEqual(float(policy[:, 7:].abs().max()), 0.0)
-        noisy = obs.policy_group(x, noise, generator())[:, 3:7]
+        noisy = obs.policy_group(x, c, generator())[:, 3:7]
         torch.testing.assert_close(noisy.norm(dim=-1), torch.ones(many))
         self.assertAlmostEqual(float(quat_angle(noisy, x.object_quat).square().mean().sqrt()), 0.05 * math.sqrt(3), delta=0.005)
-        c = replace(self.config, noise=noise)
         proprio = obs.proprio_group(x, c, generator()) - obs.proprio_group(x, self.config, generator())
         self.assertAlmostEqual(float(proprio[:, : self.J].std()), 0.01 / 2.5, delta=2e-4)
         self.assertAlmostEqual(float(proprio[:, self.J : 2 * self.J].std()), 0.1 * 0.2, delta=1e-3)
         self.assertEqual(float(proprio[:, 2 * self.J :].abs().max()), 0.0)
         origin = torch.zeros(1, many, 3)
-        cloud = obs.cloud_frame(origin, torch.zeros(1, 3), IDENTITY[None], 0.03, generator())
+        cloud = obs.cloud_frame(origin, torch.zeros(1, 3), IDENTITY[None], c, generator())
         self.assertAlmostEqual(float(cloud.std()), 0.03, delta=0.001)
 
 
@@ -470,6 +503,11 @@ class EvaluationTaskTest(unittest.TestCase):
         task = TaskConfig(action=ActionConfig(arm_step=0.03), reset=ResetConfig(spawn_xy=0.05, demo_probability=0.5))
         found = evaluation_task(task)
         self.assertEqual(found.observation.noise, QUIET)
+        self.assertEqual((found.timestep, found.substeps), (task.timestep, task.substeps))
+        faster = evaluation_task(replace(task, timestep=1 / 120, substeps=2))
+        self.assertEqual((faster.timestep, faster.substeps), (1 / 240, 4))
+        odd = evaluation_task(replace(task, timestep=1 / 100, substeps=1))
+        self.assertEqual((odd.timestep, odd.substeps), (1 / 100, 1))
         self.assertEqual((found.reset.demo_probability, found.reset.home_gravity_std, found.randomization.enabled), (0.0, 0.0, False))
         back = replace(found, observation=task.observation, reset=task.reset, randomization=task.randomization)
         self.assertEqual(back, task)

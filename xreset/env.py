@@ -274,7 +274,8 @@ class ManipulationEnv:
         state = self.backend.state()
         for name, value in self._before.items():
             value.copy_(getattr(state, name))
-        self._action.clamp_(-1.0, 1.0)
+        if not self.task.reward.raw_actions:
+            self._action.clamp_(-1.0, 1.0)
         self._target.copy_(self.actions.targets(self._action, self._target, state.joint_pos))
 
     def _judge(self) -> tuple[Reading, Reward]:
@@ -293,7 +294,7 @@ class ManipulationEnv:
             RewardInput(
                 tip_distance=reading.tip_distance,
                 best_reach=self._best_reach.clone(),
-                tip_force=reading.contacts.tip_force.norm(dim=-1),
+                tip_force=reading.contacts.tip_force,
                 object_pos=reading.state.object_pos,
                 object_quat=reading.state.object_quat,
                 goal_pos=self.goal_pos,
@@ -397,7 +398,7 @@ class ManipulationEnv:
             goal_pos=self.goal_pos,
             goal_quat=self.goal_quat,
             gravity_fraction=self.gravity_fraction,
-            previous_action=self._previous_action,
+            previous_action=self._previous_action.clamp(-1.0, 1.0),
             palm_pos=links.pos[:, 0],
             palm_quat=links.quat[:, 0],
             palm_linvel=links.linvel[:, 0],
@@ -407,11 +408,11 @@ class ManipulationEnv:
             tip_distance=reading.tip_distance,
             reward=self._reward,
         )
-        frame = obs.cloud_frame(self._cloud_points, state.object_pos, state.object_quat, c.noise.cloud, self.generator)[:, None]
+        frame = obs.cloud_frame(self._cloud_points, state.object_pos, state.object_quat, c, self.generator)[:, None]
         history = torch.cat((self._cloud[:, 1:], frame), dim=1)
         self._cloud.copy_(torch.where(self._fresh.view(-1, 1, 1, 1), frame, history))
         groups = {
-            "policy": obs.policy_group(x, c.noise, self.generator),
+            "policy": obs.policy_group(x, c, self.generator),
             "proprio": obs.proprio_group(x, c, self.generator),
             "perception": self._cloud,
             "privileged": obs.privileged_group(x),

@@ -24,18 +24,21 @@ class ModelConfig:
     initial_hand_std: float | None = None
     """The same for the hand's joints, whose actions are absolute: 0.3 shakes each by a third of half its range, and grasps fall apart.
     None: ``initial_std``."""
+    synergy_std: float | None = None
+    """Initial standard deviation of the exploration along the hand's synergies, in units of the demonstrated spread; beside it, each joint
+    keeps its own. None: no such noise (:mod:`xreset.learning.synergies`)."""
     normalize_observations: bool = True
     """Running normalisation of the flat observations (not of the clouds). Not in the paper; its library's usual setting."""
 
     @property
     def layers(self) -> dict[str, Any]:
         """What networks must share for one to take over the weights of the other."""
-        return {name: getattr(self, name) for name in ("pointnet", "lstm", "mlp", "activation", "normalize_observations")}
+        names = ("pointnet", "lstm", "mlp", "activation", "normalize_observations")
+        return {name: getattr(self, name) for name in names} | {"synergies": self.synergy_std is not None}
 
     def __post_init__(self) -> None:
         check_numbers(self, positive=("lstm", "initial_std"))
-        if self.initial_hand_std is not None:
-            check_numbers(self, positive=("initial_hand_std",))
+        check_numbers(self, positive=[name for name in ("initial_hand_std", "synergy_std") if getattr(self, name) is not None])
         for name in ("pointnet", "mlp"):
             if not getattr(self, name) or min(getattr(self, name)) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected one width or more, each above 0")
@@ -98,8 +101,14 @@ class TrainConfig:
         check_numbers(self, positive=("iterations", "save_interval"))
 
 
-def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
-    """The nested dictionary that rsl-rl's runner takes."""
+def rsl_rl_config(config: TrainConfig, num_envs: int, synergies: Any = None) -> dict[str, Any]:
+    """The nested dictionary that rsl-rl's runner takes.
+
+    Args:
+        config: model and algorithm.
+        num_envs: worlds of one process.
+        synergies: [J, K] directions of :class:`xreset.learning.synergies.SynergyGaussian`; None or no column: independent noise.
+    """
     m, p = config.model, config.ppo
     network: dict[str, Any] = {
         "class_name": "xreset.learning.model:PointNetLstmModel",
@@ -111,6 +120,10 @@ def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
         "bfloat16_clouds": p.precision == "bfloat16",
     }
     gaussian = {"class_name": "GaussianDistribution", "init_std": m.initial_std, "std_type": "log", "learn_std": True}
+    if m.synergy_std is not None and synergies is not None and synergies.shape[1]:
+        gaussian |= {
+            "class_name": "xreset.learning.synergies:SynergyGaussian", "directions": synergies.tolist(), "synergy_std": m.synergy_std,
+        }  # fmt: skip
     return {
         "num_steps_per_env": p.horizon,
         "save_interval": config.save_interval,

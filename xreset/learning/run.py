@@ -3,6 +3,7 @@
 RUN/run.json                 everything that the training was started with
 RUN/checkpoints/000050.pt    model, optimiser, random state and counters after 50 iterations
 RUN/worlds.pt                the worlds at the newest checkpoint, so that a resumed run goes on in the middle of its episodes
+RUN/lift.json                when success from home passed 1, 10 and 50 %
 RUN/faults.npz               the last worlds whose simulation failed, if the run ended because of too many
 RUN/policy.onnx              the policy, with its contract
 RUN/events.out.tfevents.*    TensorBoard

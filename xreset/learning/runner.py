@@ -21,9 +21,11 @@ from torch import Tensor
 from xreset.env import ManipulationEnv
 from xreset.errors import RunError
 from xreset.files import atomic_write
+from xreset.learning.clock import LiftClock
 from xreset.learning.config import TrainConfig, rsl_rl_config
 from xreset.learning.distributed import Processes
 from xreset.learning.faults import FaultBudget, FaultCounts, dump_faults, too_many_faults
+from xreset.learning.synergies import hand_synergies
 
 
 class TrainingRunner(OnPolicyRunner):
@@ -34,7 +36,8 @@ class TrainingRunner(OnPolicyRunner):
         self.folder = folder
         self.train_config = config
         torch.set_float32_matmul_precision("highest" if config.ppo.precision == "float32" else "high")
-        super().__init__(env, rsl_rl_config(config, env.num_envs), log_dir=None, device=str(env.device))  # pyright: ignore[reportArgumentType]
+        synergies = None if config.model.synergy_std is None else hand_synergies(env.resets.joint_pos, env.actions)
+        super().__init__(env, rsl_rl_config(config, env.num_envs, synergies), log_dir=None, device=str(env.device))  # pyright: ignore[reportArgumentType]
         if config.model.initial_hand_std is not None:
             log_std = cast(torch.nn.Parameter, self.alg.get_policy().distribution.log_std_param)  # pyright: ignore[reportOptionalMemberAccess]
             log_std.data[~env.actions.is_arm] = math.log(config.model.initial_hand_std)
@@ -74,8 +77,10 @@ class TrainingRunner(OnPolicyRunner):
             alg.broadcast_parameters()
         obs = env.get_observations()
         log = _Log(self.folder, env.num_envs, str(env.device), num_learning_iterations) if self.processes.is_main else None
-        if log is not None and self._log_state is not None:
-            log.restore(self._log_state)
+        if log is not None:
+            log.clock.resume(self.iteration)
+            if self._log_state is not None:
+                log.restore(self._log_state)
         saved_at = self.iteration
         budget = FaultBudget(horizon * env.num_envs * self.gpu_world_size)
         end = time.perf_counter() + seconds
@@ -254,6 +259,7 @@ class _Log:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
         from torch.utils.tensorboard import SummaryWriter
 
+        self.clock = LiftClock(folder)
         self._writer = SummaryWriter(log_dir=str(folder), flush_secs=10)
         self._returns, self._lengths = torch.zeros(num_envs, device=device), torch.zeros(num_envs, device=device)
         self._finished = torch.zeros(3, device=device)  # sum of returns, sum of lengths, number of episodes
@@ -315,9 +321,11 @@ class _Log:
             scalars |= {"episode/return": returns / episodes, "episode/length": lengths / episodes}
         for name, value in scalars.items():
             self._writer.add_scalar(name, value, it)
+        from_home = means["task/success_from_home"]
+        self.clock.tick(from_home, iteration=it, env_steps=runner.env_steps, seconds=runner.elapsed)
         text = (
-            f"return {returns / max(episodes, 1):7.3f}  grasped {means['task/grasped']:5.1%}  success {means['task/success']:5.1%}  "
-            f"{fps:,.0f} steps/s"
+            f"return {returns / max(episodes, 1):7.3f}  grasped {means['task/grasped']:5.1%}  success {means['task/success']:5.1%}, "
+            f"from home {from_home:5.1%}  {fps:,.0f} steps/s"
         )
         self._progress.update(self._task, completed=it, text=text)
         if not self._console.is_terminal and (time.monotonic() - self._last_line > 10 or it == self._total):
@@ -329,6 +337,7 @@ class _Log:
     def close(self, *, stopped: bool) -> None:
         self._progress.stop()
         self._writer.close()
+        self.clock.write()
         if stopped:
             self._console.print("stopped after the current iteration; a checkpoint is written.")
 

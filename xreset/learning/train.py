@@ -181,7 +181,8 @@ def ensure_policy(out: Path) -> Path:
     from xreset.learning.runner import read_checkpoint
 
     info = read_run(out)
-    cfg = rsl_rl_config(info.config, info.num_envs)
+    weights = read_checkpoint(checkpoint)["actor_state_dict"]
+    cfg = rsl_rl_config(info.config, info.num_envs, weights.get("distribution.directions"))
     actor_cfg = {k: v for k, v in cfg["actor"].items() if k != "class_name"}
     widths = {group: sum(terms.values()) for group, terms in info.contract["observation_layout"].items()}
     o = info.config.task.observation
@@ -194,6 +195,6 @@ def ensure_policy(out: Path) -> Path:
         batch_size=[1],
     )
     actor = PointNetLstmModel(example, {"actor": cfg["obs_groups"]["actor"]}, "actor", len(info.contract["joint_names"]), **actor_cfg)
-    actor.load_state_dict(read_checkpoint(checkpoint)["actor_state_dict"])
+    actor.load_state_dict(weights)
     export_onnx(actor, policy, info.contract)
     return policy

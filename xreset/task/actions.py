@@ -14,13 +14,22 @@ from xreset.urdf import robot_tree
 
 @dataclass(frozen=True, kw_only=True)
 class ActionSpace:
-    """Maps actions [N, J] in [-1, 1] to joint targets [N, J]: arm joints relative, hand joints absolute within their limits."""
+    """Maps actions [N, J] in [-1, 1] to joint targets [N, J]: arm joints relative, hand joints absolute within their limits.
+
+    A hand joint's target is piecewise linear in its action: the lower limit at -1, :attr:`zero` at 0, the upper limit at +1.
+    """
 
     lower: Tensor
     """[J] joint limits."""
     upper: Tensor
     is_arm: Tensor
     """[J] bool"""
+    zero: Tensor
+    """[J] a hand joint's target under action 0; 0 for arm joints."""
+    below: Tensor
+    """[J] from ``zero`` down to the lower limit, reached at -1; 1 for arm joints."""
+    above: Tensor
+    """[J] from ``zero`` up to the upper limit, reached at +1; 1 for arm joints."""
     config: ActionConfig
 
     @classmethod
@@ -30,7 +39,16 @@ class ActionSpace:
         limits = [(tree.joint(name).lower, tree.joint(name).upper) for name in robot.joint_names]
         lower, upper = torch.tensor(limits, dtype=torch.float32, device=device).unbind(-1)
         is_arm = torch.tensor([joint.group == "arm" for joint in robot.joints], device=device)
-        return cls(lower=lower, upper=upper, is_arm=is_arm, config=config)
+        if config.hand_zero == "home":
+            home = torch.as_tensor(robot.home, dtype=torch.float32, device=device)
+            zero = torch.minimum(torch.maximum(home, lower), upper)
+            below, above = zero - lower, upper - zero
+        else:
+            zero = (lower + upper) / 2
+            below = above = (upper - lower) / 2
+        # Continuous arm joints have infinite limits; where() must not see inf * 0 from them.
+        zero, below, above = (torch.where(is_arm, other, value) for value, other in ((zero, 0.0), (below, 1.0), (above, 1.0)))
+        return cls(lower=lower, upper=upper, is_arm=is_arm, zero=zero, below=below, above=above, config=config)
 
     def targets(self, action: Tensor, target: Tensor, joint_pos: Tensor) -> Tensor:
         """[N, J] new joint targets.
@@ -42,8 +60,7 @@ class ActionSpace:
         action = action.clamp(-1.0, 1.0)
         arm = target + c.arm_step * action
         arm = torch.minimum(torch.maximum(arm, joint_pos - c.arm_lead), joint_pos + c.arm_lead)
-        # Continuous joints have infinite limits; where() must not see inf * 0 from them.
-        hand = self._hand_center + self._hand_half * action
+        hand = self.zero + torch.where(action < 0, self.below, self.above) * action
         hand = target + c.hand_smoothing * (hand - target)
         return torch.minimum(torch.maximum(torch.where(self.is_arm, arm, hand), self.lower), self.upper)
 
@@ -51,13 +68,6 @@ class ActionSpace:
         """[N, J] the action whose targets come nearest to ``wanted`` [N, J], given the present targets."""
         c = self.config
         arm = (wanted - target) / c.arm_step
-        hand = (target + (wanted - target) / c.hand_smoothing - self._hand_center) / self._hand_half.clamp_min(1e-9)
+        hand = target + (wanted - target) / c.hand_smoothing - self.zero
+        hand = hand / torch.where(hand < 0, self.below, self.above).clamp_min(1e-9)
         return torch.where(self.is_arm, arm, hand).clamp(-1.0, 1.0)
-
-    @property
-    def _hand_center(self) -> Tensor:
-        return torch.where(self.is_arm, 0.0, (self.lower + self.upper) / 2)
-
-    @property
-    def _hand_half(self) -> Tensor:
-        return torch.where(self.is_arm, 1.0, (self.upper - self.lower) / 2)

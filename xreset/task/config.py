@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 from xreset.checks import check_numbers
 
@@ -18,6 +19,10 @@ class ActionConfig:
     """Largest change of an arm joint's target per control step [rad]: 1.8 rad/s at 60 Hz. Not in the paper."""
     arm_lead: float = 0.15
     """Farthest that an arm target may run ahead of the joint [rad], so that a blocked arm does not wind up. Not in the paper."""
+    hand_zero: Literal["middle", "home"] = "middle"
+    """Where a hand joint is sent by action 0: to the middle of its limits, which is a half-closed fist, or to the robot's home pose, from
+    which -1 and +1 lead to the limits along two slopes. A new policy's mean is 0: with ``middle`` it closes the open hand at once and comes
+    down on the object with its knuckles. Not in the paper."""
     hand_smoothing: float = 1.0
     """Share of the new hand target that is taken per control step, in (0, 1]; 1 is the paper's plain absolute target."""
 
@@ -52,6 +57,11 @@ class ObservationConfig:
     """Points per cloud (P)."""
     cloud_history: int = 5
     """Frames of cloud history (H), oldest first."""
+    rotation: Literal["quaternion", "matrix"] = "quaternion"
+    """How orientations are shown: a quaternion with w >= 0, which jumps where w is 0, or the first two columns of the rotation matrix,
+    which never do (Zhou et al. 2019, On the Continuity of Rotation Representations)."""
+    cloud_scale: float = 1.0
+    """Factor on the clouds' coordinates [1/m]."""
     contact_force_scale: float = 0.1
     """Factor on fingertip forces [1/N] before they are limited to [-1, 1]."""
     joint_vel_scale: float = 0.1
@@ -59,7 +69,12 @@ class ObservationConfig:
     noise: NoiseConfig = field(default_factory=NoiseConfig)
 
     def __post_init__(self) -> None:
-        check_numbers(self, positive=("cloud_points", "cloud_history"), not_negative=("contact_force_scale", "joint_vel_scale"))
+        check_numbers(
+            self,
+            positive=("cloud_points", "cloud_history", "cloud_scale"),
+            finite=("cloud_scale",),
+            not_negative=("contact_force_scale", "joint_vel_scale"),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,8 +99,14 @@ class RewardConfig:
     action: float = -0.005
     action_rate: float = -0.005
     out_of_bounds: float = -500.0
+    contact: Literal["any", "opposing"] = "any"
+    """What opens the contact gate: thumb and another finger press (the paper), or press against each other: their forces on the object are
+    more than 90 degrees apart. Pressing an object down from above, both push in one direction; holding it, they do not."""
     contact_threshold: float = 0.1
     """Force [N] from which a finger counts as in contact. Not in the paper."""
+    raw_actions: bool = False
+    """Whether ``action`` and ``action_rate`` take actions as the policy gave them, and not as limited to [-1, 1]. Where a mean lies beyond
+    the limit, noise explores nothing, and only a penalty of the raw action pulls it back (as in Isaac Lab's action terms)."""
     scale: float = 0.01
     """Factor on the total (Table VIII)."""
 
@@ -196,11 +217,19 @@ class TaskConfig:
         check_numbers(self, positive=("timestep", "substeps", "distance_points"), finite=("timestep",))
 
 
-def evaluation_task(task: TaskConfig) -> TaskConfig:
-    """The task as a policy is evaluated: from home at full gravity, nominal physics, no observation noise; spawns stay perturbed."""
-    from dataclasses import replace
+EVALUATION_TIMESTEP = 1.0 / 240.0
+"""Physics timestep of evaluations [s], whatever a policy was trained at."""
 
+
+def evaluation_task(task: TaskConfig) -> TaskConfig:
+    """The task as a policy is evaluated: from home at full gravity, nominal physics, no observation noise; spawns stay perturbed.
+
+    Physics takes steps of :data:`EVALUATION_TIMESTEP`, if whole ones make a control step.
+    """
     zero = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
+    substeps = round(task.timestep * task.substeps / EVALUATION_TIMESTEP)
+    if substeps and abs(substeps * EVALUATION_TIMESTEP - task.timestep * task.substeps) < 1e-9:
+        task = replace(task, timestep=EVALUATION_TIMESTEP, substeps=substeps)
     return replace(
         task,
         observation=replace(task.observation, noise=zero),

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.rotations import quat_conjugate, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_axis_angle
-from xreset.task.config import NoiseConfig, ObservationConfig
+from xreset.rotations import quat_conjugate, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_axis_angle, quat_to_matrix
+from xreset.task.config import ObservationConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,13 +57,21 @@ def layout(num_joints: int, num_tips: int, c: ObservationConfig) -> dict[str, di
 
     ``perception`` is listed with its number of values H * P * 3.
     """
+    turn, width = ("quat", 4) if c.rotation == "quaternion" else ("rotation", 6)
     return {
-        "policy": {"object_pos": 3, "object_quat": 4, "goal_pos": 3, "goal_quat": 4, "gravity_fraction": 1, "previous_action": num_joints},
+        "policy": {
+            "object_pos": 3,
+            f"object_{turn}": width,
+            "goal_pos": 3,
+            f"goal_{turn}": width,
+            "gravity_fraction": 1,
+            "previous_action": num_joints,
+        },
         "proprio": {
             "joint_pos": num_joints,
             "joint_vel": num_joints,
             "palm_pos": 3,
-            "palm_quat": 4,
+            f"palm_{turn}": width,
             "palm_linvel": 3,
             "palm_angvel": 3,
             "tip_pos": 3 * num_tips,
@@ -73,16 +81,20 @@ def layout(num_joints: int, num_tips: int, c: ObservationConfig) -> dict[str, di
     }
 
 
-def policy_group(x: ObservationInput, noise: NoiseConfig, generator: torch.Generator) -> Tensor:
-    """[N, 15 + J] object pose (noisy), goal pose, gravity fraction, previous action."""
+def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
+    """[N, 15 + J] (19 + J with ``rotation="matrix"``) object pose (noisy), goal pose, gravity fraction, previous action."""
+    noise = c.noise
     pos = x.object_pos + noise.object_pos * _normal(x.object_pos, generator)
     turn = quat_from_axis_angle(noise.object_rot * _normal(x.object_pos, generator))
-    quat = _positive(quat_multiply(turn, x.object_quat))
-    return torch.cat((pos, quat, x.goal_pos, _positive(x.goal_quat), x.gravity_fraction[:, None], x.previous_action), dim=-1)
+    rotation = _shown(quat_multiply(turn, x.object_quat), c)
+    return torch.cat((pos, rotation, x.goal_pos, _shown(x.goal_quat, c), x.gravity_fraction[:, None], x.previous_action), dim=-1)
 
 
 def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
-    """[N, 2 J + 13 + 6 E] joints (position within the limits as [-1, 1], scaled velocity), palm, fingertips, limited contact forces."""
+    """[N, 2 J + 13 + 6 E] joints (position within the limits as [-1, 1], scaled velocity), palm, fingertips, limited contact forces.
+
+    With ``rotation="matrix"`` there are two numbers more.
+    """
     pos = x.joint_pos + c.noise.joint_pos * _normal(x.joint_pos, generator)
     vel = x.joint_vel + c.noise.joint_vel * _normal(x.joint_vel, generator)
     force = (c.contact_force_scale * x.tip_force).clamp(-1.0, 1.0)
@@ -91,7 +103,7 @@ def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Ge
             2.0 * (pos - x.joint_lower) / (x.joint_upper - x.joint_lower) - 1.0,
             c.joint_vel_scale * vel,
             x.palm_pos,
-            _positive(x.palm_quat),
+            _shown(x.palm_quat, c),
             x.palm_linvel,
             x.palm_angvel,
             x.tip_pos.flatten(1),
@@ -118,16 +130,18 @@ def privileged_group(x: ObservationInput) -> Tensor:
     )
 
 
-def cloud_frame(points: Tensor, object_pos: Tensor, object_quat: Tensor, noise: float, generator: torch.Generator) -> Tensor:
-    """[N, P, 3] the object's points [N, P, 3] (object frame) in the world frame, with noise [m]."""
+def cloud_frame(points: Tensor, object_pos: Tensor, object_quat: Tensor, c: ObservationConfig, generator: torch.Generator) -> Tensor:
+    """[N, P, 3] the object's points [N, P, 3] (object frame) in the world frame, with noise, times ``cloud_scale``."""
     cloud = quat_rotate(object_quat[:, None], points) + object_pos[:, None]
-    return cloud + noise * _normal(cloud, generator)
+    return c.cloud_scale * (cloud + c.noise.cloud * _normal(cloud, generator))
 
 
 def _normal(like: Tensor, generator: torch.Generator) -> Tensor:
     return torch.randn(like.shape, generator=generator, device=like.device, dtype=like.dtype)
 
 
-def _positive(quat: Tensor) -> Tensor:
-    """The same rotation with w >= 0: a policy must not see two numbers for one pose."""
-    return torch.where(quat[..., :1] < 0, -quat, quat)
+def _shown(quat: Tensor, c: ObservationConfig) -> Tensor:
+    """[..., 4] or [..., 6] the same rotation for whichever of its two quaternions: a policy must not see two numbers for one pose."""
+    if c.rotation == "quaternion":
+        return torch.where(quat[..., :1] < 0, -quat, quat)
+    return quat_to_matrix(quat)[..., :2].transpose(-1, -2).flatten(-2)

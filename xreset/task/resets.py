@@ -79,6 +79,7 @@ class ResetDistribution:
     """Draws resets for worlds of given objects from a bank; all tensors live on one device, nothing is copied per draw.
 
     Attributes:
+        joint_pos: [L, J] robot states of the bank.
         reached: [L] share of recent episodes from each bank state that reached the goal, 0.5 before the first (:meth:`learn`). States are
             numbered as they are kept here, sorted by object.
     """
@@ -123,7 +124,7 @@ class ResetDistribution:
 
         self._state_first, self._state_count = ranges(state_object[state_rows])
         self._sequence_first, self._sequence_count = ranges(sequence_object[sequence_rows])
-        self._joint_pos = tensor(bank.joint_pos[state_rows])
+        self.joint_pos = tensor(bank.joint_pos[state_rows])
         self._object_pos = tensor(bank.object_pos[state_rows])
         self._object_quat = tensor(bank.object_quat_wxyz[state_rows])
         self._state_sequence = tensor(bank.sequence_index[state_rows])
@@ -160,7 +161,7 @@ class ResetDistribution:
         sequence_count = self._sequence_count[object_index]
         pick = self._sequence_first[object_index] + torch.minimum((uniform[:, 2] * sequence_count).long(), sequence_count - 1)
         home = self.home(self._sequence_rows[pick], generator)
-        if not len(self._joint_pos):
+        if not len(self.joint_pos):
             return home
         sequence = torch.where(from_bank, self._state_sequence[row], home.sequence)
 
@@ -169,7 +170,7 @@ class ResetDistribution:
 
         gravity = uniform[:, 3] if c.random_gravity else torch.ones_like(uniform[:, 3])
         return Reset(
-            joint_pos=mix(self._joint_pos[row], home.joint_pos),
+            joint_pos=mix(self.joint_pos[row], home.joint_pos),
             object_pos=mix(self._object_pos[row], home.object_pos),
             object_quat=mix(self._object_quat[row], home.object_quat),
             goal_pos=self._goal_pos[sequence],

@@ -23,13 +23,13 @@ class RewardInput:
     best_reach: Tensor
     """[N] smallest mean fingertip distance of the episode, this step included [m]."""
     tip_force: Tensor
-    """[N, E] magnitude of each finger's contact force [N]."""
+    """[N, E, 3] each finger's contact force on the object [N], world frame."""
     object_pos: Tensor
     object_quat: Tensor
     goal_pos: Tensor
     goal_quat: Tensor
     action: Tensor
-    """[N, J] this step's action."""
+    """[N, J] this step's action, as it is penalised."""
     previous_action: Tensor
     out_of_bounds: Tensor
     """[N] bool"""
@@ -49,15 +49,24 @@ class Reward:
     """[N] bool, contact-gated pose success."""
 
 
-def contact_gate(tip_force: Tensor, threshold: float) -> Tensor:
-    """[N] bool: the thumb (first) and at least one other finger press with more than ``threshold`` [N]."""
-    pressing = tip_force > threshold
-    return pressing[:, 0] & pressing[:, 1:].any(dim=-1)
+def contact_gate(tip_force: Tensor, threshold: float, *, opposing: bool = False) -> Tensor:
+    """[N] bool: whether the thumb (first) and at least one other finger press on the object.
+
+    Args:
+        tip_force: [N, E, 3] contact forces on the object [N].
+        threshold: force [N] from which a finger presses.
+        opposing: whether that other finger's force must be more than 90 degrees from the thumb's.
+    """
+    pressing = tip_force.norm(dim=-1) > threshold
+    others = pressing[:, 1:]
+    if opposing:
+        others = others & ((tip_force[:, :1] * tip_force[:, 1:]).sum(dim=-1) < 0)
+    return pressing[:, 0] & others.any(dim=-1)
 
 
 def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     """The reward of one control step."""
-    gate = contact_gate(x.tip_force, c.contact_threshold)
+    gate = contact_gate(x.tip_force, c.contact_threshold, opposing=c.contact == "opposing")
     position_error = (x.object_pos - x.goal_pos).norm(dim=-1)
     rotation_error = quat_angle(x.object_quat, x.goal_quat)
     success = gate & (position_error < c.success_position) & (rotation_error < c.success_rotation)

@@ -1,0 +1,85 @@
+"""The lift clock: when a training first succeeds from home.
+
+Until it has lifted the object from home, a training has learned nothing that its reward curves would show; after the first lift the rest
+follows within minutes. So this is what trainings are compared by.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from xreset.files import read_json, write_json
+from xreset.typed import from_dict
+
+SCHEMA = "xreset-lift/1"
+FILE = "lift.json"
+"""Beside ``run.json``."""
+SHARES = (0.01, 0.1, 0.5)
+"""Shares of the home worlds' steps spent at the goal whose first passing is noted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Passing:
+    """The first iteration in which at least ``share`` of the steps of worlds that began at home were at the goal."""
+
+    share: float
+    iteration: int
+    env_steps: int
+    """Of all worlds, until then."""
+    minutes: float
+    """Of training until then, without compiling."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lift:
+    """Contents of ``lift.json``."""
+
+    passed: tuple[Passing, ...] = ()
+    """In the order of :data:`SHARES`."""
+    iteration: int = 0
+    """How far the training has come."""
+    env_steps: int = 0
+    minutes: float = 0.0
+    success_from_home: float = 0.0
+    """In the last iteration."""
+
+
+@dataclass
+class LiftClock:
+    """Keeps ``lift.json`` of a run."""
+
+    folder: Path
+    lift: Lift = field(default_factory=Lift)
+
+    def resume(self, iteration: int) -> None:
+        """Go on from the file, if there is one, forgetting what came after ``iteration``."""
+        if iteration and (self.folder / FILE).is_file():
+            old = read_lift(self.folder)
+            self.lift = Lift(passed=tuple(p for p in old.passed if p.iteration <= iteration))
+
+    def tick(self, share: float, *, iteration: int, env_steps: int, seconds: float) -> None:
+        """Take note of an iteration's share of success from home."""
+        now = {"iteration": iteration, "env_steps": env_steps, "minutes": seconds / 60}
+        known = {p.share for p in self.lift.passed}
+        new = tuple(Passing(share=s, **now) for s in SHARES if s not in known and share >= s)
+        self.lift = Lift(passed=(*self.lift.passed, *new), success_from_home=share, **now)
+        if new:
+            self.write()
+
+    def write(self) -> None:
+        """Write the file."""
+        write_json(self.folder / FILE, {"schema": SCHEMA} | asdict(self.lift))
+
+
+def read_lift(folder: Path) -> Lift:
+    """Read a run's ``lift.json``; an empty one if the run has none, because it is of an earlier version.
+
+    Raises:
+        FileFormatError: the file is damaged.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        return Lift()
+    data = read_json(path, SCHEMA)
+    return from_dict(Lift, {name: value for name, value in data.items() if name != "schema"}, str(path))

@@ -19,11 +19,11 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.backends.base import KnownDifference
 from xreset.backends.rigid import Body, Inertia, Mechanism, mechanism, object_inertia
 from xreset.errors import ObjectError, XResetError
+from xreset.geometry.urdf import Joint
+from xreset.physics import KnownDifference
 from xreset.spec import GRAVITY, Geometry, ObjectSpec, SceneSpec
-from xreset.urdf import Joint
 
 TABLE, OTHER_LINK, OBJECT = -1, -2, -3
 """Values of :attr:`SceneModel.geom_role` beside the fingertip indices 0..E-1."""

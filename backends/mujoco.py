@@ -11,9 +11,9 @@ from typing import ClassVar, get_args
 
 import numpy as np
 
-from xreset.backends.base import Capability, KnownDifference, unavailable
 from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import Inertia
+from xreset.physics import Capability, KnownDifference, unavailable
 from xreset.spec import SceneSpec
 
 try:

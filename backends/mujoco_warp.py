@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.base import Backend, Capability, Contacts, Health, KnownDifference, Links, MassProperties, State, unavailable
 from xreset.backends.pool import initial_state
 from xreset.errors import BackendUnavailableError, XResetError
-from xreset.rotations import quat_to_matrix
+from xreset.geometry.rotations import quat_to_matrix
+from xreset.physics import Backend, Capability, Contacts, Health, KnownDifference, Links, MassProperties, State, unavailable
 from xreset.spec import SceneSpec
 
 try:

@@ -1,6 +1,6 @@
 """Warp kernels around MuJoCo-Warp's own: they translate between its arrays and the project's, on the device.
 
-Letters as in :mod:`xreset.backends.base`; Q mimic joints. Quaternions are stored (w, x, y, z) in a ``wp.quat``, as MuJoCo does.
+Letters as in :mod:`xreset.physics`; Q mimic joints. Quaternions are stored (w, x, y, z) in a ``wp.quat``, as MuJoCo does.
 """
 
 # Warp compiles these functions from their source; to a type checker of Python they make no sense.

@@ -1,4 +1,4 @@
-"""Worlds of a CPU engine in a pool of processes, behind :class:`~xreset.backends.base.Backend`.
+"""Worlds of a CPU engine in a pool of processes, behind :class:`~xreset.physics.Backend`.
 
 An engine is added by writing a :class:`World` (one world, numpy) and a :class:`PoolBackend` that names it.
 
@@ -6,7 +6,7 @@ Each worker is a fresh interpreter (``python -c``), so it inherits neither torch
 main guard. Numbers travel through one file that every process maps and that the parent then unlinks; commands travel through the worker's
 standard input, and the worker ends with it. So whatever way the parent dies, its workers end and nothing is left behind.
 
-Shape letters as in :mod:`xreset.backends.base`; arrays of one world have no leading N.
+Shape letters as in :mod:`xreset.physics`; arrays of one world have no leading N.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.base import Backend, Contacts, Health, Links, MassProperties, State
 from xreset.backends.rigid import Inertia
 from xreset.errors import CapabilityError, XResetError
+from xreset.physics import Backend, Contacts, Health, Links, MassProperties, State
 from xreset.spec import RobotSpec, SceneSpec, Shape
 
 STATE_FIELDS = tuple(field.name for field in fields(State))
 
 
 class World(ABC):
-    """One world of a scene in one process. Arrays are numpy float64; conventions are those of :class:`~xreset.backends.base.Backend`.
+    """One world of a scene in one process. Arrays are numpy float64; conventions are those of :class:`~xreset.physics.Backend`.
 
     The state is undefined until :meth:`set_state`, which the pool calls first. A world that reports a non-finite state is not stepped
     again before its state is set. :meth:`links` and :meth:`contacts` are called only where somebody wants them, in any order, once or
@@ -54,11 +54,11 @@ class World(ABC):
 
     @abstractmethod
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Set every field of :class:`~xreset.backends.base.State`; nothing of the past may remain (but physical parameters do)."""
+        """Set every field of :class:`~xreset.physics.State`; nothing of the past may remain (but physical parameters do)."""
 
     @abstractmethod
     def get_state(self) -> dict[str, np.ndarray]:
-        """Every field of :class:`~xreset.backends.base.State`.
+        """Every field of :class:`~xreset.physics.State`.
 
         They may be views of the engine's memory, which the next call that changes the world overwrites.
         """
@@ -334,7 +334,7 @@ class PoolBackend(Backend):
 
 
 def initial_state(scene: SceneSpec, object_index: int) -> dict[str, np.ndarray]:
-    """Fields of :class:`~xreset.backends.base.State` for one world: robot at home and at rest, object upright on the table's centre."""
+    """Fields of :class:`~xreset.physics.State` for one world: robot at home and at rest, object upright on the table's centre."""
     robot = scene.robot
     height = -lowest_point(scene.objects[object_index].pieces)
     return {

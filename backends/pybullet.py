@@ -23,7 +23,6 @@ from typing import Any, get_args
 
 import numpy as np
 
-from xreset.backends.base import Capability, unavailable
 from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.rigid import (
     Arms,
@@ -39,6 +38,7 @@ from xreset.backends.rigid import (
     rotate,
 )
 from xreset.errors import XResetError
+from xreset.physics import Capability, unavailable
 from xreset.spec import GRAVITY, Geometry, SceneSpec, Shape
 
 

@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 
 from xreset.errors import ObjectError, RobotError, XResetError
+from xreset.geometry.urdf import Joint, Link, RobotTree, robot_tree
 from xreset.spec import ObjectSpec, RobotSpec, Shape
-from xreset.urdf import Joint, Link, RobotTree, robot_tree
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,6 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from xreset.backends.base import Capability, KnownDifference, unavailable
 from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.rigid import (
     Arms,
@@ -37,6 +36,7 @@ from xreset.backends.rigid import (
     rotate,
 )
 from xreset.errors import RobotError, XResetError
+from xreset.physics import Capability, KnownDifference, unavailable
 from xreset.spec import GRAVITY, Geometry, MimicSpec, SceneSpec, Shape
 
 
@@ -430,7 +430,7 @@ class _Joints:
         )
         self._brakes = bool(self._loss.any())
         if self._brakes:
-            from xreset.robots.dynamics import mass_matrix
+            from xreset.geometry.dynamics import mass_matrix
 
             self._felt = 1.0 / np.diag(np.linalg.inv(mass_matrix(spec, spec.home) + np.diag(self._armature)))
 

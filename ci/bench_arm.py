@@ -13,7 +13,7 @@ from rich.console import Console
 
 from xreset import robots
 from xreset.demos import demo_objects, read_demos, synthesize
-from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
+from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, track
 from xreset.retarget.pipeline import wrist_paths
 from xreset.retarget.validity import Measures, Thresholds
 

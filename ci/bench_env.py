@@ -15,13 +15,13 @@ from rich.console import Console
 from rich.table import Table
 
 from xreset import robots
-from xreset.backends import make_backend
 from xreset.env import ManipulationEnv, make_scene
 from xreset.objects import load_objects
+from xreset.plugins import make_backend
 from xreset.resets.bank import ResetBank
+from xreset.resets.distribution import ResetDistribution
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
-from xreset.task.resets import ResetDistribution
 
 
 def run(options: Options, console: Console) -> None:

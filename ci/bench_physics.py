@@ -33,12 +33,11 @@ from rich.console import Console
 from rich.table import Table
 
 from xreset import robots
-from xreset.backends import make_backend
-from xreset.backends.base import Backend, State
 from xreset.backends.pool import PoolBackend, World, usable_cores
-from xreset.backends.registry import backend_class
 from xreset.env import make_scene
 from xreset.objects import load_objects
+from xreset.physics import Backend, State
+from xreset.plugins import backend_class, make_backend
 from xreset.spec import GRAVITY, SceneSpec
 from xreset.task.config import TaskConfig
 

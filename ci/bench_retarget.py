@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from xreset import robots
 from xreset.demos import Demos, demo_objects, read_demos
-from xreset.retarget.hand_config import HandConfig
-from xreset.retarget.hand_model import HandModel
+from xreset.retarget.hand.config import HandConfig
+from xreset.retarget.hand.model import HandModel
 from xreset.retarget.pipeline import RetargetConfig, hand_motions, rest_on_table
 from xreset.spec import ObjectSpec
 

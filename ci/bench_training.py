@@ -25,12 +25,12 @@ from benchlib import OBJECT, Options, rate, run_time, seconds_of
 from rich.console import Console
 from rich.table import Table
 
-from xreset.backends import backend_status, make_backend
 from xreset.env import ManipulationEnv, make_scene
 from xreset.learning.config import PpoConfig, TrainConfig
 from xreset.learning.runner import TrainingRunner
 from xreset.learning.train import load_inputs
-from xreset.task.resets import ResetDistribution
+from xreset.plugins import backend_status, make_backend
+from xreset.resets.distribution import ResetDistribution
 
 
 def add_arguments(group: argparse._ArgumentGroup) -> None:

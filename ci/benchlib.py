@@ -12,8 +12,8 @@ import torch
 from rich.console import Console
 from rich.markup import escape
 
-from xreset.backends import backend_names, backend_status
-from xreset.backends.base import State
+from xreset.physics import State
+from xreset.plugins import backend_names, backend_status
 from xreset.spec import ObjectSpec, RobotSpec
 
 OBJECT = "005_tomato_soup_can"
@@ -82,7 +82,7 @@ def held_grasp(robot: RobotSpec, objects: Sequence[ObjectSpec]) -> State:
     centre.
     """
     from xreset.demos.synth import synthesize
-    from xreset.kinematics import Kinematics
+    from xreset.geometry.kinematics import Kinematics
     from xreset.retarget.pipeline import rest_on_table, retarget
 
     moved = retarget(rest_on_table(synthesize([objects[0].name], 1, seed=0), objects), robot, objects)

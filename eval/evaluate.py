@@ -9,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from xreset import robots
-from xreset.backends.registry import backend_class, device_for
 from xreset.demos.archive import SCHEMA_NAME as DEMOS
 from xreset.demos.archive import demo_objects, read_demos
+from xreset.description import load_robot
 from xreset.errors import FileFormatError, PolicyError
 from xreset.eval.baselines import KinematicRetargeting
 from xreset.eval.results import mesh_folder, summarize, write_results
 from xreset.eval.rollout import roll_out
 from xreset.files import file_hash, npz_schema
 from xreset.objects import load_objects
+from xreset.plugins import backend_class, device_for
 from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
 from xreset.resets.bank import ResetBank, check_robot
@@ -64,7 +64,7 @@ def resolve(policy: str, robot: str | None, seed: int) -> Subject:
     if policy in BASELINES:
         if robot is None:
             raise PolicyError(f"the baseline {policy!r} needs --robot.")
-        spec = robots.load(robot)
+        spec = load_robot(robot)
         makers: dict[str, Callable[[RobotSpec, Retargeted | None], Policy]] = {
             "zero": lambda r, _: ZeroPolicy(len(r.joints)),
             "random": lambda r, _: RandomPolicy(len(r.joints), seed),
@@ -89,7 +89,7 @@ def resolve(policy: str, robot: str | None, seed: int) -> Subject:
         known = ", ".join(BASELINES) + (f", or a policy that ships with xreset: {', '.join(ours)}" if ours else "")
         raise PolicyError(f"there is no policy {policy!r}: expected a run folder, a .onnx file, or one of {known}. Check the name or path.")
     contract = OnnxPolicy(file).contract
-    spec = robots.load(robot or contract["robot"])
+    spec = load_robot(robot or contract["robot"])
     task = from_dict(TaskConfig, contract["task"], f"{file}: task")
     check_contract(str(file), contract, spec, task)
     return Subject(

@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from xreset.backends import make_backend
-from xreset.backends.registry import backend_class, device_for
 from xreset.env import ManipulationEnv, Reading, make_scene
 from xreset.errors import DemoError
 from xreset.eval.evaluate import Subject
@@ -23,12 +21,13 @@ from xreset.eval.metrics import MetricsConfig
 from xreset.eval.rollout import play, world_keypoints
 from xreset.files import file_hash, write_json
 from xreset.objects import load_objects
+from xreset.plugins import backend_class, device_for, make_backend
 from xreset.policy import Policy
 from xreset.resets.bank import ResetBank, check_objects, read_bank
+from xreset.resets.distribution import ResetDistribution, bank_starts
 from xreset.schedule import schedule
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
-from xreset.task.resets import ResetDistribution, bank_starts
 
 SCHEMA = "xreset-frontier/1"
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from xreset.env import Reading
-from xreset.rotations import quat_angle, quat_rotate
+from xreset.geometry.rotations import quat_angle, quat_rotate
 from xreset.task.rewards import contact_gate
 
 STAGE_SCORES = (0.0, 0.33, 0.66, 1.0)

@@ -9,17 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from xreset.backends import make_backend
-from xreset.backends.base import Backend
 from xreset.env import ManipulationEnv, Reading, make_scene
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
 from xreset.objects import keypoints
+from xreset.physics import Backend
+from xreset.plugins import make_backend
 from xreset.policy import Policy
 from xreset.resets.bank import ResetBank
+from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.schedule import schedule
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task.config import TaskConfig
-from xreset.task.resets import Reset, ResetDistribution
 from xreset.task.terminations import out_of_bounds
 
 MakeBackend = Callable[[SceneSpec, int, torch.Tensor], Backend]

@@ -1,6 +1,7 @@
 """Writing URDFs of the built-in robots from tables of published figures.
 
-The figures become a :class:`~xreset.urdf.RobotTree`, the same plain data that a URDF is read into, so writing and reading are inverse.
+The figures become a :class:`~xreset.geometry.urdf.RobotTree`, the same plain data that a URDF is read into, so writing and reading
+are inverse.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
+from xreset.geometry.urdf import Joint, Link, RobotTree
 from xreset.spec import Geometry, MimicSpec, Shape
-from xreset.urdf import Joint, Link, RobotTree
 
 FRAME_MASS = 1e-4
 """Mass [kg] of a link that is only a frame: some engines invent a mass (1 kg) for a link that has none."""

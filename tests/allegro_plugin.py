@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from xreset.geometry.urdf import Joint, Link, RobotTree, load_urdf
 from xreset.robots.writer import axes, fixed, frame, pose, urdf_text
-from xreset.urdf import Joint, Link, RobotTree, load_urdf
 
 NAME = "allegro"
 _PACKAGE = "example-robot-data"

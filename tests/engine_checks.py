@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from xreset.backends.base import State
 from xreset.backends.conformance.scene import gripper, objects, scene
 from xreset.backends.pool import PoolBackend
-from xreset.kinematics import Kinematics
-from xreset.robots.dynamics import mass_matrix
+from xreset.geometry.dynamics import mass_matrix
+from xreset.geometry.kinematics import Kinematics
+from xreset.physics import State
 from xreset.spec import GRAVITY, Geometry, ObjectSpec, RobotSpec, SceneSpec, Shape
 
 

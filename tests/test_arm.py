@@ -11,17 +11,19 @@ import numpy as np
 import torch
 
 from xreset import robots
+from xreset.description import DESCRIPTION
 from xreset.errors import RobotError
-from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
-from xreset.retarget.splice import splice, spread_over
+from xreset.geometry.rotations import matrix_to_quat, quat_multiply
+from xreset.plugins import robot_folder
+from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, track
+from xreset.retarget.arm.splice import splice, spread_over
 from xreset.retarget.validity import Thresholds, classify
-from xreset.robots import load, registry
-from xreset.robots.check import check_description
-from xreset.robots.placement import Finalist, PlaceConfig, Placement, Reach, Search, write_placement
-from xreset.rotations import matrix_to_quat, quat_multiply
+from xreset.robot_tools.check import check_description
+from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search, write_placement
+from xreset.robots import load
 
 try:
-    from xreset.robots import place as placing
+    from xreset.robot_tools import place as placing
 except ImportError as error:
     raise unittest.SkipTest(str(error)) from error
 
@@ -238,8 +240,8 @@ class WritePlacementTest(unittest.TestCase):
         folder = tempfile.TemporaryDirectory()
         self.addCleanup(folder.cleanup)
         self.folder = Path(folder.name) / "arm"
-        shutil.copytree(registry.robot_folder("openarm"), self.folder)
-        self.file = self.folder / registry.DESCRIPTION
+        shutil.copytree(robot_folder("openarm"), self.folder)
+        self.file = self.folder / DESCRIPTION
         best = Finalist(
             placement=Placement(pos=(0.1, 0.2, 0.3), quat=(0.6, 0.0, 0.8, 0.0)), reach=Reach(reached=0.9123, dexterity=0.5), followed=0.8765
         )

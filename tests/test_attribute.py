@@ -12,15 +12,17 @@ from pathlib import Path
 import torch
 
 from tests import toy_grasp
-from xreset.backends.base import State
-from xreset.backends.parity.trials import Engine, engine
 from xreset.cli import main
 from xreset.errors import CapabilityError, XResetError
-from xreset.eval.attribute import PROPERTIES, Alteration, Attribution, Measured, altered_engine, attribute, measure
-from xreset.eval.attribute.experiment import Row
-from xreset.eval.attribute.plot import write_plot
-from xreset.eval.attribute.table import amount, label, not_tried, rich_table, verdict
+from xreset.eval.engines.attribution import Attribution, Row, attribute
+from xreset.eval.engines.figures import write_plot
+from xreset.eval.engines.measure import Measured, measure
+from xreset.eval.engines.perturb import Alteration, altered_engine
+from xreset.eval.engines.properties import PROPERTIES
+from xreset.eval.engines.tables import amount, label, not_tried, rich_table, verdict
+from xreset.eval.engines.trials import Engine, engine
 from xreset.eval.rollout import Episode
+from xreset.physics import State
 from xreset.spec import SceneSpec
 from xreset.task.config import RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
 

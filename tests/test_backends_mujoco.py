@@ -14,17 +14,17 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.toy_robot import toy_hand_arm
-from xreset.backends.base import Backend
 from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench, snapshot
 from xreset.backends.conformance.scene import gripper, objects, scene
 from xreset.backends.mjcf import OBJECT, OTHER_LINK, TABLE, SceneModel, compile_scene
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.mujoco_warp import MujocoWarpBackend, _differing_fields
-from xreset.backends.registry import device_for
 from xreset.errors import BackendUnavailableError, ObjectError, RobotError, XResetError
+from xreset.geometry.urdf import robot_tree
+from xreset.physics import Backend
+from xreset.plugins import device_for
 from xreset.spec import FingertipSpec
-from xreset.urdf import robot_tree
 
 
 def colliding_geoms(model: mujoco.MjModel) -> set[frozenset[str]]:

@@ -16,7 +16,7 @@ from xreset.backends.conformance.scene import gripper, objects, scene
 from xreset.backends.pybullet import PybulletBackend, PybulletSettings, PybulletWorld, _origin
 from xreset.backends.rigid import mechanism
 from xreset.errors import BackendUnavailableError, ObjectError
-from xreset.robots.dynamics import mass_matrix
+from xreset.geometry.dynamics import mass_matrix
 from xreset.spec import Geometry, Shape
 
 

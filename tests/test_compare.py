@@ -12,15 +12,14 @@ import numpy as np
 from tests.test_cli import run
 from tests.toy_results import toy_rollouts, toy_summary
 from xreset.errors import FileFormatError, RunError, XResetError
-from xreset.eval.compare import compare
-from xreset.eval.compare.data import read_training, read_trainings
-from xreset.eval.compare.groups import grouped
-from xreset.eval.compare.make import choose_curves
-from xreset.eval.compare.progress import Line, amounts, line, processes
-from xreset.eval.compare.score import score
-from xreset.eval.compare.table import escape
 from xreset.eval.report import plots as report_plots
+from xreset.eval.report.compare import choose_curves, compare
 from xreset.eval.report.data import Curve, read_curves
+from xreset.eval.report.groups import grouped
+from xreset.eval.report.progress import Line, amounts, line, processes
+from xreset.eval.report.score import score
+from xreset.eval.report.tables import escape
+from xreset.eval.report.trainings import read_training, read_trainings
 from xreset.eval.results import write_results
 from xreset.eval.rollout import Rollouts
 from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95
@@ -517,7 +516,7 @@ class DrawTest(InFolder):
     def test_lines_and_bands(self):
         from matplotlib.collections import PolyCollection
 
-        from xreset.eval.compare.plot import draw_lines
+        from xreset.eval.report.compare_plots import draw_lines
 
         x, mean = np.array([1e6, 3e6]), np.array([0.1, 0.3])
         lines = {"a": Line(x=x, mean=mean, low=mean, high=mean), "c": Line(x=x, mean=mean, low=mean - 0.1, high=mean + 0.1)}
@@ -529,7 +528,7 @@ class DrawTest(InFolder):
         self.assertEqual((ax.get_xlabel(), ax.get_title(loc="left")), ("million environment steps", "at the goal"))
 
     def test_the_ninth_training_has_another_line_and_hatch(self):
-        from xreset.eval.compare.plot import draw_lines, draw_scores
+        from xreset.eval.report.compare_plots import draw_lines, draw_scores
 
         values = np.array([0.1, 0.3])
         names = [f"n{i}" for i in range(9)]
@@ -545,7 +544,7 @@ class DrawTest(InFolder):
         self.assertTrue(all(a[1] < b[0] for a, b in pairwise(edges)), "bars do not overlap")
 
     def test_bars_are_as_long_as_the_results(self):
-        from xreset.eval.compare.plot import draw_scores
+        from xreset.eval.report.compare_plots import draw_scores
 
         self.write_results("a", rollouts_with(1.0, 0.5, 0.5, 0.0), ("mujoco", "sapien"))
         self.write_results("b", rollouts_with(0.2, 0.2, 0.2, 0.2), ("sapien",))

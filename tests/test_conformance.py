@@ -17,13 +17,13 @@ import mujoco
 import numpy as np
 import torch
 
-from xreset.backends.base import KnownDifference
 from xreset.backends.conformance import CHECKS, CheckResult, Measure, run
 from xreset.backends.mjcf import OBJECT
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.rigid import Inertia, conjugate, rotate
 from xreset.cli import main
 from xreset.errors import BackendUnavailableError
+from xreset.physics import KnownDifference
 
 Defect = type[MujocoWorld] | type[MujocoBackend]
 DEFECTS: list[tuple[Defect, tuple[str, ...]]] = []

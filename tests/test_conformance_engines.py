@@ -14,7 +14,7 @@ import numpy as np
 
 from xreset.backends import backend_status, make_backend
 from xreset.backends.conformance import CHECKS, CheckResult, run
-from xreset.robots.dynamics import drive_inertia
+from xreset.geometry.dynamics import drive_inertia
 from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
 
 BACKENDS = ("mujoco", "mujoco-warp", "pybullet", "sapien")

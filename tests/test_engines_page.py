@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from xreset.backends.conformance import SCHEMA
-from xreset.backends.matrix import page, read
-from xreset.backends.parity.compare import SCHEMA as PARITY
 from xreset.cli import main
 from xreset.errors import FileFormatError, XResetError
+from xreset.eval.engines.agreement import SCHEMA as PARITY
+from xreset.eval.engines.page import page, read
 
 STORED = Path(__file__).with_name("engines")
 DOCS = Path(__file__).resolve().parents[1] / "docs"

@@ -15,9 +15,9 @@ from tests.toy_robot import toy_hand_arm
 from xreset.env import ManipulationEnv, make_scene
 from xreset.objects import load_objects
 from xreset.policy import ZeroPolicy
+from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import ActionConfig, NoiseConfig, ObservationConfig, ResetConfig, TaskConfig, TerminationConfig, evaluation_task
 from xreset.task.observations import layout
-from xreset.task.resets import ResetDistribution
 
 try:
     from xreset.backends.mujoco import MujocoBackend

@@ -14,7 +14,8 @@ from unittest import mock
 
 import torch
 
-from xreset.backends import backend_status, make_backend, registry
+from xreset import plugins
+from xreset.backends import backend_status, make_backend
 from xreset.backends.conformance import run
 from xreset.backends.conformance.scene import scene
 from xreset.cli import main
@@ -27,8 +28,8 @@ MISSING = "Drake is not installed: pip install -e examples/xreset-drake"
 def declared() -> EntryPoint:
     """The entry point of the example, as its pyproject.toml states it."""
     project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
-    [(name, value)] = project["entry-points"][registry.GROUP].items()
-    return EntryPoint(name=name, value=value, group=registry.GROUP)
+    [(name, value)] = project["entry-points"][plugins.ENGINES].items()
+    return EntryPoint(name=name, value=value, group=plugins.ENGINES)
 
 
 class PluginTest(unittest.TestCase):
@@ -40,8 +41,8 @@ class PluginTest(unittest.TestCase):
         self.enterContext(mock.patch.object(sys, "path", [str(folder), *sys.path]))
         self.enterContext(mock.patch.dict(sys.modules))
         sys.modules.pop("someones_engine", None)
-        entry = EntryPoint(name="someones", value=value, group=registry.GROUP)
-        self.enterContext(mock.patch.object(registry, "_entries", lambda: {"someones": entry}))
+        entry = EntryPoint(name="someones", value=value, group=plugins.ENGINES)
+        self.enterContext(mock.patch.object(plugins, "entry_points", lambda group: [entry]))
 
     def test_a_plugin_is_found_built_and_tested_like_any_engine(self):
         self.plugin(
@@ -74,7 +75,7 @@ class PluginTest(unittest.TestCase):
 
     def test_an_entry_point_that_names_no_backend(self):
         self.plugin("def SomeonesBackend(scene, num_worlds): return None\n")
-        self.assert_unavailable("expected a class that inherits from xreset.backends.base.Backend")
+        self.assert_unavailable("expected a class that inherits from xreset.physics.Backend")
 
     def test_a_plugin_that_says_what_to_install_is_quoted(self):
         self.plugin("from xreset.errors import BackendUnavailableError\nraise BackendUnavailableError('pip install their-engine')\n")
@@ -102,14 +103,14 @@ class ExampleTest(unittest.TestCase):
         kept = {name: module for name, module in sys.modules.items() if not name.startswith("xreset_drake")}
         with (
             mock.patch.dict(sys.modules, kept | absent, clear=True),
-            mock.patch.object(registry, "_entries", lambda: {"drake": declared()}),
+            mock.patch.object(plugins, "entry_points", lambda group: [declared()]),
         ):
             with self.assertRaisesRegex(BackendUnavailableError, "pip install drake"):
                 make_backend("drake", scene(), 1)
             self.assertIn("pip install drake", backend_status("drake").reason or "")
 
     def test_it_uses_the_public_interface_only(self):
-        public = {"xreset.backends.base", "xreset.backends.pool", "xreset.backends.rigid", "xreset.spec", "xreset.errors"}
+        public = {"xreset.physics", "xreset.backends.pool", "xreset.backends.rigid", "xreset.spec", "xreset.errors"}
         for file in EXAMPLE.rglob("*.py"):
             for line in file.read_text().splitlines():
                 words = line.split()

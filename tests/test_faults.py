@@ -22,8 +22,8 @@ from xreset.learning.ppo import SequencePpo
 from xreset.learning.run import checkpoints
 from xreset.learning.runner import TrainingRunner
 from xreset.objects import load_objects
+from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import ObservationConfig, TaskConfig
-from xreset.task.resets import ResetDistribution
 
 try:
     from xreset.backends.mujoco import MujocoBackend

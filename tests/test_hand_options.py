@@ -13,14 +13,15 @@ import tyro
 from tests.test_retarget import FAR_OBJECT, FLOAT
 from tests.toy_robot import toy_hand_arm, toy_motion
 from xreset import robots
-from xreset.retarget import cost, hand
-from xreset.retarget.cost import system
-from xreset.retarget.hand import HandConfig, HandTargets, retarget_hand
-from xreset.retarget.hand_model import HandModel, finger_keypoints
-from xreset.retarget.hold import hold
-from xreset.retarget.problem import HandState
-from xreset.retarget.scale import hand_scale, resized
-from xreset.rotations import quat_from_axis_angle, quat_multiply, quat_rotate, quat_rotate_inverse
+from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply, quat_rotate, quat_rotate_inverse
+from xreset.retarget.hand import cost
+from xreset.retarget.hand import solve as hand
+from xreset.retarget.hand.cost import system
+from xreset.retarget.hand.hold import hold
+from xreset.retarget.hand.model import HandModel, finger_keypoints
+from xreset.retarget.hand.problem import HandState
+from xreset.retarget.hand.scale import hand_scale, resized
+from xreset.retarget.hand.solve import HandConfig, HandTargets, retarget_hand
 from xreset.spec import KEYPOINTS
 
 S, T = 3, 12

@@ -7,7 +7,7 @@ import torch
 
 from tests.toy_robot import toy_hand_arm, write_urdf
 from xreset.errors import RobotError
-from xreset.kinematics import Kinematics
+from xreset.geometry.kinematics import Kinematics
 
 
 class KinematicsTest(unittest.TestCase):

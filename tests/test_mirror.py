@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from xreset.demos import mirrored, symmetry, synthesize
 from xreset.errors import DemoError
+from xreset.geometry.shapes import box, surface_of
 from xreset.objects import load_object
-from xreset.objects.geometry import box, surface_of
 from xreset.spec import ObjectSpec, TableSpec
 
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.data import data_dir
 from xreset.errors import ObjectError
+from xreset.geometry.shapes import half_spaces, hull
 from xreset.objects import (
     bounding_box,
     bounding_radius,
@@ -29,7 +30,6 @@ from xreset.objects import (
     surface_points,
 )
 from xreset.objects.decompose import limited_hull
-from xreset.objects.geometry import half_spaces, hull
 from xreset.objects.meshes import DEFAULT_DENSITY, import_with_notes, mesh_files
 from xreset.objects.sampling import sample_surface, winding_number
 

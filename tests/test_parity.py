@@ -16,8 +16,9 @@ import torch
 from tests.toy_bank import toy_bank
 from xreset import cli, robots
 from xreset.backends import backend_status
-from xreset.backends.parity.compare import compare
-from xreset.backends.parity.episodes import (
+from xreset.errors import DemoError
+from xreset.eval.engines.agreement import compare
+from xreset.eval.engines.episodes import (
     Motion,
     at_rest,
     carried_palm,
@@ -27,16 +28,15 @@ from xreset.backends.parity.episodes import (
     squeezed,
     squeezing_state,
 )
-from xreset.backends.parity.grasps import NEAR, Frames, find_grasps
-from xreset.backends.parity.load import load_frames
-from xreset.backends.parity.metrics import Metric, carried, outcome_metric, palm_distance, path_difference, path_metrics, press_metrics
-from xreset.backends.parity.recording import Recording
-from xreset.backends.parity.trials import Engine, ParityConfig, engine
-from xreset.errors import DemoError
-from xreset.kinematics import Kinematics
+from xreset.eval.engines.grasps import NEAR, Frames, find_grasps
+from xreset.eval.engines.load import load_frames
+from xreset.eval.engines.metrics import Metric, carried, outcome_metric, palm_distance, path_difference, path_metrics, press_metrics
+from xreset.eval.engines.recording import Recording
+from xreset.eval.engines.trials import Engine, ParityConfig, engine
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.objects import load_object, rest_height
 from xreset.retarget.file import Retargeted, write_retargeted
-from xreset.rotations import quat_from_axis_angle
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
 DT = 1 / 60
@@ -489,8 +489,8 @@ class Command(unittest.TestCase):
         good, bad = engine("mujoco", workers=0), altered(engine("mujoco", workers=0), "pybullet", robot=lambda r: with_drives(r, 0.3))
         for made, code in ((replace(good, name="pybullet"), None), (bad, 1)):
             with (
-                mock.patch("xreset.backends.parity.trials.engine", lambda name, made=made, **_: made),
-                mock.patch("xreset.backends.parity.compare.engine", lambda name: good),
+                mock.patch("xreset.eval.engines.trials.engine", lambda name, made=made, **_: made),
+                mock.patch("xreset.eval.engines.agreement.engine", lambda name: good),
             ):
                 text, found = self.run_command(path, "--backend", "pybullet", "--grasps", 2, "--json", out)
             self.assertEqual(found, code)

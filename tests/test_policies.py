@@ -20,8 +20,8 @@ from tests.toy_bank import SOUP
 from xreset import policies, robots
 from xreset.demos import synthesize, write_demos
 from xreset.errors import PolicyError
+from xreset.eval.engines.sources import from_policy
 from xreset.eval.evaluate import resolve
-from xreset.eval.trace.sources import from_policy
 from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel
 from xreset.learning.shrink import shrink
@@ -205,7 +205,7 @@ class ShippedTest(WithPolicy):
         code, out, err = run("report", "skilled")
         self.assertEqual((code, err), (0, ""))
         self.assertTrue(Path("runs/skilled/report/index.html").is_file(), out)
-        with mock.patch("xreset.eval.trace.sources.play_policy") as play:
+        with mock.patch("xreset.eval.engines.sources.play_policy") as play:
             from_policy(
                 "skilled", Path("demos.npz"), mock.Mock(), object_name=None, episode=0, repetition=0, robot=None, objects=None, seed=0,
                 progress=lambda done, total: None,

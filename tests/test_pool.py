@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from xreset.backends.base import State
 from xreset.backends.pool import STATE_FIELDS, PoolBackend, World, initial_state, is_finite, lowest_point
 from xreset.errors import CapabilityError, RobotError, XResetError
+from xreset.physics import State
 from xreset.spec import DriveSpec, FingertipSpec, Geometry, JointSpec, ObjectSpec, RobotSpec, SceneSpec, Shape
 
 REPOSITORY = Path(__file__).resolve().parents[1]

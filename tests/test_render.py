@@ -7,10 +7,10 @@ import numpy as np
 import torch
 import trimesh
 
-from xreset import render
 from xreset.errors import RobotError
-from xreset.kinematics import Kinematics
-from xreset.render import Camera, Frames, Points, Renderer, link_colors, pose_matrix, write_png
+from xreset.geometry.kinematics import Kinematics
+from xreset.pictures import raster as render
+from xreset.pictures.raster import Camera, Frames, Points, Renderer, link_colors, pose_matrix, write_png
 from xreset.robots import load
 from xreset.spec import Geometry, ObjectSpec, SceneSpec, Shape
 

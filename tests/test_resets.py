@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from xreset import robots
-from xreset.backends.base import Health
 from xreset.errors import DemoError
 from xreset.objects import load_objects, rest_height
+from xreset.physics import Health
 from xreset.resets.filter import REASONS, FilterConfig, make_bank, try_states
 from xreset.retarget.pipeline import Retargeted
 from xreset.spec import SceneSpec

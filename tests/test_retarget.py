@@ -17,25 +17,25 @@ from tests.toy_robot import toy_hand_arm, toy_motion
 from xreset import robots
 from xreset.demos import demo_objects, read_demos, synthesize, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError
-from xreset.kinematics import Kinematics
-from xreset.objects.geometry import box, surface_of
-from xreset.retarget import arm_solver
+from xreset.geometry.balls import inscribed_balls, sharp_points
+from xreset.geometry.collision import SelfCollision, height_above_table, support_points
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_matrix
+from xreset.geometry.shapes import box, surface_of
+from xreset.geometry.surface import Surface, keypoint_contacts, solid_nodes
 from xreset.retarget import pipeline as pipeline_module
-from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, measure, track
-from xreset.retarget.balls import inscribed_balls, sharp_points
+from xreset.retarget.arm import cost as arm_cost
+from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, measure, track
 from xreset.retarget.chain import solve_chain
-from xreset.retarget.clearance import Distances, Objects, not_touching, too_near
-from xreset.retarget.collision import SelfCollision, height_above_table, support_points
-from xreset.retarget.cost import system
 from xreset.retarget.file import Retargeted, read_retargeted, write_retargeted
-from xreset.retarget.hand import HandConfig, HandTargets, retarget_hand
-from xreset.retarget.hand_model import HandModel, keypoint_pairs
+from xreset.retarget.hand.clearance import Distances, Objects, not_touching, too_near
+from xreset.retarget.hand.cost import system
+from xreset.retarget.hand.model import HandModel, keypoint_pairs
+from xreset.retarget.hand.problem import HandState
+from xreset.retarget.hand.solve import HandConfig, HandTargets, retarget_hand
 from xreset.retarget.partial import discard, run_key
 from xreset.retarget.pipeline import RetargetConfig, rest_on_table, retarget
-from xreset.retarget.problem import HandState
-from xreset.retarget.surface import Surface, keypoint_contacts, solid_nodes
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
-from xreset.rotations import quat_angle, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_matrix
 from xreset.spec import KEYPOINTS, Geometry, ObjectSpec, TableSpec
 
 FLOAT = torch.float64
@@ -431,7 +431,7 @@ class ArmTest(unittest.TestCase):
         """Targets from the hand's pose along arm joints [T, n], lowered by ``lower`` [m]."""
         hand = torch.as_tensor(self.robot.home[self.robot.hand_indices]).expand(1, len(joints), -1)
         T = self.model.kinematics.link_poses(self.model.full(joints[None], hand), [self.robot.hand_root])[:, :, 0]
-        from xreset.rotations import matrix_to_quat
+        from xreset.geometry.rotations import matrix_to_quat
 
         pos = T[..., :3, 3].clone()
         pos[..., 2] -= lower
@@ -483,15 +483,15 @@ class ArmTest(unittest.TestCase):
         folded = torch.as_tensor(self.robot.home[self.robot.arm_indices]).clone()[None]
         folded[0, self.robot.joint_names.index("elbow_joint")] = 2.95
         targets = self.along(folded)
-        frame = arm_solver.Frame(
+        frame = arm_cost.Frame(
             pos=targets.root_pos[:, 0],
             quat=targets.root_quat[:, 0],
             support=self.model.hand_support(targets.hand_joints)[:, 0],
             hand_joints=targets.hand_joints[:, 0],
             previous=None,
         )
-        plain = arm_solver.system(self.model, frame, folded, self.config, self_collision=False)
-        full = arm_solver.system(self.model, frame, folded, self.config, self_collision=True)
+        plain = arm_cost.system(self.model, frame, folded, self.config, self_collision=False)
+        full = arm_cost.system(self.model, frame, folded, self.config, self_collision=True)
         self.assertGreater((full.cost - plain.cost).item(), 0.1)
         push = full.gradient - plain.gradient
         step = 1e-6
@@ -500,8 +500,8 @@ class ArmTest(unittest.TestCase):
             shift = torch.zeros_like(folded)
             shift[0, k] = step
             costs = [
-                arm_solver.system(self.model, frame, folded + sign * shift, self.config, self_collision=True).cost
-                - arm_solver.system(self.model, frame, folded + sign * shift, self.config, self_collision=False).cost
+                arm_cost.system(self.model, frame, folded + sign * shift, self.config, self_collision=True).cost
+                - arm_cost.system(self.model, frame, folded + sign * shift, self.config, self_collision=False).cost
                 for sign in (1.0, -1.0)
             ]
             slopes.append(((costs[0] - costs[1]) / (4 * step)).item())

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from xreset import robots
-from xreset.kinematics import Kinematics
-from xreset.retarget import terms
+from xreset.geometry.kinematics import Kinematics
+from xreset.retarget.hand import terms
 
 FLOAT = torch.float64
 STEP = 1e-6

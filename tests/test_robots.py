@@ -11,15 +11,16 @@ from unittest import mock
 import numpy as np
 import torch
 
+from xreset import plugins
 from xreset.cli import main
 from xreset.errors import RobotError
-from xreset.kinematics import Kinematics
-from xreset.robots import load, registry, robot_names
-from xreset.robots.check import check_description
-from xreset.robots.dynamics import damping_ratio, mass_matrix
+from xreset.geometry.dynamics import damping_ratio, mass_matrix
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.urdf import load_urdf
+from xreset.robot_tools.check import check_description
+from xreset.robots import load, robot_names
 from xreset.robots.openarm import build as openarm
 from xreset.robots.ur7e_sharpa import build as ur7e_sharpa
-from xreset.urdf import load_urdf
 
 BUILT_IN = {"ur7e-sharpa": ur7e_sharpa, "openarm": openarm}
 
@@ -144,7 +145,7 @@ class Dynamics(unittest.TestCase):
     @unittest.skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
     def test_a_step_settles_without_overshoot(self):
         from xreset.backends import make_backend
-        from xreset.robots.check import _probe
+        from xreset.robot_tools.check import _probe
         from xreset.spec import SceneSpec
 
         robot = load("openarm")
@@ -189,10 +190,10 @@ class Registry(unittest.TestCase):
 
     def test_a_broken_plugin_harms_nobody(self):
         entries = [
-            EntryPoint("broken", "xreset_no_such_package.robot", registry.GROUP),
-            EntryPoint("openarm", "xreset.robots.openarm", registry.GROUP),
+            EntryPoint("broken", "xreset_no_such_package.robot", plugins.ROBOTS),
+            EntryPoint("openarm", "xreset.robots.openarm", plugins.ROBOTS),
         ]
-        with mock.patch.object(registry, "entry_points", lambda group: entries):
+        with mock.patch.object(plugins, "entry_points", lambda group: entries):
             self.assertEqual(robot_names(), ["broken", "openarm"])
             self.assertEqual(load("openarm").name, "openarm")
             with self.assertRaisesRegex(RobotError, "'broken'.*xreset_no_such_package"):

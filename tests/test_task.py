@@ -12,8 +12,9 @@ import torch
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.errors import DemoError, PolicyError
+from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_rotate
 from xreset.policy import OnnxPolicy, RandomPolicy, ZeroPolicy, check_contract, policy_contract
-from xreset.rotations import quat_angle, quat_from_axis_angle, quat_rotate
+from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.spec import TableSpec
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
@@ -29,7 +30,6 @@ from xreset.task.config import (
     evaluation_task,
 )
 from xreset.task.randomization import pair_friction, sample_friction, sample_mass_scale
-from xreset.task.resets import Reset, ResetDistribution
 from xreset.task.rewards import RewardInput, compute_reward, contact_gate
 from xreset.task.terminations import episode_steps, out_of_bounds
 

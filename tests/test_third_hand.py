@@ -16,12 +16,12 @@ import torch
 from tests import allegro_plugin
 from xreset.cli import main
 from xreset.demos import read_demos, synthesize, write_demos
-from xreset.kinematics import Kinematics
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.urdf import load_urdf
 from xreset.resets.bank import read_bank
 from xreset.retarget.file import read_retargeted
+from xreset.robot_tools.check import check_description
 from xreset.robots import load, robot_names
-from xreset.robots.check import check_description
-from xreset.urdf import load_urdf
 
 OBJECTS = ["005_tomato_soup_can", "010_potted_meat_can"]
 

@@ -14,23 +14,22 @@ import torch
 
 from tests import toy_grasp
 from tests.data import data_dir
-from xreset.backends.base import State
-from xreset.backends.parity.recording import Recording
-from xreset.backends.parity.trials import engine
 from xreset.cli import main
 from xreset.errors import DemoError, FileFormatError, XResetError
+from xreset.eval.engines.actions import Actions, play_policy, read_actions, recorded_actions, write_actions
+from xreset.eval.engines.divergence import Parting, Thresholds, differences, first_of, partings
+from xreset.eval.engines.film import write_strip
+from xreset.eval.engines.recording import Recording
+from xreset.eval.engines.replay import TraceResult, trace, write_trace
+from xreset.eval.engines.sources import from_file
+from xreset.eval.engines.trace_figure import write_plot
+from xreset.eval.engines.trace_table import rich_table, sentences
+from xreset.eval.engines.trials import engine
 from xreset.eval.results import write_results
 from xreset.eval.rollout import roll_out
-from xreset.eval.trace import Actions, Parting, Thresholds, play_policy, read_actions, trace, write_actions
-from xreset.eval.trace.actions import recorded_actions
-from xreset.eval.trace.film import write_strip
-from xreset.eval.trace.partings import differences, first_of, partings
-from xreset.eval.trace.plot import write_plot
-from xreset.eval.trace.replay import TraceResult, write_trace
-from xreset.eval.trace.sources import from_file
-from xreset.eval.trace.table import rich_table, sentences
 from xreset.files import read_json, read_npz
-from xreset.rotations import quat_from_axis_angle
+from xreset.geometry.rotations import quat_from_axis_angle
+from xreset.physics import State
 from xreset.spec import PairFriction
 from xreset.task.config import RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
 
@@ -368,9 +367,9 @@ class RealGraspTest(unittest.TestCase):
 
     def test_a_demonstrated_grasp_is_lifted(self):
         from xreset import robots
-        from xreset.backends.parity.grasps import Frames, find_grasps
         from xreset.demos.archive import read_demos
-        from xreset.eval.trace import grasp_and_lift
+        from xreset.eval.engines.actions import grasp_and_lift
+        from xreset.eval.engines.grasps import Frames, find_grasps
         from xreset.objects import load_objects
         from xreset.retarget.pipeline import retarget
 

@@ -21,14 +21,14 @@ from xreset import robots
 from xreset.cli import main
 from xreset.demos.archive import Demos, write_demos
 from xreset.errors import FileFormatError, XResetError
-from xreset.kinematics import Kinematics
-from xreset.render import tinted, write_png
+from xreset.geometry.kinematics import Kinematics
+from xreset.pictures.raster import tinted, write_png
+from xreset.pictures.view.colors import reason_color
+from xreset.pictures.view.load import load_view
+from xreset.pictures.view.picture import Drawer
+from xreset.pictures.view.sheet import moment_tiles, reason_tiles
 from xreset.resets.bank import write_bank
 from xreset.retarget.file import Retargeted, write_retargeted
-from xreset.view.colors import reason_color
-from xreset.view.load import load_view
-from xreset.view.picture import Drawer
-from xreset.view.sheet import moment_tiles, reason_tiles
 
 FRAMES = 4
 NAMES = np.array(["demo_a", "demo_b"])
@@ -323,7 +323,7 @@ class Pictures(WithFiles):
 @unittest.skipUnless(find_spec("viser"), "viser is not installed")
 class Served(WithFiles):
     def page(self, path: Path, **options):
-        from xreset.view.page import Page
+        from xreset.pictures.view.page import Page
 
         with redirect_stdout(io.StringIO()):
             page = Page(load_view(path), port=8930, **options)

@@ -14,9 +14,9 @@ from tests.test_view import toy_demos, toy_retargeted
 from tests.toy_bank import SOUP, toy_bank
 from xreset import robots
 from xreset.demos.archive import write_demos
+from xreset.pictures.view.load import load_view
 from xreset.resets.bank import write_bank
 from xreset.retarget.file import write_retargeted
-from xreset.view.load import load_view
 
 INPUT = "document.getElementById([...document.querySelectorAll('label')].find(e => e.textContent === '{label}').htmlFor)"
 SLIDER = INPUT + ".querySelector('[role=slider]')"
@@ -40,7 +40,7 @@ class InTheBrowser(unittest.TestCase):
 
     def open(self, path: Path, **options):
         """A page that the browser shows."""
-        from xreset.view.page import Page
+        from xreset.pictures.view.page import Page
 
         with redirect_stdout(io.StringIO()):
             page = Page(load_view(path, **options), port=8940)

@@ -10,11 +10,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.toy_bank import toy_bank
-from xreset.backends.base import State
 from xreset.backends.conformance.scene import gripper, objects
-from xreset.backends.parity.episodes import at_rest
-from xreset.backends.parity.trials import Engine
-from xreset.kinematics import Kinematics
+from xreset.eval.engines.episodes import at_rest
+from xreset.eval.engines.trials import Engine
+from xreset.geometry.kinematics import Kinematics
+from xreset.physics import State
 from xreset.resets.bank import ResetBank
 from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
 

@@ -14,21 +14,21 @@ from torch import Tensor
 
 from xreset.capture import GraphRunner
 from xreset.faults import FaultRecorder
+from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.objects import surface_points
-from xreset.rotations import quat_rotate_inverse
+from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
 from xreset.task.randomization import sample_friction, sample_mass_scale
-from xreset.task.resets import Reset, ResetDistribution
 from xreset.task.rewards import Reward, RewardInput, compute_reward
 from xreset.task.terminations import episode_steps, out_of_bounds
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
 
-    from xreset.backends.base import Backend, Contacts, Health, Links, State
+    from xreset.physics import Backend, Contacts, Health, Links, State
 
 
 _LASTING = (
@@ -241,7 +241,7 @@ class ManipulationEnv:
 
     def restore(self, snapshot: dict[str, Tensor]) -> bool:
         """Go on from a snapshot; False, and nothing is changed, if it is of another number of worlds or of another task."""
-        from xreset.backends.base import State
+        from xreset.physics import State
 
         if {name: value.shape for name, value in snapshot.items()} != {name: value.shape for name, value in self.snapshot().items()}:
             return False
@@ -447,7 +447,7 @@ class ManipulationEnv:
 
 def rest_state(joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor) -> State:
     """A state at rest whose drives hold the given joint positions [M, J]."""
-    from xreset.backends.base import State
+    from xreset.physics import State
 
     zero = torch.zeros_like(object_pos)
     return State(

@@ -1,4 +1,4 @@
-"""Whether a backend keeps the contracts of :class:`~xreset.backends.base.Backend`: a list of checks that any engine must pass.
+"""Whether a backend keeps the contracts of :class:`~xreset.physics.Backend`: a list of checks that any engine must pass.
 
     from xreset.backends.conformance import run
     results = run(lambda scene, num_worlds, **kw: MyBackend(scene, num_worlds, **kw))
@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
-from xreset.backends.base import KnownDifference
 from xreset.backends.conformance import (
     contact_checks,
     friction_checks,
@@ -27,6 +26,7 @@ from xreset.backends.conformance.harness import Bench, MakeBackend
 from xreset.backends.conformance.results import SCHEMA, Check, CheckResult, Measure, Skipped, Verdict, judge
 from xreset.backends.conformance.scene import scene
 from xreset.errors import BackendUnavailableError, CapabilityError
+from xreset.physics import KnownDifference
 from xreset.spec import RobotSpec
 
 CHECKS: tuple[Check, ...] = (

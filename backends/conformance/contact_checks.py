@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from xreset.backends.base import Backend, State
 from xreset.backends.conformance.harness import Bench, largest, replace_fields, rotation_angle, snapshot, start_state
 from xreset.backends.conformance.results import Check, Measure
 from xreset.backends.conformance.scene import flat_objects
 from xreset.backends.pool import lowest_point
+from xreset.physics import Backend, State
 from xreset.spec import GRAVITY, ObjectSpec, PairFriction, Shape
 
 _SETTLE = 120  # steps

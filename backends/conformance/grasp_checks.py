@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from xreset.backends.base import State
 from xreset.backends.conformance.harness import Bench, largest, replace_fields, rotation_angle, snapshot
 from xreset.backends.conformance.results import Check, Measure
-from xreset.rotations import matrix_to_quat, quat_conjugate, quat_multiply, quat_rotate
+from xreset.geometry.rotations import matrix_to_quat, quat_conjugate, quat_multiply, quat_rotate
+from xreset.physics import State
 from xreset.spec import GRAVITY
 
 _SETTLE = 120  # steps

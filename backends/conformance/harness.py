@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.base import Backend, State
 from xreset.backends.conformance.results import Measure, Skipped
 from xreset.backends.conformance.scene import gripper
 from xreset.backends.pool import initial_state
-from xreset.kinematics import Kinematics
-from xreset.rotations import quat_normalize
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import quat_normalize
+from xreset.physics import Backend, State
 from xreset.spec import SceneSpec
 
 
@@ -88,7 +88,7 @@ class Bench:
 
         The reference itself, if it is what is tested, is compared with finer steps of its own.
         """
-        from xreset.backends.registry import backend_status, make_backend
+        from xreset.plugins import backend_status, make_backend
 
         status = backend_status(REFERENCE)
         if status.reason is not None:

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from xreset.backends.base import Capability, KnownDifference
+from xreset.physics import Capability, KnownDifference
 
 if TYPE_CHECKING:
     from xreset.backends.conformance.harness import Bench

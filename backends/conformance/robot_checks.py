@@ -13,14 +13,14 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from xreset.backends.base import Backend, State
 from xreset.backends.conformance.harness import Bench, largest, replace_fields, rotation_angle, snapshot, start_state
 from xreset.backends.conformance.results import Check, Measure, Skipped
 from xreset.backends.conformance.scene import without_collisions
-from xreset.kinematics import Kinematics
-from xreset.rotations import matrix_to_quat
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import matrix_to_quat
+from xreset.geometry.urdf import robot_tree
+from xreset.physics import Backend, State
 from xreset.spec import GRAVITY, RobotSpec, SceneSpec
-from xreset.urdf import robot_tree
 
 _CONFIGURATIONS = 200
 _WAY = 0.2  # rad, of a joint's step and of the amplitude of its sine

@@ -11,6 +11,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from xreset.geometry.urdf import robot_tree
 from xreset.spec import (
     DriveSpec,
     FingertipSpec,
@@ -24,7 +25,6 @@ from xreset.spec import (
     SceneSpec,
     Shape,
 )
-from xreset.urdf import robot_tree
 
 
 @cache

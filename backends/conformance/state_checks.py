@@ -8,7 +8,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from xreset.backends.base import Links, State
 from xreset.backends.conformance.harness import (
     ROUND_TRIP,
     Bench,
@@ -22,10 +21,11 @@ from xreset.backends.conformance.harness import (
 )
 from xreset.backends.conformance.results import Check, Measure, Skipped
 from xreset.backends.conformance.scene import reorder_joints
-from xreset.kinematics import Kinematics
-from xreset.rotations import matrix_to_quat
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import matrix_to_quat
+from xreset.geometry.urdf import robot_tree
+from xreset.physics import Links, State
 from xreset.spec import SceneSpec
-from xreset.urdf import robot_tree
 
 
 def link_measures(

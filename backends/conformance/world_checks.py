@@ -7,7 +7,6 @@ from dataclasses import fields
 
 import torch
 
-from xreset.backends.base import Backend, State
 from xreset.backends.conformance.harness import (
     ROUND_TRIP,
     Bench,
@@ -20,6 +19,7 @@ from xreset.backends.conformance.harness import (
     start_state,
 )
 from xreset.backends.conformance.results import Check, Measure, Skipped
+from xreset.physics import Backend, State
 
 _SAME: dict[str, tuple[float, str]] = {
     "joint_pos": (1e-5, "rad, m"),

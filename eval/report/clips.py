@@ -13,7 +13,7 @@ from xreset.errors import XResetError
 from xreset.eval.rollout import Episode, Trace
 
 if TYPE_CHECKING:
-    from xreset.render import Camera
+    from xreset.pictures.raster import Camera
     from xreset.spec import ObjectSpec, RobotSpec
 
 SIZE = (400, 300)
@@ -63,7 +63,7 @@ def camera_for(traces: list[Trace], *, distance: float = 1.0) -> Camera:
         traces: all start and end alike; the first decides.
         distance: factor on the camera's distance.
     """
-    from xreset.render import Camera
+    from xreset.pictures.raster import Camera
 
     start, goal = traces[0].object_pos[0].astype(float), traces[0].goal_pos.astype(float)
     center = (start + goal) / 2 + (0.0, 0.0, 0.06)
@@ -85,7 +85,7 @@ def draw_clip(engine: str, episode: Episode, trace: Trace, robot: RobotSpec, obj
         obj: the object that the trace is of.
         camera: where from.
     """
-    from xreset.render import Renderer, pose_matrix
+    from xreset.pictures.raster import Renderer, pose_matrix
     from xreset.spec import SceneSpec
 
     interval = float(trace.time[1] - trace.time[0]) if len(trace.time) > 1 else 1.0 / FRAMES_PER_SECOND

@@ -58,7 +58,7 @@ def count_failures(episodes: Sequence[Episode]) -> dict[str, int]:
 
 def draw_strip(episode: Episode, trace: Trace, robot: RobotSpec, obj: ObjectSpec) -> Strip:
     """Draw an episode's strip, the goal as a translucent object; states that are not finite are left grey."""
-    from xreset.render import Renderer, pose_matrix
+    from xreset.pictures.raster import Renderer, pose_matrix
     from xreset.spec import SceneSpec
 
     renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=SIZE, camera=camera_for([trace], distance=0.7))

@@ -79,11 +79,11 @@ def _draw(
     data: ReportData, robot: str | None, objects: Path | None, progress: Callable[[int, int], None]
 ) -> tuple[list[Clip], list[Strip]]:
     """One episode in every engine, and the first engine's failures."""
-    from xreset import robots
+    from xreset.description import load_robot
     from xreset.objects import load_object
 
     first = data.summaries[0]
-    spec = robots.load(robot or (data.run.robot if data.run is not None else first["robot"]))
+    spec = load_robot(robot or (data.run.robot if data.run is not None else first["robot"]))
     recorded = {engine: read_traces(data.results, engine, spec.joint_names) for engine in data.engines}
     sequence = choose_sequence(data.episodes, recorded)
     if sequence is None:

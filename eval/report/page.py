@@ -13,7 +13,7 @@ from xreset.eval.report.clips import Clip, encode_mp4
 from xreset.eval.report.data import ReportData
 from xreset.eval.report.failures import Strip, count_failures
 from xreset.eval.rollout import Episode
-from xreset.render import encode_png
+from xreset.pictures.raster import encode_png
 
 _CSS = """
 :root { color-scheme: light dark; --ground: #fbfbf9; --card: #fff; --text: #1c2024; --soft: #5c6670; --line: #dfe3e6; --accent: #0072b2; }

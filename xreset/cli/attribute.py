@@ -54,11 +54,11 @@ def attribute(
     from rich.console import Console
     from rich.progress import Progress
 
-    from xreset.backends.parity.trials import engine
     from xreset.errors import DemoError, XResetError
-    from xreset.eval.attribute import attribute as experiment
-    from xreset.eval.attribute.plot import write_plot
-    from xreset.eval.attribute.table import not_tried, rich_table, verdict
+    from xreset.eval.engines.attribution import attribute as experiment
+    from xreset.eval.engines.figures import write_plot
+    from xreset.eval.engines.tables import not_tried, rich_table, verdict
+    from xreset.eval.engines.trials import engine
     from xreset.eval.evaluate import load_motion, resolve
     from xreset.files import file_hash, write_json
     from xreset.objects import load_objects

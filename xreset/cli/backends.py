@@ -9,7 +9,7 @@ def backends() -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from xreset.backends import backend_names, backend_status
+    from xreset.plugins import backend_names, backend_status
 
     table = Table("backend", "engine version", "device", "available")
     for name in backend_names():

@@ -32,8 +32,8 @@ def compare(
     """
     from rich.console import Console
 
-    from xreset.eval.compare import compare as make
-    from xreset.eval.compare.table import rich_different, rich_results
+    from xreset.eval.report.compare import compare as make
+    from xreset.eval.report.tables import rich_different, rich_results
 
     console = Console()
     with console.status("reading"):

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from torch import Tensor
 
-    from xreset.backends.base import Backend
     from xreset.backends.conformance import CheckResult, MakeBackend, Measure
+    from xreset.physics import Backend
     from xreset.spec import SceneSpec
 
 
@@ -39,12 +39,11 @@ def conformance(
     from rich.console import Console
 
     from xreset import __version__, robots
-    from xreset.backends import backend_status
     from xreset.backends.conformance import CHECKS, SCHEMA, run
     from xreset.backends.conformance.scene import gripper
-    from xreset.backends.registry import backend_class
     from xreset.errors import XResetError
     from xreset.files import write_json
+    from xreset.plugins import backend_class, backend_status
 
     known = [c.name for c in CHECKS]
     if unknown := sorted(set(check) - set(known)):
@@ -88,7 +87,7 @@ def _command(backends: tuple[str, ...], robot: str | None, device: str, checks: 
 
 def _usable(console: Console) -> list[str]:
     """Names of the backends that can be used here; says why others cannot."""
-    from xreset.backends import backend_names, backend_status
+    from xreset.plugins import backend_names, backend_status
 
     names = []
     for name in backend_names():
@@ -102,10 +101,9 @@ def _usable(console: Console) -> list[str]:
 
 def _maker(name: str, device: str) -> MakeBackend:
     """Builds worlds on the device; a few of them, for one check only, run in this process sooner than processes start."""
-    from xreset.backends import make_backend
     from xreset.backends.conformance.harness import Bench
     from xreset.backends.pool import PoolBackend
-    from xreset.backends.registry import backend_class
+    from xreset.plugins import backend_class, make_backend
 
     pooled = issubclass(backend_class(name), PoolBackend)
 

@@ -20,7 +20,7 @@ def engines(
             check of the same engine, device and robot, the later one counts.
         out: File to write; default: print it.
     """
-    from xreset.backends.matrix import page, read
+    from xreset.eval.engines.page import page, read
     from xreset.files import atomic_write
 
     text = page(read(source))

@@ -11,8 +11,8 @@ import tyro
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from xreset.backends.parity.compare import EngineParity, Parity
-    from xreset.backends.parity.metrics import Metric
+    from xreset.eval.engines.agreement import EngineParity, Parity
+    from xreset.eval.engines.metrics import Metric
 
 
 def parity(
@@ -47,10 +47,10 @@ def parity(
     from rich.progress import Progress
 
     from xreset import __version__
-    from xreset.backends.parity.compare import REFERENCE, compare
-    from xreset.backends.parity.load import load_frames
-    from xreset.backends.parity.trials import engine
     from xreset.errors import XResetError
+    from xreset.eval.engines.agreement import REFERENCE, compare
+    from xreset.eval.engines.load import load_frames
+    from xreset.eval.engines.trials import engine
     from xreset.files import file_hash, write_json
 
     if grasps < 1:
@@ -107,7 +107,7 @@ def _command(
 
 def _usable(console, reference: str) -> list[str]:
     """Names of the backends that can be used here, besides the reference; says why others cannot."""
-    from xreset.backends import backend_names, backend_status
+    from xreset.plugins import backend_names, backend_status
 
     names = []
     for name in backend_names():

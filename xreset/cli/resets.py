@@ -34,8 +34,8 @@ def resets(
     from rich.progress import Progress
     from rich.table import Table
 
-    from xreset import robots
     from xreset.accounts import accounts_path, described, with_totals, write_accounts
+    from xreset.description import load_robot
     from xreset.files import file_hash
     from xreset.objects import load_objects
     from xreset.resets.bank import check_robot, write_bank
@@ -45,7 +45,7 @@ def resets(
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
     console = Console(width=None if sys.stdout.isatty() else 160)  # a file or a pipe has no width of its own
     data = read_retargeted(retargeted)
-    spec = robots.load(robot or data.robot)
+    spec = load_robot(robot or data.robot)
     check_robot(
         retargeted, "retargeted file", spec, name=data.robot, joint_names=tuple(data.joint_names), fingerprint=data.robot_fingerprint
     )

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from xreset.retarget.arm_config import ArmConfig
-from xreset.retarget.hand_config import HandConfig
+from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.hand.config import HandConfig
 
 
 def retarget(
@@ -48,16 +48,16 @@ def retarget(
     from rich.progress import Progress
     from rich.table import Table
 
-    from xreset import robots
     from xreset.accounts import accounts_path, described, with_totals, write_accounts
     from xreset.demos import demo_objects, levelled, read_demos
     from xreset.demos.align import on_something
+    from xreset.description import load_robot
     from xreset.files import file_hash
     from xreset.retarget import pipeline
     from xreset.retarget.partial import discard
 
     console = Console(width=None if sys.stdout.isatty() else 160)  # a file or a pipe has no width of its own
-    spec = robots.load(robot)
+    spec = load_robot(robot)
     chosen = read_demos(demos)
     if max_per_object is not None:
         chosen = chosen.select(max_per_object=max_per_object)
@@ -87,9 +87,9 @@ def retarget(
     discard(partial)
 
     if picture is not None:
-        from xreset.render import write_png
-        from xreset.view.load import load_view
-        from xreset.view.sheet import draw_sheet, moment_tiles
+        from xreset.pictures.raster import write_png
+        from xreset.pictures.view.load import load_view
+        from xreset.pictures.view.sheet import draw_sheet, moment_tiles
 
         shown = load_view(out, demos=demos, robot=robot, objects=objects)
         write_png(picture, draw_sheet(shown, moment_tiles(shown)))

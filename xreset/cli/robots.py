@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from xreset.errors import RobotError
-from xreset.robots.placement import PlaceConfig, Reach
+from xreset.robot_tools.placement import PlaceConfig, Reach
 
 
 def list_robots() -> None:
@@ -16,13 +16,13 @@ def list_robots() -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from xreset.robots import load, robot_names
-    from xreset.robots.registry import robot_folder
+    from xreset.description import load_robot, robot_folder
+    from xreset.plugins import robot_names
 
     table = Table("robot", "joints (arm + hand)", "fingertips", "folder")
     for name in robot_names():
         try:
-            spec = load(name)
+            spec = load_robot(name)
         except RobotError as error:  # one broken plugin must not hide the others
             table.add_row(name, "-", "-", f"broken: {error}")
             continue
@@ -48,8 +48,8 @@ def check(
     from rich.console import Console
     from rich.markup import escape
 
-    from xreset.robots.check import Finding
-    from xreset.robots.check import check as run_checks
+    from xreset.robot_tools.check import Finding
+    from xreset.robot_tools.check import check as run_checks
 
     console = Console()
     styles = {"ok": "green", "skipped": "dim", "warning": "yellow", "error": "bold red"}
@@ -61,11 +61,11 @@ def check(
     findings = run_checks(robot, report=report, engines=engines)
     counts = {level: sum(finding.level == level for finding in findings) for level in ("error", "warning")}
     if picture is not None and findings[0].level == "ok":
-        from xreset.render import write_png
-        from xreset.robots import load
-        from xreset.robots.picture import robot_picture
+        from xreset.description import load_robot
+        from xreset.pictures.raster import write_png
+        from xreset.robot_tools.picture import robot_picture
 
-        write_png(picture, robot_picture(load(robot)))
+        write_png(picture, robot_picture(load_robot(robot)))
         console.print(f"wrote {picture}", highlight=False)
     console.print(f"{counts['error']} errors, {counts['warning']} warnings", highlight=False)
     if counts["error"]:
@@ -99,15 +99,14 @@ def place(
     from rich.console import Console
     from rich.progress import Progress
 
-    from xreset import robots
     from xreset.demos import demo_objects, read_demos
+    from xreset.description import DESCRIPTION, load_robot, robot_folder
     from xreset.retarget.pipeline import rest_on_table, wrist_paths
-    from xreset.robots.place import place as search_place
-    from xreset.robots.placement import write_placement
-    from xreset.robots.registry import DESCRIPTION, robot_folder
+    from xreset.robot_tools.place import place as search_place
+    from xreset.robot_tools.placement import write_placement
 
     console = Console()
-    spec = robots.load(robot)
+    spec = load_robot(robot)
     chosen = read_demos(demos).select(max_per_object=max_per_object)
     specs = list(demo_objects(chosen, objects).values())
     with Progress(console=console, transient=True) as bar:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
-    from xreset.backends.parity.trials import Engine
-    from xreset.eval.trace import Actions
+    from xreset.eval.engines.actions import Actions
+    from xreset.eval.engines.trials import Engine
 
 
 def trace(
@@ -70,14 +70,15 @@ def trace(
     from rich.console import Console
     from rich.progress import Progress
 
-    from xreset.backends.parity.trials import engine
     from xreset.errors import XResetError
-    from xreset.eval.trace import Thresholds, write_actions
-    from xreset.eval.trace import trace as replay
-    from xreset.eval.trace.film import write_film, write_strip
-    from xreset.eval.trace.plot import write_plot
-    from xreset.eval.trace.replay import write_trace
-    from xreset.eval.trace.table import rich_table, sentences
+    from xreset.eval.engines.actions import write_actions
+    from xreset.eval.engines.divergence import Thresholds
+    from xreset.eval.engines.film import write_film, write_strip
+    from xreset.eval.engines.replay import trace as replay
+    from xreset.eval.engines.replay import write_trace
+    from xreset.eval.engines.trace_figure import write_plot
+    from xreset.eval.engines.trace_table import rich_table, sentences
+    from xreset.eval.engines.trials import engine
 
     limits = (joint_threshold, position_threshold, angle_threshold, force_threshold, contact_time)
     if min(limits) <= 0:
@@ -125,7 +126,7 @@ def trace(
 
 def _usable(console) -> list[str]:
     """Names of the backends that can be used here; says why others cannot."""
-    from xreset.backends import backend_names, backend_status
+    from xreset.plugins import backend_names, backend_status
 
     statuses = [backend_status(name) for name in backend_names()]
     for status in statuses:
@@ -148,7 +149,7 @@ def _actions(
     progress: Callable[[int, int], None],
 ) -> Actions:
     """The sequence that the command's arguments mean."""
-    from xreset.eval.trace import sources
+    from xreset.eval.engines import sources
 
     if policy is not None:
         return sources.from_policy(

@@ -10,7 +10,7 @@ import tyro
 if TYPE_CHECKING:
     import numpy as np
 
-    from xreset.view.data import View
+    from xreset.pictures.view.data import View
 
 
 def view(
@@ -50,7 +50,7 @@ def view(
         reasons: Let --png show one example of every reason for which a frame or state is not used.
     """
     from xreset.errors import XResetError
-    from xreset.view.load import load_view
+    from xreset.pictures.view.load import load_view
 
     if (moments or reasons) and (png is None or (moments and reasons)):
         raise XResetError("--moments and --reasons say what picture to write: give one of them, and a file with --png.")
@@ -69,7 +69,7 @@ def view(
 
 
 def _serve(shown: View, host: str, port: int, sequence: int | None, frame: int) -> None:
-    from xreset.view.page import Page
+    from xreset.pictures.view.page import Page
 
     page = Page(shown, host=host, port=port, sequence=sequence, frame=frame)
     number = page.url.rpartition(":")[2]
@@ -85,8 +85,8 @@ def _serve(shown: View, host: str, port: int, sequence: int | None, frame: int) 
 
 def _write_png(path: Path, shown: View, rows: np.ndarray, frame: int | None) -> None:
     from xreset.errors import XResetError
-    from xreset.render import write_png
-    from xreset.view.picture import Drawer
+    from xreset.pictures.raster import write_png
+    from xreset.pictures.view.picture import Drawer
 
     chosen = len(rows) // 2 if frame is None else frame
     if not 0 <= chosen < len(rows):
@@ -99,8 +99,8 @@ def _write_sheet(path: Path, shown: View, *, moments: bool) -> None:
     from rich.console import Console
     from rich.progress import Progress
 
-    from xreset.render import write_png
-    from xreset.view.sheet import draw_sheet, moment_tiles, reason_tiles
+    from xreset.pictures.raster import write_png
+    from xreset.pictures.view.sheet import draw_sheet, moment_tiles, reason_tiles
 
     tiles = moment_tiles(shown) if moments else reason_tiles(shown)
     console = Console()
@@ -121,7 +121,7 @@ def _write_mp4(path: Path, shown: View, rows: np.ndarray) -> None:
     from xreset.errors import XResetError
     from xreset.eval.report.clips import encode_mp4
     from xreset.files import atomic_write
-    from xreset.view.picture import Drawer
+    from xreset.pictures.view.picture import Drawer
 
     if not len(rows):
         raise XResetError("this sequence has no state to film; choose another one with --sequence.")

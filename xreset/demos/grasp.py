@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from xreset.demos import hand
-from xreset.objects.geometry import half_spaces
+from xreset.geometry.shapes import half_spaces
 from xreset.spec import KEYPOINTS, ObjectSpec
 
 TIPS = tuple(KEYPOINTS.index(f"{finger}4") for finger in ("thumb", "index", "middle", "ring", "little"))

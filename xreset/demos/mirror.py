@@ -37,7 +37,7 @@ class Symmetry:
 
 def symmetry(obj: ObjectSpec) -> Symmetry:
     """The best plane of symmetry of an object's surface: from the principal axes of its points, refined by Nelder and Mead's method."""
-    from xreset.retarget.surface import Surface
+    from xreset.geometry.surface import Surface
 
     surface = Surface(obj)
     points = surface.samples(_SAMPLES)

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import torch
 
-from xreset import robots
-from xreset.backends import make_backend
-from xreset.backends.registry import backend_class, device_for
+from xreset.description import load_robot
 from xreset.env import ManipulationEnv, make_scene
 from xreset.errors import RunError
 from xreset.files import file_hash
@@ -20,10 +18,11 @@ from xreset.learning.export import export_onnx
 from xreset.learning.run import RunInfo, latest_checkpoint, read_run, write_run
 from xreset.learning.runner import TrainingRunner
 from xreset.objects import load_objects
+from xreset.plugins import backend_class, device_for, make_backend
 from xreset.policy import check_contract, policy_contract
 from xreset.resets.bank import ResetBank, check_objects, read_bank
+from xreset.resets.distribution import ResetDistribution
 from xreset.spec import ObjectSpec, RobotSpec
-from xreset.task.resets import ResetDistribution
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +45,7 @@ class RunInputs:
 def load_inputs(robot: str, resets: str | Path, objects: str | Path | None) -> RunInputs:
     """Load robot, bank and objects, and refuse what does not belong together."""
     folder = Path(objects) if objects else None
-    spec = robots.load(robot)
+    spec = load_robot(robot)
     bank = read_bank(resets, robot=spec)
     loaded = tuple(load_objects(bank.object_names, folder))
     check_objects(resets, bank, loaded)

@@ -8,8 +8,8 @@
     cloud = surface_points(can, 64)
 """
 
+from xreset.geometry.shapes import shape_mesh
 from xreset.objects.catalogue import canonical_name, load_object, load_objects, object_names
-from xreset.objects.geometry import shape_mesh
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.objects.sampling import bounding_box, bounding_radius, keypoints, surface_points
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from xreset.errors import FileFormatError, ObjectError, XResetError
 from xreset.files import Field, read_npz, write_npz
-from xreset.objects.geometry import hull
+from xreset.geometry.shapes import hull
 from xreset.spec import Shape
 
 if TYPE_CHECKING:

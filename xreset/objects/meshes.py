@@ -12,8 +12,8 @@ import numpy as np
 
 from xreset.errors import ObjectError
 from xreset.files import file_hash
+from xreset.geometry.shapes import hull, mass_properties, shape_mesh
 from xreset.objects.decompose import cached_pieces
-from xreset.objects.geometry import hull, mass_properties, shape_mesh
 from xreset.objects.ycb import MASSES
 from xreset.spec import ObjectSpec
 

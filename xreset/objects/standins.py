@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from xreset.objects.geometry import box, cylinder, hull, loft, mass_properties, prism, section, surface_of
+from xreset.geometry.shapes import box, cylinder, hull, loft, mass_properties, prism, section, surface_of
 from xreset.objects.ycb import MASSES
 from xreset.spec import ObjectSpec, Shape
 

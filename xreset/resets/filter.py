@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from xreset.backends import make_backend
-from xreset.backends.base import Backend
-from xreset.backends.registry import device_for
 from xreset.env import rest_state
 from xreset.errors import DemoError
+from xreset.physics import Backend
+from xreset.plugins import device_for, make_backend
 from xreset.resets.bank import ResetBank
 from xreset.retarget.pipeline import Retargeted
 from xreset.schedule import schedule

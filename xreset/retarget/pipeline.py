@@ -14,16 +14,16 @@ from torch import Tensor
 from xreset.demos.align import grounded, levelled
 from xreset.demos.archive import Demos
 from xreset.errors import DemoError
-from xreset.retarget.arm import ArmConfig, ArmModel, ArmTargets, track
-from xreset.retarget.fields import DistanceFields
+from xreset.geometry.fields import DistanceFields
+from xreset.geometry.rotations import matrix_to_quat
+from xreset.geometry.surface import Surface, keypoint_contacts
+from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, track
 from xreset.retarget.file import SCHEMA, Retargeted, read_retargeted, write_retargeted
-from xreset.retarget.hand import HandMotion, HandTargets, retarget_hand
-from xreset.retarget.hand_config import HandConfig
-from xreset.retarget.hand_model import HandModel
+from xreset.retarget.hand.config import HandConfig
+from xreset.retarget.hand.model import HandModel
+from xreset.retarget.hand.solve import HandMotion, HandTargets, retarget_hand
 from xreset.retarget.partial import Batch, Partial, run_key
-from xreset.retarget.surface import Surface, keypoint_contacts
 from xreset.retarget.validity import REASONS, Thresholds, classify
-from xreset.rotations import matrix_to_quat
 from xreset.spec import ObjectSpec, RobotSpec
 
 __all__ = ["SCHEMA", "RetargetConfig", "Retargeted", "read_retargeted", "rest_on_table", "retarget", "write_retargeted"]

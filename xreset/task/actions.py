@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from xreset.geometry.urdf import robot_tree
 from xreset.spec import RobotSpec
 from xreset.task.config import ActionConfig
-from xreset.urdf import robot_tree
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.rotations import quat_angle
+from xreset.geometry.rotations import quat_angle
 from xreset.task.config import RewardConfig
 
 

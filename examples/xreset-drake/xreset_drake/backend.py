@@ -20,10 +20,10 @@ from typing import get_args
 
 import numpy as np
 
-from xreset.backends.base import Capability, KnownDifference
 from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.rigid import Inertia, mechanism, nearer, object_inertia, principal
 from xreset.errors import BackendUnavailableError, XResetError
+from xreset.physics import Capability, KnownDifference
 from xreset.spec import GRAVITY, SceneSpec
 
 try:

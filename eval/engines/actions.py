@@ -1,0 +1,317 @@
+"""An action sequence that can be replayed anywhere: a state, what the drives are then told at each control step, and the physics meant.
+
+Actions are kept as joint targets, not as a policy's outputs: what a policy's output becomes depends on where the joints are (see
+:mod:`xreset.task.actions`), and would no longer be the same in every engine. Shape letters: T control steps, J joints, P phases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from xreset.errors import FileFormatError
+from xreset.files import Field, Schema, read_npz, write_npz
+from xreset.physics import State
+from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
+
+if TYPE_CHECKING:
+    from xreset.eval.engines.episodes import Episode, Motion
+    from xreset.eval.engines.grasps import Grasps
+    from xreset.eval.engines.trials import Engine
+    from xreset.eval.rollout import Trace
+    from xreset.policy import Policy
+    from xreset.resets.bank import ResetBank
+    from xreset.task.config import TaskConfig
+
+SCHEMA = "xreset-actions/1"
+
+_STATE_KEYS = {f.name: f"start_{f.name}_wxyz" if f.name == "object_quat" else f"start_{f.name}" for f in fields(State)}
+
+_FIELDS: Schema = {
+    "robot": Field((), "U"),
+    "robot_fingerprint": Field((), "U"),
+    "joint_names": Field(("J",), "U"),
+    "object_name": Field((), "U"),
+    "object_source": Field((), "U"),
+    "label": Field((), "U"),
+    "timestep": Field((), "f"),
+    "substeps": Field((), "i"),
+    "friction": Field((3,), "f"),
+    "phase_name": Field(("P",), "U"),
+    "phase_start": Field(("P",), "f"),
+    "joint_target": Field(("T", "J"), "f"),
+    "start_joint_pos": Field(("J",), "f"),
+    "start_joint_vel": Field(("J",), "f"),
+    "start_joint_target": Field(("J",), "f"),
+    "start_object_pos": Field((3,), "f"),
+    "start_object_quat_wxyz": Field((4,), "f"),
+    "start_object_linvel": Field((3,), "f"),
+    "start_object_angvel": Field((3,), "f"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Actions:
+    """One action sequence from one state."""
+
+    robot: RobotSpec
+    object: ObjectSpec
+    label: str
+    """What it is, for people."""
+    timestep: float
+    """Physics timestep [s]."""
+    substeps: int
+    """Physics steps per control step."""
+    friction: PairFriction
+    start: State
+    """[1, ...]"""
+    joint_target: torch.Tensor
+    """[T, J] rad (m): what the drives are told at the beginning of each control step."""
+    phases: tuple[tuple[str, float], ...] = ()
+    """Parts of the sequence: name, and when it begins [s]."""
+
+    @property
+    def scene(self) -> SceneSpec:
+        """The scene that it is played in."""
+        return SceneSpec(robot=self.robot, objects=(self.object,), friction=self.friction, timestep=self.timestep, substeps=self.substeps)
+
+    def phase_at(self, time: float) -> str:
+        """Name of the phase at a time [s]; empty if there are none."""
+        begun = [name for name, start in self.phases if start <= time]
+        return begun[-1] if begun else ""
+
+
+def grasp_and_lift(
+    robot: RobotSpec, thing: ObjectSpec, grasps: Grasps, number: int = 0, *, scene: SceneSpec | None = None, motion: Motion | None = None
+) -> Actions:
+    """The open-loop try of a grasp: the hand, open around the object at rest, closes, lifts and shakes (:mod:`xreset.backends.parity`).
+
+    Args:
+        robot: the robot.
+        thing: the object of the grasp.
+        grasps: as :func:`xreset.eval.engines.grasps.find_grasps` finds them.
+        number: which of them.
+        scene: timestep, substeps and friction; default: those of :class:`SceneSpec`.
+        motion: distances and durations.
+    """
+    from xreset.eval.engines.episodes import Motion, closing_episode
+
+    motion, scene = motion or Motion(), scene or SceneSpec(robot=robot, objects=(thing,))
+    chosen = slice(number, number + 1)
+    dt = scene.control_dt
+    episode = closing_episode(robot, grasps.joint_pos[chosen], grasps.object_pos[chosen], grasps.object_quat[chosen], dt, motion)
+    durations = {
+        "settle": motion.settle,
+        "close": motion.close,
+        "hold": motion.hold,
+        "lift": motion.lift,
+        "carry": motion.hold,
+        "shake x": motion.shake,
+        "shake y": motion.shake,
+    }
+    return _of_episode(episode, scene, label=f"grasp and lift of {thing.name}, {grasps.label[number]}", phases=_phases(durations, dt))
+
+
+def play_policy(
+    policy: Policy,
+    engine: Engine,
+    robot: RobotSpec,
+    thing: ObjectSpec,
+    demos: ResetBank,
+    task: TaskConfig,
+    *,
+    sequence: int,
+    repetition: int = 0,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Actions:
+    """Let a policy act through one episode in one engine, and record what the drives were told.
+
+    Args:
+        policy: what acts.
+        engine: where.
+        robot: the robot.
+        thing: the object of the demonstration.
+        demos: starts and goals.
+        task: usually :func:`xreset.task.config.evaluation_task` of the policy's own.
+        sequence: index of the demonstration.
+        repetition: which perturbation of its start, as ``xreset eval`` counts them.
+        seed: of the perturbations.
+        progress: called with (control steps done, control steps in all).
+    """
+    from xreset.env import ManipulationEnv, rest_state
+    from xreset.eval.rollout import episode_starts
+    from xreset.resets.distribution import ResetDistribution
+
+    scene = evaluation_scene(robot, (thing,), task)
+    on_cpu = ResetDistribution(demos, robot, (thing.name,), task.reset)
+    start = episode_starts(on_cpu, np.array([sequence]), np.array([repetition]), seed)
+    with engine.make(scene, 1, torch.zeros(1, dtype=torch.long)) as backend:
+        resets = on_cpu if backend.device.type == "cpu" else ResetDistribution(demos, robot, (thing.name,), task.reset, backend.device)
+        env = ManipulationEnv(backend, task, resets, seed=seed)
+        env.reset(start=start.to(backend.device))
+        policy.begin(env)
+        targets = []
+        for step in range(env.max_episode_length):
+            env.advance(policy.act(env.get_observations()))
+            targets.append(env.joint_target[0].cpu().clone())
+            progress(step + 1, env.max_episode_length)
+    return Actions(
+        robot=robot,
+        object=thing,
+        label=f"{policy.name} in {engine.name}, {demos.sequence_name[sequence]} (perturbation {repetition}, seed {seed})",
+        timestep=scene.timestep,
+        substeps=scene.substeps,
+        friction=scene.friction,
+        start=rest_state(start.joint_pos, start.object_pos, start.object_quat),
+        joint_target=torch.stack(targets),
+    )
+
+
+def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label: str) -> Actions:
+    """The actions of an episode that an evaluation has recorded; it has begun at rest, with the physics of an evaluation.
+
+    Args:
+        robot: the robot.
+        thing: the object.
+        trace: the episode, with its joint targets.
+        label: what it is, for people.
+
+    Raises:
+        FileFormatError: the episode was not played at the control rate of the default task.
+    """
+    from xreset.env import rest_state
+    from xreset.task.config import TaskConfig
+
+    assert trace.joint_target is not None, "the trace holds no actions"
+    first = (torch.as_tensor(x[:1], dtype=torch.float32) for x in (trace.joint_pos, trace.object_pos, trace.object_quat))
+    scene = evaluation_scene(robot, (thing,), TaskConfig())
+    interval, length = float(trace.time[1] - trace.time[0]), len(trace.joint_target) * scene.control_dt
+    if not trace.time[-1] <= length + 1e-6 < trace.time[-1] + interval + 1e-6:
+        raise FileFormatError(
+            f"{len(trace.joint_target)} actions at {1 / scene.control_dt:.0f} Hz last {length:.2f} s, but the episode lasts "
+            f"{trace.time[-1]:.2f} s: it was played at another control rate. Give --policy instead, which knows its own."
+        )
+    return Actions(
+        robot=robot,
+        object=thing,
+        label=label,
+        timestep=scene.timestep,
+        substeps=scene.substeps,
+        friction=scene.friction,
+        start=rest_state(*first),
+        joint_target=torch.as_tensor(trace.joint_target, dtype=torch.float32),
+    )
+
+
+def evaluation_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
+    """The scene of a task with the pair friction of an evaluation, which draws none at random."""
+    from xreset.env import make_scene
+    from xreset.task.randomization import sample_friction
+
+    scene = make_scene(robot, objects, task)
+    nominal = replace(task.randomization, enabled=False)
+    tip, link, table = sample_friction(1, nominal, torch.Generator())[0].tolist()
+    return replace(scene, friction=replace(scene.friction, tip=tip, link=link, table=table))
+
+
+def write_actions(path: str | Path, actions: Actions) -> None:
+    """Write an action sequence; see :func:`xreset.files.write_npz`."""
+    friction = actions.friction
+    write_npz(
+        path,
+        SCHEMA,
+        {
+            "robot": actions.robot.name,
+            "robot_fingerprint": actions.robot.fingerprint,
+            "joint_names": np.array(actions.robot.joint_names),
+            "object_name": actions.object.name,
+            "object_source": actions.object.source,
+            "label": actions.label,
+            "timestep": np.float64(actions.timestep),
+            "substeps": np.int64(actions.substeps),
+            "friction": np.array([friction.tip, friction.link, friction.table]),
+            "phase_name": np.array([name for name, _ in actions.phases], dtype=np.str_),
+            "phase_start": np.array([start for _, start in actions.phases], dtype=np.float64),
+            "joint_target": actions.joint_target.numpy(),
+            **{key: getattr(actions.start, name)[0].numpy() for name, key in _STATE_KEYS.items()},
+        },
+    )
+
+
+def read_actions(path: str | Path, robot: RobotSpec, objects: Callable[[str], ObjectSpec]) -> Actions:
+    """Read an action sequence.
+
+    Args:
+        path: file.
+        robot: the robot, which must be the one of the file.
+        objects: gives the object of a name.
+
+    Raises:
+        FileFormatError: the file is damaged, or for another robot or object geometry.
+    """
+    from xreset.resets.bank import check_robot
+
+    a = read_npz(path, SCHEMA, _FIELDS, what="an action sequence", check=_check)
+    names = tuple(a["joint_names"].tolist())
+    check_robot(path, "action sequence", robot, name=str(a["robot"]), joint_names=names, fingerprint=str(a["robot_fingerprint"]))
+    thing = objects(str(a["object_name"]))
+    if thing.source != str(a["object_source"]):
+        raise FileFormatError(
+            f"{path} was made with another geometry of {thing.name} ({a['object_source']}, here {thing.source}). "
+            "Give the same --objects folder."
+        )
+    tip, link, table = a["friction"].tolist()
+    return Actions(
+        robot=robot,
+        object=thing,
+        label=str(a["label"]),
+        timestep=float(a["timestep"]),
+        substeps=int(a["substeps"]),
+        friction=PairFriction(tip=tip, link=link, table=table),
+        start=State(**{name: torch.as_tensor(a[key], dtype=torch.float32)[None] for name, key in _STATE_KEYS.items()}),
+        joint_target=torch.as_tensor(a["joint_target"], dtype=torch.float32),
+        phases=tuple(zip(a["phase_name"].tolist(), a["phase_start"].tolist(), strict=True)),
+    )
+
+
+def robot_of(path: str | Path) -> str:
+    """Name of the robot that an action sequence is for."""
+    return str(read_npz(path, SCHEMA, _FIELDS, what="an action sequence")["robot"])
+
+
+def _check(arrays: dict[str, np.ndarray]) -> str | None:
+    for name, value in arrays.items():
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            return f"array {name!r} holds non-finite numbers."
+    if not len(arrays["joint_target"]):
+        return "it has no control step."
+    if not (arrays["timestep"] > 0 and arrays["substeps"] > 0):
+        return f"timestep {arrays['timestep']} and substeps {arrays['substeps']} must be positive."
+    return None
+
+
+def _of_episode(episode: Episode, scene: SceneSpec, *, label: str, phases: Sequence[tuple[str, float]]) -> Actions:
+    """The only world of an episode."""
+    return Actions(
+        robot=scene.robot,
+        object=scene.objects[0],
+        label=label,
+        timestep=scene.timestep,
+        substeps=scene.substeps,
+        friction=scene.friction,
+        start=episode.start,
+        joint_target=episode.targets[:, 0],
+        phases=tuple(phases),
+    )
+
+
+def _phases(durations: dict[str, float], dt: float) -> list[tuple[str, float]]:
+    """When each part begins, in whole control steps [s]."""
+    steps = [round(seconds / dt) for seconds in durations.values()]
+    return [(name, sum(steps[:i]) * dt) for i, name in enumerate(durations)]

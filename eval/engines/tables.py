@@ -1,0 +1,99 @@
+"""The attribution for a terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from xreset.eval.engines.attribution import Attribution, Row
+from xreset.eval.engines.measure import Measured
+from xreset.eval.engines.properties import PROPERTIES, Property
+from xreset.eval.stats import bootstrap_ci95
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+_BY_NAME = {p.name: p for p in PROPERTIES}
+
+
+def rich_table(found: Attribution, title: str) -> Table:
+    """One row per run: what was changed, the score, and how much that differs from A as it is. Bold: the interval leaves out zero."""
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    table.add_column("")
+    for name in ("value", "task progress", "grasp", "reorient", f"against {found.a}", "of gap"):
+        table.add_column(name, justify="right")
+    for row in found.rows:
+        low, high = bootstrap_ci95(row.score(), row.sequences)
+        d, (least, most) = found.difference(row)
+        share, first = found.share(row), row.kind == "as it is"
+        table.add_row(
+            label(row),
+            _change(row, found),
+            f"{row.score().mean():.1%}\n{100 * low:.0f}-{100 * high:.0f}",
+            f"{row.score('grasp').mean():.0%}",
+            f"{row.score('reorient').mean():.0%}",
+            "" if first else f"{100 * d:+.1f}\n{100 * least:+.1f} to {100 * most:+.1f}",
+            "" if first or math.isnan(share) else f"{share:.0%}",
+            style="bold" if found.matters(row) and not first else None,
+        )
+    return table
+
+
+def not_tried(found: Attribution) -> Iterator[str]:
+    """A line for each property that was not changed towards B: its value in both, and why not."""
+    for s in found.skipped:
+        p = _BY_NAME.get(s.name)
+        values = "" if p is None else f" ({_value(p, found.measured_a)} in {found.a}, {_value(p, found.measured_b)} in {found.b})"
+        yield f"not tried: {s.name}{values}: {s.reason}"
+
+
+def verdict(found: Attribution) -> str:
+    """The result in a sentence or two."""
+    gap, (low, high) = found.difference(found.rows[-1])
+    episodes = len(found.rows[0].episodes)
+    size = f"{100 * gap:+.1f} points of task progress ({100 * low:+.1f} to {100 * high:+.1f})"
+    if not found.matters(found.rows[-1]):
+        return (
+            f"{found.b} and {found.a} do not differ for sure: {size} over {episodes} episodes. "
+            "There is nothing to attribute; more episodes would tell smaller differences."
+        )
+    row = found.costs()
+    if row is None:
+        return f"{found.b} differs from {found.a} by {size}, and none of the properties that could be changed explains it."
+    best = f"{row.name!r} alone brings about {found.share(row):.0%} of it"
+    if row.kind == "at most":
+        best = f"{row.name!r} may bring about {found.share(row):.0%} of it, at most ({_BY_NAME[row.name].at_most})"
+    together = next((r for r in found.rows if r.kind == "all"), None)
+    rest = "" if together is None else f", {together.name} {found.share(together):.0%}"
+    return f"{found.b} differs from {found.a} by {size}; {best}{rest}."
+
+
+def label(row: Row) -> str:
+    """Name of a run."""
+    return f"{row.name} ({row.kind})" if row.kind in ("what if", "at most") else row.name
+
+
+def amount(row: Row) -> str:
+    """By how much a run's physics was changed."""
+    changed = {name: value for name, value in vars(row.alteration).items() if value != (0 if name == "delay" else 1.0)}
+    return ", ".join(
+        f"{value:+d} control step" if name == "delay" else f"x {value:g}" if value else "none" for name, value in changed.items()
+    )
+
+
+def _value(p: Property, measured: Measured) -> str:
+    value = p.value(measured) * p.scale
+    return f"{value:.3g} {p.unit}".rstrip() if math.isfinite(value) else "unknown"
+
+
+def _change(row: Row, found: Attribution) -> str:
+    """A's value and B's; or by how much the property was changed, for want of a difference."""
+    p = _BY_NAME.get(row.name)
+    if p is None:
+        return ""
+    if row.kind in ("towards", "at most"):
+        return f"{p.value(found.measured_a) * p.scale:.3g} -> {_value(p, found.measured_b)}"
+    return amount(row)

@@ -1,0 +1,181 @@
+"""What an engine is put through: closings, presses, holds and paths.
+
+Shape letters: G grasps (one per world), M moved or chosen ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xreset.eval.engines.episodes import Motion, closing_episode, holding_episode, lifting_episode, squeezing_state
+from xreset.eval.engines.grasps import Grasps
+from xreset.eval.engines.recording import Recording, play
+from xreset.physics import Backend, State
+from xreset.plugins import backend_class, device_for, make_backend
+from xreset.spec import RobotSpec, SceneSpec
+
+MakeBackend = Callable[[SceneSpec, int, Tensor], Backend]
+"""Builds worlds of a scene: how many, and which object each holds [G]."""
+
+SAME_EQUATIONS = frozenset({"mujoco-warp"})
+"""Backends that solve the equations of ``mujoco``, in other arithmetic."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParityConfig:
+    """What is tried."""
+
+    motion: Motion = field(default_factory=Motion)
+    frictions: tuple[float, ...] = (0.5, 0.8)
+    """Pair frictions of hand and object in the holds."""
+    in_air: float = 1 / 3
+    """Share of the common states that demonstrations show in the air; the others come from closings."""
+    press_mass: float = 1e6
+    """How many times its own mass an object is given that nothing shall move."""
+    press_time: float = 0.25
+    """Forces are averaged over the last of these seconds of a press."""
+    path_time: float = 1.0
+    """[s]"""
+    path_grasps: int = 16
+    """Grasps whose paths are compared, at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Engine:
+    """An engine to put through it."""
+
+    name: str
+    make: MakeBackend
+    version: str
+    device: str = "cpu"
+    grasps: bool = True
+    """Whether press, closing and hold are measured."""
+    path: bool = False
+    """Whether paths are compared."""
+
+
+def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
+    """An installed backend.
+
+    If it solves the reference's equations, its paths are compared; and on the CPU nothing else is, for a GPU engine is slow there.
+
+    Args:
+        name: of the backend.
+        device: where it runs if it can run there; else the CPU.
+        options: further keywords of the backend.
+
+    Raises:
+        BackendUnavailableError: it cannot be used here.
+    """
+    version = backend_class(name).engine_version()
+    used = device_for(name, device)
+
+    def make(scene: SceneSpec, num_worlds: int, object_index: Tensor) -> Backend:
+        return make_backend(name, scene, num_worlds, object_index=object_index, device=used, **options)
+
+    same = name in SAME_EQUATIONS
+    return Engine(name=name, make=make, version=version, device=used, grasps=not same or used != "cpu", path=same)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Closings:
+    """What came of closing hands."""
+
+    press: Recording
+    """Around objects that nothing moves, up to the lift."""
+    whole: Recording
+    """Around objects at rest on the table, to the end."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommonStates:
+    """States from which every engine lifts and shakes."""
+
+    label: tuple[str, ...]
+    """Sequence, frame, and whether the demonstration shows it or which engine closed the hand."""
+    object_index: Tensor
+    """[G]"""
+    start: State
+    """[G, ...]"""
+
+    def __getitem__(self, chosen: Tensor) -> CommonStates:
+        """Some of them [M]."""
+        label = tuple(self.label[i] for i in chosen.tolist())
+        return CommonStates(label=label, object_index=self.object_index[chosen], start=self.start[chosen])
+
+
+def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps, config: ParityConfig) -> Closings:
+    """Close each hand, at the scene's frictions: around an object too heavy to be moved, and for good."""
+    dt, motion = scene.control_dt, config.motion
+    episode = closing_episode(scene.robot, grasps.joint_pos, grasps.object_pos, grasps.object_quat, dt, motion)
+    with _worlds(tested, scene, grasps.object_index) as backend:
+        whole = play(backend, episode)
+        n, device = backend.num_worlds, backend.device
+        mass = torch.tensor([scene.objects[i].mass for i in grasps.object_index.tolist()], device=device)
+        backend.set_object_mass(config.press_mass * mass)
+        backend.set_object_gravity(torch.zeros(n, device=device))
+        press = play(backend, episode.first(motion.closing_steps(dt)))
+    return Closings(press=press, whole=whole)
+
+
+def try_holds(tested: Engine, scene: SceneSpec, common: CommonStates, config: ParityConfig) -> tuple[Recording, ...]:
+    """Lift and shake, once with each of the frictions."""
+    episode = lifting_episode(scene.robot, common.start, scene.control_dt, config.motion)
+    recordings = []
+    with _worlds(tested, scene, common.object_index) as backend:
+        for mu in config.frictions:
+            friction = torch.tensor([mu, mu, scene.friction.table], device=backend.device)
+            backend.set_friction(friction.repeat(backend.num_worlds, 1))
+            recordings.append(play(backend, episode))
+    return tuple(recordings)
+
+
+def try_paths(tested: Engine, scene: SceneSpec, common: CommonStates, config: ParityConfig) -> Recording:
+    """Hold still for a while."""
+    with _worlds(tested, scene, common.object_index) as backend:
+        return play(backend, holding_episode(common.start, config.path_time, scene.control_dt))
+
+
+def common_states(
+    robot: RobotSpec, table: Grasps, air: Grasps, closings: Mapping[str, Recording], count: int, dt: float, config: ParityConfig
+) -> CommonStates:
+    """States that favour no engine: some as demonstrations show them in the air, the others from the closings of all engines in turn.
+
+    A closing counts if a fingertip touches the object when the hand has closed.
+
+    Args:
+        robot: the robot.
+        table: the grasps of the closings.
+        air: grasps in the air.
+        closings: by engine, the whole closings.
+        count: how many at most; fewer where hands have closed on nothing.
+        dt: control step [s].
+        config: what is tried.
+    """
+    shown = min(round(count * config.in_air), len(air))
+    labels = [f"{label} as demonstrated" for label in air.label[:shown]]
+    states = [squeezing_state(robot, air.joint_pos[:shown], air.object_pos[:shown], air.object_quat[:shown], config.motion)]
+    index = [air.object_index[:shown]]
+    last = config.motion.closing_steps(dt) - 1
+    names = list(closings)
+    for g in range(len(table)):
+        for name in names[g % len(names) :] + names[: g % len(names)]:
+            if len(labels) < count and closings[name].tip_touch[last, g].any():
+                labels.append(f"{table.label[g]} closed in {name}")
+                states.append(closings[name].state_after(last)[torch.tensor([g])])
+                index.append(table.object_index[[g]])
+                break
+    start = State(**{f.name: torch.cat([getattr(state, f.name) for state in states]) for f in fields(State)})
+    return CommonStates(label=tuple(labels), object_index=torch.cat(index), start=start)
+
+
+@contextmanager
+def _worlds(tested: Engine, scene: SceneSpec, object_index: Tensor) -> Iterator[Backend]:
+    with tested.make(scene, len(object_index), object_index) as backend:
+        yield backend

@@ -1,0 +1,148 @@
+"""The comparison as tables: for a terminal, and as Markdown like that of ``docs/results.md``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from xreset.errors import RunError
+from xreset.eval.report.groups import Group
+from xreset.eval.report.progress import X, amounts, processes
+from xreset.eval.report.score import Scores, engines_of
+from xreset.eval.report.trainings import Fact, Training
+
+if TYPE_CHECKING:
+    from rich.table import Table
+    from rich.text import Text
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """A table of text."""
+
+    head: tuple[str, ...]
+    body: tuple[tuple[str, ...], ...]
+
+
+def results(groups: Sequence[Group], found: Scores) -> Rows:
+    """Three rows for each group (four if it has several trainings), one column for each engine; ``-`` where it was not evaluated."""
+    engines = engines_of(found)
+    versions: dict[str, set[str]] = {}
+    for member in (m for group in groups for m in group.members):
+        for engine, summary in member.summaries.items():
+            versions.setdefault(engine, set()).add(summary["backend_version"])
+    body = []
+    for label, row in found.items():
+        several = max(len(s.each) for s in row.values()) > 1
+        lines = {
+            "task progress (95 % interval)": lambda s: f"{_percent(s.task_progress, 1)} ({100 * s.ci95[0]:.0f}-{100 * s.ci95[1]:.0f})",
+            **({"task progress of each seed": lambda s: ", ".join(f"{100 * x:.1f}" for x in s.each.values()) + " %"} if several else {}),
+            "approach / grasp / reorient": lambda s: " / ".join(f"{100 * x:.0f}" for x in (s.approach, s.grasp, s.reorient)) + " %",
+            "at the goal at any time; reorientation progress": lambda s: (
+                f"{_percent(s.reorient_once)}; {_percent(s.reorientation_progress, 1)}"
+            ),
+        }
+        for i, (name, text) in enumerate(lines.items()):
+            body.append(("" if i else label, name, *(text(row[e]) if e in row else "-" for e in engines)))
+    return Rows(head=("", "", *(f"{e} {', '.join(sorted(versions[e]))}" for e in engines)), body=tuple(body))
+
+
+def different(groups: Sequence[Group]) -> Rows:
+    """The fields in which not all trainings are equal, a column for each group; and how long each was trained.
+
+    Baselines, which have no configuration, have no column.
+    """
+    columns = [g for g in groups if g.members[0].facts or g.members[0].scalars]
+    configured = [m for g in columns for m in g.members if m.facts]
+    names = dict.fromkeys(name for m in configured for name in m.facts)
+    body = []
+    for name in names:
+        facts = [m.facts.get(name, _ABSENT) for m in configured]
+        if any(fact.value != facts[0].value for fact in facts):
+            body.append((name, *(_values(m.facts.get(name, _ABSENT).text for m in g.members) for g in columns)))
+    body += [(name, *(_values(cells) for cells in column)) for name, column in _extent(columns)]
+    return Rows(head=("", *(g.label for g in columns)), body=tuple(body))
+
+
+def markdown(rows: Rows) -> str:
+    """As a table in Markdown."""
+    lines = [rows.head, ("---",) * len(rows.head), *rows.body]
+    return "\n".join("| " + " | ".join(escape(cell) for cell in line) + " |" for line in lines) + "\n"
+
+
+def escape(text: str) -> str:
+    """Text that Markdown shows as it is, in one line."""
+    for special in "\\|*_<>`[]":
+        text = text.replace(special, f"\\{special}")
+    return " ".join(text.split())
+
+
+def rich_results(rows: Rows) -> Table:
+    """:func:`results` for a terminal: what describes a row is in one column, so that four engines fit into 80 characters."""
+    table = _rich_table(("", *rows.head[2:]), "evaluation")
+    for label, name, *cells in rows.body:
+        if label:
+            table.add_section()
+            table.add_row(_cell(label), style="bold")
+        table.add_row(_cell(name), *map(_cell, cells))
+    return table
+
+
+def rich_different(rows: Rows) -> Table:
+    """:func:`different` for a terminal."""
+    table = _rich_table(rows.head, "what differs between the trainings")
+    for line in rows.body:
+        table.add_row(*map(_cell, line))
+    return table
+
+
+def _rich_table(head: Sequence[str], title: str) -> Table:
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for i, name in enumerate(head):
+        table.add_column(_cell(name), justify="right" if i else "left", overflow="fold")
+    return table
+
+
+def _cell(text: str) -> Text:
+    """As it is, without markup; a number stays beside its unit, and three shares on one line."""
+    from rich.text import Text
+
+    return Text(text.replace(" / ", "/").replace(" %", "\N{NO-BREAK SPACE}%"))
+
+
+_ABSENT = Fact(None, "-")
+
+
+def _extent(columns: Sequence[Group]) -> Iterator[tuple[str, list[list[str]]]]:
+    """How long was trained: name, and for each group the text of every training."""
+
+    def amount(member: Training, what: X) -> str:
+        if not member.scalars:
+            return "-"
+        try:
+            done = amounts(member, what)[1][-1]
+        except RunError:
+            return "-"
+        return f"{done:,.0f}" if what == "iterations" else f"{done / 1e6 if what == 'steps' else done:.1f}"
+
+    kinds: dict[str, X] = {"iterations trained": "iterations", "million environment steps": "steps", "minutes of training": "minutes"}
+    for name, what in kinds.items():
+        cells = [[amount(m, what) for m in g.members] for g in columns]
+        if any(cell != "-" for column in cells for cell in column):
+            yield name, cells
+    cells = [["-" if (n := processes(m)) is None else str(n) for m in g.members] for g in columns]
+    if len({cell for column in cells for cell in column} - {"-"}) > 1:
+        yield "processes", cells
+
+
+def _values(texts: Sequence[str] | Iterator[str]) -> str:
+    """One text if all are the same, else all of them."""
+    texts = list(texts)
+    return texts[0] if len(set(texts)) == 1 else "; ".join(texts)
+
+
+def _percent(value: float, digits: int = 0) -> str:
+    return f"{value:.{digits}%}".replace("%", " %")

@@ -1,0 +1,181 @@
+"""A hand as balls: what keeps it out of the object, the table and itself while it is being retargeted.
+
+Balls make distances and their derivatives cheap over whole trajectories. They are exact for capsules and spheres, and inscribed in other
+shapes, whose edges and corners balls of radius 0 stand for; what they miss is for the exact checks that follow (coal, then physics).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from itertools import product
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xreset.geometry.collision import SelfCollision, support_points
+from xreset.geometry.kinematics import Kinematics
+from xreset.spec import Geometry, RobotSpec, Shape
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spans:
+    """Groups of consecutive rows of a table (G in number)."""
+
+    start: Tensor
+    """[G] first row of each group."""
+    count: Tensor
+    """[G] number of its rows."""
+
+    def members(self, groups: Tensor) -> tuple[Tensor, Tensor]:
+        """All rows of some groups [C]: for each row, the place [A] in ``groups`` that asks for it, ascending, and the row [A] itself."""
+        counts = self.count[groups]
+        asking = torch.repeat_interleave(torch.arange(len(groups), device=groups.device), counts)
+        within = torch.arange(len(asking), device=groups.device) - (counts.cumsum(0) - counts)[asking]
+        return asking, self.start[groups][asking] + within
+
+
+@dataclass(frozen=True, kw_only=True)
+class Balls:
+    """Balls fixed to the links of a hand: Q balls on G links, which R pairs of balls on H pairs of links must not overlap."""
+
+    links: tuple[str, ...]
+    """The links that carry balls (length G)."""
+    spans: Spans
+    """[G] the balls of each link."""
+    link: Tensor
+    """[Q] each ball's link, as an index of ``links``; ascending."""
+    centers: Tensor
+    """[Q, 3] in the link's frame."""
+    radii: Tensor
+    """[Q]"""
+    bound_centers: Tensor
+    """[G, 3] centre, in the link's frame, of a ball about all of the link's balls."""
+    bound_radii: Tensor
+    """[G]"""
+    link_pairs: Tensor
+    """[H, 2] pairs of links, as indices of ``links``."""
+    pair_spans: Spans
+    """[H] the pairs of balls of each pair of links."""
+    pairs: Tensor
+    """[R, 2] balls, of a radius above 0, that must not overlap each other."""
+
+    def to(self, device: torch.device | str) -> Balls:
+        """The same on another device."""
+
+        def moved(value: Any) -> Any:
+            if isinstance(value, Spans):
+                return Spans(start=value.start.to(device), count=value.count.to(device))
+            return value.to(device) if isinstance(value, Tensor) else value
+
+        return Balls(**{f.name: moved(getattr(self, f.name)) for f in fields(self)})
+
+
+def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> Balls:
+    """The balls of a hand.
+
+    Args:
+        robot: the robot.
+        hand: kinematics of its hand.
+        collision: decides which links must not overlap.
+    """
+    links: list[str] = []
+    centers: list[np.ndarray] = []
+    radii: list[np.ndarray] = []
+    for name in hand.link_names:
+        shapes = hand.tree.link(name).collisions
+        if not shapes:
+            continue
+        links.append(name)
+        parts = [_shape_balls(shape) for shape in shapes]
+        centers.append(np.concatenate([points for points, _ in parts]))
+        radii.append(np.concatenate([radius for _, radius in parts]))
+    counts = np.array([len(part) for part in radii], dtype=np.int64)
+    owner = np.repeat(np.arange(len(links)), counts)
+    radius = np.concatenate([np.zeros(0), *radii])
+    middles = np.array([(part.max(axis=0) + part.min(axis=0)) / 2 for part in centers]).reshape(-1, 3)
+    reach = np.array([(np.linalg.norm(c - m, axis=1) + r).max() for c, m, r in zip(centers, middles, radii, strict=True)])
+
+    link_pairs, pairs = [], []
+    for names in ((hand.link_names[a], hand.link_names[b]) for a, b in collision.link_pairs):
+        if not set(names) <= set(links):
+            continue
+        a, b = (links.index(name) for name in names)
+        meeting = np.stack(np.meshgrid(*(np.flatnonzero((owner == g) & (radius > 0)) for g in (a, b))), -1).reshape(-1, 2)
+        if len(meeting):
+            link_pairs.append((a, b))
+            pairs.append(meeting)
+    return Balls(
+        links=tuple(links),
+        spans=_spans(counts),
+        link=torch.as_tensor(owner),
+        centers=torch.as_tensor(np.concatenate([np.zeros((0, 3)), *centers])),
+        radii=torch.as_tensor(radius),
+        bound_centers=torch.as_tensor(middles),
+        bound_radii=torch.as_tensor(reach),
+        link_pairs=torch.as_tensor(np.array(link_pairs, dtype=np.int64).reshape(-1, 2)),
+        pair_spans=_spans(np.array([len(part) for part in pairs], dtype=np.int64)),
+        pairs=torch.as_tensor(np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])),
+    )
+
+
+def inscribed_balls(geometry: Geometry) -> tuple[np.ndarray, float]:
+    """Balls inside a shape that fill it well: centres [n, 3] in the shape's frame and their radius.
+
+    A capsule or a long cylinder gets a row along its axis, a sphere itself. A box gets layers of balls as thick as its thinnest side; so
+    does a flat cylinder, through the square in its rim, and a hull, through the box about it shrunk to the hull's volume.
+    """
+    if geometry.kind == "sphere":
+        return np.zeros((1, 3)), geometry.size[0]
+    if geometry.kind == "capsule" or (geometry.kind == "cylinder" and geometry.size[1] >= geometry.size[0]):
+        radius, half = geometry.size
+        return _grid((0.0, 0.0, half if geometry.kind == "capsule" else half - radius), radius), radius
+    if geometry.kind == "cylinder":
+        radius, half = geometry.size
+        center, sides = np.zeros(3), np.array((radius * 0.5**0.5, radius * 0.5**0.5, half))
+    elif geometry.kind == "box":
+        center, sides = np.zeros(3), np.array(geometry.size)
+    else:
+        from scipy.spatial import ConvexHull
+
+        points, _ = support_points(geometry)
+        low, high = points.min(axis=0), points.max(axis=0)
+        center, sides = (low + high) / 2, (high - low) / 2 * (ConvexHull(points).volume / np.prod(high - low)) ** (1 / 3)
+    radius = float(sides.min())
+    return center + _grid(tuple(sides - radius), radius), radius
+
+
+def sharp_points(geometry: Geometry, spacing: float) -> np.ndarray:
+    """[n, 3] points where a shape stands out of balls in it: a box's edges, a cylinder's rims, a hull's vertices; none for round shapes."""
+    points, radius = support_points(geometry)
+    if radius > 0:
+        return np.zeros((0, 3))
+    if geometry.kind != "box":
+        return points
+    edges = []
+    for axis, half in enumerate(geometry.size):
+        along = np.linspace(-half, half, int(np.ceil(2 * half / spacing)) + 1)
+        for corner in points[points[:, axis] > 0]:
+            edge = np.repeat(corner[None], len(along), axis=0)
+            edge[:, axis] = along
+            edges.append(edge)
+    return np.unique(np.concatenate(edges), axis=0)
+
+
+def _shape_balls(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Centres [n, 3] in the link's frame and radii [n] of the balls of one shape."""
+    inner, radius = inscribed_balls(shape.geometry)
+    sharp = sharp_points(shape.geometry, radius)
+    points = np.concatenate((inner, sharp)) @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
+    return points, np.concatenate((np.full(len(inner), radius), np.zeros(len(sharp))))
+
+
+def _spans(counts: np.ndarray) -> Spans:
+    return Spans(start=torch.as_tensor(np.cumsum(counts) - counts), count=torch.as_tensor(counts))
+
+
+def _grid(half: tuple[float, ...], radius: float) -> np.ndarray:
+    """[n, 3] an even grid over [-half, half] with steps of at most the radius."""
+    rows = [np.linspace(-h, h, int(np.ceil(2 * h / radius - 1e-9)) + 1) if h > 0 else np.zeros(1) for h in half]
+    return np.array(list(product(*rows)))

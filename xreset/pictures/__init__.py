@@ -1,0 +1,1 @@
+"""Pictures, films and the browser viewer, drawn without any engine, display or GPU."""

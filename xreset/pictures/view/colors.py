@@ -1,0 +1,40 @@
+"""What each colour on the page and in the pictures means."""
+
+from __future__ import annotations
+
+from xreset.pictures.raster import INVALID_COLOR, Color
+
+HUMAN_COLOR: Color = (0.85, 0.10, 0.45)
+TOUCH_COLOR: Color = (1.00, 0.80, 0.00)
+"""Of keypoints in contact with the object."""
+CONTACT_COLOR: Color = (0.05, 0.05, 0.05)
+"""Of the points of the object's surface that they touch."""
+REACHED_COLOR: Color = (0.10, 0.55, 0.90)
+"""Of the robot's fingertips."""
+GOOD_COLOR: Color = (0.30, 0.70, 0.35)
+"""Of valid frames on the time line."""
+
+REASON_COLORS: dict[str, Color] = {
+    # of retargeting
+    "not annotated": (0.55, 0.55, 0.55),
+    "hand error": (0.58, 0.20, 0.75),
+    "joint limit": (0.50, 0.30, 0.12),
+    "wrist position": (0.12, 0.30, 0.85),
+    "wrist orientation": (0.10, 0.68, 0.85),
+    "arm jump": (0.90, 0.75, 0.05),
+    "table collision": (0.86, 0.13, 0.13),
+    "self collision": (0.95, 0.35, 0.60),
+    # of the physics filter
+    "out of bounds": (0.35, 0.35, 0.35),
+    "object linear velocity": (0.12, 0.30, 0.85),
+    "object angular velocity": (0.58, 0.20, 0.75),
+    "joint velocity": (0.90, 0.75, 0.05),
+    "not finite": (0.05, 0.05, 0.05),
+    "overflow": (0.50, 0.30, 0.12),
+}
+"""Reason -> colour of its frames on the time line, and of the robot in them."""
+
+
+def reason_color(reason: str) -> Color:
+    """The colour of a reason; red for one that is not known here."""
+    return REASON_COLORS.get(reason, INVALID_COLOR)

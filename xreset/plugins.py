@@ -1,0 +1,148 @@
+"""Plugins: which physics engines and robots there are, and which engines can be used here.
+
+A package makes an engine known with an entry point of the group :data:`ENGINES`, a robot with one of :data:`ROBOTS`; xreset's own are
+listed in ``pyproject.toml`` in the same way. A plugin that fails to load is named with its traceback, and harms no other.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from xreset.errors import BackendUnavailableError, RobotError, XResetError
+
+if TYPE_CHECKING:
+    from xreset.physics import Backend
+    from xreset.spec import SceneSpec
+
+ENGINES = "xreset.backends"
+"""Entry-point group of engines: ``name = "package.module:BackendClass"``."""
+ROBOTS = "xreset.robots"
+"""Entry-point group of robots: ``name = "package.module"``, the module beside a ``robot.toml``."""
+_KINDS: Mapping[str, tuple[str, type[XResetError]]] = {ENGINES: ("backend", BackendUnavailableError), ROBOTS: ("robot", RobotError)}
+
+
+def plugins(group: str) -> dict[str, EntryPoint]:
+    """Name -> entry point of a group, in order of registration. None of them is loaded."""
+    return {entry.name: entry for entry in entry_points(group=group)}
+
+
+def load_plugin(group: str, name: str) -> Any:
+    """What a plugin's entry point names.
+
+    Raises:
+        BackendUnavailableError, RobotError: after the group: there is no plugin of that name, or it does not load.
+    """
+    noun, error_class = _KINDS[group]
+    entries = plugins(group)
+    if name not in entries:
+        raise error_class(f"there is no {noun} {name!r}; there are {known_plugins(group)}.")
+    try:
+        return entries[name].load()
+    except XResetError:
+        raise
+    except Exception as error:  # a plugin may fail in any way; it must be named, and harm nothing else
+        trace = traceback.format_exc(limit=-2)
+        raise error_class(f"the {noun} {name!r} ({entries[name].value}) does not load: {error}\n{trace}") from error
+
+
+def known_plugins(group: str) -> str:
+    """The names of a group for a message."""
+    return ", ".join(sorted(plugins(group))) or "none (is xreset installed? run: pip install -e .)"
+
+
+# Robots ----------------------------------------------------------------------------------------------------------------------------------
+
+
+def robot_names() -> list[str]:
+    """Names of all registered robots, in order of registration. None of them is loaded."""
+    return list(plugins(ROBOTS))
+
+
+def robot_folder(name_or_folder: str | Path) -> Path:
+    """The folder of a robot, by its registered name or by its own path.
+
+    Raises:
+        RobotError: there is neither such a robot nor such a folder, or its package does not load.
+    """
+    name = str(name_or_folder)
+    if name not in plugins(ROBOTS):
+        folder = Path(name_or_folder)
+        if folder.is_dir():
+            return folder.resolve()
+        raise RobotError(f"there is no robot {name!r}, and no folder of that name. Robots: {known_plugins(ROBOTS)}.")
+    module = load_plugin(ROBOTS, name)
+    if not isinstance(module, ModuleType) or not module.__file__:
+        raise RobotError(f"the robot {name!r}: {module!r} is no module with a file; put an __init__.py beside its robot.toml.")
+    return Path(module.__file__).resolve().parent
+
+
+# Engines ---------------------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class BackendStatus:
+    """Whether a backend can be used here."""
+
+    name: str
+    version: str | None
+    """Engine version; None if unavailable."""
+    device: str
+    """``cpu``, ``cuda`` or ``cuda, cpu``."""
+    reason: str | None
+    """Why it is unavailable, and the command that mends it; None if available."""
+
+
+def backend_names() -> list[str]:
+    """Names of all registered backends, in order of registration."""
+    return list(plugins(ENGINES))
+
+
+def backend_class(name: str) -> type[Backend]:
+    """The class of a backend.
+
+    Raises:
+        BackendUnavailableError: no backend of that name, or its plugin does not load.
+    """
+    cls = load_plugin(ENGINES, name)
+    from xreset.physics import Backend
+
+    if not (isinstance(cls, type) and issubclass(cls, Backend)):
+        raise BackendUnavailableError(f"the backend {name!r} is {cls!r}, expected a class that inherits from xreset.physics.Backend.")
+    return cls
+
+
+def device_for(name: str, device: str) -> str:
+    """Where a backend runs, if those that can run on ``device`` are to run there: on it, or else on the CPU.
+
+    Raises:
+        BackendUnavailableError: no backend of that name, or nothing that could be a device.
+    """
+    kind = device.partition(":")[0]
+    if kind not in ("cpu", "cuda"):
+        raise BackendUnavailableError(f"there is no device {device!r}; expected cpu, cuda or one of several GPUs, such as cuda:1.")
+    return device if kind in backend_class(name).devices() else "cpu"
+
+
+def make_backend(name: str, scene: SceneSpec, num_worlds: int, **options: Any) -> Backend:
+    """Build a backend by name; see :class:`xreset.physics.Backend` for the options."""
+    cls = backend_class(name)
+    cls.engine_version()  # fails with reason and remedy where the engine is missing
+    return cls(scene, num_worlds, **options)
+
+
+def backend_status(name: str) -> BackendStatus:
+    """Whether the backend can be used here, without raising."""
+    try:
+        cls = backend_class(name)
+        version = cls.engine_version()
+    except BackendUnavailableError as error:
+        return BackendStatus(name, None, "-", str(error))
+    except Exception as error:  # a plugin's defect must not hide the other engines
+        return BackendStatus(name, None, "-", f"its engine_version() fails: {type(error).__name__}: {error}")
+    return BackendStatus(name, version, ", ".join(cls.devices()), None)

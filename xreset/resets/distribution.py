@@ -1,0 +1,226 @@
+"""The reset distribution: home resets and bank resets, mixed (the paper's sections IV-B and appendix D.c, D.e).
+
+Home: robot near its home configuration, object at a demonstration's first pose, perturbed. Bank: a demonstrated hand-object state.
+The goal is the last object pose of the same demonstration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from typing import Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xreset.errors import DemoError
+from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply
+from xreset.geometry.urdf import robot_tree
+from xreset.resets.bank import ResetBank
+from xreset.spec import GRAVITY, RobotSpec
+from xreset.task.config import ResetConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reset:
+    """Start of M episodes."""
+
+    joint_pos: Tensor
+    """[M, J]"""
+    object_pos: Tensor
+    object_quat: Tensor
+    goal_pos: Tensor
+    goal_quat: Tensor
+    gravity_fraction: Tensor
+    """[M]"""
+    state: Tensor
+    """[M] which of the distribution's bank states, -1 for home."""
+    sequence: Tensor
+    """[M] index of the demonstration."""
+
+    @property
+    def from_bank(self) -> Tensor:
+        """[M] bool"""
+        return self.state >= 0
+
+    @classmethod
+    def stack(cls, parts: Sequence[Self]) -> Self:
+        """Several resets as one."""
+        return cls(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(cls)})
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same on another device."""
+        return type(self)(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+
+def _tensor(array: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
+    """Numbers in single precision, or 64-bit integers."""
+    return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32 if array.dtype.kind == "f" else torch.long, device=device)
+
+
+def bank_starts(bank: ResetBank, rows: np.ndarray) -> Reset:
+    """Given states [M] of a bank, as they are, at full gravity; ``state`` counts the bank's own rows."""
+    sequence = bank.sequence_index[rows]
+    return Reset(
+        joint_pos=_tensor(bank.joint_pos[rows]),
+        object_pos=_tensor(bank.object_pos[rows]),
+        object_quat=_tensor(bank.object_quat_wxyz[rows]),
+        goal_pos=_tensor(bank.goal_pos[sequence]),
+        goal_quat=_tensor(bank.goal_quat_wxyz[sequence]),
+        gravity_fraction=torch.ones(len(rows)),
+        state=_tensor(rows),
+        sequence=_tensor(sequence),
+    )
+
+
+class ResetDistribution:
+    """Draws resets for worlds of given objects from a bank; all tensors live on one device, nothing is copied per draw.
+
+    Attributes:
+        joint_pos: [L, J] robot states of the bank.
+        reached: [L] share of recent episodes from each bank state that reached the goal, 0.5 before the first (:meth:`learn`). States are
+            numbered as they are kept here, sorted by object.
+    """
+
+    FLOOR = 0.01
+    """Least weight of a state at the frontier, so that there is one while every state fails, or none does."""
+
+    def __init__(
+        self, bank: ResetBank, robot: RobotSpec, object_names: tuple[str, ...], config: ResetConfig, device: torch.device | str = "cpu"
+    ) -> None:
+        """Prepare the tables.
+
+        Args:
+            bank: states, starts and goals.
+            robot: its home configuration and joint limits.
+            object_names: objects of the scene, in the scene's order.
+            config: mixture, gravity and perturbations.
+            device: where to draw.
+
+        Raises:
+            DemoError: an object of the scene has no demonstration in the bank.
+        """
+        self.config = config
+        if config.pre_contact_only:
+            bank = bank.select(pre_contact_only=True)
+        missing = [name for name in object_names if name not in bank.sequence_object]
+        if missing:
+            raise DemoError(f"the reset bank has no demonstration of {', '.join(missing)}; it has {', '.join(bank.object_names)}.")
+
+        tensor = partial(_tensor, device=device)
+
+        # States and sequences sorted by object: object o owns the rows first[o] : first[o] + count[o].
+        number = {name: i for i, name in enumerate(object_names)}
+        state_object = np.array([number.get(name, -1) for name in bank.object_name], dtype=np.int64)
+        state_rows = np.flatnonzero(state_object >= 0)[np.argsort(state_object[state_object >= 0], kind="stable")]
+        sequence_object = np.array([number.get(name, -1) for name in bank.sequence_object], dtype=np.int64)
+        sequence_rows = np.flatnonzero(sequence_object >= 0)[np.argsort(sequence_object[sequence_object >= 0], kind="stable")]
+
+        def ranges(owner: np.ndarray) -> tuple[Tensor, Tensor]:
+            count = np.bincount(owner, minlength=len(object_names))
+            return tensor(np.cumsum(count) - count), tensor(count)
+
+        self._state_first, self._state_count = ranges(state_object[state_rows])
+        self._sequence_first, self._sequence_count = ranges(sequence_object[sequence_rows])
+        self.joint_pos = tensor(bank.joint_pos[state_rows])
+        self._object_pos = tensor(bank.object_pos[state_rows])
+        self._object_quat = tensor(bank.object_quat_wxyz[state_rows])
+        self._state_sequence = tensor(bank.sequence_index[state_rows])
+        self._sequence_rows = tensor(sequence_rows)
+        self._start_pos, self._start_quat = tensor(bank.start_pos), tensor(bank.start_quat_wxyz)
+        self._goal_pos, self._goal_quat = tensor(bank.goal_pos), tensor(bank.goal_quat_wxyz)
+        tree = robot_tree(robot)
+        limits = np.array([(tree.joint(name).lower, tree.joint(name).upper) for name in robot.joint_names])
+        self._lower, self._upper = tensor(limits[:, 0]), tensor(limits[:, 1])
+        self.reached = torch.full((len(state_rows),), 0.5, device=device)
+        self._home = tensor(robot.home)
+        self._home_std = tensor(np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints]))
+
+    @property
+    def states_per_object(self) -> Tensor:
+        """[O] bank states of each object of the scene."""
+        return self._state_count
+
+    def sample(self, object_index: Tensor, generator: torch.Generator) -> Reset:
+        """Draw one reset for each world.
+
+        Args:
+            object_index: [M] object of each world.
+            generator: random numbers, on this distribution's device.
+        """
+        m, c = len(object_index), self.config
+        uniform = torch.rand(m, 6, generator=generator, device=generator.device)
+        count = self._state_count[object_index]
+        from_bank = (uniform[:, 0] < c.demo_probability) & (count > 0)
+        row = self._state_first[object_index] + (uniform[:, 1] * count).long().clamp_max((count - 1).clamp_min(0))
+        if c.frontier > 0:
+            row = torch.where(uniform[:, 4] < c.frontier, self._at_frontier(object_index, uniform[:, 1]), row)
+        row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
+        sequence_count = self._sequence_count[object_index]
+        pick = self._sequence_first[object_index] + torch.minimum((uniform[:, 2] * sequence_count).long(), sequence_count - 1)
+        home = self.home(self._sequence_rows[pick], generator)
+        if not len(self.joint_pos):
+            return home
+        sequence = torch.where(from_bank, self._state_sequence[row], home.sequence)
+
+        def mix(bank_value: Tensor, home_value: Tensor) -> Tensor:
+            return torch.where(from_bank.view(-1, *[1] * (home_value.ndim - 1)), bank_value, home_value)
+
+        gravity = uniform[:, 3] if c.random_gravity else torch.ones_like(uniform[:, 3])
+        return Reset(
+            joint_pos=mix(self.joint_pos[row], home.joint_pos),
+            object_pos=mix(self._object_pos[row], home.object_pos),
+            object_quat=mix(self._object_quat[row], home.object_quat),
+            goal_pos=self._goal_pos[sequence],
+            goal_quat=self._goal_quat[sequence],
+            gravity_fraction=mix(gravity, home.gravity_fraction),
+            state=torch.where(from_bank, row, -1),
+            sequence=sequence,
+        )
+
+    def home(self, sequence: Tensor, generator: torch.Generator) -> Reset:
+        """Home resets for given demonstrations [M], perturbed as configured."""
+        m, c, device = len(sequence), self.config, generator.device
+        noise = torch.randn(m, len(self._home), generator=generator, device=device) * self._home_std * float(c.home_noise)
+        joint_pos = torch.minimum(torch.maximum(self._home + noise, self._lower), self._upper)
+        shift = 2.0 * torch.rand(m, 3, generator=generator, device=device) - 1.0
+        offset = torch.cat((shift[:, :2] * c.spawn_xy, torch.zeros(m, 1, device=device)), dim=-1)
+        yaw = torch.cat((torch.zeros(m, 2, device=device), shift[:, 2:] * c.spawn_yaw), dim=-1)
+        gravity = 1.0 + torch.randn(m, generator=generator, device=device) * c.home_gravity_std / GRAVITY
+        return Reset(
+            joint_pos=joint_pos,
+            object_pos=self._start_pos[sequence] + offset,
+            object_quat=quat_multiply(quat_from_axis_angle(yaw), self._start_quat[sequence]),
+            goal_pos=self._goal_pos[sequence],
+            goal_quat=self._goal_quat[sequence],
+            gravity_fraction=gravity.clamp(1.0 - c.home_gravity_clip, 1.0 + c.home_gravity_clip),
+            state=torch.full((m,), -1, device=device),
+            sequence=sequence,
+        )
+
+    def learn(self, state: Tensor, ended: Tensor, reached: Tensor) -> None:
+        """Take note of episodes that have ended; ``reached`` changes in place.
+
+        Args:
+            state: [M] the bank state that each episode began with, -1 for home.
+            ended: [M] bool, whether it has ended; the others are left out.
+            reached: [M] bool, whether it reached the goal.
+        """
+        if not len(self.reached):
+            return
+        told = ended & (state >= 0)
+        row = torch.where(told, state, 0)
+        episodes, hits = (torch.zeros_like(self.reached).index_add_(0, row, what.to(self.reached.dtype)) for what in (told, told & reached))
+        fresh = 1.0 - (1.0 - self.config.frontier_rate) ** episodes
+        self.reached += fresh * (hits / episodes.clamp_min(1.0) - self.reached)
+
+    def _at_frontier(self, object_index: Tensor, uniform: Tensor) -> Tensor:
+        """[M] bank states of the given objects in proportion to s (1 - s), from uniform numbers in [0, 1)."""
+        weight = (self.reached * (1.0 - self.reached)).clamp_min(self.FLOOR)
+        total = torch.cat((weight.new_zeros(1), weight.double().cumsum(0)))
+        first, count = self._state_first[object_index], self._state_count[object_index]
+        low, high = total[first], total[first + count]
+        row = torch.searchsorted(total, low + uniform * (high - low), right=True) - 1
+        return torch.minimum(torch.maximum(row, first), first + (count - 1).clamp_min(0))

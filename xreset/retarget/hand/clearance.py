@@ -1,0 +1,158 @@
+"""What a hand meets: which of its balls come too near to the object, the table or each other, and which fingertips do not yet touch.
+
+Shape letters: B frames, G links with balls, A things found, n variables.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from xreset.geometry.collision import height_above_table
+from xreset.geometry.fields import DistanceFields
+from xreset.geometry.rotations import quat_to_matrix
+from xreset.retarget.hand.model import Bodies, HandModel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distances:
+    """Signed distances and how they change with the variables."""
+
+    frame: Tensor
+    """[A] the frame of each."""
+    value: Tensor
+    """[A] less what is allowed [m]."""
+    slope: Tensor
+    """[A, n] derivative."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Objects:
+    """The object of every frame."""
+
+    pos: Tensor
+    """[B, 3]"""
+    rot: Tensor
+    """[B, 3, 3]"""
+    index: Tensor
+    """[B] among the objects of ``fields``."""
+    fields: DistanceFields
+
+    @staticmethod
+    def at(pos: Tensor, quat: Tensor, index: Tensor, fields: DistanceFields) -> Objects:
+        """Objects at positions [B, 3] and orientations [B, 4]."""
+        return Objects(pos=pos, rot=quat_to_matrix(quat), index=index, fields=fields)
+
+    def local(self, points: Tensor, frame: Tensor) -> Tensor:
+        """[..., 3] points in the mesh frame of the object of their frame [...]."""
+        return (self.rot[frame].mT @ (points - self.pos[frame])[..., None])[..., 0]
+
+    def signed_distance(self, points: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance [A] of world points [A, 3] and its gradient [A, 3] in the world."""
+        distance, slope = self.fields.signed_distance(self.local(points, frame), self.index[frame])
+        return distance, (self.rot[frame] @ slope[..., None])[..., 0]
+
+
+def too_near(
+    model: HandModel, bodies: Bodies, objects: Objects, considered: Tensor, object_clearance: float, self_depth: float
+) -> Distances:
+    """Balls nearer to the object than ``object_clearance``, below the table's top, or deeper in each other than ``self_depth`` [m].
+
+    Links are told apart by one ball about each before their own balls are looked at.
+
+    Args:
+        model: the hand.
+        bodies: its B configurations.
+        objects: of the same frames.
+        considered: [B] bool: other frames are left out.
+        object_clearance: [m]
+        self_depth: [m]
+    """
+    bounds = bodies.pos[:, model.group_body] + (bodies.rot[:, model.group_body] @ model.balls.bound_centers[..., None])[..., 0]  # [B, G, 3]
+    found = (
+        _below_table(model, bodies, bounds, considered),
+        _in_object(model, bodies, bounds, objects, considered, object_clearance),
+        _in_each_other(model, bodies, bounds, considered, self_depth),
+    )
+    return _sorted(*(torch.cat([getattr(part, name) for part in found]) for name in ("frame", "value", "slope")))
+
+
+def not_touching(model: HandModel, bodies: Bodies, objects: Objects, touching: Tensor, gap: float) -> Distances:
+    """Fingertips that should touch the object and are farther than ``gap`` [m] from it: the distance of the nearest of their balls.
+
+    Args:
+        model: the hand.
+        bodies: its B configurations.
+        objects: of the same frames.
+        touching: [B, E] bool: which fingertips (as in ``model.pads``) should touch.
+        gap: [m]
+    """
+    frame, tip = touching.nonzero(as_tuple=True)
+    balls = model.pads.balls[tip]  # [A, W]
+    wide = frame[:, None].expand_as(balls)
+    centers = model.ball_centers(bodies, wide, balls)
+    distance, slope = objects.signed_distance(centers.flatten(0, 1), wide.flatten())
+    outside = distance.view(balls.shape) - model.balls.radii[balls] - gap
+    value, nearest = outside.min(dim=1)
+    row = torch.arange(len(frame), device=frame.device)
+    direction = slope.view(*balls.shape, 3)[row, nearest]
+    far = value > 0
+    row, nearest, frame = row[far], nearest[far], frame[far]
+    slope = model.ball_slope(bodies, frame, balls[row, nearest], centers[row, nearest], direction[far])
+    return Distances(frame=frame, value=value[far], slope=slope)
+
+
+def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Distances:
+    candidate, group = ((bounds[..., 2] < model.balls.bound_radii) & considered[:, None]).nonzero(as_tuple=True)
+    asking, ball = model.balls.spans.members(group)
+    frame = candidate[asking]
+    centers = model.ball_centers(bodies, frame, ball)
+    value = height_above_table(centers, model.balls.radii[ball], model.table)
+    low = value < 0
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=centers.dtype, device=centers.device).expand(int(low.sum()), 3)
+    slope = model.ball_slope(bodies, frame[low], ball[low], centers[low], up)
+    return Distances(frame=frame[low], value=value[low], slope=slope)
+
+
+def _in_object(
+    model: HandModel, bodies: Bodies, bounds: Tensor, objects: Objects, considered: Tensor, object_clearance: float
+) -> Distances:
+    every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
+    low, high = (value[objects.index][:, None] for value in (objects.fields.low, objects.fields.high))
+    middle = objects.local(bounds, every)
+    beside = (middle - torch.minimum(torch.maximum(middle, low), high)).norm(dim=-1)
+    candidate, group = ((beside < model.balls.bound_radii + object_clearance) & considered[:, None]).nonzero(as_tuple=True)
+    asking, ball = model.balls.spans.members(group)
+    frame = candidate[asking]
+    centers = model.ball_centers(bodies, frame, ball)
+    distance, direction = objects.signed_distance(centers, frame)
+    value = distance - model.balls.radii[ball] - object_clearance
+    near = value < 0
+    slope = model.ball_slope(bodies, frame[near], ball[near], centers[near], direction[near])
+    return Distances(frame=frame[near], value=value[near], slope=slope)
+
+
+def _in_each_other(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor, self_depth: float) -> Distances:
+    a, b = model.balls.link_pairs.unbind(1)
+    reach = model.balls.bound_radii[a] + model.balls.bound_radii[b] - self_depth
+    near = (bounds[:, a] - bounds[:, b]).norm(dim=-1) < reach
+    candidate, group = (near & considered[:, None]).nonzero(as_tuple=True)
+    asking, pair = model.balls.pair_spans.members(group)
+    frame = candidate[asking]
+    first, second = model.balls.pairs[pair].unbind(1)
+    at_first, at_second = model.ball_centers(bodies, frame, first), model.ball_centers(bodies, frame, second)
+    gap = at_first - at_second
+    distance = gap.norm(dim=-1)
+    value = distance - model.balls.radii[first] - model.balls.radii[second] + self_depth
+    deep = value < 0
+    frame, first, second, at_first, at_second = (v[deep] for v in (frame, first, second, at_first, at_second))
+    direction = gap[deep] / distance[deep, None].clamp_min(1e-9)
+    slope = model.ball_slope(bodies, frame, first, at_first, direction) - model.ball_slope(bodies, frame, second, at_second, direction)
+    return Distances(frame=frame, value=value[deep], slope=slope)
+
+
+def _sorted(frame: Tensor, value: Tensor, slope: Tensor) -> Distances:
+    order = frame.argsort(stable=True)
+    return Distances(frame=frame[order], value=value[order], slope=slope[order])

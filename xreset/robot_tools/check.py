@@ -1,0 +1,385 @@
+"""Says everything that is wrong with a robot in one go: its description, its URDF, its physics, and what the engines make of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+from xml.etree import ElementTree
+
+import numpy as np
+
+from xreset.description import DESCRIPTION, load_robot
+from xreset.errors import BackendUnavailableError, XResetError
+from xreset.geometry.urdf import RobotTree, find_mesh, robot_tree
+from xreset.plugins import robot_folder
+from xreset.spec import Geometry, ObjectSpec, RobotSpec, SceneSpec, Shape, TableSpec
+
+Level = Literal["ok", "skipped", "warning", "error"]
+
+MIN_CLEARANCE = 0.005
+"""Clearance [m] from the table that the home configuration should have."""
+_ROUNDING = 1e-3
+"""Relative slack of the triangle inequality: published inertias are rounded."""
+_SAMPLES = 200
+_POSE_TOLERANCE = 1e-3
+_HOLD_STEPS = 30
+_HOLD_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    level: Level
+    topic: str
+    """What was looked at, such as ``joints``."""
+    message: str
+    """What was found, what was expected, and what to do."""
+
+
+def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, list[Finding]]:
+    """Check everything that needs no engine.
+
+    Returns:
+        The robot, or None if its description or its URDF cannot be read; and the findings, one ``ok`` for each topic without a problem.
+    """
+    try:
+        folder = robot_folder(name_or_folder)
+        spec = load_robot(name_or_folder)
+    except XResetError as error:
+        return None, [Finding("error", "description", str(error))]
+    found = [Finding("ok", "description", f"{folder / DESCRIPTION}: {_summary(spec)}")]
+    if missing := _missing_meshes(spec.urdf):
+        return None, [*found, *(Finding("error", "meshes", problem) for problem in missing)]
+    try:
+        tree = robot_tree(spec)
+    except XResetError as error:
+        return None, [*found, Finding("error", "URDF", str(error))]
+    shapes = sum(len(link.collisions) for link in tree.links)
+    mass = sum(link.mass for link in tree.links)
+    found.append(Finding("ok", "URDF", f"{len(tree.links)} links, {len(tree.joints)} joints, {shapes} collision shapes, {mass:.1f} kg"))
+
+    found += _topic("joints", _joints(spec, tree), f"{len(spec.joints)} actuated joints exist, have limits, and are at home within them")
+    found += _topic("mimic joints", _mimics(spec, tree), f"{len(spec.mimics)} follow an actuated joint")
+    found += _topic("links", _links(spec, tree), "palm, fingertips, keypoints and collision links exist")
+    found += _topic("inertias", _inertias(tree), "masses are positive, inertias are those of solid bodies")
+    if any(finding.level == "error" for finding in found):
+        found.append(Finding("skipped", "home", "mend the errors above first"))
+        return spec, found
+    found += _topic("drives", _drives(spec), _drive_summary(spec))
+    found += _topic("frames", _frames(spec), "the palm looks along the fingers")
+    found += _home(spec)
+    if spec.placement is not None:
+        stated = f"reaches {spec.placement.reached:.1%} and follows {spec.placement.followed:.1%} of {spec.placement.frames} frames"
+        found.append(Finding("ok", "placement", f"{stated}, says {DESCRIPTION}: {spec.placement.command}"))
+    return spec, found
+
+
+def check_engine(spec: RobotSpec, backend: str) -> Finding:
+    """Build the robot in an engine, compare its link poses with xreset's own kinematics, and let it hold its home configuration."""
+    from xreset.plugins import make_backend
+
+    topic = f"engine {backend}"
+    try:
+        with make_backend(backend, SceneSpec(robot=spec, objects=(_probe(),)), 1) as engine:
+            problem = _links_disagree(spec, engine) or _does_not_hold(spec, engine)
+    except BackendUnavailableError as error:
+        return Finding("skipped", topic, str(error))
+    except Exception as error:  # whatever an engine says about this robot is what its author needs to read
+        return Finding("error", topic, f"{type(error).__name__}: {error}")
+    if problem:
+        return Finding("error", topic, problem)
+    return Finding("ok", topic, f"link poses agree within {_POSE_TOLERANCE * 1e3:g} mm; home is held")
+
+
+def check(name_or_folder: str | Path, *, report: Callable[[Finding], None] = lambda _: None, engines: bool = True) -> list[Finding]:
+    """Check a robot.
+
+    Args:
+        name_or_folder: a registered name or a folder.
+        report: called with each finding as soon as there is one (building a scene can take a minute in some engines).
+        engines: whether to build the robot in every installed engine.
+
+    Returns:
+        All findings.
+    """
+    from xreset.plugins import backend_names
+
+    spec, found = check_description(name_or_folder)
+    for finding in found:
+        report(finding)
+    if spec is None or not engines:
+        return found
+    if any(finding.level == "error" for finding in found):
+        found.append(Finding("skipped", "engines", "mend the errors above first"))
+        report(found[-1])
+        return found
+    for backend in backend_names():
+        found.append(check_engine(spec, backend))
+        report(found[-1])
+    return found
+
+
+def _topic(topic: str, problems: Iterator[tuple[Level, str]], otherwise: str) -> list[Finding]:
+    return [Finding(level, topic, message) for level, message in problems] or [Finding("ok", topic, otherwise)]
+
+
+def _summary(spec: RobotSpec) -> str:
+    return f"{len(spec.arm_indices)} arm joints, {len(spec.hand_indices)} hand joints, {len(spec.fingertips)} fingertips"
+
+
+# Description against URDF ----------------------------------------------------------------------------------------------------------------
+
+
+def _missing_meshes(urdf: Path) -> list[str]:
+    """Every mesh of a collision shape that is not there (reading the URDF stops at the first)."""
+    try:
+        xml = ElementTree.parse(urdf)
+    except (OSError, ElementTree.ParseError):
+        return []  # load_urdf says so
+    names = [mesh.get("filename", "") for collision in xml.iter("collision") for mesh in collision.iter("mesh")]
+    return [
+        f"{urdf.name} uses {name!r}, which is not there. Put it beside the URDF."
+        for name in dict.fromkeys(names)
+        if not find_mesh(name, urdf)
+    ]
+
+
+def _joints(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
+    known = {joint.name: joint for joint in tree.joints}
+    below = _below(tree, spec.hand_root)
+    for joint in spec.joints:
+        if joint.name not in known:
+            yield "error", f"{joint.name!r} is not in the URDF, which has {_listed(n for n, j in known.items() if j.type != 'fixed')}."
+            continue
+        found = known[joint.name]
+        if found.type == "fixed":
+            yield "error", f"{joint.name!r} is fixed in the URDF; an actuated joint must move."
+        elif not np.isfinite((found.lower, found.upper)).all() or found.lower >= found.upper:
+            yield "error", f"{joint.name!r} has the limits {found.lower:g}..{found.upper:g}; expected finite ones, the lower one first."
+        elif not found.lower <= joint.home <= found.upper:
+            yield "error", f"{joint.name!r} is at home at {joint.home:g}, outside its limits {found.lower:g}..{found.upper:g}."
+        elif (found.child in below) != (joint.group == "hand"):
+            where = "below" if found.child in below else "not below"
+            yield "warning", f"{joint.name!r} is of group {joint.group!r} but lies {where} the hand's root {spec.hand_root!r}."
+    moved = {*spec.joint_names, *(mimic.joint for mimic in spec.mimics)}
+    for name in (name for name, joint in known.items() if joint.type != "fixed" and name not in moved):
+        yield "error", f"the URDF's {name!r} moves but is neither actuated nor a mimic joint; add it to either, or make it fixed."
+
+
+def _mimics(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
+    known = {joint.name for joint in tree.joints if joint.type != "fixed"}
+    stated = _mimic_tags(spec.urdf)
+    for mimic in spec.mimics:
+        if mimic.joint not in known:
+            yield "error", f"{mimic.joint!r} is not a moving joint of the URDF."
+        elif mimic.joint in stated and stated[mimic.joint] != (mimic.source, mimic.multiplier, mimic.offset):
+            here, there = (mimic.source, mimic.multiplier, mimic.offset), stated[mimic.joint]
+            described, tagged = (f"{factor:g} {source} + {offset:g}" for source, factor, offset in (here, there))
+            yield "error", f"{mimic.joint!r} = {described} in the description, but {tagged} in the URDF."
+    for name in stated.keys() - {mimic.joint for mimic in spec.mimics}:
+        yield "error", f"the URDF lets {name!r} mimic {stated[name][0]!r}, but the description has no such entry in mimics."
+
+
+def _mimic_tags(urdf: Path) -> dict[str, tuple[str, float, float]]:
+    found = {}
+    for joint in ElementTree.parse(urdf).getroot().findall("joint"):
+        tag = joint.find("mimic")
+        if tag is not None:
+            found[joint.get("name", "")] = (tag.get("joint", ""), float(tag.get("multiplier", 1)), float(tag.get("offset", 0)))
+    return found
+
+
+def _links(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
+    known = {link.name: link for link in tree.links}
+    wanted = [("hand.root", spec.hand_root), ("hand.palm", spec.palm)]
+    wanted += [(f"fingertip {tip.name!r}", tip.link) for tip in spec.fingertips]
+    wanted += [(f"contact_links of {tip.name!r}", link) for tip in spec.fingertips for link in tip.contact_links]
+    wanted += [(f"keypoint {point.keypoint!r}", point.link) for point in spec.keypoints]
+    wanted += [("collision.self", link) for link in spec.self_collision_links]
+    wanted += [("collision.exclude", link) for pair in spec.collision_exclude for link in pair]
+    wanted += [("collision.table_exclude", link) for link in spec.table_exclude]
+    absent = [(where, link) for where, link in wanted if link not in known]
+    for where, link in absent:
+        yield "error", f"{where}: the URDF has no link {link!r}."
+    if absent:
+        yield "error", f"the URDF's links are {_listed(known)}."
+        return
+    below = _below(tree, spec.hand_root)
+    for tip in spec.fingertips:
+        if not any(known[link].collisions for link in tip.contact_links):
+            yield "error", f"fingertip {tip.name!r}: none of {_listed(tip.contact_links)} has a collision shape, so it can touch nothing."
+        if tip.link not in below:
+            yield "error", f"fingertip {tip.name!r}: {tip.link!r} does not lie below the hand's root {spec.hand_root!r}."
+    for link in spec.self_collision_links:
+        if not known[link].collisions:
+            yield "warning", f"collision.self: {link!r} has no collision shape."
+
+
+def _inertias(tree: RobotTree) -> Iterator[tuple[Level, str]]:
+    fixed = {joint.child for joint in tree.joints if joint.type == "fixed"}
+    for link in tree.links:
+        if link.mass <= 0:
+            if link.name not in fixed and link.name != tree.root:
+                yield "error", f"{link.name!r} moves but has the mass {link.mass:g} kg; every moving link needs a mass and an inertia."
+            continue
+        moments = np.linalg.eigvalsh(link.inertia)
+        if moments[0] <= 0:
+            yield "error", f"{link.name!r} has the principal moments {_numbers(moments)} kg m^2; expected positive ones."
+        elif moments[2] > (moments[0] + moments[1]) * (1 + _ROUNDING):
+            yield (
+                "error",
+                f"{link.name!r} has the principal moments {_numbers(moments)} kg m^2: the largest exceeds the sum of the others, which no "
+                "solid body has.",
+            )
+
+
+# Physics ---------------------------------------------------------------------------------------------------------------------------------
+
+
+def _drives(spec: RobotSpec) -> Iterator[tuple[Level, str]]:
+    from xreset.geometry.dynamics import damping_ratio, drive_inertia
+
+    for joint in spec.joints:
+        drive = joint.drive
+        if drive.kp <= 0 or drive.effort <= 0 or min(drive.kd, drive.armature, drive.friction_loss) < 0:
+            yield "error", f"{joint.name!r}: kp and effort must be positive; kd, armature and friction_loss must not be negative."
+            return
+    step = SceneSpec.timestep
+    for joint, ratio, inertia in zip(spec.joints, damping_ratio(spec, spec.home), drive_inertia(spec, spec.home), strict=True):
+        if ratio < 0.5:
+            yield "warning", f"{joint.name!r} has the damping ratio {ratio:.2f} at home and will swing; 0.7 to 1.5 is usual: raise kd."
+        if ratio > 5:
+            yield "warning", f"{joint.name!r} has the damping ratio {ratio:.1f} at home and will creep; 0.7 to 1.5 is usual: lower kd."
+        if joint.drive.kd * step > inertia:
+            yield (
+                "warning",
+                f"{joint.name!r}: kd = {joint.drive.kd:g} is more than its inertia {inertia:.3g} bears at a step of 1/{1 / step:.0f} s; "
+                "engines that integrate drives explicitly become unstable. Lower kp and kd, or add the rotor's inertia to the link.",
+            )
+
+
+def _drive_summary(spec: RobotSpec) -> str:
+    from xreset.geometry.dynamics import damping_ratio
+
+    ratio = damping_ratio(spec, spec.home)
+    return f"damping ratios at home are {ratio.min():.2f}..{ratio.max():.2f}"
+
+
+def _frames(spec: RobotSpec) -> Iterator[tuple[Level, str]]:
+    import torch
+
+    from xreset.geometry.kinematics import Kinematics
+
+    poses = Kinematics(spec).link_poses(torch.tensor(spec.home), spec.tracked_links).numpy()
+    palm, tips = poses[0], poses[1:]
+    ahead = (tips[:, :3, 3] - palm[:3, 3]).mean(axis=0) @ palm[:3, 0]
+    if ahead <= 0:
+        yield "warning", f"the fingertips lie {-ahead:.3f} m behind the palm {spec.palm!r}: its x should point towards the fingers."
+
+
+def _home(spec: RobotSpec) -> list[Finding]:
+    """Home, and configurations spread around it as at the start of episodes, against the table and against the robot itself."""
+    import torch
+
+    from xreset.geometry.collision import SelfCollision, height_above_table, table_points
+    from xreset.geometry.kinematics import Kinematics
+
+    kinematics = Kinematics(spec)
+    home = torch.tensor(spec.home)
+    spread = torch.zeros_like(home)
+    spread[spec.arm_indices], spread[spec.hand_indices] = spec.home_std
+    noise = torch.randn(_SAMPLES, len(home), generator=torch.Generator().manual_seed(0), dtype=home.dtype)
+    q = torch.cat((home[None], kinematics.clamp(home + spread * noise)))
+    found = []
+
+    support = table_points(spec, kinematics)
+    points = kinematics.points(q, support.links, torch.tensor(support.points))
+    height = height_above_table(points, torch.tensor(support.radii), TableSpec())
+    clearance, lowest = height[0].min(dim=0)
+    below = 100 * float((height.min(dim=1).values < 0).double().mean())
+    text = f"lowest at {clearance * 1e3:.0f} mm above the table ({support.links[int(lowest)]}); {below:.0f} % of the spread below it"
+    level = "error" if clearance < 0 else "warning" if clearance < MIN_CLEARANCE or below > 1 else "ok"
+    found.append(Finding(level, "home and table", text))
+
+    try:
+        collision = SelfCollision(spec, kinematics)
+    except XResetError as error:
+        return [*found, Finding("skipped", "home and self", str(error))]
+    poses = kinematics.link_poses(q).numpy()
+    names = np.array(kinematics.link_names)
+    for pair in collision.overlapping_at_home:
+        found.append(
+            Finding("error", "home and self", f"{' and '.join(pair)} overlap at home: move home, or add the pair to collision.exclude.")
+        )
+    near = collision.near(poses, 0.0)
+    share = 100 * len(np.unique(near.configuration)) / len(q)
+    pairs = sorted({" and ".join(names[pair]) for pair in near.links})
+    if share > 20:
+        found.append(Finding("warning", "home and self", f"{share:.0f} % of the spread around home touches itself: {_listed(pairs)}"))
+    elif not collision.overlapping_at_home:
+        found.append(Finding("ok", "home and self", f"free at home; {share:.0f} % of the spread around it touches itself"))
+    return found
+
+
+def _probe() -> ObjectSpec:
+    """A small box for the engines' scenes."""
+    import trimesh
+
+    half = 0.03
+    mesh = trimesh.creation.box([2 * half] * 3)
+    return ObjectSpec(
+        name="box",
+        pieces=(Shape(geometry=Geometry(kind="box", size=(half,) * 3)),),
+        mass=0.2,
+        com=np.zeros(3),
+        inertia=np.eye(3) * 0.2 * (2 * half) ** 2 / 6,
+        vertices=np.asarray(mesh.vertices),
+        faces=np.asarray(mesh.faces),
+    )
+
+
+def _links_disagree(spec: RobotSpec, engine) -> str | None:
+    import torch
+
+    from xreset.geometry.kinematics import Kinematics
+
+    state = engine.state()
+    expected = Kinematics(spec).link_poses(state.joint_pos[0].double().cpu(), spec.tracked_links)[:, :3, 3]
+    away = (engine.links().pos[0].double().cpu() - expected).norm(dim=-1)
+    if bool(torch.isfinite(away).all()) and float(away.max()) < _POSE_TOLERANCE:
+        return None
+    return f"at home {spec.tracked_links[int(away.argmax())]!r} is {float(away.max()) * 1e3:.1f} mm from where xreset's kinematics has it."
+
+
+def _does_not_hold(spec: RobotSpec, engine) -> str | None:
+    import torch
+
+    home = torch.tensor(spec.home, dtype=torch.float32)
+    engine.set_joint_targets(home.to(engine.device)[None])
+    for _ in range(_HOLD_STEPS):
+        engine.step()
+    away = (engine.state().joint_pos[0].cpu() - home).abs()
+    if bool(torch.isfinite(away).all()) and float(away.max()) < _HOLD_TOLERANCE:
+        return None
+    joint = spec.joint_names[int(away.nan_to_num(torch.inf).argmax())]
+    return f"after {_HOLD_STEPS} control steps with home as the target {joint!r} is {float(away.max()):.3f} rad (m) away from it."
+
+
+def _below(tree: RobotTree, root: str) -> set[str]:
+    """The links below ``root``, without itself."""
+    below = {root}
+    for joint in tree.joints:  # parents come before children
+        if joint.parent in below:
+            below.add(joint.child)
+    return below - {root}
+
+
+def _listed(names) -> str:
+    return ", ".join(names)
+
+
+def _numbers(values: np.ndarray) -> str:
+    return ", ".join(f"{value:.3g}" for value in values)

@@ -1,0 +1,163 @@
+"""Where a robot should stand: the base placement from which its arm reaches most of what human hands did.
+
+Hand retargeting says where the hand root must be in every frame of some demonstrations. Candidates are drawn at random, then around the
+best of them (the cross-entropy method), and tried on frames each on its own, from several starts: what the arm *can* reach. The few best,
+and the robot's own placement, then follow whole motions as in ``xreset retarget``, and the one that follows most wins.
+
+Shape letters: F frames, n arm joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from xreset.errors import RobotError
+from xreset.geometry.rotations import matrix_to_quat
+from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, track
+from xreset.retarget.validity import Thresholds, classify
+from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search
+from xreset.spec import RobotSpec
+
+_LENGTH = 0.10
+"""Length that counts as much as one radian in the measure of dexterity [m]."""
+_SHRINK = 0.6
+"""Factor by which the spread of candidates about the best shrinks from round to round."""
+
+
+def place(
+    robot: RobotSpec,
+    paths: list[ArmTargets],
+    avoid: np.ndarray,
+    config: PlaceConfig | None = None,
+    progress: Callable[[float, Reach], None] = lambda done, best: None,
+) -> Search:
+    """The placement from which the robot follows most of the motions.
+
+    Args:
+        robot: the robot; its own placement is the first candidate, and a finalist.
+        paths: what hand retargeting asks of the arm: see :func:`xreset.retarget.pipeline.wrist_paths`.
+        avoid: [., 3] points that the base keeps clear of.
+        config: ranges and effort.
+        progress: called with the share that is done and the best reach yet.
+
+    Raises:
+        RobotError: there is no wrist pose to reach.
+    """
+    config = config or PlaceConfig()
+    wrists = single_frames(paths, Thresholds().hand_error)
+    if not len(wrists.annotated):
+        raise RobotError(f"robot {robot.name!r}: there is no frame to reach; hand retargeting followed none within its threshold.")
+    random = np.random.default_rng(config.seed)
+    order = torch.as_tensor(random.permutation(len(wrists.annotated)))
+    tried, kept = wrists.select(order[: config.frames]), wrists.select(order[config.frames :][: config.final_frames])
+    if not len(kept.annotated):
+        kept = tried
+    own = Placement(pos=robot.base_pos, quat=robot.base_quat)
+    found = [(own, reach(robot, own, tried, config))]
+    effort = config.rounds * config.candidates + 10 * (1 + config.elite)  # a finalist takes as long as ten candidates or so
+    for step, candidate in enumerate(_draws(robot, avoid, config, random, found)):
+        found.append((candidate, reach(robot, candidate, tried, config)))
+        found.sort(key=lambda pair: pair[1].rank, reverse=True)
+        progress((step + 1) / effort, found[0][1])
+
+    finalists = []
+    for placement in dict.fromkeys([own, *(placement for placement, _ in found[: config.elite if config.rounds else 0])]):
+        finalists.append(
+            Finalist(placement=placement, reach=reach(robot, placement, kept, config), followed=_followed(robot, placement, paths))
+        )
+        progress(1.0 - 10 * (1 + config.elite - len(finalists)) / effort, found[0][1])
+    best = max(finalists, key=lambda finalist: finalist.followed)
+    home = robot.home[robot.arm_indices] if best.placement == own else _home(robot, best.placement)
+    return Search(best=best, own=finalists[0], home=home, frames=sum(int(path.annotated.sum()) for path in paths))
+
+
+def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: PlaceConfig) -> Reach:
+    """What the robot reaches of wrist poses [F, 1, ...] from a placement."""
+    model = ArmModel(replace(robot, base_pos=placement.pos, base_quat=placement.quat))
+    thresholds = Thresholds(hand_error=np.inf, wrist_position=config.position, wrist_orientation=np.radians(config.orientation))
+    joints, measures = track(model, wrists, thresholds, ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0))
+    reached = (classify(measures, thresholds) == 0)[:, 0]
+    if not bool(reached.any()):
+        return Reach(reached=0.0, dexterity=0.0)
+    full = model.full(joints[reached, 0], wrists.hand_joints[reached, 0])
+    jacobian = model.kinematics.jacobian(full, [robot.hand_root])
+    rows = torch.cat((jacobian.linear[:, 0] / _LENGTH, jacobian.angular[:, 0]), dim=1)[..., model.arm]
+    return Reach(reached=float(reached.double().mean()), dexterity=float(torch.linalg.svdvals(rows)[:, -1].mean()))
+
+
+def single_frames(paths: list[ArmTargets], hand_error: float) -> ArmTargets:
+    """[F, 1, ...] the annotated frames of paths, each on its own, that hand retargeting follows within ``hand_error`` [m]."""
+
+    def flat(name: str) -> torch.Tensor:
+        return torch.cat([getattr(path, name)[path.annotated & (path.hand_error <= hand_error)] for path in paths])[:, None]
+
+    return ArmTargets(**{name: flat(name) for name in vars(paths[0])})
+
+
+def _followed(robot: RobotSpec, placement: Placement, paths: list[ArmTargets]) -> float:
+    """Share of the annotated frames that are valid when the arm follows the paths from a placement."""
+    model = ArmModel(replace(robot, base_pos=placement.pos, base_quat=placement.quat))
+    valid = sum(int((classify(track(model, path, Thresholds())[1], Thresholds()) == 0).sum()) for path in paths)
+    return valid / sum(int(path.annotated.sum()) for path in paths)
+
+
+def _draws(
+    robot: RobotSpec, avoid: np.ndarray, config: PlaceConfig, random: np.random.Generator, found: list[tuple[Placement, Reach]]
+) -> Iterator[Placement]:
+    """Candidates: first evenly over the ranges, then around the best that ``found`` holds by then."""
+    own_tilt = float(np.degrees(np.arccos(np.clip(Rotation.from_quat(robot.base_quat, scalar_first=True).as_matrix()[2, 2], -1, 1))))
+    tilt = config.tilt or (own_tilt, own_tilt)
+    low = np.array([config.x[0], config.y[0], config.z[0], -180.0, tilt[0], -180.0])
+    high = np.array([config.x[1], config.y[1], config.z[1], 180.0, tilt[1], 180.0])
+    for number in range(config.rounds):
+        centres = [_parameters(placement) for placement, _ in found[: config.elite]]
+        for _ in range(config.candidates):
+            while True:
+                if number == 0:
+                    drawn = random.uniform(low, high)
+                else:
+                    spread = (high - low) / 4 * _SHRINK**number
+                    drawn = centres[random.integers(len(centres))] + spread * random.standard_normal(6)
+                drawn[:3], drawn[4] = np.clip(drawn[:3], low[:3], high[:3]), np.clip(drawn[4], tilt[0], tilt[1])
+                if not len(avoid) or np.linalg.norm(avoid - drawn[:3], axis=1).min() >= config.clear:
+                    break
+            yield _placement(drawn)
+
+
+def _placement(parameters: np.ndarray) -> Placement:
+    """From (x, y, z, azimuth, tilt, spin): the base is spun about its z axis, which is tilted towards an azimuth; angles in degrees."""
+    turn = Rotation.from_euler("ZYZ", parameters[3:], degrees=True)
+    x, y, z = (float(v) for v in parameters[:3])
+    a, b, c, d = (float(v) for v in turn.as_quat(canonical=True, scalar_first=True))
+    return Placement(pos=(x, y, z), quat=(a, b, c, d))
+
+
+def _parameters(placement: Placement) -> np.ndarray:
+    R = Rotation.from_quat(placement.quat, scalar_first=True).as_matrix()
+    tilt = np.arccos(np.clip(R[2, 2], -1.0, 1.0))
+    azimuth = np.arctan2(R[1, 2], R[0, 2]) if np.sin(tilt) > 1e-6 else 0.0
+    back = Rotation.from_euler("ZY", (azimuth, tilt)).inv().as_matrix() @ R
+    return np.array([*placement.pos, *np.degrees((azimuth, tilt, np.arctan2(back[1, 0], back[0, 0])))])
+
+
+def _home(robot: RobotSpec, placement: Placement) -> np.ndarray | None:
+    """[n] arm joints near home, from a placement, that hold the hand where the description's own placement and home hold it."""
+    own, model = ArmModel(robot), ArmModel(replace(robot, base_pos=placement.pos, base_quat=placement.quat))
+    home = torch.as_tensor(robot.home)[None, None]
+    root = own.kinematics.link_poses(home, [robot.hand_root])[..., 0, :, :]
+    hand = home[..., torch.as_tensor(own.hand.joint_indices)]
+    target = ArmTargets(
+        root_pos=root[..., :3, 3],
+        root_quat=matrix_to_quat(root[..., :3, :3]),
+        hand_joints=hand,
+        annotated=torch.ones(1, 1, dtype=torch.bool),
+        hand_error=torch.zeros(1, 1, dtype=root.dtype),
+        hand_clearance=torch.zeros(1, 1, dtype=root.dtype),
+    )
+    joints, measures = track(model, target, Thresholds())
+    return joints[0, 0].numpy() if int(classify(measures, Thresholds())) == 0 else None

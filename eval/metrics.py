@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from xreset.env import Reading
-from xreset.geometry.rotations import quat_angle, quat_rotate
-from xreset.task.rewards import contact_gate
+from xreset.geometry.rotations import quat_angle
+from xreset.task.rewards import contact_gate, keypoint_distance
 
 STAGE_SCORES = (0.0, 0.33, 0.66, 1.0)
 """Task progress of: no stage, approach, grasp, reorientation."""
@@ -35,13 +35,6 @@ class MetricsConfig:
     """[m]"""
     goal_angle: float = 0.2617993877991494
     """[rad], 15 degrees."""
-
-
-def keypoint_distance(pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, keypoints: Tensor) -> Tensor:
-    """[N] pose error d(o, g) = max_i |o_i - g_i| of object-frame keypoints [N, 4, 3]."""
-    here = pos[:, None] + quat_rotate(quat[:, None], keypoints)
-    goal = goal_pos[:, None] + quat_rotate(goal_quat[:, None], keypoints)
-    return (here - goal).norm(dim=-1).amax(dim=-1)
 
 
 class EpisodeMetrics:

@@ -1,5 +1,6 @@
 """The environment and the rollouts on the MuJoCo C engine: episodes begin and end as they should, world by world."""
 
+import math
 import tempfile
 import unittest
 from dataclasses import replace
@@ -13,10 +14,20 @@ import torch
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.env import ManipulationEnv, make_scene
-from xreset.objects import load_objects
+from xreset.geometry.rotations import quat_rotate
+from xreset.objects import keypoints, load_objects
 from xreset.policy import ZeroPolicy
 from xreset.resets.distribution import ResetDistribution
-from xreset.task.config import ActionConfig, NoiseConfig, ObservationConfig, ResetConfig, TaskConfig, TerminationConfig, evaluation_task
+from xreset.task.config import (
+    ActionConfig,
+    NoiseConfig,
+    ObservationConfig,
+    ResetConfig,
+    RewardConfig,
+    TaskConfig,
+    TerminationConfig,
+    evaluation_task,
+)
 from xreset.task.observations import layout
 
 try:
@@ -123,6 +134,19 @@ class StepTest(WithEnv):
         best = torch.stack(distance).cummin(dim=0).values[1:]
         torch.testing.assert_close(torch.stack(reach), 1 - torch.tanh(best / TASK.reward.reach_width))
         self.assertTrue(bool((torch.stack(distance)[1:] > best + 1e-3).any()), "the hand moved away at times")
+
+    def test_progress_counts_from_each_worlds_demonstration(self):
+        env = self.make(replace(QUIET, reward=RewardConfig(tracking="progress", progress_width=0.3)))
+        with mock.patch("xreset.task.rewards.contact_gate", lambda *_, **__: torch.ones(N, dtype=torch.bool)):
+            reading, reward = env.advance(torch.zeros(N, 7))
+        for world in range(N):
+            demo, corners = int(env.sequence[world]), torch.as_tensor(keypoints(self.objects[int(env.backend.object_index[world])])).float()
+            poses = [torch.as_tensor(array[demo]) for array in (self.bank.start_pos, self.bank.start_quat_wxyz)]
+            poses += [reading.state.object_pos[world], reading.state.object_quat[world]]
+            poses += [torch.as_tensor(array[demo]) for array in (self.bank.goal_pos, self.bank.goal_quat_wxyz)]
+            start, now, goal = (pos + quat_rotate(quat, corners) for pos, quat in zip(poses[::2], poses[1::2], strict=True))
+            far, farthest = (math.tanh(float((points - goal).norm(dim=-1).max()) / 0.3) for points in (now, start))
+            self.assertAlmostEqual(float(reward.terms["progress"][world]), 8 * (1 - far / farthest), places=4)
 
     def test_the_same_seed_gives_the_same_episodes(self):
         runs = [self.make(seed=seed) for seed in (3, 3, 4)]

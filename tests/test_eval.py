@@ -14,12 +14,13 @@ from tests.toy_bank import SOUP, SPAM
 from tests.toy_results import toy_rollouts, toy_summary
 from xreset.env import Reading
 from xreset.errors import FileFormatError
-from xreset.eval.metrics import EpisodeMetrics, MetricsConfig, keypoint_distance
+from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
 from xreset.eval.results import read_results, read_traces, write_results
 from xreset.eval.rollout import Episode
 from xreset.eval.stats import bootstrap_ci95
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import Contacts, Health, Links, State
+from xreset.task.rewards import keypoint_distance
 
 CORNERS = torch.tensor([[-1.0, -1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]]) * 0.05
 IDENTITY = torch.tensor([1.0, 0, 0, 0])

@@ -61,6 +61,9 @@ class RewardTest(unittest.TestCase):
             "object_quat": IDENTITY,
             "goal_pos": torch.tensor([0.5, 0.3, 0.1]),
             "goal_quat": IDENTITY,
+            "start_pos": torch.tensor([0.5, 0.3, 0.1]),
+            "start_quat": IDENTITY,
+            "keypoints": torch.tensor([[0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05], [0, 0, 0.0]]),
             "action": torch.zeros(4),
             "previous_action": torch.zeros(4),
             "out_of_bounds": torch.tensor(False),
@@ -95,6 +98,39 @@ class RewardTest(unittest.TestCase):
         )
         position, rotation = 4 * (1 - math.tanh(0.1 / 0.2)), 4 * (1 - math.tanh(math.pi / 3 / 1.5))
         self.assert_terms(reward, grasp=1, position=position, rotation=rotation)
+
+    def test_progress_is_paid_in_place_of_presence(self):
+        """A press that moves nothing earns nothing, the goal everything, half the way what the formula says, and losing ground costs."""
+        config, far, start = RewardConfig(tracking="progress"), torch.tensor(1e3), torch.tensor([0.5, 0.3, -0.2])
+
+        def reward(height: float, **changes):
+            return self.reward(config, **({"best_reach": far, "tip_force": self.PRESS, "start_pos": start} | changes),
+                               object_pos=torch.tensor([0.5, 0.3, height]))  # fmt: skip
+
+        def f(x: float) -> float:
+            return 1 - math.tanh(x / 0.15)
+
+        self.assert_terms(reward(-0.2), grasp=1, progress=0)
+        self.assert_terms(reward(0.1), grasp=1, progress=8, success=10)
+        self.assert_terms(reward(-0.05), grasp=1, progress=8 * (f(0.15) - f(0.3)) / (1 - f(0.3)))
+        self.assert_terms(reward(-0.5), grasp=1, progress=8 * (f(0.6) - f(0.3)) / (1 - f(0.3)))
+        self.assertLess(float(reward(-0.5).terms["progress"]), 0)
+        self.assert_terms(reward(0.1, tip_force=torch.zeros(3, 3)))
+        self.assertNotIn("position", reward(0.1).terms)
+
+    def test_progress_counts_rotation_by_the_farthest_keypoint(self):
+        config = RewardConfig(tracking="progress")
+        reward = self.reward(config, tip_force=self.PRESS, object_quat=turned(60), start_quat=turned(180))
+        now, start = 2 * 0.05 * math.sin(math.radians(30)), 2 * 0.05
+        expected = 8 * (1 - math.tanh(now / 0.15) / math.tanh(start / 0.15))
+        self.assertAlmostEqual(float(reward.terms["progress"]), expected, places=5)
+
+    def test_progress_where_a_demonstration_ends_where_it_starts(self):
+        config, at = RewardConfig(tracking="progress"), torch.tensor([0.5, 0.3, 0.14])
+        for start in (at, torch.tensor([0.5, 0.3, 0.1]), torch.tensor([0.5, 0.3, 0.11])):
+            reward = self.reward(config, tip_force=self.PRESS, object_pos=at, start_pos=start)
+            known = max(0.02, float((start - torch.tensor([0.5, 0.3, 0.1])).norm()))
+            self.assertAlmostEqual(float(reward.terms["progress"]), 8 * (1 - math.tanh(0.04 / 0.15) / math.tanh(known / 0.15)), places=4)
 
     def test_a_quaternion_and_its_negative_are_one_rotation(self):
         a = self.reward(tip_force=self.PRESS, object_quat=turned(40))

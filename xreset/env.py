@@ -6,16 +6,18 @@ same class, with another configuration, runs evaluations.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from xreset.capture import GraphRunner
 from xreset.faults import FaultRecorder
 from xreset.geometry.rotations import quat_rotate_inverse
-from xreset.objects import surface_points
+from xreset.objects import keypoints, surface_points
 from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task import observations as obs
@@ -96,12 +98,13 @@ class ManipulationEnv:
         self._graphs = GraphRunner(self.device, self.generator)
         self.actions = ActionSpace.of(scene.robot, task.action, self.device)
 
-        def per_object(count: int) -> Tensor:
-            points = [torch.as_tensor(surface_points(o, count), dtype=torch.float32) for o in scene.objects]
-            return torch.stack(points).to(self.device)[backend.object_index]
+        def per_object(points: Callable[[ObjectSpec], np.ndarray]) -> Tensor:
+            found = [torch.as_tensor(points(o), dtype=torch.float32) for o in scene.objects]
+            return torch.stack(found).to(self.device)[backend.object_index]
 
-        self._cloud_points = per_object(task.observation.cloud_points)
-        self._surface_points = per_object(task.distance_points)
+        self._cloud_points = per_object(lambda o: surface_points(o, task.observation.cloud_points))
+        self._surface_points = per_object(lambda o: surface_points(o, task.distance_points))
+        self._keypoints = per_object(keypoints)
         self._nominal_mass = torch.tensor([o.mass for o in scene.objects], device=self.device)[backend.object_index]
         self._limits = tuple(
             torch.where(limit.isfinite(), limit, sign * torch.pi) for limit, sign in ((self.actions.lower, -1.0), (self.actions.upper, 1.0))
@@ -290,6 +293,7 @@ class ManipulationEnv:
         lost = out_of_bounds(reading.state.object_pos, self.backend.scene.table, self.task.termination) & ~broken
         reach = reading.tip_distance.mean(dim=-1)
         self._best_reach.copy_(torch.where(broken, self._best_reach, torch.minimum(self._best_reach, reach)))
+        start_pos, start_quat = self.resets.start_pose(self.sequence)
         reward = compute_reward(
             RewardInput(
                 tip_distance=reading.tip_distance,
@@ -299,6 +303,9 @@ class ManipulationEnv:
                 object_quat=reading.state.object_quat,
                 goal_pos=self.goal_pos,
                 goal_quat=self.goal_quat,
+                start_pos=start_pos,
+                start_quat=start_quat,
+                keypoints=self._keypoints,
                 action=self._action,
                 previous_action=self._previous_action,
                 out_of_bounds=lost,

@@ -143,6 +143,10 @@ class ResetDistribution:
         """[O] bank states of each object of the scene."""
         return self._state_count
 
+    def start_pose(self, sequence: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the object is at the start of given demonstrations [M]: position [M, 3] and quaternion [M, 4]."""
+        return self._start_pos[sequence], self._start_quat[sequence]
+
     def sample(self, object_index: Tensor, generator: torch.Generator) -> Reset:
         """Draw one reset for each world.
 
@@ -188,11 +192,12 @@ class ResetDistribution:
         shift = 2.0 * torch.rand(m, 3, generator=generator, device=device) - 1.0
         offset = torch.cat((shift[:, :2] * c.spawn_xy, torch.zeros(m, 1, device=device)), dim=-1)
         yaw = torch.cat((torch.zeros(m, 2, device=device), shift[:, 2:] * c.spawn_yaw), dim=-1)
+        start_pos, start_quat = self.start_pose(sequence)
         gravity = 1.0 + torch.randn(m, generator=generator, device=device) * c.home_gravity_std / GRAVITY
         return Reset(
             joint_pos=joint_pos,
-            object_pos=self._start_pos[sequence] + offset,
-            object_quat=quat_multiply(quat_from_axis_angle(yaw), self._start_quat[sequence]),
+            object_pos=start_pos + offset,
+            object_quat=quat_multiply(quat_from_axis_angle(yaw), start_quat),
             goal_pos=self._goal_pos[sequence],
             goal_quat=self._goal_quat[sequence],
             gravity_fraction=gravity.clamp(1.0 - c.home_gravity_clip, 1.0 + c.home_gravity_clip),

@@ -85,12 +85,22 @@ class RewardConfig:
     reach_width: float = 0.1
     """Distance [m] at which 1 - tanh(d / width) falls to 0.24. Not in the paper."""
     grasp: float = 1.0
+    tracking: Literal["presence", "progress"] = "presence"
+    """What pays for the object's pose while the contact gate is open. ``presence``: how near it is to the goal, in position and in rotation
+    (the paper), also of an object that is only pressed down where it stands. ``progress``: how much nearer than at the demonstration's
+    start, which pays nothing for that. Isaac Lab came to reward lifting so (isaac-sim/IsaacLab#6155); this form is our own."""
     position: float = 4.0
+    """``presence`` only."""
     position_width: float = 0.2
     """[m]"""
     rotation: float = 4.0
+    """``presence`` only."""
     rotation_width: float = 1.5
     """[rad]"""
+    progress: float = 8.0
+    """``progress`` only: paid in full at the goal, nothing at the start, and less than nothing farther away."""
+    progress_width: float = 0.15
+    """[m]"""
     success: float = 10.0
     success_position: float = 0.02
     """[m] (section V)"""
@@ -113,9 +123,9 @@ class RewardConfig:
     def __post_init__(self) -> None:
         check_numbers(
             self,
-            positive=("reach_width", "position_width", "rotation_width", "success_position", "success_rotation", "scale"),
+            positive=("reach_width", "position_width", "rotation_width", "progress_width", "success_position", "success_rotation", "scale"),
             not_negative=("contact_threshold",),
-            finite=("reach", "grasp", "position", "rotation", "success", "action", "action_rate", "out_of_bounds", "scale"),
+            finite=("reach", "grasp", "position", "rotation", "progress", "success", "action", "action_rate", "out_of_bounds", "scale"),
         )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from xreset.errors import FileFormatError
 from xreset.eval.rollout import Episode, Rollouts, Trace
 from xreset.eval.stats import bootstrap_ci95
-from xreset.files import Field, read_json, read_npz, write_json, write_npz
+from xreset.files import POSITION, UNIT_TOLERANCE, Field, read_json, read_npz, write_json, write_npz
 from xreset.typed import from_dict
 
 SCHEMA = "xreset-eval/1"
@@ -19,16 +19,16 @@ EPISODES_SCHEMA = "xreset-episodes/1"
 TRACE_SCHEMA = "xreset-trace/1"
 
 _TRACE_FIELDS = {
-    "time": Field(("T",), "f"),
+    "time": Field(("T",), "f", within=(0.0, 1e6)),
     "joint_names": Field(("J",), "U"),
-    "joint_pos": Field(("K", "T", "J"), "f"),
-    "object_pos": Field(("K", "T", 3), "f"),
-    "object_quat_wxyz": Field(("K", "T", 4), "f"),
-    "goal_pos": Field(("K", 3), "f"),
-    "goal_quat_wxyz": Field(("K", 4), "f"),
+    "joint_pos": Field(("K", "T", "J"), "f", within=None),
+    "object_pos": Field(("K", "T", 3), "f", within=None),
+    "object_quat_wxyz": Field(("K", "T", 4), "f", within=None),
+    "goal_pos": Field(("K", 3), "f", within=POSITION),
+    "goal_quat_wxyz": Field(("K", 4), "f", unit=True),
     "object_name": Field(("K",), "U"),
-    "sequence_index": Field(("K",), "i"),
-    "joint_target": Field(("K", "C", "J"), "f", required=False),
+    "sequence_index": Field(("K",), "i", within=(0, 2**31)),
+    "joint_target": Field(("K", "C", "J"), "f", required=False, within=None),
 }
 
 
@@ -122,7 +122,7 @@ def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tup
         FileFormatError: the file is damaged, or its joints are not ``joint_names`` in that order.
     """
     path = folder / f"{backend}.trace.npz"
-    a = read_npz(path, TRACE_SCHEMA, _TRACE_FIELDS, what="an evaluation trace")
+    a = read_npz(path, TRACE_SCHEMA, _TRACE_FIELDS, what="an evaluation trace", check=_check_traces)
     found = tuple(a["joint_names"].tolist())
     if found != joint_names:
         raise FileFormatError(
@@ -142,6 +142,28 @@ def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tup
         )
         for i in range(len(a["object_name"]))
     )
+
+
+_FAR = 1e6
+"""[m, rad] An object may fall for a while and a joint may run away, but not so far."""
+
+
+def _check_traces(a: dict[str, np.ndarray]) -> str | None:
+    """What no engine can have given. One that breaks down gives numbers that are not finite, from some frame after the first on."""
+    if len(a["time"]) < 2 or (np.diff(a["time"]) <= 0).any():
+        return "the times of its frames do not rise."
+    state = np.concatenate((a["joint_pos"], a["object_pos"], a["object_quat_wxyz"]), axis=2)
+    sound = np.isfinite(state).all(axis=2)
+    if not sound[:, 0].all():
+        return "an episode begins with numbers that are not finite."
+    if (np.abs(state[sound]) > _FAR).any():
+        return f"a state holds {np.abs(state[sound]).max():.3g}, expected at most {_FAR:g}."
+    if (np.abs(np.linalg.norm(a["object_quat_wxyz"][sound].astype(float), axis=-1) - 1) > UNIT_TOLERANCE).any():
+        return "array 'object_quat_wxyz' holds quaternions that are not unit."
+    targets = a.get("joint_target")
+    if targets is not None and not (np.abs(targets[sound.min(axis=1)]) <= _FAR).all():
+        return "array 'joint_target' holds numbers that are not finite, or far too large."
+    return None
 
 
 def _per_demo(episodes: list[Episode]) -> dict[str, Any]:

@@ -5,8 +5,10 @@ import os
 import subprocess
 import sys
 import tempfile
+import tracemalloc
 import unittest
 import zipfile
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from errno import ENOSPC
 from pathlib import Path
@@ -51,6 +53,17 @@ class InFolder(unittest.TestCase):
 
     def refused(self, *words: str):
         return self.assertRaisesRegex(FileFormatError, "(?s)" + ".*".join(words))
+
+
+@contextmanager
+def limited_memory(test: unittest.TestCase, megabytes: int):
+    """The block may allocate no more at once."""
+    tracemalloc.start()
+    try:
+        yield
+        test.assertLess(tracemalloc.get_traced_memory()[1], megabytes << 20)
+    finally:
+        tracemalloc.stop()
 
 
 class AtomicWriteTest(InFolder):
@@ -124,7 +137,16 @@ class JsonTest(InFolder):
             read_json(path)
         with self.refused("is a folder"):
             read_json(self.folder)
-        for text, words in (('{"schema": "x/1"', "not valid JSON"), ("[1]", "a JSON list"), ("\xff\xfe", "not valid JSON")):
+        for text, words in (
+            ('{"schema": "x/1"', "not valid JSON"),
+            ("[1]", "a JSON list"),
+            ("\xff\xfe", "not valid JSON"),
+            ('{"a": ' + "[" * 100_000, "nested too deeply"),
+            ('{"a": ' + "1" * 5000 + "}", "not valid JSON"),
+            ('{"a": NaN}', "NaN is no number"),
+            (r'{"a": ["\ud800"]}', "control a terminal"),
+            (r'{"\u001b[31m": 1}', "control a terminal"),
+        ):
             path.write_text(text, encoding="latin-1")
             with self.subTest(text), self.refused(words):
                 read_json(path)
@@ -221,6 +243,53 @@ class NpzTest(InFolder):
         self.write(offsets=np.array([0, 1, 4], dtype=np.uint16))
         self.assertEqual(self.read()["offsets"].tolist(), [0, 1, 4])
 
+    def test_numbers_are_native(self):
+        for offsets in (np.array([0, 1, 4], dtype=">u4"), np.array([0, 1, 4], dtype=np.uint64)):
+            for points in (ARRAYS["points"].astype(np.longdouble), ARRAYS["points"].astype(">f8")):
+                self.write(offsets=offsets, points=points)
+                found = self.read()
+                self.assertEqual((found["offsets"].dtype, found["points"].dtype), (np.dtype("=i8"), np.dtype("=f8")))
+                np.testing.assert_array_equal(found["points"], ARRAYS["points"])
+        self.write(offsets=np.array([0, 1, 2**63], dtype=np.uint64))
+        with self.refused("more than 63 bits"):
+            self.read()
+
+    def test_what_no_schema_asks_for_is_never_unpacked(self):
+        self.write(bomb=np.zeros(200_000_000, dtype=np.uint8))
+        with self.assertLogs("xreset.files", "WARNING") as said, limited_memory(self, 100):
+            self.assertNotIn("bomb", self.read())
+        self.assertIn("also holds ['bomb'], which this xreset", said.output[0])
+
+    def test_what_unpacks_to_too_much_is_refused_before(self):
+        self.write(points=np.zeros((400_000, 3)), good=np.zeros(400_000, dtype=bool))
+        with (
+            mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="9"),
+            limited_memory(self, 100),
+            self.refused("take 9 MB unpacked", "XRESET_MAX_FILE_MB"),
+        ):
+            self.read()
+        with mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="10"):
+            self.read()
+        with mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="many"), self.assertRaisesRegex(XResetError, "expected a whole number"):
+            self.read()
+
+    def test_text_that_controls_a_terminal(self):
+        for text in ("\x1b[31m", "\x9b1m", "a\u202eb", "\ud800"):
+            self.write(names=np.array(["a", text]))
+            with self.subTest(ascii(text)), self.refused("array 'names' holds the text"):
+                self.read()
+
+    def test_numbers_out_of_range(self):
+        schema = SCHEMA | {"points": Field(("F", 3), "f", within=(-100, 100)), "turn": Field((4,), "f", unit=True)}
+        for words, changes in (
+            ("'points' holds non-finite", {"points": np.full((4, 3), np.nan)}),
+            ("'points' holds 1e.30, expected numbers from -100 to 100", {"points": np.full((4, 3), 1e30)}),
+            ("'turn' holds quaternions that are not unit", {"turn": np.zeros(4)}),
+        ):
+            self.write(**{"turn": np.array([1.0, 0, 0, 0])} | changes)
+            with self.subTest(words), self.refused(words):
+                read_npz(self.file, "test/1", schema, what="a test file")
+
     def test_a_further_check_may_refuse(self):
         self.write()
         with self.refused("the offsets are odd"):
@@ -276,6 +345,8 @@ class TypedTest(unittest.TestCase):
             (r"widths\[0\] is True, expected int", good | {"widths": [True]}),
             ("name is 3, expected str", good | {"name": 3}),
             ("configuration is 3, expected an object", 3),
+            (r"widths\[0\] is an integer of 15001 bits, expected int", good | {"widths": [2**15000]}),
+            (r"pair is .{1,200}, expected a list", good | {"pair": {str(i): ["x" * 1000] * 1000 for i in range(1000)}}),
         ):
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
                 from_dict(Outer, data)

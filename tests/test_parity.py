@@ -501,7 +501,7 @@ class Command(unittest.TestCase):
     def test_wrong_use_is_explained(self):
         path = self.retargeted()
         for said, words in (
-            ("there is no file", [self.folder / "none.npz"]),
+            ("there is no ", [self.folder / "none.npz"]),
             ("at least 1, found 0", [path, "--grasps", 0]),
             ("there is no object 'bottle'", [path, "--only", "bottle"]),
             ("for the robot 'ur7e-sharpa'", [path, "--robot", "openarm"]),

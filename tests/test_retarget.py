@@ -627,7 +627,7 @@ class PipelineTest(unittest.TestCase):
     def test_a_file_that_contradicts_itself_is_refused(self):
         for changes, message in (
             ({"valid": ~self.result.valid}, "contradict"),
-            ({"joint_pos": np.full_like(self.result.joint_pos, np.nan)}, "not finite"),
+            ({"joint_pos": np.full_like(self.result.joint_pos, np.nan)}, "non-finite"),
             ({"reason": self.result.reason + 100}, "points beyond"),
             ({"frame_offsets": self.result.frame_offsets[::-1].copy()}, "frame_offsets"),
             ({"first_contact": np.array([10_000, -1])}, "first_contact"),

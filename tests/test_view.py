@@ -203,7 +203,7 @@ class Data(WithFiles):
         self.assertEqual(view.text(3), ("stable in physics", SPAM, "sequence 1: demo_b", "frame 8", "after contact"))
 
     def test_wrong_use_is_explained(self):
-        with self.assertRaisesRegex(FileFormatError, "no file"):
+        with self.assertRaisesRegex(FileFormatError, "there is no"):
             load_view(self.folder / "none.npz")
         text = self.folder / "text.npz"
         text.write_text("hello")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from math import inf, isfinite
 
+import numpy as np
+
 
 def check_numbers(
     config: object,
@@ -44,3 +46,10 @@ def check_numbers(
         low, high = getattr(config, name)
         if not 0 <= low <= high < inf:
             raise ValueError(f"{name} is {low} to {high}, expected two finite numbers, 0 or more, the lower one first")
+
+
+def is_rigid(T: np.ndarray) -> bool:
+    """Whether a matrix [4, 4] is a rotation and a translation: right-handed, without scale, to three digits as people write them."""
+    R = T[:3, :3]
+    straight = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=2e-3) and np.array_equal(T[3], (0, 0, 0, 1))
+    return bool(straight and np.linalg.det(R) > 0)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from xreset.errors import FileFormatError
-from xreset.files import Field, Schema, read_npz, write_npz
+from xreset.files import JOINT, POSITION, Field, Schema, read_npz, write_npz
 from xreset.physics import State
 from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
 
@@ -39,19 +39,19 @@ _FIELDS: Schema = {
     "object_name": Field((), "U"),
     "object_source": Field((), "U"),
     "label": Field((), "U"),
-    "timestep": Field((), "f"),
-    "substeps": Field((), "i"),
-    "friction": Field((3,), "f"),
+    "timestep": Field((), "f", within=(1e-6, 1.0)),
+    "substeps": Field((), "i", within=(1, 1e6)),
+    "friction": Field((3,), "f", within=(0.0, 100.0)),
     "phase_name": Field(("P",), "U"),
-    "phase_start": Field(("P",), "f"),
-    "joint_target": Field(("T", "J"), "f"),
-    "start_joint_pos": Field(("J",), "f"),
-    "start_joint_vel": Field(("J",), "f"),
-    "start_joint_target": Field(("J",), "f"),
-    "start_object_pos": Field((3,), "f"),
-    "start_object_quat_wxyz": Field((4,), "f"),
-    "start_object_linvel": Field((3,), "f"),
-    "start_object_angvel": Field((3,), "f"),
+    "phase_start": Field(("P",), "f", within=(0.0, 1e6)),
+    "joint_target": Field(("T", "J"), "f", within=JOINT),
+    "start_joint_pos": Field(("J",), "f", within=JOINT),
+    "start_joint_vel": Field(("J",), "f", within=(-1e4, 1e4)),
+    "start_joint_target": Field(("J",), "f", within=JOINT),
+    "start_object_pos": Field((3,), "f", within=POSITION),
+    "start_object_quat_wxyz": Field((4,), "f", unit=True),
+    "start_object_linvel": Field((3,), "f", within=(-1e4, 1e4)),
+    "start_object_angvel": Field((3,), "f", within=(-1e4, 1e4)),
 }
 
 
@@ -286,13 +286,8 @@ def robot_of(path: str | Path) -> str:
 
 
 def _check(arrays: dict[str, np.ndarray]) -> str | None:
-    for name, value in arrays.items():
-        if value.dtype.kind == "f" and not np.isfinite(value).all():
-            return f"array {name!r} holds non-finite numbers."
     if not len(arrays["joint_target"]):
         return "it has no control step."
-    if not (arrays["timestep"] > 0 and arrays["substeps"] > 0):
-        return f"timestep {arrays['timestep']} and substeps {arrays['substeps']} must be positive."
     return None
 
 

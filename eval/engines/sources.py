@@ -20,6 +20,7 @@ from xreset.files import npz_schema, read_json
 from xreset.objects import load_object, load_objects
 from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import read_bank
+from xreset.retarget.file import read_retargeted
 from xreset.retarget.pipeline import SCHEMA as RETARGETED
 from xreset.task.config import evaluation_task
 
@@ -140,8 +141,7 @@ def _from_evaluation(source: Path, object_name: str | None, episode: int, robot:
 def _robot_of_retargeted(source: Path, schema: str) -> str:
     if schema == DEMOS:
         raise XResetError(f"{source} holds human demonstrations, which are for no robot yet: give --robot.")
-    with np.load(source, allow_pickle=False) as file:
-        return str(file["robot"])
+    return read_retargeted(source).robot
 
 
 def _object(source: Path, wanted: str | None, there: Sequence[str] | dict[str, None]) -> str:

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from xreset.checks import is_rigid
 from xreset.errors import DemoError, ObjectError
-from xreset.files import Field, read_npz, write_npz
+from xreset.files import POSITION, RATE, UNIT_TOLERANCE, Field, offsets_problem, read_npz, write_npz
 from xreset.objects import canonical_name, load_object
 from xreset.spec import ObjectSpec
 
@@ -25,18 +26,19 @@ SCHEMA = {
     "object_name": Field(("S",), "U"),
     "hand_side": Field(("S",), "U"),
     "frame_offsets": Field(("S+1",), "i"),
-    "hand_keypoints": Field(("F", 21, 3), "f"),
+    "hand_keypoints": Field(("F", 21, 3), "f", within=None),
     "hand_valid": Field(("F",), "b"),
-    "wrist_quat_wxyz": Field(("F", 4), "f"),
-    "object_pos": Field(("F", 3), "f"),
-    "object_quat_wxyz": Field(("F", 4), "f"),
-    "fps": Field((), "f"),
+    "wrist_quat_wxyz": Field(("F", 4), "f", within=None),
+    "object_pos": Field(("F", 3), "f", within=None),
+    "object_quat_wxyz": Field(("F", 4), "f", within=None),
+    "fps": Field((), "f", within=None),
     "subjects": Field(("B",), "U", required=False),
-    "T_level_from_table": Field(("B", 4, 4), "f", required=False),
+    "T_level_from_table": Field(("B", 4, 4), "f", required=False, within=POSITION),
 }
 SIDES = ("right", "left")
 
-_UNIT_TOLERANCE = 1e-3
+_HAND = 0.5
+"""[m] No keypoint is so far from its wrist: the longest hand on record has 33 cm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,7 +243,7 @@ def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSp
 
 def _arrays(demos: Demos) -> dict[str, Any]:
     values = {field.name: getattr(demos, field.name) for field in fields(Demos)}
-    values["fps"] = np.float32(demos.fps)
+    values["fps"], values["frame_offsets"] = np.float32(demos.fps), demos.frame_offsets.astype(np.int32)
     return {name: value for name, value in values.items() if value is not None}
 
 
@@ -260,29 +262,21 @@ def _all_there(what: str, wanted: Iterable[str], there: np.ndarray) -> list[str]
 
 def _problem(arrays: Mapping[str, Any]) -> str | None:
     """What is wrong with the values, or None. Types and shapes have been checked."""
-    offsets = np.asarray(arrays["frame_offsets"])
-    names = arrays["sequence_name"]
+    offsets, names = np.asarray(arrays["frame_offsets"]), arrays["sequence_name"]
     frames = len(arrays["object_pos"])
-    if not len(names):
-        return "it holds no sequence."
-    if offsets[0] != 0 or offsets[-1] != frames:
-        return f"frame_offsets go from {offsets[0]} to {offsets[-1]}, expected 0 to {frames} (the number of frames)."
-    if (np.diff(offsets) <= 0).any():
-        i = int(np.argmax(np.diff(offsets) <= 0))
-        return f"frame_offsets must increase, but sequence {i} ({names[i]!s}) has {np.diff(offsets)[i]} frames."
-    unique, counts = np.unique(names, return_counts=True)
-    if (counts > 1).any():
-        return f"sequence names must be unique, but {unique[np.argmax(counts)]!s} occurs {counts.max()} times."
+    if problem := offsets_problem(arrays, frames):
+        return problem
     wrong = ~np.isin(arrays["hand_side"], SIDES)
     if wrong.any():
         i = int(np.argmax(wrong))
         return f"sequence {i} ({names[i]!s}) has hand_side {str(arrays['hand_side'][i])!r}, expected 'right' or 'left'."
-    if not (np.isfinite(arrays["fps"]) and arrays["fps"] > 0):
-        return f"fps is {arrays['fps']}, expected a positive number."
+    if not RATE[0] <= arrays["fps"] <= RATE[1]:
+        return f"fps is {arrays['fps']}, expected a positive number, from {RATE[0]:g} to {RATE[1]:g}."
     if (arrays.get("subjects") is None) != (arrays.get("T_level_from_table") is None):
         return "subjects and T_level_from_table belong together, but one of them is missing."
-    if arrays.get("T_level_from_table") is not None and not np.isfinite(arrays["T_level_from_table"]).all():
-        return "T_level_from_table has a value that is not finite."
+    level = arrays.get("T_level_from_table")
+    if level is not None and not (np.isfinite(level).all() and all(is_rigid(T) for T in np.asarray(level, dtype=float))):
+        return "T_level_from_table has a matrix that is no rotation and translation."
 
     def first(bad: np.ndarray) -> str:
         frame = int(np.argmax(bad))
@@ -297,7 +291,20 @@ def _problem(arrays: Mapping[str, Any]) -> str | None:
             return f"{name} is not finite in {first(bad)}{hint}."
     for name, where in (("object_quat_wxyz", np.ones(frames, dtype=bool)), ("wrist_quat_wxyz", valid)):
         norm = np.linalg.norm(np.where(where[:, None], arrays[name], [1.0, 0, 0, 0]), axis=1)
-        bad = np.abs(norm - 1) > _UNIT_TOLERANCE
+        bad = np.abs(norm - 1) > UNIT_TOLERANCE
         if bad.any():
             return f"{name} has length {norm[np.argmax(bad)]:.4f} in {first(bad)}, expected unit quaternions."
+    bad = (np.abs(arrays["object_pos"]) > POSITION[1]).any(axis=1)
+    if bad.any():
+        place = np.round(arrays["object_pos"][np.argmax(bad)], 3).tolist()
+        return f"object_pos is {place} in {first(bad)}, expected metres in the table frame."
+    hand = np.where(valid[:, None, None], arrays["hand_keypoints"], 0.0)
+    bad = np.linalg.norm(hand[:, 1:] - hand[:, :1], axis=2).max(axis=1) > _HAND
+    if bad.any():
+        size = float(np.linalg.norm(hand[:, 1:] - hand[:, :1], axis=2).max(axis=1)[np.argmax(bad)])
+        unit = " Are these millimetres?" if 0.05 < size / 1000 < _HAND else ""
+        return f"hand_keypoints are up to {size:.4g} m from the wrist in {first(bad)}, expected the metres of a hand.{unit}"
+    bad = np.abs(hand).max(axis=(1, 2)) > POSITION[1]
+    if bad.any():
+        return f"hand_keypoints are over {POSITION[1]:g} m away in {first(bad)}, expected metres in the table frame."
     return None

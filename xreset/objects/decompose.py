@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from xreset.errors import FileFormatError, ObjectError, XResetError
-from xreset.files import Field, read_npz, write_npz
+from xreset.files import POSITION, Field, read_npz, write_npz
 from xreset.geometry.shapes import hull
 from xreset.spec import Shape
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import trimesh
 
 SCHEMA_NAME = "xreset-pieces/1"
-SCHEMA = {"vertices": Field(("V", 3), "f"), "offsets": Field(("K+1",), "i")}
+SCHEMA = {"vertices": Field(("V", 3), "f", within=POSITION), "offsets": Field(("K+1",), "i")}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ import numpy as np
 
 from xreset.accounts import Account, accounts
 from xreset.errors import FileFormatError
-from xreset.files import Field, Schema, read_npz, write_npz
+from xreset.files import JOINT, POSITION, Field, Schema, read_npz, unique_problem, write_npz
 from xreset.spec import ObjectSpec, RobotSpec
 
 SCHEMA = "xreset-resets/1"
@@ -25,19 +25,19 @@ _FIELDS: Schema = {
     "robot_fingerprint": Field((), "U"),
     "backends": Field(("B",), "U"),
     "joint_names": Field(("J",), "U"),
-    "joint_pos": Field(("L", "J"), "f"),
-    "object_pos": Field(("L", 3), "f"),
-    "object_quat_wxyz": Field(("L", 4), "f"),
+    "joint_pos": Field(("L", "J"), "f", within=JOINT),
+    "object_pos": Field(("L", 3), "f", within=POSITION),
+    "object_quat_wxyz": Field(("L", 4), "f", unit=True),
     "object_name": Field(("L",), "U"),
     "sequence_index": Field(("L",), "i"),
     "frame_index": Field(("L",), "i"),
     "post_contact": Field(("L",), "b"),
     "sequence_name": Field(("S",), "U"),
     "sequence_object": Field(("S",), "U"),
-    "start_pos": Field(("S", 3), "f"),
-    "start_quat_wxyz": Field(("S", 4), "f"),
-    "goal_pos": Field(("S", 3), "f"),
-    "goal_quat_wxyz": Field(("S", 4), "f"),
+    "start_pos": Field(("S", 3), "f", within=POSITION),
+    "start_quat_wxyz": Field(("S", 4), "f", unit=True),
+    "goal_pos": Field(("S", 3), "f", within=POSITION),
+    "goal_quat_wxyz": Field(("S", 4), "f", unit=True),
     "object_names": Field(("O",), "U"),
     "object_sources": Field(("O",), "U"),
     "rejected_sequence_index": Field(("C",), "i"),
@@ -164,12 +164,11 @@ def _array(value: Any) -> np.ndarray:
 
 
 def _check(arrays: dict[str, np.ndarray]) -> str | None:
-    for name, value in arrays.items():
-        if value.dtype.kind == "f" and not np.isfinite(value).all():
-            return f"array {name!r} holds non-finite numbers."
-    for name in ("object_quat_wxyz", "start_quat_wxyz", "goal_quat_wxyz"):
-        if len(arrays[name]) and np.abs(np.linalg.norm(arrays[name], axis=-1) - 1).max() > 1e-3:
-            return f"array {name!r} holds quaternions that are not unit."
+    if problem := unique_problem(arrays["sequence_name"]):
+        return problem
+    for name in ("frame_index", "rejected_frame_index"):
+        if (arrays[name] < 0).any():
+            return f"array {name!r} holds negative numbers."
     for name, owner, what in (
         ("sequence_index", "sequence_name", "sequences"),
         ("rejected_sequence_index", "sequence_name", "sequences"),

@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from xreset.accounts import Account, accounts
-from xreset.files import Field, Schema, read_npz, write_npz
+from xreset.demos.archive import SIDES
+from xreset.files import JOINT, POSITION, RATE, Field, Schema, offsets_problem, read_npz, write_npz
+from xreset.text import shown
 
 SCHEMA = "xreset-retargeted/1"
 
@@ -24,25 +26,25 @@ _FIELDS: Schema = {
     "object_name": Field(("S",), "U"),
     "hand_side": Field(("S",), "U"),
     "frame_offsets": Field(("S+1",), "i"),
-    "fps": Field((), "f"),
+    "fps": Field((), "f", within=RATE),
     "joint_names": Field(("J",), "U"),
-    "joint_pos": Field(("F", "J"), "f"),
-    "palm_pos": Field(("F", 3), "f"),
-    "palm_quat_wxyz": Field(("F", 4), "f"),
+    "joint_pos": Field(("F", "J"), "f", within=JOINT),
+    "palm_pos": Field(("F", 3), "f", within=POSITION),
+    "palm_quat_wxyz": Field(("F", 4), "f", unit=True),
     "fingertip_names": Field(("E",), "U"),
-    "fingertip_pos": Field(("F", "E", 3), "f"),
-    "object_pos": Field(("F", 3), "f"),
-    "object_quat_wxyz": Field(("F", 4), "f"),
-    "goal_pos": Field(("S", 3), "f"),
-    "goal_quat_wxyz": Field(("S", 4), "f"),
+    "fingertip_pos": Field(("F", "E", 3), "f", within=POSITION),
+    "object_pos": Field(("F", 3), "f", within=POSITION),
+    "object_quat_wxyz": Field(("F", 4), "f", unit=True),
+    "goal_pos": Field(("S", 3), "f", within=POSITION),
+    "goal_quat_wxyz": Field(("S", 4), "f", unit=True),
     "annotated": Field(("F",), "b"),
     "valid": Field(("F",), "b"),
     "reason": Field(("F",), "i"),
     "reason_names": Field(("R",), "U"),
     "contact": Field(("F",), "b"),
     "first_contact": Field(("S",), "i"),
-    "hand_error": Field(("F",), "f"),
-    "wrist_error": Field(("F",), "f"),
+    "hand_error": Field(("F",), "f", within=None),
+    "wrist_error": Field(("F",), "f", within=None),
 }
 
 
@@ -129,27 +131,18 @@ def read_retargeted(path: str | Path) -> Retargeted:
 
 
 def _check(arrays: dict[str, np.ndarray]) -> str | None:
-    offsets, frames = arrays["frame_offsets"], len(arrays["joint_pos"])
-    if offsets[0] != 0 or offsets[-1] != frames or (np.diff(offsets) <= 0).any():
-        return f"frame_offsets must increase from 0 to {frames} (the number of frames)."
+    offsets = arrays["frame_offsets"]
+    if problem := offsets_problem(arrays, len(arrays["joint_pos"])):
+        return problem
+    if (wrong := ~np.isin(arrays["hand_side"], SIDES)).any():
+        return f"array 'hand_side' holds {shown(str(arrays['hand_side'][wrong][0]))}, expected right or left."
     if ((arrays["reason"] < 0) | (arrays["reason"] >= len(arrays["reason_names"]))).any():
         return "array 'reason' points beyond 'reason_names'."
     if (arrays["valid"] != (arrays["reason"] == 0)).any():
         return "'valid' and 'reason' contradict each other."
-    for name in (
-        "joint_pos",
-        "palm_pos",
-        "palm_quat_wxyz",
-        "fingertip_pos",
-        "object_pos",
-        "object_quat_wxyz",
-        "goal_pos",
-        "goal_quat_wxyz",
-    ):
-        if not np.isfinite(arrays[name]).all():
-            return f"array {name!r} holds numbers that are not finite."
-        if name.endswith("wxyz") and (np.abs(np.linalg.norm(arrays[name], axis=-1) - 1) > 1e-3).any():
-            return f"array {name!r} holds quaternions that are not unit."
+    for name in ("hand_error", "wrist_error"):
+        if not (arrays[name] >= 0).all():
+            return f"array {name!r} holds negative distances, or some that are no number."
     if ((arrays["first_contact"] < -1) | (arrays["first_contact"] >= np.diff(offsets))).any():
         return "array 'first_contact' points beyond its sequence."
     return None

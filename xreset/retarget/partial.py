@@ -18,16 +18,17 @@ import numpy as np
 from xreset import __version__
 from xreset.demos.archive import Demos
 from xreset.errors import FileFormatError
-from xreset.files import Field, Schema, read_npz, write_npz
+from xreset.files import JOINT, Field, Schema, read_npz, write_npz
+from xreset.retarget.validity import REASONS
 from xreset.spec import ObjectSpec, RobotSpec
 
 _SCHEMA_NAME = "xreset-retargeted-batch/1"
 _SCHEMA: Schema = {
     "key": Field((), "U"),
-    "joint_pos": Field(("F", "J"), "f"),
-    "reason": Field(("F",), "i"),
-    "hand_error": Field(("F",), "f"),
-    "wrist_error": Field(("F",), "f"),
+    "joint_pos": Field(("F", "J"), "f", within=JOINT),
+    "reason": Field(("F",), "i", within=(0, len(REASONS) - 1)),
+    "hand_error": Field(("F",), "f", within=None),
+    "wrist_error": Field(("F",), "f", within=None),
 }
 
 

@@ -28,15 +28,9 @@ except ImportError as error:
 from xreset.backends import mujoco_warp_kernels as kernels
 from xreset.backends.mjcf import KNOWN_DIFFERENCES, MIN_FRICTION, MujocoSettings, compile_scene
 
-wp.config.log_level = wp.LOG_WARNING  # else a line for each of some hundred kernels; what a user needs to know is announced below
-
 _WRONG_DEPTHS = ("4.0.0",)
 """Versions of MuJoCo-Warp that were seen to take the wrong depth of some contacts. Others are left as they are, and their private modules
 unread; ``tests/test_mujoco_warp_depth.py`` says whether they need it too."""
-if mjw.__version__ in _WRONG_DEPTHS:
-    from xreset.backends.mujoco_warp_depth import correct_depths
-
-    correct_depths()
 
 _SET_PER_WORLD = (
     "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "body_gravcomp", "geom_friction",
@@ -98,7 +92,7 @@ class MujocoWarpBackend(Backend):
             BackendUnavailableError: there is no such device.
         """
         super().__init__(scene, num_worlds, object_index=object_index, device=_existing_device(device))
-        wp.init()
+        prepare_engine()
         self._warp_device = wp.device_from_torch(self.device)
         self._streams: dict[int, Any] = {}
         held = self.object_index.unique().tolist()
@@ -469,6 +463,16 @@ class MujocoWarpBackend(Backend):
     def _must_be_open(self) -> None:
         if self._data is None:
             raise XResetError(f"the backend {self.name!r} is closed. Build a new one.")
+
+
+def prepare_engine() -> None:
+    """Set Warp up for this process, before any kernel is made: quiet, and with right depths of contacts."""
+    wp.config.log_level = wp.LOG_WARNING  # else a line for each of some hundred kernels; what a user needs to know is announced
+    wp.init()
+    if mjw.__version__ in _WRONG_DEPTHS:
+        from xreset.backends.mujoco_warp_depth import correct_depths
+
+        correct_depths()
 
 
 def _existing_device(name: str) -> str:

@@ -20,7 +20,6 @@ from xreset.errors import DemoError
 from xreset.eval.engines.agreement import compare
 from xreset.eval.engines.episodes import (
     Motion,
-    at_rest,
     carried_palm,
     closing_episode,
     lifting_episode,
@@ -36,6 +35,7 @@ from xreset.eval.engines.trials import Engine, ParityConfig, engine
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.objects import load_object, rest_height
+from xreset.physics import State
 from xreset.retarget.file import Retargeted, write_retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
@@ -247,7 +247,7 @@ class Finding(unittest.TestCase):
 def recording(**changes) -> Recording:
     """Two worlds, three steps, one joint, two fingertips; ``changes`` replace fields."""
     t, g = 3, 2
-    still = at_rest(torch.zeros(g, 1), torch.zeros(g, 3), torch.tensor([[1.0, 0, 0, 0]] * g))
+    still = State.at_rest(torch.zeros(g, 1), torch.zeros(g, 3), torch.tensor([[1.0, 0, 0, 0]] * g))
     fields = {
         "start": still,
         "joint_pos": torch.zeros(t, g, 1),

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from tests.toy_bank import toy_bank
 from xreset.backends.conformance.scene import gripper, objects
-from xreset.eval.engines.episodes import at_rest
 from xreset.eval.engines.trials import Engine
 from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
@@ -48,7 +47,7 @@ def brick_pose() -> tuple[np.ndarray, np.ndarray]:
 def start() -> State:
     """[1] the robot at home, the brick between its jaws, everything at rest."""
     pos, quat = brick_pose()
-    return at_rest(torch.as_tensor(robot().home)[None], torch.as_tensor(pos)[None], torch.as_tensor(quat)[None])
+    return State.at_rest(torch.as_tensor(robot().home)[None], torch.as_tensor(pos)[None], torch.as_tensor(quat)[None])
 
 
 def targets(step: int) -> np.ndarray:

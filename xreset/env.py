@@ -18,6 +18,7 @@ from xreset.capture import GraphRunner
 from xreset.faults import FaultRecorder
 from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.objects import keypoints, surface_points
+from xreset.physics import Backend, Contacts, Health, Links, State
 from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task import observations as obs
@@ -29,8 +30,6 @@ from xreset.task.terminations import episode_steps, out_of_bounds
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
-
-    from xreset.physics import Backend, Contacts, Health, Links, State
 
 
 _LASTING = (
@@ -244,8 +243,6 @@ class ManipulationEnv:
 
     def restore(self, snapshot: dict[str, Tensor]) -> bool:
         """Go on from a snapshot; False, and nothing is changed, if it is of another number of worlds or of another task."""
-        from xreset.physics import State
-
         if {name: value.shape for name, value in snapshot.items()} != {name: value.shape for name, value in self.snapshot().items()}:
             return False
         for name in _LASTING:
@@ -371,7 +368,7 @@ class ManipulationEnv:
         start = self._start
         self.backend.set_where(
             self._fresh,
-            state=rest_state(start.joint_pos, start.object_pos, start.object_quat),
+            state=State.at_rest(start.joint_pos, start.object_pos, start.object_quat),
             friction=self._friction,
             object_mass=self._mass,
             object_gravity=start.gravity_fraction,
@@ -452,20 +449,4 @@ class ManipulationEnv:
         return (*rows, *totals), torch.cat((means, torch.stack([value.float() for value in totals.values()])))
 
 
-def rest_state(joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor) -> State:
-    """A state at rest whose drives hold the given joint positions [M, J]."""
-    from xreset.physics import State
-
-    zero = torch.zeros_like(object_pos)
-    return State(
-        joint_pos=joint_pos,
-        joint_vel=torch.zeros_like(joint_pos),
-        joint_target=joint_pos,
-        object_pos=object_pos,
-        object_quat=object_quat,
-        object_linvel=zero,
-        object_angvel=zero,
-    )
-
-
-__all__ = ["ManipulationEnv", "Reading", "make_scene", "rest_state"]
+__all__ = ["ManipulationEnv", "Reading", "make_scene"]

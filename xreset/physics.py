@@ -40,6 +40,15 @@ class State:
     object_angvel: Tensor
     """[N, 3] world frame, rad/s."""
 
+    @classmethod
+    def at_rest(cls, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor) -> Self:
+        """Nothing moves, and the drives hold the joint positions [N, J]."""
+        q, pos, still = joint_pos.float(), object_pos.float(), torch.zeros_like(object_pos, dtype=torch.float32)
+        return cls(
+            joint_pos=q, joint_vel=torch.zeros_like(q), joint_target=q.clone(),
+            object_pos=pos, object_quat=object_quat.float(), object_linvel=still, object_angvel=still.clone(),
+        )  # fmt: skip
+
     def __getitem__(self, worlds) -> Self:
         """The states of some worlds."""
         return type(self)(**{f.name: getattr(self, f.name)[worlds] for f in fields(self)})

@@ -144,7 +144,7 @@ def play_policy(
         seed: of the perturbations.
         progress: called with (control steps done, control steps in all).
     """
-    from xreset.env import ManipulationEnv, rest_state
+    from xreset.env import ManipulationEnv
     from xreset.eval.rollout import episode_starts
     from xreset.resets.distribution import ResetDistribution
 
@@ -168,7 +168,7 @@ def play_policy(
         timestep=scene.timestep,
         substeps=scene.substeps,
         friction=scene.friction,
-        start=rest_state(start.joint_pos, start.object_pos, start.object_quat),
+        start=State.at_rest(start.joint_pos, start.object_pos, start.object_quat),
         joint_target=torch.stack(targets),
     )
 
@@ -185,7 +185,6 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
     Raises:
         FileFormatError: the episode was not played at the control rate of the default task.
     """
-    from xreset.env import rest_state
     from xreset.task.config import TaskConfig
 
     assert trace.joint_target is not None, "the trace holds no actions"
@@ -204,7 +203,7 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
         timestep=scene.timestep,
         substeps=scene.substeps,
         friction=scene.friction,
-        start=rest_state(*first),
+        start=State.at_rest(*first),
         joint_target=torch.as_tensor(trace.joint_target, dtype=torch.float32),
     )
 

@@ -88,7 +88,7 @@ def closing_episode(
     share = torch.cat((torch.zeros(settle), torch.linspace(0, 1, close + 1)[1:], torch.ones(hold)))[:, None, None]
     closing = opened + share * (closed - opened)
     targets = torch.cat((closing, _carried(kinematics, closed, motion, dt)))
-    return Episode(start=at_rest(opened, object_pos, object_quat), targets=targets.float())
+    return Episode(start=State.at_rest(opened, object_pos, object_quat), targets=targets.float())
 
 
 def lifting_episode(robot: RobotSpec, start: State, dt: float, motion: Motion | None = None) -> Episode:
@@ -114,23 +114,8 @@ def holding_episode(start: State, seconds: float, dt: float) -> Episode:
 def squeezing_state(robot: RobotSpec, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, motion: Motion | None = None) -> State:
     """[G] a state at rest in which the drives already squeeze; arguments as in :func:`closing_episode`."""
     closed = squeezed(Kinematics(robot), joint_pos.double(), motion or Motion())
-    state = at_rest(joint_pos, object_pos, object_quat)
+    state = State.at_rest(joint_pos, object_pos, object_quat)
     return State(**{f.name: getattr(state, f.name) for f in fields(State)} | {"joint_target": closed.float()})
-
-
-def at_rest(joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor) -> State:
-    """[G] a state in which nothing moves and the drives hold the joint positions."""
-    q, pos, quat = joint_pos.float(), object_pos.float(), object_quat.float()
-    still = torch.zeros_like(pos)
-    return State(
-        joint_pos=q,
-        joint_vel=torch.zeros_like(q),
-        joint_target=q.clone(),
-        object_pos=pos,
-        object_quat=quat,
-        object_linvel=still,
-        object_angvel=still.clone(),
-    )
 
 
 def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float) -> Tensor:

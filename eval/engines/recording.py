@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.eval.engines.episodes import Episode, at_rest
+from xreset.eval.engines.episodes import Episode
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.physics import Backend, State
 
@@ -42,7 +42,7 @@ class Recording:
 
     def state_after(self, step: int) -> State:
         """[G] the state after a control step, brought to rest: positions and targets, without velocities."""
-        state = at_rest(self.joint_pos[step], self.object_pos[step], self.object_quat[step])
+        state = State.at_rest(self.joint_pos[step], self.object_pos[step], self.object_quat[step])
         state.joint_target.copy_(self.joint_target[step])
         return state
 

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from xreset.env import rest_state
 from xreset.errors import DemoError
-from xreset.physics import Backend
+from xreset.physics import Backend, State
 from xreset.plugins import device_for, make_backend
 from xreset.resets.bank import ResetBank
 from xreset.retarget.pipeline import Retargeted
@@ -58,7 +57,7 @@ def try_states(
     """
     n = backend.num_worlds
     backend.set_object_gravity(torch.zeros(n, device=backend.device))
-    backend.set_state(rest_state(joint_pos, object_pos, object_quat))
+    backend.set_state(State.at_rest(joint_pos, object_pos, object_quat))
     for _ in range(config.steps):
         backend.step()
     state, health = backend.state(), backend.health()

@@ -20,7 +20,7 @@ import numpy as np
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import Field, atomic_write, meta_of, read_json, read_npz, write_json, write_npz
+from xreset.files import Field, atomic_write, claim, meta_of, read_json, read_npz, write_json, write_npz
 from xreset.resets.bank import check_objects, read_bank, write_bank
 from xreset.spec import ObjectSpec
 from xreset.task.config import TaskConfig
@@ -123,6 +123,33 @@ class AtomicWriteTest(InFolder):
         (self.folder / "a").write_text("a file, not a folder")
         with self.assertRaisesRegex(XResetError, "cannot write"):
             write_json(self.folder / "a" / "b.json", {})
+
+
+class ClaimTest(InFolder):
+    def test_one_writer_at_a_time(self):
+        program = (
+            "import sys\nfrom xreset.files import claim\nwith claim(sys.argv[1]):\n    print('mine', flush=True)\n    sys.stdin.read()\n"
+        )
+        for path in (self.folder, self.file):
+            with self.subTest(path):
+                command = [sys.executable, "-c", program, str(path)]
+                with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+                    assert other.stdout is not None
+                    self.assertEqual(other.stdout.readline(), "mine\n")
+                    with self.assertRaisesRegex(XResetError, "another command is writing"), claim(path):
+                        self.fail("two writers")
+                    other.kill()  # what a killed one held is free
+                with claim(path):
+                    pass
+        self.assert_only()
+
+    def test_what_a_killed_writer_left_is_removed(self):
+        for name in (".file.npz.abc.part", ".other.npz.abc.part"):
+            (self.folder / name).write_bytes(b"half")
+        with claim(self.file):
+            self.assert_only(".file.npz.lock", ".other.npz.abc.part")
+        with claim(self.folder):
+            self.assert_only()
 
 
 class JsonTest(InFolder):

@@ -10,7 +10,7 @@ import tempfile
 import threading
 import time
 import unittest
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,8 +23,8 @@ from tests.toy_bank import SOUP, SPAM, toy_bank
 from xreset import robots
 from xreset.backends import make_backend
 from xreset.cli import main
-from xreset.errors import FileFormatError, PolicyError, RunError
-from xreset.files import file_hash
+from xreset.errors import BackendUnavailableError, FileFormatError, PolicyError, RunError, XResetError
+from xreset.files import claim, file_hash
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt, read_checkpoint
@@ -216,8 +216,8 @@ class TrainingTest(unittest.TestCase):
         info = self.start(out, config=still, weights=self.out)
         given = latest_checkpoint(self.out)
         self.assertEqual((info.weights, info.weights_hash), (str(given), file_hash(given)))
-        self.assertEqual(read_run(out), info)
         train_only(out, info)
+        self.assertEqual(read_run(out), info)
         content, before = read_checkpoint(latest_checkpoint(out)), read_checkpoint(given)
         self.assertEqual((content["iteration"], content["env_steps"]), (1, 8 * 4))  # counters begin anew
         for networks in ("actor_state_dict", "critic_state_dict"):
@@ -268,6 +268,76 @@ class TrainingTest(unittest.TestCase):
         again = OnnxPolicy(ensure_policy(out))
         self.assertEqual(made.contract, again.contract)
 
+    def test_a_run_without_a_checkpoint_goes_on_or_begins_anew(self):
+        """Killed before the first one: whether the same command is given again or --resume, and whatever is left of the first."""
+        for resume in (True, False):
+            with self.subTest(resume=resume):
+                out = self.folder / f"early-{resume}"
+                info = self.start(out)
+                with mock.patch.object(TrainingRunner, "learn", side_effect=ZeroDivisionError), self.assertRaises(ZeroDivisionError):
+                    train_only(out, info)
+                (out / "events.out.tfevents.old").write_bytes(b"half")
+                (out / ".worlds.pt.abc.part").write_bytes(b"half")
+                (out / "checkpoints" / ".000001.pt.abc.part").write_bytes(b"half")
+                said = io.StringIO()
+                with redirect_stdout(said):
+                    train_only(out, resumed(out, iterations=None) if resume else self.start(out, seed=5), resume=resume)
+                self.assertEqual("beginning anew" in said.getvalue(), resume)
+                self.assertEqual(read_run(out).seed, 3 if resume else 5)
+                self.assertEqual(len(checkpoints(out)), 2)
+                self.assertFalse([f.name for f in out.rglob("*") if f.name.endswith((".part", ".old", ".lock"))])
+
+    def test_an_engine_that_does_not_stand_leaves_no_run(self):
+        out = self.folder / "nothing"
+        broken = mock.patch("xreset.learning.train.make_backend", side_effect=BackendUnavailableError("no GPU"))
+        with broken, self.assertRaisesRegex(BackendUnavailableError, "no GPU"):
+            train(out, self.start(out))
+        self.assertFalse((out / "run.json").exists())
+        for problem, options in (
+            ("--num-envs is 0", {"num_envs": 0}),
+            ("no device 'quantum'", {"device": "quantum"}),
+            ("'mujoco' does not run on 'cuda'", {"device": "cuda"}),
+        ):
+            with self.subTest(problem), self.assertRaisesRegex(XResetError, problem):
+                self.start(out, **options)
+
+    def test_two_trainings_do_not_share_a_folder(self):
+        out = self.folder / "shared"
+        info = self.start(out)
+        out.mkdir()
+        with claim(out), self.assertRaisesRegex(XResetError, "another command is writing"):
+            train_only(out, info)
+        train_only(out, info)
+
+    def test_too_little_memory_is_said(self):
+        out = self.folder / "memory"
+        for error in (
+            torch.OutOfMemoryError("CUDA out of memory"),
+            RuntimeError("Failed to allocate 10 bytes on device 'cuda:0'"),
+            MemoryError(),
+        ):
+            info = self.start(out)
+            with (
+                mock.patch.object(TrainingRunner, "learn", side_effect=error),
+                self.assertRaisesRegex(RunError, "4 worlds on cpu need more memory.*--num-envs"),
+            ):
+                train_only(out, info)
+
+    def test_damaged_worlds_begin_episodes_anew(self):
+        out = self.folder / "damaged-worlds"
+        train_only(out, self.start(out))
+        whole = torch.load(out / "worlds.pt", weights_only=True)
+        for content in (
+            {"iteration": 10},
+            [],
+            {**whole, "processes": [{}]},
+            {**whole, "processes": [{**whole["processes"][0], "memories": 3}]},
+        ):
+            torch.save(content, out / "worlds.pt")
+            done = len(checkpoints(out))
+            train_only(out, resumed(out, iterations=done + 1), resume=True)
+            self.assertEqual(len(checkpoints(out)), done + 1)
+
     def test_a_run_is_never_overwritten(self):
         with self.assertRaisesRegex(RunError, "holds a run already.*--resume"):
             self.start(self.out)
@@ -306,6 +376,21 @@ class TrainingTest(unittest.TestCase):
         (out / "run.json").write_text(json.dumps(data))
         with self.assertRaisesRegex(FileFormatError, r"config\.task\.action.*unknown: gripper"):
             read_run(out)
+        good = json.loads((self.out / "run.json").read_text())
+        for words, changes in (
+            ("missing: resets", {"resets": None}),
+            ("missing: config", {"config": None}),
+            (r"\(of xreset '9.9'\).*unknown: later", {"later": 1, "xreset": "9.9"}),
+            ("num_envs is -5", {"num_envs": -5}),
+            ("seed is {}, expected int", {"seed": {}}),
+            ("device is 0.5, expected str", {"device": 0.5}),
+            ("contract in which joint_names", {"contract": good["contract"] | {"joint_names": 3}}),
+        ):
+            (out / "run.json").write_text(
+                json.dumps({k: v for k, v in (good | changes).items() if v is not None or k in ("objects", "weights", "weights_hash")})
+            )
+            with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
+                read_run(out)
 
 
 if __name__ == "__main__":

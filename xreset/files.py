@@ -6,6 +6,9 @@ configuration it was made with and the SHA-256 of its inputs. Arrays are never p
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import glob
 import hashlib
 import json
 import logging
@@ -90,6 +93,51 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def claim(path: str | Path) -> Iterator[None]:
+    """Keep a file, or a folder that is there, to this process while the block runs, and remove what killed writers have left of it.
+
+    Raises:
+        XResetError: another command is writing it.
+    """
+    path = Path(path)
+    lock = path if path.is_dir() else path.with_name(f".{path.name}.lock")
+    descriptor = _locked(path, lock)
+    try:
+        folder, pattern = (path, ".*.part") if lock == path else (path.parent, f".{glob.escape(path.name)}.*.part")
+        for leftover in folder.glob(pattern):
+            leftover.unlink(missing_ok=True)
+        yield
+    finally:
+        if lock != path:
+            lock.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _locked(path: Path, lock: Path) -> int:
+    try:
+        while True:
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(lock, os.O_RDONLY if lock.is_dir() else os.O_RDWR | os.O_CREAT, 0o666)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if os.path.samestat(os.fstat(descriptor), os.stat(lock)):
+                    return descriptor
+            except BlockingIOError:
+                os.close(descriptor)
+                raise XResetError(f"another command is writing {path}. Wait for its end, or choose another --out.") from None
+            except FileNotFoundError:  # the owner has just finished and removed it
+                pass
+            except OSError as error:
+                if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
+                    os.close(descriptor)
+                    raise
+                return descriptor  # a file system without locks
+            os.close(descriptor)
+    except OSError as error:
+        raise XResetError(f"cannot write {path}: {error.strerror or error}. Choose another place.") from error
 
 
 def write_json(path: str | Path, data: Any) -> None:

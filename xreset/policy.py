@@ -70,7 +70,7 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
         PolicyError: names the first thing that differs.
     """
     here = policy_contract(robot, task, ())
-    _check_schema(source, contract)
+    check_contract_entries(source, contract)
     for key, what in (("robot", "robot"), ("joint_names", "joint order"), ("fingertip_names", "fingertips")):
         if contract[key] != here[key]:
             raise PolicyError(
@@ -99,7 +99,8 @@ _ENTRIES: dict[str, type | tuple[type, ...]] = {
 }  # fmt: skip
 
 
-def _check_schema(source: str, contract: dict[str, Any]) -> None:
+def check_contract_entries(source: str, contract: dict[str, Any]) -> None:
+    """Refuse a contract that lacks an entry or holds one of another type; ``PolicyError``."""
     if contract.get("schema") != SCHEMA:
         raise PolicyError(f"{source} has policy schema {contract.get('schema')!r}, expected {SCHEMA!r}. Export it again.")
     wrong = [name for name, kind in _ENTRIES.items() if not isinstance(contract.get(name), kind)]
@@ -116,7 +117,7 @@ def _read_contract(path: Path, metadata: dict[str, str]) -> dict[str, Any]:
         raise PolicyError(f"{path} holds a contract that is no JSON ({error}). Export it again.") from error
     if not isinstance(contract, dict):
         raise PolicyError(f"{path} holds the contract {contract!r}, expected a JSON object. Export it again.")
-    _check_schema(str(path), contract)
+    check_contract_entries(str(path), contract)
     return contract
 
 

@@ -17,9 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from xreset import __version__
-from xreset.errors import RunError
+from xreset.checks import check_numbers
+from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.files import read_json, write_json
 from xreset.learning.config import TrainConfig
+from xreset.policy import check_contract_entries
+from xreset.text import shown
 from xreset.typed import from_dict
 
 SCHEMA = "xreset-run/1"
@@ -50,6 +53,10 @@ class RunInfo:
     weights_hash: str | None = None
     """Its SHA-256."""
 
+    def __post_init__(self) -> None:
+        check_numbers(self, positive=("num_envs",), not_negative=("seed",))
+        check_contract_entries("the contract", self.contract)
+
 
 def write_run(folder: Path, info: RunInfo) -> None:
     """Write ``run.json``."""
@@ -61,13 +68,17 @@ def read_run(folder: str | Path) -> RunInfo:
 
     Raises:
         RunError: the folder is no run.
+        FileFormatError: the file is damaged, or of another version of xreset.
     """
     folder = Path(folder)
     if not (folder / "run.json").is_file():
         raise RunError(f"{folder} is not a run folder: it has no run.json. Make one with: xreset train --out {folder} ...")
     data = read_json(folder / "run.json", SCHEMA)
-    config = from_dict(TrainConfig, data["config"], "run.json: config")
-    return RunInfo(**{k: v for k, v in data.items() if k not in ("schema", "xreset", "config")}, config=config)
+    where = f"{folder / 'run.json'} (of xreset {shown(data.pop('xreset', None))})"
+    try:
+        return from_dict(RunInfo, {name: value for name, value in data.items() if name != "schema"}, where)
+    except PolicyError as error:
+        raise FileFormatError(f"{where}: {error}") from error
 
 
 def checkpoints(folder: Path) -> list[Path]:
@@ -79,5 +90,5 @@ def latest_checkpoint(folder: Path) -> Path:
     """The newest checkpoint; ``RunError`` if there is none."""
     found = checkpoints(folder)
     if not found:
-        raise RunError(f"{folder} has no checkpoint yet. Train it further: xreset train --out {folder} --resume")
+        raise RunError(f"{folder} has no checkpoint yet. Train it: xreset train --out {folder} --resume")
     return found[-1]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import pickle
 import signal
 import time
 from collections import deque
@@ -26,6 +25,7 @@ from xreset.learning.config import TrainConfig, rsl_rl_config
 from xreset.learning.distributed import Processes
 from xreset.learning.faults import FaultBudget, FaultCounts, dump_faults, too_many_faults
 from xreset.learning.synergies import hand_synergies
+from xreset.text import shown
 
 
 class TrainingRunner(OnPolicyRunner):
@@ -140,12 +140,12 @@ class TrainingRunner(OnPolicyRunner):
     def load_checkpoint(self, path: Path) -> None:
         """Continue from a checkpoint: models, optimiser, learning rate, counters and random state; the worlds too if ``worlds.pt`` fits."""
         content = read_checkpoint(path, self.device)
-        self.alg.load(content, None, strict=True)
-        self.alg.learning_rate = content["learning_rate"]
-        self.iteration, self.env_steps, self.elapsed = content["iteration"], content["env_steps"], content["elapsed"]
-        if self.processes.rank < len(content["random"]):
-            self._set_random_state(content["random"][self.processes.rank])
-
+        with _fits(path):
+            self.alg.load(content, None, strict=True)
+            self.alg.learning_rate = float(content["learning_rate"])
+            self.iteration, self.env_steps, self.elapsed = int(content["iteration"]), int(content["env_steps"]), float(content["elapsed"])
+            if self.processes.rank < len(content["random"]):
+                self._set_random_state(content["random"][self.processes.rank])
         self._continue_worlds()
 
     def load_networks(self, path: Path) -> None:
@@ -154,7 +154,8 @@ class TrainingRunner(OnPolicyRunner):
         A learning rate that adapts begins where it was there: a new run's would undo in one step what they have learned.
         """
         content = read_checkpoint(path, self.device)
-        self.alg.load(content, {"actor": True, "critic": True}, strict=True)
+        with _fits(path):
+            self.alg.load(content, {"actor": True, "critic": True}, strict=True)
         if self.train_config.ppo.schedule == "adaptive":
             self.alg.learning_rate = content["learning_rate"]
 
@@ -165,18 +166,22 @@ class TrainingRunner(OnPolicyRunner):
 
     def _continue_worlds(self) -> None:
         """Go on in the middle of episodes, if ``worlds.pt`` fits; otherwise the episodes begin anew."""
+        path, env = self.folder / "worlds.pt", cast(ManipulationEnv, self.env)
+        if not path.exists():
+            return
+        before = env.snapshot()
         try:
-            content = torch.load(self.folder / "worlds.pt", map_location=self.device, weights_only=True)
-        except (OSError, RuntimeError, EOFError, pickle.UnpicklingError):  # none, or damaged: episodes are easily begun anew
-            return
-        if content["iteration"] != self.iteration or self.processes.rank >= len(content["processes"]):
-            return
-        mine = content["processes"][self.processes.rank]
-        if not cast(ManipulationEnv, self.env).restore(mine["env"]):
-            return
-        self._worlds_continue, self._log_state = True, content["log"]
-        for name, model in (("actor", self.alg.actor), ("critic", self.alg.critic)):
-            model.reset(hidden_state=mine["memories"][name])
+            content = torch.load(path, map_location=self.device, weights_only=True)
+            mine = content["processes"][self.processes.rank] if self.processes.rank < len(content["processes"]) else None
+            if mine is None or content["iteration"] != self.iteration or not env.restore(mine["env"]):
+                return
+            for name, model in (("actor", self.alg.actor), ("critic", self.alg.critic)):
+                model.reset(hidden_state=mine["memories"][name])
+            self._worlds_continue, self._log_state = True, content["log"]
+        except Exception:  # damaged, in whatever way: episodes are easily begun anew
+            env.restore(before)
+            for model in (self.alg.actor, self.alg.critic):
+                model.reset()
 
     def _random_state(self) -> dict[str, Tensor | None]:
         """Of the numbers that this process draws."""
@@ -233,11 +238,27 @@ def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str,
     """
     try:
         content = torch.load(path, map_location=device, weights_only=True)
-        return {key: content[key] for key in _CHECKPOINT_KEYS}
-    except KeyError as error:
-        raise RunError(f"{path} is not a checkpoint of xreset: it has no entry {error}.") from error
-    except Exception as error:
-        raise RunError(f"{path} cannot be read as a checkpoint: {error}. Delete it to continue from the one before.") from error
+    except torch.OutOfMemoryError:
+        raise
+    except Exception as error:  # its message would advise to load without care
+        raise RunError(
+            f"{path} cannot be read as a checkpoint: it is damaged, or holds more than tensors and plain values. "
+            "Move it away to continue from the one before; do not use it elsewhere if you do not know where it comes from."
+        ) from error
+    missing = [key for key in _CHECKPOINT_KEYS if not isinstance(content, dict) or key not in content]
+    if missing:
+        raise RunError(f"{path} is not a checkpoint of xreset: it has no entry {', '.join(missing)}.")
+    return {key: content[key] for key in _CHECKPOINT_KEYS}
+
+
+@contextmanager
+def _fits(path: Path) -> Iterator[None]:
+    """What a checkpoint's content does not allow becomes one error."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, RuntimeError) as error:
+        reason = shown(str(error).splitlines()[0] if str(error) else type(error).__name__)
+        raise RunError(f"{path} does not fit this run ({reason}). Was it written by another run, or another version of xreset?") from error
 
 
 _CHECKPOINT_KEYS = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,11 +12,11 @@ import torch
 from xreset.description import load_robot
 from xreset.env import ManipulationEnv, make_scene
 from xreset.errors import RunError
-from xreset.files import file_hash
+from xreset.files import claim, file_hash
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx
-from xreset.learning.run import RunInfo, latest_checkpoint, read_run, write_run
+from xreset.learning.run import RunInfo, checkpoints, latest_checkpoint, read_run, write_run
 from xreset.learning.runner import TrainingRunner
 from xreset.objects import load_objects
 from xreset.plugins import backend_class, device_for, make_backend
@@ -57,7 +58,7 @@ def load_inputs(robot: str, resets: str | Path, objects: str | Path | None) -> R
 def start_run(
     inputs: RunInputs, *, backend: str, device: str, num_envs: int, seed: int, config: TrainConfig, out: Path, weights: Path | None = None,
 ) -> RunInfo:  # fmt: skip
-    """Check everything that a training needs and write ``run.json`` (the main process only).
+    """Check everything that a training needs; :func:`train` then writes ``run.json``, once the engine stands.
 
     Args:
         inputs: the run's files.
@@ -74,9 +75,12 @@ def start_run(
             like these.
         PolicyError: ``weights`` is of another robot, or its policy observes something else.
     """
-    main = Processes.of_environment().is_main
-    if main and (out / "run.json").exists():
+    if checkpoints(out):
         raise RunError(f"{out} holds a run already. Continue it with --resume, or choose another --out.")
+    if num_envs < 1:
+        raise RunError(f"--num-envs is {num_envs}, expected at least 1.")
+    if device_for(backend, device) != device:
+        raise RunError(f"the engine {backend!r} does not run on {device!r}. Leave out --device, or choose another --backend.")
     version = backend_class(backend).engine_version()
     if config.task.reset.demo_probability > 0 and not inputs.bank.num_states:
         raise RunError(
@@ -93,7 +97,7 @@ def start_run(
                 f"Start from its configuration: --like {weights}"
             )
         checkpoint = latest_checkpoint(weights)
-    info = RunInfo(
+    return RunInfo(
         robot=inputs.robot_name,
         resets=str(inputs.resets),
         resets_hash=inputs.resets_hash,
@@ -108,9 +112,6 @@ def start_run(
         weights=str(checkpoint) if checkpoint else None,
         weights_hash=file_hash(checkpoint) if checkpoint else None,
     )
-    if main:
-        write_run(out, info)
-    return info
 
 
 def train(out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: bool = False, seconds: float = math.inf) -> None:
@@ -124,8 +125,38 @@ def train(out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: 
         inputs: the run's files, if they are loaded already.
         resume: continue from the newest checkpoint.
         seconds: most time to spend on iterations.
+
+    Raises:
+        RunError: another command trains here, the bank is not the run's, the newest checkpoint does not fit, or there is too little memory.
     """
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "checkpoints").mkdir(exist_ok=True)
     processes = Processes.of_environment()
+    with ExitStack() as claims:
+        if processes.is_main:
+            claims.enter_context(claim(out))
+            claims.enter_context(claim(out / "checkpoints"))
+        try:
+            _train(processes, out, info, inputs, resume=resume, seconds=seconds)
+        except (MemoryError, torch.OutOfMemoryError) as error:
+            raise RunError(_too_little_memory(out, info)) from error
+        except RuntimeError as error:  # how Warp tells of it
+            if "allocate" not in str(error) and "out of memory" not in str(error):
+                raise
+            raise RunError(_too_little_memory(out, info)) from error
+        finally:
+            leave()
+
+
+def _too_little_memory(out: Path, info: RunInfo) -> str:
+    goes_on = "the last checkpoint is sound" if checkpoints(out) else "nothing was lost"
+    return (
+        f"{info.num_envs} worlds on {info.device} need more memory than there is; {goes_on}. Start with fewer (--num-envs), or smaller "
+        "minibatches (--config.ppo.minibatch-size), in another --out."
+    )
+
+
+def _train(processes: Processes, out: Path, info: RunInfo, inputs: RunInputs | None, *, resume: bool, seconds: float) -> None:
     device, seed = processes.device(info.device), processes.seed(info.seed)
     if device.startswith("cuda:"):
         torch.cuda.set_device(device)
@@ -135,22 +166,29 @@ def train(out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: 
     config, names = info.config, tuple(o.name for o in inputs.objects)
     torch.manual_seed(seed)
     scene = make_scene(inputs.robot, inputs.objects, config.task)
-    try:
-        with make_backend(info.backend, scene, info.num_envs, device=device) as backend:
-            resets = ResetDistribution(inputs.bank, inputs.robot, names, config.task.reset, backend.device)
-            env = ManipulationEnv(backend, config.task, resets, seed=seed)
-            runner = TrainingRunner(env, config, out)
-            if resume:
-                runner.load_checkpoint(latest_checkpoint(out))
-                if processes.is_main:
-                    print(f"continuing after iteration {runner.iteration}", flush=True)
-            elif info.weights is not None:
-                runner.load_networks(Path(info.weights))
-            runner.learn(config.iterations, init_at_random_ep_len=config.random_episode_start, seconds=seconds)
-            if processes.is_main:
-                export_onnx(runner.alg.get_policy(), out / "policy.onnx", info.contract)  # pyright: ignore[reportArgumentType]
-    finally:
-        leave()
+    with make_backend(info.backend, scene, info.num_envs, device=device) as backend:
+        resets = ResetDistribution(inputs.bank, inputs.robot, names, config.task.reset, backend.device)
+        env = ManipulationEnv(backend, config.task, resets, seed=seed)
+        runner = TrainingRunner(env, config, out)
+        if resume and checkpoints(out):
+            runner.load_checkpoint(latest_checkpoint(out))
+        elif info.weights is not None:
+            runner.load_networks(Path(info.weights))
+        if processes.is_main:
+            _begin(out, info, runner.iteration, resume=resume)
+        runner.learn(config.iterations, init_at_random_ep_len=config.random_episode_start, seconds=seconds)
+        if processes.is_main:
+            export_onnx(runner.alg.get_policy(), out / "policy.onnx", info.contract)  # pyright: ignore[reportArgumentType]
+
+
+def _begin(out: Path, info: RunInfo, iteration: int, *, resume: bool) -> None:
+    """Write ``run.json``, now that the engine stands; before the first checkpoint a killed run leaves nothing that is worth keeping."""
+    if not iteration:
+        for events in out.glob("events.out.tfevents.*"):
+            events.unlink()
+    write_run(out, info)
+    if resume:
+        print(f"continuing after iteration {iteration}" if iteration else "there is no checkpoint yet: beginning anew", flush=True)
 
 
 def default_device(backend: str) -> str:
@@ -163,8 +201,6 @@ def resumed(out: Path, *, iterations: int | None) -> RunInfo:
     info = read_run(out)
     if iterations is not None and iterations != info.config.iterations:
         info = replace(info, config=replace(info.config, iterations=iterations))
-        if Processes.of_environment().is_main:
-            write_run(out, info)
     return info
 
 

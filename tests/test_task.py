@@ -83,6 +83,16 @@ class RewardTest(unittest.TestCase):
         self.assert_terms(self.reward(), reach=1 - math.tanh(2.0))
         self.assert_terms(self.reward(best_reach=torch.tensor(0.03)), reach=1 - math.tanh(0.3))
 
+    def test_a_second_reach_term_has_its_own_width(self):
+        config = RewardConfig(reach_width=0.4, reach_near=0.5, reach_near_width=0.1)
+        self.assert_terms(self.reward(config), reach=1 - math.tanh(0.5), reach_near=0.5 * (1 - math.tanh(2.0)))
+
+    def test_with_an_opposing_gate_a_press_is_paid_as_contact_and_nothing_more(self):
+        far, config = torch.tensor(1e3), RewardConfig(contact="opposing")
+        self.assert_terms(self.reward(config, best_reach=far, tip_force=self.PRESS), grasp=1)
+        squeeze = torch.tensor([[3.0, 0, 1], [0, 0, 0], [-3.0, 0, 1]])
+        self.assert_terms(self.reward(config, best_reach=far, tip_force=squeeze), grasp=1, position=4, rotation=4, success=10)
+
     def test_every_tracking_term_needs_contact(self):
         """At the goal with no contact nothing but reach is paid; with it, 1 + 4 + 4 + 10."""
         far = torch.tensor(1e3)

@@ -84,6 +84,11 @@ class RewardConfig:
     reach: float = 1.0
     reach_width: float = 0.1
     """Distance [m] at which 1 - tanh(d / width) falls to 0.24. Not in the paper."""
+    reach_near: float = 0.0
+    """Weight of a second reach term with its own width. One width cannot do both: 0.1 m pays nothing 36 cm away, where home is, and with
+    0.4 m the last centimetres, in which fingers wrap around the object, are worth less than what moving costs."""
+    reach_near_width: float = 0.05
+    """[m]"""
     grasp: float = 1.0
     tracking: Literal["presence", "progress"] = "presence"
     """What pays for the object's pose while the contact gate is open. ``presence``: how near it is to the goal, in position and in rotation
@@ -110,8 +115,9 @@ class RewardConfig:
     action_rate: float = -0.005
     out_of_bounds: float = -500.0
     contact: Literal["any", "opposing"] = "any"
-    """What opens the contact gate: thumb and another finger press (the paper), or press against each other: their forces on the object are
-    more than 90 degrees apart. Pressing an object down from above, both push in one direction; holding it, they do not."""
+    """What opens the gate of ``position``, ``rotation`` and ``success``: thumb and another finger press (the paper), or press against each
+    other: their forces on the object are more than 90 degrees apart. A hand that presses an object down from above pushes with both in one
+    direction; one that holds it does not. ``grasp`` is paid for either."""
     contact_threshold: float = 0.1
     """Force [N] from which a finger counts as in contact. Not in the paper."""
     raw_actions: bool = False
@@ -123,9 +129,30 @@ class RewardConfig:
     def __post_init__(self) -> None:
         check_numbers(
             self,
-            positive=("reach_width", "position_width", "rotation_width", "progress_width", "success_position", "success_rotation", "scale"),
+            positive=(
+                "reach_width",
+                "reach_near_width",
+                "position_width",
+                "rotation_width",
+                "progress_width",
+                "success_position",
+                "success_rotation",
+                "scale",
+            ),
             not_negative=("contact_threshold",),
-            finite=("reach", "grasp", "position", "rotation", "progress", "success", "action", "action_rate", "out_of_bounds", "scale"),
+            finite=(
+                "reach",
+                "reach_near",
+                "grasp",
+                "position",
+                "rotation",
+                "progress",
+                "success",
+                "action",
+                "action_rate",
+                "out_of_bounds",
+                "scale",
+            ),
         )
 
 

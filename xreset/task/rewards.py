@@ -52,7 +52,7 @@ class Reward:
     terms: dict[str, Tensor]
     """Name -> [N] weighted term, before ``scale``."""
     grasped: Tensor
-    """[N] bool, the contact gate: the thumb and at least one other finger."""
+    """[N] bool: the thumb and at least one other finger press on the object."""
     success: Tensor
     """[N] bool, contact-gated pose success."""
 
@@ -93,7 +93,8 @@ def progress(x: RewardInput, c: RewardConfig) -> Tensor:
 
 def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     """The reward of one control step."""
-    gate = contact_gate(x.tip_force, c.contact_threshold, opposing=c.contact == "opposing")
+    grasped = contact_gate(x.tip_force, c.contact_threshold)
+    gate = contact_gate(x.tip_force, c.contact_threshold, opposing=True) if c.contact == "opposing" else grasped
     position_error = (x.object_pos - x.goal_pos).norm(dim=-1)
     rotation_error = quat_angle(x.object_quat, x.goal_quat)
     success = gate & (position_error < c.success_position) & (rotation_error < c.success_rotation)
@@ -107,7 +108,8 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
         }
     terms = {
         "reach": c.reach * (1.0 - torch.tanh(x.best_reach / c.reach_width)),
-        "grasp": c.grasp * gate_f,
+        "reach_near": c.reach_near * (1.0 - torch.tanh(x.best_reach / c.reach_near_width)),
+        "grasp": c.grasp * grasped.to(gate_f.dtype),
         **tracking,
         "success": c.success * success.to(gate_f.dtype),
         "action": c.action * x.action.square().sum(dim=-1),
@@ -115,4 +117,4 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
         "out_of_bounds": c.out_of_bounds * x.out_of_bounds.to(gate_f.dtype),
     }
     total = c.scale * torch.stack(list(terms.values())).sum(dim=0)
-    return Reward(total=total, terms=terms, grasped=gate, success=success)
+    return Reward(total=total, terms=terms, grasped=grasped, success=success)

@@ -573,6 +573,12 @@ class PolicyTest(WithRobot):
         check_contract("p.onnx", contract, self.robot, self.TASK)
         check_contract("p.onnx", contract, self.robot, evaluation_task(self.TASK))
 
+    def test_a_contract_of_an_earlier_version_means_what_was_done_then(self):
+        contract = policy_contract(self.robot, self.TASK, (SOUP,))
+        for group, name in (("action", "hand_zero"), ("observation", "cloud_scale"), ("observation", "rotation")):
+            del contract["task"][group][name]
+        check_contract("p.onnx", contract, self.robot, self.TASK)
+
     def test_the_contract_states_the_observations_widths(self):
         widths = policy_contract(self.robot, self.TASK, ())["observation_layout"]
         self.assertEqual(sum(widths["policy"].values()), 15 + 7)
@@ -589,6 +595,10 @@ class PolicyTest(WithRobot):
         self.refused("observation layout .perception.cloud: 960 in the policy, 576 here", task=fewer)
         extra = policy_contract(self.robot, self.TASK, ())["observation_layout"]
         self.refused(r"policy.tactile: 4 in the policy, None here", observation_layout=extra | {"policy": extra["policy"] | {"tactile": 4}})
+        home = replace(self.TASK, action=ActionConfig(hand_zero="home"))
+        self.refused("another action mapping .hand_zero: 'middle' in the policy, 'home' here", task=home)
+        scaled = replace(self.TASK, observation=replace(self.TASK.observation, cloud_scale=5.0))
+        self.refused("other scales of observations .cloud_scale: 1.0 in the policy, 5.0 here", task=scaled)
         self.refused("acts every 0.016667 s, here a control step lasts 0.020833 s", task=replace(self.TASK, substeps=5))
 
     def test_files_that_are_no_policies(self):

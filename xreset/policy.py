@@ -7,7 +7,7 @@ Running one needs neither warp nor rsl-rl.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -17,8 +17,9 @@ from torch import Tensor
 
 from xreset.errors import PolicyError
 from xreset.spec import RobotSpec
-from xreset.task.config import TaskConfig
+from xreset.task.config import NoiseConfig, TaskConfig
 from xreset.task.observations import layout
+from xreset.typed import from_dict
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -89,6 +90,20 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
         raise PolicyError(
             f"{source} was trained with another observation layout ({'; '.join(differing)}). Use the run's own configuration."
         )
+    trained = from_dict(TaskConfig, contract["task"], f"{source}: task")
+    quiet = NoiseConfig()
+    meanings = (
+        ("another action mapping", trained.action, task.action),
+        ("other scales of observations", replace(trained.observation, noise=quiet), replace(task.observation, noise=quiet)),
+    )
+    for what, of_policy, of_task in meanings:
+        differing = [
+            f"{f.name}: {getattr(of_policy, f.name)!r} in the policy, {getattr(of_task, f.name)!r} here"
+            for f in fields(of_policy)
+            if getattr(of_policy, f.name) != getattr(of_task, f.name)
+        ]
+        if differing:
+            raise PolicyError(f"{source} was trained with {what} ({'; '.join(differing)}). Use the run's own configuration.")
     if abs(contract["control_dt"] - here["control_dt"]) > 1e-9:
         raise PolicyError(f"{source} acts every {contract['control_dt']:.6f} s, here a control step lasts {here['control_dt']:.6f} s.")
 

@@ -198,7 +198,7 @@ def episode_starts(on_cpu: ResetDistribution, sequence: np.ndarray, repetition: 
     for s, r in zip(sequence.tolist(), repetition.tolist(), strict=True):
         generator = torch.Generator().manual_seed(int(np.random.SeedSequence([seed, s, r]).generate_state(1)[0]))
         parts.append(on_cpu.home(torch.tensor([s]), generator))
-    return Reset.stack(parts)
+    return Reset.cat(parts)
 
 
 def _episode(result: EpisodeMetrics, world: int, sequence: int, repetition: int, demos: ResetBank) -> Episode:

@@ -112,7 +112,7 @@ class PlaceTest(unittest.TestCase):
         torch.testing.assert_close(ArmModel(moved).kinematics.link_poses(q, ["palm"]), before, atol=5e-3, rtol=0)
 
     def test_nothing_to_reach_is_an_error(self):
-        none = self.wrists.select(torch.arange(0))
+        none = self.wrists[torch.arange(0)]
         with self.assertRaisesRegex(RobotError, "no frame to reach"):
             placing.place(self.robot, [none], np.zeros((0, 3)), CONFIG)
 

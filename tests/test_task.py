@@ -428,7 +428,7 @@ class ResetTest(WithRobot):
     def test_stack(self):
         distribution = self.distribution()
         one, two = (distribution.home(torch.tensor([s]), generator(s)) for s in (0, 1))
-        both = Reset.stack([one, two])
+        both = Reset.cat([one, two])
         self.assertEqual(both.sequence.tolist(), [0, 1])
         torch.testing.assert_close(both.joint_pos[1:], two.joint_pos)
 

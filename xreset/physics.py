@@ -7,7 +7,7 @@ Tensors are float32 on the backend's device. World frame, SI units, quaternions 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from xreset.errors import BackendUnavailableError, CapabilityError
 from xreset.spec import SceneSpec
+from xreset.tensors import Tensors
 
 Capability = Literal["object_mass", "friction", "object_gravity", "object_wrench", "overflow", "mass_properties"]
 """What a backend may be unable to do: per-world object mass, pair friction or gravity fraction; a wrench; counting overflows; reading back
@@ -22,7 +23,7 @@ masses, centres of mass and inertias."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class State:
+class State(Tensors):
     """The full state of worlds. Setting it leaves nothing of the past: no warm start, no old target, no external force."""
 
     joint_pos: Tensor
@@ -41,25 +42,17 @@ class State:
     """[N, 3] world frame, rad/s."""
 
     @classmethod
-    def at_rest(cls, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor) -> Self:
-        """Nothing moves, and the drives hold the joint positions [N, J]."""
+    def at_rest(cls, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, joint_target: Tensor | None = None) -> Self:
+        """Nothing moves; the drives hold the joint positions [N, J], or are told targets [N, J]."""
         q, pos, still = joint_pos.float(), object_pos.float(), torch.zeros_like(object_pos, dtype=torch.float32)
         return cls(
-            joint_pos=q, joint_vel=torch.zeros_like(q), joint_target=q.clone(),
+            joint_pos=q, joint_vel=torch.zeros_like(q), joint_target=q.clone() if joint_target is None else joint_target.float(),
             object_pos=pos, object_quat=object_quat.float(), object_linvel=still, object_angvel=still.clone(),
         )  # fmt: skip
 
-    def __getitem__(self, worlds) -> Self:
-        """The states of some worlds."""
-        return type(self)(**{f.name: getattr(self, f.name)[worlds] for f in fields(self)})
-
-    def to(self, device: torch.device | str) -> Self:
-        """The same on another device."""
-        return type(self)(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
-
 
 @dataclass(frozen=True, kw_only=True)
-class Links:
+class Links(Tensors):
     """Poses and velocities of the tracked links (palm, then fingertips)."""
 
     pos: Tensor
@@ -73,7 +66,7 @@ class Links:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Contacts:
+class Contacts(Tensors):
     """Contact forces *on the object*, world frame, of the last physics step (zero right after a state is set)."""
 
     tip_force: Tensor
@@ -85,7 +78,7 @@ class Contacts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Health:
+class Health(Tensors):
     """What went wrong in a world since its state was last set."""
 
     nonfinite: Tensor
@@ -95,7 +88,7 @@ class Health:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MassProperties:
+class MassProperties(Tensors):
     """What the engine itself holds of the bodies that move: B of the robot (links fixed to one another are one), then the object.
 
     The robot's bodies are in the order of :func:`xreset.backends.rigid.mechanism`, without the base.

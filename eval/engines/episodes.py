@@ -7,7 +7,7 @@ Shape letters: G grasps, J joints, E fingertips, T control steps.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -114,8 +114,7 @@ def holding_episode(start: State, seconds: float, dt: float) -> Episode:
 def squeezing_state(robot: RobotSpec, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, motion: Motion | None = None) -> State:
     """[G] a state at rest in which the drives already squeeze; arguments as in :func:`closing_episode`."""
     closed = squeezed(Kinematics(robot), joint_pos.double(), motion or Motion())
-    state = State.at_rest(joint_pos, object_pos, object_quat)
-    return State(**{f.name: getattr(state, f.name) for f in fields(State)} | {"joint_target": closed.float()})
+    return State.at_rest(joint_pos, object_pos, object_quat, closed)
 
 
 def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float) -> Tensor:

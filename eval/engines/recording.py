@@ -42,9 +42,7 @@ class Recording:
 
     def state_after(self, step: int) -> State:
         """[G] the state after a control step, brought to rest: positions and targets, without velocities."""
-        state = State.at_rest(self.joint_pos[step], self.object_pos[step], self.object_quat[step])
-        state.joint_target.copy_(self.joint_target[step])
-        return state
+        return State.at_rest(self.joint_pos[step], self.object_pos[step], self.object_quat[step], self.joint_target[step])
 
     def in_palm(self, step: int, points: Tensor) -> Tensor:
         """[G, P, 3] where points [G, P, 3] of the objects (in their mesh frames) are in the palm's frame after a control step [m]."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -171,8 +171,7 @@ def common_states(
                 states.append(closings[name].state_after(last)[torch.tensor([g])])
                 index.append(table.object_index[[g]])
                 break
-    start = State(**{f.name: torch.cat([getattr(state, f.name) for state in states]) for f in fields(State)})
-    return CommonStates(label=tuple(labels), object_index=torch.cat(index), start=start)
+    return CommonStates(label=tuple(labels), object_index=torch.cat(index), start=State.cat(states))
 
 
 @contextmanager

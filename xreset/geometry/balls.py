@@ -6,9 +6,8 @@ shapes, whose edges and corners balls of radius 0 stand for; what they miss is f
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,10 +16,11 @@ from torch import Tensor
 from xreset.geometry.collision import SelfCollision, support_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.spec import Geometry, RobotSpec, Shape
+from xreset.tensors import Tensors
 
 
 @dataclass(frozen=True, kw_only=True)
-class Spans:
+class Spans(Tensors):
     """Groups of consecutive rows of a table (G in number)."""
 
     start: Tensor
@@ -37,7 +37,7 @@ class Spans:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Balls:
+class Balls(Tensors):
     """Balls fixed to the links of a hand: Q balls on G links, which R pairs of balls on H pairs of links must not overlap."""
 
     links: tuple[str, ...]
@@ -60,16 +60,6 @@ class Balls:
     """[H] the pairs of balls of each pair of links."""
     pairs: Tensor
     """[R, 2] balls, of a radius above 0, that must not overlap each other."""
-
-    def to(self, device: torch.device | str) -> Balls:
-        """The same on another device."""
-
-        def moved(value: Any) -> Any:
-            if isinstance(value, Spans):
-                return Spans(start=value.start.to(device), count=value.count.to(device))
-            return value.to(device) if isinstance(value, Tensor) else value
-
-        return Balls(**{f.name: moved(getattr(self, f.name)) for f in fields(self)})
 
 
 def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> Balls:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from xreset.tensors import Tensors
+
 
 @dataclass(frozen=True, kw_only=True)
-class DistanceFields:
+class DistanceFields(Tensors):
     """Signed distances to M objects' surfaces at the nodes of one grid per object, in the objects' mesh frames [m]."""
 
     values: Tensor
@@ -35,14 +37,7 @@ class DistanceFields:
             raise ValueError(f"grids must have one spacing, found {sorted({part.spacing for part in parts})}")
         sizes = torch.tensor([len(part.values) for part in parts], device=parts[0].start.device)
         shift = sizes.cumsum(0) - sizes
-        joined = {f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(DistanceFields) if f.name != "spacing"}
-        joined["start"] = torch.cat([part.start + shift[i] for i, part in enumerate(parts)])
-        return DistanceFields(**joined, spacing=parts[0].spacing)
-
-    def to(self, device: torch.device | str) -> DistanceFields:
-        """The same on another device."""
-        tensors = {f.name: getattr(self, f.name).to(device) for f in fields(self) if f.name != "spacing"}
-        return DistanceFields(**tensors, spacing=self.spacing)
+        return replace(DistanceFields.cat(parts), start=torch.cat([part.start + shift[i] for i, part in enumerate(parts)]))
 
     def signed_distance(self, points: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance [N] and its gradient [N, 3] by trilinear interpolation.

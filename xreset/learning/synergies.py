@@ -62,7 +62,8 @@ class SynergyGaussian(GaussianDistribution):
             synergy_std: initial s.
             options: of rsl-rl's Gaussian.
         """
-        super().__init__(output_dim, **options | {"std_type": "log"})
+        settings: dict[str, Any] = options | {"std_type": "log"}
+        super().__init__(output_dim, **settings)
         directions = torch.as_tensor(directions, dtype=torch.float32).reshape(output_dim, -1)
         self.directions: Tensor
         self.register_buffer("directions", directions)

@@ -6,10 +6,8 @@ The goal is the last object pose of the same demonstration.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
-from typing import Self
 
 import numpy as np
 import torch
@@ -21,10 +19,11 @@ from xreset.geometry.urdf import robot_tree
 from xreset.resets.bank import ResetBank
 from xreset.spec import GRAVITY, RobotSpec
 from xreset.task.config import ResetConfig
+from xreset.tensors import Tensors
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reset:
+class Reset(Tensors):
     """Start of M episodes."""
 
     joint_pos: Tensor
@@ -44,15 +43,6 @@ class Reset:
     def from_bank(self) -> Tensor:
         """[M] bool"""
         return self.state >= 0
-
-    @classmethod
-    def stack(cls, parts: Sequence[Self]) -> Self:
-        """Several resets as one."""
-        return cls(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(cls)})
-
-    def to(self, device: torch.device | str) -> Self:
-        """The same on another device."""
-        return type(self)(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
 def _tensor(array: np.ndarray, device: torch.device | str = "cpu") -> Tensor:

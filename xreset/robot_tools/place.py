@@ -54,7 +54,7 @@ def place(
         raise RobotError(f"robot {robot.name!r}: there is no frame to reach; hand retargeting followed none within its threshold.")
     random = np.random.default_rng(config.seed)
     order = torch.as_tensor(random.permutation(len(wrists.annotated)))
-    tried, kept = wrists.select(order[: config.frames]), wrists.select(order[config.frames :][: config.final_frames])
+    tried, kept = wrists[order[: config.frames]], wrists[order[config.frames :][: config.final_frames]]
     if not len(kept.annotated):
         kept = tried
     own = Placement(pos=robot.base_pos, quat=robot.base_quat)

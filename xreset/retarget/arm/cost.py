@@ -19,6 +19,8 @@ from xreset.geometry.collision import height_above_table
 from xreset.geometry.rotations import matrix_to_quat, quat_conjugate, quat_multiply, quat_to_axis_angle
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel
+from xreset.retarget.least_squares import free_to_move, minimise
+from xreset.tensors import Tensors
 
 _CONVERGED = 1e-5
 """Steps smaller than this end the iteration [rad or m]."""
@@ -41,7 +43,7 @@ class Frame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class System:
+class System(Tensors):
     """Cost and its Gauss-Newton approximation."""
 
     cost: Tensor
@@ -57,28 +59,20 @@ def solve(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, iteration
 
     A joint at a limit stays there while the cost pulls it outwards; steps beyond a limit are cut off there.
     """
-    damping = torch.full((len(q),), 1e-3, dtype=q.dtype)
-    now = system(model, frame, q, config, self_collision=self_collision)
-    for _ in range(iterations):
-        outward = ((q <= model.lower) & (now.gradient > 0)) | ((q >= model.upper) & (now.gradient < 0))
-        free = (~outward).to(q.dtype)
-        ridge = damping[:, None] * now.hessian.diagonal(dim1=-2, dim2=-1).clamp_min(1e-3) * free + (1.0 - free)
-        H = now.hessian * free[:, :, None] * free[:, None, :] + torch.diag_embed(ridge)
-        step = torch.linalg.solve(H, -now.gradient * free)
-        trial_q = torch.minimum(torch.maximum(q + step, model.lower), model.upper)
-        trial = system(model, frame, trial_q, config, self_collision=self_collision)
-        better = trial.cost < now.cost
-        moved = (trial_q - q).abs().amax(-1)
-        q = torch.where(better[:, None], trial_q, q)
-        now = System(
-            cost=torch.where(better, trial.cost, now.cost),
-            hessian=torch.where(better[:, None, None], trial.hessian, now.hessian),
-            gradient=torch.where(better[:, None], trial.gradient, now.gradient),
-        )
-        damping = torch.where(better, damping * 0.2, damping * 8.0).clamp(1e-9, 1e9)
-        if bool((moved < _CONVERGED).all()):
-            break
-    return q
+
+    def step(q: Tensor, here: System, damping: Tensor) -> Tensor:
+        free = free_to_move(q, here.gradient, model.lower, model.upper)
+        ridge = damping[:, None] * here.hessian.diagonal(dim1=-2, dim2=-1).clamp_min(1e-3) * free + (1.0 - free)
+        H = here.hessian * free[:, :, None] * free[:, None, :] + torch.diag_embed(ridge)
+        return torch.minimum(torch.maximum(q + torch.linalg.solve(H, -here.gradient * free), model.lower), model.upper)
+
+    def done(before: Tensor, after: Tensor, *_: Tensor) -> Tensor:  # all together: the batch keeps its size
+        return ((after - before).abs() < _CONVERGED).all().expand(len(before))
+
+    def evaluate(q: Tensor, _: Tensor) -> System:
+        return system(model, frame, q, config, self_collision=self_collision)
+
+    return minimise(q, evaluate, step, done, iterations, damping_range=(1e-9, 1e9))[0]
 
 
 def system(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, *, self_collision: bool) -> System:

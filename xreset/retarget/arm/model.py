@@ -16,6 +16,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.retarget.validity import Measures
 from xreset.spec import RobotSpec, TableSpec
+from xreset.tensors import Tensors
 
 _SELF_SEARCH = 0.02
 """Distances between shapes are measured up to here [m]."""
@@ -24,7 +25,7 @@ _AT_LIMIT = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class ArmTargets:
+class ArmTargets(Tensors):
     """What the arm should do."""
 
     root_pos: Tensor
@@ -40,13 +41,9 @@ class ArmTargets:
     hand_clearance: Tensor
     """[S, T] smallest signed distance between the hand's own shapes [m]; the arm cannot change it."""
 
-    def select(self, *index: Tensor) -> ArmTargets:
-        """Those of some sequences, or of some frames of them: every tensor is indexed alike."""
-        return ArmTargets(**{name: value[index] for name, value in vars(self).items()})
-
     def reversed(self) -> ArmTargets:
         """The same from the last frame to the first."""
-        return ArmTargets(**{name: value.flip(1) for name, value in vars(self).items()})
+        return self.map(lambda x: x.flip(1))
 
 
 class ArmModel:

@@ -16,6 +16,7 @@ from xreset.retarget.arm.cost import Frame, solve, system
 from xreset.retarget.arm.model import ArmModel, ArmTargets, arm_jump, measure
 from xreset.retarget.arm.splice import splice, spread_over
 from xreset.retarget.validity import Thresholds, classify
+from xreset.tensors import Tensors
 
 Progress = Callable[[float], None]
 """Called with the fraction that is done."""
@@ -27,7 +28,7 @@ _DISTINCT = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Paths:
+class Paths(Tensors):
     """Paths of the arm's joints, and what has been found of their frames."""
 
     joints: Tensor
@@ -36,17 +37,9 @@ class Paths:
     """[S, K, T] bool: valid if the joints do not jump there. Whether they do depends on the frame before, and so on the direction and on
     where paths are spliced; all else holds wherever the frame ends up, and is measured once."""
 
-    def select(self, rows: Tensor) -> Paths:
-        """Those of some sequences."""
-        return Paths(joints=self.joints[rows], sound=self.sound[rows])
-
     def reversed(self) -> Paths:
         """The same from the last frame to the first."""
-        return Paths(joints=self.joints.flip(2), sound=self.sound.flip(2))
-
-    def joined(self, other: Paths) -> Paths:
-        """These, then the other's, of the same sequences."""
-        return Paths(joints=torch.cat((self.joints, other.joints), dim=1), sound=torch.cat((self.sound, other.sound), dim=1))
+        return self.map(lambda x: x.flip(2))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +54,8 @@ class ArmProblem:
     config: ArmConfig
 
     def select(self, *index: Tensor) -> ArmProblem:
-        """That of some sequences, or of some frames of them: see :meth:`ArmTargets.select`."""
-        return replace(self, targets=self.targets.select(*index), support=self.support[index])
+        """That of some sequences, or of some frames of them: every tensor is indexed alike."""
+        return replace(self, targets=self.targets[index], support=self.support[index])
 
     def repeated(self, count: int) -> ArmProblem:
         """Every sequence so many times, one after the other: [S count, ...]."""
@@ -121,7 +114,7 @@ def mend(problem: ArmProblem, known: Paths, missed: Tensor, progress: Progress) 
     column = torch.arange(len(owner)) - (count.cumsum(0) - count)[owner]
     new = known.joints[:, :1].repeat(1, int(count.max()), 1, 1)  # sequences with fewer new paths than others repeat a known one
     new[owner, column] = paths
-    known = known.joined(problem.examined(new))
+    known = Paths.cat((known, problem.examined(new)), dim=1)
 
     annotated = problem.targets.annotated
     detour = problem.config.detour_cost * (known.joints - problem.model.home).square().sum(-1) * annotated[:, None]

@@ -57,7 +57,7 @@ def track(
     joints, worth = best(problem, forwards)
     failing = (problem.reasons(joints) > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
     if len(failing):
-        joints[failing] = _rescued(problem.select(failing), forwards.select(failing), joints[failing], worth[failing], report)
+        joints[failing] = _rescued(problem.select(failing), forwards[failing], joints[failing], worth[failing], report)
     report(1.0)
     return joints, measure(model, targets, joints)
 
@@ -76,14 +76,14 @@ def _rescued(problem: ArmProblem, forwards: Paths, joints: Tensor, worth: Tensor
     backwards = branches(turned, lambda done: report(0.3 + 0.3 * done))
     back, other = best(turned, backwards)
     joints = torch.where((other > worth)[:, None, None], back.flip(1), joints)
-    paths = forwards.joined(backwards.reversed())
+    paths = Paths.cat((forwards, backwards.reversed()), dim=1)
 
     def apart(part: ArmProblem, rows: Tensor, _: Tensor) -> Tensor:
         return follow(part, joints[rows, 0], lambda done: report(0.6 + 0.1 * done), self_collision=True)
 
     def mended(part: ArmProblem, rows: Tensor, missed: Tensor) -> Tensor:
         present = part.examined(joints[rows, None])  # it may have been followed anew
-        return mend(part, present.joined(paths.select(rows)), missed, lambda done: report(0.7 + 0.3 * done))
+        return mend(part, Paths.cat((present, paths[rows]), dim=1), missed, lambda done: report(0.7 + 0.3 * done))
 
     _improve(problem, joints, ("self collision",), apart)
     if problem.config.reseeds:

@@ -1,4 +1,4 @@
-"""What a hand meets: which of its balls come too near to the object, the table or each other, and which fingertips do not yet touch.
+"""What a hand meets: which of its balls come too near to the object, the table or each other.
 
 Shape letters: B frames, G links with balls, A things found, n variables.
 """
@@ -77,31 +77,6 @@ def too_near(
         _in_each_other(model, bodies, bounds, considered, self_depth),
     )
     return _sorted(*(torch.cat([getattr(part, name) for part in found]) for name in ("frame", "value", "slope")))
-
-
-def not_touching(model: HandModel, bodies: Bodies, objects: Objects, touching: Tensor, gap: float) -> Distances:
-    """Fingertips that should touch the object and are farther than ``gap`` [m] from it: the distance of the nearest of their balls.
-
-    Args:
-        model: the hand.
-        bodies: its B configurations.
-        objects: of the same frames.
-        touching: [B, E] bool: which fingertips (as in ``model.pads``) should touch.
-        gap: [m]
-    """
-    frame, tip = touching.nonzero(as_tuple=True)
-    balls = model.pads.balls[tip]  # [A, W]
-    wide = frame[:, None].expand_as(balls)
-    centers = model.ball_centers(bodies, wide, balls)
-    distance, slope = objects.signed_distance(centers.flatten(0, 1), wide.flatten())
-    outside = distance.view(balls.shape) - model.balls.radii[balls] - gap
-    value, nearest = outside.min(dim=1)
-    row = torch.arange(len(frame), device=frame.device)
-    direction = slope.view(*balls.shape, 3)[row, nearest]
-    far = value > 0
-    row, nearest, frame = row[far], nearest[far], frame[far]
-    slope = model.ball_slope(bodies, frame, balls[row, nearest], centers[row, nearest], direction[far])
-    return Distances(frame=frame, value=value[far], slope=slope)
 
 
 def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Distances:

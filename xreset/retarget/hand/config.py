@@ -36,15 +36,6 @@ class HandConfig:
     """Change of a hand joint between neighbouring frames beyond which ``jump_weight`` applies [rad or m] (not the paper's)."""
     jump_weight: float = 1000.0
     """Change of a hand joint between neighbouring frames beyond ``jump_limit``."""
-    touch_weight: float = 0.0
-    """Distance from the object to a fingertip's shape, beyond ``touch_gap``, where the human's touches (not the paper's); 0: off."""
-    touch_gap: float = 0.001
-    """Distance between a fingertip's shape and the object that counts as touching [m]."""
-    user_scale: bool = False
-    """Whether each user's hand is first enlarged (or shrunk) to the robot's size, every finger about its own tip (not the paper's)."""
-    hold_weight: float = 0.0
-    """Change between neighbouring frames of the posture of fingers that touch in both, and of the hand's pose as the grasped object sees
-    it (not the paper's); 0: off."""
     length_scale: float = 0.10
     """Length that counts as much as one radian [m]: about a finger's length."""
     clearance_growth: tuple[float, ...] = (0.01, 0.1)
@@ -63,9 +54,9 @@ class HandConfig:
             positive=("smoothness_weight", "contact_knee", "jump_limit", "length_scale"),
             not_negative=(
                 "local_weight", "global_weight", "tip_factor", "contact_weight", "contact_margin", "clearance_weight", "jump_weight",
-                "touch_weight", "hold_weight", "growth_iterations", "iterations", "tolerance",
+                "growth_iterations", "iterations", "tolerance",
             ),
-            finite=("object_clearance", "self_depth", "touch_gap"),
+            finite=("object_clearance", "self_depth"),
         )  # fmt: skip
         if not all(0 <= share < inf for share in self.clearance_growth):
             raise ValueError(f"clearance_growth is {self.clearance_growth}, expected finite numbers, 0 or more")

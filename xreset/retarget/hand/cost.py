@@ -1,7 +1,7 @@
 """The cost of hand retargeting over whole trajectories, and its Gauss-Newton approximation.
 
-    sum over frames of  bone vectors and directions + keypoints + contact + clearance (+ touch)
-    + sum over neighbouring frames of  joint and root smoothness, and a wall against joint jumps (+ hold)
+    sum over frames of  bone vectors and directions + keypoints + contact + clearance
+    + sum over neighbouring frames of  joint and root smoothness, and a wall against joint jumps
 
 Shape letters: S sequences padded to T frames, B frames of a chunk, P mapped keypoints, C pairs of keypoints, n = J + 6 variables.
 """
@@ -15,18 +15,18 @@ from torch import Tensor
 
 from xreset.geometry.rotations import quat_conjugate, quat_multiply, quat_to_axis_angle
 from xreset.retarget.hand import terms
-from xreset.retarget.hand.clearance import Distances, Objects, not_touching, too_near
+from xreset.retarget.hand.clearance import Distances, Objects, too_near
 from xreset.retarget.hand.config import HandConfig
-from xreset.retarget.hand.hold import hold
 from xreset.retarget.hand.model import HandModel
 from xreset.retarget.hand.problem import HandState, HandTargets
+from xreset.tensors import Tensors
 
 _FRAMES_PER_CHUNK = {"cpu": 256, "cuda": 8192}
 """On a CPU what fits its caches; on a GPU what fills it."""
 
 
 @dataclass(frozen=True)
-class System:
+class System(Tensors):
     """Cost and its Gauss-Newton approximation, a symmetric block-tridiagonal system per sequence."""
 
     cost: Tensor
@@ -38,10 +38,6 @@ class System:
     gradient: Tensor
     """[S, T, n] half the gradient."""
 
-    def select(self, sequences: Tensor) -> System:
-        """That of some sequences."""
-        return System(**{name: value[sequences] for name, value in vars(self).items()})
-
 
 def system(model: HandModel, targets: HandTargets, config: HandConfig, state: HandState) -> System:
     """Cost of every sequence and its Gauss-Newton approximation."""
@@ -52,20 +48,15 @@ def system(model: HandModel, targets: HandTargets, config: HandConfig, state: Ha
     for begin in range(0, sequences, size):
         part = slice(begin, begin + size)
         rows = torch.arange(sequences, device=state.joints.device)[part]
-        values = _frames(model, targets.select(rows), config, state.select(rows))
+        values = _frames(model, targets[rows], config, state[rows])
         for whole, value in zip((cost, gradient, diagonal), values, strict=True):
             whole[part] = value.view(whole[part].shape)
 
     change, gradient_by_change, curvature = terms.change(_changes(state), *_change_weights(model, config))
-    by_later, by_earlier = gradient_by_change, -gradient_by_change
-    if config.hold_weight:
-        held = hold(targets, model.tip_joints, state, config.hold_weight, config.length_scale)
-        change, curvature = change + held.cost, curvature + held.curvature
-        by_later, by_earlier = by_later + held.later, by_earlier + held.earlier
     diagonal.diagonal(dim1=-2, dim2=-1)[:, 1:] += curvature
     diagonal.diagonal(dim1=-2, dim2=-1)[:, :-1] += curvature
-    gradient[:, 1:] += by_later
-    gradient[:, :-1] += by_earlier
+    gradient[:, 1:] += gradient_by_change
+    gradient[:, :-1] -= gradient_by_change
     return System(cost=cost.sum(1) + change.sum(1), diagonal=diagonal, coupling=-curvature, gradient=gradient)
 
 
@@ -120,16 +111,11 @@ def _frames(model: HandModel, targets: HandTargets, config: HandConfig, state: H
         targets.object_index.repeat_interleave(frames),
         targets.fields,
     )
-    found = [(too_near(model, bodies, objects, annotated, config.object_clearance, config.self_depth), config.clearance_weight)]
-    if config.touch_weight:
-        touching = targets.in_contact.flatten(0, 1)[:, model.pads.keypoint] & annotated[:, None]
-        found.append((not_touching(model, bodies, objects, touching, config.touch_gap), config.touch_weight))
-    for distances, weight in found:
-        value, row = _dense(distances, len(x))
-        value, row = value / scale, row / scale
-        cost = cost + weight * value.square().sum(1)
-        gradient = gradient + weight * (row.mT @ value[..., None])[..., 0]
-        hessian = hessian + weight * (row.mT @ row)
+    value, row = _dense(too_near(model, bodies, objects, annotated, config.object_clearance, config.self_depth), len(x))
+    value, row, weight = value / scale, row / scale, config.clearance_weight
+    cost = cost + weight * value.square().sum(1)
+    gradient = gradient + weight * (row.mT @ value[..., None])[..., 0]
+    hessian = hessian + weight * (row.mT @ row)
     return cost, gradient, hessian
 
 

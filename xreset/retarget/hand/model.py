@@ -35,16 +35,6 @@ class Bodies:
     """[B, L, 3, n] angular velocity per variable."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Pads:
-    """The shapes that fingertips touch with, of the E mapped fingertips that have any."""
-
-    keypoint: Tensor
-    """[E] index of the fingertip's keypoint among the mapped ones."""
-    balls: Tensor
-    """[E, W] its balls; shorter lists repeat their first."""
-
-
 class HandModel:
     """A robot's hand as a floating tree, and which of its links follow which human keypoints."""
 
@@ -92,9 +82,6 @@ class HandModel:
         upright = self.home.new_tensor([1.0, 0.0, 0.0, 0.0])
         self.at_home = self.keypoints(self.kinematics.clamp(self.home), self.home.new_zeros(3), upright)
         """[P, 3] keypoints at home, in the root's frame."""
-        moves = self.kinematics.jacobian(self.home, self.links)
-        self.tip_joints = ((moves.linear != 0) | (moves.angular != 0)).any(dim=-2) & self.is_tip[:, None]
-        """[P, J] joints that move each fingertip; none for other keypoints."""
         self.table = table or TableSpec()
 
         on_cpu = self.kinematics if self.device.type == "cpu" else Kinematics(robot, root=robot.hand_root)  # as coal wants it
@@ -105,22 +92,6 @@ class HandModel:
         self._keypoint_bodies = torch.tensor([self._bodies.index(link) for link in self.links], device=self.device)
         self.group_body = torch.tensor([self._bodies.index(link) for link in self.balls.links], dtype=torch.long, device=self.device)
         """[G] index among the bodies of each link with balls."""
-        self.pads = self._tip_pads()
-        """Balls that fingertips touch with."""
-
-    def _tip_pads(self) -> Pads:
-        """The balls of the links whose contact counts as a mapped fingertip's."""
-        tips = [tip for tip in self.robot.fingertips if tip.keypoint in self.names]
-        owner = [self.balls.links[i] for i in self.balls.link.tolist()]
-        solid = (self.balls.radii > 0).tolist()
-        balls = [[q for q, name in enumerate(owner) if name in tip.contact_links and solid[q]] for tip in tips]
-        kept = [(self.names.index(tip.keypoint), mine) for tip, mine in zip(tips, balls, strict=True) if mine]
-        width = max((len(mine) for _, mine in kept), default=0)
-        padded = [mine + mine[:1] * (width - len(mine)) for _, mine in kept]  # a ball twice changes no minimum
-        return Pads(
-            keypoint=torch.tensor([k for k, _ in kept], dtype=torch.long, device=self.device),
-            balls=torch.tensor(padded, dtype=torch.long, device=self.device).view(len(kept), width),
-        )
 
     def keypoints(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Tensor:
         """[..., P, 3] positions of the keypoint links."""
@@ -172,18 +143,13 @@ def keypoint_pairs(names: Sequence[str], links: Sequence[str]) -> list[tuple[int
     Works for any subset of the 21 keypoints; pairs on one and the same link say nothing and are left out.
     """
     wrist = [i for i, name in enumerate(names) if name == "wrist"]
-    fingers = finger_keypoints(names)
+    fingers = [sorted((i for i, name in enumerate(names) if name.startswith(f)), key=lambda i: names[i]) for f in FINGERS]  # base to tip
     pairs = [pair for finger in fingers for pair in pairwise(wrist + finger)]
     thumb, others = fingers[0], [finger for finger in fingers[1:] if finger]
     for left, right in pairwise(others):
         pairs += [(left[0], right[0]), (left[-1], right[-1])]
     pairs += [(thumb[-1], finger[-1]) for finger in others if thumb]
     return [(a, b) for a, b in dict.fromkeys(pairs) if links[a] != links[b]]
-
-
-def finger_keypoints(names: Sequence[str]) -> list[list[int]]:
-    """Indices of each finger's mapped keypoints, thumb first, from base to tip; empty for a finger that has none."""
-    return [sorted((i for i, name in enumerate(names) if name.startswith(finger)), key=lambda i: names[i]) for finger in FINGERS]
 
 
 def _pose(pos: Tensor, quat: Tensor) -> Tensor:

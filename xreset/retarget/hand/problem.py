@@ -5,16 +5,16 @@ Shape letters: S sequences padded to T frames, P mapped keypoints, J hand joints
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from xreset.geometry.fields import DistanceFields
+from xreset.tensors import Tensors
 
 
 @dataclass(frozen=True, kw_only=True)
-class HandTargets:
+class HandTargets(Tensors):
     """What the hand should follow; all tensors on one device."""
 
     keypoints: Tensor
@@ -34,21 +34,9 @@ class HandTargets:
     fields: DistanceFields
     """Signed distances to the objects' surfaces."""
 
-    def select(self, sequences: Tensor) -> HandTargets:
-        """Those of some sequences."""
-        tensors = {name: value[sequences] for name, value in self._tensors().items()}
-        return HandTargets(**tensors, fields=self.fields)
-
-    def to(self, device: torch.device | str) -> HandTargets:
-        """The same on another device."""
-        return HandTargets(**{name: value.to(device) for name, value in self._tensors().items()}, fields=self.fields.to(device))
-
-    def _tensors(self) -> dict[str, Tensor]:
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "fields"}
-
 
 @dataclass(frozen=True)
-class HandState:
+class HandState(Tensors):
     """The variables: joints and root pose of every frame."""
 
     joints: Tensor
@@ -57,7 +45,3 @@ class HandState:
     """[S, T, 3]"""
     root_quat: Tensor
     """[S, T, 4]"""
-
-    def select(self, sequences: Tensor) -> HandState:
-        """That of some sequences."""
-        return HandState(**{name: value[sequences] for name, value in vars(self).items()})

@@ -11,26 +11,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from xreset.geometry.rotations import matrix_to_quat, quat_from_axis_angle, quat_multiply, quat_normalize
-from xreset.retarget.chain import solve_chain
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.cost import System, system
 from xreset.retarget.hand.model import HandModel
 from xreset.retarget.hand.problem import HandState, HandTargets
-from xreset.retarget.hand.scale import hand_scale, resized
+from xreset.retarget.least_squares import free_to_move, minimise, solve_chain
+from xreset.tensors import Tensors
 
 __all__ = ["HandConfig", "HandMotion", "HandTargets", "retarget_hand"]
 
-_Batch = TypeVar("_Batch", HandState, System)
-
 
 @dataclass(frozen=True, kw_only=True)
-class HandMotion:
+class HandMotion(Tensors):
     """A hand's motion."""
 
     joints: Tensor
@@ -43,10 +40,6 @@ class HandMotion:
     """[S, T, P, 3] the robot's keypoints."""
     cost: Tensor
     """[S] final cost."""
-
-    def to(self, device: torch.device | str) -> HandMotion:
-        """The same on another device."""
-        return HandMotion(**{name: value.to(device) for name, value in vars(self).items()})
 
 
 def retarget_hand(
@@ -65,9 +58,6 @@ def retarget_hand(
     """
     config, home = config or HandConfig(), targets.keypoints.device
     targets = targets.to(model.device)
-    if config.user_scale:
-        scale = hand_scale(model, targets.keypoints, targets.annotated)
-        targets = replace(targets, keypoints=resized(targets.keypoints, scale, model.names))
     sequences, frames = targets.annotated.shape
     root_pos, root_quat = _align_root(model, targets)
     state = HandState(model.kinematics.clamp(model.home).expand(sequences, frames, -1), root_pos, root_quat)
@@ -85,35 +75,19 @@ def retarget_hand(
 def _minimise(
     model: HandModel, targets: HandTargets, config: HandConfig, start: HandState, progress: Callable[[int], None]
 ) -> tuple[HandState, Tensor]:
-    """Levenberg-Marquardt from a first guess: the best state found and its cost [S]. A sequence that is done costs nothing more."""
-    state = HandState(**{name: value.clone() for name, value in vars(start).items()})
-    sequences = len(state.joints)
-    damping = torch.full((sequences,), 1e-3, dtype=torch.float64, device=model.device)
-    active = torch.arange(sequences, device=model.device)
-    now, here = state, system(model, targets, config, state)
-    final = here.cost.clone()
-    for iteration in range(config.iterations):
-        progress(iteration)
-        trial = _retract(model, now, _limited_step(model, now, here, damping))
-        there = system(model, targets.select(active), config, trial)
-        better = there.cost < here.cost
-        gain = (here.cost - there.cost) / here.cost.clamp_min(1e-12)
-        now, here = _chosen(better, trial, now), _chosen(better, there, here)
-        damping = torch.where(better, damping * 0.2, damping * 8.0)
-        for name, value in vars(now).items():
-            getattr(state, name)[active] = value
-        final[active] = here.cost
-        left = ~((better & (gain < config.tolerance)) | (damping > 1e6))
-        if not bool(left.any()):
-            break
-        active, damping, now, here = active[left], damping[left], now.select(left), here.select(left)
-    return state, final
+    """The best state that is found from a first guess, and its cost [S]."""
 
+    def done(_before: HandState, _after: HandState, cost: Tensor, tried: Tensor, damping: Tensor) -> Tensor:
+        return ((tried < cost) & ((cost - tried) / cost.clamp_min(1e-12) < config.tolerance)) | (damping > 1e6)
 
-def _chosen(first: Tensor, yes: _Batch, no: _Batch) -> _Batch:
-    """Sequence by sequence, one or the other."""
-    parts = {name: torch.where(first.view(-1, *[1] * (value.dim() - 1)), value, getattr(no, name)) for name, value in vars(yes).items()}
-    return type(yes)(**parts)
+    return minimise(
+        start,
+        lambda state, rows: system(model, targets[rows], config, state),
+        lambda state, here, damping: _retract(model, state, _limited_step(model, state, here, damping)),
+        done,
+        config.iterations,
+        progress=progress,
+    )
 
 
 def _align_root(model: HandModel, targets: HandTargets) -> tuple[Tensor, Tensor]:
@@ -149,16 +123,14 @@ def _retract(model: HandModel, state: HandState, step: Tensor) -> HandState:
 
 
 def _limited_step(model: HandModel, state: HandState, here: System, damping: Tensor) -> Tensor:
-    """[S, T, n] Levenberg-Marquardt step in which joints at a limit stay there if the cost pulls them outwards (Bertsekas' projection).
+    """[S, T, n] Levenberg-Marquardt step in which joints at a limit stay there if the cost pulls them outwards.
 
     The damping of the root knows no direction, so that the step turns with the scene.
     """
     joints = state.joints
     count = joints.shape[-1]
-    pull = here.gradient[..., :count]
-    outward = ((joints <= model.kinematics.lower) & (pull > 0)) | ((joints >= model.kinematics.upper) & (pull < 0))
     free = torch.ones_like(here.gradient)
-    free[..., :count] = (~outward).to(free.dtype)
+    free[..., :count] = free_to_move(joints, here.gradient[..., :count], model.kinematics.lower, model.kinematics.upper)
     size = here.diagonal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6)
     root = size[..., count:].unflatten(-1, (2, 3)).mean(-1, keepdim=True).expand(-1, -1, -1, 3).flatten(-2)  # the same in all directions
     ridge = damping[:, None, None] * torch.cat((size[..., :count], root), dim=-1) * free + (1.0 - free)

@@ -1,0 +1,103 @@
+"""Levenberg-Marquardt with projected steps for a batch of independent problems, and the linear systems of a chain in time.
+
+Shape letters: B problems, R of them that are not done; S chains (sequences), T blocks (frames), n unknowns per block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xreset.tensors import where
+
+
+def minimise(
+    x: Any,
+    evaluate: Callable[[Any, Tensor], Any],
+    step: Callable[[Any, Any, Tensor], Any],
+    done: Callable[[Any, Any, Tensor, Tensor, Tensor], Tensor],
+    iterations: int,
+    *,
+    damping_range: tuple[float, float] = (0.0, inf),
+    progress: Callable[[int], None] = lambda _: None,
+) -> tuple[Any, Tensor]:
+    """Damped Gauss-Newton steps; a problem takes those that lower its cost, and costs nothing more when it is done.
+
+    Args:
+        x: first guess: a tensor, or a bundle of tensors (:class:`~xreset.tensors.Tensors`), of B rows.
+        evaluate: costs and their approximation, a bundle with ``cost`` [R], at x [R, ...], given which of the problems those are [R].
+        step: where a damped step leads, given x, the approximation and the damping [R].
+        done: [R] whether problems are done, given x before, x tried, both costs [R], and the damping [R] of the next step.
+        iterations: most steps.
+        damping_range: of the damping.
+        progress: called with the number of steps done, before each.
+
+    Returns:
+        The best x found, and its cost [B].
+    """
+    first = next(iter(vars(x).values())) if not isinstance(x, Tensor) else x
+    rows = torch.arange(len(first), device=first.device)
+    damping = torch.full((len(rows),), 1e-3, dtype=torch.float64, device=first.device)
+    best, now, here = x.clone(), x, evaluate(x, rows)
+    cost = here.cost.clone()
+    for iteration in range(iterations):
+        progress(iteration)
+        trial = step(now, here, damping)
+        there = evaluate(trial, rows)
+        better = there.cost < here.cost
+        damping = torch.where(better, damping * 0.2, damping * 8.0).clamp(*damping_range)
+        left = ~done(now, trial, here.cost, there.cost, damping)
+        now, here = where(better, trial, now), where(better, there, here)
+        best[rows], cost[rows] = now, here.cost
+        if not bool(left.any()):
+            break
+        if not bool(left.all()):
+            rows, damping, now, here = rows[left], damping[left], now[left], here[left]
+    return best, cost
+
+
+def free_to_move(x: Tensor, gradient: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """1 for variables that may move, 0 for those at a bound while the cost pulls them outwards (Bertsekas' projection)."""
+    return (~(((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0)))).to(gradient.dtype)
+
+
+def solve_chain(diagonal: Tensor, coupling: Tensor, rhs: Tensor) -> Tensor:
+    """Solve H x = b, where H has ``diagonal`` blocks D_t and diagonal matrices C_t between blocks t and t + 1.
+
+    Block elimination (the matrix form of Thomas' algorithm): with A_0 = D_0,
+
+        A_t = D_t - C_{t-1} A_{t-1}^-1 C_{t-1},   y_t = b_t - C_{t-1} A_{t-1}^-1 y_{t-1},   x_t = A_t^-1 (y_t - C_t x_{t+1}).
+
+    The cost is linear in T; every step is batched over S.
+
+    Args:
+        diagonal: [S, T, n, n] symmetric blocks; H must be positive definite.
+        coupling: [S, T-1, n] diagonals of the blocks beside the diagonal.
+        rhs: [S, T, n] right-hand side b.
+
+    Returns:
+        [S, T, n] the solution.
+
+    Raises:
+        torch.linalg.LinAlgError: H is not positive definite.
+    """
+    frames = diagonal.shape[1]
+    inverses: list[Tensor] = []
+    reduced: list[Tensor] = []
+    block, y = diagonal[:, 0], rhs[:, 0]
+    for t in range(frames):
+        if t:
+            link = coupling[:, t - 1]
+            block = diagonal[:, t] - link[:, :, None] * inverses[-1] * link[:, None, :]
+            y = rhs[:, t] - link * (inverses[-1] @ reduced[-1][..., None])[..., 0]
+        inverses.append(torch.cholesky_inverse(torch.linalg.cholesky(block)))
+        reduced.append(y)
+    solution = [(inverses[-1] @ reduced[-1][..., None])[..., 0]]
+    for t in range(frames - 2, -1, -1):
+        y = reduced[t] - coupling[:, t] * solution[-1]
+        solution.append((inverses[t] @ y[..., None])[..., 0])
+    return torch.stack(solution[::-1], dim=1)

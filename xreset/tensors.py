@@ -1,0 +1,56 @@
+"""Bundles of tensors: frozen dataclasses that are indexed, moved and joined as one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self, TypeVar
+
+import torch
+from torch import Tensor
+
+_Batch = TypeVar("_Batch", bound="Tensor | Tensors")
+
+
+@dataclass(frozen=True)
+class Tensors:
+    """Base of a dataclass whose tensors share their first dimension.
+
+    Fields of other kinds stay as they are, but for bundles inside, which move along to another device.
+    """
+
+    def map(self, function: Callable[..., Tensor], *others: Self) -> Self:
+        """A bundle of ``function(own, *the others')``, tensor by tensor."""
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        mapped = {name: function(x, *(getattr(o, name) for o in others)) for name, x in own.items() if isinstance(x, Tensor)}
+        return replace(self, **mapped)
+
+    def __getitem__(self, rows: Any) -> Self:
+        """Some of them."""
+        return self.map(lambda x: x[rows])
+
+    def __setitem__(self, rows: Any, values: Self) -> None:
+        """Write some of them, in place."""
+        self.map(lambda x, new: x.index_put_((rows,), new), values)
+
+    def clone(self) -> Self:
+        """A copy."""
+        return self.map(torch.clone)
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same on another device."""
+        inside = {f.name: getattr(self, f.name) for f in fields(self)}
+        moved = {name: x.to(device) for name, x in inside.items() if isinstance(x, Tensor | Tensors)}
+        return replace(self, **moved)
+
+    @classmethod
+    def cat(cls, parts: Sequence[Self], dim: int = 0) -> Self:
+        """All of several, behind one another."""
+        return parts[0].map(lambda *tensors: torch.cat(tensors, dim=dim), *parts[1:])
+
+
+def where(mask: Tensor, yes: _Batch, no: _Batch) -> _Batch:
+    """Row by row [B], one or the other."""
+    if isinstance(yes, Tensor):
+        return torch.where(mask.view(-1, *[1] * (yes.dim() - 1)), yes, no)  # pyright: ignore
+    return yes.map(lambda a, b: where(mask, a, b), no)  # pyright: ignore

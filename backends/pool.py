@@ -12,14 +12,17 @@ Shape letters as in :mod:`xreset.physics`; arrays of one world have no leading N
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import math
 import mmap
 import os
 import pickle
+import select
 import signal
 import subprocess
 import sys
 import tempfile
+import time
 import traceback
 import weakref
 from abc import ABC, abstractmethod
@@ -584,14 +587,13 @@ class _Team:
                 "Move it to a module, or pass workers=0."
             )
         shared = Path("/dev/shm")
-        folder = str(shared) if os.access(shared, os.W_OK) else None  # memory where there is some, else the temporary folder
+        folder = shared if os.access(shared, os.W_OK) else Path(tempfile.gettempdir())  # memory where there is some
+        _sweep(folder)
         descriptor, path = tempfile.mkstemp(prefix="xreset-", dir=folder)
         self._workers: list[_Worker] = []
         try:
-            try:
-                os.truncate(descriptor, _size(layout))
-            finally:
-                os.close(descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_SH)
+            os.truncate(descriptor, _size(layout))
             self.arrays = _map(path, layout)
             self._workers += [_Worker(job) for job in jobs]  # they start while others are still being asked
             for worker in self._workers:
@@ -603,6 +605,7 @@ class _Team:
             raise
         finally:
             os.unlink(path)
+            os.close(descriptor)
 
     def command(self, method: str, worlds: np.ndarray | None, argument: Any, readings: frozenset[str]) -> None:
         """Have all workers concerned run it at the same time, and wait for all of them."""
@@ -630,11 +633,22 @@ class _Team:
         self._workers.clear()
 
 
+def _sweep(folder: Path) -> None:
+    """Remove the files of processes that were killed before they could: nobody holds them any more."""
+    for path in folder.glob("xreset-*"):
+        with contextlib.suppress(OSError), open(path, "rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if time.time() - os.fstat(file.fileno()).st_mtime > 60.0:  # a young one's owner may not have come to hold it yet
+                path.unlink()
+
+
 class _Worker:
     """One worker process, as its parent sees it."""
 
     _PATIENCE = 5.0
     """Seconds that a worker may take to end."""
+    _ANSWER = 600.0
+    """Seconds that it may take to answer: building an engine's worlds takes some, a command far less than one."""
 
     def __init__(self, job: _Job) -> None:
         self.job = job
@@ -658,6 +672,12 @@ class _Worker:
     def receive(self, doing: str) -> None:
         """Wait for the reply, and raise what it says has gone wrong."""
         assert self._process.stdout is not None
+        if not select.select([self._process.stdout], [], [], self._ANSWER)[0]:
+            self._process.kill()
+            raise XResetError(
+                f"a worker process of the backend {self.job.backend!r} has not answered {doing!r} for {self._ANSWER:.0f} s and was ended; "
+                f"it ran worlds {self.first} to {self.stop - 1}. workers=0 runs the worlds in this process, where a debugger can see them."
+            )
         if self._process.stdout.read(len(_DONE)) == _DONE:
             return
         try:

@@ -71,6 +71,46 @@ class UsageTest(unittest.TestCase):
         self.assertRegex(err, r"^xreset resets: there is no /nowhere/retargeted\.npz")
         self.assertNotIn("Traceback", err)
 
+    def test_impossible_options_are_refused_before_work_begins(self):
+        long, demos = "x" * 300, ("--demos", "none.npz")
+        for words, argv in (
+            (r"--seed is -1, expected a whole number from 0 to 4294967295", ("demos", "synth", "--out", "x.npz", "--seed", "-1")),
+            (r"--seed is 9{20}, expected", ("eval", "zero", "--robot", "openarm", *demos, "--seed", "9" * 20)),
+            (r"--seed is -1, expected", ("train", "--out", "x", "--seed", "-1")),
+            (r"--num-envs is 0, expected a whole number from 1", ("train", "--out", "x", "--num-envs", "0")),
+            (r"--num-envs is -3, expected", ("resets", "none.npz", "--out", "x.npz", "--num-envs", "-3")),
+            (r"--iterations is 0, expected", ("train", "--out", "x", "--iterations", "0")),
+            (r"--joint-threshold is not a number", ("trace", "none.npz", "--joint-threshold", "nan")),
+            (r"no device 'quantum'; expected cpu, cuda or", ("train", "--out", "x", "--device", "quantum")),
+            (
+                r"no device 'quantum'; expected cpu, cuda or",
+                ("retarget", "none.npz", "--robot", "openarm", "--out", "x.npz", "--device", "quantum"),
+            ),
+            (r"fps is 1000000000.0, expected at least 1, and 5 to 1000", ("demos", "synth", "--out", "x.npz", "--fps", "1e9")),
+            (r"(File name too long|there is no)", ("demos", "info", long)),
+            (r"(File name too long|there is no)", ("eval", long, *demos)),
+            (r"(File name too long|there is no)", ("robots", "check", long)),
+            (r"(File name too long|there is no)", ("train", "--out", "x", "--robot", "openarm", "--resets", long)),
+            (r"Nothing was overwritten", ("retarget", "d.npz", "--robot", "openarm", "--out", "./d.npz")),
+        ):
+            with self.subTest(" ".join(argv)[:80]):
+                code, out, err = run(*argv)
+                self.assertIn(code, (1, 2))
+                self.assertRegex(err + out, words)
+                self.assertNotIn("Traceback", err)
+
+    def test_a_gpu_that_is_not_there(self):
+        with mock.patch("torch.cuda.device_count", return_value=0):
+            code, _, err = run("resets", "none.npz", "--out", "x.npz", "--backend", "mujoco-warp", "--device", "cuda")
+        self.assertEqual(code, 1)
+        self.assertIn("--device is cuda, but of GPUs there is none", err)
+
+    def test_what_reaches_the_terminal_is_text(self):
+        code, _, err = run("eval", "\x1b[31mred\x1b]0;title\x07", "--demos", "none.npz")
+        self.assertEqual(code, 1)
+        self.assertIn("red", err)
+        self.assertNotIn("\x1b", err)
+
     def test_an_engine_that_does_not_exist(self):
         code, _, err = run("conformance", "--backend", "bulet")
         self.assertEqual(code, 1)

@@ -502,7 +502,7 @@ class Command(unittest.TestCase):
         path = self.retargeted()
         for said, words in (
             ("there is no ", [self.folder / "none.npz"]),
-            ("at least 1, found 0", [path, "--grasps", 0]),
+            ("--grasps is 0, expected a whole number from 1", [path, "--grasps", 0]),
             ("there is no object 'bottle'", [path, "--only", "bottle"]),
             ("for the robot 'ur7e-sharpa'", [path, "--robot", "openarm"]),
         ):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -13,11 +14,12 @@ import unittest
 from dataclasses import fields
 from itertools import product
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import torch
 
-from xreset.backends.pool import STATE_FIELDS, PoolBackend, World, initial_state, is_finite, lowest_point
+from xreset.backends.pool import STATE_FIELDS, PoolBackend, World, _sweep, _Worker, initial_state, is_finite, lowest_point
 from xreset.errors import CapabilityError, RobotError, XResetError
 from xreset.physics import State
 from xreset.spec import DriveSpec, FingertipSpec, Geometry, JointSpec, ObjectSpec, RobotSpec, SceneSpec, Shape
@@ -400,6 +402,28 @@ class RestHeightTest(unittest.TestCase):
 
     def test_initial_state_has_every_field(self):
         self.assertEqual(set(initial_state(toy_scene(), 0)), {f.name for f in fields(State)})
+
+
+class LeftBehind(unittest.TestCase):
+    def test_what_killed_processes_left_in_shared_memory_is_swept(self):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            for kind in ("orphan", "held", "young"):
+                (folder / f"xreset-{kind}").write_bytes(b"1")
+                if kind != "young":
+                    os.utime(folder / f"xreset-{kind}", (0, 0))
+            with open(folder / "xreset-held") as held:
+                fcntl.flock(held, fcntl.LOCK_SH)
+                _sweep(folder)
+            self.assertEqual(sorted(f.name for f in folder.iterdir()), ["xreset-held", "xreset-young"])
+
+    def test_a_worker_that_does_not_answer_is_named(self):
+        with ToyBackend(toy_scene(), 4, workers=2) as backend:
+            assert backend._team is not None
+            os.kill(backend._team._workers[1]._process.pid, signal.SIGSTOP)
+            words = "has not answered 'step' for 0 s and was ended; it ran worlds 2 to 3"
+            with mock.patch.object(_Worker, "_ANSWER", 0.4), self.assertRaisesRegex(XResetError, words):
+                backend.step()
 
 
 if __name__ == "__main__":

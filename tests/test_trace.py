@@ -355,7 +355,7 @@ class CommandTest(unittest.TestCase):
         missing = str(self.folder / "none.npz")
         self.assertIn("there is no", self.refuse(missing))
         self.assertIn("thresholds must be above 0", self.refuse(missing, "--force-threshold", "0"))
-        self.assertIn("count from 0", self.refuse(missing, "--episode", "-1"))
+        self.assertIn("expected a whole number from 0", self.refuse(missing, "--episode", "-1"))
         self.assertIn("there is no backend 'havok'", self.refuse(missing, "--backend", "havok"))
         wrong = self.folder / "wrong.npz"
         np.savez(wrong, schema="xreset-replays/1")

@@ -11,6 +11,7 @@ from xreset.eval.engines.replay import EngineTrace, TraceResult
 
 if TYPE_CHECKING:
     from rich.table import Table
+    from rich.text import Text
 
 _SHOWN = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "N": ("N", 1.0), "fingers": ("fingers", 1.0)}
 
@@ -60,8 +61,8 @@ def _sentence(result: TraceResult, engine: EngineTrace) -> str:
     return f"{engine.name} parts first in {first.quantity} at {first.time:.3f} s{during}{where}."
 
 
-def _cell(result: TraceResult, p: Parting, *, dim: bool) -> str:
-    from rich.markup import escape
+def _cell(result: TraceResult, p: Parting, *, dim: bool) -> Text:
+    from rich.text import Text
 
     if p.time is None:
         first = "never"
@@ -72,8 +73,8 @@ def _cell(result: TraceResult, p: Parting, *, dim: bool) -> str:
     most = f"most {shown(p, p.largest)} at {p.largest_time:.2f} s"
     if p.largest_where and p.largest_where != p.where:
         most += f" ({p.largest_where})"
-    text = escape(f"{first}\nend {shown(p, p.end)}\n{most}")
-    return f"[dim]{text}\nwithin noise[/]" if dim and p.time is not None else text
+    text = f"{first}\nend {shown(p, p.end)}\n{most}"
+    return Text(f"{text}\nwithin noise", "dim") if dim and p.time is not None else Text(text)
 
 
 def _height(metres: float) -> str:

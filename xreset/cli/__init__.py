@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
+from io import TextIOWrapper
+from typing import NoReturn
 
 COMMANDS: dict[str, str] = {
     "demos": "Import, make and describe human demonstrations.",
@@ -38,6 +40,9 @@ def main(argv: list[str] | None = None) -> None:
     from xreset.errors import XResetError
 
     argv = sys.argv[1:] if argv is None else argv
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # what the terminal has no character for is written as an escape
+            stream.reconfigure(errors="backslashreplace")
     if not argv or argv[0] in ("-h", "--help"):
         print(_usage())
         return
@@ -52,26 +57,41 @@ def main(argv: list[str] | None = None) -> None:
     try:
         _run(argv[0], argv[1:])
     except XResetError as error:
-        print(f"xreset {argv[0]}: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
+        _fail(argv[0], str(error))
     except KeyboardInterrupt:
         print("\nstopped.", file=sys.stderr)
         raise SystemExit(130) from None
     except BrokenPipeError:  # `xreset ... | head`
         sys.stderr.close()
         raise SystemExit(0) from None
+    except OSError as error:  # a name too long, a folder that may not be read, a port that is taken
+        if error.strerror is None:
+            raise
+        _fail(argv[0], f"{error.strerror}: {error.filename}" if error.filename else error.strerror)
+    except MemoryError:
+        _fail(argv[0], "there is too little memory for this. Use fewer worlds (--num-envs) or a smaller file.")
+
+
+def _fail(command: str, message: str) -> NoReturn:
+    from xreset.text import plain
+
+    print(f"xreset {command}: {plain(message)}", file=sys.stderr)
+    raise SystemExit(1) from None
 
 
 def _run(name: str, arguments: list[str]) -> None:
     import tyro
 
+    from xreset.cli._options import checked
+
     module = import_module(f"xreset.cli.{name}")
     command = module.command_for(arguments) if hasattr(module, "command_for") else module.COMMAND
     program = f"xreset {name}"
     if isinstance(command, dict):
-        tyro.extras.subcommand_cli_from_dict(command, prog=program, description=COMMANDS[name], args=arguments)
+        verbs = {verb: checked(function) for verb, function in command.items()}
+        tyro.extras.subcommand_cli_from_dict(verbs, prog=program, description=COMMANDS[name], args=arguments)
     else:
-        tyro.cli(command, prog=program, description=COMMANDS[name], args=arguments)
+        tyro.cli(checked(command), prog=program, description=COMMANDS[name], args=arguments)
 
 
 def _usage() -> str:

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 @contextmanager
 def engine_bars(console: Console, names: Sequence[str]) -> Iterator[Callable[[str, int, int], None]]:
     """One bar for each engine; gives the function that moves them: (engine, steps done, steps in all)."""
-    from rich.progress import Progress
+    from xreset.cli._terminal import Progress
 
-    with Progress(console=console, transient=True) as bar:
+    with Progress(console) as bar:
         tasks = {name: bar.add_task(name, total=None) for name in names}
         yield lambda name, done, total: bar.update(tasks[name], completed=done, total=total)

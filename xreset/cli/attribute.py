@@ -51,9 +51,8 @@ def attribute(
         out: Folder for attribution.json and attribution.png; default: attribute/ beside the policy's results.
     """
     import numpy as np
-    from rich.console import Console
-    from rich.progress import Progress
 
+    from xreset.cli._terminal import Console, Progress
     from xreset.errors import DemoError, XResetError
     from xreset.eval.engines.attribution import attribute as experiment
     from xreset.eval.engines.figures import write_plot
@@ -81,7 +80,7 @@ def attribute(
         chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, max_demos).round().astype(int))]
     loaded = load_objects(sorted({*map(str, bank.sequence_object[chosen])}), folder)
     out = out or subject.folder.parent / "attribute"
-    with Progress(console=console, transient=True) as bar:
+    with Progress(console) as bar:
         task = bar.add_task("", total=None)
         found = experiment(
             lambda: subject.policy(subject.robot, trajectories), a, b, subject.robot, loaded, bank, evaluation_task(subject.task),
@@ -103,9 +102,9 @@ def attribute(
     write_plot(out / "attribution.png", found, title)
     console.print(rich_table(found, title))
     for line in not_tried(found):
-        console.print(line, style="dim", markup=False, highlight=False)
-    console.print(verdict(found), markup=False, highlight=False)
-    console.print(f"results in {out}", markup=False)
+        console.print(line, style="dim", highlight=False)
+    console.print(verdict(found), highlight=False)
+    console.print(f"results in {out}")
 
 
 COMMAND = attribute

@@ -5,16 +5,15 @@ from __future__ import annotations
 
 def backends() -> None:
     """List the physics engines: name, engine version, device, and why not where one cannot be used."""
-    from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
 
+    from xreset.cli._terminal import Console
     from xreset.plugins import backend_names, backend_status
 
     table = Table("backend", "engine version", "device", "available")
     for name in backend_names():
         status = backend_status(name)
-        table.add_row(name, status.version or "-", status.device, "yes" if status.reason is None else f"no: {escape(status.reason)}")
+        table.add_row(name, status.version or "-", status.device, "yes" if status.reason is None else f"no: {status.reason}")
     Console().print(table)
 
 

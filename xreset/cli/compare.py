@@ -30,8 +30,7 @@ def compare(
         apart: Show also runs that differ in their seed only one by one.
         out: Folder for compare.png and compare.md.
     """
-    from rich.console import Console
-
+    from xreset.cli._terminal import Console
     from xreset.eval.report.compare import compare as make
     from xreset.eval.report.tables import rich_different, rich_results
 
@@ -43,10 +42,10 @@ def compare(
     if made.different.body:
         console.print(rich_different(made.different))
     for caption in made.captions:
-        console.print(caption, markup=False, highlight=False)
+        console.print(caption, highlight=False)
     for note in made.notes:
-        console.print(f"note: {note}", style="yellow", markup=False)
-    console.print(f"picture: {made.picture}\npage:    {made.page}", markup=False, soft_wrap=True)
+        console.print(f"note: {note}", style="yellow")
+    console.print(f"picture: {made.picture}\npage:    {made.page}", soft_wrap=True)
 
 
 COMMAND = compare

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from torch import Tensor
 
     from xreset.backends.conformance import CheckResult, MakeBackend, Measure
+    from xreset.cli._terminal import Console
     from xreset.physics import Backend
     from xreset.spec import SceneSpec
 
@@ -36,11 +36,12 @@ def conformance(
         json: File to write the results to.
         verbose: Show every number that was measured, not only the one nearest to its tolerance.
     """
-    from rich.console import Console
+    from rich.text import Text
 
     from xreset import __version__, robots
     from xreset.backends.conformance import CHECKS, SCHEMA, run
     from xreset.backends.conformance.scene import gripper
+    from xreset.cli._terminal import Console
     from xreset.errors import XResetError
     from xreset.files import write_json
     from xreset.plugins import backend_class, backend_status
@@ -54,7 +55,8 @@ def conformance(
     for name in dict.fromkeys(backend) or _usable(console):
         status = backend_status(name)
         used = device if device.split(":")[0] in status.device else "cpu"
-        console.print(f"[bold]{name}[/] {status.version}, {spec.name}, {used}: verdict, check, and what came nearest to its tolerance")
+        what = f" {status.version}, {spec.name}, {used}: verdict, check, and what came nearest to its tolerance"
+        console.print(Text.assemble((name, "bold"), what))
         results = run(_maker(name, used), robot=spec, only=check or None, report=lambda r: _print(console, r, verbose))
         runs.append(
             {
@@ -70,7 +72,7 @@ def conformance(
     if json is not None:
         command = _command(backend, robot, device, check)
         write_json(json, {"schema": SCHEMA, "xreset_version": __version__, "command": command, "runs": runs})
-        console.print(f"wrote {json}", markup=False)
+        console.print(f"wrote {json}")
     failed = sum(result["verdict"] == "failed" for record in runs for result in record["checks"])
     console.print(f"{failed} checks failed" if failed else "no check failed", style="bold red" if failed else "bold green")
     if failed:
@@ -95,7 +97,7 @@ def _usable(console: Console) -> list[str]:
         if status.reason is None:
             names.append(name)
         else:
-            console.print(f"left out {name}: {status.reason}", markup=False)
+            console.print(f"left out {name}: {status.reason}")
     return names
 
 
@@ -119,19 +121,21 @@ _STYLE = {"passed": "green", "known difference": "cyan", "failed": "bold red", "
 
 
 def _print(console: Console, result: CheckResult, verbose: bool) -> None:
+    from rich.text import Text
+
     detail = _text(result.worst) if result.measures else result.problem
-    console.print(f"  [{_STYLE[result.verdict]}]{result.verdict:<16}[/] {result.name:<22} {result.seconds:5.1f} s  ", end="")
-    console.print(detail, markup=False)
+    verdict = (f"{result.verdict:<16}", _STYLE[result.verdict])
+    console.print(Text.assemble("  ", verdict, f" {result.name:<22} {result.seconds:5.1f} s  {detail}"))
     for measure in result.measures:
         if verbose or measure.verdict != "passed":
-            console.print(f"{'':19}{measure.verdict}: {_text(measure)}", markup=False)
+            console.print(f"{'':19}{measure.verdict}: {_text(measure)}")
             if measure.verdict == "known difference" and measure.known is not None:
-                console.print(f"{'':19}accepted up to {measure.known.bound:.3g}: {measure.known.reason}", markup=False)
+                console.print(f"{'':19}accepted up to {measure.known.bound:.3g}: {measure.known.reason}")
     if result.verdict == "failed":
-        console.print(f"{'':19}asserted: {result.check.statement}", markup=False)
+        console.print(f"{'':19}asserted: {result.check.statement}")
         if result.problem:
-            console.print(f"{'':19}raised: {result.problem}", markup=False)
-        console.print(f"{'':19}likely: {result.check.cause}", markup=False)
+            console.print(f"{'':19}raised: {result.problem}")
+        console.print(f"{'':19}likely: {result.check.cause}")
 
 
 def _text(measure: Measure | None) -> str:

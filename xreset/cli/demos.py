@@ -85,9 +85,9 @@ def mirror(
         objects: Folder of real meshes; default: the built-in stand-ins.
         tolerance: Largest distance between an object's surface and its reflection, over 95 % of it [m].
     """
-    from rich.console import Console
     from rich.table import Table
 
+    from xreset.cli._terminal import Console
     from xreset.demos import demo_objects, mirrored, read_demos, symmetry, write_demos
     from xreset.files import file_hash
 
@@ -119,10 +119,9 @@ def _sides(side: Side) -> tuple[Literal["right", "left"], ...]:
 
 @contextmanager
 def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
-    from rich.console import Console
-    from rich.progress import Progress
+    from xreset.cli._terminal import Console, Progress
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    with Progress(Console(stderr=True)) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total, name: bar.update(task, completed=done, total=total, description=f"{what}: {name}")
 
@@ -130,9 +129,9 @@ def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
 def _print_summary(demos: Demos, path: Path) -> None:
     from math import degrees
 
-    from rich.console import Console
     from rich.table import Table
 
+    from xreset.cli._terminal import Console
     from xreset.demos.info import summarize
 
     columns = ("right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg")

@@ -37,15 +37,11 @@ def evaluate(
         out: Folder for the results; default: eval/ in the run folder or beside the policy; runs/NAME/eval for a policy that ships with
             xreset, runs/BASELINE-ROBOT/eval for a baseline.
     """
-    from rich.console import Console
-
     from xreset.cli._bars import engine_bars
-    from xreset.errors import XResetError
+    from xreset.cli._terminal import Console
     from xreset.eval.evaluate import evaluate, resolve
     from xreset.eval.table import rich_table
 
-    if episodes < 1 or num_envs < 1:
-        raise XResetError(f"--episodes and --num-envs must be at least 1, found {episodes} and {num_envs}.")
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
     console = Console()
     subject = resolve(policy, robot, seed)

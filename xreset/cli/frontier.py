@@ -36,16 +36,14 @@ def frontier(
         device: Where GPU engines run: cpu or cuda.
         out: Folder for the results; default: frontier/ in the run folder or beside the policy.
     """
-    from rich.console import Console
     from rich.table import Table
 
     from xreset.cli._bars import engine_bars
-    from xreset.errors import PolicyError, XResetError
+    from xreset.cli._terminal import Console
+    from xreset.errors import PolicyError
     from xreset.eval.evaluate import resolve
     from xreset.eval.frontier import STAGES, frontier
 
-    if states < 1 or num_envs < 1:
-        raise XResetError(f"--states and --num-envs must be at least 1, found {states} and {num_envs}.")
     if policy == "ik":
         raise PolicyError("ik follows a demonstration from its beginning and cannot go on from a state. Give a policy, zero or random.")
     backends = list(dict.fromkeys(backend)) or ["mujoco"]

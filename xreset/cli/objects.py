@@ -19,8 +19,7 @@ def list_(*, objects: Path | None = None) -> None:
     Args:
         objects: Folder of real meshes; default: the built-in stand-ins.
     """
-    from rich.console import Console
-
+    from xreset.cli._terminal import Console
     from xreset.objects import load_object, object_names
 
     table = _table()
@@ -35,8 +34,7 @@ def import_(folder: Annotated[Path, tyro.conf.Positional]) -> None:
     Args:
         folder: Folder with NAME.obj, NAME/textured_simple.obj or NAME/textured.obj; in metres, in the frame of the object poses.
     """
-    from rich.console import Console
-
+    from xreset.cli._terminal import Console
     from xreset.objects.meshes import import_with_notes, mesh_files
 
     console = Console()

@@ -10,6 +10,7 @@ import tyro
 
 if TYPE_CHECKING:
     from rich.table import Table
+    from rich.text import Text
 
     from xreset.eval.engines.agreement import EngineParity, Parity
     from xreset.eval.engines.metrics import Metric
@@ -43,22 +44,17 @@ def parity(
         device: Where engines run that can run on GPUs: cpu or cuda.
         json: File to write the results to.
     """
-    from rich.console import Console
-    from rich.progress import Progress
-
     from xreset import __version__
-    from xreset.errors import XResetError
+    from xreset.cli._terminal import Console, Progress
     from xreset.eval.engines.agreement import REFERENCE, compare
     from xreset.eval.engines.load import load_frames
     from xreset.eval.engines.trials import engine
     from xreset.files import file_hash, write_json
 
-    if grasps < 1:
-        raise XResetError(f"--grasps must be at least 1, found {grasps}.")
     console = Console(highlight=False, soft_wrap=True)
     names = [name for name in dict.fromkeys(backend) if name != REFERENCE] if backend else _usable(console, REFERENCE)
     engines = [engine(name, device=device) for name in names]
-    with Progress(console=console, transient=True) as bar:
+    with Progress(console) as bar:
         task = bar.add_task("reading")
         spec, loaded, frames = load_frames(
             motion, robot=robot, objects_folder=objects, only=only,
@@ -76,11 +72,9 @@ def parity(
     if json is not None:
         command = _command(motion, robot, objects, only, backend, grasps, device)
         write_json(json, result.as_dict() | {"xreset_version": __version__, "command": command, "inputs": inputs})
-        console.print(f"wrote {json}", markup=False)
+        console.print(f"wrote {json}")
     missed = [f"{tested.engine.name}: {metric.name}" for tested in result.engines for metric in tested.metrics if not metric.ok]
-    console.print(
-        f"missed: {'; '.join(missed)}" if missed else "all targets met", style="bold red" if missed else "bold green", markup=False
-    )
+    console.print(f"missed: {'; '.join(missed)}" if missed else "all targets met", style="bold red" if missed else "bold green")
     if missed:
         raise SystemExit(1)
 
@@ -113,7 +107,7 @@ def _usable(console, reference: str) -> list[str]:
     for name in backend_names():
         status = backend_status(name)
         if status.reason is not None:
-            console.print(f"left out {name}: {status.reason}", markup=False)
+            console.print(f"left out {name}: {status.reason}")
         elif name != reference:
             names.append(name)
     return names
@@ -139,9 +133,11 @@ def _table(result: Parity) -> Table:
     return table
 
 
-def _cell(metric: Metric) -> str:
+def _cell(metric: Metric) -> Text:
+    from rich.text import Text
+
     style = "green" if metric.ok else "bold red"
-    return f"[{style}]{_number(metric.measured, metric.unit)}[/] (n = {metric.n})"
+    return Text.assemble((_number(metric.measured, metric.unit), style), f" (n = {metric.n})")
 
 
 def _number(value: float, unit: str) -> str:

@@ -10,9 +10,9 @@ import tyro
 
 def list_() -> None:
     """List the policies that ship with xreset; wherever a policy is asked for, their names will do."""
-    from rich.console import Console
     from rich.table import Table
 
+    from xreset.cli._terminal import Console
     from xreset.policies import shipped
     from xreset.policy import OnnxPolicy
 
@@ -30,13 +30,12 @@ def shrink(policy: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, t
         policy: Exported policy (.onnx).
         out: File to write.
     """
-    from rich.console import Console
-
+    from xreset.cli._terminal import Console
     from xreset.learning.shrink import shrink as write_shrunk
 
     before = policy.stat().st_size if policy.is_file() else 0  # now, for the output may replace it; of what is no file, shrinking complains
     write_shrunk(policy, out)
-    Console().print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, was {before / 1e6:.2f} MB", markup=False, highlight=False, soft_wrap=True)
+    Console().print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, was {before / 1e6:.2f} MB", highlight=False, soft_wrap=True)
 
 
 COMMAND = {"list": list_, "shrink": shrink}

@@ -19,9 +19,7 @@ def report(
         robot: Name or folder of the robot, for the clips; default: as the results name it.
         objects: Folder of real meshes, for the clips; default: as the results name it.
     """
-    from rich.console import Console
-    from rich.progress import Progress
-
+    from xreset.cli._terminal import Console, Progress
     from xreset.eval.report import make_report
     from xreset.eval.table import rich_table
     from xreset.policies import results_folder, shipped
@@ -29,7 +27,7 @@ def report(
     if not run.exists() and str(run) in shipped():
         run = results_folder(str(run))
     console = Console()
-    with Progress(console=console, transient=True) as bar:
+    with Progress(console) as bar:
         task = bar.add_task("drawing clips", total=None)
         made = make_report(
             run, out, robot=robot, objects=objects, progress=lambda done, total: bar.update(task, completed=done, total=total)
@@ -37,8 +35,8 @@ def report(
     console.print(rich_table(made.summaries))
     console.print(made.headline)
     for note in made.notes:
-        console.print(f"note: {note}", style="yellow", markup=False)
-    console.print(f"page:    {made.html}\npicture: {made.overview}", markup=False, soft_wrap=True)
+        console.print(f"note: {note}", style="yellow")
+    console.print(f"page:    {made.html}\npicture: {made.overview}", soft_wrap=True)
 
 
 COMMAND = report

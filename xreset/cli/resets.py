@@ -30,11 +30,10 @@ def resets(
         num_envs: Worlds at a time.
         device: Where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
     """
-    from rich.console import Console
-    from rich.progress import Progress
     from rich.table import Table
 
     from xreset.accounts import accounts_path, described, with_totals, write_accounts
+    from xreset.cli._terminal import Console, Progress
     from xreset.description import load_robot
     from xreset.files import file_hash
     from xreset.objects import load_objects
@@ -50,7 +49,7 @@ def resets(
         retargeted, "retargeted file", spec, name=data.robot, joint_names=tuple(data.joint_names), fingerprint=data.robot_fingerprint
     )
     loaded = load_objects(sorted({*map(str, data.object_name)}), objects)
-    with Progress(console=console, transient=True) as bar:
+    with Progress(console) as bar:
         task = bar.add_task(f"states in {', '.join(backends)}")
         bank = make_bank(
             data, spec, loaded, backends, num_envs=num_envs, device=device,

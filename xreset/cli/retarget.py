@@ -44,11 +44,10 @@ def retarget(
     from dataclasses import asdict
 
     import numpy as np
-    from rich.console import Console
-    from rich.progress import Progress
     from rich.table import Table
 
     from xreset.accounts import accounts_path, described, with_totals, write_accounts
+    from xreset.cli._terminal import Console, Progress
     from xreset.demos import demo_objects, levelled, read_demos
     from xreset.demos.align import on_something
     from xreset.description import load_robot
@@ -67,7 +66,7 @@ def retarget(
     if restart:
         discard(partial)
     try:
-        with Progress(console=console, transient=True) as bar:
+        with Progress(console) as bar:
             task = bar.add_task("sequences", total=chosen.num_sequences)
             result = pipeline.retarget(
                 chosen, spec, list(specs.values()), config,

@@ -13,9 +13,9 @@ from xreset.robot_tools.placement import PlaceConfig, Reach
 
 def list_robots() -> None:
     """List the robots: built in, and from installed packages."""
-    from rich.console import Console
     from rich.table import Table
 
+    from xreset.cli._terminal import Console
     from xreset.description import load_robot, robot_folder
     from xreset.plugins import robot_names
 
@@ -45,9 +45,9 @@ def check(
         picture: write a picture (PNG) of the robot at home, with the frames of its palm, fingertips and joints.
         engines: build the robot in every installed engine (the first time, mujoco-warp compiles for a minute or two).
     """
-    from rich.console import Console
-    from rich.markup import escape
+    from rich.text import Text
 
+    from xreset.cli._terminal import Console
     from xreset.robot_tools.check import Finding
     from xreset.robot_tools.check import check as run_checks
 
@@ -55,8 +55,8 @@ def check(
     styles = {"ok": "green", "skipped": "dim", "warning": "yellow", "error": "bold red"}
 
     def report(finding: Finding) -> None:
-        level = f"[{styles[finding.level]}]{finding.level:8}[/]"
-        console.print(f"{level} {escape(finding.topic)}: {escape(finding.message)}", soft_wrap=True, highlight=False)
+        level = (f"{finding.level:8}", styles[finding.level])
+        console.print(Text.assemble(level, f" {finding.topic}: {finding.message}"), soft_wrap=True)
 
     findings = run_checks(robot, report=report, engines=engines)
     counts = {level: sum(finding.level == level for finding in findings) for level in ("error", "warning")}
@@ -96,9 +96,8 @@ def place(
     from dataclasses import fields
 
     import numpy as np
-    from rich.console import Console
-    from rich.progress import Progress
 
+    from xreset.cli._terminal import Console, Progress
     from xreset.demos import demo_objects, read_demos
     from xreset.description import DESCRIPTION, load_robot, robot_folder
     from xreset.retarget.pipeline import rest_on_table, wrist_paths
@@ -109,7 +108,7 @@ def place(
     spec = load_robot(robot)
     chosen = read_demos(demos).select(max_per_object=max_per_object)
     specs = list(demo_objects(chosen, objects).values())
-    with Progress(console=console, transient=True) as bar:
+    with Progress(console) as bar:
         task = bar.add_task("hand retargeting", total=chosen.num_sequences)
         paths = wrist_paths(chosen, spec, specs, progress=lambda done, total: bar.update(task, completed=done, total=total))
         wrists = np.concatenate([path.root_pos[path.annotated].numpy() for path in paths])

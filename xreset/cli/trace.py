@@ -67,9 +67,7 @@ def trace(
     """
     import math
 
-    from rich.console import Console
-    from rich.progress import Progress
-
+    from xreset.cli._terminal import Console, Progress
     from xreset.errors import XResetError
     from xreset.eval.engines.actions import write_actions
     from xreset.eval.engines.divergence import Thresholds
@@ -97,7 +95,7 @@ def trace(
     base = engine(reference, device=device)
     names = [name for name in dict.fromkeys(backend) or _usable(console) if name != reference]
     engines = [engine(name, device=device) for name in names]
-    with Progress(console=console, transient=True) as bar:
+    with Progress(console) as bar:
         task = bar.add_task("actions", total=None)
 
         def show(what: str) -> Callable[[int, int], None]:
@@ -120,8 +118,8 @@ def trace(
             write_film(out / "film.mp4", result, progress=show("film"))
     console.print(rich_table(result))
     for sentence in sentences(result):
-        console.print(sentence, markup=False, highlight=False)
-    console.print(f"results in {out}", markup=False)
+        console.print(sentence, highlight=False)
+    console.print(f"results in {out}")
 
 
 def _usable(console) -> list[str]:
@@ -131,7 +129,7 @@ def _usable(console) -> list[str]:
     statuses = [backend_status(name) for name in backend_names()]
     for status in statuses:
         if status.reason is not None:
-            console.print(f"left out {status.name}: {status.reason}", markup=False)
+            console.print(f"left out {status.name}: {status.reason}")
     return [status.name for status in statuses if status.reason is None]
 
 

@@ -96,15 +96,13 @@ def _write_png(path: Path, shown: View, rows: np.ndarray, frame: int | None) -> 
 
 
 def _write_sheet(path: Path, shown: View, *, moments: bool) -> None:
-    from rich.console import Console
-    from rich.progress import Progress
-
+    from xreset.cli._terminal import Console, Progress
     from xreset.pictures.raster import write_png
     from xreset.pictures.view.sheet import draw_sheet, moment_tiles, reason_tiles
 
     tiles = moment_tiles(shown) if moments else reason_tiles(shown)
     console = Console()
-    with Progress(console=console, transient=True) as bar:
+    with Progress(console) as bar:
         task = bar.add_task("drawing", total=len(tiles))
         picture = draw_sheet(shown, tiles, progress=lambda done, total: bar.update(task, completed=done, total=total))
     write_png(path, picture)
@@ -115,9 +113,9 @@ def _write_sheet(path: Path, shown: View, *, moments: bool) -> None:
 
 def _write_mp4(path: Path, shown: View, rows: np.ndarray) -> None:
     import numpy as np
-    from rich.console import Console
     from rich.progress import track
 
+    from xreset.cli._terminal import Console
     from xreset.errors import XResetError
     from xreset.eval.report.clips import encode_mp4
     from xreset.files import atomic_write

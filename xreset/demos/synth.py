@@ -73,8 +73,8 @@ def synthesize(
         ObjectError: unknown object.
         DemoError: ``per_object`` is not positive, or ``fps`` is too small for a motion of a second.
     """
-    if per_object < 1 or not fps >= 5:
-        raise DemoError(f"per_object is {per_object} and fps is {fps}, expected at least 1 and 5.")
+    if per_object < 1 or not 5 <= fps <= 1000:
+        raise DemoError(f"per_object is {per_object} and fps is {fps}, expected at least 1, and 5 to 1000.")
     specs = [load_object(name) for name in (object_names() if objects is None else objects)]
     parts = []
     for spec in specs:

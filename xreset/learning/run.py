@@ -21,7 +21,6 @@ from xreset.checks import check_numbers
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.files import read_json, write_json
 from xreset.learning.config import TrainConfig
-from xreset.policy import check_contract_entries
 from xreset.text import shown
 from xreset.typed import from_dict
 
@@ -55,7 +54,6 @@ class RunInfo:
 
     def __post_init__(self) -> None:
         check_numbers(self, positive=("num_envs",), not_negative=("seed",))
-        check_contract_entries("the contract", self.contract)
 
 
 def write_run(folder: Path, info: RunInfo) -> None:
@@ -70,15 +68,19 @@ def read_run(folder: str | Path) -> RunInfo:
         RunError: the folder is no run.
         FileFormatError: the file is damaged, or of another version of xreset.
     """
+    from xreset.policy import check_contract_entries  # torch, which --help must not wait for
+
     folder = Path(folder)
     if not (folder / "run.json").is_file():
         raise RunError(f"{folder} is not a run folder: it has no run.json. Make one with: xreset train --out {folder} ...")
     data = read_json(folder / "run.json", SCHEMA)
     where = f"{folder / 'run.json'} (of xreset {shown(data.pop('xreset', None))})"
+    info = from_dict(RunInfo, {name: value for name, value in data.items() if name != "schema"}, where)
     try:
-        return from_dict(RunInfo, {name: value for name, value in data.items() if name != "schema"}, where)
+        check_contract_entries("it", info.contract)
     except PolicyError as error:
         raise FileFormatError(f"{where}: {error}") from error
+    return info
 
 
 def checkpoints(folder: Path) -> list[Path]:

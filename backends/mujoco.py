@@ -165,6 +165,16 @@ class MujocoWorld(World):
         self._model.body_gravcomp[self._at.object_body] = 1.0 - fraction
         self._ahead = False
 
+    def set_drives(self, scale: np.ndarray) -> None:
+        """See :meth:`World.set_drives`."""
+        model, nominal = self._model, self._at.model
+        stiffness, damping, effort = scale
+        model.actuator_gainprm[:, 0] = stiffness * nominal.actuator_gainprm[:, 0]
+        model.actuator_biasprm[:, 1] = stiffness * nominal.actuator_biasprm[:, 1]
+        model.actuator_biasprm[:, 2] = damping * nominal.actuator_biasprm[:, 2]
+        model.actuator_forcerange[:] = effort[:, None] * nominal.actuator_forcerange
+        self._ahead = False
+
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
         """See :meth:`World.set_object_wrench`."""
         self._wrench[:3], self._wrench[3:] = force, torque

@@ -34,6 +34,7 @@ unread; ``tests/test_mujoco_warp_depth.py`` says whether they need it too."""
 
 _SET_PER_WORLD = (
     "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "body_gravcomp", "geom_friction",
+    "actuator_gainprm", "actuator_biasprm", "actuator_forcerange",
 )  # fmt: skip
 """Model fields that the setters change: they and all that MuJoCo derives from them must be batched, or every world gets world 0's."""
 
@@ -181,9 +182,23 @@ class MujocoWarpBackend(Backend):
         self._must_be_open()
         return Health(nonfinite=self._nonfinite, overflow=(self._overflow & _OVERFLOW) != 0)
 
-    def set_where(self, mask: Tensor, *, state: State, friction: Tensor, object_mass: Tensor, object_gravity: Tensor) -> None:
+    def set_where(
+        self,
+        mask: Tensor,
+        *,
+        state: State,
+        friction: Tensor,
+        object_mass: Tensor,
+        object_gravity: Tensor,
+        drives: Tensor | None = None,
+    ) -> None:
         """See :meth:`Backend.set_where`: a few copies and one graph."""
         self._must_be_open()
+        if drives is not None:
+            scaled = self._scaled_drives(self._rows(drives, (self.num_worlds, 3, self._ctrl.shape[1])))
+            for (field, column), value in scaled.items():
+                present = self._field[field][:, :, column]
+                present.copy_(torch.where(mask[:, None], value, present))
         self._coming["mask"].copy_(mask)
         for f in fields(State):
             self._coming[f.name].copy_(self._checked(f.name, getattr(state, f.name), self.num_worlds))
@@ -232,6 +247,23 @@ class MujocoWarpBackend(Backend):
         index = self._selected(worlds)
         fraction = self._rows(fraction, self._nominal["mass"][index].shape)
         self._field["body_gravcomp"][index, self._at.object_body] = 1.0 - fraction
+
+    def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_drives`."""
+        index = self._selected(worlds)
+        scale = self._rows(scale, (len(self._nominal["mass"][index]), 3, self._ctrl.shape[1]))
+        for (field, column), value in self._scaled_drives(scale).items():
+            self._field[field][index, :, column] = value
+
+    def _scaled_drives(self, scale: Tensor) -> dict[tuple[str, int], Tensor]:
+        """Field and column of the model -> its values [M, J] for factors [M, 3, J] on stiffness, damping and effort limit."""
+        factors = {"actuator_gainprm": (0,), "actuator_biasprm": (0, 1), "actuator_forcerange": (2, 2)}
+        first = {"actuator_gainprm": 0, "actuator_biasprm": 1, "actuator_forcerange": 0}
+        return {
+            (field, first[field] + i): scale[:, row] * self._nominal[field][:, first[field] + i]
+            for field, rows in factors.items()
+            for i, row in enumerate(rows)
+        }
 
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         """See :meth:`Backend.set_object_wrench`."""
@@ -317,6 +349,7 @@ class MujocoWarpBackend(Backend):
             "total_mass": self._field["body_subtreemass"][:, 0].clone(),
             "body_invweight": self._field["body_invweight0"][:, body].clone(),
             "dof_invweight": self._field["dof_invweight0"][:, dofs].clone(),
+            **{name: self._field[name][0].clone() for name in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")},
         }
 
     def _prepare(self) -> None:

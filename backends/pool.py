@@ -111,6 +111,10 @@ class World(ABC):
     def set_object_gravity(self, fraction: float) -> None:
         """Set the object's gravity fraction."""
 
+    def set_drives(self, scale: np.ndarray) -> None:
+        """Set factors (3, J) on the drives' stiffness, damping and effort limit; called only with the capability ``drives``."""
+        raise NotImplementedError
+
     @abstractmethod
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
         """Set the force (3,) at the object's centre of mass and the torque (3,); called before every :meth:`step`."""
@@ -266,6 +270,11 @@ class PoolBackend(Backend):
         self._require("object_gravity", "use another backend for gravity fractions.")
         self._set_parameter("object_gravity", fraction, worlds)
 
+    def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_drives`."""
+        self._require("drives", "build a scene whose robot has such drives.")
+        self._set_parameter("drives", scale, worlds)
+
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         """See :meth:`Backend.set_object_wrench`; the worlds read it at the next step."""
         self._require("object_wrench", "use another backend for external wrenches.")
@@ -401,6 +410,7 @@ def _layout(n: int, robot: RobotSpec) -> Layout:
         "object_mass": ((n,), f),
         "friction": ((n, 3), f),
         "object_gravity": ((n,), f),
+        "drives": ((n, 3, joints), f),
         "wrench": ((n, 6), f),
         "body_mass": ((n, bodies), f),
         "body_com": ((n, bodies, 3), f),
@@ -468,6 +478,7 @@ _GIVEN = {
     "set_object_mass": ("object_mass",),
     "set_friction": ("friction",),
     "set_object_gravity": ("object_gravity",),
+    "set_drives": ("drives",),
 }
 """Arrays that a command's worlds are given, in double precision."""
 
@@ -545,6 +556,9 @@ class _Local:
 
     def _set_object_gravity(self, i: int, _) -> None:
         self._worlds[i].set_object_gravity(float(self._given["object_gravity"][i]))
+
+    def _set_drives(self, i: int, _) -> None:
+        self._worlds[i].set_drives(self._given["drives"][i])
 
     def _publish(self, i: int) -> None:
         world, arrays = self._worlds[i], self._arrays

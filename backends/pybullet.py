@@ -218,6 +218,10 @@ class PybulletWorld(World):
         """See :meth:`World.set_object_gravity`."""
         self._fraction = fraction
 
+    def set_drives(self, scale: np.ndarray) -> None:
+        """See :meth:`World.set_drives`."""
+        self._drives.scale(scale.astype(np.float64))
+
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
         """See :meth:`World.set_object_wrench`."""
         self._force, self._torque = force, torque
@@ -339,9 +343,9 @@ class _Drives:
         self._multiplier = np.array([mimic.multiplier for mimic in spec.mimics])
         self._offset = np.array([mimic.offset for mimic in spec.mimics])
         drives = [joint.drive for joint in spec.joints]
-        self._kp, self._kd, self._effort, self._armature, self._loss = (
-            np.array([getattr(drive, field) for drive in drives]) for field in ("kp", "kd", "effort", "armature", "friction_loss")
-        )
+        self._nominal = np.array([[getattr(drive, field) for drive in drives] for field in ("kp", "kd", "effort")])
+        self._kp, self._kd, self._effort = self._nominal
+        self._armature, self._loss = (np.array([getattr(drive, field) for drive in drives]) for field in ("armature", "friction_loss"))
         self._brakes = bool(self._loss.any())
 
         self.reset(spec.home, np.zeros(len(drives)), spec.home)
@@ -369,6 +373,11 @@ class _Drives:
         self.target = target
         self._mass_matrix_age = 0
         self._last_step: tuple[np.ndarray, np.ndarray] | None = None
+
+    def scale(self, factors: np.ndarray) -> None:
+        """Set factors (3, J) on stiffness, damping and effort limit."""
+        self._kp, self._kd, self._effort = factors * self._nominal
+        self._mass_matrix_age = 0  # what is implicit in the damping has to be factorised anew
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities [D] of all moving joints."""

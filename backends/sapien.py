@@ -189,6 +189,10 @@ class SapienWorld(World):
         """See :meth:`World.set_object_gravity`."""
         self._fraction = fraction
 
+    def set_drives(self, scale: np.ndarray) -> None:
+        """See :meth:`World.set_drives`."""
+        self._joints.set_drives(scale.astype(np.float64))
+
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
         """See :meth:`World.set_object_wrench`."""
         self._force, self._torque = force, torque
@@ -414,9 +418,7 @@ class _Joints:
         for joint in articulation.active_joints:
             joint.set_friction(0.0)
         for joint, described in zip(self._drives, spec.joints, strict=True):
-            drive = described.drive
-            joint.set_drive_properties(drive.kp, drive.kd, drive.effort, "force")
-            joint.set_armature(np.array([[drive.armature]]))
+            joint.set_armature(np.array([[described.drive.armature]]))
         for mimic in spec.mimics:
             _couple(articulation, joints, mimic)
 
@@ -424,9 +426,10 @@ class _Joints:
         self.target = spec.home
         """[J] drive targets."""
         self._dt = dt
-        self._kp, self._kd, self._effort, self._armature, self._loss = (
-            np.array([getattr(joint.drive, field) for joint in spec.joints])
-            for field in ("kp", "kd", "effort", "armature", "friction_loss")
+        self._nominal = np.array([[getattr(joint.drive, field) for joint in spec.joints] for field in ("kp", "kd", "effort")])
+        self.set_drives(np.ones_like(self._nominal))
+        self._armature, self._loss = (
+            np.array([getattr(joint.drive, field) for joint in spec.joints]) for field in ("armature", "friction_loss")
         )
         self._brakes = bool(self._loss.any())
         if self._brakes:
@@ -446,6 +449,12 @@ class _Joints:
         """Positions and velocities [J] of the actuated joints."""
         position, velocity = self._articulation.qpos, self._articulation.qvel
         return position[self._driven].astype(np.float64), velocity[self._driven].astype(np.float64)
+
+    def set_drives(self, scale: np.ndarray) -> None:
+        """Set factors (3, J) on stiffness, damping and effort limit."""
+        self._kp, self._kd, self._effort = scale * self._nominal
+        for joint, kp, kd, effort in zip(self._drives, self._kp.tolist(), self._kd.tolist(), self._effort.tolist(), strict=True):
+            joint.set_drive_properties(kp, kd, effort, "force")
 
     def set_targets(self, targets: np.ndarray) -> None:
         """Set the drive targets [J]."""

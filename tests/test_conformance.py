@@ -427,6 +427,19 @@ class BouncyContacts(_Remodelled):
         model.geom_solref[:] = (-2e4, -20.0)
 
 
+@breaks("drive_scale")
+class DriveScalesThatAccumulate(MujocoWorld):
+    def set_drives(self, scale):
+        self._scale = getattr(self, "_scale", 1.0) * scale
+        super().set_drives(self._scale)
+
+
+@breaks("drive_scale")
+class DriveScalesWithoutDamping(MujocoWorld):
+    def set_drives(self, scale):
+        super().set_drives(np.stack((scale[0], np.ones_like(scale[1]), scale[2])))
+
+
 @breaks("sliding_distance", "slope")
 class FrictionSquared(MujocoWorld):
     """As the product of two bodies that both have the pair's coefficient."""

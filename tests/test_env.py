@@ -22,6 +22,7 @@ from xreset.task.config import (
     ActionConfig,
     NoiseConfig,
     ObservationConfig,
+    RandomizationConfig,
     ResetConfig,
     RewardConfig,
     TaskConfig,
@@ -240,6 +241,54 @@ class ResetTest(WithEnv):
         self.assertTrue(bool(((scale >= 0.7) & (scale <= 1.3)).all()) and float(scale[0]) != float(scale[1]))
         self.assertEqual(tuple(friction.call_args.args[0].shape), (2, 3))
         self.assertTrue(torch.equal(gravity.call_args.args[0], env.gravity_fraction[[0, 2]]))
+
+
+class RobustnessTest(WithEnv):
+    def task(self, **ranges) -> TaskConfig:
+        return replace(QUIET, randomization=RandomizationConfig(**ranges))
+
+    def test_drives_hear_late_and_an_episode_begins_with_what_it_holds(self):
+        env = self.make(self.task(action_latency=(1.0, 1.0)))
+        actions, held = self.actions(4), env.joint_target.clone()
+        heard = []
+        with mock.patch.object(env.backend, "set_joint_targets", side_effect=lambda targets: heard.append(targets.clone())):
+            commanded = [env.step(action) and env.joint_target.clone() for action in actions]
+        for late, command in zip(heard, [held, *commanded], strict=False):
+            torch.testing.assert_close(late, command)
+
+    def test_the_objects_pose_is_seen_late(self):
+        env = self.make(self.task(observation_latency=(2.0, 2.0)))
+        poses, seen = [], []
+        for action in self.actions(6):
+            observations, *_ = env.step(action)
+            poses.append(env.backend.state().object_pos.clone())
+            seen.append(observations["policy"][:, :3].clone())
+        for late, pose in zip(seen[2:], poses, strict=False):
+            torch.testing.assert_close(late, pose)
+
+    def test_drives_are_set_for_the_worlds_that_begin(self):
+        env = self.make(self.task(arm_stiffness=(0.5, 0.6), hand_damping=(2.0, 3.0)))
+        with mock.patch.object(env.backend, "set_drives") as drives:
+            env.reset(torch.tensor([1]))
+        scale, worlds = drives.call_args.args
+        self.assertEqual((worlds.tolist(), tuple(scale.shape)), ([1], (1, 3, 7)))
+        self.assertTrue(bool((scale[0, 0, :3] < 0.6001).all() and (scale[0, 1, 3:] > 1.999).all() and (scale[0, 2] == 1).all()))
+        plain = self.make()
+        with mock.patch.object(plain.backend, "set_drives") as drives:
+            plain.reset(torch.tensor([1]))
+        self.assertFalse(drives.called)
+
+    def test_a_snapshot_holds_what_is_late_and_scaled(self):
+        task = self.task(action_latency=(0.0, 2.0), observation_latency=(0.0, 2.0), effort=(0.5, 1.0), force_gain=(0.5, 1.0))
+        env, other = self.make(task), self.make(task, seed=1)
+        for action in self.actions(5):
+            env.step(action)
+        self.assertTrue(other.restore(env.snapshot()))
+        other.set_rng_state(env.rng_state())
+        for action in self.actions(5, seed=1):
+            (one, *_), (two, *_) = env.step(action), other.step(action)
+        torch.testing.assert_close(one["policy"], two["policy"], atol=1e-4, rtol=0)
+        torch.testing.assert_close(env._drives, other._drives)
 
 
 class FailureTest(WithEnv):

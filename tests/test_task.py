@@ -29,7 +29,8 @@ from xreset.task.config import (
     TerminationConfig,
     evaluation_task,
 )
-from xreset.task.randomization import pair_friction, sample_friction, sample_mass_scale
+from xreset.task.latency import DelayLine
+from xreset.task.randomization import pair_friction, sample_drives, sample_friction, sample_mass_scale
 from xreset.task.rewards import RewardInput, compute_reward, contact_gate
 from xreset.task.terminations import episode_steps, out_of_bounds
 
@@ -265,7 +266,44 @@ class ActionTest(WithRobot):
         self.assertEqual(action[0, 3], 1.0)  # beyond the limit
 
 
+class LatencyTest(unittest.TestCase):
+    def test_values_come_late_and_are_mixed_between_whole_steps(self):
+        line = DelayLine(torch.zeros(4, 1), 2.0)
+        line.delay.copy_(torch.tensor([0.0, 1.0, 1.5, 2.0]))
+        line.fill(torch.ones(4, dtype=torch.bool), torch.zeros(4, 1))
+        heard = [line.push(torch.full((4, 1), float(value)))[:, 0].tolist() for value in (10, 20, 30)]
+        self.assertEqual(heard, [[10, 0, 0, 0], [20, 10, 5, 0], [30, 20, 15, 10]])
+        line.fill(torch.tensor([False, True, False, False]), torch.full((4, 1), 7.0))
+        self.assertEqual(line.push(torch.full((4, 1), 40.0))[:, 0].tolist(), [40, 7, 25, 20])
+
+
 class RandomizationTest(unittest.TestCase):
+    def test_drives_are_scaled_group_by_group(self):
+        c = RandomizationConfig(arm_stiffness=(0.8, 1.2), hand_damping=(0.5, 0.6), effort=(0.9, 0.9))
+        self.assertTrue(c.scales_drives)
+        self.assertFalse(RandomizationConfig().scales_drives or replace(c, enabled=False).scales_drives)
+        is_arm = torch.tensor([True, True, False])
+        found = sample_drives(is_arm, 5000, c, generator())
+        self.assertEqual(tuple(found.shape), (5000, 3, 3))
+        stiffness, damping, effort = found.unbind(1)
+        self.assertTrue(torch.equal(stiffness[:, 0], stiffness[:, 1]))
+        self.assertAlmostEqual(float(stiffness[:, 0].min()), 0.8, delta=0.01)
+        self.assertAlmostEqual(float(stiffness[:, 0].max()), 1.2, delta=0.01)
+        self.assertEqual(float((stiffness[:, 2] - 1).abs().max() + (damping[:, :2] - 1).abs().max()), 0.0)
+        self.assertAlmostEqual(float(damping[:, 2].mean()), 0.55, delta=0.01)
+        torch.testing.assert_close(effort, torch.full_like(effort, 0.9))
+
+    def test_the_hands_friction_may_be_drawn(self):
+        c = RandomizationConfig(hand_friction=(0.5, 1.0))
+        tip, link, _ = sample_friction(5000, c, generator()).unbind(-1)
+        drawn = 2 * link - (2 * tip - c.elastomer)
+        self.assertAlmostEqual(float(drawn.min()), 0.5, delta=0.01)
+        self.assertAlmostEqual(float(drawn.max()), 1.0, delta=0.01)
+
+    def test_ranges_that_make_no_sense_are_refused(self):
+        with self.assertRaisesRegex(ValueError, "arm_stiffness is 1.2 to 0.8, expected two finite numbers, 0 or more, the lower one first"):
+            RandomizationConfig(arm_stiffness=(1.2, 0.8))
+
     def test_a_pairs_friction_is_the_mean_of_its_materials(self):
         c = RandomizationConfig(elastomer=0.8, metal=0.1, table=0.5)
         torch.testing.assert_close(pair_friction(torch.tensor([0.5, 1.0]), c), torch.tensor([[0.65, 0.3, 0.5], [0.9, 0.55, 0.75]]))
@@ -450,7 +488,8 @@ class ObservationTest(unittest.TestCase):
 
         self.x = obs.ObservationInput(
             joint_pos=rand(self.J), joint_vel=rand(self.J), joint_lower=torch.full((self.J,), -2.0), joint_upper=torch.full((self.J,), 3.0),
-            object_pos=rand(3), object_quat=quat(), object_linvel=rand(3), object_angvel=rand(3), goal_pos=rand(3), goal_quat=quat(),
+            seen_pos=rand(3), seen_quat=quat(), object_pos=rand(3), object_quat=quat(), object_linvel=rand(3), object_angvel=rand(3),
+            goal_pos=rand(3), goal_quat=quat(),
             gravity_fraction=rand(), previous_action=rand(self.J), palm_pos=rand(3), palm_quat=quat(), palm_linvel=rand(3),
             palm_angvel=rand(3), tip_pos=rand(self.E, 3), tip_force=10 * rand(self.E, 3), tip_distance=rand(self.E).abs(), reward=rand(),
         )  # fmt: skip
@@ -464,8 +503,8 @@ class ObservationTest(unittest.TestCase):
         return dict(zip(widths, group.split(list(widths.values()), dim=-1), strict=True))
 
     def test_without_noise_the_policy_group_is_exact(self):
-        for name in ("object_pos", "goal_pos", "previous_action"):
-            torch.testing.assert_close(self.policy[name], getattr(self.x, name))
+        for name, own in (("object_pos", "seen_pos"), ("goal_pos", "goal_pos"), ("previous_action", "previous_action")):
+            torch.testing.assert_close(self.policy[name], getattr(self.x, own))
         torch.testing.assert_close(self.policy["gravity_fraction"][:, 0], self.x.gravity_fraction)
 
     def test_without_noise_the_proprio_group_is_exact(self):
@@ -480,11 +519,13 @@ class ObservationTest(unittest.TestCase):
         torch.testing.assert_close(force.view(self.N, self.E, 3)[small], 0.1 * self.x.tip_force[small])
 
     def test_one_rotation_is_one_observation(self):
-        negated = replace(self.x, object_quat=-self.x.object_quat, goal_quat=-self.x.goal_quat, palm_quat=-self.x.palm_quat)
+        negated = replace(
+            self.x, seen_quat=-self.x.seen_quat, object_quat=-self.x.object_quat, goal_quat=-self.x.goal_quat, palm_quat=-self.x.palm_quat
+        )
         torch.testing.assert_close(obs.policy_group(negated, self.config, generator()), obs.policy_group(self.x, self.config, generator()))
         again = obs.proprio_group(negated, self.config, generator())
         torch.testing.assert_close(again, obs.proprio_group(self.x, self.config, generator()))
-        for name, quat, own in (("object_quat", self.policy, self.x.object_quat), ("palm_quat", self.proprio, self.x.palm_quat)):
+        for name, quat, own in (("object_quat", self.policy, self.x.seen_quat), ("palm_quat", self.proprio, self.x.palm_quat)):
             self.assertTrue(bool((quat[name][:, 0] >= 0).all()), name)
             torch.testing.assert_close(quat_angle(quat[name], own), torch.zeros(self.N), atol=1e-3, rtol=0)
         torch.testing.assert_close(obs.privileged_group(negated)[:, 9:12].norm(dim=-1), quat_angle(self.x.object_quat, self.x.goal_quat))
@@ -512,14 +553,14 @@ class ObservationTest(unittest.TestCase):
     def test_rotations_as_columns_of_the_matrix(self):
         c = replace(self.config, rotation="matrix")
         widths = obs.layout(self.J, self.E, c)
-        x = replace(self.x, object_quat=turned(90)[None].expand(self.N, 4))
+        x = replace(self.x, seen_quat=turned(90)[None].expand(self.N, 4))
         policy, proprio = obs.policy_group(x, c, generator()), obs.proprio_group(x, c, generator())
         shown = self.split(policy, widths["policy"]) | self.split(proprio, widths["proprio"])
         torch.testing.assert_close(shown["object_rotation"], torch.tensor([0.0, 1, 0, -1, 0, 0]).expand(self.N, 6))
         first, second = shown["palm_rotation"].split(3, dim=-1)
         torch.testing.assert_close(first, quat_rotate(x.palm_quat, torch.tensor([1.0, 0, 0]).expand(self.N, 3)))
         torch.testing.assert_close(second, quat_rotate(x.palm_quat, torch.tensor([0.0, 1, 0]).expand(self.N, 3)))
-        negated = replace(x, object_quat=-x.object_quat, goal_quat=-x.goal_quat)
+        negated = replace(x, seen_quat=-x.seen_quat, goal_quat=-x.goal_quat)
         torch.testing.assert_close(obs.policy_group(negated, c, generator()), policy)
 
     def test_noise_has_the_configured_spread_and_touches_only_what_is_measured(self):
@@ -534,7 +575,7 @@ class ObservationTest(unittest.TestCase):
         self.assertEqual(float(policy[:, 7:].abs().max()), 0.0)
         noisy = obs.policy_group(x, c, generator())[:, 3:7]
         torch.testing.assert_close(noisy.norm(dim=-1), torch.ones(many))
-        self.assertAlmostEqual(float(quat_angle(noisy, x.object_quat).square().mean().sqrt()), 0.05 * math.sqrt(3), delta=0.005)
+        self.assertAlmostEqual(float(quat_angle(noisy, x.seen_quat).square().mean().sqrt()), 0.05 * math.sqrt(3), delta=0.005)
         proprio = obs.proprio_group(x, c, generator()) - obs.proprio_group(x, self.config, generator())
         self.assertAlmostEqual(float(proprio[:, : self.J].std()), 0.01 / 2.5, delta=2e-4)
         self.assertAlmostEqual(float(proprio[:, self.J : 2 * self.J].std()), 0.1 * 0.2, delta=1e-3)

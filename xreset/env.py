@@ -24,7 +24,8 @@ from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
-from xreset.task.randomization import sample_friction, sample_mass_scale
+from xreset.task.latency import DelayLine
+from xreset.task.randomization import sample_drives, sample_friction, sample_mass_scale, sample_range
 from xreset.task.rewards import Reward, RewardInput, compute_reward
 from xreset.task.terminations import episode_steps, out_of_bounds
 
@@ -135,6 +136,14 @@ class ManipulationEnv:
             sequence=zeros(dtype=torch.long),
         )
         self._friction, self._mass = zeros(3), zeros()
+        # What differs between one robot and the next is None where it does not: then it costs nothing, and draws no random number.
+        random = task.randomization
+        self._drives = torch.ones(n, 3, self.num_actions, device=self.device) if random.scales_drives else None
+        self._force_gain = torch.ones(n, 1, 1, device=self.device) if random.enabled and random.force_gain != (1.0, 1.0) else None
+        late_actions, late_poses = (limits[1] if random.enabled else 0.0 for limits in (random.action_latency, random.observation_latency))
+        self._commands = DelayLine(self._target, late_actions) if late_actions else None
+        self._poses = DelayLine(zeros(7), late_poses) if late_poses else None
+        self._heard = zeros(self.num_actions)
         # What is kept of a step in case that it breaks a world.
         state = backend.state()
         self._before = {f.name: getattr(state, f.name).clone() for f in fields(state)}
@@ -236,7 +245,7 @@ class ManipulationEnv:
         """All that the worlds' futures depend on besides random numbers and an engine's warm start, on the CPU: for :meth:`restore`."""
         state = self.backend.state()
         values = {f"state.{f.name}": getattr(state, f.name) for f in fields(state)}
-        values |= {f"env.{name}": getattr(self, name) for name in _LASTING}
+        values |= {f"env.{name}": value for name, value in self._lasting.items()}
         values |= {f"observed.{name}": self._observations[name] for name in set(self._observations.keys())}
         values["resets.reached"] = self.resets.reached
         return {name: value.to("cpu", copy=True) for name, value in values.items()}
@@ -245,8 +254,8 @@ class ManipulationEnv:
         """Go on from a snapshot; False, and nothing is changed, if it is of another number of worlds or of another task."""
         if {name: value.shape for name, value in snapshot.items()} != {name: value.shape for name, value in self.snapshot().items()}:
             return False
-        for name in _LASTING:
-            getattr(self, name).copy_(snapshot[f"env.{name}"])
+        for name, value in self._lasting.items():
+            value.copy_(snapshot[f"env.{name}"])
         self._fresh.fill_(True)
         self.backend.set_where(
             self._fresh,
@@ -254,6 +263,7 @@ class ManipulationEnv:
             friction=self._friction,
             object_mass=self._mass,
             object_gravity=self.gravity_fraction,
+            drives=self._drives,
         )
         self._fresh.zero_()
         for name in set(self._observations.keys()):
@@ -261,12 +271,22 @@ class ManipulationEnv:
         self.resets.reached.copy_(snapshot["resets.reached"])
         return True
 
+    @property
+    def _lasting(self) -> dict[str, Tensor]:
+        """What is kept of each world from step to step, besides the engine's state."""
+        lasting = {name: getattr(self, name) for name in _LASTING}
+        lasting |= {name: value for name in ("_drives", "_force_gain") if (value := getattr(self, name)) is not None}
+        for name in ("_commands", "_poses"):
+            if (line := getattr(self, name)) is not None:
+                lasting |= {f"{name}.values": line.values, f"{name}.delay": line.delay}
+        return lasting
+
     # Parts -------------------------------------------------------------------------------------------------------------------------
 
     def _move(self, action: Tensor) -> None:
         self._action.copy_(action)
         self._graphs.run(self._aim)
-        self.backend.set_joint_targets(self._target)
+        self.backend.set_joint_targets(self._heard)
         self.backend.step()
 
     def _aim(self) -> None:
@@ -277,6 +297,7 @@ class ManipulationEnv:
         if not self.task.reward.raw_actions:
             self._action.clamp_(-1.0, 1.0)
         self._target.copy_(self.actions.targets(self._action, self._target, state.joint_pos))
+        self._heard.copy_(self._target if self._commands is None else self._commands.push(self._target))
 
     def _judge(self) -> tuple[Reading, Reward]:
         """What the step has brought: reward, ends of episodes, numbers to log."""
@@ -349,7 +370,19 @@ class ManipulationEnv:
                 getattr(start, f.name).copy_(getattr(drawn, f.name))
         friction = sample_friction(self.num_envs, self.task.randomization, self.generator)
         mass = self._nominal_mass * sample_mass_scale(self.num_envs, self.task.randomization, self.generator)
+        random, n, generator = self.task.randomization, self.num_envs, self.generator
+        drawn_too = []
+        if self._drives is not None:
+            drawn_too.append((sample_drives(self.actions.is_arm, n, random, generator), self._drives))
+        if self._force_gain is not None:
+            drawn_too.append((sample_range(n, random.force_gain, generator).view(-1, 1, 1), self._force_gain))
+        for line, limits in ((self._commands, random.action_latency), (self._poses, random.observation_latency)):
+            if line is not None:
+                drawn_too.append((sample_range(n, limits, generator), line.delay))
+        if self._commands is not None:
+            self._commands.fill(fresh, start.joint_pos)
         for new, old in (
+            *drawn_too,
             (friction, self._friction),
             (mass, self._mass),
             (start.goal_pos, self.goal_pos),
@@ -372,6 +405,7 @@ class ManipulationEnv:
             friction=self._friction,
             object_mass=self._mass,
             object_gravity=start.gravity_fraction,
+            drives=self._drives,
         )
 
     def _read(self) -> Reading:
@@ -390,11 +424,14 @@ class ManipulationEnv:
         reading = self._read()
         c, state, links = self.task.observation, reading.state, reading.links
         self._best_reach.copy_(torch.where(self._fresh, reading.tip_distance.mean(dim=-1), self._best_reach))
+        seen_pos, seen_quat = self._seen(state)
         x = obs.ObservationInput(
             joint_pos=state.joint_pos,
             joint_vel=state.joint_vel,
             joint_lower=self._limits[0],
             joint_upper=self._limits[1],
+            seen_pos=seen_pos,
+            seen_quat=seen_quat,
             object_pos=state.object_pos,
             object_quat=state.object_quat,
             object_linvel=state.object_linvel,
@@ -408,11 +445,11 @@ class ManipulationEnv:
             palm_linvel=links.linvel[:, 0],
             palm_angvel=links.angvel[:, 0],
             tip_pos=links.pos[:, 1:],
-            tip_force=reading.contacts.tip_force,
+            tip_force=reading.contacts.tip_force * (1.0 if self._force_gain is None else self._force_gain),
             tip_distance=reading.tip_distance,
             reward=self._reward,
         )
-        frame = obs.cloud_frame(self._cloud_points, state.object_pos, state.object_quat, c, self.generator)[:, None]
+        frame = obs.cloud_frame(self._cloud_points, seen_pos, seen_quat, c, self.generator)[:, None]
         history = torch.cat((self._cloud[:, 1:], frame), dim=1)
         self._cloud.copy_(torch.where(self._fresh.view(-1, 1, 1, 1), frame, history))
         groups = {
@@ -425,6 +462,17 @@ class ManipulationEnv:
             if name not in self._observations:
                 self._observations[name] = torch.zeros_like(value)
             self._observations[name].copy_(value)
+
+    def _seen(self, state: State) -> tuple[Tensor, Tensor]:
+        """[N, 3], [N, 4] the object's pose as it is seen, which may be late."""
+        if self._poses is None:
+            return state.object_pos, state.object_quat
+        last = self._poses.values[:, 0, 3:]
+        facing = (state.object_quat * last).sum(dim=-1, keepdim=True) < 0  # of a rotation's two quaternions, the one near the last
+        pose = torch.cat((state.object_pos, torch.where(facing, -state.object_quat, state.object_quat)), dim=-1)
+        self._poses.fill(self._fresh, pose)
+        pos, quat = self._poses.push(pose).split((3, 4), dim=-1)
+        return pos, torch.nn.functional.normalize(quat, dim=-1)
 
     def _log(self, reward: Reward, done: Tensor, sound: Tensor) -> tuple[tuple[str, ...], Tensor]:
         """Names and values [K] of what there is to say about this step: means over worlds, on the device, so that nothing waits for them.

@@ -17,9 +17,9 @@ from xreset.errors import BackendUnavailableError, CapabilityError
 from xreset.spec import SceneSpec
 from xreset.tensors import Tensors
 
-Capability = Literal["object_mass", "friction", "object_gravity", "object_wrench", "overflow", "mass_properties"]
-"""What a backend may be unable to do: per-world object mass, pair friction or gravity fraction; a wrench; counting overflows; reading back
-masses, centres of mass and inertias."""
+Capability = Literal["object_mass", "friction", "object_gravity", "drives", "object_wrench", "overflow", "mass_properties"]
+"""What a backend may be unable to do: per-world object mass, pair friction, gravity fraction or drives; a wrench; counting overflows;
+reading back masses, centres of mass and inertias."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,6 +232,15 @@ class Backend(ABC):
         The robot is not affected (the paper, appendix D.e).
         """
 
+    def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
+        """Set factors on the drives: [M, 3, J] of stiffness, damping and effort limit; 1 is what the robot spec says.
+
+        Raises:
+            CapabilityError: the backend lacks ``drives``.
+        """
+        self._require("drives", "build a scene whose robot has such drives.")
+        raise NotImplementedError(f"the backend {self.name!r} says that it can set drives, and does not")
+
     @abstractmethod
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         """Set an external force [N, 3] N at the object's centre of mass and a torque [N, 3] N m, world frame.
@@ -241,7 +250,16 @@ class Backend(ABC):
 
     # Many worlds at once --------------------------------------------------------------------------------------------------------------
 
-    def set_where(self, mask: Tensor, *, state: State, friction: Tensor, object_mass: Tensor, object_gravity: Tensor) -> None:
+    def set_where(
+        self,
+        mask: Tensor,
+        *,
+        state: State,
+        friction: Tensor,
+        object_mass: Tensor,
+        object_gravity: Tensor,
+        drives: Tensor | None = None,
+    ) -> None:
         """Set state and physical parameters of the worlds of a mask, as the single setters do.
 
         Values are given for all worlds, and those outside the mask are ignored: a backend on a GPU overrides this so that nothing waits
@@ -253,6 +271,7 @@ class Backend(ABC):
             friction: [N, 3]
             object_mass: [N] kg.
             object_gravity: [N]
+            drives: [N, 3, J] factors; None leaves the drives as they are.
         """
         worlds = mask.nonzero().squeeze(-1)
         if not len(worlds):
@@ -260,6 +279,8 @@ class Backend(ABC):
         self.set_friction(friction[worlds], worlds)
         self.set_object_mass(object_mass[worlds], worlds)
         self.set_object_gravity(object_gravity[worlds], worlds)
+        if drives is not None:
+            self.set_drives(drives[worlds], worlds)
         self.set_state(state[worlds], worlds)
 
     # The end ---------------------------------------------------------------------------------------------------------------------

@@ -205,6 +205,62 @@ def _paths(backend: Backend, start: State, way: Tensor, signal: Tensor, substeps
     return torch.stack(path)
 
 
+_DRIVE_SCALES = ((1.0, 1.0, 1.0), (0.7, 1.4, 1.0), (1.3, 0.8, 0.5))  # of stiffness, damping and effort limit
+
+
+def drive_scale(bench: Bench) -> list[Measure]:
+    """Scale the drives of some worlds, and compare with engines that were built with a robot of such drives.
+
+    All joints step at once. Factors set through a mask must do the same, and worlds outside of it must keep theirs.
+    """
+    scene = without_collisions(bench.scene)
+    scales = torch.tensor(_DRIVE_SCALES)
+    count, joints = len(scales), len(scene.robot.joints)
+    which = torch.zeros(count, dtype=torch.long)
+    _, way = _alone(bench, scene)
+    start = bench.placed(start_state(scene, which))
+    limits = bench.kinematics
+    target = (start.joint_pos + way).minimum(limits.upper.float()).maximum(limits.lower.float())
+    factors = scales[:, :, None].expand(count, 3, joints)
+
+    def path(backend: Backend, rows: slice) -> Tensor:
+        backend.set_state(start[rows].to(backend.device))
+        backend.set_joint_targets(target[rows].to(backend.device))
+        found = []
+        for _ in range(30):
+            backend.step()
+            found.append(backend.state().joint_pos.cpu().clone())
+        return torch.stack(found, dim=1)
+
+    expected = []
+    for i, (stiffness, damping, effort) in enumerate(_DRIVE_SCALES):
+        scaled = tuple(
+            replace(joint, drive=replace(
+                joint.drive, kp=stiffness * joint.drive.kp, kd=damping * joint.drive.kd, effort=effort * joint.drive.effort
+            ))
+            for joint in scene.robot.joints
+        )  # fmt: skip
+        with bench.other(replace(scene, robot=replace(scene.robot, joints=scaled)), 1, which[:1]) as backend:
+            expected.append(path(backend, slice(i, i + 1)))
+    with bench.other(scene, count, which) as backend:
+        backend.set_drives(factors.to(backend.device))
+        at_once = path(backend, slice(None))
+        backend.set_drives(factors.flip(0).to(backend.device))
+        mask = torch.tensor([True, False, True], device=backend.device)
+        ones = torch.ones(count, device=backend.device)
+        mass = torch.full_like(ones, scene.objects[0].mass)
+        friction = torch.tensor([[scene.friction.tip, scene.friction.link, scene.friction.table]], device=backend.device).expand(count, 3)
+        backend.set_where(
+            mask, state=start.to(backend.device), friction=friction, object_mass=mass, object_gravity=ones,
+            drives=factors.to(backend.device),
+        )  # fmt: skip
+        masked = path(backend, slice(None))
+    return [
+        Measure(what="set at once", measured=largest(at_once - torch.cat(expected)), tolerance=1e-4, unit="rad, m"),
+        Measure(what="set through a mask", measured=largest(masked - torch.cat(expected)), tolerance=1e-4, unit="rad, m"),
+    ]
+
+
 def drive_equation(bench: Bench) -> list[Measure]:
     """Step the target of the vertical slide and compare with the drive's differential equation, effort limit and armature included.
 
@@ -343,6 +399,12 @@ CHECKS = (
         "a drive is a PD position drive with effort limit and armature",
         "gains are scaled, armature or effort limit are missing, joint damping or friction is added, or gravity is not compensated",
         own_robot_only=True,
+    ),
+    _check(
+        drive_scale,
+        "factors on stiffness, damping and effort limit act as in a robot that was built with such drives",
+        "a factor is applied to what the last one left, to all worlds, or not to what an implicit drive was factorised with",
+        capabilities=("drives",),
     ),
     _check(
         effort_limit,

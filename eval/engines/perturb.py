@@ -173,6 +173,10 @@ class AlteredBackend(Backend):
         """See :meth:`Backend.set_object_gravity`."""
         self._inner.set_object_gravity(fraction, worlds)
 
+    def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_drives`."""
+        self._inner.set_drives(scale, worlds)
+
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         """See :meth:`Backend.set_object_wrench`."""
         self._inner.set_object_wrench(force, torque)

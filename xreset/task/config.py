@@ -213,7 +213,10 @@ class ResetConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizationConfig:
-    """Physical parameters drawn at each reset (Table IX)."""
+    """Physical parameters drawn at each reset (Table IX), and what else differs between one robot and the next (not in the paper).
+
+    The second kind is off by default: what a policy loses to it between engines is measured in docs/sim-to-sim.md.
+    """
 
     enabled: bool = True
     friction: tuple[float, float] = (0.5, 1.0)
@@ -228,9 +231,38 @@ class RandomizationConfig:
     """Coefficient of the table's material. Not in the paper."""
     mass_scale: tuple[float, float] = (0.7, 1.3)
     """Range of the factor on the object's mass."""
+    hand_friction: tuple[float, float] | None = None
+    """Range of the coefficient of every link's material beside the fingertips'; None: ``metal``."""
+    arm_stiffness: tuple[float, float] = (1.0, 1.0)
+    """Range of the factor on the stiffness of the arm's drives, one for all of them; likewise the next four."""
+    arm_damping: tuple[float, float] = (1.0, 1.0)
+    hand_stiffness: tuple[float, float] = (1.0, 1.0)
+    hand_damping: tuple[float, float] = (1.0, 1.0)
+    effort: tuple[float, float] = (1.0, 1.0)
+    """Of every drive's effort limit."""
+    action_latency: tuple[float, float] = (0.0, 0.0)
+    """Range of the control steps by which drives hear of an action late; between whole ones the two targets are mixed."""
+    observation_latency: tuple[float, float] = (0.0, 0.0)
+    """Range of the control steps by which the object's pose and cloud are seen late."""
+    force_gain: tuple[float, float] = (1.0, 1.0)
+    """Range of the factor on the fingertips' force readings."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, positive=("friction_buckets",), not_negative=("elastomer", "metal", "table"), ranges=("friction", "mass_scale"))
+        scales = ("arm_stiffness", "arm_damping", "hand_stiffness", "hand_damping", "effort", "force_gain")
+        check_numbers(
+            self,
+            positive=("friction_buckets",),
+            not_negative=("elastomer", "metal", "table"),
+            ranges=("friction", "mass_scale", "action_latency", "observation_latency", *scales),
+        )
+        if self.hand_friction is not None:
+            check_numbers(self, ranges=("hand_friction",))
+
+    @property
+    def scales_drives(self) -> bool:
+        """Whether drives differ from what the robot spec says."""
+        names = ("arm_stiffness", "arm_damping", "hand_stiffness", "hand_damping", "effort")
+        return self.enabled and any(getattr(self, name) != (1.0, 1.0) for name in names)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,6 +28,9 @@ class ObservationInput:
     """[J]"""
     joint_upper: Tensor
     """[J]"""
+    seen_pos: Tensor
+    """[N, 3] object position as the policy sees it, which may be late."""
+    seen_quat: Tensor
     object_pos: Tensor
     object_quat: Tensor
     object_linvel: Tensor
@@ -84,9 +87,9 @@ def layout(num_joints: int, num_tips: int, c: ObservationConfig) -> dict[str, di
 def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
     """[N, 15 + J] (19 + J with ``rotation="matrix"``) object pose (noisy), goal pose, gravity fraction, previous action."""
     noise = c.noise
-    pos = x.object_pos + noise.object_pos * _normal(x.object_pos, generator)
-    turn = quat_from_axis_angle(noise.object_rot * _normal(x.object_pos, generator))
-    rotation = _shown(quat_multiply(turn, x.object_quat), c)
+    pos = x.seen_pos + noise.object_pos * _normal(x.seen_pos, generator)
+    turn = quat_from_axis_angle(noise.object_rot * _normal(x.seen_pos, generator))
+    rotation = _shown(quat_multiply(turn, x.seen_quat), c)
     return torch.cat((pos, rotation, x.goal_pos, _shown(x.goal_quat, c), x.gravity_fraction[:, None], x.previous_action), dim=-1)
 
 

@@ -8,13 +8,16 @@ from torch import Tensor
 from xreset.task.config import RandomizationConfig
 
 
-def pair_friction(material: Tensor, c: RandomizationConfig) -> Tensor:
+def pair_friction(material: Tensor, c: RandomizationConfig, link: Tensor | float | None = None) -> Tensor:
     """[M, 3] friction of the pairs object-fingertip, object-link, object-table.
 
     Args:
         material: [M] the object material's coefficient. A pair's coefficient is the mean of its two materials.
+        c: the other materials' coefficients.
+        link: [M] that of the links beside the fingertips; None: ``c.metal``.
     """
-    return torch.stack([(material + other) / 2 for other in (c.elastomer, c.metal, c.table)], dim=-1)
+    others = (c.elastomer, c.metal if link is None else link, c.table)
+    return torch.stack([(material + other) / 2 for other in others], dim=-1)
 
 
 def sample_friction(count: int, c: RandomizationConfig, generator: torch.Generator) -> Tensor:
@@ -23,10 +26,33 @@ def sample_friction(count: int, c: RandomizationConfig, generator: torch.Generat
     if not c.enabled:
         return pair_friction(torch.full((count,), (low + high) / 2, device=generator.device), c)
     bucket = torch.randint(c.friction_buckets, (count,), generator=generator, device=generator.device)
-    return pair_friction(low + (high - low) * (bucket + 0.5) / c.friction_buckets, c)
+    link = None if c.hand_friction is None else sample_range(count, c.hand_friction, generator)
+    return pair_friction(low + (high - low) * (bucket + 0.5) / c.friction_buckets, c, link)
+
+
+def sample_range(count: int, limits: tuple[float, float], generator: torch.Generator) -> Tensor:
+    """[M] uniform numbers of a range."""
+    low, high = limits
+    return low + (high - low) * torch.rand(count, generator=generator, device=generator.device)
 
 
 def sample_mass_scale(count: int, c: RandomizationConfig, generator: torch.Generator) -> Tensor:
     """[M] factor on the object's mass; 1 if disabled."""
-    low, high = c.mass_scale if c.enabled else (1.0, 1.0)
-    return low + (high - low) * torch.rand(count, generator=generator, device=generator.device)
+    return sample_range(count, c.mass_scale if c.enabled else (1.0, 1.0), generator)
+
+
+def sample_drives(is_arm: Tensor, count: int, c: RandomizationConfig, generator: torch.Generator) -> Tensor:
+    """[M, 3, J] factors on the drives' stiffness, damping and effort limit.
+
+    Args:
+        is_arm: [J] bool.
+        count: M.
+        c: ranges.
+        generator: random numbers.
+    """
+    ranges = ((c.arm_stiffness, c.hand_stiffness), (c.arm_damping, c.hand_damping), (c.effort, c.effort))
+    rows = [
+        torch.where(is_arm, sample_range(count, arm, generator)[:, None], sample_range(count, hand, generator)[:, None])
+        for arm, hand in ranges
+    ]
+    return torch.stack(rows, dim=1)

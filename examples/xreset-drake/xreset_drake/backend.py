@@ -249,7 +249,7 @@ class DrakeBackend(PoolBackend):
     """N worlds of Drake; the keyword ``settings`` takes :class:`DrakeSettings`."""
 
     name = "drake"
-    capabilities = frozenset(get_args(Capability))
+    capabilities = frozenset(get_args(Capability)) - {"drives"}
     known_differences = _KNOWN_DIFFERENCES
     world_class = DrakeWorld
 

@@ -1,0 +1,37 @@
+"""What is heard or seen late: the last values of each world, read back a whole or broken number of steps later."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+class DelayLine:
+    """The last values of N worlds, newest first; all work is over fixed buffers, so that it can be captured in a graph."""
+
+    def __init__(self, like: Tensor, longest: float) -> None:
+        """Allocate.
+
+        Args:
+            like: [N, D] what is delayed.
+            longest: largest delay [steps].
+        """
+        self.values = torch.zeros(like.shape[0], math.ceil(longest) + 1, like.shape[1], device=like.device)
+        """[N, K, D]"""
+        self.delay = torch.zeros(like.shape[0], device=like.device)
+        """[N] steps."""
+
+    def fill(self, fresh: Tensor, value: Tensor) -> None:
+        """In the worlds of a mask [N], a value [N, D] becomes all that was."""
+        self.values.copy_(torch.where(fresh[:, None, None], value[:, None], self.values))
+
+    def push(self, value: Tensor) -> Tensor:
+        """Take in the newest value [N, D] and return what is known of the past: [N, D], mixed between whole steps."""
+        self.values.copy_(torch.cat((value[:, None], self.values[:, :-1]), dim=1))
+        whole = self.delay.floor()
+        at = whole.long()[:, None, None].expand(-1, 1, value.shape[1])
+        newer = self.values.gather(1, at)[:, 0]
+        older = self.values.gather(1, (at + 1).clamp_max(self.values.shape[1] - 1))[:, 0]
+        return newer + (self.delay - whole)[:, None] * (older - newer)

@@ -324,7 +324,7 @@ class CommandTest(unittest.TestCase):
     def test_bad_input(self):
         rest = ("--demos", "none.npz", "--robot", "ur7e-sharpa")
         self.assertIn("does not differ from itself", self.refuse("zero", *rest, "--backend", "mujoco", "--towards", "mujoco"))
-        self.assertIn("must be at least 1", self.refuse("zero", *rest, "--towards", "sapien", "--episodes", "0"))
+        self.assertIn("expected a whole number from 1", self.refuse("zero", *rest, "--towards", "sapien", "--episodes", "0"))
         self.assertIn("there is no backend 'havok'", self.refuse("zero", *rest, "--towards", "havok"))
         self.assertIn("there is no file none.npz", self.refuse("zero", *rest, "--towards", "sapien"))
         self.assertIn("there is no policy", self.refuse("none", *rest, "--towards", "sapien"))

@@ -232,13 +232,18 @@ def write_npz(
 
 
 def read_npz(
-    path: str | Path, schema_name: str, schema: Schema, *, what: str, check: Callable[[dict[str, np.ndarray]], str | None] | None = None
+    path: str | Path,
+    schema_name: str | None,
+    schema: Schema,
+    *,
+    what: str,
+    check: Callable[[dict[str, np.ndarray]], str | None] | None = None,
 ) -> dict[str, np.ndarray]:
     """Read an npz file and check all of it before anything is used; names, kinds, shapes and sizes before anything is unpacked.
 
     Args:
         path: file.
-        schema_name: schema that the file must state.
+        schema_name: schema that the file must state; None: a file that others made, which states none.
         schema: fields that it must have. Others are left aside, with a warning.
         what: what the file is, for messages ("a reset bank").
         check: further check; returns a message if something is wrong.
@@ -253,8 +258,10 @@ def read_npz(
     _must_exist(path, what)
     with _archive(path, f"cannot be read as {what}") as archive:
         found = _headers(archive)
-        _check_schema(path, _text(archive, found, "schema"), schema_name)
-        own = {"schema": Field((), "U"), "meta": Field((), "U", required=False), **schema}
+        own = schema
+        if schema_name is not None:
+            _check_schema(path, _text(archive, found, "schema"), schema_name)
+            own = {"schema": Field((), "U"), "meta": Field((), "U", required=False), **schema}
         problem = _match(found, own) or _too_large(found, own)
         arrays = {} if problem else {name: _read(archive, found[name]) for name in own if name in found}
     problem = problem or _bad_values(arrays, schema) or (check(arrays) if check else None)

@@ -31,8 +31,8 @@ COMMANDS: dict[str, str] = {
     "compare": "Put several trainings side by side: curves, results in every engine, and what differs between them.",
     "report": "Make a self-contained HTML page of a run's evaluations.",
 }
-"""Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``: a function, or a dictionary of sub-commands. One whose
-defaults depend on an argument has ``command_for`` instead: arguments -> such a function."""
+"""Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``: a function, or a dictionary of sub-commands, each of one or
+two words. One whose defaults depend on an argument has ``command_for`` instead: arguments -> such a function."""
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -89,6 +89,8 @@ def _run(name: str, arguments: list[str]) -> None:
     program = f"xreset {name}"
     if isinstance(command, dict):
         verbs = {verb: checked(function) for verb, function in command.items()}
+        two = " ".join(arguments[:2])
+        arguments = [two, *arguments[2:]] if two in verbs else arguments
         tyro.extras.subcommand_cli_from_dict(verbs, prog=program, description=COMMANDS[name], args=arguments)
     else:
         tyro.cli(checked(command), prog=program, description=COMMANDS[name], args=arguments)

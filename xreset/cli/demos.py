@@ -15,28 +15,72 @@ if TYPE_CHECKING:
 Side = Literal["right", "left", "both"]
 
 
-def import_(
-    dataset: Annotated[Literal["dexycb"], tyro.conf.Positional],
+def dexycb(
     folder: Annotated[Path, tyro.conf.Positional],
     *,
     out: Path,
     objects: tuple[str, ...] = (),
     side: Side = "both",
 ) -> None:
-    """Read a data set in its own layout and write an archive of demonstrations.
+    """Read DexYCB in its own layout and write an archive of demonstrations.
 
     Args:
-        dataset: The data set. dexycb: the folder that holds the subjects' folders and `calibration`.
-        folder: Where it is.
+        folder: The folder that holds the subjects' folders and `calibration`.
         out: Archive to write.
         objects: Only sequences that grasp one of these objects; default: all.
         side: Only sequences of this hand.
     """
     from xreset.demos import read_dexycb, write_demos
 
-    with _progress(f"reading {dataset}") as progress:
+    with _progress("reading DexYCB") as progress:
         demos = read_dexycb(folder, objects=objects or None, sides=_sides(side), progress=progress)
-    write_demos(out, demos, config={"dataset": dataset, "objects": list(objects), "side": side})
+    write_demos(out, demos, config={"dataset": "dexycb", "objects": list(objects), "side": side})
+    _print_summary(demos, out)
+
+
+def keypoints(
+    path: Annotated[Path, tyro.conf.Positional],
+    *,
+    out: Path,
+    order: Literal["mano", "mediapipe", "openpose"] | None = None,
+    units: Literal["m", "mm"] | None = None,
+    coordinates: Literal["table", "camera"] | None = None,
+    table_from_camera: Path | None = None,
+    quat: Literal["wxyz", "xyzw"] | None = None,
+    fps: float | None = None,
+    object: str | None = None,
+    side: Literal["right", "left"] | None = None,
+    subject: str = "unknown",
+) -> None:
+    """Read 21 hand keypoints and object poses of any tracker and write an archive of demonstrations.
+
+    What the numbers mean is never guessed: what is not in the files must be said, and what contradicts them is refused.
+    docs/demonstrations.md has the layout of the files.
+
+    Args:
+        path: An npz file (one sequence), a CSV file (one row for each frame), or a folder of them.
+        out: Archive to write.
+        order: Order of the keypoints.
+        units: Unit of keypoints and object positions.
+        coordinates: Frame that all are in: z up with the table's top at z = 0, or that of a camera at rest.
+        table_from_camera: File with the camera's pose in the table frame: 4x4, metres, as text or npy.
+        quat: Order of quaternions whose name in the file does not say it.
+        fps: Frames per second; files with times are resampled to it.
+        object: The grasped object, where the files do not say it.
+        side: The hand, where the files do not say it.
+        subject: Who demonstrated, where the files do not say it.
+    """
+    from xreset.demos import Convention, read_keypoints, read_transform, write_demos
+    from xreset.files import file_hash
+
+    T = None if table_from_camera is None else read_transform(table_from_camera)
+    convention = Convention(
+        order=order, units=units, frame=coordinates, table_from_camera=T, quat=quat, fps=fps, object_name=object, side=side, subject=subject
+    )
+    with _progress("reading keypoints") as progress:
+        demos = read_keypoints(path, convention, progress=progress)
+    config = {"dataset": "keypoints", **vars(convention), "table_from_camera": None if T is None else T.tolist()}
+    write_demos(out, demos, config=config, inputs={"keypoints": file_hash(path)} if path.is_file() else {})
     _print_summary(demos, out)
 
 
@@ -157,4 +201,4 @@ def _print_summary(demos: Demos, path: Path) -> None:
     )
 
 
-COMMAND = {"import": import_, "synth": synth, "mirror": mirror, "info": info}
+COMMAND = {"import dexycb": dexycb, "import keypoints": keypoints, "synth": synth, "mirror": mirror, "info": info}

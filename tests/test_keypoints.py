@@ -1,0 +1,245 @@
+"""Demonstrations of other trackers: orders, units, frames, rates and conventions of poses; what cannot be known is refused."""
+
+import contextlib
+import csv
+import io
+import re
+import tempfile
+import unittest
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tests.data import data_dir
+from xreset.cli import main
+from xreset.demos import Convention, read_demos, read_keypoints, synthesize
+from xreset.demos.keypoints import ORDERS
+from xreset.errors import DemoError, FileFormatError
+
+CAMERA = np.eye(4)
+CAMERA[:3, :3] = Rotation.from_euler("xyz", [2.2, 0.1, 3.0]).as_matrix()
+CAMERA[:3, 3] = (0.4, 1.3, 0.9)
+"""Pose of a camera that looks down at the table."""
+PLAIN = Convention(order="mediapipe", units="m", frame="table", fps=10.0)
+
+
+def written(points, order):
+    """[F, 21, 3] this project's keypoints in the order of others."""
+    return points[:, np.argsort(ORDERS[order])]
+
+
+def seen_from(T, demos):
+    """Keypoints, object positions and orientations of one sequence in a camera's frame; T: the camera's pose in the table frame."""
+    turn = Rotation.from_matrix(T[:3, :3]).inv()
+    points = (demos.hand_keypoints.astype(float) - T[:3, 3]) @ T[:3, :3]
+    pos = (demos.object_pos.astype(float) - T[:3, 3]) @ T[:3, :3]
+    return points, pos, turn * Rotation.from_quat(demos.object_quat_wxyz, scalar_first=True)
+
+
+def write_csv(path, points, pos, turn, scale=1.0, columns=(), quat="wxyz"):
+    """One row for each frame, as a tracker would; ``columns``: (name, value or values) to add."""
+    frames = len(points)
+    added = {name: [value] * frames if np.ndim(value) == 0 else value for name, value in columns}
+    names = [f"{axis}{k}" for k in range(21) for axis in "xyz"] + [f"object_{a}" for a in "xyz"] + [f"object_q{a}" for a in quat]
+    quats = turn.as_quat(scalar_first=quat == "wxyz")
+    with open(path, "w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow([*added, *names])
+        for i in range(frames):
+            numbers = np.concatenate((scale * points[i].ravel(), scale * pos[i]))
+            cells = ["" if np.isnan(x) else f"{x:.6f}" for x in numbers] + [f"{x:.9f}" for x in quats[i]]
+            table.writerow([*(values[i] for values in added.values()), *cells])
+
+
+class Synthetic(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.demos = synthesize(["soup"], per_object=1, seed=1, fps=10)
+
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name)
+        self.points = self.demos.hand_keypoints.astype(float)
+        self.arrays = {
+            "keypoints": self.points,
+            "object_pos": self.demos.object_pos,
+            "object_quat_wxyz": self.demos.object_quat_wxyz,
+            "object": np.array(str(self.demos.object_name[0])),
+            "side": np.array("right"),
+        }
+
+    def npz(self, **changes):
+        path = self.folder / "a.npz"
+        np.savez(path, **{name: value for name, value in (self.arrays | changes).items() if value is not None})  # pyright: ignore[reportArgumentType]
+        return path
+
+    def same(self, found, tolerance=2e-6):
+        np.testing.assert_allclose(found.hand_keypoints, self.demos.hand_keypoints, atol=tolerance)
+        np.testing.assert_allclose(found.object_pos, self.demos.object_pos, atol=tolerance)
+        turn = Rotation.from_quat(found.object_quat_wxyz, scalar_first=True)
+        off = (turn.inv() * Rotation.from_quat(self.demos.object_quat_wxyz, scalar_first=True)).magnitude()
+        self.assertLess(off.max(), 1e-3)
+        self.assertEqual(found.object_name.tolist(), self.demos.object_name.tolist())
+
+    def refused(self, message, convention=PLAIN, **changes):
+        with self.assertRaisesRegex(DemoError, message):
+            read_keypoints(self.npz(**changes), convention)
+
+    def test_every_order_unit_and_frame_arrives_the_same(self):
+        points, pos, turn = seen_from(CAMERA, self.demos)
+        for order in ORDERS:
+            for units, scale in (("m", 1.0), ("mm", 1e3)):
+                pose = np.tile(np.eye(4), (len(pos), 1, 1))
+                pose[:, :3, :3], pose[:, :3, 3] = turn.as_matrix(), scale * pos
+                changes = {"object_pos": None, "object_quat_wxyz": None, "object_pose": pose}
+                path = self.npz(keypoints=scale * written(points, order), **changes)
+                convention = Convention(order=order, units=units, frame="camera", table_from_camera=CAMERA, fps=10.0)  # pyright: ignore[reportArgumentType]
+                with self.subTest(order=order, units=units):
+                    self.same(read_keypoints(path, convention))
+
+    def test_quaternions_say_their_order_or_must_be_told(self):
+        wxyz = self.demos.object_quat_wxyz
+        xyzw = np.roll(wxyz, -1, axis=1)
+        self.same(read_keypoints(self.npz(object_quat_wxyz=None, object_quat_xyzw=xyzw), PLAIN))
+        self.same(read_keypoints(self.npz(object_quat_wxyz=None, object_quat=xyzw), replace(PLAIN, quat="xyzw")))
+        self.same(read_keypoints(self.npz(object_quat_wxyz=None, object_quat=wxyz), replace(PLAIN, quat="wxyz")))
+        self.refused("say --quat wxyz or xyzw", object_quat_wxyz=None, object_quat=wxyz)
+        self.refused("must be given once", object_quat=wxyz)
+        self.refused("must be given once, .* found object_pos", object_quat_wxyz=None)
+        self.refused("quaternion of frame 0 has length 2", object_quat_wxyz=2 * wxyz)
+
+    def test_the_wrist_is_that_of_manos_root(self):
+        found = read_keypoints(self.npz(), PLAIN)
+        off = Rotation.from_quat(found.wrist_quat_wxyz, scalar_first=True).inv() * Rotation.from_quat(
+            self.demos.wrist_quat_wxyz, scalar_first=True
+        )
+        self.assertLess(off.magnitude().max(), 1e-3)  # synthetic hands are the average hand
+
+    def test_what_is_not_known_is_asked_for_in_one_go(self):
+        self.refused("(?s)--order mano, mediapipe or openpose.*--units m or mm.*--coordinates table or camera", Convention())
+        self.refused("--table-from-camera FILE", replace(PLAIN, frame="camera"))
+        self.refused("--coordinates says .* table frame already", replace(PLAIN, table_from_camera=np.eye(4)))
+        self.refused("say it with --object", object=None)
+        self.refused("say it with --side", side=None)
+        self.refused("with --fps", replace(PLAIN, fps=None))
+
+    def test_what_contradicts_the_numbers_is_refused(self):
+        self.refused("In --units mm it would", keypoints=1e3 * self.points)
+        self.refused("In --units m it would", replace(PLAIN, units="mm"))
+        self.refused("Say --order mano", keypoints=written(self.points, "mano"))
+        self.refused("Say --order (mediapipe|openpose)", replace(PLAIN, order="mano"))
+        self.refused("It is the other hand .*or the coordinates are left-handed", side=np.array("left"))
+        self.refused("file says side 'right', but --side says 'left'", replace(PLAIN, side="left"))
+        self.refused("file says 20 frames per second, but --fps says 10", fps=np.array(20.0))
+        self.refused("centred on the hand", keypoints=self.points - self.points.mean(axis=1, keepdims=True))
+        swelling = np.linspace(0.4, 2.5, len(self.points))[:, None, None]
+        self.refused("are no metric keypoints", keypoints=self.points[:, :1] + swelling * (self.points - self.points[:, :1]))
+        points, pos, turn = seen_from(CAMERA, self.demos)
+        seen = {"keypoints": points, "object_pos": pos, "object_quat_wxyz": turn.as_quat(scalar_first=True)}
+        self.refused("Are these the camera's coordinates", **seen)
+        inverse = Convention(order="mediapipe", units="m", frame="camera", table_from_camera=np.linalg.inv(CAMERA), fps=10.0)
+        self.refused("or is that matrix the inverse", inverse, **seen)
+
+    def test_damage_is_named(self):
+        self.refused("no frame has all 21 keypoints", keypoints=np.full_like(self.points, np.nan))
+        with self.assertRaisesRegex(FileFormatError, "has shape .* expected .*21, 3"):
+            read_keypoints(self.npz(keypoints=self.points[:, :20]), PLAIN)
+        with self.assertRaisesRegex(FileFormatError, "no array 'keypoints'"):
+            read_keypoints(self.npz(keypoints=None), PLAIN)
+        with self.assertRaisesRegex(FileFormatError, "non-finite"):
+            read_keypoints(self.npz(object_pos=np.full_like(self.demos.object_pos, np.nan)), PLAIN)
+        with self.assertRaisesRegex(FileFormatError, "objects are never read"):
+            read_keypoints(self.npz(side=np.array([None])), PLAIN)
+        with self.assertRaisesRegex(DemoError, "no .npz and no .csv"):
+            (self.folder / "empty").mkdir()
+            read_keypoints(self.folder / "empty", PLAIN)
+
+    def test_hand_less_frames_stay_so(self):
+        self.points[:3] = np.nan
+        found = read_keypoints(self.npz(), PLAIN)
+        self.assertEqual(np.flatnonzero(~found.hand_valid).tolist(), [0, 1, 2])
+
+    def test_times_are_resampled(self):
+        frames = len(self.points)
+        time = 5.0 + np.arange(frames) / 10
+        self.assertEqual(read_keypoints(self.npz(time=time), replace(PLAIN, fps=None)).fps, 10.0)
+        found = read_keypoints(self.npz(time=time), replace(PLAIN, fps=30.0))
+        self.assertEqual((found.fps, found.num_frames), (30.0, 3 * (frames - 1) + 1))
+        np.testing.assert_allclose(found.hand_keypoints[::3], self.demos.hand_keypoints, atol=1e-6)
+        half = (self.demos.object_pos[1:] + 2 * self.demos.object_pos[:-1]) / 3
+        np.testing.assert_allclose(found.object_pos[1::3], half, atol=1e-6)
+        time[5:] += 0.07
+        self.refused("--fps to resample", replace(PLAIN, fps=None), time=time)
+        self.refused("must be in seconds", replace(PLAIN, fps=None), time=1e3 * (time - 5.0))
+        self.refused("must increase", time=time[::-1].copy())
+
+    def test_a_csv_of_several_sequences(self):
+        path = self.folder / "two.csv"
+        turn = Rotation.from_quat(self.demos.object_quat_wxyz, scalar_first=True)
+        columns = [("object", str(self.demos.object_name[0])), ("side", "right"), ("confidence", 0.9)]
+        write_csv(path, self.points, self.demos.object_pos, turn, columns=[("sequence", "a"), *columns], quat="xyzw")
+        first = path.read_text()
+        path.write_text(first + re.sub("(?m)^a,", "b,", first.split("\n", 1)[1]))
+        with self.assertLogs("xreset.demos.keypoints", "WARNING") as log:
+            found = read_keypoints(path, PLAIN)
+        self.assertIn("confidence", log.output[0])
+        self.assertEqual(found.sequence_name.tolist(), ["a", "b"])
+        self.same(found.select(names=["a"]))
+        with self.assertRaisesRegex(DemoError, "line 2, column x0: 'oops' is no number"), self.assertLogs("xreset.demos.keypoints"):
+            path.write_text(re.sub(r"(?m)(^a,[^,]*,right,0.9,)[^,]*", r"\1oops", first))
+            read_keypoints(path, PLAIN)
+        with self.assertRaisesRegex(DemoError, "lacks the columns .*z20"):
+            path.write_text(first.replace("z20", "depth"))
+            read_keypoints(path, PLAIN)
+        with self.assertRaisesRegex(DemoError, "line 2: 1 cells"), self.assertLogs("xreset.demos.keypoints"):
+            path.write_text(first.split("\n")[0] + "\n3\n")
+            read_keypoints(path, PLAIN)
+
+    def test_command(self):
+        turn = Rotation.from_quat(self.demos.object_quat_wxyz, scalar_first=True)
+        (self.folder / "in").mkdir()
+        for name in ("one", "two"):
+            write_csv(self.folder / "in" / f"{name}.csv", self.points, self.demos.object_pos, turn, scale=1e3)
+        out, err = io.StringIO(), io.StringIO()
+        np.savetxt(self.folder / "T.txt", np.eye(4))
+        words = f"--order mediapipe --units mm --coordinates camera --table-from-camera {self.folder / 'T.txt'} --fps 10"
+        words += f" --side right --object 005_tomato_soup_can --out {self.folder / 'out.npz'}"
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            main(["demos", "import", "keypoints", str(self.folder / "in"), *words.split()])
+        self.assertIn("2 sequences", out.getvalue())
+        self.assertEqual(read_demos(self.folder / "out.npz").sequence_name.tolist(), ["one", "two"])
+        with contextlib.redirect_stderr(err), self.assertRaises(SystemExit):
+            main(["demos", "import", "keypoints", str(self.folder / "in"), "--out", str(self.folder / "no.npz")])
+        self.assertIn("--order mano", err.getvalue())
+        self.assertFalse((self.folder / "no.npz").exists())
+
+
+class Real(unittest.TestCase):
+    def test_dexycb_as_a_csv_of_mediapipe_in_millimetres_and_the_cameras_frame(self):
+        demos = read_demos(data_dir() / "dexycb_right_9x20.npz").select(indices=[0, 57, 130])
+        with tempfile.TemporaryDirectory() as folder:
+            for i in range(3):
+                one = demos.select(indices=[i])
+                columns = [("object", str(one.object_name[0])), ("side", "right"), ("time", np.arange(one.num_frames) / 30)]
+                points, pos, turn = seen_from(CAMERA, one)
+                points = written(points, "mediapipe")
+                path = Path(folder, f"{i}.csv")
+                write_csv(path, points, pos, turn, scale=1e3, columns=columns, quat="xyzw")
+            convention = Convention(order="mediapipe", units="mm", frame="camera", table_from_camera=CAMERA)
+            found = read_keypoints(folder, convention)
+        np.testing.assert_array_equal(found.hand_valid, demos.hand_valid)
+        self.assertAlmostEqual(found.fps, 30, delta=1e-3)
+        seen = demos.hand_valid
+        self.assertLess(np.abs(found.hand_keypoints - demos.hand_keypoints)[seen].max(), 1e-4)
+        self.assertLess(np.abs(found.object_pos - demos.object_pos).max(), 1e-4)
+        turns = [Rotation.from_quat(d.object_quat_wxyz, scalar_first=True) for d in (found, demos)]
+        self.assertLess((turns[0].inv() * turns[1]).magnitude().max(), 1e-3)
+        wrists = [Rotation.from_quat(d.wrist_quat_wxyz[seen], scalar_first=True) for d in (found, demos)]
+        self.assertLess((wrists[0].inv() * wrists[1]).magnitude().max(), np.radians(3.7))
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -3,7 +3,7 @@
 import math
 import tempfile
 import unittest
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
@@ -16,6 +16,7 @@ from tests.toy_robot import toy_hand_arm
 from xreset.env import ManipulationEnv, make_scene
 from xreset.geometry.rotations import quat_rotate
 from xreset.objects import keypoints, load_objects
+from xreset.physics import State
 from xreset.policy import ZeroPolicy
 from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import (
@@ -329,6 +330,25 @@ class FailureTest(WithEnv):
         self.assertEqual((int(env.nonfinite_count), done.tolist()), (1, [0] * N))
         self.assertEqual(float(extras["log"]["health/nonfinite_total"]), 1.0)
         self.assertNotEqual(float(reward[1]), 0.0)
+
+    def test_an_action_that_is_not_finite_ends_the_world_and_no_other(self):
+        env, same = self.make(), self.make()
+        action = self.actions(1)[0]
+        for value in (torch.nan, torch.inf):
+            bad = action.clone()
+            bad[1, 3] = value
+            observations, reward, done, extras = env.step(bad)
+            same.step(action)
+            self.assertEqual((done.tolist(), extras["faulty"].tolist()), ([0, 1, 0], [False, True, False]))
+            self.assertEqual(float(reward[1]), 0.0)
+            for group in set(observations.keys()):
+                self.assertTrue(bool(observations[group].isfinite().all()), group)
+            for f in fields(State):
+                found, expected = getattr(env.backend.state(), f.name), getattr(same.backend.state(), f.name)
+                self.assertTrue(torch.equal(found[[0, 2]], expected[[0, 2]]), f.name)
+        self.assertEqual(int(env.nonfinite_count), 2)
+        *_, done, extras = env.step(action)
+        self.assertEqual(done.tolist(), [0] * N)
 
     def test_the_log_of_a_step_with_a_broken_world_is_finite(self):
         env = self.make(kind=BreakableBackend)

@@ -123,9 +123,60 @@ class ShrinkTest(WithPolicy):
             shrink(large, out)
         weights.CopyFrom(numpy_helper.from_array(np.full(tuple(weights.dims), np.nan, dtype=np.float32), weights.name))
         large.write_bytes(model.SerializeToString())
-        with self.assertRaisesRegex(PolicyError, r"weights in mlp\.0\.weight that are NaN or infinite"):
+        with self.assertRaisesRegex(PolicyError, "gives numbers that are not finite"):
             shrink(large, out)
         self.assertFalse(out.exists())
+
+    def test_what_cannot_act_is_refused_before_work_begins(self):
+        """One step with zeros at loading: whatever the graph is like, evaluation meets no surprise."""
+        flat = sum(sum(self.contract["observation_layout"][g].values()) for g in ("policy", "proprio"))
+        joints, width = len(self.contract["joint_names"]), 128
+
+        def write(*, lstm=width, actions=joints, kind=TensorProto.FLOAT, outputs=3, value=0.5, contract=self.contract, metadata=None):
+            inputs = [
+                helper.make_tensor_value_info(name, kind if name == "flat" else TensorProto.FLOAT, shape)
+                for name, shape in (("flat", ["n", flat]), ("cloud", ["n", 2, 8, 3]), ("h_in", [1, "n", lstm]), ("c_in", [1, "n", lstm]))
+            ]
+            given = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in ("actions", "h_out", "c_out")[:outputs]]
+            weights = numpy_helper.from_array(np.full((flat, actions), value, dtype=np.float32), "w")
+            nodes = [
+                helper.make_node("Cast", ["flat"], ["x"], to=TensorProto.FLOAT),
+                helper.make_node("MatMul", ["x", "w"], ["actions"]),
+                helper.make_node("Identity", ["h_in"], ["h_out"]),
+                helper.make_node("Identity", ["c_in"], ["c_out"]),
+            ]
+            graph = helper.make_graph(nodes, "policy", inputs, given, [weights])
+            model = helper.make_model(graph, ir_version=9, opset_imports=[helper.make_opsetid("", 18)])
+            entry = model.metadata_props.add()
+            entry.key, entry.value = "xreset", json.dumps(contract) if metadata is None else metadata
+            path = self.folder / "tried.onnx"
+            path.write_bytes(model.SerializeToString())
+            return path
+
+        OnnxPolicy(write())
+        layout = self.contract["observation_layout"]
+        for words, changes in (
+            ("numbers that are not finite", {"value": np.nan}),
+            (r"gives float32 \(2, 3\), ", {"actions": 3}),
+            ("cannot act", {"kind": TensorProto.INT64}),
+            ("LSTM state of shape", {"lstm": "width"}),
+            ("LSTM state of shape", {"lstm": 10**11}),
+            ("LSTM state of shape", {"lstm": -5}),
+            ("gives float32 .* for 2 worlds, expected", {"outputs": 2}),
+            ("nested too deeply", {"metadata": '{"a": ' + "[" * 100_000}),
+            (
+                "observation_layout is missing",
+                {"contract": self.contract | {"observation_layout": {"policy": 3, "proprio": 4}}},
+            ),
+            ("observation_layout is missing", {"contract": self.contract | {"observation_layout": layout | {"policy": {"x": -1}}}}),
+            ("joint_names is missing", {"contract": self.contract | {"joint_names": [1, 2]}}),
+        ):
+            with self.subTest(words, **{k: str(v)[:40] for k, v in changes.items()}), self.assertRaisesRegex(PolicyError, words):
+                OnnxPolicy(write(**changes))
+        path = write()
+        path.write_bytes(path.read_bytes().replace(b'"schema"', b"\xff\xfe\xff\xfe\xff\xfe\xff\xfe"))
+        with self.assertRaises(PolicyError):
+            OnnxPolicy(path)
 
     def test_a_damaged_contract_or_another_graph_is_refused(self):
         model, damaged = onnx.load(str(self.file)), self.folder / "damaged.onnx"
@@ -133,8 +184,8 @@ class ShrinkTest(WithPolicy):
         contract = entry.value
         partial = json.dumps({name: value for name, value in json.loads(contract).items() if name != "robot"} | {"task": []})
         for text, said in (
-            ("{nope", "no JSON"),
-            ("[]", r"contract \[\], expected a JSON object"),
+            ("{nope", "not valid JSON"),
+            ("[]", r"a JSON list, expected an object"),
             ("{}", "policy schema None"),
             (partial, "in which robot, task is missing or of another type"),
         ):
@@ -151,7 +202,7 @@ class ShrinkTest(WithPolicy):
         other = helper.make_model(graph, opset_imports=model.opset_import, ir_version=model.ir_version)
         helper.set_model_props(other, {"xreset": contract})
         damaged.write_bytes(other.SerializeToString())
-        with self.assertRaisesRegex(PolicyError, "takes the inputs x; a policy takes flat, cloud, h_in, c_in"):
+        with self.assertRaisesRegex(PolicyError, r"takes the inputs \(.x.,\); a policy takes flat, cloud, h_in, c_in"):
             OnnxPolicy(damaged)
 
     def test_the_command_says_both_sizes_and_may_replace_its_input(self):

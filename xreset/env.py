@@ -7,7 +7,7 @@ same class, with another configuration, runs evaluations.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,6 +53,7 @@ class Reading:
     links: Links
     contacts: Contacts
     health: Health
+    """Of the engine; a world that was given an action that is not finite counts as not finite, too."""
     tip_distance: Tensor
     """[N, E] distance from each fingertip to the object's surface points [m]."""
 
@@ -125,6 +126,7 @@ class ManipulationEnv:
         self._cloud = zeros(task.observation.cloud_history, task.observation.cloud_points, 3)
         # What a step puts down for the next part of it: which worlds begin anew, how, and what there is to log.
         self._fresh = zeros(dtype=torch.bool)
+        self._no_action = zeros(dtype=torch.bool)
         self._start = Reset(
             joint_pos=zeros(self.num_actions),
             object_pos=zeros(3),
@@ -179,7 +181,7 @@ class ManipulationEnv:
         """One control step, then a reset of every world whose episode has ended.
 
         Args:
-            action: [N, J] in [-1, 1] (limited to it).
+            action: [N, J] in [-1, 1] (limited to it). A world that is given numbers that are not finite ends as if its engine had failed.
 
         Returns:
             Observations (of the new episode where one has begun), reward [N], done [N] (0 or 1), extras with ``time_outs`` [N] (ended
@@ -294,6 +296,8 @@ class ManipulationEnv:
         state = self.backend.state()
         for name, value in self._before.items():
             value.copy_(getattr(state, name))
+        self._no_action |= ~self._action.isfinite().all(dim=1)  # a world without an action ends as one whose engine failed
+        self._action.nan_to_num_(0.0, 0.0, 0.0)
         if not self.task.reward.raw_actions:
             self._action.clamp_(-1.0, 1.0)
         self._target.copy_(self.actions.targets(self._action, self._target, state.joint_pos))
@@ -399,6 +403,7 @@ class ManipulationEnv:
     def _begin(self) -> None:
         """Put the fresh worlds into their new states."""
         start = self._start
+        self._no_action &= ~self._fresh
         self.backend.set_where(
             self._fresh,
             state=State.at_rest(start.joint_pos, start.object_pos, start.object_quat),
@@ -409,13 +414,13 @@ class ManipulationEnv:
         )
 
     def _read(self) -> Reading:
-        state, links = self.backend.state(), self.backend.links()
+        state, links, health = self.backend.state(), self.backend.links(), self.backend.health()
         local = quat_rotate_inverse(state.object_quat[:, None], links.pos[:, 1:] - state.object_pos[:, None])
         return Reading(
             state=state,
             links=links,
             contacts=self.backend.contacts(),
-            health=self.backend.health(),
+            health=replace(health, nonfinite=health.nonfinite | self._no_action),
             tip_distance=torch.cdist(local, self._surface_points).amin(dim=-1),
         )
 

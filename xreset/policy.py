@@ -16,9 +16,11 @@ import torch
 from torch import Tensor
 
 from xreset.errors import PolicyError
+from xreset.files import max_bytes, parse_json
 from xreset.spec import RobotSpec
 from xreset.task.config import NoiseConfig, TaskConfig
 from xreset.task.observations import layout
+from xreset.text import shown
 from xreset.typed import from_dict
 
 if TYPE_CHECKING:
@@ -119,21 +121,32 @@ def check_contract_entries(source: str, contract: dict[str, Any]) -> None:
     if contract.get("schema") != SCHEMA:
         raise PolicyError(f"{source} has policy schema {contract.get('schema')!r}, expected {SCHEMA!r}. Export it again.")
     wrong = [name for name, kind in _ENTRIES.items() if not isinstance(contract.get(name), kind)]
+    texts = ("joint_names", "fingertip_names", "objects")
+    wrong += [name for name in texts if name not in wrong and not all(isinstance(text, str) for text in contract[name])]
+    if "observation_layout" not in wrong and not _is_layout(contract["observation_layout"]):
+        wrong.append("observation_layout")
     if wrong:
         raise PolicyError(f"{source} states a contract in which {', '.join(wrong)} is missing or of another type. Export it again.")
+
+
+def _is_layout(layout: dict[str, Any]) -> bool:
+    widths = [width for terms in layout.values() for width in (terms.values() if isinstance(terms, dict) else [None])]
+    return {"policy", "proprio"} <= set(layout) and all(type(width) is int and 0 < width < 1 << 20 for width in widths)
 
 
 def _read_contract(path: Path, metadata: dict[str, str]) -> dict[str, Any]:
     if METADATA_KEY not in metadata:
         raise PolicyError(f"{path} is an ONNX file without xreset's contract: it was not exported by xreset.")
     try:
-        contract = json.loads(metadata[METADATA_KEY])
+        contract = parse_json(metadata[METADATA_KEY])
     except ValueError as error:
-        raise PolicyError(f"{path} holds a contract that is no JSON ({error}). Export it again.") from error
-    if not isinstance(contract, dict):
-        raise PolicyError(f"{path} holds the contract {contract!r}, expected a JSON object. Export it again.")
+        raise PolicyError(f"{path} holds a contract that is not valid JSON ({error}). Export it again.") from error
     check_contract_entries(str(path), contract)
     return contract
+
+
+_MAX_LSTM = 65536
+"""Units of an LSTM: far more than any policy has, and its state still fits into memory."""
 
 
 class OnnxPolicy:
@@ -154,17 +167,50 @@ class OnnxPolicy:
             raise PolicyError(f"onnxruntime cannot be imported ({error}). Install it with: pip install 'xreset[eval]'") from error
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3
+        if path.stat().st_size > max_bytes():
+            raise PolicyError(f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
         try:
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            self._session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+            metadata = self._session.get_modelmeta().custom_metadata_map
         except Exception as error:
-            raise PolicyError(f"{path} cannot be read as an ONNX policy: {error}") from error
-        self.contract = _read_contract(path, self._session.get_modelmeta().custom_metadata_map)
+            raise PolicyError(f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?") from error
+        self.contract = _read_contract(path, metadata)
         inputs = tuple(given.name for given in self._session.get_inputs())
         if inputs != INPUTS:
-            raise PolicyError(f"{path} takes the inputs {', '.join(inputs)}; a policy takes {', '.join(INPUTS)}. Export it again.")
+            raise PolicyError(f"{path} takes the inputs {shown(inputs)}; a policy takes {', '.join(INPUTS)}. Export it again.")
+        self._lstm_dim = self._try(path)
         self.name = path.stem if path.stem != "policy" else path.resolve().parent.name
-        self._lstm_dim = int(self._session.get_inputs()[2].shape[2])
         self._state: list[np.ndarray] | None = None
+
+    def _try(self, path: Path) -> int:
+        """One step with zeros, so that what cannot act is refused before work begins; returns the units of the LSTM."""
+        shape = self._session.get_inputs()[2].shape
+        width = shape[2] if len(shape) == 3 else None
+        if not isinstance(width, int) or not 0 < width <= _MAX_LSTM:
+            raise PolicyError(f"{path} has an LSTM state of shape {shown(shape)}, expected (1, worlds, 1 to {_MAX_LSTM}). Export it again.")
+        task = from_dict(TaskConfig, self.contract["task"], f"{path}: task").observation
+        layout_, worlds = self.contract["observation_layout"], 2
+        shapes = {
+            "flat": (worlds, sum(sum(layout_[group].values()) for group in ("policy", "proprio"))),
+            "cloud": (worlds, task.cloud_history, task.cloud_points, 3),
+            "h_in": (1, worlds, width),
+            "c_in": (1, worlds, width),
+        }
+        try:
+            found: list[Any] = self._session.run(None, {name: np.zeros(shape, dtype=np.float32) for name, shape in shapes.items()})
+        except Exception as error:
+            raise PolicyError(f"{path} cannot act: {shown(str(error))}. Export it again.") from error
+        expected = [(worlds, len(self.contract["joint_names"])), shapes["h_in"], shapes["c_in"]]
+        if [getattr(value, "shape", None) for value in found] != expected or any(value.dtype != np.float32 for value in found):
+            described = ", ".join(
+                f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__ for value in found
+            )
+            raise PolicyError(
+                f"{path} gives {described} for {worlds} worlds, expected float32 {', '.join(map(str, expected))}. Export it again."
+            )
+        if not all(np.isfinite(value).all() for value in found):
+            raise PolicyError(f"{path} gives numbers that are not finite: its training broke down, or the file is damaged.")
+        return width
 
     def begin(self, env: ManipulationEnv) -> None:
         """Zero the recurrent state."""

@@ -20,6 +20,8 @@ _INDICES = {"seed", "episode", "repetition", "sequence", "frame", "port"}
 """At least 0."""
 _WRITTEN = ("out", "png", "mp4", "picture", "json")
 """Files or folders that a command writes."""
+_IN_PLACE = {"policy"}
+"""What a command may replace by what it makes of it."""
 _LARGEST = 2**32 - 1
 """The largest seed that all of numpy, torch and the engines take; more worlds or episodes no machine holds."""
 
@@ -49,7 +51,7 @@ def _check(options: dict[str, Any]) -> None:
             raise XResetError(f"{flag} is {value}, expected a whole number from {low} to {_LARGEST}.")
         if isinstance(value, float) and math.isnan(value):
             raise XResetError(f"{flag} is not a number.")
-        if name == "device":
+        if name == "device" and isinstance(value, str):
             check_device(value)
     _check_overwriting(options)
 
@@ -74,7 +76,7 @@ def _check_overwriting(options: dict[str, Any]) -> None:
         if name not in given or given[name].is_dir():
             continue
         for other, path in given.items():
-            if other != name and path.resolve() == given[name].resolve():
+            if other not in (name, *_IN_PLACE) and path.resolve() == given[name].resolve():
                 raise XResetError(
                     f"--{name} is {path}, which is given as {other.replace('_', ' ')} too. Nothing was overwritten; choose another file."
                 )

@@ -10,6 +10,7 @@ import unittest
 import urllib.request
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
+from http.client import HTTPConnection
 from importlib.util import find_spec
 from pathlib import Path
 from unittest import mock
@@ -392,6 +393,50 @@ class Served(WithFiles):
             self.assertEqual(process.wait(timeout=20), 0, rest)
         self.assertIn("closed.", rest)
         self.assertNotIn("Traceback", rest)
+
+
+@unittest.skipUnless(find_spec("viser"), "viser is not installed")
+class OwnPageOnly(unittest.TestCase):
+    """A socket from another site, or a name that is made to point here, gets nothing."""
+
+    def test_headers(self):
+        from xreset.pictures.view.page import is_own_page
+
+        for host, origin, served, expected in (
+            ("localhost:8080", None, "127.0.0.1", True),
+            ("127.0.0.1:8080", "http://127.0.0.1:8080", "127.0.0.1", True),
+            ("[::1]:8080", "http://[::1]:8080", "::1", True),
+            ("10.0.0.7:8080", "http://10.0.0.7:8080", "0.0.0.0", True),
+            ("127.0.0.1:8080", "http://evil.example", "127.0.0.1", False),
+            ("127.0.0.1:8080", "http://127.0.0.1:9999", "127.0.0.1", False),
+            ("evil.example", None, "127.0.0.1", False),
+            ("evil.example:8080", "http://evil.example:8080", "0.0.0.0", False),
+            ("", None, "127.0.0.1", False),
+            ("127.0.0.1:8080", "null", "127.0.0.1", False),
+        ):
+            with self.subTest(host=host, origin=origin):
+                self.assertEqual(is_own_page(host, origin, served), expected)
+
+    def test_the_server(self):
+        import viser
+        from websockets.exceptions import InvalidStatus
+        from websockets.sync.client import connect
+
+        from xreset.pictures.view.page import _own_page_only
+
+        with _own_page_only("127.0.0.1"):
+            server = viser.ViserServer(host="127.0.0.1", port=8990, verbose=False)
+        self.addCleanup(server.stop)
+        address = f"127.0.0.1:{server.get_port()}"
+        for host, status in ((address, 200), ("evil.example", 403)):
+            connection = HTTPConnection(address, timeout=10)
+            connection.request("GET", "/", headers={"Host": host})
+            self.assertEqual(connection.getresponse().status, status)
+            connection.close()
+        with self.assertRaisesRegex(InvalidStatus, "403"):
+            connect(f"ws://{address}", origin="http://evil.example", subprotocols=["viser-v0"])  # pyright: ignore[reportArgumentType]
+        with connect(f"ws://{address}", origin=f"http://{address}"):  # pyright: ignore[reportArgumentType]
+            pass
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ def read_description(path: Path) -> RobotSpec:
         raise RobotError(
             f"{path.parent} has no readable {path.name} ({error.strerror}). A robot's folder holds one beside its URDF."
         ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also texts that are not UTF-8, numbers of thousands of digits
         raise RobotError(f"{path} is not valid TOML: {error}.") from error
     if data.get("schema") != SCHEMA:
         raise RobotError(f"{path} states schema {data.get('schema')!r}, expected {SCHEMA!r}.")
@@ -229,11 +229,15 @@ class _Table:
 
 
 def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and bool(value.strip())
+    return isinstance(value, str) and bool(value.strip()) and value.isprintable()
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST
+
+
+_LARGEST = 1e9
+"""Of any number of a description: stiffnesses reach 1e5, everything else far less."""
 
 
 def _shown(value: Any) -> str:

@@ -17,7 +17,7 @@ import os
 import stat
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -270,6 +270,25 @@ def read_npz(
     if unknown := sorted(set(found) - set(own)):
         logging.getLogger(__name__).warning("%s also holds %s, which this xreset (%s) leaves aside.", path, shown(unknown), __version__)
     return arrays
+
+
+def read_arrays(path: str | Path, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Some arrays of a foreign npz file, which states no schema; sizes are checked before anything is unpacked.
+
+    Raises:
+        FileFormatError: the file is damaged, too large, or lacks one of them.
+    """
+    path = Path(path)
+    _must_exist(path, "npz file")
+    with _archive(path, "cannot be read") as archive:
+        found = _headers(archive)
+        if missing := [name for name in names if name not in found]:
+            raise FileFormatError(f"{path} has no array {', '.join(missing)}.")
+        if wrong := [name for name in names if found[name].dtype.kind not in "fiu"]:
+            raise FileFormatError(f"{path} has no numbers in {', '.join(wrong)}.")
+        if problem := _too_large(found, {name: Field((), "f") for name in names}):
+            raise FileFormatError(f"{path}: {problem}")
+        return {name: _read(archive, found[name]) for name in names}
 
 
 def npz_schema(path: str | Path) -> str:

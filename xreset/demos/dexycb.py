@@ -11,7 +11,6 @@ without a hand have ``pose_m`` = 0 and joints = -1.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +20,17 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from xreset.checks import is_rigid
 from xreset.demos.archive import SIDES, Demos, concatenate
-from xreset.errors import DemoError
+from xreset.errors import DemoError, FileFormatError
+from xreset.files import read_arrays
 from xreset.objects import canonical_name
 from xreset.objects.ycb import NAME_OF_ID
+from xreset.text import is_plain, shown
 
 FPS = 30.0
+_MAX_FRAMES = 100_000
+"""An hour of frames; DexYCB's sequences have 72."""
 
 _META = ("extrinsics", "mano_sides", "num_frames", "serials", "ycb_grasp_ind", "ycb_ids")
 
@@ -100,6 +104,9 @@ def _read(sequence: _Sequence, extrinsics: Mapping[str, np.ndarray]) -> Demos:
     _expect(sequence, "pose.npz: pose_m", poses["pose_m"].shape, (frames, 1, 51))
     pose_object = poses["pose_y"][:, sequence.object_index].astype(float)
     pose_hand = poses["pose_m"][:, 0].astype(float)
+    for name, values in (("pose_y", pose_object), ("pose_m", pose_hand)):
+        if not (np.abs(values) < 1e3).all():
+            raise DemoError(f"sequence {sequence.name}: {name} of pose.npz holds numbers that are not finite, or far too large.")
     if (np.linalg.norm(pose_object[:, :4], axis=1) < 0.5).any():
         raise DemoError(f"sequence {sequence.name}: frame {np.argmin(np.linalg.norm(pose_object[:, :4], axis=1))} has no object pose.")
 
@@ -159,13 +166,23 @@ def _meta(path: Path) -> _Sequence:
     missing = [key for key in _META if key not in meta]
     if missing:
         raise DemoError(f"{path} has no {', '.join(missing)}; it is not a DexYCB meta.yml.")
-    ids, index, sides = list(meta["ycb_ids"]), int(meta["ycb_grasp_ind"]), list(meta["mano_sides"])
+    ids, index, frames, sides, serials = (meta[key] for key in ("ycb_ids", "ycb_grasp_ind", "num_frames", "mano_sides", "serials"))
+    for key, value, fits in (
+        ("ycb_ids", ids, isinstance(ids, list) and all(type(i) is int for i in ids)),
+        ("ycb_grasp_ind", index, type(index) is int),
+        ("num_frames", frames, type(frames) is int and 0 < frames <= _MAX_FRAMES),
+        ("mano_sides", sides, isinstance(sides, list) and all(isinstance(side, str) for side in sides)),
+        ("serials", serials, isinstance(serials, list) and all(isinstance(s, str | int) and is_plain(str(s)) for s in serials)),
+        ("extrinsics", meta["extrinsics"], isinstance(meta["extrinsics"], str | int)),
+    ):
+        if not fits:
+            raise DemoError(f"{path}: {key} is {shown(value)}, which is no value of DexYCB's.")
     if not 0 <= index < len(ids):
         raise DemoError(f"{path}: ycb_grasp_ind is {index}, but there are {len(ids)} objects in ycb_ids.")
     if ids[index] not in NAME_OF_ID:
         raise DemoError(f"{path}: the grasped object has YCB id {ids[index]}; DexYCB's ids go from 1 to {len(NAME_OF_ID)}.")
     if len(sides) != 1 or sides[0] not in SIDES:
-        raise DemoError(f"{path}: mano_sides is {sides}, expected one of right and left.")
+        raise DemoError(f"{path}: mano_sides is {shown(sides)}, expected one of right and left.")
     return _Sequence(
         folder=path.parent,
         extrinsics=str(meta["extrinsics"]),
@@ -173,8 +190,8 @@ def _meta(path: Path) -> _Sequence:
         object_name=NAME_OF_ID[ids[index]],
         object_index=index,
         num_objects=len(ids),
-        num_frames=int(meta["num_frames"]),
-        serials=tuple(map(str, meta["serials"])),
+        num_frames=frames,
+        serials=tuple(map(str, serials)),
     )
 
 
@@ -186,10 +203,14 @@ def _extrinsics(root: Path, name: str) -> dict[str, np.ndarray]:
         raise DemoError(f"{path} has no pose 'apriltag' under 'extrinsics': without it the table frame is unknown.")
     poses = {}
     for key, values in entries.items():
+        numbers = isinstance(values, list | tuple) and all(type(x) in (int, float) for x in values)
+        if not numbers or len(values) != 12:
+            found = f"{len(values)} numbers" if numbers else shown(values)
+            raise DemoError(f"{path}: the pose {shown(key)} has {found}, expected the 12 numbers of a 3x4 matrix.")
         T = np.eye(4)
-        if len(values) != 12:
-            raise DemoError(f"{path}: the pose {key!r} has {len(values)} numbers, expected the 12 of a 3x4 matrix.")
         T[:3] = np.asarray(values, dtype=float).reshape(3, 4)
+        if not is_rigid(T):
+            raise DemoError(f"{path}: the pose {shown(key)} is no rotation and translation: it is scaled, mirrored or damaged.")
         poses[str(key)] = T
     return poses
 
@@ -211,9 +232,11 @@ def _yaml(path: Path) -> dict[str, Any]:
             f"there is no {path}; the DexYCB folder is incomplete. Unpack its calibration archive beside the subjects' folders."
         )
     try:
+        if path.stat().st_size > 1 << 20:
+            raise ValueError("it has more than a megabyte")
         data = yaml.load(path.read_text(), Loader=_Loader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise DemoError(f"{path} is not valid YAML: {error}") from error
+    except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise DemoError(f"{path} is not valid YAML: {shown(str(error) or 'it is nested too deeply')}") from error
     if not isinstance(data, dict):
         raise DemoError(f"{path} holds a {type(data).__name__}, expected names and values.")
     return data
@@ -223,10 +246,9 @@ def _npz(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise DemoError(f"there is no {path}; the sequence is incomplete. Unpack it again.")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in names}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise DemoError(f"{path} cannot be read: {error}. It is damaged or not DexYCB's; unpack it again.") from error
+        return read_arrays(path, names)
+    except FileFormatError as error:
+        raise DemoError(f"{error} It is damaged or not DexYCB's; unpack it again.") from error
 
 
 def _expect(sequence: _Sequence, what: str, found: tuple[int, ...], expected: tuple[int, ...]) -> None:

@@ -11,13 +11,18 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 from xml.etree import ElementTree
 
 import numpy as np
 
 from xreset.errors import RobotError
+from xreset.files import max_bytes
 from xreset.spec import Geometry, RobotSpec, Shape
+from xreset.text import is_plain, shown
+
+if TYPE_CHECKING:
+    import trimesh
 
 JointType = Literal["revolute", "prismatic", "fixed"]
 
@@ -112,6 +117,8 @@ def load_urdf(path: str | Path) -> RobotTree:
     path = Path(path).resolve()
     if not path.is_file():
         raise RobotError(f"there is no URDF at {path}.")
+    if path.stat().st_size > max_bytes() // 16:
+        raise RobotError(f"{path} has {path.stat().st_size >> 20} MB, too many for a URDF.")
     return _load(path, path.stat().st_mtime_ns)
 
 
@@ -131,8 +138,8 @@ def _load(path: Path, _modified: int) -> RobotTree:
             load_meshes=False,
             filename_handler=lambda name: name,
         ).robot
-    except (ElementTree.ParseError, ValueError, TypeError, AttributeError, KeyError) as error:
-        raise RobotError(f"{path} cannot be read as a URDF: {error}") from error
+    except Exception as error:  # yourdfpy raises whatever its parsing meets
+        raise RobotError(f"{path} cannot be read as a URDF: {shown(str(error))}") from error
 
     joints = {joint.child: joint for joint in robot.joints}
     names = [link.name for link in robot.links]
@@ -157,12 +164,42 @@ def _load(path: Path, _modified: int) -> RobotTree:
         raise RobotError(f"{path}: links {sorted(set(names) - set(order))} are not connected to the root {roots[0]!r}.")
 
     by_name = {link.name: link for link in robot.links}
-    return RobotTree(
-        name=robot.name or path.stem,
-        root=roots[0],
-        links=tuple(_link(by_name[name], path) for name in order),
-        joints=tuple(_joint(joints[name], path) for name in order[1:]),
-    )
+    for name in (*names, *(joint.name for joint in robot.joints)):
+        if not isinstance(name, str) or not is_plain(name):
+            raise RobotError(f"{path}: the name {shown(name)} holds characters that control a terminal, or is none.")
+    try:
+        tree = RobotTree(
+            name=robot.name or path.stem,
+            root=roots[0],
+            links=tuple(_link(by_name[name], path) for name in order),
+            joints=tuple(_joint(joints[name], path) for name in order[1:]),
+        )
+    except (ValueError, TypeError, IndexError) as error:  # vectors of two numbers, texts for numbers
+        raise RobotError(f"{path} has numbers that make no sense: {shown(str(error))}") from error
+    _check_numbers(tree, path)
+    return tree
+
+
+_LARGEST = 1e6
+"""Of any number of a URDF but limits: masses [kg], positions [m], inertias [kg m^2]. No robot comes near."""
+
+
+def _check_numbers(tree: RobotTree, path: Path) -> None:
+    """Refuse numbers that are not finite or beyond anything real; the limits of continuous joints are infinite on purpose."""
+    for link in tree.links:
+        parts = [link.com, link.inertia, np.array([link.mass])]
+        for shape in link.collisions:
+            parts += [shape.T_body_shape, np.asarray(shape.geometry.size or 0.0)]
+            parts += [] if shape.geometry.vertices is None else [shape.geometry.vertices]
+        if not all((np.abs(part) < _LARGEST).all() for part in parts):
+            raise RobotError(f"{path}: link {link.name!r} has a number that is not finite, or far too large.")
+        if link.mass < 0:
+            raise RobotError(f"{path}: link {link.name!r} has the mass {link.mass} kg, expected 0 or more.")
+    for joint in tree.joints:
+        if not ((np.abs(joint.T_parent_joint) < _LARGEST).all() and np.isfinite(joint.axis).all()):
+            raise RobotError(f"{path}: joint {joint.name!r} has a number that is not finite, or far too large.")
+        if math.isnan(joint.velocity) or not joint.lower <= joint.upper:
+            raise RobotError(f"{path}: joint {joint.name!r} has the limits {joint.lower} to {joint.upper}, expected the lower one first.")
 
 
 def _link(link, path: Path) -> Link:
@@ -198,10 +235,23 @@ def _hull(mesh, link: str, path: Path) -> Geometry:
     file = find_mesh(mesh.filename, path)
     if file is None:
         raise RobotError(f"{path}: link {link!r} uses the mesh {mesh.filename!r}, which is not there. Put it beside the URDF.")
-    loaded = trimesh.load(file, force="mesh")
-    scale = np.ones(3) if mesh.scale is None else np.broadcast_to(np.asarray(mesh.scale, dtype=float), 3)
-    hull = trimesh.Trimesh(np.asarray(loaded.vertices) * scale, loaded.faces).convex_hull
+    try:
+        loaded = trimesh.load(file, force="mesh", process=False)
+        if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.vertices):
+            raise ValueError("it holds no triangles")
+        if not (np.abs(loaded.vertices) < _LARGEST).all():
+            raise ValueError("it has a vertex that is not finite, or far away")
+        hull = _scaled_hull(loaded, mesh)
+    except Exception as error:  # trimesh and qhull raise whatever they meet
+        raise RobotError(f"{path}: link {link!r} uses the mesh {mesh.filename!r}, which cannot be read: {shown(str(error))}") from error
     return Geometry(kind="hull", vertices=np.asarray(hull.vertices, dtype=float), faces=np.asarray(hull.faces, dtype=np.int64))
+
+
+def _scaled_hull(loaded: trimesh.Trimesh, mesh) -> trimesh.Trimesh:
+    import trimesh
+
+    scale = np.ones(3) if mesh.scale is None else np.broadcast_to(np.asarray(mesh.scale, dtype=float), 3)
+    return trimesh.Trimesh(np.asarray(loaded.vertices) * scale, loaded.faces).convex_hull
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:
@@ -210,7 +260,10 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
     candidates = [relative] if relative.is_absolute() else [folder / relative for folder in urdf.parents]
     if name.startswith("package://"):  # the package's own folder may be one of the URDF's ancestors
         candidates += [folder / Path(*relative.parts[1:]) for folder in urdf.parents]
-    return next((file for file in candidates if file.is_file()), None)
+    try:
+        return next((file for file in candidates if file.is_file()), None)
+    except (OSError, ValueError):  # a name too long, or with a zero in it
+        return None
 
 
 def _joint(joint, path: Path) -> Joint:

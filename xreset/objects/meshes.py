@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from xreset.errors import ObjectError
-from xreset.files import file_hash
+from xreset.files import file_hash, max_bytes
 from xreset.geometry.shapes import hull, mass_properties, shape_mesh
 from xreset.objects.decompose import cached_pieces
 from xreset.objects.ycb import MASSES
 from xreset.spec import ObjectSpec
+from xreset.text import shown
 
 if TYPE_CHECKING:
     import trimesh
@@ -115,14 +116,18 @@ def _load(path: Path) -> trimesh.Trimesh:
 
     if not path.is_file():
         raise ObjectError(f"there is no mesh at {path}.")
+    if path.stat().st_size > max_bytes():
+        raise ObjectError(f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
     try:
         mesh = trimesh.load(path, force="mesh", skip_materials=True, process=False)  # processing would drop damaged vertices silently
     except Exception as error:  # trimesh raises whatever its parsers meet
-        raise ObjectError(f"{path} cannot be read as a mesh: {error}") from error
+        raise ObjectError(f"{path} cannot be read as a mesh: {shown(str(error))}") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not len(mesh.vertices):
         raise ObjectError(f"{path} holds no triangles; it is empty or damaged.")
     if not np.isfinite(mesh.vertices).all():
         raise ObjectError(f"{path} has a vertex that is not finite; it is damaged.")
+    if mesh.extents is not None and mesh.extents.max() > _LARGEST:  # before merging, which rounds by the size
+        raise ObjectError(f"{path} measures {_size(mesh)}; meshes must be in metres. Is it in millimetres?")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # texture seams are no holes
     mesh.update_faces(mesh.nondegenerate_faces())
     mesh.remove_unreferenced_vertices()
@@ -130,8 +135,6 @@ def _load(path: Path) -> trimesh.Trimesh:
         mesh.invert()  # inside out
     if not len(mesh.faces) or mesh.extents.min() < 1e-5:
         raise ObjectError(f"{path} is flat: {_size(mesh)}; a solid object is needed.")
-    if mesh.extents.max() > _LARGEST:
-        raise ObjectError(f"{path} measures {_size(mesh)}; meshes must be in metres. Is it in millimetres?")
     return mesh
 
 

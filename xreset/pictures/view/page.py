@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from ipaddress import ip_address
+from socket import getfqdn, gethostname
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -49,7 +54,8 @@ class Page:
             raise XResetError(f"there is no frame {frame}; the sequence has {len(self._rows)}, counted from 0.")
         self._lock = threading.RLock()
         try:
-            self._server = viser.ViserServer(host=host, port=port, label="xreset view", verbose=False)
+            with _own_page_only(host):
+                self._server = viser.ViserServer(host=host, port=port, label="xreset view", verbose=False)
         except OSError as error:
             raise XResetError(f"the page cannot be served at {host}:{port}: {error}. Choose others with --host and --port.") from error
         self._scene = _Scene(view, self._server)
@@ -222,3 +228,45 @@ def _rgb(color: Any) -> tuple[int, int, int]:
     """Red, green, blue in 0..255."""
     red, green, blue = (round(255 * float(part)) for part in color)
     return red, green, blue
+
+
+@contextmanager
+def _own_page_only(host: str) -> Iterator[None]:
+    """Servers that viser starts in this block answer their own pages only: viser itself asks nobody where he comes from.
+
+    A page of another site may open a socket to any address, and a name of its own may be made to point here.
+    """
+    from websockets.asyncio import server
+
+    serve = server.serve
+
+    def guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            if not is_own_page(request.headers.get("Host", ""), request.headers.get("Origin"), host):
+                return connection.respond(403, "this server answers its own page only\n")
+            return process_request(connection, request) if process_request else None
+
+        return serve(*arguments, process_request=check, **options)
+
+    server.serve = guarded
+    try:
+        yield
+    finally:
+        server.serve = serve
+
+
+def is_own_page(host: str, origin: str | None, served: str) -> bool:
+    """Whether a request comes from the page itself.
+
+    Args:
+        host: the header ``Host``: an address, which no foreign name can hide behind, or this machine's name.
+        origin: the header ``Origin``, which a browser sends with a socket; None without a browser.
+        served: the address that is listened at.
+    """
+    name = urlsplit(f"//{host}").hostname or ""
+    try:
+        ip_address(name)
+    except ValueError:
+        if name not in ("localhost", served, gethostname(), getfqdn()):
+            return False
+    return origin is None or origin in (f"http://{host}", f"https://{host}")

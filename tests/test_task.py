@@ -377,7 +377,7 @@ class ResetTest(WithRobot):
         both = torch.tensor([0, 1] * 4000)
         resets = self.distribution(demo_probability=1.0, frontier=0.75)
         names = ((resets.sample(both, generator()).object_pos[:, 0] - 0.6) * 100).round().long()
-        resets.reached.copy_(torch.tensor([0.0, 0.5, 0.9, 1.0, 0.2, 0.1]))  # soup, soup, soup, soup, spam, spam: sorted by object
+        resets.reached_from_bank.copy_(torch.tensor([0.0, 0.5, 0.9, 1.0, 0.2, 0.1]))  # soup, soup, soup, soup, spam, spam: sorted by object
         reset = resets.sample(both, generator())
         chosen = reset.state
         self.assertEqual(sorted(set(names.tolist())), [0, 1, 2, 3, 4, 5])
@@ -387,19 +387,63 @@ class ResetTest(WithRobot):
             torch.testing.assert_close(share, 0.25 / len(weights) + 0.75 * weight / weight.sum(), atol=0.03, rtol=0)
         self.assertEqual(reset.sequence[both == 1].unique().tolist(), [1])
 
-    def test_what_became_of_an_episode_is_remembered_by_its_state(self):
+    def test_a_flatter_frontier_keeps_what_is_hardly_solved_in_practice(self):
+        """Of two states, one solved in 1 % of episodes and one in half of them, the first is drawn as often as the exponent says."""
+        bank = toy_bank(self.robot).select(sequences=np.array([True, False, False]))
+        for power, relative in ((1.0, 0.04), (0.5, 0.2), (0.25, 0.45)):
+            resets = self.distribution((SOUP,), bank, demo_probability=1.0, frontier=1.0, frontier_power=power)
+            resets.reached_from_bank.copy_(torch.tensor([0.0101, 0.5]))  # s (1 - s) is FLOOR
+            share = float((resets.sample(self.SOUPS, generator()).state == 0).float().mean())
+            self.assertAlmostEqual(share, relative / (1 + relative), delta=0.02, msg=power)
+
+    def test_home_starts_and_bank_states_may_be_one_table(self):
+        """Weights are the even mixture's chances times the frontier's weights; of home, demonstrations differ too."""
+        both = torch.tensor([0, 1] * 4000)
+        resets = self.distribution(demo_probability=0.25, frontier=1.0, frontier_over="all")
+        even = resets.sample(both, generator())
+        self.assertAlmostEqual(float(even.from_bank.float().mean()), 0.25, delta=0.02, msg="as long as nothing is known")
+        resets.reached_from_bank.copy_(torch.tensor([1.0, 1.0, 0.5, 0.0, 0.5, 0.5]))  # soup (demonstrations 0, 2), then spam
+        resets.reached[:3] = torch.tensor([0.5, 0.0, 0.1])
+        reset = resets.sample(both, generator())
+        soup, spam = both == 0, both == 1
+        home, states = (0.75 / 2 * np.array([0.25, 0.09])), 0.25 / 4 * np.array([0.01, 0.01, 0.25, 0.01])
+        total = home.sum() + states.sum()
+        found = torch.bincount(torch.where(reset.from_bank, reset.state, 4 + reset.sequence)[soup], minlength=7) / 4000
+        expected = torch.tensor([*states, home[0], 0.0, home[1]], dtype=torch.float32) / total
+        torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
+        self.assertAlmostEqual(float(reset.from_bank[spam].float().mean()), 0.25 * 0.25 / (0.25 * 0.25 + 0.75 * 0.01), delta=0.02)
+
+    def test_one_table_where_either_part_is_empty(self):
+        for p, expected in ((0.0, 0.0), (1.0, 1.0)):
+            resets = self.distribution(demo_probability=p, frontier=1.0, frontier_over="all")
+            self.assertEqual(float(resets.sample(self.SOUPS, generator()).from_bank.float().mean()), expected)
+        none = toy_bank(self.robot).select(sequences=np.array([True, False, True]))
+        resets = self.distribution(bank=none, demo_probability=1.0, frontier=1.0, frontier_over="all")
+        self.assertEqual(resets.sample(torch.tensor([0, 1] * 100), generator()).from_bank.tolist(), [True, False] * 100)
+
+    def test_what_became_of_an_episode_is_remembered_by_its_start(self):
         resets = self.distribution(frontier=0.5, frontier_rate=0.1)
         state = torch.tensor([0, 0, 0, 1, 2, -1, 3])
+        sequence = torch.tensor([0, 0, 0, 0, 2, 1, 2])
         ended = torch.tensor([True, True, True, True, True, True, False])
         reached = torch.tensor([True, True, False, False, True, True, True])
-        resets.learn(state, ended, reached)
+        resets.learn(state, sequence, ended, reached)
         three = 0.5 * 0.9**3 + (1 - 0.9**3) * 2 / 3
-        torch.testing.assert_close(resets.reached, torch.tensor([three, 0.45, 0.55, 0.5, 0.5, 0.5]))
+        torch.testing.assert_close(resets.reached_from_bank, torch.tensor([three, 0.45, 0.55, 0.5, 0.5, 0.5]))
+        torch.testing.assert_close(resets.reached_from_home, torch.tensor([0.5, 0.5, 0.55]), msg="demonstrations 0, 2 (soup) and 1 (spam)")
         for _ in range(100):
-            resets.learn(state, ended, reached)
-        torch.testing.assert_close(resets.reached, torch.tensor([2 / 3, 0.0, 1.0, 0.5, 0.5, 0.5]), atol=1e-4, rtol=0)
+            resets.learn(state, sequence, ended, reached)
+        torch.testing.assert_close(resets.reached_from_bank, torch.tensor([2 / 3, 0.0, 1.0, 0.5, 0.5, 0.5]), atol=1e-4, rtol=0)
+        torch.testing.assert_close(resets.reached_from_home, torch.tensor([0.5, 0.5, 1.0]), atol=1e-4, rtol=0)
         empty = self.distribution(bank=toy_bank(self.robot).select(sequences=np.zeros(3, dtype=bool)), frontier=0.5)
-        empty.learn(torch.full((7,), -1), ended, reached)
+        empty.learn(torch.full((7,), -1), sequence, ended, reached)
+        self.assertEqual(len(empty.reached_from_bank), 0)
+
+    def test_frontier_options_out_of_range(self):
+        for words, changes in (("frontier is 1.5", {"frontier": 1.5}), ("frontier_power is 0", {"frontier_power": 0}),
+                               ("frontier_power is inf", {"frontier_power": math.inf})):  # fmt: skip
+            with self.assertRaisesRegex(ValueError, words):
+                ResetConfig(**changes)
 
     def test_an_object_without_demonstration_is_an_error(self):
         with self.assertRaisesRegex(DemoError, "no demonstration of 011_banana; it has 005_tomato_soup_can, 010_potted_meat_can"):

@@ -342,7 +342,7 @@ class ManipulationEnv:
         self._fresh.copy_(lost | time_out)
         self._reached |= reward.success
         if self.resets.config.frontier > 0:
-            self.resets.learn(self.bank_state, self._fresh & ~self._faulty, self._reached)
+            self.resets.learn(self.bank_state, self.sequence, self._fresh & ~self._faulty, self._reached)
         names, values = self._log(reward, self._fresh, sound=~broken)
         if not self._log_names:
             self._log_names, self._log_values = names, torch.zeros_like(values)
@@ -498,7 +498,9 @@ class ManipulationEnv:
         means = torch.where(masks, values, 0).sum(dim=-1) / masks.sum(dim=-1).clamp_min(1)
         totals = {"health/nonfinite_total": self.nonfinite_count, "health/overflow_total": self.overflow_count}
         if self.resets.config.frontier > 0:
-            totals["task/reached_from_bank"] = self.resets.reached.mean()
+            totals["task/reached_from_bank"] = self.resets.reached_from_bank.mean()
+            totals["task/reached_from_home"] = self.resets.reached_from_home.mean()
+            totals["task/from_bank"] = self.from_bank.float().mean()
         return (*rows, *totals), torch.cat((means, torch.stack([value.float() for value in totals.values()])))
 
 

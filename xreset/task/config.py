@@ -182,9 +182,15 @@ class ResetConfig:
     demo_probability: float = 0.5
     """p: share of resets from the bank; 0 is X-Sim."""
     frontier: float = 0.0
-    """Share of bank resets drawn where the policy sometimes reaches the goal and sometimes does not: in proportion to s (1 - s), s being
-    the share of recent episodes from a state that reached it. The others are drawn evenly, as in the paper. That product is known as
-    learnability (Tzannetos et al. 2023, Proximal Curriculum; Rutherford et al. 2024, No Regrets)."""
+    """Share of resets drawn where the policy sometimes reaches the goal and sometimes does not: in proportion to (s (1 - s)) ^
+    ``frontier_power``, s being the share of recent episodes from a start that reached it. The others are drawn evenly, as in the paper."""
+    frontier_over: Literal["bank", "all"] = "bank"
+    """``bank``: only bank states are drawn so, and ``demo_probability`` stays their share of all resets. ``all``: bank states and home
+    starts, one of each demonstration, are one table; a start's weight is its chance in the even mixture times the one above, so
+    that resets come from the bank until home is where there is something to learn, and then from home."""
+    frontier_power: float = 1.0
+    """Of 1, the weight is the learnability of Tzannetos et al. 2023 (Proximal Curriculum) and Rutherford et al. 2024 (No Regrets): a start
+    solved in 1 % of episodes has 4 % of the greatest weight. Flatter: with 0.5 it has 20 %, with 0.25 it has 45 %."""
     frontier_rate: float = 0.1
     """Weight of an episode in s."""
     pre_contact_only: bool = False
@@ -205,7 +211,8 @@ class ResetConfig:
     def __post_init__(self) -> None:
         check_numbers(
             self,
-            positive=("frontier_rate",),
+            positive=("frontier_power", "frontier_rate"),
+            finite=("frontier_power",),
             share=("demo_probability", "frontier", "frontier_rate"),
             not_negative=("home_gravity_std", "home_gravity_clip", "spawn_xy", "spawn_yaw"),
         )

@@ -209,6 +209,17 @@ class ResetTest(WithEnv):
         torch.testing.assert_close(env.goal_pos, torch.as_tensor(self.bank.goal_pos)[env.sequence])
         self.assertEqual(float(state.object_linvel.abs().max()), 0.0)
 
+    def test_starts_may_press(self):
+        """Drives begin with the bank's targets; from home they hold the joints."""
+        task = replace(TASK, reset=ResetConfig(demo_probability=1.0))
+        self.bank = replace(self.bank, joint_target=self.bank.joint_pos + 0.01)
+        env = self.make(task)
+        state = env.backend.state()
+        torch.testing.assert_close(state.joint_target, state.joint_pos + 0.01)
+        torch.testing.assert_close(env.joint_target, state.joint_target)
+        state = self.make(replace(task, reset=ResetConfig(demo_probability=0.0))).backend.state()
+        self.assertTrue(torch.equal(state.joint_target, state.joint_pos))
+
     def test_what_became_of_episodes_moves_the_frontier(self):
         env = self.make(replace(TASK, reset=ResetConfig(demo_probability=1.0, frontier=0.5)))
         began, before = env.bank_state.clone(), env.resets.reached_from_bank.clone()

@@ -28,7 +28,7 @@ from xreset.pictures.view.colors import reason_color
 from xreset.pictures.view.load import load_view
 from xreset.pictures.view.picture import Drawer
 from xreset.pictures.view.sheet import moment_tiles, reason_tiles
-from xreset.resets.bank import write_bank
+from xreset.resets.bank import read_bank, write_bank
 from xreset.retarget.file import Retargeted, write_retargeted
 
 FRAMES = 4
@@ -190,6 +190,15 @@ class Data(WithFiles):
         assert view.joint_pos is not None and trajectories.joint_pos is not None
         np.testing.assert_allclose(view.joint_pos, trajectories.joint_pos[[0, 2, 3, 4, 6, 7]], atol=1e-6)
         np.testing.assert_allclose(view.object_pos, trajectories.object_pos[[0, 2, 3, 4, 6, 7]], atol=1e-6)
+        bank_data = read_bank(bank)
+        between = replace(
+            bank_data, joint_pos=bank_data.joint_pos + np.array([0, 0.5, 0, 0])[:, None], frame_part=np.array([0, 0.5, 0, 0]),
+            rejected_frame_part=np.array([0.0, 0.25]),
+        )  # fmt: skip
+        write_bank(bank, between, config={}, inputs={})
+        view = load_view(bank, retargeted=made_from)
+        self.assertEqual(list(zip(view.sequence.tolist(), view.frame.tolist())), [(0, 0), (0, 2), (1, 0), (1, 2)], "whole frames only")
+        self.assertEqual(view.reason, ("", "joint velocity", "", ""))
         with self.assertRaisesRegex(XResetError, "was not made from"):
             load_view(self.bank, retargeted=made_from)
         with self.assertRaisesRegex(XResetError, "no reset bank"):

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -95,12 +95,13 @@ def accounts_path(path: Path) -> Path:
     return path.with_name(f"{path.stem}.accounts.json")
 
 
-def write_accounts(path: Path, *, of: str, rows: Sequence[Account]) -> None:
+def write_accounts(path: Path, *, of: str, rows: Sequence[Account], **more: Any) -> None:
     """Write accounts as JSON.
 
     Args:
         path: file.
         of: what was counted, such as ``frames``.
         rows: per object and phase.
+        more: what else there is to say, by name.
     """
-    write_json(path, {"schema": SCHEMA, "of": of, "rows": [asdict(row) for row in with_totals(rows)]})
+    write_json(path, {"schema": SCHEMA, "of": of, "rows": [asdict(row) for row in with_totals(rows)]} | more)

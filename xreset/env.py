@@ -129,6 +129,7 @@ class ManipulationEnv:
         self._no_action = zeros(dtype=torch.bool)
         self._start = Reset(
             joint_pos=zeros(self.num_actions),
+            joint_target=zeros(self.num_actions),
             object_pos=zeros(3),
             object_quat=zeros(4),
             goal_pos=zeros(3),
@@ -394,7 +395,7 @@ class ManipulationEnv:
             (start.gravity_fraction, self.gravity_fraction),
             (start.sequence, self.sequence),
             (start.state, self.bank_state),
-            (start.joint_pos, self._target),
+            (start.joint_target, self._target),
         ):
             old.copy_(torch.where(fresh.view(-1, *[1] * (old.ndim - 1)), new, old))
         for cleared in (self._episode_length, self._previous_action, self._reward, self._reached):
@@ -406,7 +407,7 @@ class ManipulationEnv:
         self._no_action &= ~self._fresh
         self.backend.set_where(
             self._fresh,
-            state=State.at_rest(start.joint_pos, start.object_pos, start.object_quat),
+            state=State.at_rest(start.joint_pos, start.object_pos, start.object_quat, start.joint_target),
             friction=self._friction,
             object_mass=self._mass,
             object_gravity=start.gravity_fraction,

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+from xreset.resets.config import ClosingConfig, SqueezeConfig
+
 
 def resets(
     retargeted: Annotated[Path, tyro.conf.Positional],
@@ -18,6 +20,9 @@ def resets(
     objects: Path | None = None,
     num_envs: int = 64,
     device: str = "cpu",
+    closing: ClosingConfig = ClosingConfig(),  # noqa: B008 (frozen)
+    squeeze: SqueezeConfig = SqueezeConfig(),  # noqa: B008 (frozen)
+    hold: bool = False,
 ) -> None:
     """Try retargeted states in physics and keep the stable ones.
 
@@ -29,7 +34,12 @@ def resets(
         objects: Folder of real meshes; default: the built-in stand-ins.
         num_envs: Worlds at a time.
         device: Where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
+        closing: States between frames where the hand closes in.
+        squeeze: Targets of states after contact that press.
+        hold: Also count, in every engine, which lifted states hold the object for a second at full gravity.
     """
+    from dataclasses import asdict
+
     from rich.table import Table
 
     from xreset.accounts import accounts_path, described, with_totals, write_accounts
@@ -39,6 +49,7 @@ def resets(
     from xreset.objects import load_objects
     from xreset.resets.bank import check_robot, write_bank
     from xreset.resets.filter import make_bank
+    from xreset.resets.hold import hold_bank
     from xreset.retarget.pipeline import read_retargeted
 
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
@@ -52,11 +63,27 @@ def resets(
     with Progress(console) as bar:
         task = bar.add_task(f"states in {', '.join(backends)}")
         bank = make_bank(
-            data, spec, loaded, backends, num_envs=num_envs, device=device,
+            data, spec, loaded, backends, num_envs=num_envs, device=device, closing=closing, squeeze=squeeze,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
-    write_bank(out, bank, config={"backends": backends, "num_envs": num_envs}, inputs={"retargeted": file_hash(retargeted)})
-    write_accounts(accounts_path(out), of="states tried in physics", rows=bank.accounts())
+        held = []
+        if hold:
+            task = bar.add_task("lifted states hold")
+            held = hold_bank(
+                bank, spec, loaded, backends, num_envs=num_envs, device=device,
+                progress=lambda done, total: bar.update(task, completed=done, total=total),
+            )  # fmt: skip
+    config = {"backends": backends, "num_envs": num_envs, "closing": asdict(closing), "squeeze": asdict(squeeze)}
+    write_bank(out, bank, config=config, inputs={"retargeted": file_hash(retargeted)})
+    bands = bank.bands()
+    write_accounts(
+        accounts_path(out),
+        of="states tried in physics",
+        rows=bank.accounts(),
+        bands=[asdict(band) for band in bands],
+        pressing=bank.num_pressing,
+        **({"hold": [asdict(row) for row in held]} if hold else {}),
+    )
 
     annotated = {(row.object_name, row.phase): row.without("not annotated").total for row in with_totals(data.accounts())}
     table = Table(
@@ -75,6 +102,22 @@ def resets(
             described(row.lost),
         )
     console.print(table)
+    if closing.spacing is not None:
+        table = Table("finger to object", "frames: tried", "accepted", "added: tried", "accepted", title="where the hand closes in")
+        for band in bands:
+            counts = (band.tried, band.kept, band.added, band.added_kept)
+            far, near = ("" if edge is None else f"{100 * edge:g}" for edge in (band.nearer, band.farther))
+            table.add_row(f"{far} to {near} cm" if far and near else f"beyond {near} cm" if near else "contact", *map(str, counts))
+        console.print(table)
+    if squeeze.force > 0:
+        console.print(f"{bank.num_pressing} of {int(bank.post_contact.sum())} states after contact press with {squeeze.force:g} N")
+    if hold:
+        table = Table("object", "lifted", *backends, title="lifted states that hold the object for 1 s at full gravity")
+        for name in dict.fromkeys(row.object_name for row in held):
+            mine = [row for row in held if row.object_name == name]
+            shares = [f"{row.held} ({row.held / row.lifted:.0%})" if row.lifted else "-" for row in mine]
+            table.add_row(name, str(mine[0].lifted), *shares)
+        console.print(table)
     console.print(
         f"{bank.num_states} states of {bank.num_states + len(bank.rejected_reason)} kept in {out}; counts in {accounts_path(out)}"
     )

@@ -78,7 +78,7 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
         if not shapes:
             continue
         links.append(name)
-        parts = [_shape_balls(shape) for shape in shapes]
+        parts = [shape_balls(shape) for shape in shapes]
         centers.append(np.concatenate([points for points, _ in parts]))
         radii.append(np.concatenate([radius for _, radius in parts]))
     counts = np.array([len(part) for part in radii], dtype=np.int64)
@@ -153,7 +153,7 @@ def sharp_points(geometry: Geometry, spacing: float) -> np.ndarray:
     return np.unique(np.concatenate(edges), axis=0)
 
 
-def _shape_balls(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+def shape_balls(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     """Centres [n, 3] in the link's frame and radii [n] of the balls of one shape."""
     inner, radius = inscribed_balls(shape.geometry)
     sharp = sharp_points(shape.geometry, radius)

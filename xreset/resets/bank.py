@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,31 @@ _FIELDS: Schema = {
     "rejected_post_contact": Field(("C",), "b"),
     "rejected_reason": Field(("C",), "i"),
     "reason_names": Field(("R",), "U"),
+    "joint_target": Field(("L", "J"), "f", required=False, within=JOINT),
+    "frame_part": Field(("L",), "f", required=False, within=(0.0, 1.0)),
+    "rejected_frame_part": Field(("C",), "f", required=False, within=(0.0, 1.0)),
+    "finger_gap": Field(("L",), "f", required=False, within=POSITION),
+    "rejected_finger_gap": Field(("C",), "f", required=False, within=POSITION),
 }
+_OF_STATES = tuple(name for name, field in _FIELDS.items() if field.shape[:1] == ("L",))
+BANDS = (0.10, 0.05, 0.02, 0.01, 0.001)
+"""Distances [m] between a finger and the object by which states are counted where the hand closes in; nearer is contact."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Band:
+    """States whose nearest finger is between two distances from the object."""
+
+    nearer: float | None
+    """[m] nearer than this ...; None: however far."""
+    farther: float | None
+    """[m] ... and not nearer than this; None: in contact."""
+    tried: int
+    """Demonstrated frames."""
+    kept: int
+    added: int
+    """States between frames (:mod:`xreset.resets.closing`)."""
+    added_kept: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,20 +109,66 @@ class ResetBank:
     rejected_reason: np.ndarray
     """[C] index into ``reason_names``."""
     reason_names: tuple[str, ...]
+    joint_target: np.ndarray | None = None
+    """[L, J] drive targets; None: they are the joints' positions, as in files of earlier versions (:attr:`targets`)."""
+    frame_part: np.ndarray | None = None
+    """[L] how far a state lies on the way from its frame to the next, in [0, 1); None: every state is a frame."""
+    rejected_frame_part: np.ndarray | None = None
+    """[C]"""
+    finger_gap: np.ndarray | None = None
+    """[L] distance of the nearest finger from the object [m] (:mod:`xreset.resets.fingers`); None in files of earlier versions."""
+    rejected_finger_gap: np.ndarray | None = None
+    """[C]"""
 
     @property
     def num_states(self) -> int:
         """L"""
         return len(self.joint_pos)
 
+    @property
+    def targets(self) -> np.ndarray:
+        """[L, J] drive targets."""
+        return self.joint_pos if self.joint_target is None else self.joint_target
+
     def accounts(self) -> list[Account]:
-        """What became of every state that was tried, by object and phase."""
+        """What became of every frame that was tried, by object and phase; states between frames are counted by :meth:`bands`."""
         lost = np.asarray(self.sequence_object)[self.rejected_sequence_index]
+        frame = ~self._added
         return accounts(
-            np.concatenate((self.object_name, lost)),
-            np.concatenate((self.post_contact, self.rejected_post_contact)),
-            np.concatenate((np.full(self.num_states, ""), np.asarray(self.reason_names)[self.rejected_reason])),
+            np.concatenate((self.object_name, lost))[frame],
+            np.concatenate((self.post_contact, self.rejected_post_contact))[frame],
+            np.concatenate((np.full(self.num_states, ""), np.asarray(self.reason_names)[self.rejected_reason]))[frame],
         )
+
+    @property
+    def num_pressing(self) -> int:
+        """States whose drive targets are not the joints' positions."""
+        return int((self.targets != self.joint_pos).any(axis=1).sum())
+
+    def bands(self) -> list[Band]:
+        """How many states were tried and accepted by how near a finger is, the farthest first; none if that is not known."""
+        if self.finger_gap is None or self.rejected_finger_gap is None:
+            return []
+        gap, added = np.concatenate((self.finger_gap, self.rejected_finger_gap)), self._added
+        accepted = np.arange(len(gap)) < self.num_states
+        return [
+            Band(
+                nearer=high,
+                farther=low,
+                tried=int((mine & ~added).sum()),
+                kept=int((mine & ~added & accepted).sum()),
+                added=int((mine & added).sum()),
+                added_kept=int((mine & added & accepted).sum()),
+            )
+            for high, low in pairwise((None, *BANDS, None))
+            for mine in [(gap >= (-np.inf if low is None else low)) & (gap < (np.inf if high is None else high))]
+        ]
+
+    @property
+    def _added(self) -> np.ndarray:
+        """[L + C] bool: whether a state that was tried lies between frames; those that were accepted come first."""
+        parts = ((self.frame_part, self.num_states), (self.rejected_frame_part, len(self.rejected_reason)))
+        return np.concatenate([np.zeros(count, dtype=bool) if part is None else part > 0 for part, count in parts])
 
     def select(self, *, sequences: np.ndarray | None = None, pre_contact_only: bool = False) -> ResetBank:
         """A bank with the states of some sequences [bool mask over S], or only those before first contact; sequences stay listed."""
@@ -106,13 +177,13 @@ class ResetBank:
             keep &= sequences[self.sequence_index]
         if pre_contact_only:
             keep &= ~self.post_contact
-        names = ("joint_pos", "object_pos", "object_quat_wxyz", "object_name", "sequence_index", "frame_index", "post_contact")
-        return replace(self, **{name: getattr(self, name)[keep] for name in names})
+        return replace(self, **{name: value[keep] for name in _OF_STATES if (value := getattr(self, name)) is not None})
 
 
 def write_bank(path: str | Path, bank: ResetBank, *, config: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
     """Write a bank; see :func:`xreset.files.write_npz`."""
-    write_npz(path, SCHEMA, {f.name: _array(getattr(bank, f.name)) for f in fields(bank)}, config=config, inputs=inputs)
+    arrays = {f.name: _array(value) for f in fields(bank) if (value := getattr(bank, f.name)) is not None}
+    write_npz(path, SCHEMA, arrays, config=config, inputs=inputs)
 
 
 def read_bank(path: str | Path, *, robot: RobotSpec | None = None) -> ResetBank:
@@ -128,6 +199,8 @@ def read_bank(path: str | Path, *, robot: RobotSpec | None = None) -> ResetBank:
     arrays = read_npz(path, SCHEMA, _FIELDS, what="a reset bank", check=_check)
     values: dict[str, Any] = {}
     for f in fields(ResetBank):
+        if f.name not in arrays:
+            continue
         value = arrays[f.name]
         values[f.name] = str(value) if value.ndim == 0 else tuple(value.tolist()) if f.type == "tuple[str, ...]" else value
     bank = ResetBank(**values)

@@ -1,6 +1,6 @@
 """More states where a hand closes in on an object.
 
-People come in at 0.6 to 0.9 m/s, so at 30 frames a second a demonstration shows a hand two or three times between 10 cm and first contact,
+People come in at 0.6 to 0.9 m/s, so at 30 frames a second a demonstration shows a hand two or three times between 10 cm and its grasp,
 which is where a policy learns to grasp or to press. Between two frames of one motion the robot's joints are interpolated, so that
 fingertips move by a stated distance from state to state; physics judges the new states like the others.
 """
@@ -8,50 +8,63 @@ fingertips move by a stated distance from state to state; physics judges the new
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from xreset.checks import check_numbers
-from xreset.objects import surface_points
+from xreset.resets.config import ClosingConfig
+from xreset.resets.fingers import Fingers, fingers_of
 from xreset.retarget.file import Retargeted
-from xreset.spec import ObjectSpec
+from xreset.spec import ObjectSpec, RobotSpec
+
+TOUCH = 0.002
+"""A finger nearer to the object than this touches it [m]; retargeting keeps 0.5 mm between them."""
+MOVED = 0.01
+"""Once its origin is farther than this from where it started [m], an object has been moved."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ClosingConfig:
-    """Where states are added, and how many."""
+class Closing(NamedTuple):
+    """Trajectories with states between frames."""
 
-    spacing: float = 0.005
-    """Farthest that any fingertip moves from one state to the next [m]."""
-    within: float = 0.10
-    """Only where a fingertip is nearer than this to the object's surface [m], before first contact."""
-
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("spacing", "within"), finite=("spacing", "within"))
+    retargeted: Retargeted
+    """With more frames, no longer evenly spaced in time. Those that were there are unchanged and in their order."""
+    frame: np.ndarray
+    """[F] the frame that each was, or that comes before it, counted over the trajectories that were given."""
+    part: np.ndarray
+    """[F] how far it lies on the way to the next one, in [0, 1); 0 is the frame itself."""
 
 
-def with_closing_frames(retargeted: Retargeted, objects: Sequence[ObjectSpec], config: ClosingConfig) -> Retargeted:
-    """The same motion with frames added between valid ones, up to the frame of first contact.
+def with_closing_frames(retargeted: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec], config: ClosingConfig) -> Closing:
+    """The same motion with frames added between valid ones where the hand closes in.
+
+    That is where a finger is near the object, until the thumb and another one touch it or it has been moved. It is not until the human's
+    first contact: then the robot's fingers are usually 5 to 10 mm away.
 
     Args:
         retargeted: robot trajectories.
+        robot: the robot they are for.
         objects: geometry of the objects that they name.
         config: where and how densely.
-
-    Returns:
-        Trajectories whose frames are no longer evenly spaced in time. Those that were there are unchanged and in their order.
     """
     owner = retargeted.sequence_of_frame
-    distance = _tip_distance(retargeted, objects)
+    if config.spacing is None:
+        return Closing(retargeted, np.arange(len(owner)), np.zeros(len(owner)))
+    fingers = fingers_in(retargeted, robot, objects)
+    gap = fingers.nearest.numpy()
+    touch, thumb = (fingers.gap < TOUCH).numpy(), (fingers.finger == 0).numpy()
+    start = retargeted.frame_offsets[:-1][owner]
+    moved = np.linalg.norm(retargeted.object_pos - retargeted.object_pos[start], axis=-1) > MOVED
+    over = touch[:, thumb].any(axis=1) & touch[:, ~thumb].any(axis=1) | moved
+    past = np.cumsum(over)
+    over = past - (past - over)[start] > 0  # in this frame, or in one before it of the same sequence
     before = np.flatnonzero(
         (owner[:-1] == owner[1:])
         & retargeted.valid[:-1]
         & retargeted.valid[1:]
-        & ~retargeted.post_contact[:-1]
-        & (np.minimum(distance[:-1], distance[1:]) < config.within)
+        & ~over[:-1]
+        & (np.minimum(gap[:-1], gap[1:]) < config.within)
     )
     travel = np.linalg.norm(retargeted.fingertip_pos[before + 1] - retargeted.fingertip_pos[before], axis=-1).max(axis=-1)
     pieces = np.ones(len(owner), dtype=int)
@@ -74,7 +87,7 @@ def with_closing_frames(retargeted: Retargeted, objects: Sequence[ObjectSpec], c
     starts = np.cumsum(pieces) - pieces
     first = retargeted.first_contact
     contact_row = starts[np.where(first >= 0, retargeted.frame_offsets[:-1] + first, 0)]
-    return replace(
+    dense = replace(
         retargeted,
         frame_offsets=offsets.astype(retargeted.frame_offsets.dtype),
         first_contact=np.where(first >= 0, contact_row - offsets[:-1], first).astype(first.dtype),
@@ -82,17 +95,11 @@ def with_closing_frames(retargeted: Retargeted, objects: Sequence[ObjectSpec], c
         **{name: turned(getattr(retargeted, name)) for name in ("palm_quat_wxyz", "object_quat_wxyz")},
         **{name: getattr(retargeted, name)[row] for name in ("annotated", "valid", "reason", "contact", "hand_error", "wrist_error")},
     )
+    return Closing(dense, row, part)
 
 
-def _tip_distance(retargeted: Retargeted, objects: Sequence[ObjectSpec], points: int = 512) -> np.ndarray:
-    """[F] distance of the nearest fingertip to points on the object's surface [m]."""
-    trees = {o.name: cKDTree(surface_points(o, points)) for o in objects}
-    turn = Rotation.from_quat(retargeted.object_quat_wxyz, scalar_first=True).inv().as_matrix()
-    local = np.einsum("fij,fej->fei", turn, retargeted.fingertip_pos - retargeted.object_pos[:, None])
-    names = np.asarray(retargeted.object_name)[retargeted.sequence_of_frame]
-    distance = np.full(len(local), np.inf)
-    for name, tree in trees.items():
-        mine = names == name
-        if mine.any():
-            distance[mine] = tree.query(local[mine])[0].min(axis=-1)
-    return distance
+def fingers_in(retargeted: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec]) -> Fingers:
+    """Where the fingers are in every frame [F]."""
+    names = [o.name for o in objects]
+    index = np.array([names.index(str(name)) for name in retargeted.object_name])[retargeted.sequence_of_frame]
+    return fingers_of(robot, objects, index, retargeted.joint_pos, retargeted.object_pos, retargeted.object_quat_wxyz)

@@ -28,6 +28,8 @@ class Reset(Tensors):
 
     joint_pos: Tensor
     """[M, J]"""
+    joint_target: Tensor
+    """[M, J] drive targets."""
     object_pos: Tensor
     object_quat: Tensor
     goal_pos: Tensor
@@ -55,6 +57,7 @@ def bank_starts(bank: ResetBank, rows: np.ndarray) -> Reset:
     sequence = bank.sequence_index[rows]
     return Reset(
         joint_pos=_tensor(bank.joint_pos[rows]),
+        joint_target=_tensor(bank.targets[rows]),
         object_pos=_tensor(bank.object_pos[rows]),
         object_quat=_tensor(bank.object_quat_wxyz[rows]),
         goal_pos=_tensor(bank.goal_pos[sequence]),
@@ -115,6 +118,7 @@ class ResetDistribution:
         self._state_first, self._state_count = ranges(state_object[state_rows])
         self._sequence_first, self._sequence_count = ranges(sequence_object[sequence_rows])
         self.joint_pos = tensor(bank.joint_pos[state_rows])
+        self._joint_target = tensor(bank.targets[state_rows])
         self._object_pos = tensor(bank.object_pos[state_rows])
         self._object_quat = tensor(bank.object_quat_wxyz[state_rows])
         self._state_sequence = tensor(bank.sequence_index[state_rows])
@@ -172,6 +176,7 @@ class ResetDistribution:
         gravity = uniform[:, 3] if c.random_gravity else torch.ones_like(uniform[:, 3])
         return Reset(
             joint_pos=mix(self.joint_pos[row], home.joint_pos),
+            joint_target=mix(self._joint_target[row], home.joint_target),
             object_pos=mix(self._object_pos[row], home.object_pos),
             object_quat=mix(self._object_quat[row], home.object_quat),
             goal_pos=self._goal_pos[sequence],
@@ -193,6 +198,7 @@ class ResetDistribution:
         gravity = 1.0 + torch.randn(m, generator=generator, device=device) * c.home_gravity_std / GRAVITY
         return Reset(
             joint_pos=joint_pos,
+            joint_target=joint_pos,
             object_pos=start_pos + offset,
             object_quat=quat_multiply(quat_from_axis_angle(yaw), start_quat),
             goal_pos=self._goal_pos[sequence],

@@ -16,6 +16,10 @@ from xreset.errors import DemoError
 from xreset.physics import Backend, State
 from xreset.plugins import device_for, make_backend
 from xreset.resets.bank import ResetBank
+from xreset.resets.closing import Closing, with_closing_frames
+from xreset.resets.config import ClosingConfig, SqueezeConfig
+from xreset.resets.fingers import fingers_of
+from xreset.resets.squeeze import squeeze_targets
 from xreset.retarget.pipeline import Retargeted
 from xreset.schedule import schedule
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
@@ -41,7 +45,12 @@ class FilterConfig:
 
 
 def try_states(
-    backend: Backend, joint_pos: torch.Tensor, object_pos: torch.Tensor, object_quat: torch.Tensor, config: FilterConfig
+    backend: Backend,
+    joint_pos: torch.Tensor,
+    object_pos: torch.Tensor,
+    object_quat: torch.Tensor,
+    config: FilterConfig,
+    joint_target: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Spawn one state per world and let the steps pass.
 
@@ -51,13 +60,14 @@ def try_states(
         object_pos: [N, 3]
         object_quat: [N, 4]
         config: steps and thresholds.
+        joint_target: [N, J] drive targets; None: the joints' positions.
 
     Returns:
         [N] long: index into :data:`REASONS`, -1 where the state is accepted.
     """
     n = backend.num_worlds
     backend.set_object_gravity(torch.zeros(n, device=backend.device))
-    backend.set_state(State.at_rest(joint_pos, object_pos, object_quat))
+    backend.set_state(State.at_rest(joint_pos, object_pos, object_quat, joint_target))
     for _ in range(config.steps):
         backend.step()
     state, health = backend.state(), backend.health()
@@ -84,6 +94,8 @@ def make_bank(
     num_envs: int = 64,
     device: str = "cpu",
     config: FilterConfig | None = None,
+    closing: ClosingConfig | None = None,
+    squeeze: SqueezeConfig | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ResetBank:
     """Try every valid frame in every engine and keep those that all accept.
@@ -96,55 +108,86 @@ def make_bank(
         num_envs: worlds at a time.
         device: where engines run that can use it; the others run on the CPU.
         config: steps and thresholds.
+        closing: states between frames, which are tried like the others; None: none.
+        squeeze: with which force the targets of states after contact press. Accepted states are tried with them once more, and where an
+            engine does not accept that, the targets stay the joints' positions. None: all do.
         progress: called with (candidates tried, candidates in all).
 
     Raises:
         DemoError: no frame is valid.
     """
-    config = config or FilterConfig()
-    frames = np.flatnonzero(retargeted.valid)
-    if not len(frames):
+    config, closing, squeeze = config or FilterConfig(), closing or ClosingConfig(), squeeze or SqueezeConfig()
+    if not retargeted.valid.any():
         raise DemoError(
             "no frame of the retargeted trajectories is valid, so there is no state to try; look at the reasons of xreset retarget."
         )
-    sequence = retargeted.sequence_of_frame[frames]
-    names = np.asarray(retargeted.object_name)[sequence]
+    dense = with_closing_frames(retargeted, robot, objects, closing)
+    tried = dense.retargeted
+    frames = np.flatnonzero(tried.valid)
+    sequence = tried.sequence_of_frame[frames]
+    names = np.asarray(tried.object_name)[sequence]
     used = tuple(o for o in objects if o.name in set(names.tolist()))
-    reason = np.full(len(frames), -1, dtype=np.int64)
+    object_index = np.array([[o.name for o in used].index(name) for name in names])
     scene = SceneSpec(robot=robot, objects=used)
-    object_of = np.array([[o.name for o in used].index(name) for name in names])
-    for number, name in enumerate(backends):
-        left = np.flatnonzero(reason < 0)
-        if not len(left):
-            break
-        plan = schedule(object_of[left], num_envs)
-        worlds = torch.as_tensor(plan.object_index)
-        with make_backend(name, scene, len(worlds), object_index=worlds, device=device_for(name, device)) as backend:
-            tried = 0
-            for items, fresh in plan:
-                rows = frames[left[items]]
-                joint_pos, object_pos, object_quat = (
-                    torch.as_tensor(array[rows], dtype=torch.float32, device=backend.device)
-                    for array in (retargeted.joint_pos, retargeted.object_pos, retargeted.object_quat_wxyz)
-                )
-                found = try_states(backend, joint_pos, object_pos, object_quat, config).cpu().numpy()
-                reason[left[items[fresh]]] = found[fresh]
-                tried += int(fresh.sum())
-                progress(number * len(frames) + tried, len(backends) * len(frames))
-    progress(len(backends) * len(frames), len(backends) * len(frames))
-    return _bank(retargeted, robot, objects, tuple(backends), frames, sequence, reason)
+    fingers = fingers_of(robot, used, object_index, tried.joint_pos[frames], tried.object_pos[frames], tried.object_quat_wxyz[frames])
+    target = tried.joint_pos[frames].astype(np.float32)
+
+    def accepted(rows: np.ndarray, report: Callable[[int], None]) -> np.ndarray:
+        """[len(rows)] reason of states, given as rows of ``frames``; -1 where every engine accepts them."""
+        reason = np.full(len(rows), -1, dtype=np.int64)
+        for number, name in enumerate(backends):
+            left = np.flatnonzero(reason < 0)
+            if not len(left):
+                break
+            plan = schedule(object_index[rows[left]], num_envs)
+            worlds = torch.as_tensor(plan.object_index)
+            with make_backend(name, scene, len(worlds), object_index=worlds, device=device_for(name, device)) as backend:
+                done = 0
+                for items, fresh in plan:
+                    chosen = rows[left[items]]
+                    joint_pos, object_pos, object_quat, joint_target = (
+                        torch.as_tensor(array, dtype=torch.float32, device=backend.device)
+                        for array in (
+                            *(array[frames[chosen]] for array in (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz)),
+                            target[chosen],
+                        )
+                    )
+                    found = try_states(backend, joint_pos, object_pos, object_quat, config, joint_target).cpu().numpy()
+                    reason[left[items[fresh]]] = found[fresh]
+                    done += int(fresh.sum())
+                    report(number * len(rows) + done)
+        return reason
+
+    work = len(backends) * len(frames)
+    reason = accepted(np.arange(len(frames)), lambda done: progress(done, work))
+    if squeeze.force > 0:
+        rows = np.flatnonzero((reason < 0) & tried.post_contact[frames])
+        still = target[rows]
+        target[rows] = squeeze_targets(robot, fingers, tried.joint_pos[frames], squeeze)[rows]
+        work += len(backends) * len(rows)
+        refused = accepted(rows, lambda done: progress(len(backends) * len(frames) + done, work)) >= 0
+        target[rows[refused]] = still[refused]
+    progress(work, work)
+    return _bank(
+        dense, retargeted, robot, objects, tuple(backends), frames, reason, fingers.nearest.numpy(), target if squeeze.force > 0 else None
+    )
 
 
 def _bank(
-    retargeted: Retargeted,
+    dense: Closing,
+    original: Retargeted,
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
     backends: tuple[str, ...],
     frames: np.ndarray,
-    sequence: np.ndarray,
     reason: np.ndarray,
+    gap: np.ndarray,
+    target: np.ndarray | None,
 ) -> ResetBank:
-    local = frames - retargeted.frame_offsets[sequence]
+    retargeted = dense.retargeted
+    sequence = retargeted.sequence_of_frame[frames]
+    local = dense.frame[frames] - original.frame_offsets[sequence]
+    part = dense.part[frames].astype(np.float32) if dense.part.any() else None
     post = retargeted.post_contact[frames]
     keep, reject = reason < 0, reason >= 0
     rows = frames[keep]
@@ -177,4 +220,9 @@ def _bank(
         rejected_post_contact=post[reject],
         rejected_reason=reason[reject].astype(np.int32),
         reason_names=REASONS,
+        joint_target=None if target is None else target[keep],
+        frame_part=None if part is None else part[keep],
+        rejected_frame_part=None if part is None else part[reject],
+        finger_gap=gap[keep].astype(f32),
+        rejected_finger_gap=gap[reject].astype(f32),
     )

@@ -165,16 +165,21 @@ def _with_rejected(path: Path, view: View, bank: ResetBank, retargeted: Path) ->
     from xreset.retarget.file import read_retargeted
 
     data = read_retargeted(retargeted)
-    sequence = np.concatenate((bank.sequence_index, bank.rejected_sequence_index))
-    frame = np.concatenate((bank.frame_index, bank.rejected_frame_index))
+    parts = (bank.frame_part, bank.rejected_frame_part)
+    whole, whole_rejected = (  # states between frames are not in the file
+        slice(None) if part is None else part == 0 for part in parts
+    )
+    sequence = np.concatenate((bank.sequence_index[whole], bank.rejected_sequence_index[whole_rejected]))
+    frame = np.concatenate((bank.frame_index[whole], bank.rejected_frame_index[whole_rejected]))
+    kept = bank.joint_pos[whole]
     rows = data.frame_offsets[:-1][sequence] + frame if data.sequence_name.tolist() == bank.sequence_name.tolist() else np.zeros(0, int)
     tried = bool(len(rows)) and rows.max() < len(data.valid) and data.joint_names == bank.joint_names
-    if not tried or not np.allclose(data.joint_pos[rows[: bank.num_states]], bank.joint_pos, atol=1e-6):
+    if not tried or not np.allclose(data.joint_pos[rows[: len(kept)]], kept, atol=1e-6):
         raise XResetError(f"{path} was not made from {retargeted}: sequences or states differ.")
     order = np.lexsort((frame, sequence))
     rows, sequence, frame = rows[order], sequence[order], frame[order]
-    post = np.concatenate((bank.post_contact, bank.rejected_post_contact))[order]
-    names = (*("",) * bank.num_states, *(bank.reason_names[i] for i in bank.rejected_reason.tolist()))
+    post = np.concatenate((bank.post_contact[whole], bank.rejected_post_contact[whole_rejected]))[order]
+    names = (*("",) * len(kept), *(bank.reason_names[i] for i in bank.rejected_reason[whole_rejected].tolist()))
     object_of = np.array([bank.object_names.index(name) for name in bank.sequence_object.tolist()])
     return replace(
         view,

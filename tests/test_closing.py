@@ -1,0 +1,316 @@
+"""Reset banks beyond the paper's filter: states between frames where a hand closes in, targets that press, grasps that hold."""
+
+import json
+import tempfile
+import unittest
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+
+from tests import toy_grasp
+from tests.test_cli import run
+from tests.toy_bank import toy_bank
+from xreset.accounts import accounts_path
+from xreset.files import meta_of
+from xreset.geometry.kinematics import Kinematics
+from xreset.resets.bank import read_bank, write_bank
+from xreset.resets.closing import with_closing_frames
+from xreset.resets.config import ClosingConfig, HoldConfig, SqueezeConfig
+from xreset.resets.distribution import ResetDistribution, bank_starts
+from xreset.resets.fingers import Fingers, fingers_of
+from xreset.resets.squeeze import squeeze_targets
+from xreset.retarget.file import Retargeted, write_retargeted
+from xreset.task.config import ResetConfig
+
+ROBOT = toy_grasp.robot()
+JAW, LIFT = ROBOT.joint_names.index("jaw_a_slide"), ROBOT.joint_names.index("lift")
+WIDE = toy_grasp.OPEN + 0.03
+"""A jaw position 30.1 mm from the brick."""
+
+
+def retargeted(joint_pos: np.ndarray, object_pos: np.ndarray, offsets=None, **changes) -> Retargeted:
+    """Trajectories of the gripper and the brick, given by joints [F, J] and the brick's positions [F, 3]; every frame is valid."""
+    frames, quat = len(joint_pos), toy_grasp.brick_pose()[1]
+    offsets = np.array(offsets or [0, frames])
+    tips = Kinematics(ROBOT).points(torch.as_tensor(joint_pos), [tip.link for tip in ROBOT.fingertips]).numpy()
+    count = len(offsets) - 1
+    values = {
+        "robot": ROBOT.name,
+        "robot_fingerprint": ROBOT.fingerprint,
+        "sequence_name": np.array([f"demo{i}" for i in range(count)]),
+        "object_name": np.array(["brick"] * count),
+        "hand_side": np.array(["right"] * count),
+        "frame_offsets": offsets,
+        "fps": 30.0,
+        "joint_names": ROBOT.joint_names,
+        "joint_pos": joint_pos,
+        "palm_pos": np.zeros((frames, 3)),
+        "palm_quat_wxyz": np.tile([1.0, 0, 0, 0], (frames, 1)),
+        "fingertip_names": ROBOT.fingertip_names,
+        "fingertip_pos": tips,
+        "object_pos": object_pos,
+        "object_quat_wxyz": np.tile(quat, (frames, 1)),
+        "goal_pos": object_pos[offsets[1:] - 1],
+        "goal_quat_wxyz": np.tile(quat, (count, 1)),
+        "annotated": np.ones(frames, dtype=bool),
+        "valid": np.ones(frames, dtype=bool),
+        "reason": np.zeros(frames, dtype=np.int64),
+        "reason_names": ("valid", "other"),
+        "contact": np.zeros(frames, dtype=bool),
+        "first_contact": np.full(count, -1),
+        "hand_error": np.zeros(frames),
+        "wrist_error": np.zeros(frames),
+    }
+    return Retargeted(**(values | changes))
+
+
+def grasp_and_lift() -> Retargeted:
+    """Three frames: jaws 30.1 mm from the brick; 0.1 mm from it; and that 4 cm higher."""
+    joints = np.tile(ROBOT.home, (3, 1))
+    joints[:, JAW] = WIDE, toy_grasp.OPEN, toy_grasp.OPEN
+    joints[2, LIFT] += toy_grasp.RAISED
+    pos = toy_grasp.brick_pose()[0] + np.array([[0, 0, 0], [0, 0, 0], [0, 0, toy_grasp.RAISED]])
+    return retargeted(joints, pos, first_contact=np.array([1]))
+
+
+class ClosingTest(unittest.TestCase):
+    """Two demonstrations of five frames in which the first finger moves by 12 mm a frame and the second by 4."""
+
+    def setUp(self):
+        rng = np.random.default_rng(0)
+        joints = ROBOT.home + 0.01 * rng.normal(size=(10, len(ROBOT.joints)))
+        tips = np.zeros((10, 2, 3))
+        tips[:, 0, 0], tips[:, 1, 1] = 0.012 * np.arange(10), 0.004 * np.arange(10)
+        angle = 0.2 * np.arange(10)
+        turned = np.stack((np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)), axis=-1)
+        self.data = retargeted(
+            joints, np.tile([0.5, 0.3, 0.1], (10, 1)), [0, 5, 10], fingertip_pos=tips, palm_pos=rng.normal(size=(10, 3)),
+            palm_quat_wxyz=turned, object_quat_wxyz=turned, hand_error=rng.normal(size=10), contact=np.arange(10) % 5 > 2,
+            first_contact=np.array([3, -1]),
+        )  # fmt: skip
+        self.gap = np.full((10, 2), 0.03)
+
+    def dense(self, data: Retargeted | None = None, **config):
+        none = torch.zeros(10, 2, 3)
+        fingers = Fingers(links=("a", "b"), finger=torch.tensor([0, 1]), gap=torch.as_tensor(self.gap), point=none, inward=none)
+        with mock.patch("xreset.resets.closing.fingers_in", lambda *_: fingers):
+            return with_closing_frames(data or self.data, ROBOT, (toy_grasp.brick(),), ClosingConfig(**({"spacing": 0.005} | config)))
+
+    def test_fingertips_move_by_no_more_than_the_spacing(self):
+        dense, frame, part = self.dense()
+        self.assertEqual(np.diff(dense.frame_offsets).tolist(), [13, 13], "12 mm are three steps of 4 mm")
+        for s in range(2):
+            tips = dense.fingertip_pos[dense.frame_offsets[s] : dense.frame_offsets[s + 1]]
+            np.testing.assert_allclose(np.diff(tips[:, 0, 0]), 0.004, atol=1e-12)
+            np.testing.assert_allclose(np.diff(tips[:, 1, 1]), 0.004 / 3, atol=1e-12)
+        self.assertEqual(frame[:8].tolist(), [0, 0, 0, 1, 1, 1, 2, 2])
+        np.testing.assert_allclose(part[:5], [0, 1 / 3, 2 / 3, 0, 1 / 3])
+
+    def test_between_two_frames_positions_are_straight_and_rotations_even(self):
+        dense, frame, part = self.dense()
+        nxt = np.minimum(frame + 1, 9)
+        for name in ("joint_pos", "palm_pos", "object_pos", "fingertip_pos"):
+            old = getattr(self.data, name)
+            share = part.reshape(-1, *[1] * (old.ndim - 1))
+            np.testing.assert_allclose(getattr(dense, name), (1 - share) * old[frame] + share * old[nxt], atol=1e-12, err_msg=name)
+        angle = 2 * np.arctan2(dense.object_quat_wxyz[:, 3], dense.object_quat_wxyz[:, 0])
+        np.testing.assert_allclose(angle, 0.2 * (frame + part), atol=1e-9)
+
+    def test_the_frames_that_were_there_are_the_same_bit_for_bit(self):
+        dense, frame, part = self.dense()
+        here = part == 0
+        self.assertEqual(frame[here].tolist(), list(range(10)))
+        for name in ("joint_pos", "palm_pos", "palm_quat_wxyz", "fingertip_pos", "object_pos", "object_quat_wxyz", "hand_error", "contact"):
+            self.assertEqual(getattr(dense, name)[here].tobytes(), getattr(self.data, name).tobytes(), name)
+        self.assertEqual((dense.goal_pos.tobytes(), dense.fps), (self.data.goal_pos.tobytes(), 30.0))
+
+    def test_first_contact_is_the_same_frame(self):
+        dense, frame, part = self.dense()
+        self.assertEqual(dense.first_contact.tolist(), [9, -1])
+        self.assertEqual((frame[9], part[9]), (3, 0.0))
+        np.testing.assert_array_equal(dense.post_contact, self.data.post_contact[frame])
+
+    def test_sequences_are_not_mixed_and_nothing_invalid_is_bridged(self):
+        valid = np.ones(10, dtype=bool)
+        valid[[2, 7]] = False
+        dense, frame, part = self.dense(replace(self.data, valid=valid, reason=(~valid).astype(int)))
+        self.assertEqual(sorted(set(frame[part > 0].tolist())), [0, 3, 5, 8], "not 1 and 6 to an invalid frame, 2 and 7 from it, 4 to 5")
+        self.assertEqual(np.diff(dense.frame_offsets).tolist(), [9, 9])
+        self.assertEqual(dense.valid[part > 0].tolist(), [True] * 8)
+
+    def test_only_near_the_object(self):
+        self.gap[:, :] = np.array([0.3, 0.12, 0.09, 0.2, 0.2] * 2)[:, None]
+        _, frame, part = self.dense()
+        self.assertEqual(sorted(set(frame[part > 0].tolist())), [1, 2, 6, 7])
+        _, frame, part = self.dense(within=0.15)
+        self.assertEqual(sorted(set(frame[part > 0].tolist())), [0, 1, 2, 5, 6, 7])
+
+    def test_only_until_thumb_and_finger_touch_or_the_object_is_moved(self):
+        self.gap[1:, 1] = 0.001  # a finger alone
+        self.gap[2, 0], self.gap[8, 0] = 0.001, 0.001
+        _, frame, part = self.dense()
+        self.assertEqual(sorted(set(frame[part > 0].tolist())), [0, 1, 5, 6, 7], "also where the thumb lets go again")
+        pos = self.data.object_pos.copy()
+        pos[6, 0] += 0.011
+        _, frame, part = self.dense(replace(self.data, object_pos=pos))
+        self.assertEqual(sorted(set(frame[part > 0].tolist())), [0, 1, 5])
+
+    def test_off(self):
+        dense, frame, part = self.dense(spacing=None)
+        self.assertIs(dense, self.data)
+        self.assertEqual((frame.tolist(), part.tolist()), (list(range(10)), [0.0] * 10))
+
+    def test_options_out_of_range(self):
+        for words, config in (
+            ("spacing is 0, expected a number above 0", lambda: ClosingConfig(spacing=0)),
+            ("spacing is inf, expected a finite", lambda: ClosingConfig(spacing=np.inf)),
+            ("within is -1", lambda: ClosingConfig(within=-1)),
+            ("force is -2", lambda: SqueezeConfig(force=-2)),
+            ("reach is nan", lambda: SqueezeConfig(reach=np.nan)),
+            ("seconds is 0", lambda: HoldConfig(seconds=0)),
+        ):
+            with self.assertRaisesRegex(ValueError, words):
+                config()
+
+
+class FingersTest(unittest.TestCase):
+    """The gripper's jaws are flat, parallel to the brick's sides, and slide along their normal."""
+
+    def fingers(self, *jaw: float) -> tuple[Fingers, np.ndarray]:
+        joints = np.tile(ROBOT.home, (len(jaw), 1))
+        joints[:, JAW] = jaw
+        pos, quat = (np.tile(value, (len(jaw), 1)) for value in toy_grasp.brick_pose())
+        return fingers_of(ROBOT, (toy_grasp.brick(),), np.zeros(len(jaw), int), joints, pos, quat), joints
+
+    def test_gaps_and_directions(self):
+        jaws = np.array([0.0201, 0.0251, 0.0501])
+        fingers, joints = self.fingers(*jaws)
+        self.assertEqual((fingers.links, fingers.finger.tolist()), (("jaw_a", "pad_b", "finger_b"), [0, 1, 1]))
+        np.testing.assert_allclose(fingers.gap[:, 0], jaws - 0.02, atol=3e-4)
+        np.testing.assert_allclose(fingers.gap[:, 1], 1.1 * jaws - 0.002 - 0.02, atol=3e-4)
+        np.testing.assert_allclose(fingers.nearest, jaws - 0.02, atol=3e-4)
+        self.assertEqual(fingers.leading.tolist(), [[True, True, False]] * 3, "finger_b has no shape of its own")
+        wrist = Kinematics(ROBOT).link_poses(torch.as_tensor(joints), ["wrist"])[:, 0, :3, 0]
+        torch.testing.assert_close(fingers.inward[:, 0], -wrist, atol=0.02, rtol=0)
+        torch.testing.assert_close(fingers.inward[:, 1], wrist, atol=0.02, rtol=0)
+        np.testing.assert_allclose(fingers.point[:, 0, 0], -0.005, atol=1e-3)  # the jaw's inner side
+
+    def test_a_squeeze_is_as_far_beyond_as_its_force_takes(self):
+        fingers, joints = self.fingers(0.0201, 0.0501)
+        for force in (1.0, 2.5):
+            target = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=force))
+            self.assertAlmostEqual(target[0, JAW] - joints[0, JAW], -(force + 1.1 * force) / 800, delta=2e-5)  # jaw_b mimics jaw_a
+            np.testing.assert_array_equal(target[1], joints[1], "30 mm away nothing is pressed on")
+            arm = ROBOT.arm_indices
+            np.testing.assert_array_equal(target[:, arm], joints[:, arm])
+        far = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1e4))
+        self.assertAlmostEqual(far[0, JAW], 0.002 / 1.1, places=9, msg="where jaw_b, which mimics it, has its limit")
+        bend = ROBOT.joint_names.index("finger_b_bend")
+        self.assertLessEqual(abs(far[0, bend]), 0.8)
+        np.testing.assert_array_equal(squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=0.0)), joints)
+
+    def test_a_squeeze_is_within_the_drives_torque(self):
+        fingers, joints = self.fingers(0.0201)
+        weak = replace(
+            ROBOT, joints=tuple(replace(j, drive=replace(j.drive, effort=0.8)) if j.name == "jaw_a_slide" else j for j in ROBOT.joints)
+        )
+        target = squeeze_targets(weak, fingers, joints, SqueezeConfig(force=50.0))
+        self.assertAlmostEqual(target[0, JAW] - joints[0, JAW], -0.8 / 800, places=9)
+
+
+class TargetsTest(unittest.TestCase):
+    """Episodes that begin with a bank state begin with its targets."""
+
+    def setUp(self):
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+
+    def pressing(self):
+        bank = toy_bank(ROBOT)
+        return replace(bank, joint_target=bank.joint_pos + 0.25, frame_part=np.full(6, 0.5, np.float32))
+
+    def test_files(self):
+        write_bank(self.folder / "b.npz", self.pressing(), config={}, inputs={})
+        found = read_bank(self.folder / "b.npz")
+        np.testing.assert_array_equal(found.targets, found.joint_pos + 0.25)
+        np.testing.assert_array_equal(found.select(pre_contact_only=True).targets, found.targets[[0, 2, 4]])
+        self.assertEqual((found.num_pressing, found.rejected_frame_part, found.finger_gap, found.bands()), (6, None, None, []))
+        old = toy_bank(ROBOT)
+        write_bank(self.folder / "old.npz", old, config={}, inputs={})
+        with np.load(self.folder / "old.npz") as file:
+            self.assertFalse({"joint_target", "frame_part", "finger_gap"} & set(file.files))
+        found = read_bank(self.folder / "old.npz")
+        self.assertIs(found.targets, found.joint_pos)
+        self.assertEqual(found.num_pressing, 0)
+
+    def test_starts(self):
+        bank = self.pressing()
+        resets = ResetDistribution(bank, ROBOT, tuple(bank.object_names), ResetConfig(demo_probability=0.5))
+        drawn = resets.sample(torch.tensor([0, 1] * 50), torch.Generator().manual_seed(0))
+        torch.testing.assert_close(drawn.joint_target, drawn.joint_pos + 0.25 * drawn.from_bank[:, None])
+        chosen = bank_starts(bank, np.array([4, 1]))
+        torch.testing.assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
+
+
+class CommandTest(unittest.TestCase):
+    def setUp(self):
+        try:
+            import mujoco  # noqa: F401  # pyright: ignore[reportMissingImports]
+        except ImportError as error:
+            self.skipTest(str(error))
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        self.enterContext(mock.patch("xreset.description.load_robot", lambda _: ROBOT))
+        self.enterContext(mock.patch("xreset.objects.load_objects", lambda *_: (toy_grasp.brick(),)))
+        write_retargeted(self.folder / "r.npz", grasp_and_lift(), config={}, inputs={})
+
+    def resets(self, *options: str):
+        code, out, err = run("resets", str(self.folder / "r.npz"), "--out", str(self.folder / "b.npz"), *options)
+        self.assertEqual(code, 0, out + err)
+        return read_bank(self.folder / "b.npz"), json.loads(accounts_path(self.folder / "b.npz").read_text()), out
+
+    def test_everything_at_once(self):
+        """Jaws close by 30 mm (33 mm on one side): five states between; held by 2.5 N a side, and not without."""
+        bank, account, out = self.resets("--closing.spacing", "0.0056", "--squeeze.force", "2.5", "--hold")
+        assert bank.frame_part is not None and bank.finger_gap is not None
+        np.testing.assert_allclose(bank.finger_gap * 1e3, [30.1, 25.1, 20.1, 15.1, 10.1, 5.1, 0.1, 0.1], atol=0.3)
+        np.testing.assert_allclose(bank.frame_part * 6, [0, 1, 2, 3, 4, 5, 0, 0], atol=1e-5)
+        self.assertEqual(bank.frame_index.tolist(), [0] * 6 + [1, 2])
+        self.assertEqual((bank.targets != bank.joint_pos).any(axis=1).tolist(), [False] * 6 + [True] * 2)
+        counts = [(band["nearer"], band["tried"], band["kept"], band["added"], band["added_kept"]) for band in account["bands"]]
+        self.assertEqual(
+            counts,
+            [(None, 0, 0, 0, 0), (0.1, 0, 0, 0, 0), (0.05, 1, 1, 2, 2), (0.02, 0, 0, 2, 2), (0.01, 0, 0, 1, 1), (0.001, 2, 2, 0, 0)],
+        )
+        self.assertEqual(sum(row["total"] for row in account["rows"] if row["phase"] == "both"), 3, "frames only")
+        self.assertEqual(account["pressing"], 2)
+        self.assertEqual([(row["object_name"], row["lifted"], row["held"]) for row in account["hold"]], [("brick", 1, 1), ("all", 1, 1)])
+        for words in ("5 to 2 cm", "2 of 2 states after contact press with 2.5 N", "1 (100%)", "8 states of 8"):
+            self.assertIn(words, out)
+        with np.load(self.folder / "b.npz") as file:
+            config = meta_of(dict(file))["config"]
+        self.assertEqual(config["closing"], {"spacing": 0.0056, "within": 0.1})
+        self.assertEqual(config["squeeze"]["force"], 2.5)
+
+    def test_what_only_stands_there_falls(self):
+        bank, account, _ = self.resets("--hold")
+        self.assertEqual((bank.num_states, bank.joint_target, bank.frame_part, account["pressing"]), (3, None, None, 0))
+        self.assertEqual([(row["lifted"], row["held"]) for row in account["hold"]], [(1, 0), (1, 0)])
+
+    def test_a_squeeze_that_an_engine_does_not_accept_is_left_out(self):
+        still = lambda robot, fingers, joints, config: joints - (np.arange(3) == 2)[:, None]  # noqa: E731
+        with mock.patch("xreset.resets.filter.squeeze_targets", still):  # the last state's targets are 1 rad (m) away
+            bank, account, _ = self.resets("--squeeze.force", "2.5")
+        self.assertEqual((bank.num_states, account["pressing"]), (3, 0))
+        np.testing.assert_array_equal(bank.targets, bank.joint_pos)
+
+    def test_bad_options(self):
+        code, out, err = run("resets", str(self.folder / "r.npz"), "--out", str(self.folder / "b.npz"), "--closing.spacing", "0")
+        self.assertNotEqual(code, 0)
+        self.assertIn("spacing is 0.0, expected a number above 0", " ".join((out + err).split()))
+        self.assertFalse((self.folder / "b.npz").exists())
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,88 @@
+"""Which states are grasps that hold: lifted, at full gravity, with the targets unchanged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from xreset.geometry.rotations import quat_angle
+from xreset.physics import State
+from xreset.plugins import device_for, make_backend
+from xreset.resets.bank import ResetBank
+from xreset.resets.config import HoldConfig
+from xreset.schedule import schedule
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class Held:
+    """How many lifted states hold."""
+
+    backend: str
+    object_name: str
+    """``all`` in a sum over objects."""
+    lifted: int
+    held: int
+
+
+def hold_bank(
+    bank: ResetBank,
+    robot: RobotSpec,
+    objects: Sequence[ObjectSpec],
+    backends: Sequence[str],
+    *,
+    num_envs: int = 64,
+    device: str = "cpu",
+    config: HoldConfig | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Held]:
+    """Let the lifted states of a bank hold on in every engine.
+
+    Args:
+        bank: the states.
+        robot: the robot they are for.
+        objects: geometry of the objects that they name.
+        backends: engines.
+        num_envs: worlds at a time.
+        device: where engines run that can use it; the others run on the CPU.
+        config: how long, and how far an object may move.
+        progress: called with (states done, states in all).
+
+    Returns:
+        For each engine one entry per object, in the order of their names, and their sum.
+    """
+    config = config or HoldConfig()
+    lifted = np.flatnonzero(bank.post_contact & (bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2] > config.lift))
+    names = bank.object_name[lifted]
+    used = tuple(o for o in objects if o.name in set(names.tolist()))
+    found = []
+    for number, name in enumerate(backends):
+        held = np.zeros(len(lifted), dtype=bool)
+        if len(lifted):
+            plan = schedule(np.array([[o.name for o in used].index(n) for n in names]), num_envs)
+            worlds, scene, done = torch.as_tensor(plan.object_index), SceneSpec(robot=robot, objects=used), 0
+            with make_backend(name, scene, len(worlds), object_index=worlds, device=device_for(name, device)) as backend:
+                for items, fresh in plan:
+                    rows = lifted[items]
+                    joint_pos, pos, quat, target = (
+                        torch.as_tensor(array[rows], dtype=torch.float32, device=backend.device)
+                        for array in (bank.joint_pos, bank.object_pos, bank.object_quat_wxyz, bank.targets)
+                    )
+                    backend.set_object_gravity(torch.ones(len(rows), device=backend.device))
+                    backend.set_state(State.at_rest(joint_pos, pos, quat, target))
+                    for _ in range(round(config.seconds / scene.control_dt)):
+                        backend.step()
+                    state, health = backend.state(), backend.health()
+                    stays = (state.object_pos - pos).norm(dim=-1) < config.distance
+                    stays &= (quat_angle(state.object_quat, quat) < config.angle) & ~health.nonfinite & ~health.overflow
+                    held[items[fresh]] = stays.cpu().numpy()[fresh]
+                    done += int(fresh.sum())
+                    progress(number * len(lifted) + done, len(backends) * len(lifted))
+        found += [
+            Held(backend=name, object_name=label, lifted=int(mine.sum()), held=int(held[mine].sum()))
+            for label, mine in [*((n, names == n) for n in np.unique(names).tolist()), ("all", np.ones(len(lifted), dtype=bool))]
+        ]
+    return found

@@ -30,6 +30,20 @@ def bootstrap_ci95(values: np.ndarray, groups: np.ndarray | None = None, *, draw
     return float(low), float(high)
 
 
+def wilson_ci95(hits: float, count: int) -> tuple[float, float]:
+    """95 % interval of a share of which ``hits`` of ``count`` were seen (Wilson, J. Am. Stat. Assoc. 22, 1927); all of it for none.
+
+    Unlike a bootstrap it says something of few, and of none or all of them.
+    """
+    if not count:
+        return 0.0, 1.0
+    z2 = 1.959963984540054**2
+    share, weight = hits / count, 1.0 / (1.0 + z2 / count)
+    middle = weight * (share + z2 / (2 * count))
+    half = weight * float(np.sqrt(z2 * (share * (1.0 - share) / count + z2 / (4 * count**2))))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
 def crossed_bootstrap_ci95(
     values: np.ndarray, runs: np.ndarray, groups: np.ndarray, *, draws: int = 2000, seed: int = 0
 ) -> tuple[float, float]:

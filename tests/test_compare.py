@@ -16,13 +16,15 @@ from xreset.eval.report import plots as report_plots
 from xreset.eval.report.compare import choose_curves, compare
 from xreset.eval.report.data import Curve, read_curves
 from xreset.eval.report.groups import grouped
+from xreset.eval.report.lifting import Fate, fates, lift_of, share_of_runs
 from xreset.eval.report.progress import Line, amounts, line, processes
 from xreset.eval.report.score import score
 from xreset.eval.report.tables import escape
 from xreset.eval.report.trainings import read_training, read_trainings
 from xreset.eval.results import write_results
 from xreset.eval.rollout import Rollouts
-from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95
+from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95, wilson_ci95
+from xreset.learning.clock import Lift, LiftClock, Passing
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import RunInfo, write_run
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
@@ -229,6 +231,114 @@ class ProgressTest(InFolder):
         for values in (found.mean, found.low, found.high):
             np.testing.assert_allclose(values, [0.1, 0.3])
         np.testing.assert_allclose(found.x, [0.5, 1.0])
+
+
+class LiftTest(InFolder):
+    """Success from home is half of ``success`` in the toy's curves."""
+
+    def lifted(self, name: str, end: float, *passed: tuple[float, float], seed: int = 0, **changes) -> str:
+        """A run with ``lift.json``: minutes until its end and until each share that it passed; 10 iterations and 1e6 steps a minute."""
+
+        def at(minutes: float) -> dict:
+            return {"iteration": round(10 * minutes), "env_steps": round(1e6 * minutes), "minutes": minutes}
+
+        folder = self.write_run(name, seed=seed, **changes)
+        clock = LiftClock(folder, Lift(passed=tuple(Passing(share=s, **at(t)) for s, t in passed), **at(end)))
+        clock.write()
+        return name
+
+    def read(self, *names: str):
+        return [read_training(name, self.folder / name) for name in names]
+
+    def test_the_share_of_runs_is_a_step_curve_with_censored_runs(self):
+        """Of five runs, passed after 2, 4 and 8 minutes, ended without after 3 and 9: 1 - 4/5, then times 2/3, then times 1/2."""
+        found = [Fate(2.0, True, 5.0), Fate(3.0, False, 3.0), Fate(4.0, True, 8.0), Fate(8.0, True, 11.0), Fate(9.0, False, 9.0)]
+        line = share_of_runs(found[::-1])
+        np.testing.assert_allclose(line.x, [0, 2, 3, 4, 8, 9, 11], err_msg="until the last run ended")
+        np.testing.assert_allclose(line.mean, [0, 1 / 5, 1 / 5, 1 - 8 / 15, 1 - 4 / 15, 1 - 4 / 15, 1 - 4 / 15])
+        for i, known in enumerate((5, 5, 5, 4, 4, 4, 4)):  # after 3 minutes nothing is known of one
+            np.testing.assert_allclose((line.low[i], line.high[i]), wilson_ci95(line.mean[i] * known, known))
+        whole = share_of_runs([Fate(t, t < 9, 9.0) for t in (1.0, 5.0, 9.0, 9.0)])
+        np.testing.assert_allclose(whole.mean, [0, 0.25, 0.5, 0.5], err_msg="none ended early: the share of all runs")
+        at_once = share_of_runs([Fate(2.0, True, 2.0), Fate(2.0, False, 2.0), Fate(2.0, True, 2.0)])
+        np.testing.assert_allclose(at_once.mean, [0, 2 / 3], err_msg="who ends when another passes was watched until then")
+
+    def test_wilsons_interval(self):
+        """Its ends are where |p - share| is 1.96 standard deviations of p."""
+        for hits, count in ((0, 1), (1, 1), (2, 3), (10, 10), (37, 100)):
+            for p in wilson_ci95(hits, count):
+                if 0 < p < 1:
+                    self.assertAlmostEqual(abs(p - hits / count) / np.sqrt(p * (1 - p) / count), 1.959964, places=4)
+        self.assertEqual(wilson_ci95(0, 0), (0.0, 1.0))
+        self.assertEqual((wilson_ci95(0, 4)[0], wilson_ci95(4, 4)[1]), (0.0, 1.0))
+
+    def test_fates(self):
+        members = self.read(self.lifted("a", 12.0, (0.01, 6.0), (0.1, 8.5)), self.lifted("b", 10.0))
+        self.assertEqual(fates(members, 0.01, "minutes"), [(6.0, True, 12.0), (10.0, False, 10.0)])
+        self.assertEqual(fates(members, 0.1, "steps"), [(8.5e6, True, 12e6), (10e6, False, 10e6)])
+        self.assertEqual(fates(members, 0.5, "iterations"), [(120.0, False, 120.0), (100.0, False, 100.0)])
+
+    def test_runs_without_lift_json_are_read_from_their_curves(self):
+        self.write_run("old")
+        self.write_results("old")
+        success = (0.0, 0.04, 0.02, 0.3, 0.3)  # from home half of it: 2 % after 2 minutes, 15 % after 4.5
+        old = self.training("old", curves_of((60.0, 60.0, 60.0, 90.0, 30.0), success))
+        self.assertEqual(
+            [fates([old], s, "minutes") for s in (0.01, 0.1, 0.5)], [[(2.0, True, 5.0)], [(4.5, True, 5.0)], [(5.0, False, 5.0)]]
+        )
+        self.assertEqual(fates([old], 0.1, "steps"), [(4.0 * STEPS, True, 5.0 * STEPS)])
+        slow = self.training("old", {k: v for k, v in old.scalars.items() if k != "speed/learn_seconds"})
+        self.assertEqual((fates([slow], 0.1, "minutes"), fates([slow], 0.1, "iterations")), ([], [(4.0, True, 5.0)]))
+        blind = self.training("old", {k: v for k, v in old.scalars.items() if k != "task/success_from_home"})
+        self.assertIsNone(lift_of(blind))
+        self.assertEqual(fates([blind], 0.1, "minutes"), [])
+
+    def test_seeds_are_one_row_and_one_curve(self):
+        names = [self.lifted("x-s0", 12.0, (0.01, 6.0), (0.1, 8.5)), self.lifted("x-s1", 10.0, (0.01, 7.0), seed=1)]
+        names += [self.lifted("other", 8.0, num_envs=2 * WORLDS)]
+        self.write_curves("old", curves_of((60.0, 60.0), (0.0, 0.04)))
+        made = self.compare(*names, "old")
+        head, *body = [list(made.lifted.head), *map(list, made.lifted.body)]
+        self.assertEqual(head, ["", "runs", "1 % [min]", "10 % [min]", "50 % [min]"])
+        self.assertEqual(body[0], ["x", "2", "100 % (34-100); 6.0, 7.0", "50 % (9-91); 8.5, >10.0", "0 % (0-79); >12.0, >10.0"])
+        self.assertEqual(body[1], ["other", "1", *["0 % (0-79); >8.0"] * 3])
+        self.assertEqual(body[2][2], "100 % (21-100); 2.0")
+        text = "\n".join(made.notes)
+        self.assertIn("No lift.json, so when they lifted is taken from the learning curves: old.", text)
+        self.assertIn("One run only, which says little about how surely another seed lifts: other, old.", text)
+        page = made.page.read_text()
+        self.assertIn("## First success from home", page)
+        self.assertIn("Kaplan-Meier", page)
+        self.assertEqual(made.picture.read_bytes()[:8], b"\x89PNG\r\n\x1a\n")
+
+    def test_without_any_clock_nothing_is_said_of_it(self):
+        self.write_results("a")
+        made = self.compare("a")
+        self.assertEqual(made.lifted.body, ())
+        self.assertNotIn("lifted", "".join(made.notes))
+        self.assertNotIn("First success", made.page.read_text())
+
+    def test_where_some_are_not_known(self):
+        self.lifted("a", 3.0)
+        self.write_run("b")
+        self.write_results("b")
+        self.assertIn("neither lift.json nor the curve task/success_from_home: b.", "\n".join(self.compare("a", "b").notes))
+
+    def test_steps_are_drawn_as_steps(self):
+        from xreset.eval.report.compare_plots import draw_lifted
+
+        with report_plots.figure_style({}) as figure_class:
+            ax = figure_class().subplots()
+            draw_lifted(ax, {"a": share_of_runs([Fate(2e6, True, 3e6), Fate(4e6, False, 4e6)])}, 0.1, "steps", ["a"])
+        (curve,) = ax.lines
+        np.testing.assert_allclose(curve.get_xydata(), [[0, 0], [2, 50], [4, 50]])
+        self.assertEqual(curve.get_drawstyle(), "steps-post")
+        self.assertEqual((ax.get_title(loc="left"), ax.get_ylabel()), ("runs past 10 % from home", "runs"))
+
+    def test_a_damaged_clock(self):
+        (self.folder / self.lifted("a", 3.0) / "lift.json").write_text("{")
+        with self.assertRaisesRegex(FileFormatError, "lift.json is not valid JSON"):
+            self.read("a")
 
 
 class GroupTest(InFolder):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from xreset import __version__
 from xreset.errors import RunError
-from xreset.eval.report import fairness
+from xreset.eval.report import fairness, lifting
 from xreset.eval.report import tables as table
 from xreset.eval.report.compare_plots import write_picture
 from xreset.eval.report.groups import Group, grouped, singles
@@ -30,6 +30,8 @@ class Comparison:
     groups: tuple[Group, ...]
     results: table.Rows
     """Empty if nothing was evaluated."""
+    lifted: table.Rows
+    """When each training passed 1, 10 and 50 % success from home; empty if that is not known of any."""
     different: table.Rows
     """Fields in which the trainings are not equal; without a column if none has a configuration or curves."""
     notes: tuple[str, ...]
@@ -57,15 +59,23 @@ def compare(runs: Sequence[str], out: Path, *, x: X = "minutes", curves: Sequenc
     groups, notes = (singles(trainings), ()) if apart else grouped(trainings)
     tags = choose_curves(trainings, curves)
     found = scores(groups)
-    notes = (*notes, *fairness.notes(trainings), *fairness.begun(trainings), *fairness.health(found), *fairness.missing(groups, tags))
+    notes = (
+        *notes,
+        *fairness.notes(trainings),
+        *fairness.begun(trainings),
+        *fairness.health(found),
+        *fairness.missing(groups, tags),
+        *lifting.notes(groups),
+    )
     made = Comparison(
         picture=out / "compare.png",
         page=out / "compare.md",
         groups=groups,
         results=table.results(groups, found),
+        lifted=table.lifted(groups, x),
         different=table.different(groups),
         notes=notes,
-        captions=_captions(trainings, groups),
+        captions=(*_captions(trainings, groups), *([table.LIFTED] if any(map(lifting.lift_of, trainings)) else [])),
     )
     content = page(made)
     write_picture(made.picture, groups, tags, found, x)
@@ -97,6 +107,8 @@ def page(made: Comparison) -> str:
     parts += [f"> **Note:** {table.escape(note)}\n" for note in made.notes]
     if made.results.body:
         parts += ["## Evaluation\n", table.markdown(made.results)]
+    if made.lifted.body:
+        parts += ["## First success from home\n", table.markdown(made.lifted)]
     parts += [f"{table.escape(caption)}\n" for caption in made.captions]
     if len(made.different.head) > 1:
         parts += ["## What differs between the trainings\n"]

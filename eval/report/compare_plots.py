@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from xreset.eval.report.groups import Group
+from xreset.eval.report.lifting import Fate, fates, share_of_runs
 from xreset.eval.report.plots import COLORS, INK, curve_axes, figure_style, percent_axis, write_png
 from xreset.eval.report.progress import Line, X, line
 from xreset.eval.report.score import Scores, engines_of
+from xreset.learning.clock import SHARES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -83,6 +86,20 @@ def draw_scores(ax: Axes, found: Scores, order: Sequence[str]) -> None:
     ax.set_title("task progress from home, 95 % interval", fontsize="medium", loc="left")
 
 
+def draw_lifted(ax: Axes, lines: Mapping[str, Line], share: float, x: X, order: Sequence[str]) -> None:
+    """The share of each group's runs that have passed a share of success from home, in steps; ``low`` to ``high`` as a band."""
+    for label, curve in lines.items():
+        color, style = _look(order.index(label))
+        at = curve.x / (1e6 if x == "steps" else 1)
+        if (curve.high > curve.low).any():
+            ax.fill_between(at, 100 * curve.low, 100 * curve.high, step="post", color=color, alpha=0.12, linewidth=0)
+        ax.step(at, 100 * curve.mean, where="post", color=color, linestyle=_STYLES[style], linewidth=1.5, zorder=3)
+    curve_axes(ax, f"runs past {100 * share:g} % from home", AXES[x], percent=True)
+    ax.set_ylabel("runs")
+    ax.set_xlim(left=0)
+    ax.set_ylim(-2, 102)
+
+
 def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], found: Scores, x: X) -> None:
     """Write the picture.
 
@@ -96,7 +113,9 @@ def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], foun
     order = [group.label for group in groups]
     across = 3 if len(tags) % 3 == 0 else min(len(tags), 2)
     rows = len(tags) and -(-len(tags) // across)
-    heights = [2.9 * rows] * bool(rows) + [2.9] * bool(found)
+    lifted = {s: {g.label: _share_of_runs(known) for g in groups if (known := fates(g.members, s, x))} for s in SHARES}
+    lifted = {s: lines for s, lines in lifted.items() if lines}
+    heights = [2.9 * rows] * bool(rows) + [2.9] * bool(lifted) + [2.9] * bool(found)
     lines_of_legend = -(-len(order) // max(1, int(_WIDTH / (0.8 + 0.1 * max(map(len, order))))))
     with figure_style({"text.parse_math": False, "hatch.linewidth": 0.8}) as figure_class:
         figure = figure_class(figsize=(_WIDTH, sum(heights) + 0.1 + 0.25 * lines_of_legend), layout="constrained", facecolor="white")
@@ -108,6 +127,10 @@ def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], foun
                 draw_lines(ax, lines, tag, x, order)
             for ax in grid.flat[len(tags) :]:
                 ax.set_axis_off()
+        if lifted:
+            panels = next(parts).subplots(1, len(lifted), squeeze=False)[0]
+            for ax, (s, lines) in zip(panels, lifted.items(), strict=True):
+                draw_lifted(ax, lines, s, x, order)
         if found:
             draw_scores(next(parts).subplots(), found, order)
         _legend(figure, groups, -(-len(order) // lines_of_legend))
@@ -115,6 +138,12 @@ def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], foun
 
 
 _PARTS = (lambda s: s.task_progress, lambda s: s.ci95[0], lambda s: s.ci95[1])
+
+
+def _share_of_runs(known: Sequence[Fate]) -> Line:
+    """As steps; without a band for a single run, of which it would hide everything else."""
+    line = share_of_runs(known)
+    return line if len(known) > 1 else replace(line, low=line.mean, high=line.mean)
 
 
 def _look(index: int) -> tuple[str, int]:

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 from xreset.errors import RunError
 from xreset.eval.report.groups import Group
+from xreset.eval.report.lifting import Fate, fates, share_of_runs
 from xreset.eval.report.progress import X, amounts, processes
 from xreset.eval.report.score import Scores, engines_of
 from xreset.eval.report.trainings import Fact, Training
+from xreset.learning.clock import SHARES
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -46,6 +48,32 @@ def results(groups: Sequence[Group], found: Scores) -> Rows:
         for i, (name, text) in enumerate(lines.items()):
             body.append(("" if i else label, name, *(text(row[e]) if e in row else "-" for e in engines)))
     return Rows(head=("", "", *(f"{e} {', '.join(sorted(versions[e]))}" for e in engines)), body=tuple(body))
+
+
+LIFTED = (
+    "First success from home: share of runs (95 % interval) in which 1, 10 and 50 % of the steps of worlds that began at home have been at "
+    "the goal, and when that was first so in each. A run that ended without (>) counts until it ended (Kaplan-Meier); the interval is "
+    "Wilson's, of as many runs as were watched so long."
+)
+
+
+def lifted(groups: Sequence[Group], x: X) -> Rows:
+    """One row for each group, one column for each share of success: the share of its trainings that passed it, and when each did."""
+    scale, unit, digits = {"minutes": (1.0, "min", 1), "steps": (1e6, "M steps", 1), "iterations": (1.0, "iterations", 0)}[x]
+    body = []
+    for group in groups:
+        known = [fates(group.members, share, x) for share in SHARES]
+        if any(known):
+            body.append((group.label, str(len(group.members)), *(_lifted(found, scale, digits) for found in known)))
+    return Rows(head=("", "runs", *(f"{100 * share:g} % [{unit}]" for share in SHARES)), body=tuple(body))
+
+
+def _lifted(found: Sequence[Fate], scale: float, digits: int) -> str:
+    if not found:
+        return "-"
+    line = share_of_runs(found)
+    share, low, high = (f"{100 * value[-1]:.0f}" for value in (line.mean, line.low, line.high))
+    return f"{share} % ({low}-{high}); " + ", ".join(f"{'' if passed else '>'}{at / scale:.{digits}f}" for at, passed, _ in found)
 
 
 def different(groups: Sequence[Group]) -> Rows:
@@ -86,6 +114,14 @@ def rich_results(rows: Rows) -> Table:
             table.add_section()
             table.add_row(_cell(label), style="bold")
         table.add_row(_cell(name), *map(_cell, cells))
+    return table
+
+
+def rich_lifted(rows: Rows) -> Table:
+    """:func:`lifted` for a terminal."""
+    table = _rich_table(rows.head, "first success from home")
+    for line in rows.body:
+        table.add_row(*map(_cell, line))
     return table
 
 

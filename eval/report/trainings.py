@@ -13,6 +13,8 @@ from xreset.eval.report.plots import short_name
 from xreset.eval.results import read_episodes, read_results
 from xreset.eval.rollout import Episode
 from xreset.files import read_json
+from xreset.learning.clock import FILE as LIFT_FILE
+from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
 from xreset.policies import results_folder, shipped
 
@@ -43,6 +45,8 @@ class Training:
     """Engine -> ``BACKEND.json``."""
     episodes: dict[str, tuple[Episode, ...]]
     """Engine -> its episodes."""
+    lift: Lift | None = None
+    """When it first succeeded from home; None where there is no ``lift.json``."""
 
 
 def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
@@ -97,14 +101,15 @@ def read_training(label: str, folder: Path) -> Training:
             f"the event files in {folder} hold no learning curve: they are damaged, or the training has not finished an iteration. "
             + (f"Compare its evaluations alone: {label}={results}" if summaries else "Leave it out, or compare later.")
         )
-    if not summaries and not scalars:
+    lift = read_lift(folder) if (folder / LIFT_FILE).is_file() else None
+    if not summaries and not scalars and lift is None:
         raise RunError(
             f"{folder} holds neither learning curves (events.out.tfevents.*) nor evaluation results. "
             f"Evaluate it first: xreset eval {folder} --backend mujoco --demos DEMOS"
         )
     file = folder / "run.json"
     facts = run_facts(read_json(file, RUN_SCHEMA), file) if file.is_file() else {}
-    return Training(label=label, folder=folder, facts=facts, scalars=scalars, summaries=summaries, episodes=episodes)
+    return Training(label=label, folder=folder, facts=facts, scalars=scalars, summaries=summaries, episodes=episodes, lift=lift)
 
 
 def run_facts(run: dict[str, Any], file: Path) -> dict[str, Fact]:

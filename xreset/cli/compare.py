@@ -32,13 +32,15 @@ def compare(
     """
     from xreset.cli._terminal import Console
     from xreset.eval.report.compare import compare as make
-    from xreset.eval.report.tables import rich_different, rich_results
+    from xreset.eval.report.tables import rich_different, rich_lifted, rich_results
 
     console = Console()
     with console.status("reading"):
         made = make(runs, out, x=x, curves=curve, apart=apart)
     if made.results.body:
         console.print(rich_results(made.results))
+    if made.lifted.body:
+        console.print(rich_lifted(made.lifted))
     if made.different.body:
         console.print(rich_different(made.different))
     for caption in made.captions:

@@ -14,7 +14,7 @@ from xreset.demos.archive import demo_objects, read_demos
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, PolicyError
 from xreset.eval.baselines import KinematicRetargeting
-from xreset.eval.results import mesh_folder, summarize, write_results
+from xreset.eval.results import EvalResult, mesh_folder, summarize, write_results
 from xreset.eval.rollout import roll_out
 from xreset.files import file_hash, npz_schema
 from xreset.objects import load_objects
@@ -142,7 +142,7 @@ def evaluate(
     objects_folder: Path | None,
     out: Path,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
-) -> list[dict[str, Any]]:
+) -> list[EvalResult]:
     """Evaluate in each engine and write the results.
 
     Args:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from xreset.checks import check_numbers
 from xreset.errors import FileFormatError
 from xreset.eval.rollout import Episode, Rollouts, Trace
 from xreset.eval.stats import bootstrap_ci95
@@ -32,40 +32,128 @@ _TRACE_FIELDS = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class TaskProgress:
+    """Mean score of the highest stage of the episodes."""
+
+    mean: float
+    ci95: tuple[float, float]
+    """95 % bootstrap interval over demonstrations."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, share=("mean",), ranges=("ci95",))
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoResult:
+    """The episodes of one demonstration."""
+
+    sequence: str
+    object: str
+    episodes: int
+    task_progress: float
+    approach_rate: float
+    grasp_rate: float
+    reorient_rate: float
+    reorientation_progress: float
+
+    def __post_init__(self) -> None:
+        check_numbers(
+            self,
+            positive=("episodes",),
+            share=("task_progress", "approach_rate", "grasp_rate", "reorient_rate", "reorientation_progress"),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeFaults:
+    """Episodes that ended early."""
+
+    nonfinite: int
+    """Because a number was not finite: the engine broke down, or the policy's action was none."""
+    overflow: int
+    """In which the engine dropped contacts or constraints."""
+    out_of_bounds: int
+    """Because the object left the scene."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, not_negative=("nonfinite", "overflow", "out_of_bounds"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalResult:
+    """Contents of ``eval/BACKEND.json``: one policy in one engine."""
+
+    backend: str
+    backend_version: str
+    robot: str
+    objects: tuple[str, ...]
+    """Sorted."""
+    objects_folder: str | None
+    """Folder of meshes; None: the stand-ins."""
+    policy: str
+    episodes: int
+    episodes_per_demo: int
+    seed: int
+    task_progress: TaskProgress
+    approach_rate: float
+    grasp_rate: float
+    reorient_rate: float
+    reorient_once_rate: float
+    reorientation_progress: float
+    per_demo: tuple[DemoResult, ...]
+    health: EpisodeFaults
+    control_steps_per_second: float
+    inputs: dict[str, str]
+    """SHA-256 by name."""
+
+    def __post_init__(self) -> None:
+        check_numbers(
+            self,
+            positive=("episodes", "episodes_per_demo", "control_steps_per_second"),
+            not_negative=("seed",),
+            share=("approach_rate", "grasp_rate", "reorient_rate", "reorient_once_rate", "reorientation_progress"),
+        )
+        if not self.objects or not self.per_demo:
+            raise ValueError("it tells of no object or no demonstration")
+        if "/" in self.backend or not self.backend:
+            raise ValueError(f"backend is {self.backend!r}, expected an engine's name")
+
+
 def summarize(
     rollouts: Rollouts, *, backend: str, backend_version: str, robot: str, policy: str, seed: int, repetitions: int, inputs: dict[str, str],
     objects_folder: str | None,
-) -> dict[str, Any]:  # fmt: skip
-    """The content of ``eval/BACKEND.json``."""
+) -> EvalResult:  # fmt: skip
+    """What the episodes come to."""
     episodes = rollouts.episodes
     progress = np.array([e.task_progress for e in episodes])
     groups = np.array([e.sequence for e in episodes])
+    low, high = (round(x, 6) for x in bootstrap_ci95(progress, groups))
 
     def rate(name: str) -> float:
         return round(float(np.mean([getattr(e, name) for e in episodes])), 6)
 
-    return {
-        "schema": SCHEMA,
-        "backend": backend,
-        "backend_version": backend_version,
-        "robot": robot,
-        "objects": sorted({e.object for e in episodes}),
-        "objects_folder": objects_folder,
-        "policy": policy,
-        "episodes": len(episodes),
-        "episodes_per_demo": repetitions,
-        "seed": seed,
-        "task_progress": {"mean": round(float(progress.mean()), 6), "ci95": [round(x, 6) for x in bootstrap_ci95(progress, groups)]},
-        "approach_rate": rate("approach"),
-        "grasp_rate": rate("grasp"),
-        "reorient_rate": rate("reorient"),
-        "reorient_once_rate": rate("reorient_once"),
-        "reorientation_progress": rate("reorientation_progress"),
-        "per_demo": [_per_demo([e for e in episodes if e.sequence == s]) for s in dict.fromkeys(groups.tolist())],
-        "health": {name: sum(getattr(e, name) for e in episodes) for name in ("nonfinite", "overflow", "out_of_bounds")},
-        "control_steps_per_second": round(rollouts.control_steps_per_second, 1),
-        "inputs": inputs,
-    }
+    return EvalResult(
+        backend=backend,
+        backend_version=backend_version,
+        robot=robot,
+        objects=tuple(sorted({e.object for e in episodes})),
+        objects_folder=objects_folder,
+        policy=policy,
+        episodes=len(episodes),
+        episodes_per_demo=repetitions,
+        seed=seed,
+        task_progress=TaskProgress(mean=round(float(progress.mean()), 6), ci95=(low, high)),
+        approach_rate=rate("approach"),
+        grasp_rate=rate("grasp"),
+        reorient_rate=rate("reorient"),
+        reorient_once_rate=rate("reorient_once"),
+        reorientation_progress=rate("reorientation_progress"),
+        per_demo=tuple(_per_demo([e for e in episodes if e.sequence == s]) for s in dict.fromkeys(groups.tolist())),
+        health=EpisodeFaults(**{f.name: sum(getattr(e, f.name) for e in episodes) for f in fields(EpisodeFaults)}),
+        control_steps_per_second=round(rollouts.control_steps_per_second, 1),
+        inputs=inputs,
+    )
 
 
 def mesh_folder(given: Path | None, recorded: str | None) -> Path | None:
@@ -73,9 +161,9 @@ def mesh_folder(given: Path | None, recorded: str | None) -> Path | None:
     return given or (Path(recorded) if recorded else None)
 
 
-def write_results(folder: Path, summary: dict[str, Any], rollouts: Rollouts, joint_names: tuple[str, ...]) -> Path:
+def write_results(folder: Path, summary: EvalResult, rollouts: Rollouts, joint_names: tuple[str, ...]) -> Path:
     """Write ``BACKEND.json``, ``BACKEND.episodes.json`` and ``BACKEND.trace.npz``; returns the first."""
-    name = summary["backend"]
+    name = summary.backend
     write_json(folder / f"{name}.episodes.json", {"schema": EPISODES_SCHEMA, "episodes": [asdict(e) for e in rollouts.episodes]})
     traces = rollouts.traces
     recorded = [t.joint_target for t in traces if t.joint_target is not None]
@@ -96,14 +184,24 @@ def write_results(folder: Path, summary: dict[str, Any], rollouts: Rollouts, joi
             **({} if targets is None else {"joint_target": targets}),
         },
     )
-    write_json(folder / f"{name}.json", summary)
+    write_json(folder / f"{name}.json", {"schema": SCHEMA} | asdict(summary))
     return folder / f"{name}.json"
 
 
-def read_results(folder: Path) -> list[dict[str, Any]]:
-    """Every engine's summary in an ``eval`` folder, in order of name."""
+def read_results(folder: Path) -> list[EvalResult]:
+    """Every engine's result in an ``eval`` folder, in order of name."""
     files = [f for f in folder.glob("*.json") if not f.name.endswith(".episodes.json")]
-    return [read_json(file, SCHEMA) for file in sorted(files, key=lambda f: f.stem)]
+    return [read_result(file) for file in sorted(files, key=lambda f: f.stem)]
+
+
+def read_result(path: Path) -> EvalResult:
+    """One engine's result.
+
+    Raises:
+        FileFormatError: it is damaged, or lacks an entry; the message names it.
+    """
+    data = read_json(path, SCHEMA)
+    return from_dict(EvalResult, {name: value for name, value in data.items() if name != "schema"}, str(path))
 
 
 def read_episodes(folder: Path, backend: str) -> tuple[Episode, ...]:
@@ -166,17 +264,17 @@ def _check_traces(a: dict[str, np.ndarray]) -> str | None:
     return None
 
 
-def _per_demo(episodes: list[Episode]) -> dict[str, Any]:
+def _per_demo(episodes: list[Episode]) -> DemoResult:
     def mean(name: str) -> float:
         return round(float(np.mean([getattr(e, name) for e in episodes])), 6)
 
-    return {
-        "sequence": episodes[0].sequence_name,
-        "object": episodes[0].object,
-        "episodes": len(episodes),
-        "task_progress": mean("task_progress"),
-        "approach_rate": mean("approach"),
-        "grasp_rate": mean("grasp"),
-        "reorient_rate": mean("reorient"),
-        "reorientation_progress": mean("reorientation_progress"),
-    }
+    return DemoResult(
+        sequence=episodes[0].sequence_name,
+        object=episodes[0].object,
+        episodes=len(episodes),
+        task_progress=mean("task_progress"),
+        approach_rate=mean("approach"),
+        grasp_rate=mean("grasp"),
+        reorient_rate=mean("reorient"),
+        reorientation_progress=mean("reorientation_progress"),
+    )

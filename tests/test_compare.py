@@ -134,7 +134,7 @@ class ReadTest(InFolder):
 
         for name, text, message in (
             *((name, whole[name][:80], f"{name} is not valid JSON") for name in files),
-            ("eval/mujoco.json", lacks("eval/mujoco.json", "seed"), "lacks seed; it has schema, backend"),
+            ("eval/mujoco.json", lacks("eval/mujoco.json", "seed"), "does not fit EvalResult .missing: seed"),
             ("run.json", lacks("run.json", "config"), "run.json lacks config"),
             ("eval/mujoco.json", whole["eval/mujoco.json"].replace('"episodes": 4', '"episodes": 5'), "5 episodes, .* holds 4"),
         ):
@@ -407,13 +407,13 @@ class ScoreTest(InFolder):
         group = self.group((1.0, 0.33, 0.66, 0.0), engines=ENGINES)
         summary = group.members[0].summaries["pybullet"]
         found = score(group, "pybullet")
-        self.assertEqual(found.task_progress, summary["task_progress"]["mean"])
-        np.testing.assert_allclose(found.ci95, summary["task_progress"]["ci95"], atol=1e-6)
+        self.assertEqual(found.task_progress, summary.task_progress.mean)
+        np.testing.assert_allclose(found.ci95, summary.task_progress.ci95, atol=1e-6)
         for ours, theirs in (
             (found.approach, "approach_rate"), (found.grasp, "grasp_rate"), (found.reorient, "reorient_rate"),
             (found.reorient_once, "reorient_once_rate"), (found.reorientation_progress, "reorientation_progress"),
         ):  # fmt: skip
-            self.assertEqual(ours, summary[theirs], theirs)
+            self.assertEqual(ours, getattr(summary, theirs), theirs)
         self.assertEqual((found.nonfinite, found.overflow, found.episodes), (1, 1, 4))
         self.assertIsNone(score(group, "other"))
 

@@ -216,25 +216,45 @@ class ResultsTest(unittest.TestCase):
 
     def test_summary(self):
         s = toy_summary()
-        self.assertEqual(s["schema"], "xreset-eval/1")
-        self.assertEqual((s["backend"], s["robot"], s["policy"], s["seed"], s["episodes"]), ("mujoco", "toy", "zero", 3, 4))
-        self.assertEqual(s["objects"], [SOUP, SPAM])
-        self.assertAlmostEqual(s["task_progress"]["mean"], (1 + 0.33 + 0.66) / 4)
-        low, high = s["task_progress"]["ci95"]
+        self.assertEqual((s.backend, s.robot, s.policy, s.seed, s.episodes), ("mujoco", "toy", "zero", 3, 4))
+        self.assertEqual(s.objects, (SOUP, SPAM))
+        self.assertAlmostEqual(s.task_progress.mean, (1 + 0.33 + 0.66) / 4)
+        low, high = s.task_progress.ci95
         self.assertEqual((low, high), (0.33, 0.665))  # two demonstrations: the interval spans their means
-        self.assertEqual((s["approach_rate"], s["grasp_rate"], s["reorient_rate"]), (0.75, 0.5, 0.25))
-        self.assertAlmostEqual(s["reorientation_progress"], 0.375)
-        self.assertEqual(s["health"], {"nonfinite": 1, "overflow": 1, "out_of_bounds": 1})
-        self.assertEqual(s["control_steps_per_second"], 1234.6)
-        self.assertEqual([d["sequence"] for d in s["per_demo"]], ["demo_0", "demo_1"])
-        self.assertAlmostEqual(s["per_demo"][0]["task_progress"], 0.665)
-        self.assertEqual((s["per_demo"][1]["grasp_rate"], s["per_demo"][1]["object"], s["per_demo"][1]["episodes"]), (0.5, SPAM, 2))
+        self.assertEqual((s.approach_rate, s.grasp_rate, s.reorient_rate), (0.75, 0.5, 0.25))
+        self.assertAlmostEqual(s.reorientation_progress, 0.375)
+        self.assertEqual(vars(s.health), {"nonfinite": 1, "overflow": 1, "out_of_bounds": 1})
+        self.assertEqual(s.control_steps_per_second, 1234.6)
+        self.assertEqual([d.sequence for d in s.per_demo], ["demo_0", "demo_1"])
+        self.assertAlmostEqual(s.per_demo[0].task_progress, 0.665)
+        self.assertEqual((s.per_demo[1].grasp_rate, s.per_demo[1].object, s.per_demo[1].episodes), (0.5, SPAM, 2))
+
+    def test_what_is_no_result_is_refused(self):
+        write_results(self.folder, toy_summary(), toy_rollouts(), self.JOINTS)
+        path = self.folder / "mujoco.json"
+        good = json.loads(path.read_text())
+        for words, changes in (
+            ("missing: inputs", {"inputs": None}),
+            ("missing: grasp_rate", {"grasp_rate": None}),
+            ("unknown: later", {"later": 1}),
+            ("policy is 5, expected str", {"policy": 5}),
+            ("grasp_rate is -5.0, expected a number from 0 to 1", {"grasp_rate": -5}),
+            ("mean is 7.0, expected a number from 0 to 1", {"task_progress": {"mean": 7, "ci95": [0, 1]}}),
+            ("ci95 has 1 entries", {"task_progress": {"mean": 0.5, "ci95": [0]}}),
+            ("nonfinite is '<script>alert", {"health": {"nonfinite": "<script>alert(1)</script>", "overflow": 0, "out_of_bounds": 0}}),
+            ("inputs.demos is 3", {"inputs": {"demos": 3}}),
+            ("no object or no demonstration", {"per_demo": []}),
+        ):
+            changed = {name: value for name, value in (good | changes).items() if value is not None or name == "objects_folder"}
+            path.write_text(json.dumps(changed))
+            with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
+                read_results(self.folder)
 
     def test_files(self):
         rollouts = toy_rollouts()
         for name in ("sapien", "mujoco"):
             write_results(self.folder, toy_summary(name, rollouts), rollouts, self.JOINTS)
-        self.assertEqual([s["backend"] for s in read_results(self.folder)], ["mujoco", "sapien"])
+        self.assertEqual([s.backend for s in read_results(self.folder)], ["mujoco", "sapien"])
         self.assertEqual(read_results(self.folder)[0], toy_summary("mujoco"))
         traces = read_traces(self.folder, "mujoco", self.JOINTS)
         for found, made in zip(traces, rollouts.traces, strict=True):

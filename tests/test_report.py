@@ -22,7 +22,7 @@ from xreset.eval.report.clips import Clip, camera_for, choose_sequence, draw_cli
 from xreset.eval.report.data import Curve, collect, differences, read_curves
 from xreset.eval.report.failures import Strip, choose_failures, count_failures, draw_strip
 from xreset.eval.report.page import headline, page
-from xreset.eval.results import write_results
+from xreset.eval.results import EvalResult, TaskProgress, write_results
 from xreset.eval.table import rich_table
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import RunInfo, write_run
@@ -47,9 +47,19 @@ class InFolder(unittest.TestCase):
         info = {
             "robot": "openarm", "resets": "resets.npz", "resets_hash": "ef", "objects": None, "backend": "mujoco-warp",
             "backend_version": "4.0.0", "device": "cuda", "num_envs": 4096, "seed": 7,
-            "config": TrainConfig(iterations=500), "contract": {},
+            "config": TrainConfig(iterations=500), "contract": CONTRACT,
         }  # fmt: skip
         write_run(self.folder, RunInfo(**(info | changes)))
+
+
+CONTRACT = {
+    "schema": "xreset-policy/1", "robot": "openarm", "robot_fingerprint": "aa", "joint_names": ["a"], "fingertip_names": ["thumb"],
+    "objects": [SOUP], "observation_layout": {"policy": {"x": 1}, "proprio": {"y": 1}}, "control_dt": 1 / 60, "task": {},
+}  # fmt: skip
+
+
+def with_progress(result: EvalResult, mean: float, margin: float = 0.0) -> EvalResult:
+    return replace(result, task_progress=TaskProgress(mean=mean, ci95=(mean - margin, mean + margin)))
 
 
 class Outline(HTMLParser):
@@ -244,17 +254,17 @@ class FailureTest(InFolder):
 
 class PlotTest(unittest.TestCase):
     def test_progress_by_object_weighs_demonstrations_by_their_episodes(self):
-        rows = [
-            {"object": SOUP, "task_progress": 1.0, "episodes": 3},
-            {"object": SOUP, "task_progress": 0.0, "episodes": 1},
-            {"object": SPAM, "task_progress": 0.5, "episodes": 2},
-        ]
-        self.assertEqual(plots.object_progress({"per_demo": rows}), {SOUP: 0.75, SPAM: 0.5})
+        any_demo = toy_summary().per_demo[0]
+        rows = tuple(
+            replace(any_demo, object=name, task_progress=progress, episodes=episodes)
+            for name, progress, episodes in ((SOUP, 1.0, 3), (SOUP, 0.0, 1), (SPAM, 0.5, 2))
+        )
+        self.assertEqual(plots.object_progress(replace(toy_summary(), per_demo=rows)), {SOUP: 0.75, SPAM: 0.5})
 
     def test_bars_are_as_long_as_the_results(self):
         from matplotlib.figure import Figure
 
-        low, high = (toy_summary(name) | {"task_progress": {"mean": m, "ci95": [m - 0.1, m + 0.1]}} for name, m in (("a", 0.2), ("b", 0.7)))
+        low, high = (with_progress(toy_summary(name), m, 0.1) for name, m in (("a", 0.2), ("b", 0.7)))
         axes = Figure().subplots()
         plots.draw_progress(axes, [low, high])
         np.testing.assert_allclose([bar.get_width() for bar in axes.patches], [20.0, 70.0])
@@ -362,13 +372,15 @@ class PageTest(InFolder):
 
     def test_the_headline_names_best_and_worst(self):
         data = self.data()
-        made = [s | {"task_progress": {"mean": m, "ci95": [m, m]}} for s, m in zip(data.summaries, (0.4, 0.9, 0.1, 0.5), strict=True)]
+        made = [with_progress(s, m) for s, m in zip(data.summaries, (0.4, 0.9, 0.1, 0.5), strict=True)]
         text = headline(replace(data, summaries=tuple(made)))
         self.assertIn("90% in mujoco-warp and 10% in pybullet, the best and the worst of 4 engines", text)
         self.assertIn("trained in mujoco-warp", text)
         self.assertIn("25%", text)
         self.assertNotIn("worst", headline(replace(data, summaries=tuple(made[:1]))))
-        self.assertIn("40% in each of the 4 engines", headline(replace(data, summaries=tuple(made[0] | {"backend": n} for n in ENGINES))))
+        self.assertIn(
+            "40% in each of the 4 engines", headline(replace(data, summaries=tuple(replace(made[0], backend=n) for n in ENGINES)))
+        )
 
     def test_the_same_results_give_the_same_page(self):
         self.assertEqual(page(self.data(), self.clips, self.strips), page(self.data(), self.clips, self.strips))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from tests.toy_bank import SOUP, SPAM
-from xreset.eval.results import summarize
+from xreset.eval.results import EvalResult, summarize
 from xreset.eval.rollout import Episode, Rollouts, Trace
 
 OBJECTS = (SOUP, SPAM)
@@ -50,7 +50,7 @@ def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
     return Rollouts(episodes=episodes, traces=(trace(0), trace(1)), control_steps_per_second=1234.56)
 
 
-def toy_summary(backend: str = "mujoco", rollouts: Rollouts | None = None, **changes: Any) -> dict[str, Any]:
+def toy_summary(backend: str = "mujoco", rollouts: Rollouts | None = None, **changes: Any) -> EvalResult:
     """``BACKEND.json`` of the rollouts; ``changes`` replace arguments of :func:`xreset.eval.results.summarize`."""
     arguments: dict[str, Any] = {
         "backend_version": "4.0.0",

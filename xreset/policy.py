@@ -197,7 +197,7 @@ class OnnxPolicy:
             "c_in": (1, worlds, width),
         }
         try:
-            found: list[Any] = self._session.run(None, {name: np.zeros(shape, dtype=np.float32) for name, shape in shapes.items()})
+            found: Any = self._session.run(None, {name: np.zeros(shape, dtype=np.float32) for name, shape in shapes.items()})
         except Exception as error:
             raise PolicyError(f"{path} cannot act: {shown(str(error))}. Export it again.") from error
         expected = [(worlds, len(self.contract["joint_names"])), shapes["h_in"], shapes["c_in"]]

@@ -16,6 +16,7 @@ from xreset.errors import FileFormatError, XResetError
 from xreset.eval.engines.agreement import SCHEMA as PARITY
 from xreset.files import read_json
 from xreset.physics import Capability
+from xreset.text import shown
 
 _T = TypeVar("_T")
 
@@ -99,10 +100,15 @@ def read(paths: Iterable[Path]) -> Results:
         schema = data.get("schema")
         if schema not in (CONFORMANCE, PARITY):
             raise FileFormatError(f"{path} has the schema {schema!r}, expected {CONFORMANCE} or {PARITY}. Make it again with --json.")
+        add = _add_conformance if schema == CONFORMANCE else _add_parity
         try:
-            (_add_conformance if schema == CONFORMANCE else _add_parity)(results, path.name, data)
-        except (KeyError, TypeError, AttributeError) as error:
-            raise FileFormatError(f"{path} is no complete {schema}: {type(error).__name__} {error}. Make it again.") from error
+            alone = Results()
+            add(alone, path.name, data)
+            page(alone)  # whatever the page asks of a file is there
+        except (KeyError, TypeError, AttributeError, ValueError, IndexError, OverflowError) as error:
+            what = f"{type(error).__name__} {shown(str(error))}"
+            raise FileFormatError(f"{path} is no complete {schema}: {what}. Make it again.") from error
+        add(results, path.name, data)
     if not results.sources:
         raise XResetError("there is nothing to make a page of. Give files that `xreset conformance` or `xreset parity` wrote with --json.")
     checks = {robot: Checks(robot, _side_by_side(found.results)) for robot, found in results.checks.items()}

@@ -14,9 +14,8 @@ from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.eval.engines.actions import SCHEMA as ACTIONS
 from xreset.eval.engines.actions import Actions, grasp_and_lift, play_policy, read_actions, recorded_actions, robot_of
 from xreset.eval.evaluate import load_motion, resolve
-from xreset.eval.results import SCHEMA as EVALUATION
-from xreset.eval.results import TRACE_SCHEMA, mesh_folder, read_traces
-from xreset.files import npz_schema, read_json
+from xreset.eval.results import TRACE_SCHEMA, mesh_folder, read_result, read_traces
+from xreset.files import npz_schema
 from xreset.objects import load_object, load_objects
 from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import read_bank
@@ -123,8 +122,8 @@ def from_policy(
 def _from_evaluation(source: Path, object_name: str | None, episode: int, robot: str | None, objects: Path | None) -> Actions:
     """The actions of a recorded episode: an evaluation records the first of each demonstration."""
     name = source.name.removesuffix(".trace.npz")
-    summary = read_json(source.with_name(f"{name}.json"), EVALUATION)
-    spec = load_robot(robot or str(summary["robot"]))
+    summary = read_result(source.with_name(f"{name}.json"))
+    spec = load_robot(robot or summary.robot)
     traces = read_traces(source.parent, name, spec.joint_names)
     chosen = _object(source, object_name, dict.fromkeys(t.object for t in traces))
     mine = [t for t in traces if t.object == chosen]
@@ -133,9 +132,9 @@ def _from_evaluation(source: Path, object_name: str | None, episode: int, robot:
     found = mine[episode]
     if found.joint_target is None:
         raise FileFormatError(f"{source} holds states without the actions that led to them. Evaluate again.")
-    folder = mesh_folder(objects, summary["objects_folder"])
+    folder = mesh_folder(objects, summary.objects_folder)
     thing = load_object(found.object, folder)
-    return recorded_actions(spec, thing, found, label=f"{summary['policy']} in {name}, demonstration {found.sequence}")
+    return recorded_actions(spec, thing, found, label=f"{summary.policy} in {name}, demonstration {found.sequence}")
 
 
 def _robot_of_retargeted(source: Path, schema: str) -> str:

@@ -121,7 +121,7 @@ def _captions(trainings: Sequence[Training], groups: Sequence[Group]) -> tuple[s
     evaluated = [next(iter(t.summaries.values())) for t in trainings if t.summaries]
     captions = []
     if evaluated:
-        numbers = sorted({s["episodes"] for s in evaluated})
+        numbers = sorted({s.episodes for s in evaluated})
         count = str(numbers[0]) if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
         captions.append(
             f"From home at full gravity, {count} episodes of each training in each engine. "

@@ -11,7 +11,7 @@ import numpy as np
 
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.report.events import check_events
-from xreset.eval.results import read_episodes, read_results
+from xreset.eval.results import EvalResult, read_episodes, read_results
 from xreset.eval.rollout import Episode
 from xreset.files import read_json
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
@@ -25,14 +25,14 @@ CURVES = {
 """TensorBoard tag -> what it shows."""
 
 
-ASPECTS: dict[str, Callable[[dict[str, Any]], Any]] = {
-    "policy": lambda s: s["policy"],
-    "robot": lambda s: s["robot"],
-    "policy file": lambda s: s["inputs"].get("policy", "")[:12],
-    "demonstrations": lambda s: s["inputs"].get("demos", "")[:12],
-    "object meshes": lambda s: s["objects_folder"] or "stand-ins",
-    "number of episodes": lambda s: s["episodes"],
-    "seed": lambda s: s["seed"],
+ASPECTS: dict[str, Callable[[EvalResult], Any]] = {
+    "policy": lambda s: s.policy,
+    "robot": lambda s: s.robot,
+    "policy file": lambda s: s.inputs.get("policy", "")[:12],
+    "demonstrations": lambda s: s.inputs.get("demos", "")[:12],
+    "object meshes": lambda s: s.objects_folder or "stand-ins",
+    "number of episodes": lambda s: s.episodes,
+    "seed": lambda s: s.seed,
 }
 """What was evaluated, and how, from ``BACKEND.json``: results that differ in any of it cannot be compared as if they did not."""
 
@@ -56,7 +56,7 @@ class ReportData:
     """Name of the run or folder."""
     results: Path
     """Folder of the results."""
-    summaries: tuple[dict[str, Any], ...]
+    summaries: tuple[EvalResult, ...]
     """``BACKEND.json`` of every engine, in order of name."""
     episodes: dict[str, tuple[Episode, ...]]
     """Engine -> its episodes."""
@@ -71,7 +71,7 @@ class ReportData:
     @property
     def engines(self) -> tuple[str, ...]:
         """Names of the engines."""
-        return tuple(s["backend"] for s in self.summaries)
+        return tuple(s.backend for s in self.summaries)
 
 
 def collect(folder: Path) -> ReportData:
@@ -105,7 +105,7 @@ def collect(folder: Path) -> ReportData:
         name=name_of(folder),
         results=results,
         summaries=summaries,
-        episodes={s["backend"]: read_episodes(results, s["backend"]) for s in summaries},
+        episodes={s.backend: read_episodes(results, s.backend) for s in summaries},
         run=run,
         trained_with=trained_with,
         curves=curves,
@@ -130,11 +130,11 @@ def name_of(folder: Path) -> str:
     return (whole.parent if whole.name == "eval" else whole).name
 
 
-def differences(summaries: tuple[dict[str, Any], ...]) -> list[str]:
+def differences(summaries: tuple[EvalResult, ...]) -> list[str]:
     """What makes engines' results incomparable: sentences, none if all were evaluated alike."""
     notes = []
     for what, get in ASPECTS.items():
-        values = {s["backend"]: get(s) for s in summaries}
+        values = {s.backend: get(s) for s in summaries}
         if len(set(values.values())) > 1:
             listing = ", ".join(f"{engine}: {value}" for engine, value in values.items())
             notes.append(f"These results are not comparable: the {what} differs ({listing}). Evaluate all engines in one command.")

@@ -10,6 +10,7 @@ from xreset.eval.report.groups import Group
 from xreset.eval.report.plots import short_name
 from xreset.eval.report.score import Scores
 from xreset.eval.report.trainings import Training
+from xreset.eval.results import EvalResult
 
 _OF_EVALUATION = ("task.termination.", "task.reset.spawn_", "task.reset.home_noise", "task.timestep")
 """Fields of a training's task that its evaluation keeps (:func:`xreset.task.config.evaluation_task`) and that make it easier or harder."""
@@ -20,7 +21,7 @@ def notes(trainings: Sequence[Training]) -> tuple[str, ...]:
     evaluated = [t for t in trainings if t.summaries]
     found = [f"{t.label}: {note}" for t in evaluated for note in differences(tuple(t.summaries.values()))]
 
-    def compare(what: str, get: Callable[[dict[str, Any]], Any], advice: str = "") -> None:
+    def compare(what: str, get: Callable[[EvalResult], Any], advice: str = "") -> None:
         values = {(t.label, engine): get(s) for t in evaluated for engine, s in t.summaries.items()}
         first = {get(next(iter(t.summaries.values()))) for t in evaluated}  # what differs within a training has been said above
         if len(first) > 1:
@@ -40,12 +41,12 @@ def notes(trainings: Sequence[Training]) -> tuple[str, ...]:
     else:
         compare("demonstrations", ASPECTS["demonstrations"])
     compare("robot", ASPECTS["robot"])
-    folders = {s["objects_folder"] for t in evaluated for s in t.summaries.values()} - {None}
+    folders = {s.objects_folder for t in evaluated for s in t.summaries.values()} - {None}
     compare("object meshes", ASPECTS["object meshes"], " Two folders may hold the same meshes." * (len(folders) > 1))
     compare("number of episodes", ASPECTS["number of episodes"])
     compare("seed of the evaluation", ASPECTS["seed"])
     for engine in sorted({engine for t in evaluated for engine in t.summaries}):
-        versions = {(t.label, ""): t.summaries[engine]["backend_version"] for t in evaluated if engine in t.summaries}
+        versions = {(t.label, ""): t.summaries[engine].backend_version for t in evaluated if engine in t.summaries}
         if len(set(versions.values())) > 1:
             found.append(f"These results are not comparable: not the same version of {engine} ({_listing(versions)}).")
     for field in sorted({name for t in evaluated for name in t.facts if name.startswith(_OF_EVALUATION)}):

@@ -71,7 +71,7 @@ def _apart(members: Sequence[Training]) -> str | None:
                     return f"in the evaluations of {a.label} and {b.label} in {engine} the {aspect} differs"
             if _played(a, engine) != _played(b, engine):
                 return f"{a.label} and {b.label} were evaluated with different episodes in {engine}"
-            if a.summaries[engine]["backend_version"] != b.summaries[engine]["backend_version"]:
+            if a.summaries[engine].backend_version != b.summaries[engine].backend_version:
                 return f"{a.label} and {b.label} were evaluated in different versions of {engine}"
     return None
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from xreset.errors import XResetError
 from xreset.eval.report.clips import Clip, camera_for, choose_sequence, draw_clip, recorded_episode
@@ -13,7 +12,7 @@ from xreset.eval.report.data import ReportData, collect
 from xreset.eval.report.failures import Strip, choose_failures, draw_strip
 from xreset.eval.report.page import headline, page
 from xreset.eval.report.plots import short_name, write_overview
-from xreset.eval.results import mesh_folder, read_traces
+from xreset.eval.results import EvalResult, mesh_folder, read_traces
 from xreset.files import atomic_write
 
 
@@ -23,7 +22,7 @@ class Report:
 
     html: Path
     overview: Path
-    summaries: tuple[dict[str, Any], ...]
+    summaries: tuple[EvalResult, ...]
     """``BACKEND.json`` of every engine."""
     headline: str
     """The result in one or two sentences."""
@@ -65,7 +64,7 @@ def make_report(
     first = data.summaries[0]
     shown = clips[0].episode if clips else None
     caption = f"{short_name(shown.object)}: middle and end of the same episode in each engine" if shown else ""
-    write_overview(overview, f"{first['policy']} on {first['robot']}", data.summaries, clips, caption)
+    write_overview(overview, f"{first.policy} on {first.robot}", data.summaries, clips, caption)
     with atomic_write(html) as file:
         file.write(content.encode())
     return Report(html=html, overview=overview, summaries=data.summaries, headline=headline(data), notes=data.notes)
@@ -83,14 +82,14 @@ def _draw(
     from xreset.objects import load_object
 
     first = data.summaries[0]
-    spec = load_robot(robot or (data.run.robot if data.run is not None else first["robot"]))
+    spec = load_robot(robot or (data.run.robot if data.run is not None else first.robot))
     recorded = {engine: read_traces(data.results, engine, spec.joint_names) for engine in data.engines}
     sequence = choose_sequence(data.episodes, recorded)
     if sequence is None:
         raise XResetError("no demonstration was recorded in every engine. Evaluate all engines in one command.")
     traces = {engine: next(t for t in found if t.sequence == sequence) for engine, found in recorded.items()}
     missed = choose_failures(data.episodes[data.engines[0]], recorded[data.engines[0]], _FAILURES)
-    meshes = mesh_folder(objects, first["objects_folder"])
+    meshes = mesh_folder(objects, first.objects_folder)
     drawn = (*traces.values(), *(trace for _, trace in missed))
     things = {name: load_object(name, meshes) for name in dict.fromkeys(trace.object for trace in drawn)}
     camera = camera_for(list(traces.values()))

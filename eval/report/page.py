@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Any
@@ -67,7 +68,9 @@ document.getElementById('together')?.addEventListener('click', together);
 if (!calm) addEventListener('load', together);
 """
 
-_POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+_HASH = base64.b64encode(hashlib.sha256(_SCRIPT.encode()).digest()).decode()
+_POLICY = f"default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'; script-src 'sha256-{_HASH}'"
+"""Of scripts, the page runs the one above and no other, whatever names may hold."""
 
 _METRICS = """
 <p class="soft">Every engine plays the same episodes: the same demonstrations, from the same perturbed starts at home, at full gravity.
@@ -82,7 +85,7 @@ the rest of the row means little.</p>
 def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) -> str:
     """The whole page; clips and strips (of the first engine's failures) may be empty."""
     s = data.summaries[0]
-    title = f"{s['policy']} on {s['robot']}"
+    title = f"{s.policy} on {s.robot}"
     sections = [
         _header(title, data),
         _matrix(data),
@@ -105,34 +108,34 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) 
 
 def headline(data: ReportData) -> str:
     """The result in one or two sentences."""
-    ranked = sorted(data.summaries, key=lambda s: -s["task_progress"]["mean"])
+    ranked = sorted(data.summaries, key=lambda s: -s.task_progress.mean)
     best, worst = ranked[0], ranked[-1]
-    high, low = (_percent(x["task_progress"]["mean"]) for x in (best, worst))
+    high, low = (_percent(x.task_progress.mean) for x in (best, worst))
     if len(ranked) == 1:
-        text = f"Task progress is {high} in {best['backend']}"
+        text = f"Task progress is {high} in {best.backend}"
     elif high == low:
         text = f"Task progress is {high} in each of the {len(ranked)} engines"
     else:
         number = f"{len(ranked)} engines" if len(ranked) > 2 else "the two engines"
-        text = f"Task progress is {high} in {best['backend']} and {low} in {worst['backend']}, the best and the worst of {number}"
-    text += f". The object is grasped in {_between([s['grasp_rate'] for s in ranked])} of the episodes and at its goal at the end of "
-    text += f"{_between([s['reorient_rate'] for s in ranked])}."
-    trained = data.run and next((s for s in ranked if s["backend"] == data.run.backend), None)
+        text = f"Task progress is {high} in {best.backend} and {low} in {worst.backend}, the best and the worst of {number}"
+    text += f". The object is grasped in {_between([s.grasp_rate for s in ranked])} of the episodes and at its goal at the end of "
+    text += f"{_between([s.reorient_rate for s in ranked])}."
+    trained = data.run and next((s for s in ranked if s.backend == data.run.backend), None)
     if trained and len(ranked) > 1:
-        text += f" The policy was trained in {trained['backend']}."
+        text += f" The policy was trained in {trained.backend}."
     return text
 
 
 def _header(title: str, data: ReportData) -> str:
     s, run = data.summaries[0], data.run
-    demos, each = len(s["per_demo"]), s["episodes_per_demo"]
+    demos, each = len(s.per_demo), s.episodes_per_demo
     facts = {
-        "Robot": s["robot"],
-        "Policy": s["policy"],
-        "Engines": ", ".join(f"{x['backend']} {x['backend_version']}" for x in data.summaries),
-        "Objects": ", ".join(map(plots.short_name, s["objects"])) + (" (meshes)" if s["objects_folder"] else " (built-in stand-ins)"),
-        "Episodes": f"{s['episodes']} in each engine: {demos} demonstration{'s' * (demos != 1)}, {each} start{'s' * (each != 1)} each",
-        "Seed": str(s["seed"]),
+        "Robot": s.robot,
+        "Policy": s.policy,
+        "Engines": ", ".join(f"{x.backend} {x.backend_version}" for x in data.summaries),
+        "Objects": ", ".join(map(plots.short_name, s.objects)) + (" (meshes)" if s.objects_folder else " (built-in stand-ins)"),
+        "Episodes": f"{s.episodes} in each engine: {demos} demonstration{'s' * (demos != 1)}, {each} start{'s' * (each != 1)} each",
+        "Seed": str(s.seed),
     }
     if run is not None:
         facts["Trained in"] = f"{run.backend} {run.backend_version} on {run.device}, {run.num_envs:,} worlds"
@@ -152,17 +155,17 @@ def _matrix(data: ReportData) -> str:
     head = _row("th", (*names, "not finite", "overflow", "left the scene", "control steps/s"), scope="col")
     body = []
     for i, s in enumerate(data.summaries):
-        mean, (low, high), health = s["task_progress"]["mean"], s["task_progress"]["ci95"], s["health"]
-        tag = ' <span class="tag">trained here</span>' if data.run and data.run.backend == s["backend"] else ""
-        faults = [f'<td class="bad">{count}</td>' if count else f"<td>{count}</td>" for count in (health["nonfinite"], health["overflow"])]
+        mean, (low, high), health = s.task_progress.mean, s.task_progress.ci95, s.health
+        tag = ' <span class="tag">trained here</span>' if data.run and data.run.backend == s.backend else ""
+        faults = [f'<td class="bad">{count}</td>' if count else f"<td>{count}</td>" for count in (health.nonfinite, health.overflow)]
         cells = [
-            f'<th scope="row">{_swatch(i)}{escape(s["backend"])}{tag}<br><small>{escape(s["backend_version"])}</small></th>',
+            f'<th scope="row">{_swatch(i)}{escape(s.backend)}{tag}<br><small>{escape(s.backend_version)}</small></th>',
             _bar(mean, f"<b>{mean:.1%}</b><br><small>{100 * low:.1f} to {high:.1%}</small>"),
-            *(f"<td>{s[key]:.0%}</td>" for key, _ in plots.STAGES),
-            _bar(s["reorientation_progress"], f"{s['reorientation_progress']:.1%}"),
+            *(f"<td>{getattr(s, key):.0%}</td>" for key, _ in plots.STAGES),
+            _bar(s.reorientation_progress, f"{s.reorientation_progress:.1%}"),
             *faults,
-            f"<td>{health['out_of_bounds']}</td>",
-            f"<td>{s['control_steps_per_second']:,.0f}</td>",
+            f"<td>{health.out_of_bounds}</td>",
+            f"<td>{s.control_steps_per_second:,.0f}</td>",
         ]
         body.append(f"<tr>{''.join(cells)}</tr>")
     return _section("Engines side by side", _table(head, body, "One row per physics engine.") + _METRICS)
@@ -224,16 +227,16 @@ def _failures(data: ReportData, strips: Sequence[Strip]) -> str:
 
 def _plots(data: ReportData) -> str:
     s = data.summaries
-    progress = "; ".join(f"{x['backend']} {_percent(x['task_progress']['mean'])}" for x in s)
-    stages = "; ".join(f"{x['backend']} " + ", ".join(f"{label} {_percent(x[key])}" for key, label in plots.STAGES) for x in s)
+    progress = "; ".join(f"{x.backend} {_percent(x.task_progress.mean)}" for x in s)
+    stages = "; ".join(f"{x.backend} " + ", ".join(f"{label} {_percent(getattr(x, key))}" for key, label in plots.STAGES) for x in s)
     objects = "; ".join(
-        f"{x['backend']}: " + ", ".join(f"{plots.short_name(name)} {_percent(value)}" for name, value in plots.object_progress(x).items())
+        f"{x.backend}: " + ", ".join(f"{plots.short_name(name)} {_percent(value)}" for name, value in plots.object_progress(x).items())
         for x in s
     )
     figures = _figure(plots.figure_progress(s, "progress"), f"Bar chart of task progress. {progress}.", "Task progress in each engine.")
     figures += _figure(plots.figure_stages(s, "stages"), f"Bar chart of stage rates. {stages}.", "How far the episodes get.")
     drawn = f'<div class="grid wide">{figures}</div>'
-    if len(s[0]["objects"]) > 1:
+    if len(s[0].objects) > 1:
         chart = plots.figure_objects(s, "objects")
         drawn += "<br>" + _figure(
             chart, f"Dot chart of task progress by object. {objects}.", "Task progress by object; one dot per engine."
@@ -250,26 +253,26 @@ def _training(data: ReportData) -> str:
 
 
 def _demonstrations(data: ReportData) -> str:
-    found = [{row["sequence"]: row for row in s["per_demo"]} for s in data.summaries]
+    found = [{row.sequence: row for row in s.per_demo} for s in data.summaries]
     head = _row("th", ("demonstration", "object", *data.engines), scope="col")
     body = []
     for name in dict.fromkeys(name for rows_of in found for name in rows_of):
         known = next(rows_of[name] for rows_of in found if name in rows_of)
-        cells = [f'<th scope="row">{escape(name)}</th><td class="text">{escape(plots.short_name(known["object"]))}</td>']
+        cells = [f'<th scope="row">{escape(name)}</th><td class="text">{escape(plots.short_name(known.object))}</td>']
         for rows_of in found:
             row = rows_of.get(name)
             if row is None:
                 cells.append("<td>-</td>")
                 continue
-            detail = f"grasp {row['grasp_rate']:.0%}, reorient {row['reorient_rate']:.0%}"
-            cells.append(_bar(row["task_progress"], f"{row['task_progress']:.0%}<br><small>{detail}</small>"))
+            detail = f"grasp {row.grasp_rate:.0%}, reorient {row.reorient_rate:.0%}"
+            cells.append(_bar(row.task_progress, f"{row.task_progress:.0%}<br><small>{detail}</small>"))
         body.append(f"<tr>{''.join(cells)}</tr>")
     table = _table(head, body, "Task progress of each demonstration in each engine, and the share of its episodes that grasp and reorient.")
     return f"<details>\n<summary>Every demonstration ({len(body)})</summary>\n{table}\n</details>"
 
 
 def _inputs(data: ReportData) -> str:
-    lines = {f"SHA-256 of the {name}": value for s in data.summaries[:1] for name, value in s["inputs"].items()}
+    lines = {f"SHA-256 of the {name}": value for s in data.summaries[:1] for name, value in s.inputs.items()}
     if data.run is not None:
         lines |= {"Reset bank": data.run.resets, "SHA-256 of the reset bank": data.run.resets_hash}
         if data.run.weights is not None:

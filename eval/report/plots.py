@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from xreset.errors import XResetError
+from xreset.eval.results import EvalResult
 from xreset.files import atomic_write
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ STAGES = (("approach_rate", "approach"), ("grasp_rate", "grasp"), ("reorient_rat
 INK = "#010203"
 """Text colour; in an SVG it is replaced by ``currentColor``."""
 
-Summaries = Sequence[dict[str, Any]]
+Summaries = Sequence[EvalResult]
 
 
 def short_name(name: str) -> str:
@@ -35,13 +36,13 @@ def short_name(name: str) -> str:
     return re.sub(r"^\d+_", "", name).replace("_", " ")
 
 
-def object_progress(summary: dict[str, Any]) -> dict[str, float]:
+def object_progress(summary: EvalResult) -> dict[str, float]:
     """Object -> mean task progress over its episodes in one engine."""
     sums: dict[str, list[float]] = {}
-    for row in summary["per_demo"]:
-        total = sums.setdefault(row["object"], [0.0, 0.0])
-        total[0] += row["task_progress"] * row["episodes"]
-        total[1] += row["episodes"]
+    for row in summary.per_demo:
+        total = sums.setdefault(row.object, [0.0, 0.0])
+        total[0] += row.task_progress * row.episodes
+        total[1] += row.episodes
     return {name: total / count for name, (total, count) in sorted(sums.items())}
 
 
@@ -51,11 +52,11 @@ def object_progress(summary: dict[str, Any]) -> dict[str, float]:
 def draw_progress(ax: Axes, summaries: Summaries) -> None:
     """Task progress of each engine with its 95 % interval."""
     for i, s in enumerate(summaries):
-        mean, (low, high) = s["task_progress"]["mean"], s["task_progress"]["ci95"]
+        mean, (low, high) = s.task_progress.mean, s.task_progress.ci95
         ax.barh(i, 100 * mean, color=COLORS[i % len(COLORS)], height=0.62)
         ax.errorbar(100 * mean, i, xerr=[[100 * max(mean - low, 0)], [100 * max(high - mean, 0)]], color=INK, capsize=3, linewidth=1.2)
         ax.text(100 * high + 2, i, f"{mean:.0%}", va="center")
-    ax.set_yticks(range(len(summaries)), [s["backend"] for s in summaries])
+    ax.set_yticks(range(len(summaries)), [s.backend for s in summaries])
     ax.invert_yaxis()
     percent_axis(ax, "x")
     ax.set_xlim(0, 112)
@@ -67,7 +68,7 @@ def draw_stages(ax: Axes, summaries: Summaries) -> None:
     width = 0.8 / len(summaries)
     for i, s in enumerate(summaries):
         at = np.arange(len(STAGES)) - 0.4 + width * (i + 0.5)
-        bars = ax.bar(at, [100 * s[key] for key, _ in STAGES], width=0.9 * width, color=COLORS[i % len(COLORS)], label=s["backend"])
+        bars = ax.bar(at, [100 * getattr(s, key) for key, _ in STAGES], width=0.9 * width, color=COLORS[i % len(COLORS)], label=s.backend)
         ax.bar_label(bars, fmt="%.0f", fontsize="small", padding=1)
     ax.set_xticks(range(len(STAGES)), [label for _, label in STAGES])
     percent_axis(ax, "y")
@@ -76,12 +77,12 @@ def draw_stages(ax: Axes, summaries: Summaries) -> None:
 
 def draw_objects(ax: Axes, summaries: Summaries) -> None:
     """Task progress per object and engine: a dot each, so that engines which agree lie on one another."""
-    names = sorted({row["object"] for s in summaries for row in s["per_demo"]})
+    names = sorted({row.object for s in summaries for row in s.per_demo})
     for i, s in enumerate(summaries):
         found = object_progress(s)
         offset = 0.5 * ((i + 0.5) / len(summaries) - 0.5)
         rows = [(100 * found[name], j + offset) for j, name in enumerate(names) if name in found]
-        ax.scatter(*zip(*rows, strict=True), s=34, color=COLORS[i % len(COLORS)], label=s["backend"], zorder=3, clip_on=False)
+        ax.scatter(*zip(*rows, strict=True), s=34, color=COLORS[i % len(COLORS)], label=s.backend, zorder=3, clip_on=False)
     ax.set_yticks(range(len(names)), [short_name(name) for name in names])
     ax.set_ylim(len(names) - 0.5, -0.5)
     percent_axis(ax, "x")
@@ -147,7 +148,7 @@ def figure_stages(summaries: Summaries, salt: str) -> str:
 
 def figure_objects(summaries: Summaries, salt: str) -> str:
     """SVG of :func:`draw_objects`."""
-    number = len({row["object"] for s in summaries for row in s["per_demo"]})
+    number = len({row.object for s in summaries for row in s.per_demo})
 
     def draw(figure: Figure) -> None:
         ax = figure.subplots()
@@ -203,7 +204,7 @@ def write_png(path: Path, figure: Figure) -> None:
 
 
 def _index(summaries: Summaries, engine: str) -> int:
-    return [s["backend"] for s in summaries].index(engine) % len(COLORS)
+    return [s.backend for s in summaries].index(engine) % len(COLORS)
 
 
 def percent_axis(ax: Axes, which: str) -> None:

@@ -33,7 +33,7 @@ def results(groups: Sequence[Group], found: Scores) -> Rows:
     versions: dict[str, set[str]] = {}
     for member in (m for group in groups for m in group.members):
         for engine, summary in member.summaries.items():
-            versions.setdefault(engine, set()).add(summary["backend_version"])
+            versions.setdefault(engine, set()).add(summary.backend_version)
     body = []
     for label, row in found.items():
         several = max(len(s.each) for s in row.values()) > 1

@@ -10,16 +10,13 @@ from typing import Any, NamedTuple
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.report.data import Curve, name_of, read_scalars, results_in
 from xreset.eval.report.plots import short_name
-from xreset.eval.results import read_episodes, read_results
+from xreset.eval.results import EvalResult, read_episodes, read_results
 from xreset.eval.rollout import Episode
 from xreset.files import read_json
 from xreset.learning.clock import FILE as LIFT_FILE
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
 from xreset.policies import results_folder, shipped
-
-_NEEDED = ("backend", "backend_version", "robot", "policy", "episodes", "seed", "objects_folder", "inputs")
-"""Entries of ``BACKEND.json`` that are used here; all figures come from the episodes."""
 
 
 class Fact(NamedTuple):
@@ -41,7 +38,7 @@ class Training:
     """Its configuration by name of the field, such as ``task.reset.demo_probability``; empty where there is no ``run.json``."""
     scalars: dict[str, Curve]
     """TensorBoard tag -> curve; empty where there are no event files."""
-    summaries: dict[str, dict[str, Any]]
+    summaries: dict[str, EvalResult]
     """Engine -> ``BACKEND.json``."""
     episodes: dict[str, tuple[Episode, ...]]
     """Engine -> its episodes."""
@@ -85,14 +82,12 @@ def read_training(label: str, folder: Path) -> Training:
     results = results_in(folder)
     summaries = {}
     for summary in read_results(results):
-        if missing := [name for name in _NEEDED if name not in summary]:
-            raise FileFormatError(f"a result in {results} lacks {', '.join(missing)}; it has {', '.join(summary)}. Evaluate again.")
-        summaries[summary["backend"]] = summary
+        summaries[summary.backend] = summary
     episodes = {engine: read_episodes(results, engine) for engine in summaries}
     for engine, found in episodes.items():
-        if not found or len(found) != summaries[engine]["episodes"]:
+        if not found or len(found) != summaries[engine].episodes:
             raise FileFormatError(
-                f"{results / engine}.json tells of {summaries[engine]['episodes']} episodes, {engine}.episodes.json holds {len(found)}. "
+                f"{results / engine}.json tells of {summaries[engine].episodes} episodes, {engine}.episodes.json holds {len(found)}. "
                 "They are not of the same evaluation; evaluate again."
             )
     scalars = read_scalars(folder)

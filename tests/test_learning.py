@@ -13,7 +13,7 @@ from xreset import robots
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig, rsl_rl_config
 from xreset.learning.export import export_onnx
-from xreset.learning.model import PointNetLstmModel, embed_sequences
+from xreset.learning.model import PointNetLstmModel, ReturnCritic, embed_sequences
 from xreset.learning.ppo import SequencePpo, SequenceStorage
 from xreset.policy import OnnxPolicy, policy_contract
 from xreset.task.config import ObservationConfig, RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
@@ -159,8 +159,11 @@ class StorageTest(unittest.TestCase):
             self.assertTrue(torch.equal(batch.masks, expected))
         self.assertEqual(sorted(seen), list(range(T * N)))
 
-    def test_ppo_improves_a_bandit(self):
-        """The whole algorithm on an environment whose reward is -|action - 0.5|: the mean action moves to 0.5."""
+    def bandit(self, target: float = 0.5, iterations: int = 40, bias: float = 0.0, **ppo) -> tuple[SequencePpo, torch.Tensor, torch.Tensor]:
+        """The algorithm, and the mean actions before and after it, on an environment whose reward is -|action - target|.
+
+        ``bias`` is added to the first policy's means.
+        """
 
         class Bandit:
             num_envs, num_actions, device = 64, A, "cpu"
@@ -168,25 +171,61 @@ class StorageTest(unittest.TestCase):
             def get_observations(self):
                 return observations(self.num_envs)
 
-        config = TrainConfig(
-            model=ModelConfig(pointnet=(8, 6), lstm=12, mlp=(16,), initial_std=0.5), ppo=PpoConfig(horizon=8, minibatch_size=128)
-        )
-        cfg = rsl_rl_config(config, 64) | {"multi_gpu": None}
+        model = ModelConfig(pointnet=(8, 6), lstm=12, mlp=(16,), initial_std=0.5, normalize_returns=ppo.pop("normalize_returns", False))
+        config = TrainConfig(model=model, ppo=PpoConfig(horizon=8, minibatch_size=128, **ppo))
         torch.manual_seed(0)
-        alg = SequencePpo.construct_algorithm(observations(64), Bandit(), cfg, "cpu")
+        alg = SequencePpo.construct_algorithm(observations(64), Bandit(), rsl_rl_config(config, 64) | {"multi_gpu": None}, "cpu")
+        alg.actor.mlp[-1].bias.data += bias
         obs = observations(64)
         obs["perception"] = obs["perception"][:, -1:].expand(-1, 5, -1, -1)  # a scene in which nothing moves
-        before = float((alg.actor(obs) - 0.5).detach().abs().mean())
+        before = alg.actor(obs).detach()
         alg.actor.reset()
-        for _ in range(40):
+        for _ in range(iterations):
             with torch.no_grad():
                 for _ in range(8):
                     actions = alg.act(obs)
-                    alg.process_env_step(obs, -(actions - 0.5).abs().mean(-1), torch.zeros(64), {})
+                    alg.process_env_step(obs, -(actions - target).abs().mean(-1), torch.zeros(64), {})
                 alg.compute_returns(obs)
-            alg.update()
+            self.losses = alg.update()
         alg.actor.reset()
-        self.assertLess(float((alg.actor(obs) - 0.5).abs().mean()), 0.5 * before)
+        return alg, before, alg.actor(obs).detach()
+
+    def test_ppo_improves_a_bandit(self):
+        _, before, after = self.bandit()
+        self.assertLess(float((after - 0.5).abs().mean()), 0.5 * float((before - 0.5).abs().mean()))
+
+    def test_a_critic_may_have_its_own_rate_and_unit(self):
+        alg, before, after = self.bandit(iterations=20, normalize_returns=True, critic_learning_rate=3e-4)
+        self.assertLess(float((after - 0.5).abs().mean()), 0.8 * float((before - 0.5).abs().mean()))
+        actor, critic = alg.optimizer.param_groups
+        self.assertEqual((critic["lr"], actor["lr"]), (3e-4, alg.learning_rate))
+        self.assertNotEqual(alg.learning_rate, 1e-3, "the actor's has adapted")
+
+    def test_a_bounds_loss_pulls_means_back_from_beyond_the_limits(self):
+        _, before, free = self.bandit(iterations=5, bias=3.0, target=3.0)
+        self.assertGreater(float(before.min()), 2.0)
+        self.assertGreater(self.losses["bounds"], 1.0)
+        _, _, held = self.bandit(iterations=5, bias=3.0, target=3.0, bounds_loss=1.0)
+        self.assertLess(float(held.mean()), float(free.mean()) - 0.1)
+
+
+class ReturnCriticTest(unittest.TestCase):
+    def test_values_stay_when_their_unit_changes(self):
+        torch.manual_seed(0)
+        critic = ReturnCritic(observations(N), GROUPS, "critic", 1, **SMALL)
+        obs = observations(N)
+        before = critic(obs)
+        returns = 3.0 * torch.randn(4000, generator=torch.Generator().manual_seed(0)) + 7.0
+        critic.take_returns(returns)
+        critic.reset()
+        torch.testing.assert_close(critic(obs), before, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close((critic.return_mean, critic.return_std), (returns.mean(), returns.std(unbiased=False)))
+        for _ in range(3):
+            critic.take_returns(returns + 10.0)
+        critic.reset()
+        torch.testing.assert_close(critic(obs), before, atol=1e-4, rtol=1e-4)
+        everything = torch.cat((returns, *[returns + 10.0] * 3))
+        torch.testing.assert_close((critic.return_mean, critic.return_std), (everything.mean(), everything.std(unbiased=False)))
 
 
 class ExportTest(unittest.TestCase):

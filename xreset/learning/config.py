@@ -27,13 +27,16 @@ class ModelConfig:
     synergy_std: float | None = None
     """Initial standard deviation of the exploration along the hand's synergies, in units of the demonstrated spread; beside it, each joint
     keeps its own. None: no such noise (:mod:`xreset.learning.synergies`)."""
+    normalize_returns: bool = False
+    """Whether the critic learns returns in units of their running standard deviation (:class:`xreset.learning.model.ReturnCritic`), as the
+    paper's library does if told so. Trained policies' returns lie between 0 and 20, so the clip of values means something else without."""
     normalize_observations: bool = True
     """Running normalisation of the flat observations (not of the clouds). Not in the paper; its library's usual setting."""
 
     @property
     def layers(self) -> dict[str, Any]:
         """What networks must share for one to take over the weights of the other."""
-        names = ("pointnet", "lstm", "mlp", "activation", "normalize_observations")
+        names = ("pointnet", "lstm", "mlp", "activation", "normalize_observations", "normalize_returns")
         return {name: getattr(self, name) for name in names} | {"synergies": self.synergy_std is not None}
 
     def __post_init__(self) -> None:
@@ -58,11 +61,17 @@ class PpoConfig:
     discount: float = 0.99
     gae_lambda: float = 0.95
     learning_rate: float = 1e-3
+    """Of the actor, and of the critic if that has none of its own."""
+    critic_learning_rate: float | None = None
+    """A fixed rate of the critic's own. None: the actor's, which adapts to how far the *policy* moves."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """``adaptive``: the rate is divided (multiplied) by 1.5 where the policy moved more than twice (less than half) ``desired_kl``."""
     desired_kl: float = 0.01
     clip: float = 0.2
     entropy: float = 0.005
+    bounds_loss: float = 0.0
+    """Weight of the squared excess of the actions' means over +-1.1, summed over actions: beyond the limit noise explores nothing. The
+    paper's library has it, with 1e-4."""
     value_loss: float = 1.0
     """Weight of the value loss. Not in the paper."""
     clip_values: bool = True
@@ -77,9 +86,11 @@ class PpoConfig:
         check_numbers(
             self,
             positive=("horizon", "sequence_length", "mini_epochs", "minibatch_size", "learning_rate", "desired_kl", "clip", "grad_norm"),
-            not_negative=("entropy", "value_loss"),
+            not_negative=("entropy", "value_loss", "bounds_loss"),
             share=("discount", "gae_lambda"),
         )
+        if self.critic_learning_rate is not None:
+            check_numbers(self, positive=("critic_learning_rate",))
         if self.horizon % self.sequence_length:
             raise ValueError(f"sequence_length is {self.sequence_length}, expected a divisor of the horizon, which is {self.horizon}")
 
@@ -132,10 +143,12 @@ def rsl_rl_config(config: TrainConfig, num_envs: int, synergies: Any = None) -> 
             "critic": ["policy", "proprio", "privileged", "perception"],
         },
         "actor": network | {"distribution_cfg": gaussian},
-        "critic": dict(network),
+        "critic": network | {"class_name": "xreset.learning.model:ReturnCritic"} if m.normalize_returns else dict(network),
         "algorithm": {
             "class_name": "xreset.learning.ppo:SequencePpo",
             "sequence_length": p.sequence_length,
+            "critic_learning_rate": p.critic_learning_rate,
+            "bounds_loss": p.bounds_loss,
             "num_learning_epochs": p.mini_epochs,
             "num_mini_batches": max(1, min(num_envs * p.horizon // p.minibatch_size, num_envs // 2)),
             "clip_param": p.clip,

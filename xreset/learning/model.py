@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import importlib.util
+from typing import Any
 
 import torch
 from rsl_rl.models import MLPModel
@@ -238,6 +239,46 @@ class PointNetLstmModel(MLPModel):
 
     def _get_latent_dim(self) -> int:
         return self._latent_dim
+
+
+class ReturnCritic(PointNetLstmModel):
+    """A critic whose last layer gives returns in units of their running standard deviation, around their running mean.
+
+    When mean and deviation change, the last layer is changed so that the values stay what they were (van Hasselt et al. 2016, Learning
+    values across many orders of magnitude).
+    """
+
+    RATE = 0.01
+    """Weight of a rollout in the running moments, once there have been a hundred."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        """Build; returns are first taken for numbers around 0 with a deviation of 1."""
+        super().__init__(*args, **options)
+        self.return_mean: Tensor
+        self.return_std: Tensor
+        self.rollouts: Tensor
+        self.register_buffer("return_mean", torch.zeros(()))
+        self.register_buffer("return_std", torch.ones(()))
+        self.register_buffer("rollouts", torch.zeros((), dtype=torch.long))
+
+    def forward(self, *args: Any, **options: Any) -> Tensor:
+        """[..., 1] values, in the unit of the rewards."""
+        return self.return_mean + self.return_std * super().forward(*args, **options)
+
+    @torch.no_grad()
+    def take_returns(self, returns: Tensor) -> None:
+        """Take a rollout's returns into mean and deviation; the values of any observation stay."""
+        self.rollouts += 1
+        rate = (1.0 / self.rollouts).clamp_min(self.RATE)
+        shift = returns.mean() - self.return_mean
+        mean = self.return_mean + rate * shift
+        variance = (1 - rate) * self.return_std.square() + rate * returns.var(unbiased=False) + rate * (1 - rate) * shift.square()
+        std = variance.sqrt().clamp_min(1e-3)
+        last = [layer for layer in self.mlp.modules() if isinstance(layer, nn.Linear)][-1]
+        last.weight.mul_(self.return_std / std)
+        last.bias.mul_(self.return_std).add_(self.return_mean - mean).div_(std)
+        self.return_mean.copy_(mean)
+        self.return_std.copy_(std)
 
 
 class ExportedPolicy(nn.Module):

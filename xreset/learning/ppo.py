@@ -20,6 +20,8 @@ from rsl_rl.utils import resolve_class, resolve_obs_groups
 from tensordict import TensorDict
 from torch import Tensor
 
+from xreset.learning.model import ReturnCritic
+
 
 class SequenceStorage(RolloutStorage):
     """A rollout that is handed out world by world, cut into sequences of fixed length."""
@@ -60,8 +62,102 @@ class SequenceStorage(RolloutStorage):
                 )
 
 
+BOUND = 1.1
+"""Mean of an action beyond which ``bounds_loss`` pulls it back."""
+SLOWEST, FASTEST = 1e-5, 1e-2
+"""Limits of an adaptive learning rate (rsl-rl's)."""
+
+
 class SequencePpo(PPO):
-    """rsl-rl's PPO with :class:`SequenceStorage`."""
+    """rsl-rl's PPO with :class:`SequenceStorage`, an update that never waits for a GPU, and a critic that may learn at its own rate."""
+
+    def __init__(self, *args: Any, critic_learning_rate: float | None = None, bounds_loss: float = 0.0, **options: Any) -> None:
+        """Set up as rsl-rl does.
+
+        Args:
+            args: rsl-rl's.
+            critic_learning_rate: a rate of the critic's own; None: the actor's.
+            bounds_loss: weight of the squared excess of the actions' means over :data:`BOUND`.
+            options: rsl-rl's.
+        """
+        super().__init__(*args, **options)
+        self.critic_learning_rate, self.bounds_loss = critic_learning_rate, bounds_loss
+        if critic_learning_rate is not None:
+            groups = [{"params": list(self.actor.parameters())}, {"params": list(self.critic.parameters()), "lr": critic_learning_rate}]
+            self.optimizer = type(self.optimizer)(groups, lr=self.learning_rate)
+
+    def update(self) -> dict[str, float]:
+        """Learn from the rollout; the mean losses of its minibatches.
+
+        Unlike rsl-rl's, it reads no number back from the device until the end: the adaptive learning rate lives there, too.
+        """
+        storage, on_gpu = self.storage, torch.device(self.device).type == "cuda"
+        value_unit = 1.0
+        if isinstance(self.critic, ReturnCritic):
+            self.critic.take_returns(storage.returns)
+            value_unit = self.critic.return_std
+        rate = torch.tensor(self.learning_rate, device=self.device, dtype=torch.float32 if on_gpu else torch.float64)
+        self._use_rate(rate, on_gpu)
+        sums = torch.zeros(4, device=self.device)
+        for batch in storage.recurrent_mini_batch_generator(self.num_mini_batches, self.num_learning_epochs):
+            self.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0], stochastic_output=True)
+            log_prob = self.actor.get_output_log_prob(batch.actions)
+            values = self.critic(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[1])
+            entropy = self.actor.output_entropy.mean()
+            if self.schedule == "adaptive":
+                self._adapt(rate, batch)
+                if not on_gpu:
+                    self._use_rate(rate, on_gpu)
+            advantages = batch.advantages.squeeze(-1)
+            ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze(-1))
+            surrogate = torch.max(-advantages * ratio, -advantages * ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)).mean()
+            value = self._value_loss(values, batch, value_unit)
+            excess = (self.actor.output_mean.abs() - BOUND).clamp_min(0.0).square().sum(dim=-1).mean()
+            loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy + self.bounds_loss * excess
+            self.optimizer.zero_grad()
+            loss.backward()
+            if self.is_multi_gpu:
+                self.reduce_parameters()
+            for model in (self.actor, self.critic):
+                torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+            self.optimizer.step()
+            sums += torch.stack((value, surrogate, entropy, excess)).detach()
+        observations = storage.observations.flatten(0, 1)
+        self.actor.update_normalization(observations)
+        self.critic.update_normalization(observations)
+        storage.clear()
+        means = (sums / (self.num_learning_epochs * self.num_mini_batches)).tolist()
+        self.learning_rate = float(rate)
+        return dict(zip(("value", "surrogate", "entropy", "bounds"), means, strict=True))
+
+    def _value_loss(self, values: Tensor, batch: RolloutStorage.Batch, unit: Tensor | float) -> Tensor:
+        error = (values - batch.returns) / unit
+        if not self.use_clipped_value_loss:
+            return error.square().mean()
+        near = batch.values + unit * ((values - batch.values) / unit).clamp(-self.clip_param, self.clip_param)
+        return torch.max(error.square(), ((near - batch.returns) / unit).square()).mean()
+
+    @torch.no_grad()
+    def _adapt(self, rate: Tensor, batch: RolloutStorage.Batch) -> None:
+        """Divide (multiply) the rate by 1.5 where the policy moved more than twice (less than half) the desired divergence; in place."""
+        kl = self.actor.get_kl_divergence(batch.old_distribution_params, self.actor.output_distribution_params).mean()
+        if self.is_multi_gpu:
+            torch.distributed.all_reduce(kl)
+            kl = kl / self.gpu_world_size
+        slower, faster = (rate / 1.5).clamp_min(SLOWEST), (rate * 1.5).clamp_max(FASTEST)
+        too_little = (kl < self.desired_kl / 2.0) & (kl > 0.0)
+        rate.copy_(torch.where(kl > self.desired_kl * 2.0, slower, torch.where(too_little, faster, rate)))
+
+    def _use_rate(self, rate: Tensor, on_gpu: bool) -> None:
+        """Give the rate to the optimiser: on a GPU as a tensor that it reads there, for which it has to be the fused one."""
+        groups = self.optimizer.param_groups
+        for group in groups[:1] if self.critic_learning_rate is not None else groups:
+            group["lr"] = rate if on_gpu else float(rate)
+        if on_gpu and not groups[0].get("fused"):
+            for group in groups:
+                group["fused"], group["foreach"] = True, False
+            for state in self.optimizer.state.values():
+                state["step"] = state["step"].to(self.device)
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions; the very first step of a run starts from a zero LSTM state, which is stored like any other."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,16 @@ from xreset.errors import FileFormatError, PolicyError
 from xreset.eval.baselines import KinematicRetargeting
 from xreset.eval.results import EvalResult, mesh_folder, summarize, write_results
 from xreset.eval.rollout import roll_out
+from xreset.eval.setting import Setting
+from xreset.eval.trial import Engine, Trial
 from xreset.files import file_hash, npz_schema
 from xreset.objects import load_objects
-from xreset.plugins import backend_class, device_for
 from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
 from xreset.resets.bank import ResetBank, check_robot
 from xreset.retarget.pipeline import SCHEMA as RETARGETED
 from xreset.retarget.pipeline import Retargeted, read_retargeted, rest_on_table, retarget
-from xreset.spec import ObjectSpec, RobotSpec
+from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
 from xreset.typed import from_dict
 
@@ -51,6 +53,17 @@ class Subject:
     def meshes(self, given: Path | None) -> Path | None:
         """The folder of meshes to use: the given one, else its own; None: the stand-ins."""
         return mesh_folder(given, self.objects_folder)
+
+    def trial(self, bank: ResetBank, setting: Setting) -> Trial:
+        """Its own task as evaluations play it, with the objects of a bank."""
+        objects = load_objects(sorted({*map(str, bank.sequence_object)}), self.meshes(setting.objects))
+        task = evaluation_task(self.task)
+        return Trial(robot=self.robot, objects=tuple(objects), bank=bank, task=task, seed=setting.seed, num_envs=setting.num_envs)
+
+    def episodes(self, demos: Path, setting: Setting) -> tuple[Trial, Retargeted | None]:
+        """The episodes of a file of demonstrations, and the trajectories that the ik baseline follows."""
+        bank, trajectories = load_motion(demos, self.robot, self.meshes(setting.objects), trajectories=self.label == "ik")
+        return self.trial(bank, setting), trajectories
 
 
 def resolve(policy: str, robot: str | None, seed: int) -> Subject:
@@ -132,61 +145,41 @@ def load_motion(path: Path, robot: RobotSpec, objects_folder: Path | None, *, tr
 
 def evaluate(
     subject: Subject,
-    backends: list[str],
+    engines: Sequence[Engine],
     demos: Path,
+    setting: Setting,
+    out: Path,
     *,
     episodes: int,
-    seed: int,
-    num_envs: int,
-    device: str,
-    objects_folder: Path | None,
-    out: Path,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> list[EvalResult]:
     """Evaluate in each engine and write the results.
 
     Args:
         subject: what to evaluate.
-        backends: engines; all are checked before the first rollout.
+        engines: where.
         demos: demonstrations or retargeted trajectories.
-        episodes: episodes per demonstration.
-        seed: of the perturbations and of the random policy.
-        num_envs: worlds at a time.
-        device: where GPU engines run.
-        objects_folder: folder of meshes; None: the policy's own, or the stand-ins.
+        setting: meshes, seed of the perturbations, worlds at a time.
         out: folder for the results.
+        episodes: episodes per demonstration.
         progress: called with (engine, control steps done, control steps in all).
 
     Returns:
-        The summaries that were written, in the order of ``backends``.
+        The summaries that were written, in the order of the engines.
     """
-    versions = {name: backend_class(name).engine_version() for name in backends}
-    folder = subject.meshes(objects_folder)
-    bank, trajectories = load_motion(demos, subject.robot, folder, trajectories=subject.label == "ik")
-    objects: tuple[ObjectSpec, ...] = tuple(load_objects(sorted({*map(str, bank.sequence_object)}), folder))
-    task, inputs = evaluation_task(subject.task), subject.inputs | {"demos": file_hash(demos)}
+    trial, trajectories = subject.episodes(demos, setting)
+    folder, inputs = subject.meshes(setting.objects), subject.inputs | {"demos": file_hash(demos)}
     summaries = []
-    for name in backends:
-        rollouts = roll_out(
-            subject.policy(subject.robot, trajectories),
-            name,
-            subject.robot,
-            objects,
-            bank,
-            task,
-            repetitions=episodes,
-            seed=seed,
-            num_envs=num_envs,
-            device=device_for(name, device),
-            progress=lambda done, total, name=name: progress(name, done, total),
-        )
+    for engine in engines:
+        policy = subject.policy(subject.robot, trajectories)
+        rollouts = roll_out(policy, engine, trial, repetitions=episodes, progress=partial(progress, engine.name))
         summary = summarize(
             rollouts,
-            backend=name,
-            backend_version=versions[name],
+            backend=engine.name,
+            backend_version=engine.version,
             robot=subject.robot.name,
             policy=subject.label,
-            seed=seed,
+            seed=setting.seed,
             repetitions=episodes,
             inputs=inputs,
             objects_folder=str(folder) if folder else None,

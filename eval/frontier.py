@@ -6,28 +6,27 @@ in about that order, so the first stage from which it fails is what training has
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from xreset.env import ManipulationEnv, Reading, make_scene
+from xreset.env import Reading
 from xreset.errors import DemoError
 from xreset.eval.evaluate import Subject
 from xreset.eval.metrics import MetricsConfig
-from xreset.eval.rollout import play, world_keypoints
+from xreset.eval.rollout import play
+from xreset.eval.setting import Setting
+from xreset.eval.trial import Engine, Trial
 from xreset.files import file_hash, write_json
-from xreset.objects import load_objects
-from xreset.plugins import backend_class, device_for, make_backend
 from xreset.policy import Policy
-from xreset.resets.bank import ResetBank, check_objects, read_bank
-from xreset.resets.distribution import ResetDistribution, bank_starts
+from xreset.resets.bank import check_objects, read_bank
+from xreset.resets.distribution import bank_starts
 from xreset.schedule import schedule
-from xreset.spec import ObjectSpec, RobotSpec
-from xreset.task.config import TaskConfig, evaluation_task
 
 SCHEMA = "xreset-frontier/1"
 
@@ -75,42 +74,27 @@ def stage_of(tip_distance: np.ndarray, lift: np.ndarray) -> np.ndarray:
 
 def try_policy(
     policy: Policy,
-    backend_name: str,
-    robot: RobotSpec,
-    objects: tuple[ObjectSpec, ...],
-    bank: ResetBank,
-    task: TaskConfig,
+    engine: Engine,
+    trial: Trial,
     rows: np.ndarray,
-    *,
-    num_envs: int,
-    device: str = "cpu",
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Tried]:
     """Let a policy go on from states of a bank, at rest and at full gravity, for one episode each.
 
     Args:
         policy: what acts.
-        backend_name: engine.
-        robot: robot.
-        objects: objects of the bank's sequences.
-        bank: the states.
-        task: usually :func:`xreset.task.config.evaluation_task` of the policy's own.
+        engine: where.
+        trial: robot, objects and bank.
         rows: [M] states to try.
-        num_envs: worlds at a time.
-        device: of GPU engines.
         progress: called with (control steps done, control steps in all).
     """
-    names = tuple(o.name for o in objects)
-    plan = schedule(np.array([names.index(name) for name in bank.object_name[rows]]), num_envs)
-    worlds = torch.as_tensor(plan.object_index)
+    bank = trial.bank
+    plan = schedule(np.array([trial.names.index(name) for name in bank.object_name[rows]]), trial.num_envs)
     found: dict[int, Tried] = {}
-    scene = make_scene(robot, objects, task)
-    with make_backend(backend_name, scene, len(worlds), object_index=worlds, device=device) as backend:
-        env = ManipulationEnv(backend, task, ResetDistribution(bank, robot, names, task.reset, backend.device))
-        points = world_keypoints(objects, backend)
+    with trial.worlds(engine, torch.as_tensor(plan.object_index)) as (env, points):
         for number, (items, fresh) in enumerate(plan):
             chosen = rows[items]
-            env.reset(start=bank_starts(bank, chosen).to(backend.device))
+            env.reset(start=bank_starts(bank, chosen).to(env.device))
             lift = bank.object_pos[chosen, 2] - bank.start_pos[bank.sequence_index[chosen], 2]
             stage = stage_of(env.reading().tip_distance.amin(dim=-1).cpu().numpy(), lift)
 
@@ -146,70 +130,52 @@ def by_stage(tried: list[Tried]) -> list[dict[str, Any]]:
 
 def frontier(
     subject: Subject,
-    backends: list[str],
+    engines: Sequence[Engine],
     resets: Path,
+    setting: Setting,
+    out: Path,
     *,
     states: int,
-    seed: int,
-    num_envs: int,
-    device: str,
-    objects_folder: Path | None,
-    out: Path,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> list[dict[str, Any]]:
     """Try states of a bank in each engine and write ``OUT/BACKEND.json``.
 
     Args:
         subject: what to try.
-        backends: engines; all are checked before the first rollout.
+        engines: where.
         resets: reset bank.
-        states: how many to draw from it, without repetition; all if it has fewer.
-        seed: of the draw.
-        num_envs: worlds at a time.
-        device: where GPU engines run.
-        objects_folder: folder of meshes; None: the policy's own, or the stand-ins.
+        setting: meshes, seed of the draw, worlds at a time.
         out: folder for the results.
+        states: how many to draw from the bank, without repetition; all if it has fewer.
         progress: called with (engine, control steps done, control steps in all).
 
     Returns:
-        What was written, in the order of ``backends``.
+        What was written, in the order of the engines.
 
     Raises:
         DemoError: the bank holds no state.
     """
-    versions = {name: backend_class(name).engine_version() for name in backends}
     bank = read_bank(resets, robot=subject.robot)
     if not bank.num_states:
         raise DemoError(f"{resets} holds no state to try: every candidate was rejected. Look at its reasons (xreset resets).")
-    objects = tuple(load_objects(sorted({*map(str, bank.sequence_object)}), subject.meshes(objects_folder)))
-    check_objects(resets, bank, objects)
-    rows = np.sort(np.random.default_rng(seed).permutation(bank.num_states)[:states])
-    task, inputs = evaluation_task(subject.task), subject.inputs | {"resets": file_hash(resets)}
+    trial = subject.trial(bank, setting)
+    check_objects(resets, bank, trial.objects)
+    rows = np.sort(np.random.default_rng(setting.seed).permutation(bank.num_states)[:states])
+    inputs = subject.inputs | {"resets": file_hash(resets)}
     written = []
-    for name in backends:
-        tried = try_policy(
-            subject.policy(subject.robot, None),
-            name,
-            subject.robot,
-            objects,
-            bank,
-            task,
-            rows,
-            num_envs=num_envs,
-            device=device_for(name, device),
-            progress=lambda done, total, name=name: progress(name, done, total),
-        )
+    for engine in engines:
+        tried = try_policy(subject.policy(subject.robot, None), engine, trial, rows, partial(progress, engine.name))
         content = {
             "schema": SCHEMA,
-            "backend": name,
-            "backend_version": versions[name],
+            "backend": engine.name,
+            "backend_version": engine.version,
             "robot": subject.robot.name,
             "policy": subject.label,
-            "seed": seed,
+            "seed": setting.seed,
             "inputs": inputs,
             "stages": by_stage(tried),
             "tried": [asdict(t) for t in tried],
         }
-        write_json(out / f"{name}.json", content)
+        write_json(out / f"{engine.name}.json", content)
         written.append(content)
     return written

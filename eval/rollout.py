@@ -9,21 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from xreset.env import ManipulationEnv, Reading, make_scene
+from xreset.env import ManipulationEnv, Reading
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
-from xreset.objects import keypoints
-from xreset.physics import Backend
-from xreset.plugins import make_backend
+from xreset.eval.trial import Engine, Trial
 from xreset.policy import Policy
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.schedule import schedule
-from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
-from xreset.task.config import TaskConfig
 from xreset.task.terminations import out_of_bounds
-
-MakeBackend = Callable[[SceneSpec, int, torch.Tensor], Backend]
-"""Builds worlds of a scene: how many, and which object each holds [N]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,88 +73,58 @@ class Rollouts:
 
 def roll_out(
     policy: Policy,
-    backend_name: str,
-    robot: RobotSpec,
-    objects: tuple[ObjectSpec, ...],
-    demos: ResetBank,
-    task: TaskConfig,
+    engine: Engine,
+    trial: Trial,
     *,
     repetitions: int,
-    seed: int,
-    num_envs: int,
-    device: str = "cpu",
+    only: np.ndarray | None = None,
     trace_interval: float = 0.05,
     metrics: MetricsConfig | None = None,
-    only: np.ndarray | None = None,
-    make: MakeBackend | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Rollouts:
     """Run demonstrations ``repetitions`` times each.
 
     Args:
         policy: what acts.
-        backend_name: engine.
-        robot: robot.
-        objects: objects of the demonstrations.
-        demos: starts and goals (its states are not used).
-        task: usually :func:`xreset.task.config.evaluation_task` of the policy's own.
+        engine: where.
+        trial: robot, objects, starts and goals, task.
         repetitions: episodes per demonstration, each with its own perturbation of robot and object.
-        seed: of the perturbations: the same in every engine and for every number of worlds.
-        num_envs: worlds at a time.
-        device: of GPU engines.
+        only: indices of the demonstrations to run; None: all.
         trace_interval: time between the states of a trace [s].
         metrics: thresholds.
-        only: indices of the demonstrations to run; None: all.
-        make: builds the worlds, of an engine that is not as it is registered; None: the registered engine, on the device.
         progress: called with (control steps done, control steps in all).
     """
-    names = tuple(o.name for o in objects)
+    demos, names = trial.bank, trial.names
     chosen = np.arange(len(demos.sequence_name)) if only is None else np.asarray(only)
     sequences = np.repeat(chosen, repetitions)
     repetition = np.tile(np.arange(repetitions), len(chosen))
-    object_of = np.array([names.index(name) for name in demos.sequence_object[sequences]])
-    plan = schedule(object_of, num_envs)
+    plan = schedule(np.array([names.index(name) for name in demos.sequence_object[sequences]]), trial.num_envs)
     recorded = np.flatnonzero(repetition == 0)
-    scene = make_scene(robot, objects, task)
     found: dict[int, Episode] = {}
     traces: list[Trace] = []
-    steps, spent = 0, 0.0
-    worlds = torch.as_tensor(plan.object_index)
-    if make is None:
-        backend = make_backend(backend_name, scene, len(worlds), object_index=worlds, device=device)
-    else:
-        backend = make(scene, len(worlds), worlds)
-    with backend:
-        on_cpu = ResetDistribution(demos, robot, names, task.reset)
-        resets = on_cpu if backend.device.type == "cpu" else ResetDistribution(demos, robot, names, task.reset, backend.device)
-        env = ManipulationEnv(backend, task, resets, seed=seed)
-        points = world_keypoints(objects, backend)
-        every = max(1, round(trace_interval / scene.control_dt))
+    steps, spent, starts = 0, 0.0, trial.starts()
+    with trial.worlds(engine, torch.as_tensor(plan.object_index)) as (env, points):
+        dt = env.backend.scene.control_dt
+        every = max(1, round(trace_interval / dt))
         for number, (items, fresh) in enumerate(plan):
-            env.reset(start=episode_starts(on_cpu, sequences[items], repetition[items], seed).to(backend.device))
+            env.reset(start=episode_starts(starts, sequences[items], repetition[items], trial.seed).to(env.device))
             recorder = _Recorder([int(w) for w in np.flatnonzero(fresh & np.isin(items, recorded))])
 
             def look(step: int, reading: Reading, number: int = number, recorder: _Recorder = recorder) -> None:
                 if step % every == 0:
-                    recorder.add(step * scene.control_dt, reading)
+                    recorder.add(step * dt, reading)
                 if step:
                     recorder.add_targets(env.joint_target)
                     progress(number * env.max_episode_length + step, len(plan.rounds) * env.max_episode_length)
 
             result, seconds = play(policy, env, points, metrics or MetricsConfig(), look)
             spent += seconds
-            steps += env.max_episode_length * backend.num_worlds
+            steps += env.max_episode_length * env.backend.num_worlds
             traces += recorder.traces(env, names)
             for world in np.flatnonzero(fresh):
                 found[int(items[world])] = _episode(result, int(world), int(sequences[items[world]]), int(repetition[items[world]]), demos)
     episodes = tuple(found[i] for i in sorted(found))
     return Rollouts(episodes=episodes, traces=tuple(sorted(traces, key=lambda t: t.sequence)), control_steps_per_second=steps / spent)
-
-
-def world_keypoints(objects: tuple[ObjectSpec, ...], backend: Backend) -> torch.Tensor:
-    """[N, 4, 3] keypoints of each world's object, in its frame."""
-    points = torch.stack([torch.as_tensor(keypoints(o), dtype=torch.float32) for o in objects])
-    return points.to(backend.device)[backend.object_index]
 
 
 def play(
@@ -172,7 +135,7 @@ def play(
     Args:
         policy: what acts; it begins anew.
         env: the worlds, just reset.
-        points: [N, 4, 3] (:func:`world_keypoints`).
+        points: [N, 4, 3] of the objects, in their frames.
         metrics: thresholds.
         look: called with (steps done, reading), first at the start and then after every control step.
 
@@ -192,12 +155,12 @@ def play(
     return result, spent
 
 
-def episode_starts(on_cpu: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int) -> Reset:
+def episode_starts(distribution: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int) -> Reset:
     """One start per world. Each has random numbers of its own, drawn on the CPU, so engine and number of worlds change nothing."""
     parts = []
     for s, r in zip(sequence.tolist(), repetition.tolist(), strict=True):
         generator = torch.Generator().manual_seed(int(np.random.SeedSequence([seed, s, r]).generate_state(1)[0]))
-        parts.append(on_cpu.home(torch.tensor([s]), generator))
+        parts.append(distribution.home(torch.tensor([s]), generator))
     return Reset.cat(parts)
 
 

@@ -20,8 +20,8 @@ from xreset.eval.engines.measure import Measured, measure
 from xreset.eval.engines.perturb import Alteration, altered_engine
 from xreset.eval.engines.properties import PROPERTIES
 from xreset.eval.engines.tables import amount, label, not_tried, rich_table, verdict
-from xreset.eval.engines.trials import Engine, engine
 from xreset.eval.rollout import Episode
+from xreset.eval.trial import Engine, engine
 from xreset.physics import State
 from xreset.spec import SceneSpec
 from xreset.task.config import RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
@@ -183,10 +183,7 @@ class AttributeTest(unittest.TestCase):
     """A grasp that just holds, and engines with one deliberate mistake each."""
 
     def attribute(self, b: Engine, **options) -> Attribution:
-        return attribute(
-            toy_grasp.OpenLoop, mujoco(), b, toy_grasp.robot(), [toy_grasp.brick()], toy_grasp.bank(), TASK, episodes=1, seed=0, num_envs=3,
-            **options,
-        )  # fmt: skip
+        return attribute(toy_grasp.OpenLoop, mujoco(), b, toy_grasp.trial(TASK, num_envs=3), episodes=1, **options)
 
     def test_half_the_friction_is_what_costs_the_grasp(self):
         b = toy_grasp.with_scene(mujoco(), "slippery", lambda scene: scene)
@@ -317,7 +314,7 @@ class OutcomeTest(unittest.TestCase):
 class CommandTest(unittest.TestCase):
     def refuse(self, *arguments: str) -> str:
         with contextlib.redirect_stderr(io.StringIO()) as text, self.assertRaises(SystemExit) as stopped:
-            main(["attribute", *arguments])
+            main(["engines", "attribute", *arguments])
         self.assertEqual(stopped.exception.code, 1)
         return text.getvalue()
 
@@ -326,7 +323,7 @@ class CommandTest(unittest.TestCase):
         self.assertIn("does not differ from itself", self.refuse("zero", *rest, "--backend", "mujoco", "--towards", "mujoco"))
         self.assertIn("expected a whole number from 1", self.refuse("zero", *rest, "--towards", "sapien", "--episodes", "0"))
         self.assertIn("there is no backend 'havok'", self.refuse("zero", *rest, "--towards", "havok"))
-        self.assertIn("there is no file none.npz", self.refuse("zero", *rest, "--towards", "sapien"))
+        self.assertIn("there is no none.npz", self.refuse("zero", *rest, "--towards", "sapien"))
         self.assertIn("there is no policy", self.refuse("none", *rest, "--towards", "sapien"))
 
 

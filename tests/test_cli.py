@@ -9,7 +9,7 @@ import sys
 import unittest
 from unittest import mock
 
-from xreset.cli import COMMANDS, main
+from xreset.cli import COMMANDS, MOVED, main
 
 HEAVY = ("torch", "warp", "mujoco", "mujoco_warp", "pybullet", "sapien", "matplotlib", "trimesh", "scipy", "rsl_rl", "tyro", "numpy")
 
@@ -65,6 +65,11 @@ class UsageTest(unittest.TestCase):
         self.assertIn("no command 'trian'", err)
         self.assertIn("train", err)
 
+    def test_an_earlier_name_answers_with_the_new_one(self):
+        for old, new in MOVED.items():
+            code, _, err = run(old, "--anything")
+            self.assertEqual((code, new in err), (2, True))
+
     def test_an_error_that_the_user_can_mend_is_one_message(self):
         code, _, err = run("resets", "/nowhere/retargeted.npz", "--out", "/nowhere/bank.npz")
         self.assertEqual(code, 1)
@@ -80,7 +85,7 @@ class UsageTest(unittest.TestCase):
             (r"--num-envs is 0, expected a whole number from 1", ("train", "--out", "x", "--num-envs", "0")),
             (r"--num-envs is -3, expected", ("resets", "none.npz", "--out", "x.npz", "--num-envs", "-3")),
             (r"--iterations is 0, expected", ("train", "--out", "x", "--iterations", "0")),
-            (r"--joint-threshold is not a number", ("trace", "none.npz", "--joint-threshold", "nan")),
+            (r"--joint-threshold is not a number", ("engines", "trace", "none.npz", "--joint-threshold", "nan")),
             (r"no device 'quantum'; expected cpu, cuda or", ("train", "--out", "x", "--device", "quantum")),
             (
                 r"no device 'quantum'; expected cpu, cuda or",
@@ -112,12 +117,12 @@ class UsageTest(unittest.TestCase):
         self.assertNotIn("\x1b", err)
 
     def test_an_engine_that_does_not_exist(self):
-        code, _, err = run("conformance", "--backend", "bulet")
+        code, _, err = run("engines", "check", "--backend", "bulet")
         self.assertEqual(code, 1)
         self.assertRegex(err, "no backend 'bulet'; there are .*pybullet")
 
     def test_a_missing_engine_is_named_with_the_command_that_mends_it(self):
-        code = "import sys; sys.modules['pybullet'] = None; from xreset.cli import main; main(['backends'])"
+        code = "import sys; sys.modules['pybullet'] = None; from xreset.cli import main; main(['engines', 'list'])"
         wide = os.environ | {"COLUMNS": "300"}
         out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, env=wide).stdout
         self.assertRegex(out, r"pybullet .* no: .*pip install 'xreset\[pybullet\]'")
@@ -127,7 +132,7 @@ class UsageTest(unittest.TestCase):
             argv = ["eval", "zero", "--robot", "openarm", "--demos", "x.npz", *(w for name in given for w in ("--backend", name))]
             with mock.patch("xreset.eval.evaluate.evaluate", side_effect=KeyboardInterrupt) as evaluate:
                 self.assertEqual(run(*argv)[0], 130)
-            self.assertEqual(evaluate.call_args.args[1], expected)
+            self.assertEqual([engine.name for engine in evaluate.call_args.args[1]], expected)
 
     def test_a_policy_that_does_not_exist(self):
         code, _, err = run("eval", "nonsense", "--demos", "x.npz")

@@ -580,11 +580,11 @@ class Harness(unittest.TestCase):
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "c.json"
             with contextlib.redirect_stdout(io.StringIO()) as out:
-                main(["conformance", "--backend", "mujoco", "--check", "free_fall", "--json", str(file)])
+                main(["engines", "check", "--backend", "mujoco", "--check", "free_fall", "--json", str(file)])
             self.assertIn("no check failed", out.getvalue())
             data = json.loads(file.read_text())
             self.assertEqual(data["schema"], "xreset-conformance/2")
-            self.assertEqual(data["command"], "xreset conformance --backend mujoco --check free_fall")
+            self.assertEqual(data["command"], "xreset engines check --backend mujoco --check free_fall")
             self.assertEqual([c["verdict"] for c in data["runs"][0]["checks"]], ["passed"])
             broken = Measure(what="x", measured=float("nan"), tolerance=1.0)
             check = next(check for check in CHECKS if check.name == "free_fall")
@@ -594,7 +594,7 @@ class Harness(unittest.TestCase):
                 contextlib.redirect_stdout(io.StringIO()),
                 self.assertRaises(SystemExit) as raised,
             ):
-                main(["conformance", "--backend", "mujoco", "--check", "free_fall", "--json", str(file)])
+                main(["engines", "check", "--backend", "mujoco", "--check", "free_fall", "--json", str(file)])
             self.assertEqual(raised.exception.code, 1)
             self.assertEqual(json.loads(file.read_text())["runs"][0]["checks"][0]["measures"][0]["measured"], "nan")
 

@@ -102,7 +102,7 @@ class AnyProcessor(unittest.TestCase):
             self.skipTest("numpy does not use OpenBLAS here, whose kernels this test chooses")
         if (reason := backend_status("pybullet").reason) is not None:
             self.skipTest(f"pybullet: {reason}")
-        command = [sys.executable, "-m", "xreset", "conformance", "--backend", "pybullet", "--check", "set_as_built"]
+        command = [sys.executable, "-m", "xreset", "engines", "check", "--backend", "pybullet", "--check", "set_as_built"]
         for kernel in ("Haswell", *["SkylakeX"] * ("avx512f" in Path("/proc/cpuinfo").read_text())):
             with self.subTest(kernel=kernel):
                 done = subprocess.run(command, env=os.environ | {"OPENBLAS_CORETYPE": kernel}, capture_output=True, text=True, timeout=300)

@@ -24,7 +24,7 @@ CONFORMANCE: dict[str, Any] = json.loads((STORED / "conformance.json").read_text
 GRASPS: dict[str, Any] = {
     "schema": PARITY,
     "xreset_version": "0.1.0",
-    "command": "xreset parity retargeted.npz --backend sapien",
+    "command": "xreset engines compare retargeted.npz --backend sapien",
     "robot": "ur7e-sharpa",
     "objects": [{"name": "005_tomato_soup_can", "source": "stand-in"}],
     "reference": {"backend": "mujoco", "version": "4.0.0", "device": "cpu", "metrics": []},
@@ -70,7 +70,7 @@ class PageTest(unittest.TestCase):
     def test_the_command_makes_the_stored_page(self):
         out = self.folder / "engines.md"
         with contextlib.redirect_stdout(io.StringIO()):
-            main(["engines", "--from", str(STORED / "conformance.json"), "--out", str(out)])
+            main(["engines", "page", "--from", str(STORED / "conformance.json"), "--out", str(out)])
         self.assertEqual(out.read_text(), (STORED / "page.md").read_text())
 
     def test_every_number_is_on_the_page(self):
@@ -162,7 +162,7 @@ class DocsTest(unittest.TestCase):
         text = (DOCS / "engines.md").read_text()
         for engine in ("mujoco", "mujoco-warp", "pybullet", "sapien", "drake"):
             self.assertRegex(text, rf"[|;] {engine} \d+\.\d+[\d.]* with [\w-]+ on \w+", engine)
-            self.assertRegex(text, rf"`xreset conformance [^`]*--backend {engine}\b", engine)
+            self.assertRegex(text, rf"`xreset engines check [^`]*--backend {engine}\b", engine)
         for robot in ("conformance-gripper", "ur7e-sharpa", "openarm"):
             for device in ("cpu", "cuda"):
                 self.assertRegex(text, rf"\bmujoco-warp [\d.]+ with {robot} on {device}\b")

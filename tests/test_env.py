@@ -14,6 +14,8 @@ import torch
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.env import ManipulationEnv, make_scene
+from xreset.eval.rollout import roll_out
+from xreset.eval.trial import Engine, Trial
 from xreset.geometry.rotations import quat_rotate
 from xreset.objects import keypoints, load_objects
 from xreset.physics import State
@@ -397,14 +399,11 @@ class RolloutTest(WithEnv):
     TASK = evaluation_task(TASK)
 
     def roll_out(self, policy, num_envs: int, backend: type[MujocoBackend] = MujocoBackend, **options):
-        from xreset.eval import rollout
+        def make(scene, num_worlds, object_index):
+            return backend(scene, num_worlds, workers=0, object_index=object_index)
 
-        def make(name, scene, num_worlds, **kwargs):
-            return backend(scene, num_worlds, workers=0, **kwargs)
-
-        arguments = {"repetitions": 2, "seed": 0} | options
-        with mock.patch.object(rollout, "make_backend", make):
-            return rollout.roll_out(policy, "mujoco", self.robot, self.objects, self.bank, self.TASK, num_envs=num_envs, **arguments)
+        trial = Trial(robot=self.robot, objects=tuple(self.objects), bank=self.bank, task=self.TASK, num_envs=num_envs, **options)
+        return roll_out(policy, Engine(name="mujoco", make=make, version=""), trial, repetitions=2)
 
     def test_every_demonstration_is_played_as_often_as_asked(self):
         found = self.roll_out(ZeroPolicy(7), 4)

@@ -56,7 +56,7 @@ class PluginTest(unittest.TestCase):
         with make_backend("someones", scene(), 1) as backend:
             self.assertEqual(backend.name, "someones")
         with contextlib.redirect_stdout(io.StringIO()) as out:
-            main(["conformance", "--backend", "someones", "--check", "state_round_trip"])
+            main(["engines", "check", "--backend", "someones", "--check", "state_round_trip"])
         self.assertIn("someones 7.1", out.getvalue())
         self.assertIn("no check failed", out.getvalue())
 
@@ -90,7 +90,7 @@ class PluginTest(unittest.TestCase):
         )
         self.assertIn("engine_version() fails: KeyError", backend_status("someones").reason or "")
         with contextlib.redirect_stdout(io.StringIO()) as out:
-            main(["backends"])
+            main(["engines", "list"])
         self.assertIn("someones", out.getvalue())
 
 
@@ -120,7 +120,7 @@ class ExampleTest(unittest.TestCase):
 
 
 class DrakeTest(unittest.TestCase):
-    """What the suite takes minutes for is left to `xreset conformance --backend drake`."""
+    """What the suite takes minutes for is left to `xreset engines check --backend drake`."""
 
     def setUp(self):
         try:

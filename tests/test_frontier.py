@@ -16,6 +16,8 @@ from xreset.cli import main
 from xreset.errors import DemoError
 from xreset.eval.evaluate import Subject
 from xreset.eval.frontier import STAGES, Tried, by_stage, frontier, stage_of
+from xreset.eval.setting import Setting
+from xreset.eval.trial import engine
 from xreset.objects import load_objects
 from xreset.objects.rest import rest_height
 from xreset.policy import ZeroPolicy
@@ -86,10 +88,7 @@ class FrontierTest(unittest.TestCase):
         )  # fmt: skip
 
     def run_frontier(self, resets: Path, states: int = 100, num_envs: int = 4) -> list[dict]:
-        return frontier(
-            self.subject(), ["mujoco"], resets, states=states, seed=0, num_envs=num_envs, device="cpu", objects_folder=None,
-            out=self.folder / "out",
-        )  # fmt: skip
+        return frontier(self.subject(), [engine("mujoco")], resets, Setting(num_envs=num_envs), self.folder / "out", states=states)
 
     def test_every_state_is_tried_once_and_what_became_of_it_is_written(self):
         (result,) = self.run_frontier(self.resets)
@@ -121,7 +120,7 @@ class FrontierTest(unittest.TestCase):
     def test_the_command_refuses_what_cannot_go_on_from_a_state(self):
         for arguments, words in (
             (("ik", "--robot", "ur7e-sharpa"), "cannot go on from a state"),
-            (("zero", "--states", "0"), "at least 1"),
+            (("zero", "--states", "0"), "expected a whole number from 1"),
         ):
             err = io.StringIO()
             with self.subTest(words), contextlib.redirect_stderr(err), self.assertRaises(SystemExit):

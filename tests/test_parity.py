@@ -31,7 +31,8 @@ from xreset.eval.engines.grasps import NEAR, Frames, find_grasps
 from xreset.eval.engines.load import load_frames
 from xreset.eval.engines.metrics import Metric, carried, outcome_metric, palm_distance, path_difference, path_metrics, press_metrics
 from xreset.eval.engines.recording import Recording
-from xreset.eval.engines.trials import Engine, ParityConfig, engine
+from xreset.eval.engines.trials import ParityConfig
+from xreset.eval.trial import Engine, engine
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.objects import load_object, rest_height
@@ -440,7 +441,7 @@ class Command(unittest.TestCase):
         out = io.StringIO()
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
             try:
-                cli.main(["parity", *map(str, words)])
+                cli.main(["engines", "compare", *map(str, words)])
             except SystemExit as end:
                 return out.getvalue(), end.code
         return out.getvalue(), None
@@ -509,7 +510,7 @@ class Command(unittest.TestCase):
             with self.subTest(said):
                 text, code = self.run_command(*words, "--backend", "mujoco")
                 self.assertEqual(code, 1)
-                self.assertIn("xreset parity:", text)
+                self.assertIn("xreset engines compare:", text)
                 self.assertIn(said, text)
 
     def test_files_that_show_grasps(self):

@@ -22,6 +22,7 @@ from xreset.demos import synthesize, write_demos
 from xreset.errors import PolicyError
 from xreset.eval.engines.sources import from_policy
 from xreset.eval.evaluate import resolve
+from xreset.eval.setting import Place, Sequence
 from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel
 from xreset.learning.shrink import shrink
@@ -240,8 +241,8 @@ class ShippedTest(WithPolicy):
 
     def test_an_unknown_name_lists_those_that_ship(self):
         expected = "no policy 'skiled': expected a run folder, a .onnx file, or one of zero, random, ik"
-        for command in (("eval",), ("attribute", "--towards", "pybullet")):
-            code, _, err = run(command[0], "skiled", "--demos", "x.npz", *command[1:])
+        for command, options in ((("eval",), ()), (("engines", "attribute"), ("--towards", "pybullet"))):
+            code, _, err = run(*command, "skiled", "--demos", "x.npz", *options)
             self.assertEqual(code, 1)
             self.assertIn(f"{expected}, or a policy that ships with xreset: skilled. Check the name or path.", err)
         next(policies.FOLDER.iterdir()).unlink()
@@ -257,10 +258,7 @@ class ShippedTest(WithPolicy):
         self.assertEqual((code, err), (0, ""))
         self.assertTrue(Path("runs/skilled/report/index.html").is_file(), out)
         with mock.patch("xreset.eval.engines.sources.play_policy") as play:
-            from_policy(
-                "skilled", Path("demos.npz"), mock.Mock(), object_name=None, episode=0, repetition=0, robot=None, objects=None, seed=0,
-                progress=lambda done, total: None,
-            )  # fmt: skip
+            from_policy(Path("demos.npz"), mock.Mock(), Sequence(policy="skilled"), Place())
         self.assertEqual(play.call_args.args[0].name, "skilled")
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 from xreset import robots
 from xreset.demos import synthesize, write_demos
 from xreset.eval.evaluate import BASELINES, evaluate, resolve
+from xreset.eval.setting import Setting
+from xreset.eval.trial import engine
 from xreset.objects import object_names
 from xreset.policies import shipped
 from xreset.policy import OnnxPolicy, check_contract
@@ -74,10 +76,7 @@ class ShippedPolicyTest(unittest.TestCase):
                 with tempfile.TemporaryDirectory() as folder:
                     demos = Path(folder) / "demos.npz"
                     write_demos(demos, synthesize(OnnxPolicy(file).contract["objects"][:1], 2))
-                    (result,) = evaluate(
-                        resolve(name, None, 0), ["mujoco"], demos, episodes=1, seed=0, num_envs=2, device="cpu", objects_folder=None,
-                        out=Path(folder),
-                    )  # fmt: skip
+                    (result,) = evaluate(resolve(name, None, 0), [engine("mujoco")], demos, Setting(num_envs=2), Path(folder), episodes=1)
                 self.assertEqual(result["episodes"], 2)
                 self.assertGreaterEqual(result["task_progress"]["mean"], FLOOR)
 

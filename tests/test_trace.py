@@ -24,9 +24,10 @@ from xreset.eval.engines.replay import TraceResult, trace, write_trace
 from xreset.eval.engines.sources import from_file
 from xreset.eval.engines.trace_figure import write_plot
 from xreset.eval.engines.trace_table import rich_table, sentences
-from xreset.eval.engines.trials import engine
 from xreset.eval.results import write_results
 from xreset.eval.rollout import roll_out
+from xreset.eval.setting import Place, Sequence
+from xreset.eval.trial import engine
 from xreset.files import npz_schema, read_json
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import State
@@ -287,9 +288,9 @@ class EvaluationTest(unittest.TestCase):
             randomization=RandomizationConfig(enabled=False),
             termination=TerminationConfig(episode_seconds=0.7),
         )
-        arguments = (toy_grasp.robot(), (toy_grasp.brick(),), toy_grasp.bank(), task)
-        cls.rollouts = roll_out(toy_grasp.OpenLoop(), "mujoco", *arguments, repetitions=1, seed=0, num_envs=1, only=np.array([1]))
-        cls.played = play_policy(toy_grasp.OpenLoop(), engine("mujoco"), *arguments[:1], arguments[1][0], *arguments[2:], sequence=1)
+        trial = toy_grasp.trial(task, num_envs=1)
+        cls.rollouts = roll_out(toy_grasp.OpenLoop(), engine("mujoco"), trial, repetitions=1, only=np.array([1]))
+        cls.played = play_policy(toy_grasp.OpenLoop(), engine("mujoco"), trial, sequence=1)
 
     def test_a_replay_in_the_same_engine_is_the_episode(self):
         (episode,) = self.rollouts.traces
@@ -320,23 +321,23 @@ class EvaluationTest(unittest.TestCase):
             summary = toy_summary("sapien", rollouts, robot="openarm")
             write_results(Path(folder), summary, rollouts, robot.joint_names)
             path = Path(folder) / "sapien.trace.npz"
-            actions = from_file(path, object_name="010_potted_meat_can", episode=0, robot=None, objects=None)
+            actions = from_file(path, Sequence(object="010_potted_meat_can", episode=0), Place())
             self.assertEqual((actions.object.name, actions.label), ("010_potted_meat_can", "zero in sapien, demonstration 1"))
             np.testing.assert_allclose(actions.joint_target.numpy(), rollouts.traces[1].joint_target, atol=1e-6)
             with self.assertRaisesRegex(DemoError, "records 1 episodes of 010_potted_meat_can, so --episode is at most 0"):
-                from_file(path, object_name="010_potted_meat_can", episode=1, robot=None, objects=None)
+                from_file(path, Sequence(object="010_potted_meat_can", episode=1), Place())
             soup = replace(rollouts, traces=tuple(replace(t, object="005_tomato_soup_can") for t in rollouts.traces))
             write_results(Path(folder), summary, soup, robot.joint_names)
             for episode in (0, 1):
-                label = from_file(path, object_name=None, episode=episode, robot=None, objects=None).label
+                label = from_file(path, Sequence(object=None, episode=episode), Place()).label
                 self.assertEqual(label, f"zero in sapien, demonstration {episode}")
             write_results(Path(folder), summary, rollouts, robot.joint_names)
             with self.assertRaisesRegex(DemoError, "has no mug; it has 005_tomato_soup_can, 010_potted_meat_can"):
-                from_file(path, object_name="mug", episode=0, robot=None, objects=None)
+                from_file(path, Sequence(object="mug", episode=0), Place())
             old = replace(rollouts, traces=tuple(replace(t, joint_target=None) for t in rollouts.traces))
             write_results(Path(folder), summary, old, robot.joint_names)
             with self.assertRaisesRegex(FileFormatError, "states without the actions"):
-                from_file(path, object_name=None, episode=0, robot=None, objects=None)
+                from_file(path, Sequence(object=None, episode=0), Place())
 
 
 class CommandTest(unittest.TestCase):
@@ -347,7 +348,7 @@ class CommandTest(unittest.TestCase):
 
     def refuse(self, *arguments: str) -> str:
         with contextlib.redirect_stderr(io.StringIO()) as text, self.assertRaises(SystemExit) as stopped:
-            main(["trace", *arguments])
+            main(["engines", "trace", *arguments])
         self.assertEqual(stopped.exception.code, 1)
         return text.getvalue()
 

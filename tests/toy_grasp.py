@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from tests.toy_bank import toy_bank
 from xreset.backends.conformance.scene import gripper, objects
-from xreset.eval.engines.trials import Engine
+from xreset.eval.trial import Engine, Trial
 from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
 from xreset.resets.bank import ResetBank
 from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
+from xreset.task.config import TaskConfig
 
 FRICTION = PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002)
 OPEN, CLOSED = 0.0201, 0.0141
@@ -74,6 +75,10 @@ def bank() -> ResetBank:
         goal_pos=(start_pos + np.array([0, 0, RAISED])).astype(np.float32),
         goal_quat_wxyz=np.tile(quat, (3, 1)).astype(np.float32),
     )
+
+
+def trial(task: TaskConfig, **setting) -> Trial:
+    return Trial(robot=robot(), objects=(brick(),), bank=bank(), task=task, **setting)
 
 
 class OpenLoop:

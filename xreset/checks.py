@@ -53,3 +53,7 @@ def is_rigid(T: np.ndarray) -> bool:
     R = T[:3, :3]
     straight = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=2e-3) and np.array_equal(T[3], (0, 0, 0, 1))
     return bool(straight and np.linalg.det(R) > 0)
+
+
+class Options:
+    """Base of dataclasses whose fields are options of a command, shown and checked as if they were its own."""

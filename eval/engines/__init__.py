@@ -4,7 +4,7 @@
 
     from xreset.eval.engines.agreement import compare
     from xreset.eval.engines.load import load_frames
-    from xreset.eval.engines.trials import engine
+    from xreset.eval.trial import engine
     robot, objects, frames = load_frames(Path("retargeted.npz"))
     result = compare(robot, objects, frames, [engine("pybullet"), engine("sapien")], grasps=48)
 """

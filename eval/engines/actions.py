@@ -7,26 +7,25 @@ Actions are kept as joint targets, not as a policy's outputs: what a policy's ou
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from xreset.env import Reading
 from xreset.errors import FileFormatError
+from xreset.eval.engines.episodes import Episode, Motion, closing_episode
+from xreset.eval.engines.grasps import Grasps
+from xreset.eval.metrics import MetricsConfig
+from xreset.eval.rollout import Trace, episode_starts, play
+from xreset.eval.trial import Engine, Trial, nominal_scene
 from xreset.files import JOINT, POSITION, Field, Schema, read_npz, write_npz
 from xreset.physics import State
+from xreset.policy import Policy
+from xreset.resets.bank import check_robot
 from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
-
-if TYPE_CHECKING:
-    from xreset.eval.engines.episodes import Episode, Motion
-    from xreset.eval.engines.grasps import Grasps
-    from xreset.eval.engines.trials import Engine
-    from xreset.eval.rollout import Trace
-    from xreset.policy import Policy
-    from xreset.resets.bank import ResetBank
-    from xreset.task.config import TaskConfig
+from xreset.task.config import TaskConfig
 
 SCHEMA = "xreset-actions/1"
 
@@ -99,8 +98,6 @@ def grasp_and_lift(
         scene: timestep, substeps and friction; default: those of :class:`SceneSpec`.
         motion: distances and durations.
     """
-    from xreset.eval.engines.episodes import Motion, closing_episode
-
     motion, scene = motion or Motion(), scene or SceneSpec(robot=robot, objects=(thing,))
     chosen = slice(number, number + 1)
     dt = scene.control_dt
@@ -120,14 +117,10 @@ def grasp_and_lift(
 def play_policy(
     policy: Policy,
     engine: Engine,
-    robot: RobotSpec,
-    thing: ObjectSpec,
-    demos: ResetBank,
-    task: TaskConfig,
+    trial: Trial,
     *,
     sequence: int,
     repetition: int = 0,
-    seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Actions:
     """Let a policy act through one episode in one engine, and record what the drives were told.
@@ -135,36 +128,28 @@ def play_policy(
     Args:
         policy: what acts.
         engine: where.
-        robot: the robot.
-        thing: the object of the demonstration.
-        demos: starts and goals.
-        task: usually :func:`xreset.task.config.evaluation_task` of the policy's own.
+        trial: robot, objects, starts and goals, task.
         sequence: index of the demonstration.
         repetition: which perturbation of its start, as ``xreset eval`` counts them.
-        seed: of the perturbations.
         progress: called with (control steps done, control steps in all).
     """
-    from xreset.env import ManipulationEnv
-    from xreset.eval.rollout import episode_starts
-    from xreset.resets.distribution import ResetDistribution
+    thing = trial.names.index(str(trial.bank.sequence_object[sequence]))
+    start = episode_starts(trial.starts(), np.array([sequence]), np.array([repetition]), trial.seed)
+    targets: list[torch.Tensor] = []
+    with trial.worlds(engine, torch.tensor([thing])) as (env, points):
+        env.reset(start=start.to(env.device))
 
-    scene = evaluation_scene(robot, (thing,), task)
-    on_cpu = ResetDistribution(demos, robot, (thing.name,), task.reset)
-    start = episode_starts(on_cpu, np.array([sequence]), np.array([repetition]), seed)
-    with engine.make(scene, 1, torch.zeros(1, dtype=torch.long)) as backend:
-        resets = on_cpu if backend.device.type == "cpu" else ResetDistribution(demos, robot, (thing.name,), task.reset, backend.device)
-        env = ManipulationEnv(backend, task, resets, seed=seed)
-        env.reset(start=start.to(backend.device))
-        policy.begin(env)
-        targets = []
-        for step in range(env.max_episode_length):
-            env.advance(policy.act(env.get_observations()))
-            targets.append(env.joint_target[0].cpu().clone())
-            progress(step + 1, env.max_episode_length)
+        def look(step: int, _: Reading) -> None:
+            if step:
+                targets.append(env.joint_target[0].cpu().clone())
+                progress(step, env.max_episode_length)
+
+        play(policy, env, points, MetricsConfig(), look)
+    scene = trial.nominal_scene
     return Actions(
-        robot=robot,
-        object=thing,
-        label=f"{policy.name} in {engine.name}, {demos.sequence_name[sequence]} (perturbation {repetition}, seed {seed})",
+        robot=trial.robot,
+        object=trial.objects[thing],
+        label=f"{policy.name} in {engine.name}, {trial.bank.sequence_name[sequence]} (perturbation {repetition}, seed {trial.seed})",
         timestep=scene.timestep,
         substeps=scene.substeps,
         friction=scene.friction,
@@ -185,11 +170,9 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
     Raises:
         FileFormatError: the episode was not played at the control rate of the default task.
     """
-    from xreset.task.config import TaskConfig
-
     assert trace.joint_target is not None, "the trace holds no actions"
     first = (torch.as_tensor(x[:1], dtype=torch.float32) for x in (trace.joint_pos, trace.object_pos, trace.object_quat))
-    scene = evaluation_scene(robot, (thing,), TaskConfig())
+    scene = nominal_scene(robot, (thing,), TaskConfig())
     interval, length = float(trace.time[1] - trace.time[0]), len(trace.joint_target) * scene.control_dt
     if not trace.time[-1] <= length + 1e-6 < trace.time[-1] + interval + 1e-6:
         raise FileFormatError(
@@ -206,17 +189,6 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
         start=State.at_rest(*first),
         joint_target=torch.as_tensor(trace.joint_target, dtype=torch.float32),
     )
-
-
-def evaluation_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
-    """The scene of a task with the pair friction of an evaluation, which draws none at random."""
-    from xreset.env import make_scene
-    from xreset.task.randomization import sample_friction
-
-    scene = make_scene(robot, objects, task)
-    nominal = replace(task.randomization, enabled=False)
-    tip, link, table = sample_friction(1, nominal, torch.Generator())[0].tolist()
-    return replace(scene, friction=replace(scene.friction, tip=tip, link=link, table=table))
 
 
 def write_actions(path: str | Path, actions: Actions) -> None:
@@ -254,8 +226,6 @@ def read_actions(path: str | Path, robot: RobotSpec, objects: Callable[[str], Ob
     Raises:
         FileFormatError: the file is damaged, or for another robot or object geometry.
     """
-    from xreset.resets.bank import check_robot
-
     a = read_npz(path, SCHEMA, _FIELDS, what="an action sequence", check=_check)
     names = tuple(a["joint_names"].tolist())
     check_robot(path, "action sequence", robot, name=str(a["robot"]), joint_names=names, fingerprint=str(a["robot_fingerprint"]))

@@ -24,15 +24,13 @@ from xreset.eval.engines.recording import Recording
 from xreset.eval.engines.trials import (
     Closings,
     CommonStates,
-    Engine,
-    MakeBackend,
     ParityConfig,
     common_states,
-    engine,
     try_closings,
     try_holds,
     try_paths,
 )
+from xreset.eval.trial import Engine, MakeBackend, engine
 from xreset.objects import surface_points
 from xreset.physics import Backend
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec

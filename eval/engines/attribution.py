@@ -8,23 +8,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
 from xreset.errors import XResetError
-from xreset.eval.engines.actions import evaluation_scene
 from xreset.eval.engines.dials import NO_CONTACT_DIAL, contact_dial
 from xreset.eval.engines.measure import Measured, measure
 from xreset.eval.engines.perturb import Alteration, altered_engine
 from xreset.eval.engines.properties import PROPERTIES
-from xreset.eval.engines.trials import Engine
 from xreset.eval.rollout import Episode, roll_out
 from xreset.eval.stats import bootstrap_ci95
+from xreset.eval.trial import Engine, Trial
 from xreset.policy import Policy
-from xreset.resets.bank import ResetBank
-from xreset.spec import ObjectSpec, RobotSpec
-from xreset.task.config import TaskConfig
 
 SCHEMA = "xreset-attribution/1"
 
@@ -144,14 +141,9 @@ def attribute(
     policy: Callable[[], Policy],
     a: Engine,
     b: Engine,
-    robot: RobotSpec,
-    objects: Sequence[ObjectSpec],
-    demos: ResetBank,
-    task: TaskConfig,
+    trial: Trial,
     *,
     episodes: int,
-    seed: int,
-    num_envs: int,
     sequences: np.ndarray | None = None,
     only: Sequence[str] = (),
     what_if: bool = False,
@@ -163,13 +155,8 @@ def attribute(
         policy: makes the policy, a fresh one for each run.
         a: engine that is changed.
         b: engine towards which it is.
-        robot: the robot.
-        objects: objects of the demonstrations; the first one's mass and inertia are measured.
-        demos: starts and goals.
-        task: usually :func:`xreset.task.config.evaluation_task` of the policy's own.
+        trial: what is played; the first object's mass and inertia are measured.
         episodes: per demonstration.
-        seed: of the perturbations of the starts.
-        num_envs: worlds at a time.
         sequences: indices of the demonstrations to play; None: all.
         only: names of the properties to try; empty: all.
         what_if: also try the properties in which A and B do not differ, with changes of a usual size.
@@ -181,8 +168,7 @@ def attribute(
     known = [p.name for p in PROPERTIES]
     if unknown := sorted(set(only) - set(known)):
         raise XResetError(f"there is no property {', '.join(unknown)}; there are {', '.join(known)}.")
-    objects = tuple(objects)
-    scene = evaluation_scene(robot, objects, task)
+    scene = trial.nominal_scene
     progress(f"measuring {a.name}", 0, 0)
     measured_a = measure(a, scene)
     progress(f"measuring {b.name}", 0, 0)
@@ -190,10 +176,8 @@ def attribute(
 
     def run(kind: Kind, name: str, engine: Engine, alteration: Alteration) -> Row:
         label = name if kind in ("as it is", "other") else f"{a.name}, {kind} {name}"
-        rollouts = roll_out(
-            policy(), engine.name, robot, objects, demos, task, repetitions=episodes, seed=seed, num_envs=num_envs, only=sequences,
-            make=altered_engine(engine, alteration).make, progress=lambda done, total: progress(label, done, total),
-        )  # fmt: skip
+        altered = altered_engine(engine, alteration)
+        rollouts = roll_out(policy(), altered, trial, repetitions=episodes, only=sequences, progress=partial(progress, label))
         return Row(kind=kind, name=name, alteration=alteration, episodes=rollouts.episodes)
 
     rows, skipped, everything = [run("as it is", a.name, a, Alteration())], [], Alteration()

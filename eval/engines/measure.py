@@ -14,7 +14,7 @@ from torch import Tensor
 
 from xreset.backends.pool import initial_state
 from xreset.errors import XResetError
-from xreset.eval.engines.trials import Engine
+from xreset.eval.trial import Engine
 from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate_inverse

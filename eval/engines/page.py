@@ -1,4 +1,4 @@
-"""The support matrix: a page of what was measured of the engines, made from the files of ``xreset conformance`` and ``xreset parity``.
+"""The support matrix: a page of what was measured of the engines, made from files of ``xreset engines check`` and ``... compare``.
 
 Nothing on the page is written by hand: every number is read from a file, and every file names the command that made it.
 """
@@ -110,7 +110,9 @@ def read(paths: Iterable[Path]) -> Results:
             raise FileFormatError(f"{path} is no complete {schema}: {what}. Make it again.") from error
         add(results, path.name, data)
     if not results.sources:
-        raise XResetError("there is nothing to make a page of. Give files that `xreset conformance` or `xreset parity` wrote with --json.")
+        raise XResetError(
+            "there is nothing to make a page of. Give files that `xreset engines check` or `xreset engines compare` wrote with --json."
+        )
     checks = {robot: Checks(robot, _side_by_side(found.results)) for robot, found in results.checks.items()}
     return replace(results, checks=checks, capabilities=_side_by_side(results.capabilities))
 

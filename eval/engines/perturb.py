@@ -10,7 +10,7 @@ from torch import Tensor
 
 from xreset.errors import CapabilityError
 from xreset.eval.engines.dials import contact_dial
-from xreset.eval.engines.trials import Engine, engine
+from xreset.eval.trial import Engine, engine
 from xreset.physics import Backend, Contacts, Health, Links, MassProperties, State
 from xreset.spec import JointSpec, SceneSpec
 

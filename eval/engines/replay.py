@@ -16,7 +16,7 @@ from xreset.eval.engines.actions import Actions
 from xreset.eval.engines.divergence import Differences, Parting, Thresholds, differences, first_of, lifted, partings, worst
 from xreset.eval.engines.episodes import Episode
 from xreset.eval.engines.recording import Recording, play
-from xreset.eval.engines.trials import Engine
+from xreset.eval.trial import Engine
 from xreset.files import write_json, write_npz
 from xreset.physics import State
 

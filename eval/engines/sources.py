@@ -1,10 +1,9 @@
-"""Action sequences from files: what the arguments of ``xreset trace`` mean."""
+"""Action sequences from files: what the arguments of ``xreset engines trace`` mean."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,36 +12,32 @@ from xreset.description import load_robot
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.eval.engines.actions import SCHEMA as ACTIONS
 from xreset.eval.engines.actions import Actions, grasp_and_lift, play_policy, read_actions, recorded_actions, robot_of
+from xreset.eval.engines.grasps import Frames, find_grasps
 from xreset.eval.evaluate import load_motion, resolve
 from xreset.eval.results import TRACE_SCHEMA, mesh_folder, read_result, read_traces
+from xreset.eval.setting import Place, Sequence, Setting
+from xreset.eval.trial import Engine
 from xreset.files import npz_schema
-from xreset.objects import load_object, load_objects
+from xreset.objects import load_object
 from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import read_bank
 from xreset.retarget.file import read_retargeted
 from xreset.retarget.pipeline import SCHEMA as RETARGETED
-from xreset.task.config import evaluation_task
-
-if TYPE_CHECKING:
-    from xreset.eval.engines.trials import Engine
 
 
-def from_file(source: Path, *, object_name: str | None, episode: int, robot: str | None, objects: Path | None) -> Actions:
+def from_file(source: Path, sequence: Sequence, place: Place) -> Actions:
     """An open-loop grasp and lift of demonstrations, retargeted trajectories or a reset bank; or recorded actions, also of an evaluation.
 
     Args:
         source: the file.
-        object_name: object, if the file has several; None: its first.
-        episode: which of the object's grasps.
-        robot: name or folder of the robot; None: the file's.
-        objects: folder of meshes; None: stand-ins.
+        sequence: object and grasp.
+        place: robot and meshes.
 
     Raises:
         FileFormatError: the file is of another kind, or for another robot.
         DemoError: there is no such grasp.
     """
-    from xreset.eval.engines.grasps import Frames, find_grasps
-
+    robot, objects = place.robot, place.objects
     schema = npz_schema(source)
     if schema == ACTIONS:
         return read_actions(source, load_robot(robot or robot_of(source)), lambda name: load_object(name, objects))
@@ -56,83 +51,57 @@ def from_file(source: Path, *, object_name: str | None, episode: int, robot: str
         assert trajectories is not None
         frames = Frames.of_retargeted(trajectories)
     elif schema == TRACE_SCHEMA:
-        return _from_evaluation(source, object_name, episode, robot, objects)
+        return _from_evaluation(source, sequence, place)
     else:
         raise FileFormatError(
             f"{source} states schema {schema!r}, expected {DEMOS!r} (xreset demos), {RETARGETED!r} (xreset retarget), {BANK!r} "
-            f"(xreset resets), {TRACE_SCHEMA!r} (xreset eval) or {ACTIONS!r} (xreset trace)."
+            f"(xreset resets), {TRACE_SCHEMA!r} (xreset eval) or {ACTIONS!r} (xreset engines trace)."
         )
-    name = _object(source, object_name, dict.fromkeys(frames.object_name.tolist()))
+    name = _object(source, sequence.object, frames.object_name.tolist())
     thing = load_object(name, objects)
     grasps = find_grasps(frames, spec, (thing,), len(frames.frame), where="table")
-    if episode >= len(grasps):
+    if sequence.episode >= len(grasps):
         raise DemoError(f"{source} shows {len(grasps)} grasps of {name} on the table, so --episode is at most {len(grasps) - 1}.")
-    return grasp_and_lift(spec, thing, grasps, episode)
+    return grasp_and_lift(spec, thing, grasps, sequence.episode)
 
 
 def from_policy(
-    policy: str,
-    demos: Path,
-    engine: Engine,
-    *,
-    object_name: str | None,
-    episode: int,
-    repetition: int,
-    robot: str | None,
-    objects: Path | None,
-    seed: int,
-    progress: Callable[[int, int], None],
+    source: Path, engine: Engine, sequence: Sequence, place: Place, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Actions:
     """The actions of a policy in one engine.
 
     Args:
-        policy: run folder, .onnx file or baseline, as for ``xreset eval``.
-        demos: demonstrations or retargeted trajectories.
+        source: demonstrations or retargeted trajectories.
         engine: where it plays.
-        object_name: object, if there are several; None: the first.
-        episode: which of the object's demonstrations.
-        repetition: which perturbation of its start.
-        robot: name or folder of the robot; None: the policy's.
-        objects: folder of meshes; None: the policy's own, or the stand-ins.
-        seed: of the perturbations and of the random policy.
+        sequence: policy, object, demonstration, and perturbation of its start.
+        place: robot, meshes and seed.
         progress: called with (control steps done, control steps in all).
     """
-    subject = resolve(policy, robot, seed)
-    folder = subject.meshes(objects)
-    bank, trajectories = load_motion(demos, subject.robot, folder, trajectories=subject.label == "ik")
-    name = _object(demos, object_name, dict.fromkeys(bank.sequence_object.tolist()))
-    mine = np.flatnonzero(bank.sequence_object == name)
-    if episode >= len(mine):
-        raise DemoError(f"{demos} has {len(mine)} demonstrations of {name}, so --episode is at most {len(mine) - 1}.")
-    (thing,) = load_objects([name], folder)
-    return play_policy(
-        subject.policy(subject.robot, trajectories),
-        engine,
-        subject.robot,
-        thing,
-        bank,
-        evaluation_task(subject.task),
-        sequence=int(mine[episode]),
-        repetition=repetition,
-        seed=seed,
-        progress=progress,
-    )
+    assert sequence.policy is not None, "no policy"
+    subject = resolve(sequence.policy, place.robot, place.seed)
+    trial, trajectories = subject.episodes(source, Setting(**vars(place)))
+    name = _object(source, sequence.object, trial.bank.sequence_object.tolist())
+    mine = np.flatnonzero(trial.bank.sequence_object == name)
+    if sequence.episode >= len(mine):
+        raise DemoError(f"{source} has {len(mine)} demonstrations of {name}, so --episode is at most {len(mine) - 1}.")
+    policy, chosen = subject.policy(subject.robot, trajectories), int(mine[sequence.episode])
+    return play_policy(policy, engine, trial, sequence=chosen, repetition=sequence.repetition, progress=progress)
 
 
-def _from_evaluation(source: Path, object_name: str | None, episode: int, robot: str | None, objects: Path | None) -> Actions:
+def _from_evaluation(source: Path, sequence: Sequence, place: Place) -> Actions:
     """The actions of a recorded episode: an evaluation records the first of each demonstration."""
     name = source.name.removesuffix(".trace.npz")
     summary = read_result(source.with_name(f"{name}.json"))
-    spec = load_robot(robot or summary.robot)
+    spec = load_robot(place.robot or summary.robot)
     traces = read_traces(source.parent, name, spec.joint_names)
-    chosen = _object(source, object_name, dict.fromkeys(t.object for t in traces))
+    chosen = _object(source, sequence.object, [t.object for t in traces])
     mine = [t for t in traces if t.object == chosen]
-    if episode >= len(mine):
+    if sequence.episode >= len(mine):
         raise DemoError(f"{source} records {len(mine)} episodes of {chosen}, so --episode is at most {len(mine) - 1}.")
-    found = mine[episode]
+    found = mine[sequence.episode]
     if found.joint_target is None:
         raise FileFormatError(f"{source} holds states without the actions that led to them. Evaluate again.")
-    folder = mesh_folder(objects, summary.objects_folder)
+    folder = mesh_folder(place.objects, summary.objects_folder)
     thing = load_object(found.object, folder)
     return recorded_actions(spec, thing, found, label=f"{summary.policy} in {name}, demonstration {found.sequence}")
 
@@ -143,8 +112,8 @@ def _robot_of_retargeted(source: Path, schema: str) -> str:
     return read_retargeted(source).robot
 
 
-def _object(source: Path, wanted: str | None, there: Sequence[str] | dict[str, None]) -> str:
-    names = list(there)
+def _object(source: Path, wanted: str | None, there: list[str]) -> str:
+    names = list(dict.fromkeys(there))
     if not names:
         raise DemoError(f"{source} shows no frame after first contact, so there is no grasp in it. Retarget more demonstrations.")
     if wanted is None:

@@ -5,10 +5,8 @@ Shape letters: G grasps (one per world), M moved or chosen ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,15 +14,9 @@ from torch import Tensor
 from xreset.eval.engines.episodes import Motion, closing_episode, holding_episode, lifting_episode, squeezing_state
 from xreset.eval.engines.grasps import Grasps
 from xreset.eval.engines.recording import Recording, play
-from xreset.physics import Backend, State
-from xreset.plugins import backend_class, device_for, make_backend
+from xreset.eval.trial import Engine
+from xreset.physics import State
 from xreset.spec import RobotSpec, SceneSpec
-
-MakeBackend = Callable[[SceneSpec, int, Tensor], Backend]
-"""Builds worlds of a scene: how many, and which object each holds [G]."""
-
-SAME_EQUATIONS = frozenset({"mujoco-warp"})
-"""Backends that solve the equations of ``mujoco``, in other arithmetic."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,43 +36,6 @@ class ParityConfig:
     """[s]"""
     path_grasps: int = 16
     """Grasps whose paths are compared, at most."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Engine:
-    """An engine to put through it."""
-
-    name: str
-    make: MakeBackend
-    version: str
-    device: str = "cpu"
-    grasps: bool = True
-    """Whether press, closing and hold are measured."""
-    path: bool = False
-    """Whether paths are compared."""
-
-
-def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
-    """An installed backend.
-
-    If it solves the reference's equations, its paths are compared; and on the CPU nothing else is, for a GPU engine is slow there.
-
-    Args:
-        name: of the backend.
-        device: where it runs if it can run there; else the CPU.
-        options: further keywords of the backend.
-
-    Raises:
-        BackendUnavailableError: it cannot be used here.
-    """
-    version = backend_class(name).engine_version()
-    used = device_for(name, device)
-
-    def make(scene: SceneSpec, num_worlds: int, object_index: Tensor) -> Backend:
-        return make_backend(name, scene, num_worlds, object_index=object_index, device=used, **options)
-
-    same = name in SAME_EQUATIONS
-    return Engine(name=name, make=make, version=version, device=used, grasps=not same or used != "cpu", path=same)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +69,7 @@ def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps, config: Parit
     """Close each hand, at the scene's frictions: around an object too heavy to be moved, and for good."""
     dt, motion = scene.control_dt, config.motion
     episode = closing_episode(scene.robot, grasps.joint_pos, grasps.object_pos, grasps.object_quat, dt, motion)
-    with _worlds(tested, scene, grasps.object_index) as backend:
+    with tested.make(scene, len(grasps), grasps.object_index) as backend:
         whole = play(backend, episode)
         n, device = backend.num_worlds, backend.device
         mass = torch.tensor([scene.objects[i].mass for i in grasps.object_index.tolist()], device=device)
@@ -128,7 +83,7 @@ def try_holds(tested: Engine, scene: SceneSpec, common: CommonStates, config: Pa
     """Lift and shake, once with each of the frictions."""
     episode = lifting_episode(scene.robot, common.start, scene.control_dt, config.motion)
     recordings = []
-    with _worlds(tested, scene, common.object_index) as backend:
+    with tested.make(scene, len(common.object_index), common.object_index) as backend:
         for mu in config.frictions:
             friction = torch.tensor([mu, mu, scene.friction.table], device=backend.device)
             backend.set_friction(friction.repeat(backend.num_worlds, 1))
@@ -138,7 +93,7 @@ def try_holds(tested: Engine, scene: SceneSpec, common: CommonStates, config: Pa
 
 def try_paths(tested: Engine, scene: SceneSpec, common: CommonStates, config: ParityConfig) -> Recording:
     """Hold still for a while."""
-    with _worlds(tested, scene, common.object_index) as backend:
+    with tested.make(scene, len(common.object_index), common.object_index) as backend:
         return play(backend, holding_episode(common.start, config.path_time, scene.control_dt))
 
 
@@ -172,9 +127,3 @@ def common_states(
                 index.append(table.object_index[[g]])
                 break
     return CommonStates(label=tuple(labels), object_index=torch.cat(index), start=State.cat(states))
-
-
-@contextmanager
-def _worlds(tested: Engine, scene: SceneSpec, object_index: Tensor) -> Iterator[Backend]:
-    with tested.make(scene, len(object_index), object_index) as backend:
-        yield backend

@@ -15,10 +15,7 @@ COMMANDS: dict[str, str] = {
     "demos": "Import, make and describe human demonstrations.",
     "objects": "List objects and import meshes.",
     "robots": "List robots, and check one.",
-    "backends": "List physics engines and whether they can be used here.",
-    "conformance": "Test that a physics engine keeps the interface's contracts.",
-    "engines": "Make the support matrix: what every engine can do and how far they agree, from measured results.",
-    "parity": "Measure how far physics engines agree on grasps.",
+    "engines": "List physics engines, check them, compare them and trace where they diverge.",
     "retarget": "Turn human demonstrations into robot trajectories.",
     "resets": "Try retargeted states in physics and keep the stable ones.",
     "view": "Look at demonstrations, robot trajectories or a reset bank in a browser, or as pictures.",
@@ -26,13 +23,23 @@ COMMANDS: dict[str, str] = {
     "policies": "List the policies that ship with xreset, and make exported ones smaller.",
     "eval": "Evaluate a policy, or a baseline, in one or several engines.",
     "frontier": "Tell from which demonstrated states a policy reaches the goal, and where its training is stuck.",
-    "trace": "Replay one action sequence in several engines, and see when, where and by how much they part.",
-    "attribute": "Tell which physical difference between two engines costs a policy its skill.",
     "compare": "Put several trainings side by side: curves, results in every engine, and what differs between them.",
     "report": "Make a self-contained HTML page of a run's evaluations.",
 }
-"""Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``: a function, or a dictionary of sub-commands, each of one or
-two words. One whose defaults depend on an argument has ``command_for`` instead: arguments -> such a function."""
+"""Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``, a function or a dictionary of sub-commands; or ``command_for``,
+arguments -> such a function, where defaults depend on an argument; or ``COMMANDS`` of its own, in modules below it."""
+
+MOVED = {
+    "backends": "engines list",
+    "conformance": "engines check",
+    "parity": "engines compare",
+    "trace": "engines trace",
+    "attribute": "engines attribute",
+}
+"""Earlier names of commands."""
+
+INVOCATION: list[str] = []
+"""The arguments of the command that is running."""
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -43,21 +50,19 @@ def main(argv: list[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # what the terminal has no character for is written as an escape
             stream.reconfigure(errors="backslashreplace")
-    if not argv or argv[0] in ("-h", "--help"):
-        print(_usage())
-        return
-    if argv[0] == "--version":
+    if argv[:1] == ["--version"]:
         from xreset import __version__
 
         print(f"xreset {__version__}")
         return
-    if argv[0] not in COMMANDS:
-        print(f"xreset: there is no command {argv[0]!r}.\n\n{_usage()}", file=sys.stderr)
+    if argv and argv[0] in MOVED:
+        print(f"xreset: {argv[0]} is now called {MOVED[argv[0]]!r}: xreset {MOVED[argv[0]]} --help", file=sys.stderr)
         raise SystemExit(2)
+    INVOCATION[:] = argv
     try:
-        _run(argv[0], argv[1:])
+        _run("", COMMANDS, argv)
     except XResetError as error:
-        _fail(argv[0], str(error))
+        _fail(argv, str(error))
     except KeyboardInterrupt:
         print("\nstopped.", file=sys.stderr)
         raise SystemExit(130) from None
@@ -67,36 +72,48 @@ def main(argv: list[str] | None = None) -> None:
     except OSError as error:  # a name too long, a folder that may not be read, a port that is taken
         if error.strerror is None:
             raise
-        _fail(argv[0], f"{error.strerror}: {error.filename}" if error.filename else error.strerror)
+        _fail(argv, f"{error.strerror}: {error.filename}" if error.filename else error.strerror)
     except MemoryError:
-        _fail(argv[0], "there is too little memory for this. Use fewer worlds (--num-envs) or a smaller file.")
+        _fail(argv, "there is too little memory for this. Use fewer worlds (--num-envs) or a smaller file.")
 
 
-def _fail(command: str, message: str) -> NoReturn:
+def _fail(argv: list[str], message: str) -> NoReturn:
     from xreset.text import plain
 
-    print(f"xreset {command}: {plain(message)}", file=sys.stderr)
+    words = argv[:2] if argv[0] == "engines" else argv[:1]
+    print(f"xreset {' '.join(words)}: {plain(message)}", file=sys.stderr)
     raise SystemExit(1) from None
 
 
-def _run(name: str, arguments: list[str]) -> None:
+def _run(group: str, commands: dict[str, str], argv: list[str]) -> None:
+    """Run the command that the first of the arguments names, of a group of commands."""
+    if not argv or argv[0] in ("-h", "--help"):
+        print(_usage(group, commands))
+        return
+    name, arguments = argv[0], argv[1:]
+    if name not in commands:
+        print(f"xreset{group}: there is no command {name!r}.\n\n{_usage(group, commands)}", file=sys.stderr)
+        raise SystemExit(2)
+    module = import_module(f"xreset.cli{group.replace(' ', '.')}.{name}")
+    if hasattr(module, "COMMANDS"):
+        _run(f"{group} {name}", module.COMMANDS, arguments)
+        return
     import tyro
 
     from xreset.cli._options import checked
 
-    module = import_module(f"xreset.cli.{name}")
     command = module.command_for(arguments) if hasattr(module, "command_for") else module.COMMAND
-    program = f"xreset {name}"
+    program, description = f"xreset{group} {name}", commands[name]
     if isinstance(command, dict):
         verbs = {verb: checked(function) for verb, function in command.items()}
-        two = " ".join(arguments[:2])
-        arguments = [two, *arguments[2:]] if two in verbs else arguments
-        tyro.extras.subcommand_cli_from_dict(verbs, prog=program, description=COMMANDS[name], args=arguments)
+        tyro.extras.subcommand_cli_from_dict(verbs, prog=program, description=description, args=arguments)
     else:
-        tyro.cli(checked(command), prog=program, description=COMMANDS[name], args=arguments)
+        tyro.cli(checked(command), prog=program, description=description, args=arguments)
 
 
-def _usage() -> str:
-    width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
-    return "\n".join(["usage: xreset COMMAND ...", "", *lines, "", "xreset COMMAND --help shows the options of one command."])
+def _usage(group: str, commands: dict[str, str]) -> str:
+    width = max(map(len, commands))
+    lines = [f"  {name:<{width}}  {text}" for name, text in commands.items()]
+    return "\n".join(
+        [f"usage: xreset{group} COMMAND ...", "", *lines, "", f"xreset{group} COMMAND --help shows the options of one command."]
+    )

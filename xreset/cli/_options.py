@@ -10,6 +10,7 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
+from xreset.checks import Options
 from xreset.errors import XResetError
 
 _COUNTS = {
@@ -33,12 +34,18 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def run(*positional: Any, **named: Any) -> None:
-        options = signature(command).bind(*positional, **named).arguments
+        options = _flat(signature(command).bind(*positional, **named).arguments)
         _check(options)
         with _claimed(options):
             command(*positional, **named)
 
     return run
+
+
+def _flat(options: dict[str, Any]) -> dict[str, Any]:
+    together = [name for name, value in options.items() if isinstance(value, Options)]
+    own = {name: value for name, value in options.items() if name not in together}
+    return own | {name: value for group in together for name, value in vars(options[group]).items()}
 
 
 def _check(options: dict[str, Any]) -> None:

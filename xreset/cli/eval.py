@@ -7,6 +7,8 @@ from typing import Annotated
 
 import tyro
 
+from xreset.eval.setting import Setting
+
 
 def evaluate(
     policy: Annotated[str, tyro.conf.Positional],
@@ -14,11 +16,7 @@ def evaluate(
     backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),  # a default would be appended to
     demos: Path,
     episodes: int = 5,
-    seed: int = 0,
-    robot: str | None = None,
-    objects: Path | None = None,
-    num_envs: int = 64,
-    device: str = "cpu",
+    setting: Annotated[Setting, tyro.conf.arg(name="")] = Setting(),  # noqa: B008
     out: Path | None = None,
 ) -> None:
     """Evaluate a policy, or a baseline, in one or several engines.
@@ -29,36 +27,22 @@ def evaluate(
         backend: Physics engine; give it again for more engines. Default: mujoco.
         demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the path of ik.
         episodes: Episodes per demonstration, each with another perturbation of robot and object.
-        seed: Seed of the perturbations; they are the same in every engine.
-        robot: Name or folder of the robot; default: the policy's.
-        objects: Folder of real meshes; default: what the policy was trained with, else the stand-ins.
-        num_envs: Worlds at a time.
-        device: Where GPU engines run: cpu or cuda.
+        setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: eval/ in the run folder or beside the policy; runs/NAME/eval for a policy that ships with
             xreset, runs/BASELINE-ROBOT/eval for a baseline.
     """
-    from xreset.cli._bars import engine_bars
+    from xreset.cli._common import engine_bars
     from xreset.cli._terminal import Console
     from xreset.eval.evaluate import evaluate, resolve
     from xreset.eval.table import rich_table
+    from xreset.eval.trial import engine
 
-    backends = list(dict.fromkeys(backend)) or ["mujoco"]
+    engines = [engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
     console = Console()
-    subject = resolve(policy, robot, seed)
+    subject = resolve(policy, setting.robot, setting.seed)
     folder = out or subject.folder
-    with engine_bars(console, backends) as progress:
-        summaries = evaluate(
-            subject,
-            backends,
-            demos,
-            episodes=episodes,
-            seed=seed,
-            num_envs=num_envs,
-            device=device,
-            objects_folder=objects,
-            out=folder,
-            progress=progress,
-        )
+    with engine_bars(console, [e.name for e in engines]) as progress:
+        summaries = evaluate(subject, engines, demos, setting, folder, episodes=episodes, progress=progress)
     console.print(rich_table(summaries))
     console.print(f"results in {folder}")
 

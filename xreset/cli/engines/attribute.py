@@ -1,29 +1,41 @@
-"""``xreset attribute``."""
+"""``xreset engines attribute``."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from xreset.checks import Options
+from xreset.errors import XResetError
+from xreset.eval.setting import Setting
+
+
+@dataclass(frozen=True, kw_only=True)
+class Played(Options):
+    """Which episodes."""
+
+    demos: Path
+    """Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the path of ik."""
+    object: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Object to play with; give it again for several. Default: all."""
+    max_demos: int | None = None
+    """Demonstrations to play at most, spread over all."""
+    episodes: int = 1
+    """Episodes per demonstration."""
+
 
 def attribute(
     policy: Annotated[str, tyro.conf.Positional],
     *,
-    demos: Path,
+    played: Annotated[Played, tyro.conf.arg(name="")],
     towards: str,
     backend: str = "mujoco",
     only: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     what_if: bool = False,
-    object: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    max_demos: int | None = None,
-    episodes: int = 1,
-    seed: int = 0,
-    robot: str | None = None,
-    objects: Path | None = None,
-    num_envs: int = 64,
-    device: str = "cpu",
+    setting: Annotated[Setting, tyro.conf.arg(name="")] = Setting(),  # noqa: B008
     out: Path | None = None,
 ) -> None:
     """Tell which physical difference between two engines costs a policy its skill.
@@ -35,64 +47,52 @@ def attribute(
     Args:
         policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or a baseline: zero,
             random, ik (open-loop kinematic retargeting).
-        demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the path of ik.
+        played: Demonstrations and episodes.
         towards: Engine towards which the properties are changed, usually the one in which the policy does worse.
         backend: Engine in which they are changed.
         only: Property to try; give it again for several. Default: all in which the engines differ.
         what_if: Also try the properties in which they do not differ, with changes of a usual size.
-        object: Object to play with; give it again for several. Default: all.
-        max_demos: Demonstrations to play at most, spread over all.
-        episodes: Episodes per demonstration.
-        seed: Seed of the perturbations of the starts.
-        robot: Name or folder of the robot; default: the policy's.
-        objects: Folder of real meshes; default: what the policy was trained with, else the stand-ins.
-        num_envs: Worlds at a time.
-        device: Where GPU engines run: cpu or cuda.
+        setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
         out: Folder for attribution.json and attribution.png; default: attribute/ beside the policy's results.
     """
     import numpy as np
 
     from xreset.cli._terminal import Console, Progress
-    from xreset.errors import DemoError, XResetError
+    from xreset.errors import DemoError
     from xreset.eval.engines.attribution import attribute as experiment
     from xreset.eval.engines.figures import write_plot
     from xreset.eval.engines.tables import not_tried, rich_table, verdict
-    from xreset.eval.engines.trials import engine
-    from xreset.eval.evaluate import load_motion, resolve
+    from xreset.eval.evaluate import resolve
+    from xreset.eval.trial import engine
     from xreset.files import file_hash, write_json
-    from xreset.objects import load_objects
-    from xreset.task.config import evaluation_task
 
-    if min(episodes, num_envs, 1 if max_demos is None else max_demos) < 1:
-        raise XResetError(f"--episodes, --num-envs and --max-demos must be at least 1, found {episodes}, {num_envs} and {max_demos}.")
     if backend == towards:
         raise XResetError(f"--backend and --towards are both {backend!r}; an engine does not differ from itself.")
-    console = Console()
-    subject = resolve(policy, robot, seed)
-    a, b = engine(backend, device=device), engine(towards, device=device)
-    folder = subject.meshes(objects)
-    bank, trajectories = load_motion(demos, subject.robot, folder, trajectories=subject.label == "ik")
-    there = sorted({*map(str, bank.sequence_object)})
-    if unknown := sorted(set(object) - set(there)):
-        raise DemoError(f"{demos} has no {', '.join(unknown)}; it has {', '.join(there)}.")
-    chosen = np.flatnonzero(np.isin(bank.sequence_object, object or there))
-    if max_demos is not None and max_demos < len(chosen):
-        chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, max_demos).round().astype(int))]
-    loaded = load_objects(sorted({*map(str, bank.sequence_object[chosen])}), folder)
-    out = out or subject.folder.parent / "attribute"
+    console, demos = Console(), played.demos
+    subject = resolve(policy, setting.robot, setting.seed)
+    a, b = engine(backend, device=setting.device), engine(towards, device=setting.device)
+    trial, trajectories = subject.episodes(demos, setting)
+    if unknown := sorted(set(played.object) - set(trial.names)):
+        raise DemoError(f"{demos} has no {', '.join(unknown)}; it has {', '.join(trial.names)}.")
+    objects = tuple(o for o in trial.objects if o.name in (played.object or trial.names))
+    chosen = np.flatnonzero(np.isin(trial.bank.sequence_object, [o.name for o in objects]))
+    if played.max_demos is not None and played.max_demos < len(chosen):
+        chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, played.max_demos).round().astype(int))]
+    objects = tuple(o for o in objects if o.name in trial.bank.sequence_object[chosen])
+    out, folder = out or subject.folder.parent / "attribute", subject.meshes(setting.objects)
     with Progress(console) as bar:
         task = bar.add_task("", total=None)
         found = experiment(
-            lambda: subject.policy(subject.robot, trajectories), a, b, subject.robot, loaded, bank, evaluation_task(subject.task),
-            episodes=episodes, seed=seed, num_envs=num_envs, sequences=chosen, only=only, what_if=what_if,
+            lambda: subject.policy(subject.robot, trajectories), a, b, replace(trial, objects=objects),
+            episodes=played.episodes, sequences=chosen, only=only, what_if=what_if,
             progress=lambda run, done, total: bar.update(task, description=run, completed=done, total=total or None),
         )  # fmt: skip
-    count = f"{len(found.rows[0].episodes)} episodes of {len(chosen)} demonstrations, seed {seed}"
+    count = f"{len(found.rows[0].episodes)} episodes of {len(chosen)} demonstrations, seed {setting.seed}"
     title = f"{subject.label} on {subject.robot.name}: what costs the skill between {backend} and {towards}\n{count}"
     content = found.as_dict() | {
         "policy": subject.label,
         "robot": subject.robot.name,
-        "seed": seed,
+        "seed": setting.seed,
         "demonstrations": len(chosen),
         "versions": {a.name: a.version, b.name: b.version},
         "objects_folder": str(folder) if folder else None,

@@ -1,4 +1,4 @@
-"""``xreset engines``."""
+"""``xreset engines page``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 
-def engines(
+def page(
     *,
     source: Annotated[tuple[Path, ...], tyro.conf.arg(name="from"), tyro.conf.UseAppendAction],
     out: Path | None = None,
@@ -16,14 +16,14 @@ def engines(
     """Make the support matrix: a Markdown page of what was measured of the engines.
 
     Args:
-        source: File that `xreset conformance --json` or `xreset parity --json` wrote; give it again for several. Where two have the same
-            check of the same engine, device and robot, the later one counts.
+        source: File that `xreset engines check --json` or `xreset engines compare --json` wrote; give it again for several. Where two have
+            the same check of the same engine, device and robot, the later one counts.
         out: File to write; default: print it.
     """
-    from xreset.eval.engines.page import page, read
+    from xreset.eval.engines import page as matrix
     from xreset.files import atomic_write
 
-    text = page(read(source))
+    text = matrix.page(matrix.read(source))
     if out is None:
         print(text, end="")
         return
@@ -32,4 +32,4 @@ def engines(
     print(f"wrote {out}")
 
 
-COMMAND = engines
+COMMAND = page

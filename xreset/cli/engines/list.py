@@ -1,9 +1,9 @@
-"""``xreset backends``: which engines can be used here."""
+"""``xreset engines list``: which engines can be used here."""
 
 from __future__ import annotations
 
 
-def backends() -> None:
+def engines() -> None:
     """List the physics engines: name, engine version, device, and why not where one cannot be used."""
     from rich.table import Table
 
@@ -17,4 +17,4 @@ def backends() -> None:
     Console().print(table)
 
 
-COMMAND = backends
+COMMAND = engines

@@ -1,28 +1,27 @@
-"""``xreset conformance``: whether physics engines keep the contracts of the interface."""
+"""``xreset engines check``: whether physics engines keep the contracts of the interface."""
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from torch import Tensor
 
     from xreset.backends.conformance import CheckResult, MakeBackend, Measure
-    from xreset.cli._terminal import Console
     from xreset.physics import Backend
     from xreset.spec import SceneSpec
 
 
-def conformance(
+def check(
     *,
     backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     robot: str | None = None,
     device: str = "cpu",
-    check: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    only: Annotated[tuple[str, ...], tyro.conf.arg(name="check"), tyro.conf.UseAppendAction] = (),
     json: Path | None = None,
     verbose: bool = False,
 ) -> None:
@@ -32,32 +31,34 @@ def conformance(
         backend: Engine to test, a plugin's too; give it again for several. Default: all that can be used here.
         robot: Robot to test with, a name or a folder. Default: a small one of the suite's own, with which every check can run.
         device: Where engines run that can run on GPUs: cpu or cuda.
-        check: Check to run; give it again for several. Default: all.
+        only: Check to run; give it again for several. Default: all.
         json: File to write the results to.
         verbose: Show every number that was measured, not only the one nearest to its tolerance.
     """
     from rich.text import Text
 
-    from xreset import __version__, robots
+    from xreset import __version__
     from xreset.backends.conformance import CHECKS, SCHEMA, run
     from xreset.backends.conformance.scene import gripper
+    from xreset.cli._common import this_command, usable_engines
     from xreset.cli._terminal import Console
+    from xreset.description import load_robot
     from xreset.errors import XResetError
     from xreset.files import write_json
     from xreset.plugins import backend_class, backend_status
 
     known = [c.name for c in CHECKS]
-    if unknown := sorted(set(check) - set(known)):
+    if unknown := sorted(set(only) - set(known)):
         raise XResetError(f"there is no check {', '.join(unknown)}; there are {', '.join(known)}.")
     console = Console(highlight=False, soft_wrap=True)
-    spec = gripper() if robot is None else robots.load(robot)
+    spec = gripper() if robot is None else load_robot(robot)
     runs = []
-    for name in dict.fromkeys(backend) or _usable(console):
+    for name in dict.fromkeys(backend) or usable_engines(console):
         status = backend_status(name)
         used = device if device.split(":")[0] in status.device else "cpu"
         what = f" {status.version}, {spec.name}, {used}: verdict, check, and what came nearest to its tolerance"
         console.print(Text.assemble((name, "bold"), what))
-        results = run(_maker(name, used), robot=spec, only=check or None, report=lambda r: _print(console, r, verbose))
+        results = run(_maker(name, used), robot=spec, only=only or None, report=lambda r: _print(console, r, verbose))
         runs.append(
             {
                 "engine": name,
@@ -70,35 +71,12 @@ def conformance(
             }
         )
     if json is not None:
-        command = _command(backend, robot, device, check)
-        write_json(json, {"schema": SCHEMA, "xreset_version": __version__, "command": command, "runs": runs})
+        write_json(json, {"schema": SCHEMA, "xreset_version": __version__, "command": this_command(), "runs": runs})
         console.print(f"wrote {json}")
     failed = sum(result["verdict"] == "failed" for record in runs for result in record["checks"])
     console.print(f"{failed} checks failed" if failed else "no check failed", style="bold red" if failed else "bold green")
     if failed:
         raise SystemExit(1)
-
-
-def _command(backends: tuple[str, ...], robot: str | None, device: str, checks: tuple[str, ...]) -> str:
-    """What to type to get the same numbers."""
-    words = ["xreset", "conformance", *(word for name in backends for word in ("--backend", name))]
-    words += [] if robot is None else ["--robot", robot]
-    words += [] if device == "cpu" else ["--device", device]
-    return shlex.join([*words, *(word for name in checks for word in ("--check", name))])
-
-
-def _usable(console: Console) -> list[str]:
-    """Names of the backends that can be used here; says why others cannot."""
-    from xreset.plugins import backend_names, backend_status
-
-    names = []
-    for name in backend_names():
-        status = backend_status(name)
-        if status.reason is None:
-            names.append(name)
-        else:
-            console.print(f"left out {name}: {status.reason}")
-    return names
 
 
 def _maker(name: str, device: str) -> MakeBackend:
@@ -144,4 +122,4 @@ def _text(measure: Measure | None) -> str:
     return f"{measure.what}: {measure.measured:.2g}, tolerance {measure.tolerance:.2g} {measure.unit}".rstrip()
 
 
-COMMAND = conformance
+COMMAND = check

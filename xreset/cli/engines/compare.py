@@ -1,8 +1,7 @@
-"""``xreset parity``: whether physics engines agree on grasps."""
+"""``xreset engines compare``: whether physics engines agree on grasps."""
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
     from xreset.eval.engines.metrics import Metric
 
 
-def parity(
+def compare(
     motion: Annotated[Path, tyro.conf.Positional],
     *,
     robot: str | None = None,
@@ -45,14 +44,16 @@ def parity(
         json: File to write the results to.
     """
     from xreset import __version__
+    from xreset.cli._common import this_command, usable_engines
     from xreset.cli._terminal import Console, Progress
-    from xreset.eval.engines.agreement import REFERENCE, compare
+    from xreset.eval.engines.agreement import REFERENCE
+    from xreset.eval.engines.agreement import compare as agreement
     from xreset.eval.engines.load import load_frames
-    from xreset.eval.engines.trials import engine
+    from xreset.eval.trial import engine
     from xreset.files import file_hash, write_json
 
     console = Console(highlight=False, soft_wrap=True)
-    names = [name for name in dict.fromkeys(backend) if name != REFERENCE] if backend else _usable(console, REFERENCE)
+    names = [name for name in dict.fromkeys(backend) or usable_engines(console) if name != REFERENCE]
     engines = [engine(name, device=device) for name in names]
     with Progress(console) as bar:
         task = bar.add_task("reading")
@@ -61,7 +62,7 @@ def parity(
             progress=lambda doing, done, total: bar.update(task, description=doing, completed=done, total=total),
         )  # fmt: skip
         inputs = {"motion": file_hash(motion)}  # now: after minutes of work the file may be another, or gone
-        result = compare(
+        result = agreement(
             spec, loaded, frames, engines, grasps=grasps,
             progress=lambda doing, done, total: bar.update(task, description=doing, completed=done, total=total),
         )  # fmt: skip
@@ -70,47 +71,12 @@ def parity(
         if tested.broken:
             console.print(f"{tested.engine.name}: {tested.broken} worlds were not finite or dropped contacts", style="bold red")
     if json is not None:
-        command = _command(motion, robot, objects, only, backend, grasps, device)
-        write_json(json, result.as_dict() | {"xreset_version": __version__, "command": command, "inputs": inputs})
+        write_json(json, result.as_dict() | {"xreset_version": __version__, "command": this_command(), "inputs": inputs})
         console.print(f"wrote {json}")
     missed = [f"{tested.engine.name}: {metric.name}" for tested in result.engines for metric in tested.metrics if not metric.ok]
     console.print(f"missed: {'; '.join(missed)}" if missed else "all targets met", style="bold red" if missed else "bold green")
     if missed:
         raise SystemExit(1)
-
-
-def _command(
-    motion: Path,
-    robot: str | None,
-    objects: Path | None,
-    only: tuple[str, ...],
-    backends: tuple[str, ...],
-    grasps: int,
-    device: str,
-) -> str:
-    """What to type to get the same numbers, with the names of files and folders but not where they lie."""
-    words = ["xreset", "parity", motion.name]
-    words += [] if robot is None else ["--robot", robot]
-    words += [] if objects is None else ["--objects", objects.name]
-    words += [word for name in only for word in ("--only", name)]
-    words += [word for name in backends for word in ("--backend", name)]
-    words += ["--grasps", str(grasps)]
-    words += [] if device == "cpu" else ["--device", device]
-    return shlex.join(words)
-
-
-def _usable(console, reference: str) -> list[str]:
-    """Names of the backends that can be used here, besides the reference; says why others cannot."""
-    from xreset.plugins import backend_names, backend_status
-
-    names = []
-    for name in backend_names():
-        status = backend_status(name)
-        if status.reason is not None:
-            console.print(f"left out {name}: {status.reason}")
-        elif name != reference:
-            names.append(name)
-    return names
 
 
 def _table(result: Parity) -> Table:
@@ -144,4 +110,4 @@ def _number(value: float, unit: str) -> str:
     return f"{value:.3g} {unit}" if unit else f"{100 * value:.1f} %"
 
 
-COMMAND = parity
+COMMAND = compare

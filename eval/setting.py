@@ -1,0 +1,45 @@
+"""How an evaluation is set up, as the commands' options say it. Imports no torch, so that the command line can show it at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from xreset.checks import Options
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place(Options):
+    """With which robot and meshes, and where."""
+
+    robot: str | None = None
+    """Name or folder of the robot; default: the policy's, or the file's."""
+    objects: Path | None = None
+    """Folder of real meshes; default: what the policy was trained with, else the stand-ins."""
+    seed: int = 0
+    """Seed of everything that is drawn; the same in every engine."""
+    device: str = "cpu"
+    """Where GPU engines run: cpu or cuda."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting(Place):
+    """The same, and with how many worlds."""
+
+    num_envs: int = 64
+    """Worlds at a time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sequence(Options):
+    """Which action sequence of a file."""
+
+    policy: str | None = None
+    """Run folder, exported policy (.onnx), name of a policy that ships with xreset, or a baseline (zero, random, ik) that plays in the
+    reference; its actions are replayed."""
+    object: str | None = None
+    """Object, if the source has several; default: the first."""
+    episode: int = 0
+    """Which of the object's grasps, demonstrations or recorded episodes."""
+    repetition: int = 0
+    """With --policy: which perturbation of the demonstration's start."""

@@ -126,6 +126,8 @@ def _load(path: Path) -> trimesh.Trimesh:
         raise ObjectError(f"{path} holds no triangles; it is empty or damaged.")
     if not np.isfinite(mesh.vertices).all():
         raise ObjectError(f"{path} has a vertex that is not finite; it is damaged.")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise ObjectError(f"{path} has a triangle of a vertex that is not there; it is damaged.")
     if mesh.extents is not None and mesh.extents.max() > _LARGEST:  # before merging, which rounds by the size
         raise ObjectError(f"{path} measures {_size(mesh)}; meshes must be in metres. Is it in millimetres?")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # texture seams are no holes

@@ -1,0 +1,87 @@
+"""Fuzzes every reader for some minutes; see tests/fuzzing.py for what is done to files and what must hold."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import resource
+import sys
+import time
+import warnings
+from collections import Counter
+from pathlib import Path
+
+sys.path.insert(0, os.getcwd())
+
+from hypothesis import HealthCheck, Phase, given, seed, settings
+
+from tests.fuzzing import Reader, damages, outcome, readers
+
+GIGABYTES = 6
+"""Of address space that the whole process may take beyond what it has at the start."""
+
+
+def _round(
+    name: str, reader: Reader, count: Counter, broken: dict[str, bytes], slowest: dict[str, float], number: int, seconds: float
+) -> None:
+    whole, end = reader.file.read_bytes(), time.monotonic() + seconds
+
+    @seed(number)
+    @settings(max_examples=400, deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+    @given(damages(reader.kind))
+    def run(damage):
+        if time.monotonic() > end:
+            return
+        damaged = damage(whole)
+        began = time.perf_counter()
+        try:
+            count[outcome(reader, damaged)] += 1
+        except (AssertionError, MemoryError) as error:
+            count["broken"] += 1
+            broken.setdefault(f"{type(error).__name__}: {str(error)[:160]}", damaged)
+        slowest[name] = max(slowest[name], time.perf_counter() - began)
+
+    run()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--reader", help="only this one")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    with readers() as found:
+        chosen = {name: reader for name, reader in found.items() if options.reader in (None, name)}
+        counts = {name: Counter() for name in chosen}
+        broken: dict[str, dict[str, bytes]] = {name: {} for name in chosen}
+        slowest = dict.fromkeys(chosen, 0.0)
+        virtual = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (virtual + (GIGABYTES << 30), resource.RLIM_INFINITY))
+        end, rounds = time.monotonic() + 60 * options.minutes, 0
+        while time.monotonic() < end:
+            rounds += 1
+            for name, reader in chosen.items():
+                _round(
+                    name, reader, counts[name], broken[name], slowest, options.seed * 1_000_003 + rounds, 15 * options.minutes / len(chosen)
+                )
+    print("| reader | files | refused | read, and sound | broken | slowest |\n|---|---|---|---|---|---|")
+    for name, count in counts.items():
+        print(f"| {name} | {count.total()} | {count['refused']} | {count['read']} | {count['broken']} | {slowest[name]:.1f} s |")
+    total = sum(counts.values(), Counter())
+    print(f"| all | {total.total()} | {total['refused']} | {total['read']} | {total['broken']} | |")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"\nseed {options.seed}, {options.minutes:g} minutes, at most {peak:.0f} MB of memory")
+    folder = Path("build/fuzz")
+    for name, problems in broken.items():
+        for problem, content in problems.items():
+            folder.mkdir(parents=True, exist_ok=True)
+            path = folder / f"{name.replace(' ', '-')}-{hashlib.sha256(content).hexdigest()[:12]}"
+            path.write_bytes(content)
+            print(f"{name}: {problem}\n  {path}")
+    return 1 if total["broken"] else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,343 @@
+"""Every reader with a valid file, ways to damage it, and what must hold then: an error that the user can mend, or sound content."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from hypothesis import strategies as st
+
+from tests.test_view import toy_demos, toy_retargeted
+from tests.toy_bank import toy_bank
+from tests.toy_results import toy_rollouts, toy_summary
+from tests.toy_robot import toy_hand_arm
+from xreset.demos import read_demos, write_demos
+from xreset.errors import XResetError
+from xreset.files import write_json
+from xreset.learning.config import TrainConfig
+from xreset.learning.run import RunInfo, read_run, write_run
+from xreset.physics import State
+from xreset.resets.bank import read_bank, write_bank
+from xreset.retarget.file import read_retargeted, write_retargeted
+from xreset.retarget.partial import Batch, Partial
+
+SECONDS = 20.0
+"""Longest time that a reader may take over a file of some kilobytes."""
+
+Damage = Callable[[bytes], bytes]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One kind of file."""
+
+    file: Path
+    """A valid one."""
+    read: Callable[[Path], Any]
+    """Reads a file of that name; the others beside it are valid."""
+    kind: str
+    """``npz``, ``json``, ``yaml``, ``text`` or ``bytes``: what damage understands of it."""
+    may_hold: tuple[str, ...] = ()
+    """Fields that may hold numbers that are not finite."""
+
+
+@contextmanager
+def readers() -> Iterator[dict[str, Reader]]:
+    """All of them, over files in a temporary folder."""
+    import torch
+
+    from xreset.backends.conformance import SCHEMA as CONFORMANCE
+    from xreset.demos.dexycb import _extrinsics, _meta, _npz
+    from xreset.description import load_robot, read_description
+    from xreset.eval.engines.actions import Actions, read_actions, write_actions
+    from xreset.eval.engines.page import page
+    from xreset.eval.engines.page import read as read_page
+    from xreset.eval.results import read_episodes, read_result, read_traces, write_results
+    from xreset.geometry.urdf import load_urdf
+    from xreset.learning.runner import read_checkpoint
+    from xreset.objects import load_object
+    from xreset.objects.meshes import _load
+    from xreset.policies import shipped
+    from xreset.policy import OnnxPolicy
+    from xreset.spec import PairFriction
+
+    logging.disable(logging.WARNING)  # what is left aside of a file is said; here it would be said ten thousand times
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        robot, openarm = toy_hand_arm(folder), load_robot("openarm")
+        found: dict[str, Reader] = {}
+
+        def add(what: str, file: str, read: Callable[[Path], Any], kind: str, may_hold: tuple[str, ...] = ()) -> Path:
+            found[what] = Reader(folder / file, read, kind, may_hold)
+            return folder / file
+
+        path = add("demonstrations", "demos.npz", read_demos, "npz", ("hand_keypoints", "wrist_quat_wxyz"))
+        write_demos(path, toy_demos())
+        path = add("retargeted", "retargeted.npz", read_retargeted, "npz", ("hand_error", "wrist_error"))
+        write_retargeted(path, toy_retargeted(openarm), config={}, inputs={})
+        path = add("reset bank", "bank.npz", lambda p: read_bank(p, robot=robot), "npz")
+        write_bank(path, toy_bank(robot), config={"steps": 8}, inputs={"retargeted": "ab"})
+
+        partial = Partial(folder, "key")
+        add("finished batch", "batch_0000.npz", lambda p: partial.read(0), "npz", ("hand_error", "wrist_error"))
+        partial.write(0, Batch(joint_pos=np.zeros((5, 4)), reason=np.zeros(5, int), hand_error=np.full(5, np.inf), wrist_error=np.ones(5)))
+
+        soup = load_object("soup")
+        home = torch.as_tensor(openarm.home, dtype=torch.float32)[None]
+        start = State.at_rest(home, torch.tensor([[0.5, 0.3, 0.1]]), torch.tensor([[1.0, 0, 0, 0]]))
+        path = add("actions", "actions.npz", lambda p: read_actions(p, openarm, lambda _: soup), "npz")
+        write_actions(
+            path,
+            Actions(
+                robot=openarm, object=soup, label="x", timestep=1 / 240, substeps=4, friction=PairFriction(), start=start,
+                joint_target=home.repeat(3, 1), phases=(("a", 0.0),),
+            ),
+        )  # fmt: skip
+
+        rollouts = toy_rollouts()
+        write_results(folder, toy_summary(rollouts=rollouts), rollouts, ("a", "b", "c"))
+        add("result", "mujoco.json", read_result, "json")
+        add("episodes", "mujoco.episodes.json", lambda p: read_episodes(p.parent, "mujoco"), "json")
+        may = ("joint_pos", "object_pos", "object_quat", "joint_target")
+        add("trace", "mujoco.trace.npz", lambda p: read_traces(p.parent, "mujoco", ("a", "b", "c")), "npz", may)
+
+        contract = {
+            "schema": "xreset-policy/1", "robot": "toy", "robot_fingerprint": "aa", "joint_names": ["a"], "fingertip_names": ["thumb"],
+            "objects": ["soup"], "observation_layout": {"policy": {"x": 1}, "proprio": {"y": 1}}, "control_dt": 1 / 60, "task": {},
+        }  # fmt: skip
+        info = RunInfo(
+            robot="toy", resets="b.npz", resets_hash="ab", objects=None, backend="mujoco", backend_version="4", device="cpu", num_envs=4,
+            seed=3, config=TrainConfig(), contract=contract,
+        )  # fmt: skip
+        write_run(folder, info)
+        add("run.json", "run.json", lambda p: read_run(p.parent), "json")
+
+        stored = json.loads((Path(__file__).with_name("engines") / "conformance.json").read_text())
+        stored["runs"] = [run | {"checks": run["checks"][:4]} for run in stored["runs"][:2]]
+        assert stored["schema"] == CONFORMANCE
+        write_json(add("conformance", "conformance.json", lambda p: page(read_page([p])), "json"), stored)
+
+        (folder / "policy.onnx").write_bytes(next(iter(shipped().values())).read_bytes())
+        add("policy", "policy.onnx", OnnxPolicy, "bytes")
+        path = add("checkpoint", "000001.pt", read_checkpoint, "bytes")
+        keys = ("actor_state_dict", "critic_state_dict", "optimizer_state_dict", "random")
+        torch.save({**{k: {} for k in keys}, "iteration": 1, "env_steps": 1, "elapsed": 0.1, "learning_rate": 1e-3}, path)
+
+        described = openarm.urdf.with_name("robot.toml")
+        (folder / "robot.toml").write_bytes(described.read_bytes())
+        add("robot.toml", "robot.toml", read_description, "text")
+        add("URDF", robot.urdf.name, load_urdf, "text")
+
+        calibration = folder / "calibration" / "extrinsics_1" / "extrinsics.yml"
+        calibration.parent.mkdir(parents=True)
+        poses = {"apriltag": np.eye(4)[:3].ravel().tolist(), "837": np.eye(4)[:3].ravel().tolist()}
+        calibration.write_text(yaml.safe_dump({"extrinsics": poses, "master": "837"}))
+        found["DexYCB calibration"] = Reader(calibration, lambda p: _extrinsics(folder, "1"), "yaml")
+        meta = {"extrinsics": "1", "mano_sides": ["right"], "num_frames": 4, "serials": ["837"], "ycb_grasp_ind": 0, "ycb_ids": [2]}
+        add("DexYCB meta", "meta.yml", _meta, "yaml").write_text(yaml.safe_dump(meta))
+        np.savez(add("DexYCB poses", "pose.npz", lambda p: _npz(p, ("pose_y",)), "npz", ("pose_y",)), pose_y=np.zeros((4, 1, 7)))
+
+        import trimesh
+
+        for suffix in ("stl", "obj", "ply", "off"):
+            path = add(f"mesh .{suffix}", f"box.{suffix}", _load, "bytes" if suffix == "stl" else "text")
+            trimesh.creation.box((0.1, 0.06, 0.04)).export(path)
+        try:
+            yield found
+        finally:
+            logging.disable(logging.NOTSET)
+
+
+def outcome(reader: Reader, damaged: bytes) -> str:
+    """``refused`` or ``read``; raises ``AssertionError`` if the reader broke, took too long, or took what is wrong."""
+    whole = reader.file.read_bytes()
+    began = time.perf_counter()
+    try:
+        reader.file.write_bytes(damaged)
+        content = reader.read(reader.file)
+    except XResetError as error:
+        assert len(str(error)) < 20_000, f"a message of {len(str(error))} characters"
+        verdict = "refused"
+    except MemoryError:
+        raise
+    except Exception as error:
+        raise AssertionError(f"{type(error).__name__}: {error}") from error
+    else:
+        verdict = "read"
+        problem = unsound(content, reader.may_hold)
+        assert not problem, f"it took {problem}"
+    finally:
+        reader.file.write_bytes(whole)
+    seconds = time.perf_counter() - began
+    assert seconds < SECONDS, f"it took {seconds:.0f} s"
+    return verdict
+
+
+def unsound(content: Any, may_hold: tuple[str, ...], name: str = "content") -> str | None:
+    """The first number in what was read that is not finite, or the first quaternion that is not unit, by its name."""
+    if is_dataclass(content) and not isinstance(content, type):
+        parts = ((f.name, getattr(content, f.name)) for f in fields(content))
+        return next((p for n, part in parts if n not in may_hold and (p := unsound(part, may_hold, n))), None)
+    if isinstance(content, dict):
+        return next((p for n, part in content.items() if n not in may_hold and (p := unsound(part, may_hold, str(n)))), None)
+    if isinstance(content, tuple | list):
+        return next((p for part in content if (p := unsound(part, may_hold, name))), None)
+    array = np.asarray(content) if isinstance(content, np.ndarray | float) or type(content).__name__ == "Tensor" else None
+    if array is None or array.dtype.kind != "f":
+        return None
+    if not np.isfinite(array).all() and name not in ("within", "velocity", "lower", "upper"):
+        return f"{name} = {array.ravel()[~np.isfinite(array.ravel())][0]}"
+    if "quat" in name and array.shape[-1:] == (4,) and array.size and np.abs(np.linalg.norm(array, axis=-1) - 1).max() > 2e-3:
+        return f"{name}, which is not unit"
+    return None
+
+
+# Damage ----------------------------------------------------------------------------------------------------------------------------------
+
+JUNK = (
+    None, True, 0, -1, 5, 2**63, 10**400, 0.5, -7.25, 1e308, -1e30, "", "x", "\x1b[31m", "[/bold]",
+    "<script>alert(1)</script>", "\ud800", "x" * 5000,
+    [], [1], ["x"], {}, {"x": 1}, [[[[]]]],
+)  # fmt: skip
+NUMBERS = (np.nan, np.inf, -np.inf, 1e30, -1e30, 1e-300, -1.0, 0.0, 2.0**63)
+TYPES = ("u1", "u4", "u8", ">u4", ">i8", "i2", "f2", ">f4", ">f8", "longdouble", "complex64", "U3", "S3", "bool", "M8[s]")
+
+
+def damages(kind: str) -> st.SearchStrategy[Damage]:
+    """Ways to damage a file of that kind; any file may also be damaged byte by byte."""
+    own = {"npz": [_arrays], "json": [_tree(json.loads, _dump_json)], "yaml": [_tree(yaml.safe_load, _dump_yaml)], "text": [_words]}
+    return st.one_of(*(make() if callable(make) else make for make in own.get(kind, [])), _bytes())
+
+
+def _bytes() -> st.SearchStrategy[Damage]:
+    def flip(places: list[tuple[float, int]]) -> Damage:
+        def damage(whole: bytes) -> bytes:
+            content = bytearray(whole)
+            for where, value in places:
+                content[int(where * len(content))] = value
+            return bytes(content)
+
+        return damage
+
+    where = st.floats(0, 1, exclude_max=True)
+    cut = where.map(lambda at: lambda whole: whole[: int(at * len(whole))])
+    insert = st.tuples(where, st.binary(min_size=1, max_size=40)).map(
+        lambda x: lambda whole: whole[: int(x[0] * len(whole))] + x[1] + whole[int(x[0] * len(whole)) :]
+    )
+    twice = where.map(lambda at: lambda whole: whole + whole[int(at * len(whole)) :])
+    flips = st.lists(st.tuples(where, st.integers(0, 255)), min_size=1, max_size=8).map(flip)
+    return st.one_of(cut, insert, twice, flips, flips)
+
+
+def _words() -> st.SearchStrategy[Damage]:
+    """Replaces one number or quoted text of a text file by junk."""
+    import re
+
+    junk = ("nan", "inf", "-1", "1e300", "0", "", "x", "1 2", '"', "\x00", "\x9b", "../../etc/passwd", "1" * 5000, "[" * 2000)
+
+    def replaced(at: float, text: str) -> Damage:
+        def damage(whole: bytes) -> bytes:
+            content = whole.decode("latin-1")
+            found = list(re.finditer(r"[-+.\w]+", content))
+            if not found:
+                return whole
+            m = found[int(at * len(found))]
+            return (content[: m.start()] + text + content[m.end() :]).encode("latin-1")
+
+        return damage
+
+    return st.builds(replaced, st.floats(0, 1, exclude_max=True), st.sampled_from(junk))
+
+
+def _arrays() -> st.SearchStrategy[Damage]:
+    """Changes one array of an npz file: its numbers, its type, its shape, its being there."""
+
+    def changed(at: float, how: str, number: float, kind: str, place: float) -> Damage:
+        def damage(whole: bytes) -> bytes:
+            arrays = dict(np.load(io.BytesIO(whole)))
+            names = sorted(arrays)
+            name = names[int(at * len(names))]
+            array = arrays[name]
+            with np.errstate(all="ignore"):
+                try:
+                    if how == "number" and array.dtype.kind in "fiu" and array.size:
+                        array = array.copy()
+                        if array.dtype.kind == "f":
+                            array.ravel()[int(place * array.size)] = number
+                        else:
+                            array.ravel()[int(place * array.size)] = int(np.nan_to_num(number, posinf=2**31, neginf=-(2**31))) % 2**31 - 5
+                    elif how == "all":
+                        array = np.full(array.shape, number) if array.dtype.kind == "f" else np.zeros_like(array)
+                    elif how == "type":
+                        array = array.astype(kind)
+                    elif how == "shape":
+                        array = array[..., None] if place < 0.3 else array.reshape(-1)[: max(0, int(place * array.size))]
+                    elif how == "text":
+                        array = np.full(array.shape, "\x1b[31m[/bold]")
+                    elif how == "swap" and len(array.shape) and len(array) > 1:
+                        array = array[::-1]
+                except (ValueError, TypeError, OverflowError):
+                    return whole[: int(place * len(whole))]
+            if how == "drop":
+                del arrays[name]
+            else:
+                arrays[name] = array
+            if how == "bomb":
+                arrays["x"] = np.zeros(1_000_000, dtype=np.uint8)
+            out = io.BytesIO()
+            np.savez_compressed(out, **arrays)
+            return out.getvalue()
+
+        return damage
+
+    hows = st.sampled_from(("number", "number", "all", "type", "type", "shape", "text", "drop", "swap", "bomb"))
+    where = st.floats(0, 1, exclude_max=True)
+    return st.builds(changed, where, hows, st.sampled_from(NUMBERS), st.sampled_from(TYPES), where)
+
+
+def _tree(load: Callable[[Any], Any], dump: Callable[[Any], bytes]) -> st.SearchStrategy[Damage]:
+    """Replaces, removes or adds an entry anywhere in nested objects and lists."""
+
+    def changed(path: list[float], how: str, junk: Any) -> Damage:
+        def damage(whole: bytes) -> bytes:
+            data = load(whole)
+            node = data
+            for step in path:
+                keys = list(node) if isinstance(node, dict) else list(range(len(node)))
+                key = keys[int(step * len(keys))] if keys else None
+                if key is None or not isinstance(node[key], dict | list) or not node[key]:
+                    break
+                node = node[key]
+            keys = list(node) if isinstance(node, dict) else list(range(len(node)))
+            key = keys[int(path[-1] * len(keys))] if keys else None
+            if how == "drop" and key is not None:
+                del node[key]
+            elif how == "add" and isinstance(node, dict):
+                node["later"] = junk
+            elif key is not None:
+                node[key] = junk
+            return dump(data)
+
+        return damage
+
+    where = st.floats(0, 1, exclude_max=True)
+    hows = st.sampled_from(("replace", "replace", "replace", "drop", "add"))
+    return st.builds(changed, st.lists(where, min_size=1, max_size=6), hows, st.sampled_from(JUNK))
+
+
+def _dump_json(data: Any) -> bytes:
+    return json.dumps(data).encode()
+
+
+def _dump_yaml(data: Any) -> bytes:
+    return yaml.dump(data).encode("utf-8", "surrogatepass")

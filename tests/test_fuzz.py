@@ -1,0 +1,43 @@
+"""Every reader, with damaged files: a small budget here, a large one by ``ci/fuzz``."""
+
+from __future__ import annotations
+
+import unittest
+from importlib.util import find_spec
+
+if not find_spec("hypothesis"):
+    raise unittest.SkipTest("hypothesis is not installed (pip install 'xreset[dev]')")
+
+from hypothesis import HealthCheck, given, settings
+
+from tests.fuzzing import Reader, damages, outcome, readers
+
+EXAMPLES = 40
+
+
+class EveryReader(unittest.TestCase):
+    def test_a_whole_file_is_read(self):
+        with readers() as found:
+            for name, reader in found.items():
+                with self.subTest(name):
+                    self.assertEqual(outcome(reader, reader.file.read_bytes()), "read")
+
+    def test_a_damaged_file_is_refused_in_one_sentence_or_its_content_is_sound(self):
+        with readers() as found:
+            for name, reader in found.items():
+                with self.subTest(name):
+                    self.fuzz(reader)
+
+    def fuzz(self, reader: Reader) -> None:
+        whole = reader.file.read_bytes()
+
+        @settings(max_examples=EXAMPLES, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
+        @given(damages(reader.kind))
+        def run(damage):
+            outcome(reader, damage(whole))
+
+        run()
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -23,6 +23,7 @@ COMMANDS: dict[str, str] = {
     "policies": "List the policies that ship with xreset, and make exported ones smaller.",
     "eval": "Evaluate a policy, or a baseline, in one or several engines.",
     "frontier": "Tell from which demonstrated states a policy reaches the goal, and where its training is stuck.",
+    "stress": "Tell what a policy bears: stiffness, latency, friction and more, swept one at a time.",
     "compare": "Put several trainings side by side: curves, results in every engine, and what differs between them.",
     "report": "Make a self-contained HTML page of a run's evaluations.",
 }

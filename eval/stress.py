@@ -1,0 +1,262 @@
+"""What a policy bears: the same episodes while one property of the world at a time is swept over a range.
+
+A property is a field of the task's randomisation, held at one value: what a training may draw at random and what is tried here are one
+list. Everything else is as in an evaluation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from xreset.errors import XResetError
+from xreset.eval.evaluate import Subject
+from xreset.eval.rollout import Episode, roll_out
+from xreset.eval.setting import Setting
+from xreset.eval.stats import bootstrap_ci95
+from xreset.eval.trial import Engine
+from xreset.files import file_hash, write_json
+from xreset.physics import Capability
+from xreset.plugins import backend_class
+from xreset.task.config import RandomizationConfig, TaskConfig
+
+SCHEMA = "xreset-stress/1"
+COSTLY = 0.10
+"""Task progress whose loss a stress card calls the limit of what a policy bears."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Property:
+    """Something that may differ from what a policy is evaluated with."""
+
+    name: str
+    field: str
+    """Of :class:`~xreset.task.config.RandomizationConfig`."""
+    values: tuple[float, ...]
+    """Swept by default, ascending; the nominal value is not among them."""
+    nominal: float = 1.0
+    unit: str = "x"
+    needs: Capability | None = None
+    """What an engine must be able to do."""
+
+
+_SCALES = (0.6, 0.8, 1.25, 1.6)
+PROPERTIES = (
+    Property(name="arm-stiffness", field="arm_stiffness", values=_SCALES, needs="drives"),
+    Property(name="arm-damping", field="arm_damping", values=_SCALES, needs="drives"),
+    Property(name="hand-stiffness", field="hand_stiffness", values=_SCALES, needs="drives"),
+    Property(name="hand-damping", field="hand_damping", values=_SCALES, needs="drives"),
+    Property(name="effort", field="effort", values=(0.4, 0.6, 0.8), needs="drives"),
+    Property(name="action-latency", field="action_latency", values=(0.5, 1.0, 2.0), nominal=0.0, unit="control steps"),
+    Property(name="observation-latency", field="observation_latency", values=(0.5, 1.0, 2.0), nominal=0.0, unit="control steps"),
+    Property(name="force-gain", field="force_gain", values=(0.5, 2.0)),
+    Property(name="object-friction", field="friction", values=(0.4, 0.55, 0.95, 1.2), nominal=0.75, unit="coefficient", needs="friction"),
+    Property(name="hand-friction", field="hand_friction", values=(0.4, 0.8), nominal=0.1, unit="coefficient", needs="friction"),
+    Property(name="object-mass", field="mass_scale", values=(0.5, 0.7, 1.3, 2.0), needs="object_mass"),
+)
+"""What can be swept. Nominal values of the frictions are those of an evaluation with the default materials."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """Task progress with one property at one value."""
+
+    value: float
+    task_progress: float
+    ci95: tuple[float, float]
+    difference: float
+    """To the same episodes as they are."""
+    difference_ci95: tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """Task progress against one property in one engine."""
+
+    property: str
+    unit: str
+    nominal: float
+    points: tuple[Point, ...]
+    """In ascending order of the value, the nominal one included."""
+    lower: float | None
+    """Value below the nominal one at which ten points are lost, between two that were tried; None: none that was tried loses so much."""
+    upper: float | None
+    """The same above it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stress:
+    """A policy's curves in one engine."""
+
+    backend: str
+    backend_version: str
+    episodes: int
+    task_progress: float
+    ci95: tuple[float, float]
+    curves: tuple[Curve, ...]
+    left_out: tuple[str, ...]
+    """Properties that the engine cannot set."""
+
+    def sentence(self) -> str:
+        """What it bears, in one line."""
+        parts = []
+        for curve in self.curves:
+            low, high = curve.points[0].value, curve.points[-1].value
+            below = f"from {curve.lower:.2g}" if curve.lower is not None else f"from {low:g} or less" if low < curve.nominal else ""
+            above = f"up to {curve.upper:.2g}" if curve.upper is not None else f"up to {high:g} or more" if high > curve.nominal else ""
+            bounds = " ".join(filter(None, (below, above)))
+            parts.append(f"{curve.property} {bounds}{'' if curve.unit == 'x' else ' ' + curve.unit}")
+        return f"{self.backend}: {100 * self.task_progress:.0f} %, and at most {100 * COSTLY:.0f} points less with {'; '.join(parts)}."
+
+
+def chosen(wanted: Sequence[str]) -> tuple[Property, ...]:
+    """Properties by ``NAME`` or ``NAME=VALUE,VALUE...``; all for none.
+
+    Raises:
+        XResetError: there is no such property, or a value cannot be.
+    """
+    known = {p.name: p for p in PROPERTIES}
+    found = []
+    for text in wanted:
+        name, _, values = text.partition("=")
+        if name not in known:
+            raise XResetError(f"there is no property {name!r}. Properties: {', '.join(known)}.")
+        prop = known[name]
+        if values:
+            try:
+                numbers = sorted({float(v) for v in values.split(",")} - {prop.nominal})
+            except ValueError:
+                raise XResetError(f"{text!r} states values that are no numbers, expected {name}=VALUE,VALUE...") from None
+            if not numbers or not all(0 <= v < float("inf") for v in numbers):
+                raise XResetError(f"{text!r}: expected finite values, 0 or more, other than the nominal one, which is {prop.nominal:g}.")
+            prop = replace(prop, values=tuple(numbers))
+        found.append(prop)
+    return tuple(found) or PROPERTIES
+
+
+def stressed(task: TaskConfig, prop: Property | None = None, value: float = 1.0) -> TaskConfig:
+    """An evaluation's task with one property at a value, and nothing drawn at random; None: as evaluations are.
+
+    Raises:
+        XResetError: a latency is longer than an episode.
+    """
+    r = task.randomization
+    middle = sum(r.friction) / 2
+    still = RandomizationConfig(friction=(middle, middle), mass_scale=(1.0, 1.0), elastomer=r.elastomer, metal=r.metal, table=r.table)
+    if prop is not None:
+        steps = task.termination.episode_seconds / (task.timestep * task.substeps)
+        if prop.field.endswith("latency") and value >= steps:
+            raise XResetError(f"{prop.name} of {value:g} control steps is no shorter than an episode, which has {steps:.0f}.")
+        still = replace(still, **{prop.field: (value, value)})
+    return replace(task, randomization=still)
+
+
+def stress(
+    subject: Subject,
+    engines: Sequence[Engine],
+    demos: Path,
+    setting: Setting,
+    out: Path,
+    *,
+    properties: Sequence[Property] = PROPERTIES,
+    repetitions: int = 2,
+    progress: Callable[[str, int, int], None] = lambda name, done, total: None,
+) -> list[Stress]:
+    """Sweep properties in each engine and write ``OUT/BACKEND.json``.
+
+    Args:
+        subject: what to try.
+        engines: where.
+        demos: demonstrations or retargeted trajectories.
+        setting: meshes, seed and worlds at a time.
+        out: folder for the results.
+        properties: what to sweep.
+        repetitions: episodes per demonstration, the same for every value.
+        progress: called with (engine, runs done, runs in all).
+
+    Returns:
+        What was written, in the order of the engines.
+    """
+    trial, trajectories = subject.episodes(demos, setting)
+    tasks = {(p.name, v): stressed(trial.task, p, v) for p in properties for v in p.values}  # all are checked before the first is played
+    found = []
+    for engine in engines:
+        able = backend_class(engine.name).capabilities
+        usable = [p for p in properties if p.needs is None or p.needs in able]
+        total = 1 + sum(len(p.values) for p in usable)
+
+        def run(task: TaskConfig, engine: Engine = engine) -> tuple[Episode, ...]:
+            policy = subject.policy(subject.robot, trajectories)
+            return roll_out(policy, engine, replace(trial, task=task), repetitions=repetitions).episodes
+
+        nominal = run(stressed(trial.task))
+        progress(engine.name, 1, total)
+        curves, done = [], 1
+        for p in usable:
+            swept: dict[float, tuple[Episode, ...]] = {p.nominal: nominal}
+            for value in p.values:
+                swept[value] = run(tasks[p.name, value])
+                done += 1
+                progress(engine.name, done, total)
+            curves.append(_curve(p, swept))
+        score, groups = _scores(nominal)
+        result = Stress(
+            backend=engine.name,
+            backend_version=engine.version,
+            episodes=len(nominal),
+            task_progress=float(score.mean()),
+            ci95=bootstrap_ci95(score, groups),
+            curves=tuple(curves),
+            left_out=tuple(p.name for p in properties if p not in usable),
+        )
+        inputs = subject.inputs | {"demos": file_hash(demos)}
+        about: dict[str, Any] = {
+            "schema": SCHEMA,
+            "policy": subject.label,
+            "robot": subject.robot.name,
+            "seed": setting.seed,
+            "inputs": inputs,
+        }
+        write_json(out / f"{engine.name}.json", about | asdict(result))
+        found.append(result)
+    return found
+
+
+def _scores(episodes: Sequence[Episode]) -> tuple[np.ndarray, np.ndarray]:
+    """[E] task progress and demonstration of each episode."""
+    return np.array([e.task_progress for e in episodes]), np.array([e.sequence for e in episodes])
+
+
+def _curve(prop: Property, swept: dict[float, tuple[Episode, ...]]) -> Curve:
+    base, groups = _scores(swept[prop.nominal])
+    points = []
+    for value in sorted(swept):
+        score, _ = _scores(swept[value])
+        points.append(
+            Point(
+                value=value,
+                task_progress=float(score.mean()),
+                ci95=bootstrap_ci95(score, groups),
+                difference=float((score - base).mean()),
+                difference_ci95=bootstrap_ci95(score - base, groups),
+            )
+        )
+    below = [p for p in reversed(points) if p.value <= prop.nominal]
+    above = [p for p in points if p.value >= prop.nominal]
+    return Curve(
+        property=prop.name, unit=prop.unit, nominal=prop.nominal, points=tuple(points), lower=_limit(below), upper=_limit(above)
+    )  # fmt: skip
+
+
+def _limit(outwards: Sequence[Point]) -> float | None:
+    """Where ten points are lost on the way from the nominal value outwards, on the line between two values that were tried."""
+    for near, far in pairwise(outwards):
+        if far.difference <= -COSTLY < near.difference:
+            share = (near.difference + COSTLY) / (near.difference - far.difference)
+            return near.value + share * (far.value - near.value)
+    return None

@@ -1,0 +1,45 @@
+"""The stress card as a picture: task progress against each property, a line for each engine."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from xreset.eval.report.plots import COLORS, figure_style
+from xreset.eval.stress import COSTLY, Stress
+from xreset.files import atomic_write
+
+
+def write_plot(path: Path, found: Sequence[Stress], title: str) -> None:
+    """Write the picture as PNG."""
+    names = list(dict.fromkeys(curve.property for stress in found for curve in stress.curves))
+    columns = min(4, len(names))
+    rows = math.ceil(len(names) / columns)
+    with figure_style({"font.size": 9}) as figure_class:
+        figure = figure_class(figsize=(2.9 * columns, 0.8 + 2.3 * rows), layout="constrained", facecolor="white")
+        axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
+        for ax, name in zip(axes.flat, names, strict=False):
+            for stress, color in zip(found, COLORS, strict=False):
+                for curve in (c for c in stress.curves if c.property == name):
+                    x = [p.value for p in curve.points]
+                    ax.fill_between(x, *([100 * p.ci95[i] for p in curve.points] for i in (0, 1)), color=color, alpha=0.15, linewidth=0)
+                    ax.plot(x, [100 * p.task_progress for p in curve.points], color=color, marker="o", markersize=3, label=stress.backend)
+                    ax.axvline(curve.nominal, color="grey", linewidth=0.7, linestyle=":")
+                    ax.set_xlabel(curve.unit if curve.unit != "x" else "factor")
+            ax.set_title(name)
+            ax.set_ylim(0, 100)
+        for ax in list(axes.flat)[len(names) :]:
+            ax.set_visible(False)
+        for stress, color in zip(found, COLORS, strict=False):
+            for ax in list(axes.flat)[: len(names)]:
+                ax.axhline(100 * (stress.task_progress - COSTLY), color=color, linewidth=0.7, linestyle="--")
+        axes[0, 0].legend(loc="lower left", fontsize=8)
+        for row in axes:
+            row[0].set_ylabel("task progress [%]")
+        figure.suptitle(f"{title}\n(shaded: 95 % interval; dashed: ten points less)", fontsize="medium", fontweight="bold")
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=110)
+    with atomic_write(path) as file:
+        file.write(buffer.getbuffer())

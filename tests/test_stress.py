@@ -1,0 +1,111 @@
+"""Sweeps of one property at a time: what is swept, what is found, and what is refused. No physics but for one short run."""
+
+from __future__ import annotations
+
+import io
+import json
+import tempfile
+import unittest
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+from xreset.cli import main
+from xreset.errors import XResetError
+from xreset.eval.rollout import Episode
+from xreset.eval.stress import PROPERTIES, Stress, _curve, chosen, stressed
+from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
+
+
+def episodes(progress: list[float]) -> tuple[Episode, ...]:
+    flags = dict.fromkeys(("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow"), False)
+    return tuple(
+        Episode(
+            sequence=i // 2, sequence_name=f"s{i // 2}", object="o", repetition=i % 2, reorientation_progress=0.0, task_progress=p, **flags
+        )
+        for i, p in enumerate(progress)
+    )
+
+
+class StressedTest(unittest.TestCase):
+    def test_nothing_is_random_and_one_thing_differs(self):
+        task = evaluation_task(TaskConfig(randomization=RandomizationConfig(arm_stiffness=(0.5, 2.0), friction=(0.4, 0.8), metal=0.2)))
+        plain = stressed(task).randomization
+        self.assertEqual(
+            (plain.friction, plain.mass_scale, plain.arm_stiffness, plain.metal), ((0.6000000000000001,) * 2, (1, 1), (1, 1), 0.2)
+        )
+        self.assertTrue(plain.enabled and not plain.scales_drives)
+        for prop in PROPERTIES:
+            value = prop.values[0]
+            found = stressed(task, prop, value).randomization
+            self.assertEqual(getattr(found, prop.field), (value, value))
+            self.assertEqual(replace(found, **{prop.field: getattr(plain, prop.field)}), plain)
+            self.assertEqual(stressed(task, prop, value).reset, task.reset)
+
+    def test_values_of_ones_own(self):
+        (prop,) = chosen(["arm-stiffness=2,0.5,1"])
+        self.assertEqual((prop.name, prop.values), ("arm-stiffness", (0.5, 2.0)))
+        self.assertEqual(chosen([]), PROPERTIES)
+
+    def test_refusals(self):
+        for text, words in (
+            ("colour", "there is no property 'colour'. Properties: arm-stiffness, "),
+            ("effort=much", "states values that are no numbers, expected effort=VALUE"),
+            ("effort=-1", "expected finite values, 0 or more, other than the nominal one, which is 1"),
+            ("effort=nan", "expected finite values"),
+        ):
+            with self.subTest(text), self.assertRaisesRegex(XResetError, words):
+                chosen([text])
+        (late,) = chosen(["action-latency=300"])
+        with self.assertRaisesRegex(XResetError, "action-latency of 300 control steps is no shorter than an episode, which has 300"):
+            stressed(TaskConfig(), late, 300.0)
+
+
+class CurveTest(unittest.TestCase):
+    def test_the_limit_lies_between_two_values_that_were_tried(self):
+        (prop,) = chosen(["arm-stiffness=0.5,0.8,1.5,2"])
+        base = [1.0, 0.6, 0.8, 0.8]
+        swept = {
+            value: episodes([p + change for p in base])
+            for value, change in ((0.5, -0.3), (0.8, -0.05), (1.0, 0.0), (1.5, -0.02), (2.0, -0.08))
+        }
+        curve = _curve(prop, swept)
+        self.assertEqual([p.value for p in curve.points], [0.5, 0.8, 1.0, 1.5, 2.0])
+        assert curve.lower is not None
+        self.assertAlmostEqual(curve.lower, 0.8 - 0.3 * 0.05 / 0.25)
+        self.assertIsNone(curve.upper)
+        np.testing.assert_allclose(curve.points[0].difference_ci95, (-0.3, -0.3), atol=1e-9)
+        card = Stress(
+            backend="mujoco", backend_version="4", episodes=4, task_progress=0.8, ci95=(0.7, 0.9), curves=(curve,), left_out=(),
+        )  # fmt: skip
+        self.assertEqual(card.sentence(), "mujoco: 80 %, and at most 10 points less with arm-stiffness from 0.74 up to 2 or more.")
+
+
+class CommandTest(unittest.TestCase):
+    def test_a_card_from_the_command_line(self):
+        """A hand that does nothing, two demonstrations and one value: files, table, picture; and an engine that cannot set drives."""
+        from xreset.backends.mujoco import MujocoBackend
+
+        with tempfile.TemporaryDirectory() as name:
+            folder, out, err = Path(name), io.StringIO(), io.StringIO()
+            demos = str(folder / "demos.npz")
+            with redirect_stdout(out), redirect_stderr(err):
+                main(["demos", "synth", "--objects", "005_tomato_soup_can", "--per-object", "2", "--out", demos])
+                options = ["--robot", "openarm", "--demos", demos, "--episodes", "1", "--out", str(folder)]
+                with mock.patch.object(MujocoBackend, "capabilities", MujocoBackend.capabilities - {"drives"}):
+                    main(["stress", "zero", *options, "--property", "arm-stiffness=0.5", "--property", "action-latency=1"])
+            found = json.loads((folder / "mujoco.json").read_text())
+            self.assertEqual((found["schema"], found["episodes"], found["left_out"]), ("xreset-stress/1", 2, ["arm-stiffness"]))
+            (curve,) = found["curves"]
+            self.assertEqual([p["value"] for p in curve["points"]], [0.0, 1.0])
+            self.assertEqual(curve["points"][0]["task_progress"], found["task_progress"])
+            self.assertTrue((folder / "stress.png").read_bytes().startswith(b"\x89PNG"))
+            self.assertIn("left out in mujoco, which cannot set them: arm-stiffness", out.getvalue())
+            self.assertIn("cannot be set", out.getvalue())
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,75 @@
+"""``xreset stress``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from xreset.eval.setting import Setting
+
+
+def stress(
+    policy: Annotated[str, tyro.conf.Positional],
+    *,
+    demos: Path,
+    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),  # a default would be appended to
+    property: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    episodes: int = 2,
+    setting: Annotated[Setting, tyro.conf.arg(name="")] = Setting(),  # noqa: B008
+    out: Path | None = None,
+) -> None:
+    """Tell what a policy bears: the same episodes while stiffness, latency, friction, mass... are swept one at a time.
+
+    Args:
+        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or a baseline (zero,
+            random, ik).
+        demos: Demonstrations whose starts and goals are played.
+        backend: Physics engine; give it again for more engines. Default: mujoco.
+        property: Property to sweep, or NAME=VALUE,VALUE... for other values than its own; give it again for several. Default: all.
+        episodes: Episodes of each demonstration, the same for every value.
+        setting: Robot, meshes, seed, device and worlds.
+        out: Folder for the results; default: stress/ in the run folder or beside the policy.
+    """
+    from rich.markup import escape
+    from rich.table import Table
+
+    from xreset.cli._common import engine_bars
+    from xreset.cli._terminal import Console
+    from xreset.eval.evaluate import resolve
+    from xreset.eval.stress import chosen
+    from xreset.eval.stress import stress as sweep
+    from xreset.eval.stress_figure import write_plot
+    from xreset.eval.trial import engine
+
+    properties = chosen(property)
+    engines = [engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
+    console = Console()
+    subject = resolve(policy, setting.robot, setting.seed)
+    folder = out or subject.folder.parent / "stress"
+    with engine_bars(console, [e.name for e in engines]) as progress:
+        found = sweep(subject, engines, demos, setting, folder, properties=properties, repetitions=episodes, progress=progress)
+    write_plot(folder / "stress.png", found, f"{subject.label}: what it bears")
+    table = Table("property", "value", title=f"{escape(subject.label)}: task progress, and its difference to the same episodes (95 %)")
+    for result in found:
+        table.add_column(result.backend, justify="right", no_wrap=True)
+    for prop in properties:
+        curves = [next((c for c in result.curves if c.property == prop.name), None) for result in found]
+        for i, value in enumerate(sorted({*prop.values, prop.nominal})):
+            cells = []
+            for curve in curves:
+                point = curve.points[i] if curve is not None else None
+                low, high = (100 * x for x in point.difference_ci95) if point else (0, 0)
+                change = f" ({100 * point.difference:+.1f}; {low:+.1f} to {high:+.1f})" if point and value != prop.nominal else ""
+                cells.append(f"{100 * point.task_progress:.1f} %{change}" if point else "cannot be set")
+            table.add_row("" if i else prop.name, f"{value:g} {'' if prop.unit == 'x' else prop.unit}", *cells, end_section=False)
+    console.print(table)
+    for result in found:
+        console.print(escape(result.sentence()))
+        if result.left_out:
+            console.print(f"left out in {result.backend}, which cannot set them: {', '.join(result.left_out)}")
+    console.print(f"results and picture in {folder}")
+
+
+COMMAND = stress

@@ -1,0 +1,59 @@
+"""The lift clock: when success from home first passed its marks, over restarts too."""
+
+from __future__ import annotations
+
+import tempfile
+import unittest
+from pathlib import Path
+
+from xreset.errors import FileFormatError
+from xreset.learning.clock import FILE, Lift, LiftClock, read_lift
+
+
+class LiftClockTest(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name)
+
+    def run_clock(self, clock: LiftClock, shares: list[float], begin: int = 0) -> None:
+        for i, share in enumerate(shares, begin + 1):
+            clock.tick(share, iteration=i, env_steps=1000 * i, seconds=30.0 * i)
+
+    def test_the_first_passing_of_each_mark_is_kept(self):
+        clock = LiftClock(self.folder)
+        self.run_clock(clock, [0.0, 0.009, 0.2, 0.05, 0.11, 0.6, 0.3])
+        clock.write()
+        lift = read_lift(self.folder)
+        self.assertEqual([(p.share, p.iteration, p.env_steps, p.minutes) for p in lift.passed],
+                         [(0.01, 3, 3000, 1.5), (0.1, 3, 3000, 1.5), (0.5, 6, 6000, 3.0)])  # fmt: skip
+        self.assertEqual((lift.iteration, lift.env_steps, lift.minutes, lift.success_from_home), (7, 7000, 3.5, 0.3))
+
+    def test_a_passing_is_on_disk_at_once(self):
+        clock = LiftClock(self.folder)
+        self.run_clock(clock, [0.0])
+        self.assertFalse((self.folder / FILE).exists())
+        self.run_clock(clock, [0.02], begin=1)
+        self.assertEqual([p.share for p in read_lift(self.folder).passed], [0.01])
+
+    def test_a_resumed_run_forgets_what_came_after_its_checkpoint(self):
+        clock = LiftClock(self.folder)
+        self.run_clock(clock, [0.0, 0.02, 0.0, 0.3])
+        again = LiftClock(self.folder)
+        again.resume(3)
+        self.assertEqual([(p.share, p.iteration) for p in again.lift.passed], [(0.01, 2)])
+        self.run_clock(again, [0.0, 0.4], begin=3)
+        self.assertEqual([(p.share, p.iteration) for p in read_lift(self.folder).passed], [(0.01, 2), (0.1, 5)])
+        fresh = LiftClock(self.folder)
+        fresh.resume(0)
+        self.assertEqual(fresh.lift, Lift())
+
+    def test_earlier_runs_and_damaged_files(self):
+        self.assertEqual(read_lift(self.folder), Lift())
+        (self.folder / FILE).write_text('{"schema": "xreset-lift/1", "passed": 3}')
+        with self.assertRaisesRegex(FileFormatError, "passed is 3, expected a list"):
+            read_lift(self.folder)
+
+
+if __name__ == "__main__":
+    unittest.main()

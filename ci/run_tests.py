@@ -1,6 +1,6 @@
 """Runs the unittest suite and ends with one line: ``N passed, N failed, N skipped``.
 
-usage: run_tests.py [-v] [MODULE ...]      (default: every tests/test_*.py)
+usage: run_tests.py [-v] [--quick] [MODULE ...]      (default: every tests/test_*.py; --quick: those that take seconds, no physics)
 """
 
 from __future__ import annotations
@@ -12,6 +12,13 @@ import time
 import unittest
 
 sys.path.insert(0, os.getcwd())
+
+
+QUICK = (
+    "accounts", "engines_page", "eval", "files", "kinematics", "mirror", "render", "retarget_terms", "robots", "schedule", "synergies",
+    "task",
+)  # fmt: skip
+"""Modules of tests that a change of code is first tried with."""
 
 
 class Result(unittest.TextTestResult):
@@ -46,6 +53,8 @@ def main() -> int:
     arguments = sys.argv[1:]
     verbosity = 2 if "-v" in arguments else 1
     names = [a for a in arguments if not a.startswith("-")]
+    if "--quick" in arguments:
+        names += [f"tests.test_{name}" for name in QUICK]
     loader = unittest.TestLoader()
     suite = loader.loadTestsFromNames(names) if names else loader.discover("tests", top_level_dir=".")
     result = unittest.TextTestRunner(resultclass=Result, verbosity=verbosity, buffer=True).run(suite)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -58,6 +59,17 @@ def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
         DemoError: an object of the demonstrations is not among ``objects``.
     """
     return grounded(levelled(demos), _by_name(demos, objects))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Batches here are small: a second thread gains nothing, and spins while it waits, which beside other work costs many times the run."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def retarget(
@@ -116,7 +128,8 @@ def retarget(
                 progress(start + share * size, len(todo))
 
             targets = _hand_targets(demos, hand, sequences, surfaces, touched, touches)
-            solved = _solve(demos, sequences, hand, arm, targets, config, report, timing or Timing())
+            with _one_thread():
+                solved = _solve(demos, sequences, hand, arm, targets, config, report, timing or Timing())
             if kept:
                 kept.write(number, solved)
         rows = np.concatenate([np.arange(demos.num_frames)[demos.frames(i)] for i in sequences])

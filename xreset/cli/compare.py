@@ -16,7 +16,7 @@ def compare(
     apart: bool = False,
     out: Path = Path("runs/compare"),
 ) -> None:
-    """Put several trainings side by side: learning curves, task progress in every engine, and what differs between their configurations.
+    """Put several trainings side by side: learning curves, first success from home, task progress in every engine, and what differs.
 
     Runs that differ in their seed only are one line with a band from the lowest to the highest, and one row of the table. What makes the
     comparison unfair, such as other demonstrations or another version of an engine, is said.

@@ -14,7 +14,7 @@ class ClosingConfig:
     spacing: float | None = None
     """Farthest that any fingertip moves from one state to the next [m], such as 0.005. None: no states are added."""
     within: float = 0.10
-    """Only where a finger is nearer than this to the object [m]."""
+    """Only between frames of which one has a finger nearer than this to the object [m]."""
 
     def __post_init__(self) -> None:
         check_numbers(self, positive=("within",), finite=("within",))

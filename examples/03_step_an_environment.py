@@ -27,7 +27,7 @@ def main(demos: str | Path) -> None:
         for _ in range(STEPS):
             observations, reward, *_ = env.step(2 * torch.rand(NUM_WORLDS, env.num_actions) - 1)
             total += reward
-    print(f"groups of observations: {', '.join(observations.keys())}; return after {STEPS} steps: {total.mean():.3f}")
+    print(f"groups of observations: {', '.join(map(str, observations.keys()))}; return after {STEPS} steps: {total.mean():.3f}")
 
 
 if __name__ == "__main__":

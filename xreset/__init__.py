@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from xreset.resets.bank import read_bank
     from xreset.resets.filter import make_bank
     from xreset.retarget.pipeline import retarget as retarget_demos
+    from xreset.vector_env import VectorEnv
 
 __version__ = "0.1.0"
 
@@ -43,12 +44,14 @@ _HOMES = {
     "retarget_demos": "xreset.retarget.pipeline",  # xreset.retarget is the package
     "synthesize": "xreset.demos.synth",
     "train": "xreset.learning.train",
+    "VectorEnv": "xreset.vector_env",
 }
 _OWN_NAMES = {"retarget_demos": "retarget"}
 
 __all__ = [
     "ManipulationEnv",
     "OnnxPolicy",
+    "VectorEnv",
     "evaluate",
     "load_object",
     "load_robot",

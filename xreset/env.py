@@ -178,11 +178,12 @@ class ManipulationEnv:
         """Observations of the present state, by group."""
         return self._observations.clone()
 
-    def step(self, action: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+    def step(self, action: Tensor, begin: Tensor | None = None) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """One control step, then a reset of every world whose episode has ended.
 
         Args:
             action: [N, J] in [-1, 1] (limited to it). A world that is given numbers that are not finite ends as if its engine had failed.
+            begin: [N] bool, worlds that are reset instead; None: those whose episode has ended.
 
         Returns:
             Observations (of the new episode where one has begun), reward [N], done [N] (0 or 1), extras with ``time_outs`` [N] (ended
@@ -193,6 +194,8 @@ class ManipulationEnv:
         self._graphs.run(self._judge)
         reward, done, time_out, faulty = self._reward.clone(), self._fresh.long(), self._time_out.float(), self._faulty.clone()
         log = dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True))
+        if begin is not None:
+            self._fresh.copy_(begin)
         if self._graphs.active or bool(self._fresh.any()):
             self._graphs.run(self._draw)
             self._begin()

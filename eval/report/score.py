@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from xreset.eval.report.groups import Group
+from xreset.eval.rollout import Episode
 from xreset.eval.stats import crossed_bootstrap_ci95
 
 
@@ -40,15 +41,14 @@ def score(group: Group, engine: str) -> Score | None:
     if not evaluated:
         return None
     episodes = [e for m in evaluated for e in m.episodes[engine]]
-    runs = np.repeat(np.arange(len(evaluated)), [len(m.episodes[engine]) for m in evaluated])
-    progress = np.array([e.task_progress for e in episodes])
+    task_progress, ci95 = estimate([m.episodes[engine] for m in evaluated], "task_progress")
 
     def mean(name: str) -> float:
         return round(float(np.mean([getattr(e, name) for e in episodes])), 6)
 
     return Score(
-        task_progress=round(float(progress.mean()), 6),
-        ci95=crossed_bootstrap_ci95(progress, runs, np.array([e.sequence for e in episodes])),
+        task_progress=task_progress,
+        ci95=ci95,
         approach=mean("approach"),
         grasp=mean("grasp"),
         reorient=mean("reorient"),
@@ -59,6 +59,19 @@ def score(group: Group, engine: str) -> Score | None:
         overflow=sum(e.overflow for e in episodes),
         episodes=len(episodes),
     )
+
+
+def estimate(episodes: Sequence[Sequence[Episode]], metric: str) -> tuple[float, tuple[float, float]]:
+    """Mean of a metric over all episodes of several trainings, and its 95 % interval as in :class:`Score`.
+
+    Args:
+        episodes: of each training, on the same demonstrations.
+        metric: field of an episode.
+    """
+    every = [e for own in episodes for e in own]
+    values = np.array([float(getattr(e, metric)) for e in every])
+    runs = np.repeat(np.arange(len(episodes)), [len(own) for own in episodes])
+    return round(float(values.mean()), 6), crossed_bootstrap_ci95(values, runs, np.array([e.sequence for e in every]))
 
 
 Scores = Mapping[str, Mapping[str, Score]]

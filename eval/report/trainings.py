@@ -72,14 +72,19 @@ def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
     return tuple(read_training(label, folder) for label, folder in named.items())
 
 
-def read_training(label: str, folder: Path) -> Training:
+def read_training(label: str, folder: Path, results: Path | None = None) -> Training:
     """Read one; what is missing (configuration, curves or evaluations) is empty, but not all of them.
+
+    Args:
+        label: what to call it.
+        folder: run folder, or folder of results.
+        results: where its evaluations lie; default: as ``xreset eval`` puts them.
 
     Raises:
         RunError: the folder does not exist, or holds neither learning curves nor results.
         FileFormatError: a file is damaged or of another version.
     """
-    results = results_in(folder)
+    results = results or results_in(folder)
     summaries = {}
     for summary in read_results(results):
         summaries[summary.backend] = summary

@@ -25,6 +25,7 @@ COMMANDS: dict[str, str] = {
     "frontier": "Tell from which demonstrated states a policy reaches the goal, and where its training is stuck.",
     "stress": "Tell what a policy bears: stiffness, latency, friction and more, swept one at a time.",
     "compare": "Put several trainings side by side: curves, results in every engine, and what differs between them.",
+    "study": "Run a study: trainings by object and seed, evaluations, and tables beside the paper's.",
     "report": "Make a self-contained HTML page of a run's evaluations.",
 }
 """Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``, a function or a dictionary of sub-commands; or ``command_for``,

@@ -14,7 +14,7 @@ from xreset.checks import Options
 from xreset.errors import XResetError
 
 _COUNTS = {
-    "num_envs", "iterations", "episodes", "states", "grasps", "per_object", "max_per_object", "max_demos", "perturbed",
+    "num_envs", "iterations", "episodes", "states", "grasps", "per_object", "max_per_object", "max_demos", "perturbed", "per_gpu",
 }  # fmt: skip
 """At least 1."""
 _INDICES = {"seed", "episode", "repetition", "sequence", "frame", "port"}

@@ -1,0 +1,403 @@
+"""Studies: the file, the plan, the launcher, and the tables; and one whole study of seconds."""
+
+import io
+import os
+import signal
+import tempfile
+import threading
+import time
+import unittest
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from unittest import mock
+
+from tests.test_cli import run
+from tests.toy_bank import SOUP
+from tests.toy_results import toy_rollouts, toy_summary
+from tests.toy_study import ShellStep
+from xreset.cli import main
+from xreset.errors import DemoError, FileFormatError, RunError, XResetError
+from xreset.eval.results import write_results
+from xreset.eval.study.file import SHIPPED, read_study, study_path
+from xreset.eval.study.launch import Places, launch
+from xreset.eval.study.paper import ALL, paper_tables
+from xreset.eval.study.plan import EvalStep, Plan, TrainStep, flags, make_plan
+from xreset.eval.study.report import write_page
+from xreset.eval.study.tables import as_rows, fill
+from xreset.files import claim
+from xreset.learning.recipes import RECIPES
+from xreset.learning.run import checkpoints, latest_checkpoint
+
+HEAD = 'schema = "xreset-study/1"\nabout = "A test."\n'
+DATA = "[data.toy]\nsynthetic_per_object = 1\n"
+RUN = '[defaults]\ndata = "toy"\nrobot = "openarm"\nobjects = ["soup", "spam"]\ndevice = "cpu"\n'
+SUBMITIT = unittest.skipUnless(find_spec("submitit"), "submitit is not installed (pip install 'xreset[study]')")
+
+
+class InFolder(unittest.TestCase):
+    def setUp(self):
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        self.out = self.folder / "out"
+
+    def file(self, text: str) -> Path:
+        path = self.folder / "study.toml"
+        path.write_text(text)
+        return path
+
+    def plan(self, text: str, **options) -> Plan:
+        return make_plan(read_study(self.file(text)), "study", given=self.folder, out=self.out, **options)
+
+
+class FileTest(InFolder):
+    def test_what_is_wrong_is_said(self):
+        run = "[runs.a]\n"
+        for text, message in (
+            ("schema = ", "is not valid TOML"),
+            ("about = 'x'", "states schema None, expected 'xreset-study/1'"),
+            (HEAD + DATA + RUN + run + "minuets = 3\n", r"runs\.a does not fit Runs \(unknown: minuets\)"),
+            (HEAD + DATA + RUN + "[runs.a]\nseeds = [0, 0]\n", r"runs\.a: seeds is \[0, 0\]"),
+            (HEAD + DATA + RUN + "[runs.a]\nminutes = 0\n", r"runs\.a: minutes is 0"),
+            (HEAD + DATA + RUN + "[runs.a]\npolicy = 'best'\n", r"runs\.a\.policy is 'best'"),
+            (HEAD + DATA + RUN + "[runs.a]\ndata = 'real'\n", r"runs\.a\.data is 'real', expected one of 'toy'"),
+            (HEAD + DATA + RUN + "[runs.a]\nweights = 'a'\n", r"runs\.a\.weights is 'a', expected one of none"),
+            (HEAD + DATA + RUN + "[runs.'../a']\n", "'../a' is no name for a folder"),
+            (HEAD + DATA + RUN + run + "[evaluations.checkpoints]\n", "would be a folder of that name"),
+            (HEAD + DATA + RUN + run + "[[tables]]\nruns = { b = 'B' }\n", r"tables\[0\]\.runs is 'b', expected one of 'a'"),
+            (HEAD + DATA + RUN + run + "[[tables]]\npaper = 'X'\nruns = { a = 'A' }\n", r"tables\[0\]\.paper is 'X', expected one of 'I'"),
+            (HEAD + DATA + RUN + run + "[[tables]]\npaper = 'I'\nruns = { a = 'A' }\n", r"runs is 'A', expected one of 'IK Oracle'"),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(FileFormatError, message):
+                read_study(self.file(text))
+        with self.assertRaisesRegex(RunError, "no study 'nothing'.*first_grasp.*seconds"):
+            study_path("nothing")
+
+    def test_every_study_that_ships_can_be_read(self):
+        files = sorted(SHIPPED.glob("*.toml"))
+        self.assertIn("nine_objects", [f.stem for f in files])
+        for file in files:
+            with self.subTest(file.stem):
+                self.assertTrue(read_study(study_path(file.stem)).tables)
+
+
+class PaperTest(unittest.TestCase):
+    def test_averages_are_those_of_the_rows(self):
+        """So a figure that is copied wrongly is found, where the paper gives an average."""
+        tables = paper_tables()
+        nine = tables["I"]
+        for column, average in zip(zip(*(v for k, v in nine.values.items() if k != ALL), strict=True), nine.values[ALL], strict=True):
+            self.assertAlmostEqual(sum(column) / 9, average, delta=0.06)
+        for method in nine.names:
+            self.assertEqual(nine.figure(method, ALL, "task_progress"), tables["II"].figure(method, ALL, "task_progress"))
+        for number in ("VI", "VII"):
+            for method, (*each, average) in tables[number].values.items():
+                with self.subTest(number, method=method):
+                    self.assertAlmostEqual(sum(each) / 3, average, delta=0.06)
+        for row in (row for table in tables.values() for row in (*table.values.values(), *table.standard_error.values())):
+            self.assertTrue(all(0 <= value <= 100 for value in row))
+        self.assertEqual(tables["III"].figure("80", SOUP, "grasp"), 100.0)
+        self.assertIsNone(tables["IV"].figure("80", SOUP, "grasp"))
+
+
+class PlanTest(InFolder):
+    def test_runs_by_object_and_seed(self):
+        plan = self.plan(
+            HEAD + DATA + RUN + "[runs.a]\nseeds = [3, 4]\n[runs.b]\nalone = true\nweights = 'a'\nseeds = [3]\n[runs.ik]\npolicy = 'ik'\n"
+        )
+        names = ["a-seed3", "a-seed4", "b-tomato_soup_can-seed3", "b-potted_meat_can-seed3", "ik"]
+        self.assertEqual([r.name for r in plan.runs], names)
+        step = plan.steps["train b-tomato_soup_can-seed3"]
+        self.assertEqual(step.needs, ("data toy-tomato_soup_can openarm", "train a-seed3"))
+        (command,) = step.commands()
+        self.assertEqual(command[command.index("--weights") + 1], str(self.out / "a-seed3"))
+        self.assertEqual(plan.steps["eval ik"].needs, ("data toy-tomato_soup_can+potted_meat_can openarm",))
+        self.assertFalse(self.out.exists())
+        self.assertEqual(len(self.plan((self.folder / "study.toml").read_text(), only=("ik",)).runs), 1)
+
+    def test_changes_of_the_recipe_are_flags(self):
+        changes = (
+            "task.reset = { random_gravity = false, demo_probability = 0.25 }\nmodel.pointnet = [8, 6]\ntask.action.hand_zero = 'middle'\n"
+        )
+        plan = self.plan(HEAD + DATA + RUN + "[runs.a]\nsteps = 1e6\nnum_envs = 64\n[runs.a.config]\n" + changes)
+        (train,) = (s for s in plan.steps.values() if isinstance(s, TrainStep))
+        base = RECIPES["minutes"].config
+        self.assertEqual(train.run.config.iterations, 977)
+        self.assertEqual(train.run.config.task.reset, replace(base.task.reset, random_gravity=False, demo_probability=0.25))
+        (command,) = train.commands()
+        module = "xreset.learning.train"
+        with (
+            mock.patch(f"{module}.load_inputs"),
+            mock.patch(f"{module}.train"),
+            mock.patch(f"{module}.start_run") as start,
+        ):
+            main(command[3:])
+        self.assertEqual(start.call_args.kwargs["config"], train.run.config)
+        self.assertEqual(list(flags({"a": {"b_c": True}})), ["--config.a.b-c"])
+
+    def test_several_gpus_are_torchrun(self):
+        plan = self.plan(HEAD + DATA + RUN + "[runs.a]\ndevice = 'cuda'\ngpus = 4\nminutes = 8\n")
+        (command,) = plan.steps["train a-seed0"].commands()
+        self.assertEqual(command[1:8], ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "4", "-m", "xreset"])
+        self.assertEqual(plan.steps["train a-seed0"].gpus, 4)
+
+    def test_what_does_not_fit_is_refused(self):
+        for text, error, message in (
+            (
+                HEAD + "[data.toy]\ndemos = 'none.npz'\n" + RUN + "[runs.a]\n",
+                FileFormatError,
+                r"no .*none\.npz \(data\.toy\.demos\).*--data",
+            ),
+            (
+                HEAD + DATA + RUN + "[runs.a.config.task.reset]\ngravity = 1\n",
+                FileFormatError,
+                r"runs\.a\.config\.task\.reset.*unknown: gravity",
+            ),
+            (HEAD + DATA + RUN + "[runs.a]\nobjects = ['cup']\n", DemoError, r"runs\.a\.objects: there is no object 'cup'"),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(error, message):
+                self.plan(text)
+        with self.assertRaisesRegex(RunError, "has no runs b; it has a"):
+            self.plan(HEAD + DATA + RUN + "[runs.a]\n", only=("b",))
+
+
+class PlacesTest(unittest.TestCase):
+    def test_gpus_are_shared_as_told(self):
+        places = Places((2, 5), per_gpu=2)
+        taken = [places.take(1) for _ in range(5)]
+        self.assertEqual(sorted(p for t in taken[:4] for p in t), [2, 2, 5, 5])
+        self.assertIsNone(taken[4])
+        self.assertEqual(places.take(0), [Places.CPU])
+        self.assertIsNone(places.take(0))
+        for one in taken[:3]:
+            places.give(one)
+        self.assertIsNone(places.take(2), "one of them is in use")
+        places.give(taken[3])
+        both = places.take(2)
+        self.assertEqual(sorted(both), [2, 5])
+        self.assertIsNone(places.take(1))
+        places.give(both)
+        self.assertIsNotNone(places.take(1))
+
+
+class LaunchTest(InFolder):
+    def launch(self, *steps: ShellStep, **options) -> tuple[list[str], list[str]]:
+        plan = mock.Mock(spec=Plan, out=self.out, steps={s.name: s for s in steps})
+        said: list[str] = []
+        return launch(plan, steps, cluster="local", say=said.append, **options), said
+
+    def step(self, name: str, command: str, *needs: str, gpus: int = 0) -> ShellStep:
+        return ShellStep(name=name, needs=needs, writes=self.folder / name.replace(" ", "-"), kind="data", gpus=gpus, command=command)
+
+    def test_submitit_that_is_missing(self):
+        with (
+            mock.patch.dict("sys.modules", {"submitit": None}),
+            self.assertRaisesRegex(XResetError, "submitit.*pip install 'xreset\\[study\\]'"),
+        ):
+            self.launch(self.step("a", "touch done"))
+
+    @SUBMITIT
+    def test_steps_are_done_in_their_order_and_failures_are_named(self):
+        problems, said = self.launch(
+            self.step("b", "test -e ../a/done && touch done", "a"),
+            self.step("a", "touch done"),
+            self.step("c", "echo it is broken; exit 3"),
+            self.step("d", "touch done", "c"),
+            self.step("e", "touch done", gpus=64),
+        )
+        self.assertTrue((self.folder / "b" / "done").exists())
+        self.assertLess(said.index("a: done"), said.index("b: done"))
+        self.assertRegex(problems[0], "^e could not begin: it needs 64 GPUs, and here is")
+        self.assertRegex(problems[1], r"^c: it is broken\. What it printed: .*c\.log$")
+        self.assertRegex(problems[2], "^d could not begin: c is not done")
+        self.assertEqual(len(problems), 3)
+
+    @SUBMITIT
+    def test_a_step_that_another_command_is_at_is_waited_for(self):
+        step = self.step("a", "touch done")
+        step.writes.mkdir()
+        held = claim(step.writes)
+        held.__enter__()
+
+        def finish():
+            time.sleep(1.0)
+            (step.writes / "done").touch()
+            held.__exit__(None, None, None)
+
+        threading.Thread(target=finish).start()
+        problems, said = self.launch(step)
+        self.assertEqual((problems, said), ([], ["a: another command is at it; waiting for its end"]))
+
+    @SUBMITIT
+    def test_ctrl_c_asks_the_command_to_end(self):
+        step = self.step("a", "trap 'touch stopped; exit 0' TERM INT; touch begun; while true; do sleep 0.1; done")
+
+        def interrupt():
+            while not (step.writes / "begun").exists():
+                time.sleep(0.05)
+            os.kill(os.getpid(), signal.SIGINT)
+
+        threading.Thread(target=interrupt, daemon=True).start()
+        with self.assertRaises(KeyboardInterrupt):
+            self.launch(step)
+        end = time.monotonic() + 20
+        while not (step.writes / "stopped").exists() and time.monotonic() < end:
+            time.sleep(0.05)
+        self.assertTrue((step.writes / "stopped").exists())
+
+
+class TablesTest(InFolder):
+    TEXT = HEAD + DATA + RUN + (
+        "seeds = [0, 1]\n[evaluations.eval]\nepisodes = 2\nengines = ['mujoco']\n[runs.ours]\n[runs.x-sim]\n[runs.ik]\npolicy = 'ik'\n"
+        "[[tables]]\npaper = 'I'\nruns = { ik = 'IK Oracle', x-sim = 'X-Sim', ours = 'Ours' }\n"
+        "[[tables]]\nmetric = 'grasp'\nrows = 'run'\nruns = { ours = 'X-RESET' }\n"
+    )  # fmt: skip
+
+    def write(self, name: str, *progress: float) -> None:
+        toy = toy_rollouts()
+        rollouts = replace(toy, episodes=tuple(replace(e, task_progress=p) for e, p in zip(toy.episodes, progress, strict=True)))
+        write_results(self.out / name / "eval", toy_summary("mujoco", rollouts, robot="openarm", seed=0), rollouts, ("a", "b", "c"))
+
+    def test_ours_beside_the_papers(self):
+        self.write("ours-seed0", 1.0, 1.0, 0.33, 0.33)
+        self.write("ours-seed1", 0.66, 0.66, 0.33, 0.33)
+        self.write("ik", 0.33, 0.33, 0.33, 0.33)
+        plan = self.plan(self.TEXT)
+        table, grasps = (fill(plan, t) for t in plan.study.tables)
+        rows = as_rows(table, "mujoco")
+        self.assertEqual(rows.head, ("%", "IK Oracle", "X-Sim", "Ours"))
+        self.assertEqual([r[0] for r in rows.body], ["tomato soup can", "potted meat can", "all of them"])
+        soup, _, everything = (dict(zip(rows.head, r, strict=True)) for r in rows.body)
+        self.assertEqual(soup["X-Sim"], "-, paper 35.0 \N{PLUS-MINUS SIGN} 0.8")
+        self.assertRegex(soup["Ours"], r"^83\.0 \(66-100\), paper 90\.8 . 1\.5$", "the interval is over the seeds, too")
+        self.assertRegex(everything["Ours"], r"^58\.0 \(33-100\), paper 78\.2$")
+        self.assertEqual(as_rows(grasps, "mujoco").body[0][0], "X-RESET")
+        page = write_page(plan, self.folder / "page")
+        text = page.path.read_text()
+        self.assertIn("![Table I", text)
+        for note in (
+            "The training ours-seed0 is not finished: not begun",
+            "Not evaluated yet: eval x-sim-seed0, eval x-sim-seed1",
+            "10,000 iterations",
+        ):
+            self.assertTrue(any(note in n for n in page.notes), note)
+        self.assertTrue((self.folder / "page" / "table-1.png").read_bytes().startswith(b"\x89PNG"))
+
+    def test_a_mean_over_some_objects_is_none_over_all(self):
+        self.write("ours-tomato_soup_can-seed0", 1.0, 1.0, 1.0, 1.0)
+        toy = toy_rollouts()
+        soup = replace(toy, episodes=toy.episodes[:2], traces=toy.traces[:1])
+        write_results(
+            self.out / "ours-tomato_soup_can-seed0" / "eval", toy_summary("mujoco", soup, robot="openarm", seed=0), soup, ("a", "b", "c")
+        )
+        plan = self.plan(self.TEXT.replace("[runs.ours]\n", "[runs.ours]\nalone = true\n"))
+        rows = as_rows(fill(plan, plan.study.tables[0]), "mujoco")
+        self.assertRegex(rows.body[0][3], r"^66\.5 ")
+        self.assertEqual([r[3][0] for r in rows.body[1:]], ["-", "-"])
+
+    def test_results_of_other_episodes_are_refused(self):
+        self.write("ik", 0.33, 0.33, 0.33, 0.33)
+        with self.assertRaisesRegex(RunError, r"ik/eval/mujoco\.json is an evaluation of another kind: seed is 0 there and 7 in the study"):
+            self.plan(self.TEXT.replace("episodes = 2\n", "episodes = 2\nseed = 7\n"))
+
+
+@SUBMITIT
+@unittest.skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
+class WholeTest(unittest.TestCase):
+    """The study of seconds, from the command line."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
+        cls.out = cls.folder / "out"
+        with redirect_stdout(io.StringIO()) as said:
+            main(["study", "seconds", "--out", str(cls.out)])
+        cls.said = said.getvalue()
+        cls.text = study_path("seconds").read_text()
+
+    def plan(self, *changes: tuple[str, str]) -> Plan:
+        text = self.text
+        for old, new in changes:
+            self.assertIn(old, text)
+            text = text.replace(old, new)
+        file = self.folder / "changed.toml"
+        file.write_text(text)
+        return make_plan(read_study(file), "changed", given=self.folder, out=self.out)
+
+    def test_it_trains_evaluates_and_writes_the_table(self):
+        self.assertRegex(self.said, r"(?s)data .*: done.*train x-reset-seed0: done.*eval x-reset-seed0: done")
+        text = (self.out / "reports" / "seconds" / "study.md").read_text()
+        self.assertRegex(text, r"\| tomato soup can \| \d.* paper 33\.0 .* \| \d.* paper 90\.8 ")
+        self.assertIn("one seed only of x-reset", text)
+        self.assertTrue((self.out / "reports" / "seconds" / "compare-tomato_soup_can" / "compare.png").is_file())
+
+    def test_what_is_done_is_not_done_again(self):
+        before = {f: f.stat().st_mtime_ns for f in self.out.glob("*-seed0/**/*") if f.is_file()}
+        with mock.patch("xreset.eval.study.report.compare"):
+            code, said, _ = run("study", "seconds", "--out", str(self.out))
+        self.assertEqual(code, 0)
+        self.assertNotIn("begun", said)
+        self.assertEqual({f: f.stat().st_mtime_ns for f in before}, before)
+        self.assertEqual({s.name for s in self.plan().steps.values() if not s.done()}, set())
+
+    def test_a_run_goes_on_when_it_is_to_be_longer(self):
+        plan = self.plan(("steps = 128", "steps = 256"))
+        step = plan.steps["train x-reset-seed0"]
+        self.assertFalse(step.done())
+        (command,) = step.commands()
+        self.assertEqual(command[3:], ["train", "--out", str(self.out / "x-reset-seed0"), "--iterations", "4", "--resume"])
+
+    def test_another_configuration_under_the_same_name_is_refused(self):
+        before = latest_checkpoint(self.out / "x-reset-seed0").read_bytes()
+        for change, message in (
+            (("lstm = 12", "lstm = 16"), r"x-reset-seed0 holds a run of another configuration: config\.model\.lstm is 12 there and 16"),
+            (("num_envs = 8", "num_envs = 16"), "num_envs is 8 there and 16 in the study"),
+            (("synthetic_per_object = 1", "synthetic_per_object = 2"), r"was made otherwise: synthetic_per_object was 1 and is 2"),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(RunError, message):
+                self.plan(change)
+        self.assertEqual(latest_checkpoint(self.out / "x-reset-seed0").read_bytes(), before)
+
+    def test_a_policy_that_has_changed_is_evaluated_again(self):
+        plan = self.plan()
+        step = plan.steps["eval x-reset-seed0"]
+        assert isinstance(step, EvalStep)
+        self.assertEqual(step.missing(), [])
+        policy = self.out / "x-reset-seed0" / "policy.onnx"
+        content = policy.read_bytes()
+        self.addCleanup(policy.write_bytes, content)
+        policy.write_bytes(content + b" ")
+        self.assertEqual(step.missing(), ["mujoco"])
+
+    def test_a_policy_that_was_brought_without_checkpoints_counts(self):
+        plan = self.plan()
+        folder = self.out / "x-reset-seed0"
+        (folder / "checkpoints").rename(folder / "elsewhere")
+        self.addCleanup((folder / "elsewhere").rename, folder / "checkpoints")
+        self.assertEqual(checkpoints(folder), [])
+        self.assertTrue(plan.steps["train x-reset-seed0"].done())
+        with self.assertRaisesRegex(RunError, "has a policy and no checkpoint"):
+            self.plan(("steps = 128", "steps = 256")).steps["train x-reset-seed0"].commands()
+
+    def test_a_dry_run_prints_the_plan(self):
+        code, said, _ = run("study", "seconds", "--out", str(self.folder / "none"), "--dry-run")
+        self.assertEqual(code, 0)
+        self.assertRegex(
+            said, r"(?s)train x-reset-seed0: not begun \(CPU, after data .*\n    xreset train --out .*/none/x-reset-seed0 --iterations 2"
+        )
+        self.assertFalse((self.folder / "none").exists())
+
+    def test_options(self):
+        for arguments, message in (
+            (("--slurm", "partition=gpu"), "--slurm goes with --cluster slurm"),
+            (("--cluster", "slurm", "--slurm", "gpu"), "--slurm gpu is not KEY=VALUE"),
+            (("--per-gpu", "0"), "--per-gpu is 0"),
+        ):
+            with self.subTest(message), redirect_stderr(io.StringIO()):
+                code, _, said = run("study", "seconds", *arguments)
+                self.assertEqual(code, 1)
+                self.assertIn(message, said)
+
+
+if __name__ == "__main__":
+    unittest.main()

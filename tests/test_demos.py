@@ -536,5 +536,41 @@ class Commands(WithFolder):
         self.assertEqual(list(self.folder.iterdir()), [])
 
 
+class Plausible(unittest.TestCase):
+    """What another convention would explain is said; what is right, is not doubted."""
+
+    def test_other_conventions(self):
+        from xreset.demos.plausible import _MANO, doubts
+
+        for side in ("right", "left"):
+            demos = synthesize(["soup"], 1, side=side)
+            self.assertEqual(doubts(demos), [])
+            mano = np.empty_like(demos.hand_keypoints)
+            mano[:, [0, *(i for chain in _MANO for i in chain[1:])]] = demos.hand_keypoints
+            high, end = demos.object_pos + np.float32([0, 0, 0.9]), demos.object_pos.copy()
+            end[-1], turn = end[0], demos.object_quat_wxyz.copy()
+            turn[-1] = turn[0]
+            for words, changes in (
+                ("MANO's order", {"hand_keypoints": mano}),
+                (r"\(x, y, z, w\)", {"wrist_quat_wxyz": demos.wrist_quat_wxyz[:, [1, 2, 3, 0]]}),
+                ("1 of 1 sequences begins .* are these coordinates of a camera", {"object_pos": high}),
+                ("1 of 1 sequences ends where it starts", {"object_pos": end, "object_quat_wxyz": turn}),
+            ):
+                with self.subTest(words, side=side):
+                    (doubt,) = doubts(replace(demos, **changes))
+                    self.assertRegex(doubt, words)
+
+    def test_millimetres_are_refused(self):
+        demos = synthesize(["soup"], 1)
+        with tempfile.TemporaryDirectory() as folder, self.assertRaisesRegex(DemoError, "Are these millimetres"):
+            write_demos(Path(folder) / "d.npz", replace(demos, hand_keypoints=1000 * demos.hand_keypoints))
+
+    def test_recorded_demonstrations_are_not_doubted(self):
+        from xreset.demos.plausible import doubts
+
+        for name in ("dexycb_right_9x20.npz", "dexycb_left_9x10.npz"):
+            self.assertEqual(doubts(read_demos(data_dir() / name)), [])
+
+
 if __name__ == "__main__":
     unittest.main()

@@ -177,6 +177,7 @@ def _print_summary(demos: Demos, path: Path) -> None:
 
     from xreset.cli._terminal import Console
     from xreset.demos.info import summarize
+    from xreset.demos.plausible import doubts
 
     columns = ("right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg")
     table = Table(caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start pose")
@@ -199,6 +200,8 @@ def _print_summary(demos: Demos, path: Path) -> None:
     console.print(
         f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second", soft_wrap=True, highlight=False
     )
+    for doubt in doubts(demos):
+        console.print(f"note: {doubt}", style="yellow", soft_wrap=True, highlight=False)
 
 
 COMMAND = {"import dexycb": dexycb, "import keypoints": keypoints, "synth": synth, "mirror": mirror, "info": info}

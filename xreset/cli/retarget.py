@@ -50,6 +50,7 @@ def retarget(
     from xreset.cli._terminal import Console, Progress
     from xreset.demos import demo_objects, levelled, read_demos
     from xreset.demos.align import on_something
+    from xreset.demos.plausible import doubts
     from xreset.description import load_robot
     from xreset.files import file_hash
     from xreset.retarget import pipeline
@@ -60,6 +61,8 @@ def retarget(
     chosen = read_demos(demos)
     if max_per_object is not None:
         chosen = chosen.select(max_per_object=max_per_object)
+    for doubt in doubts(chosen):
+        console.print(f"note: {doubt}", style="yellow", soft_wrap=True, highlight=False)
     specs = demo_objects(chosen, objects)
     config, timing = pipeline.RetargetConfig(hand=hand, arm=arm), pipeline.Timing()
     partial = out.with_name(f"{out.name}.partial")

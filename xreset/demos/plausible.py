@@ -1,0 +1,74 @@
+"""What is odd about demonstrations although every number is allowed: units, orders and frames that another convention would explain."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from xreset.demos.archive import Demos
+
+_OURS = [[0, *range(1 + 4 * finger, 5 + 4 * finger)] for finger in range(5)]
+"""Wrist and joints of thumb, index, middle, ring and little finger, in the order of :data:`xreset.spec.KEYPOINTS`."""
+_MANO = [[0, 13, 14, 15, 16], [0, 1, 2, 3, 17], [0, 4, 5, 6, 18], [0, 10, 11, 12, 19], [0, 7, 8, 9, 20]]
+"""The same in MANO's order (Romero et al. 2017): index, middle, little, ring, thumb, and then the five tips."""
+_SHORTER = 0.8
+"""A skeleton that is so much shorter in another order is in that order: bones of a wrong order cross the palm."""
+_HEIGHTS = (-0.1, 0.6)
+"""[m] Of objects at the start: origins of their meshes, above a table or a stand on it."""
+_SAME = (0.02, np.radians(15.0))
+"""Distance [m] and angle [rad] from the start within which the goal counts as reached (:class:`xreset.eval.metrics.MetricsConfig`)."""
+
+
+def doubts(demos: Demos) -> list[str]:
+    """Sentences; none if nothing is odd."""
+    found = []
+    valid = np.asarray(demos.hand_valid)
+    hand = demos.hand_keypoints[valid].astype(float)
+    if len(hand):
+        ours, mano = (np.median(_length(hand, chains)) for chains in (_OURS, _MANO))
+        if mano < _SHORTER * ours:
+            found.append(
+                f"the hand's bones are {ours:.2f} m long together, but {mano:.2f} m if the keypoints are in MANO's order. "
+                "Put them into the order of xreset.spec.KEYPOINTS."
+            )
+        wxyz = demos.wrist_quat_wxyz[valid].astype(float)
+        right = (demos.hand_side[demos.sequence_of_frame] == "right")[valid]
+        along, other = _along_fingers(hand, wxyz, right), _along_fingers(hand, wxyz[:, [3, 0, 1, 2]], right)
+        if along < 0.3 and other > 0.7:
+            found.append(
+                "the wrist's orientations point along the fingers if they are read as (x, y, z, w). They must be (w, x, y, z); "
+                "are the objects' in the right order?"
+            )
+        elif along < 0.0:
+            found.append("the wrist's orientations point away from the fingers: are they MANO's root, in the table frame?")
+    start, goal = demos.start_pose, demos.goal_pose
+    odd = (start[0][:, 2] < _HEIGHTS[0]) | (start[0][:, 2] > _HEIGHTS[1])
+    if odd.any():
+        i = int(np.argmax(odd))
+        found.append(
+            f"{_some(odd)} with the object at a height of {start[0][i, 2]:.2f} m ({demos.sequence_name[i]}): "
+            "are these coordinates of a camera? The table's top is z = 0."
+        )
+    turned = (Rotation.from_quat(start[1], scalar_first=True).inv() * Rotation.from_quat(goal[1], scalar_first=True)).magnitude()
+    same = (np.linalg.norm(goal[0] - start[0], axis=1) < _SAME[0]) & (turned < _SAME[1])
+    if same.any():
+        i = int(np.argmax(same))
+        found.append(f"{_some(same, 'ends')} where it starts ({demos.sequence_name[i]}): whatever lets the object stand solves it.")
+    return found
+
+
+def _length(hand: np.ndarray, chains: list[list[int]]) -> np.ndarray:
+    """[F] length of all bones of keypoints [F, 21, 3]."""
+    return sum((np.linalg.norm(np.diff(hand[:, chain], axis=1), axis=2).sum(axis=1) for chain in chains), np.zeros(len(hand)))
+
+
+def _along_fingers(hand: np.ndarray, quat_wxyz: np.ndarray, right: np.ndarray) -> float:
+    """Median cosine between where the fingers point and where the wrist's frames [F, 4] say: along -x, of a left hand along +x."""
+    fingers = hand[:, [5, 9, 13, 17]].mean(axis=1) - hand[:, 0]
+    fingers /= np.linalg.norm(fingers, axis=1, keepdims=True).clip(1e-9)
+    axes = Rotation.from_quat(quat_wxyz, scalar_first=True).apply([1.0, 0.0, 0.0])
+    return float(np.median(np.where(right, -1.0, 1.0) * (axes * fingers).sum(axis=1)))
+
+
+def _some(which: np.ndarray, verb: str = "begins") -> str:
+    return f"{int(which.sum())} of {len(which)} sequences {verb if which.sum() == 1 else verb.removesuffix('s')}"

@@ -64,6 +64,11 @@ class PybulletWorld(World):
     """One world of Bullet, in a client of its own."""
 
     def __init__(self, scene: SceneSpec, object_index: int, *, settings: PybulletSettings = _DEFAULTS) -> None:
+        self._arguments = scene, object_index, settings
+        self._build()
+
+    def _build(self) -> None:
+        scene, object_index, settings = self._arguments
         self._mechanism = robot = mechanism(scene.robot)
         thing = scene.objects[object_index]
         self._inertia = object_inertia(thing)
@@ -109,6 +114,8 @@ class PybulletWorld(World):
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """See :meth:`World.set_state`."""
+        if not is_finite(self.get_state()):
+            self._rebuild()
         p, client = self._p, self._client
         p.restoreState(self._clean, physicsClientId=client)
         p.performCollisionDetection(physicsClientId=client)  # with the object far away: what touched it before is forgotten
@@ -209,6 +216,7 @@ class PybulletWorld(World):
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
+        self._friction = friction
         tip, link, table = (float(mu) for mu in friction)
         self._set_surface(self._object, {None: 1.0}, torsional=0.0)
         self._set_surface(self._table, {None: table}, torsional=self._torsional)
@@ -231,6 +239,15 @@ class PybulletWorld(World):
         if self._client >= 0:
             self._p.disconnect(physicsClientId=self._client)
             self._client = -1
+
+    def _rebuild(self) -> None:
+        """Begin with a new client: in Bullet's broad phase, numbers that are not finite stay, and the body touches nothing any more."""
+        mass, friction, fraction = self._mass, self._friction, self._fraction
+        self.close()
+        self._build()
+        self.set_object_mass(mass)
+        self.set_friction(friction)
+        self.set_object_gravity(fraction)
 
     # Building ----------------------------------------------------------------------------------------------------------------------------
 

@@ -28,6 +28,19 @@ class EveryReader(unittest.TestCase):
                 with self.subTest(name):
                     self.fuzz(reader)
 
+    def test_what_fuzzing_has_found(self):
+        cases = (
+            ("DexYCB calibration", lambda whole: whole.replace(b"1.0", b"1" + b"0" * 400, 1)),
+            ("mesh .obj", lambda whole: whole.replace(b" -0.02000000", b" ", 3)),
+            ("mesh .ply", lambda whole: whole[:-4] + b"\xff\xff\x01\x00"),
+        )
+        with readers() as found:
+            for name, damage in cases:
+                whole = found[name].file.read_bytes()
+                with self.subTest(name):
+                    self.assertNotEqual(damage(whole), whole)
+                    self.assertEqual(outcome(found[name], damage(whole)), "refused")
+
     def fuzz(self, reader: Reader) -> None:
         whole = reader.file.read_bytes()
 

@@ -203,7 +203,7 @@ def _extrinsics(root: Path, name: str) -> dict[str, np.ndarray]:
         raise DemoError(f"{path} has no pose 'apriltag' under 'extrinsics': without it the table frame is unknown.")
     poses = {}
     for key, values in entries.items():
-        numbers = isinstance(values, list | tuple) and all(type(x) in (int, float) for x in values)
+        numbers = isinstance(values, list | tuple) and all(type(x) in (int, float) and abs(x) < 1e6 for x in values)
         if not numbers or len(values) != 12:
             found = f"{len(values)} numbers" if numbers else shown(values)
             raise DemoError(f"{path}: the pose {shown(key)} has {found}, expected the 12 numbers of a 3x4 matrix.")

@@ -120,8 +120,16 @@ def _load(path: Path) -> trimesh.Trimesh:
         raise ObjectError(f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
     try:
         mesh = trimesh.load(path, force="mesh", skip_materials=True, process=False)  # processing would drop damaged vertices silently
+        return _checked(mesh, path)
+    except ObjectError:
+        raise
     except Exception as error:  # trimesh raises whatever its parsers meet
         raise ObjectError(f"{path} cannot be read as a mesh: {shown(str(error))}") from error
+
+
+def _checked(mesh: object, path: Path) -> trimesh.Trimesh:
+    import trimesh
+
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not len(mesh.vertices):
         raise ObjectError(f"{path} holds no triangles; it is empty or damaged.")
     if not np.isfinite(mesh.vertices).all():

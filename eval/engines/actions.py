@@ -88,7 +88,7 @@ class Actions:
 def grasp_and_lift(
     robot: RobotSpec, thing: ObjectSpec, grasps: Grasps, number: int = 0, *, scene: SceneSpec | None = None, motion: Motion | None = None
 ) -> Actions:
-    """The open-loop try of a grasp: the hand, open around the object at rest, closes, lifts and shakes (:mod:`xreset.backends.parity`).
+    """The open-loop try of a grasp: the hand, open around the object at rest, closes, lifts and shakes (:mod:`xreset.eval.engines`).
 
     Args:
         robot: the robot.

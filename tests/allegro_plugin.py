@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from xreset.geometry.urdf import Joint, Link, RobotTree, load_urdf
-from xreset.robots.writer import axes, fixed, frame, pose, urdf_text
+from xreset.geometry.urdf_writer import axes, fixed, frame, pose, urdf_text
 
 NAME = "allegro"
 _PACKAGE = "example-robot-data"

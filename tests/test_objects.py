@@ -105,6 +105,16 @@ class Geometry(unittest.TestCase):
         self.assertTrue(mesh.is_volume)
         self.assertAlmostEqual(mesh.volume, trimesh.Trimesh(points).convex_hull.volume, places=9)
 
+    def test_hull_within_a_tolerance_has_few_points(self):
+        directions = np.random.default_rng(0).normal(size=(5000, 3))
+        points = directions / np.linalg.norm(directions, axis=1, keepdims=True) * (0.03, 0.02, 0.01)
+        few = hull(points, 5e-4)
+        planes = half_spaces(few)
+        beyond = points @ planes[:, :3].T + planes[:, 3]
+        self.assertLessEqual(beyond.max(), 5e-4)
+        self.assertLess(len(few.geometry.vertices), 200)
+        self.assertTrue((few.geometry.vertices[:, None] == points).all(axis=-1).any(axis=1).all())
+
     def test_hull_of_flat_points(self):
         with self.assertRaisesRegex(ObjectError, "span no volume"):
             hull(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]))

@@ -5,6 +5,7 @@ import json
 import tempfile
 import unittest
 from pathlib import Path
+from types import SimpleNamespace
 from typing import ClassVar
 from unittest import mock
 
@@ -17,7 +18,7 @@ from tests.toy_robot import toy_hand_arm, toy_motion
 from xreset import robots
 from xreset.demos import demo_objects, read_demos, synthesize, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError
-from xreset.geometry.balls import inscribed_balls, sharp_points
+from xreset.geometry.balls import SPACING, inscribed_balls, sharp_points
 from xreset.geometry.collision import SelfCollision, height_above_table, support_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_matrix
@@ -26,6 +27,7 @@ from xreset.geometry.surface import Surface, keypoint_contacts, solid_nodes
 from xreset.retarget import pipeline as pipeline_module
 from xreset.retarget.arm import cost as arm_cost
 from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, measure, track
+from xreset.retarget.collisions import colliding_links
 from xreset.retarget.file import Retargeted, read_retargeted, write_retargeted
 from xreset.retarget.hand.clearance import Distances, Objects, too_near
 from xreset.retarget.hand.cost import system
@@ -154,6 +156,41 @@ class CollisionTest(unittest.TestCase):
                 else:
                     np.testing.assert_allclose(np.abs(centers).max(axis=0), np.abs(points).max(axis=0))
                     self.assertEqual(radius, ball)
+
+    def test_thin_shapes_take_no_more_balls_than_spacing_asks_for(self):
+        thin = Geometry(kind="box", size=(0.04, 0.03, 0.0005))
+        centers, radius = inscribed_balls(thin)
+        self.assertEqual(radius, 0.0005)
+        self.assertLessEqual(len(centers), 21 * 16)
+        steps = np.diff(np.unique(centers[:, 0].round(9)))
+        self.assertLessEqual(steps.max(), SPACING + 1e-9)
+
+    def test_pairs_of_balls_are_bounded_and_no_pair_of_links_is_forgotten(self):
+        robot = robots.load("ur7e-sharpa")
+        whole = HandModel(robot).balls
+        with mock.patch("xreset.geometry.balls.MAX_PAIRS", 400):
+            few = HandModel(robot).balls
+        self.assertEqual(whole.spacing, 0.0)
+        self.assertGreater(few.spacing, 0.0)
+        self.assertLessEqual(len(few.pairs), 400)
+        self.assertTrue(torch.equal(few.link_pairs, whole.link_pairs))
+        self.assertTrue(torch.equal(few.centers, whole.centers))  # the object and the table still meet all of them
+
+    def test_self_collision_names_the_links(self):
+        robot = robots.load("ur7e-sharpa")
+        hand = SelfCollision(robot, Kinematics(robot, root=robot.hand_root), only=robot.self_collision_links)
+        names = Kinematics(robot, root=robot.hand_root).link_names
+        joints = np.tile(robot.home, (2, 1))
+        crossed = {"right_middle_MCP_AA": 0.3, "right_ring_MCP_AA": -0.3}
+        for name, value in crossed.items():
+            joints[1, robot.joint_names.index(name)] = value
+        result = SimpleNamespace(joint_pos=joints, reason=np.array([0, REASONS.index("self collision")]))
+        found = colliding_links(result, robot)  # pyright: ignore[reportArgumentType]
+        fingers = [pair for pair in found if all("middle" in a or "ring" in a for a in pair)]
+        self.assertTrue(fingers, found)
+        self.assertEqual(set(found.values()), {1})
+        self.assertTrue(all((names.index(a), names.index(b)) in hand.link_pairs for a, b in fingers))
+        self.assertEqual(colliding_links(SimpleNamespace(joint_pos=joints, reason=np.zeros(2)), robot), {})  # pyright: ignore[reportArgumentType]
 
     def test_sharp_points_lie_on_edges_and_round_shapes_have_none(self):
         size = np.array(self.SHAPES[0].size)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from xreset.geometry.urdf import Joint, Link, RobotTree
-from xreset.robots.writer import axes, box, capsule, cylinder, fixed, frame, inertia_matrix, pose, urdf_text
+from xreset.geometry.urdf_writer import axes, box, capsule, cylinder, fixed, frame, inertia_matrix, pose, urdf_text
 from xreset.spec import MimicSpec, Shape
 
 URDF = Path(__file__).parent / "robot.urdf"

@@ -14,7 +14,7 @@ from typing import NoReturn
 COMMANDS: dict[str, str] = {
     "demos": "Import, make and describe human demonstrations.",
     "objects": "List objects and import meshes.",
-    "robots": "List robots, and check one.",
+    "robots": "List robots, check one, make one from an arm and a hand, find its place.",
     "engines": "List physics engines, check them, compare them and trace where they diverge.",
     "retarget": "Turn human demonstrations into robot trajectories.",
     "resets": "Try retargeted states in physics and keep the stable ones.",

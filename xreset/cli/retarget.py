@@ -54,6 +54,7 @@ def retarget(
     from xreset.description import load_robot
     from xreset.files import file_hash
     from xreset.retarget import pipeline
+    from xreset.retarget.collisions import colliding_links
     from xreset.retarget.partial import discard
 
     console = Console(width=None if sys.stdout.isatty() else 160)  # a file or a pipe has no width of its own
@@ -97,7 +98,10 @@ def retarget(
         write_png(picture, draw_sheet(shown, moment_tiles(shown)))
 
     rows = result.accounts()
-    write_accounts(accounts_path(out), of="frames", rows=rows)
+    colliding = colliding_links(result, spec, config.thresholds)
+    write_accounts(
+        accounts_path(out), of="frames", rows=rows, self_collision=[{"links": list(pair), "frames": n} for pair, n in colliding.items()]
+    )
     table = Table(
         "object", "phase", "frames", "annotated", "valid", "fingertips [mm]", "invalid because of", title=f"retargeted to {spec.name}"
     )
@@ -117,6 +121,12 @@ def retarget(
             described(annotated.lost),
         )
     console.print(table)
+    if colliding:
+        meeting = Table("links that meet", "frames", title="self collision")
+        for pair, frames in colliding.items():
+            meeting.add_row(" and ".join(pair), str(frames))
+        console.print(meeting)
+        console.print("Links that meet in every position of their joints belong into collision.exclude of the robot.toml.")
     for index in np.flatnonzero(on_something(levelled(chosen), specs)):
         console.print(f"{chosen.sequence_name[index]}: the object starts on top of something that the scene does not have; not lowered.")
     console.print(f"hand {timing.hand:.1f} s, arm {timing.arm:.1f} s", highlight=False)

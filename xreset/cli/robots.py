@@ -72,6 +72,50 @@ def check(
         raise SystemExit(1)
 
 
+def import_(
+    *,
+    arm: Path,
+    hand: Path,
+    out: Path,
+    name: str | None = None,
+    flange: str | None = None,
+    offset: tuple[float, float, float] | None = None,
+    rpy: tuple[float, float, float] | None = None,
+    thumb: str | None = None,
+) -> None:
+    """Make a robot's folder from an arm and a hand as their makers publish them.
+
+    Writes robot.urdf, the meshes' hulls, a commented robot.toml and a picture; says what it guessed and what only a person can say.
+
+    Args:
+        arm: URDF or MJCF of the arm.
+        hand: URDF or MJCF of the hand.
+        out: Folder to make.
+        name: Name of the robot; default: the folder's.
+        flange: Link of the arm that carries the hand; default: the arm's last link.
+        offset: Position of the hand's root link in the flange's frame [m].
+        rpy: Its roll, pitch and yaw about the flange's fixed axes [rad].
+        thumb: A link or joint of the thumb, where names and geometry do not tell.
+    """
+    from xreset.cli._terminal import Console
+    from xreset.description import load_robot
+    from xreset.geometry.urdf_writer import pose
+    from xreset.pictures.raster import write_png
+    from xreset.robot_tools.importer import import_robot
+    from xreset.robot_tools.picture import robot_picture
+
+    T = None if offset is None and rpy is None else pose(offset or (0, 0, 0), rpy=rpy or (0, 0, 0))
+    made = import_robot(arm, hand, out, name=name, flange=flange, T_flange_hand=T, thumb=thumb)
+    write_png(out / "robot.png", robot_picture(load_robot(out)))
+    console = Console()
+    for title, lines in (("guessed", made.guessed), ("for you to say", made.to_say)):
+        console.print(f"{title}:", highlight=False)
+        for line in lines:
+            console.print(f"  - {line}", highlight=False, soft_wrap=True)
+    console.print(f"wrote {out / 'robot.toml'}, robot.urdf and robot.png; checking it", highlight=False, soft_wrap=True)
+    check(str(out), engines=False)
+
+
 def place(
     robot: Annotated[str, tyro.conf.Positional],
     /,
@@ -140,4 +184,4 @@ def place(
         console.print(f"wrote {robot_folder(robot) / DESCRIPTION}", highlight=False)
 
 
-COMMAND = {"list": list_robots, "check": check, "place": place}
+COMMAND = {"list": list_robots, "check": check, "import": import_, "place": place}

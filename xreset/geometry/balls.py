@@ -18,6 +18,13 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.spec import Geometry, RobotSpec, Shape
 from xreset.tensors import Tensors
 
+SPACING = 4e-3
+"""[m] Balls need not be closer to each other than this, however thin the shape: from 2.8 mm on they leave no hole, and thinner ones lack no
+more than their own thickness."""
+MAX_PAIRS = 6000
+"""Pairs of balls of one hand at most. Beyond, large balls stand for their neighbours where the hand is kept out of itself; what that misses
+is for the exact check that follows."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Spans(Tensors):
@@ -60,6 +67,8 @@ class Balls(Tensors):
     """[H] the pairs of balls of each pair of links."""
     pairs: Tensor
     """[R, 2] balls, of a radius above 0, that must not overlap each other."""
+    spacing: float
+    """[m] Balls that lie so near a larger one are in no pair; 0: all are."""
 
 
 def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> Balls:
@@ -87,34 +96,46 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
     middles = np.array([(part.max(axis=0) + part.min(axis=0)) / 2 for part in centers]).reshape(-1, 3)
     reach = np.array([(np.linalg.norm(c - m, axis=1) + r).max() for c, m, r in zip(centers, middles, radii, strict=True)])
 
-    link_pairs, pairs = [], []
-    for names in ((hand.link_names[a], hand.link_names[b]) for a, b in collision.link_pairs):
-        if not set(names) <= set(links):
-            continue
-        a, b = (links.index(name) for name in names)
-        meeting = np.stack(np.meshgrid(*(np.flatnonzero((owner == g) & (radius > 0)) for g in (a, b))), -1).reshape(-1, 2)
-        if len(meeting):
-            link_pairs.append((a, b))
-            pairs.append(meeting)
+    named = [(hand.link_names[a], hand.link_names[b]) for a, b in collision.link_pairs]
+    candidates = [(links.index(a), links.index(b)) for a, b in named if {a, b} <= set(links)]
+    solid = [np.flatnonzero((owner == g) & (radius > 0)) for g in range(len(links))]
+    spacing, all_centers = 0.0, np.concatenate([np.zeros((0, 3)), *centers])
+    standing = solid
+    while sum(len(standing[a]) * len(standing[b]) for a, b in candidates) > MAX_PAIRS:
+        spacing = max(SPACING, 1.25 * spacing)
+        standing = [balls[_apart(all_centers[balls], radius[balls], spacing)] for balls in solid]
+    link_pairs = [(a, b) for a, b in candidates if len(standing[a]) and len(standing[b])]
+    pairs = [np.stack(np.meshgrid(standing[a], standing[b]), -1).reshape(-1, 2) for a, b in link_pairs]
     return Balls(
         links=tuple(links),
         spans=_spans(counts),
         link=torch.as_tensor(owner),
-        centers=torch.as_tensor(np.concatenate([np.zeros((0, 3)), *centers])),
+        centers=torch.as_tensor(all_centers),
         radii=torch.as_tensor(radius),
         bound_centers=torch.as_tensor(middles),
         bound_radii=torch.as_tensor(reach),
         link_pairs=torch.as_tensor(np.array(link_pairs, dtype=np.int64).reshape(-1, 2)),
         pair_spans=_spans(np.array([len(part) for part in pairs], dtype=np.int64)),
         pairs=torch.as_tensor(np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])),
+        spacing=spacing,
     )
+
+
+def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray:
+    """Which of some balls, the largest first, are farther from each other than ``spacing``; ascending."""
+    kept: list[int] = []
+    for ball in np.argsort(-radii, kind="stable").tolist():
+        if not kept or np.linalg.norm(centers[kept] - centers[ball], axis=1).min() > spacing:
+            kept.append(ball)
+    return np.sort(kept)
 
 
 def inscribed_balls(geometry: Geometry) -> tuple[np.ndarray, float]:
     """Balls inside a shape that fill it well: centres [n, 3] in the shape's frame and their radius.
 
-    A capsule or a long cylinder gets a row along its axis, a sphere itself. A box gets layers of balls as thick as its thinnest side; so
-    does a flat cylinder, through the square in its rim, and a hull, through the box about it shrunk to the hull's volume.
+    A capsule or a long cylinder gets a row along its axis, a sphere itself. A box gets layers of balls as thick as its thinnest side, as
+    far apart as their radius or :data:`SPACING`; so does a flat cylinder, through the square in its rim, and a hull, through the box about
+    it shrunk to the hull's volume.
     """
     if geometry.kind == "sphere":
         return np.zeros((1, 3)), geometry.size[0]
@@ -156,7 +177,7 @@ def sharp_points(geometry: Geometry, spacing: float) -> np.ndarray:
 def shape_balls(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     """Centres [n, 3] in the link's frame and radii [n] of the balls of one shape."""
     inner, radius = inscribed_balls(shape.geometry)
-    sharp = sharp_points(shape.geometry, radius)
+    sharp = sharp_points(shape.geometry, max(radius, SPACING))
     points = np.concatenate((inner, sharp)) @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
     return points, np.concatenate((np.full(len(inner), radius), np.zeros(len(sharp))))
 
@@ -166,6 +187,7 @@ def _spans(counts: np.ndarray) -> Spans:
 
 
 def _grid(half: tuple[float, ...], radius: float) -> np.ndarray:
-    """[n, 3] an even grid over [-half, half] with steps of at most the radius."""
-    rows = [np.linspace(-h, h, int(np.ceil(2 * h / radius - 1e-9)) + 1) if h > 0 else np.zeros(1) for h in half]
+    """[n, 3] an even grid over [-half, half] with steps of at most the radius or :data:`SPACING`."""
+    step = max(radius, SPACING)
+    rows = [np.linspace(-h, h, int(np.ceil(2 * h / step - 1e-9)) + 1) if h > 0 else np.zeros(1) for h in half]
     return np.array(list(product(*rows)))

@@ -17,6 +17,8 @@ from xreset.spec import Geometry, Shape
 if TYPE_CHECKING:
     import trimesh
 
+_FEW = 300
+"""Points that every engine bears in a hull."""
 CYLINDER_SECTIONS = 48
 """Sides of the prism that stands for a cylinder in a surface mesh."""
 
@@ -31,8 +33,13 @@ def cylinder(center: ArrayLike, radius: float, height: float) -> Shape:
     return Shape(geometry=Geometry(kind="cylinder", size=(float(radius), float(height) / 2)), T_body_shape=_translation(center))
 
 
-def hull(points: np.ndarray) -> Shape:
+def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
     """The convex hull of points [V, 3].
+
+    Args:
+        points: [V, 3]
+        tolerance: if there are more than 300 points: the hull of a few of them, no face of which another lies beyond by more than
+            this [m]; 0: of all.
 
     Raises:
         ObjectError: the points span no volume.
@@ -41,6 +48,7 @@ def hull(points: np.ndarray) -> Shape:
 
     points = np.asarray(points, dtype=float)
     try:
+        points = _outermost(points, tolerance) if tolerance > 0 and len(points) > _FEW else points
         convex = ConvexHull(points)
     except (QhullError, ValueError) as error:
         raise ObjectError(f"{len(points)} points span no volume, so they have no convex hull: {str(error).splitlines()[0]}") from error
@@ -52,6 +60,24 @@ def hull(points: np.ndarray) -> Shape:
     faces = convex.simplices.copy()
     faces[inward] = faces[inward][:, ::-1]
     return Shape(geometry=Geometry(kind="hull", vertices=points[convex.vertices], faces=index[faces].astype(np.int64)))
+
+
+def _outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Points [n, 3] whose hull lacks less than the tolerance: those farthest beyond the hull of the points so far, face by face."""
+    from scipy.spatial import ConvexHull
+
+    points = points[ConvexHull(points).vertices]
+    directions = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
+    chosen = np.unique((points @ directions.T).argmax(axis=0))
+    while True:
+        planes = ConvexHull(points[chosen]).equations
+        beyond = points @ planes[:, :3].T + planes[:, 3]
+        farthest = beyond.argmax(axis=0)
+        worst = beyond[farthest, np.arange(len(planes))]
+        missing = np.unique(farthest[worst > max(tolerance, worst.max() / 2)])
+        if not len(missing):
+            return points[chosen]
+        chosen = np.union1d(chosen, missing)
 
 
 def loft(sections: Iterable[np.ndarray]) -> Shape:

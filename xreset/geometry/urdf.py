@@ -11,21 +11,21 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 from xml.etree import ElementTree
 
 import numpy as np
 
 from xreset.errors import RobotError
 from xreset.files import max_bytes
+from xreset.geometry.shapes import hull
 from xreset.spec import Geometry, RobotSpec, Shape
 from xreset.text import is_plain, shown
 
-if TYPE_CHECKING:
-    import trimesh
-
 JointType = Literal["revolute", "prismatic", "fixed"]
 
+HULL_TOLERANCE = 5e-4
+"""[m] How far the hull of a mesh with many points may stand back behind them: makers' meshes have thousands, engines bear hundreds."""
 _MASSLESS = 1e-9
 
 
@@ -41,7 +41,7 @@ class Link:
     inertia: np.ndarray
     """[3, 3] about the centre of mass, along the link frame's axes [kg m^2]."""
     collisions: tuple[Shape, ...]
-    """Convex collision shapes in the link frame; a mesh is its convex hull."""
+    """Convex collision shapes in the link frame; a mesh is its convex hull, within :data:`HULL_TOLERANCE`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +128,8 @@ def _load(path: Path, _modified: int) -> RobotTree:
 
     try:
         xml = ElementTree.parse(path)
+        if xml.getroot().tag == "mujoco":
+            raise RobotError(f"{path} is MJCF, not URDF; `xreset robots import` makes a robot of it.")
         for element in xml.iter("geometry"):  # yourdfpy knows no capsules: they travel as negative cylinders
             for capsule in element.findall("capsule"):
                 capsule.tag = "cylinder"
@@ -138,6 +140,8 @@ def _load(path: Path, _modified: int) -> RobotTree:
             load_meshes=False,
             filename_handler=lambda name: name,
         ).robot
+    except RobotError:
+        raise
     except Exception as error:  # yourdfpy raises whatever its parsing meets
         raise RobotError(f"{path} cannot be read as a URDF: {shown(str(error))}") from error
 
@@ -241,17 +245,10 @@ def _hull(mesh, link: str, path: Path) -> Geometry:
             raise ValueError("it holds no triangles")
         if not (np.abs(loaded.vertices) < _LARGEST).all():
             raise ValueError("it has a vertex that is not finite, or far away")
-        hull = _scaled_hull(loaded, mesh)
+        scale = np.ones(3) if mesh.scale is None else np.broadcast_to(np.asarray(mesh.scale, dtype=float), 3)
+        return hull(np.asarray(loaded.vertices) * scale, HULL_TOLERANCE).geometry
     except Exception as error:  # trimesh and qhull raise whatever they meet
         raise RobotError(f"{path}: link {link!r} uses the mesh {mesh.filename!r}, which cannot be read: {shown(str(error))}") from error
-    return Geometry(kind="hull", vertices=np.asarray(hull.vertices, dtype=float), faces=np.asarray(hull.faces, dtype=np.int64))
-
-
-def _scaled_hull(loaded: trimesh.Trimesh, mesh) -> trimesh.Trimesh:
-    import trimesh
-
-    scale = np.ones(3) if mesh.scale is None else np.broadcast_to(np.asarray(mesh.scale, dtype=float), 3)
-    return trimesh.Trimesh(np.asarray(loaded.vertices) * scale, loaded.faces).convex_hull
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:

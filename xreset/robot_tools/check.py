@@ -71,6 +71,7 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
     found += _topic("drives", _drives(spec), _drive_summary(spec))
     found += _topic("frames", _frames(spec), "the palm looks along the fingers")
     found += _home(spec)
+    found += _size(spec)
     if spec.placement is not None:
         stated = f"reaches {spec.placement.reached:.1%} and follows {spec.placement.followed:.1%} of {spec.placement.frames} frames"
         found.append(Finding("ok", "placement", f"{stated}, says {DESCRIPTION}: {spec.placement.command}"))
@@ -322,6 +323,24 @@ def _home(spec: RobotSpec) -> list[Finding]:
     elif not collision.overlapping_at_home:
         found.append(Finding("ok", "home and self", f"free at home; {share:.0f} % of the spread around it touches itself"))
     return found
+
+
+def _size(spec: RobotSpec) -> list[Finding]:
+    """What retargeting makes of the collision shapes, and the memory that it will take."""
+    from xreset.retarget.hand.model import HandModel, predicted_gigabytes
+
+    try:
+        model = HandModel(spec)
+    except XResetError as error:
+        return [Finding("skipped", "retargeting", str(error))]
+    balls = model.balls
+    text = (
+        f"{len(balls.radii)} balls on {len(balls.links)} links of the hand, {len(balls.pairs)} pairs of them on {len(balls.link_pairs)}"
+        f" pairs of links; about {predicted_gigabytes(model):.1f} GB"
+    )
+    if balls.spacing:
+        text += f"; balls within {1e3 * balls.spacing:.0f} mm of a larger one are in no pair"
+    return [Finding("ok", "retargeting", text)]
 
 
 def _probe() -> ObjectSpec:

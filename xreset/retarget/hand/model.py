@@ -137,6 +137,11 @@ class HandModel:
         return along[:, 0]
 
 
+def predicted_gigabytes(model: HandModel) -> float:
+    """Memory that hand retargeting on the CPU will take [GB], all balls of a chunk of 256 frames being near something: an upper bound."""
+    return 0.5 + 256 * 400e-9 * (len(model.balls.radii) + len(model.balls.pairs))
+
+
 def keypoint_pairs(names: Sequence[str], links: Sequence[str]) -> list[tuple[int, int]]:
     """Pairs of mapped keypoints: along each finger from the wrist, between neighbouring knuckles, and from the thumb's tip to the others.
 

@@ -1,6 +1,6 @@
-"""Writing URDFs of the built-in robots from tables of published figures.
+"""Writing URDFs: of the built-in robots from published figures, and of imported ones.
 
-The figures become a :class:`~xreset.geometry.urdf.RobotTree`, the same plain data that a URDF is read into, so writing and reading
+Both become a :class:`~xreset.geometry.urdf.RobotTree`, the same plain data that a URDF is read into, so writing and reading
 are inverse.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -114,6 +115,23 @@ def urdf_text(tree: RobotTree, effort: Mapping[str, float], *, mimics: Sequence[
     return f'<?xml version="1.0"?>\n<!--\n{head}-->\n{ElementTree.tostring(robot, encoding="unicode")}\n'
 
 
+def write_meshes(tree: RobotTree, folder: Path) -> None:
+    """Write the hulls that :func:`urdf_text` names, as OBJ, into the folder of the URDF."""
+    for link in tree.links:
+        for number, shape in enumerate(link.collisions):
+            geometry = shape.geometry
+            if geometry.vertices is None or geometry.faces is None:
+                continue
+            file = folder / _mesh_name(link.name, number)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            lines = [f"v {_numbers(vertex)}" for vertex in geometry.vertices] + [f"f {a} {b} {c}" for a, b, c in geometry.faces + 1]
+            file.write_text("\n".join(lines) + "\n")
+
+
+def _mesh_name(link: str, number: int) -> str:
+    return f"meshes/{link.replace('/', '_')}_{number}.obj"
+
+
 def _between(kind: Literal["capsule", "cylinder"], start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
     from scipy.spatial.transform import Rotation
 
@@ -136,7 +154,7 @@ def _write_link(robot: Element, link: Link) -> None:
     SubElement(inertial, "mass", value=_number(link.mass))
     names = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
     SubElement(inertial, "inertia", {name: _number(link.inertia[at]) for name, at in names.items()})
-    for shape in link.collisions:
+    for number, shape in enumerate(link.collisions):
         collision = SubElement(element, "collision")
         _write_origin(collision, shape.T_body_shape)
         geometry, size = SubElement(collision, "geometry"), shape.geometry.size
@@ -144,6 +162,8 @@ def _write_link(robot: Element, link: Link) -> None:
             SubElement(geometry, "box", size=_numbers(2 * s for s in size))
         elif shape.geometry.kind == "sphere":
             SubElement(geometry, "sphere", radius=_number(size[0]))
+        elif shape.geometry.kind == "hull":
+            SubElement(geometry, "mesh", filename=_mesh_name(link.name, number))
         else:
             SubElement(geometry, shape.geometry.kind, radius=_number(size[0]), length=_number(2 * size[1]))
 

@@ -1,0 +1,228 @@
+"""Robots from what makers publish: an arm and a hand, URDF or MJCF, to a folder that passes the check."""
+
+import contextlib
+import io
+import lzma
+import os
+import tarfile
+import tempfile
+import unittest
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.data import DEFAULT
+from xreset.cli import main
+from xreset.description import load_robot
+from xreset.errors import RobotError
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.urdf import load_urdf
+from xreset.robot_tools.check import check_description
+from xreset.robot_tools.importer import import_robot
+from xreset.robot_tools.sources import combined, read_source
+
+ARCHIVES = DEFAULT.parent / "robots"
+"""Where a development checkout has descriptions as their makers publish them."""
+
+_FINGER = """
+<link name="{0}_a"><inertial><mass value="0.05"/><origin xyz="0.02 0 0"/>
+  <inertia ixx="1e-5" iyy="1e-5" izz="1e-5" ixy="0" ixz="0" iyz="0"/></inertial>
+  <collision><origin xyz="0.02 0 0"/><geometry><box size="0.036 0.014 0.014"/></geometry></collision></link>
+<link name="{0}_b"><inertial><mass value="0.03"/><origin xyz="0.02 0 0"/>
+  <inertia ixx="1e-5" iyy="1e-5" izz="1e-5" ixy="0" ixz="0" iyz="0"/></inertial>
+  <collision><origin xyz="0.02 0 0"/><geometry><box size="0.036 0.014 0.014"/></geometry></collision></link>
+<joint name="{0}_1" type="revolute"><parent link="base"/><child link="{0}_a"/><origin xyz="{1}" rpy="{2}"/><axis xyz="0 1 0"/>
+  <limit lower="0" upper="1.5" effort="1" velocity="5"/></joint>
+<joint name="{0}_2" type="revolute"><parent link="{0}_a"/><child link="{0}_b"/><origin xyz="0.045 0 0"/><axis xyz="0 1 0"/>
+  <limit lower="0" upper="1.5" effort="1" velocity="5"/><mimic joint="{0}_1" multiplier="0.8" offset="0.1"/></joint>"""
+"""A finger along x that bends towards -z; its second joint follows the first."""
+_PALM = """<link name="base"><inertial><mass value="0.4"/><origin xyz="0.04 0 0"/>
+  <inertia ixx="3e-4" iyy="3e-4" izz="5e-4" ixy="0" ixz="0" iyz="0"/></inertial>
+  <collision><origin xyz="0.04 0 0"/><geometry><box size="0.08 0.08 0.02"/></geometry></collision></link>"""
+_PLACES = {
+    "f1": ("0.085 0.03 0", "0 0 0"),
+    "f2": ("0.085 0 0", "0 0 0"),
+    "f3": ("0.085 -0.03 0", "0 0 0"),
+    "f4": ("0.02 0.045 0", "0 0 0.9"),
+}
+"""The fourth is a right hand's thumb: seen from the back of the hand, fingers up, it is on the left."""
+HAND = '<robot name="hand">' + _PALM + "".join(_FINGER.format(name, *place) for name, place in _PLACES.items()) + "</robot>"
+
+ARM = '<robot name="arm"><link name="base"><collision><geometry><cylinder radius="0.06" length="0.1"/></geometry></collision></link>'
+for _number, (_xyz, _axis) in enumerate(
+    [("0 0 0.15", "0 0 1"), ("0 0 0.1", "0 1 0"), ("0 0 0.4", "0 1 0"), ("0 0 0.2", "0 0 1"), ("0 0 0.2", "0 1 0"), ("0 0 0.1", "0 0 1")]
+):
+    ARM += f"""<link name="l{_number}"><inertial><mass value="2"/><origin xyz="0 0 0.03"/>
+      <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
+      <collision><origin xyz="0 0 0.03"/><geometry><cylinder radius="0.03" length="0.05"/></geometry></collision></link>
+      <joint name="j{_number}" type="revolute"><parent link="{f"l{_number - 1}" if _number else "base"}"/><child link="l{_number}"/>
+      <origin xyz="{_xyz}"/><axis xyz="{_axis}"/><limit lower="-2.9" upper="2.9" effort="60" velocity="3"/></joint>"""
+ARM += "</robot>"
+
+_MJCF_FINGER = """<body name="{0}_a" pos="{1}" euler="{2}"><inertial pos="0.02 0 0" mass="0.05" diaginertia="1e-5 1e-5 1e-5"/>
+  <joint name="{0}_1" axis="0 1 0" range="0 1.5"/><geom type="box" pos="0.02 0 0" size="0.018 0.007 0.007"/>
+  <body name="{0}_b" pos="0.045 0 0"><inertial pos="0.02 0 0" mass="0.03" diaginertia="1e-5 1e-5 1e-5"/>
+  <joint name="{0}_2" axis="0 1 0" range="0 1.5"/><geom type="box" pos="0.02 0 0" size="0.018 0.007 0.007"/></body></body>"""
+MJCF = (
+    '<mujoco model="hand"><compiler angle="radian" eulerseq="XYZ"/><worldbody><body name="base">'
+    '<inertial pos="0.04 0 0" mass="0.4" diaginertia="3e-4 3e-4 5e-4"/><geom type="box" pos="0.04 0 0" size="0.04 0.04 0.01"/>'
+    + "".join(_MJCF_FINGER.format(name, *place) for name, place in _PLACES.items())
+    + "</body></worldbody><equality>"
+    + "".join(f'<joint joint1="{name}_2" joint2="{name}_1" polycoef="0.1 0.8 0 0 0"/>' for name in _PLACES)
+    + '</equality><actuator><position joint="f1_1" kp="3" kv="0.2" forcerange="-2 2"/></actuator></mujoco>'
+)
+
+
+class WithFolder(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name)
+
+    def file(self, name, text):
+        path = self.folder / name
+        path.write_text(text)
+        return path
+
+
+class Toy(WithFolder):
+    def setUp(self):
+        super().setUp()
+        self.arm, self.hand = self.file("arm.urdf", ARM), self.file("hand.urdf", HAND)
+
+    def test_a_folder_that_passes_the_check_and_says_what_it_guessed(self):
+        made = import_robot(self.arm, self.hand, self.folder / "mine")
+        spec, found = check_description(made.folder)
+        self.assertEqual([f"{f.topic}: {f.message}" for f in found if f.level == "error"], [])
+        self.assertEqual(spec.fingertip_names, ("thumb", "index", "middle", "ring"))
+        self.assertEqual([tip.contact_links for tip in spec.fingertips], [("f4_b",), ("f1_b",), ("f2_b",), ("f3_b",)])
+        self.assertEqual(len(spec.hand_indices), 4)
+        self.assertEqual({(m.joint, m.multiplier, m.offset) for m in spec.mimics}, {(f"f{i}_2", 0.8, 0.1) for i in range(1, 5)})
+        self.assertTrue(any("thumb is the finger of f4_a, f4_b" in note for note in made.guessed), made.guessed)
+        self.assertIn("--offset", made.to_say[0])
+        self.assertEqual([path.name for path in self.folder.iterdir() if path.name.startswith(".")], [])
+        keypoints = {point.keypoint: point.link for point in spec.keypoints}
+        self.assertEqual([keypoints[f"index{i}"] for i in (1, 2, 4)], ["f1_a", "f1_b", "index_tip_frame"])
+
+    def test_the_palm_looks_where_the_fingers_bend(self):
+        spec = load_robot(import_robot(self.arm, self.hand, self.folder / "mine").folder)
+        kinematics = Kinematics(spec)
+        poses = dict(zip(kinematics.link_names, kinematics.link_poses(torch.tensor(spec.home)).numpy(), strict=True))
+        in_hand = np.linalg.inv(poses["hand_base"]) @ poses["palm_frame"]
+        np.testing.assert_allclose(in_hand[:3, :3], np.stack([(1, 0, 0), (0, -1, 0), (0, 0, -1)], axis=1), atol=0.06)
+        np.testing.assert_allclose(poses["palm_frame"][:3, 2], (0, 0, -1), atol=0.05)  # at home it looks down at the table
+
+    def test_mjcf_is_the_same_hand(self):
+        mjcf, urdf = read_source(self.file("hand.xml", MJCF)), read_source(self.hand)
+        self.assertEqual(mjcf.tree.link_names, urdf.tree.link_names)
+        for a, b in zip(mjcf.tree.joints, urdf.tree.joints, strict=True):
+            self.assertEqual((a.name, a.type, a.lower, a.upper), (b.name, b.type, b.lower, b.upper))
+            np.testing.assert_allclose(a.T_parent_joint, b.T_parent_joint, atol=1e-6)
+        for a, b in zip(mjcf.tree.links, urdf.tree.links, strict=True):
+            np.testing.assert_allclose(np.r_[a.mass, a.com, a.inertia.ravel()], np.r_[b.mass, b.com, b.inertia.ravel()], atol=1e-9)
+            self.assertEqual([s.geometry.size for s in a.collisions], [s.geometry.size for s in b.collisions])
+        self.assertEqual({(m.joint, m.source, m.multiplier) for m in mjcf.mimics}, {(m.joint, m.source, m.multiplier) for m in urdf.mimics})
+        drive = mjcf.drives["f1_1"]
+        self.assertEqual((drive.kp, drive.kd, mjcf.effort["f1_1"]), (3.0, 0.2, 2.0))
+
+    def test_what_mjcf_has_and_robots_do_not_is_named_one_by_one(self):
+        ball = MJCF.replace('<joint name="f1_2" axis="0 1 0" range="0 1.5"/>', '<joint name="f1_2" type="ball"/>')
+        ball = ball.replace('<joint joint1="f1_2" joint2="f1_1" polycoef="0.1 0.8 0 0 0"/>', "").replace("0.1 0.8 0 0 0", "0.1 0.8 1 0 0")
+        ball = ball.replace('type="box" pos="0.04 0 0"', 'name="egg" type="ellipsoid" pos="0.04 0 0"')
+        with self.assertRaisesRegex(RobotError, "(?s)ball joint 'f1_2'.*ellipsoid 'egg' of body 'base'.*couples joints by a curve"):
+            read_source(self.file("ball.xml", ball))
+
+    def test_mjcf_in_place_of_a_urdf_is_told(self):
+        with self.assertRaisesRegex(RobotError, "is MJCF, not URDF; `xreset robots import`"):
+            load_urdf(self.file("hand.xml", MJCF))
+
+    def test_offset_flange_and_what_hangs_there(self):
+        gripper = '<link name="claw"/><joint name="mount" type="fixed"><parent link="l5"/><child link="claw"/></joint></robot>'
+        arm = read_source(self.file("armed.urdf", ARM.replace("</robot>", gripper)))
+        T = np.eye(4)
+        T[2, 3] = 0.05
+        whole = combined(arm, read_source(self.hand), flange="l5", T_flange_hand=T, name="x")
+        self.assertNotIn("claw", whole.tree.link_names)
+        self.assertTrue(any("claw" in note for note in whole.notes))
+        np.testing.assert_array_equal(whole.tree.joint("hand_base_fixed").T_parent_joint, T)
+        with self.assertRaisesRegex(RobotError, "no link 'wrist'"):
+            combined(arm, read_source(self.hand), flange="wrist", T_flange_hand=T, name="x")
+
+    def test_impossible_figures_are_replaced_and_told(self):
+        heavy = HAND.replace('ixx="1e-5" iyy="1e-5" izz="1e-5"', 'ixx="0.1" iyy="0.1" izz="0.1"', 1).replace(
+            '<mass value="0.4"/>', '<mass value="0"/>'
+        )
+        source = read_source(self.file("heavy.urdf", heavy))
+        self.assertEqual(len(source.notes), 2, source.notes)
+        self.assertAlmostEqual(source.tree.link("base").mass, 0.128, places=6)  # its box of water
+        self.assertLess(np.linalg.eigvalsh(source.tree.link("f1_a").inertia).max(), 1e-4)
+
+    def test_errors_leave_nothing(self):
+        with self.assertRaisesRegex(RobotError, "expected a thumb and at least one finger"):
+            import_robot(
+                self.arm,
+                self.file("one.urdf", f'<robot name="hand">{_PALM}{_FINGER.format("f1", *_PLACES["f1"])}</robot>'),
+                self.folder / "x",
+            )
+        with self.assertRaisesRegex(RobotError, "cannot be read as URDF or MJCF"):
+            import_robot(self.arm, self.folder / "nothing.urdf", self.folder / "x")
+        with self.assertRaisesRegex(RobotError, "--thumb 'f9' is in 0 fingers"):
+            import_robot(self.arm, self.hand, self.folder / "x", thumb="f9")
+        self.file("taken", "")
+        with self.assertRaisesRegex(RobotError, "is there already"):
+            import_robot(self.arm, self.hand, self.folder / "taken")
+        self.assertEqual({p.suffix or p.name for p in self.folder.iterdir()}, {".urdf", "taken"})
+
+    def test_command(self):
+        out, err = io.StringIO(), io.StringIO()
+        words = ["robots", "import", "--arm", self.arm, "--hand", self.hand, "--out", self.folder / "mine", "--offset", 0, 0, 0.02]
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            main([str(word) for word in words])
+        self.assertIn("for you to say", out.getvalue())
+        self.assertIn("0 errors", out.getvalue())
+        self.assertTrue((self.folder / "mine" / "robot.png").read_bytes().startswith(b"\x89PNG"))
+
+
+class Published(WithFolder):
+    """Hands and an arm as their makers publish them."""
+
+    def unpacked(self, name):
+        archive = Path(os.environ.get("XRESET_ROBOTS", ARCHIVES)) / f"{name}.tar.xz"
+        if not archive.is_file():
+            raise unittest.SkipTest(f"no published robot at {archive}; set XRESET_ROBOTS to the folder with the archives")
+        with lzma.open(archive) as file, tarfile.open(fileobj=file) as tar:
+            tar.extractall(self.folder, filter="data")
+        return self.folder / name
+
+    def test_hands_on_xarm7(self):
+        arm = self.unpacked("xarm7") / "xarm7.urdf"
+        cases = {
+            "leap_hand": ("leap_hand_right.urdf", ("thumb_fingertip", "fingertip", "fingertip_2", "fingertip_3"), 16, 0),
+            "allegro_hand": ("allegro_hand_right.urdf", ("link_15.0", "link_3.0", "link_7.0", "link_11.0"), 16, 0),
+            "inspire_hand": (
+                "inspire_hand_right.urdf",
+                ("thumb_distal", *(f"{f}_intermediate" for f in ("index", "middle", "ring", "pinky"))),
+                6,
+                6,
+            ),
+            "right_sharpa_wave": (
+                "right_sharpa_wave.xml",
+                tuple(f"right_{f}_DP" for f in ("thumb", "index", "middle", "ring", "pinky")),
+                22,
+                0,
+            ),
+        }
+        for name, (file, ends, joints, mimics) in cases.items():
+            with self.subTest(name):
+                made = import_robot(arm, self.unpacked(name) / file, self.folder / f"xarm7-{name}")
+                spec, found = check_description(made.folder)
+                self.assertEqual([f"{f.topic}: {f.message}" for f in found if f.level == "error"], [])
+                self.assertEqual((len(spec.hand_indices), len(spec.mimics)), (joints, mimics))
+                self.assertEqual(tuple(tip.contact_links[0] for tip in spec.fingertips), ends)
+                size = next(f.message for f in found if f.topic == "retargeting")
+                self.assertLess(float(size.split("about ")[1].split()[0]), 3.0, size)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -15,7 +15,7 @@ What differs from SAPIEN's defaults, and why:
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, Literal, NamedTuple, get_args
@@ -420,7 +420,7 @@ class _Joints:
         for joint, described in zip(self._drives, spec.joints, strict=True):
             joint.set_armature(np.array([[described.drive.armature]]))
         for mimic in spec.mimics:
-            _couple(articulation, joints, mimic)
+            _couple(articulation, joints, _by_a_neighbour(mimic, spec.mimics, joints))
 
         self._set_target = [joint.set_drive_target for joint in self._drives]
         self.target = spec.home
@@ -483,6 +483,21 @@ class _Joints:
 
 
 _TENDON_STIFFNESS, _TENDON_DAMPING = 1e5, 1e2
+
+
+def _by_a_neighbour(mimic: MimicSpec, mimics: Iterable[MimicSpec], joints: Mapping[str, Any]) -> MimicSpec:
+    """The same coupling to another joint that follows the same source, where the source is no neighbour and that one is."""
+    if _adjacent(joints[mimic.joint], joints[mimic.source]):
+        return mimic
+    for other in mimics:
+        if other.source == mimic.source and other.multiplier and other != mimic and _adjacent(joints[mimic.joint], joints[other.joint]):
+            rate = mimic.multiplier / other.multiplier
+            return MimicSpec(joint=mimic.joint, source=other.joint, multiplier=rate, offset=mimic.offset - rate * other.offset)
+    return mimic
+
+
+def _adjacent(a: Any, b: Any) -> bool:
+    return a.parent_link in (b.parent_link, b.child_link) or b.parent_link == a.child_link
 
 
 def _couple(articulation: Any, joints: Mapping[str, Any], mimic: MimicSpec) -> None:

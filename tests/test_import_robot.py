@@ -18,7 +18,7 @@ from xreset.description import load_robot
 from xreset.errors import RobotError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import load_urdf
-from xreset.robot_tools.check import check_description
+from xreset.robot_tools.check import check_description, check_engine
 from xreset.robot_tools.importer import import_robot
 from xreset.robot_tools.sources import combined, read_source
 
@@ -194,6 +194,16 @@ class Published(WithFolder):
         with lzma.open(archive) as file, tarfile.open(fileobj=file) as tar:
             tar.extractall(self.folder, filter="data")
         return self.folder / name
+
+    def test_inspires_coupled_joints_in_the_engines(self):
+        arm, hand = self.unpacked("xarm7") / "xarm7.urdf", self.unpacked("inspire_hand") / "inspire_hand_right.urdf"
+        spec = load_robot(import_robot(arm, hand, self.folder / "mine").folder)  # a joint of the thumb follows one that is no neighbour
+        for backend in ("mujoco", "pybullet", "sapien"):
+            with self.subTest(backend):
+                found = check_engine(spec, backend)
+                if found.level == "skipped":
+                    self.skipTest(found.message)
+                self.assertEqual(found.level, "ok", found.message)
 
     def test_hands_on_xarm7(self):
         arm = self.unpacked("xarm7") / "xarm7.urdf"

@@ -18,7 +18,7 @@ from tests.toy_robot import toy_hand_arm, toy_motion
 from xreset import robots
 from xreset.demos import demo_objects, read_demos, synthesize, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError
-from xreset.geometry.balls import SPACING, inscribed_balls, sharp_points
+from xreset.geometry.balls import SPACING, filling, inscribed_balls, sharp_points
 from xreset.geometry.collision import SelfCollision, height_above_table, support_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_matrix
@@ -174,7 +174,22 @@ class CollisionTest(unittest.TestCase):
         self.assertGreater(few.spacing, 0.0)
         self.assertLessEqual(len(few.pairs), 400)
         self.assertTrue(torch.equal(few.link_pairs, whole.link_pairs))
-        self.assertTrue(torch.equal(few.centers, whole.centers))  # the object and the table still meet all of them
+        own = len(whole.centers)
+        self.assertTrue(torch.equal(few.centers[:own], whole.centers))  # the object and the table still meet all of them, and no other
+        self.assertEqual(int(few.spans.count.sum()), own)
+        self.assertGreaterEqual(int(few.pairs.min()), own)
+
+    def test_a_link_of_thin_walls_is_filled_for_other_links(self):
+        walls = [box((0, 0, z), (0.06, 0.04, 0.001)) for z in (-0.015, 0.015)] + [
+            box((0, y, 0), (0.06, 0.001, 0.03)) for y in (-0.02, 0.02)
+        ]
+        centers, radii = filling(walls)
+        inside = np.random.default_rng(0).uniform((-0.03, -0.02, -0.015), (0.03, 0.02, 0.015), (500, 3))
+        outside = np.linalg.norm(inside[:, None] - centers, axis=2).min(axis=1) - radii[0]
+        self.assertLess(np.mean(outside > 0), 0.1)
+        self.assertLess(
+            (np.abs(centers) + radii[:, None] - (0.03, 0.02, 0.015)).max(), 0.010
+        )  # faces are stood out of, so that edges are covered
 
     def test_self_collision_names_the_links(self):
         robot = robots.load("ur7e-sharpa")

@@ -6,8 +6,9 @@ shapes, whose edges and corners balls of radius 0 stand for; what they miss is f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from xreset.geometry.collision import SelfCollision, support_points
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import hull
 from xreset.spec import Geometry, RobotSpec, Shape
 from xreset.tensors import Tensors
 
@@ -22,8 +24,13 @@ SPACING = 4e-3
 """[m] Balls need not be closer to each other than this, however thin the shape: from 2.8 mm on they leave no hole, and thinner ones lack no
 more than their own thickness."""
 MAX_PAIRS = 6000
-"""Pairs of balls of one hand at most. Beyond, large balls stand for their neighbours where the hand is kept out of itself; what that misses
-is for the exact check that follows."""
+"""Pairs of balls of one hand at most. Beyond, balls that fill each link's hull stand for its shapes where the hand is kept out of itself,
+and large ones for their neighbours; what that misses is for the exact check that follows."""
+
+_SURFACE_SAMPLES = 8
+"""Points on every triangle of a hull."""
+_COVERED = 0.9
+"""Share of them that balls which stand for the hull cover: the rest are its corners."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +59,7 @@ class Balls(Tensors):
     spans: Spans
     """[G] the balls of each link."""
     link: Tensor
-    """[Q] each ball's link, as an index of ``links``; ascending."""
+    """[Q] each ball's link, as an index of ``links``: ascending, and then those of the balls that only stand in pairs."""
     centers: Tensor
     """[Q, 3] in the link's frame."""
     radii: Tensor
@@ -101,6 +108,13 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
     solid = [np.flatnonzero((owner == g) & (radius > 0)) for g in range(len(links))]
     spacing, all_centers = 0.0, np.concatenate([np.zeros((0, 3)), *centers])
     standing = solid
+    if sum(len(standing[a]) * len(standing[b]) for a, b in candidates) > MAX_PAIRS:
+        filled = [filling(hand.tree.link(name).collisions) for name in links]
+        first = np.cumsum([len(all_centers), *(len(points) for points, _ in filled)])
+        solid = standing = [np.arange(a, b) for a, b in pairwise(first)]
+        all_centers = np.concatenate([all_centers, *(points for points, _ in filled)])
+        radius = np.concatenate([radius, *(radii for _, radii in filled)])
+        owner = np.concatenate([owner, np.repeat(np.arange(len(links)), [len(points) for points, _ in filled])])
     while sum(len(standing[a]) * len(standing[b]) for a, b in candidates) > MAX_PAIRS:
         spacing = max(SPACING, 1.25 * spacing)
         standing = [balls[_apart(all_centers[balls], radius[balls], spacing)] for balls in solid]
@@ -119,6 +133,26 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
         pairs=torch.as_tensor(np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])),
         spacing=spacing,
     )
+
+
+def filling(shapes: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
+    """Centres [n, 3] and radii [n] of balls that fill a link as if it were solid: makers model links as thin walls about a motor.
+
+    They fill the hull of all its shapes, and stand out where it has faces, so that most of its surface is covered. Those of thin walls
+    would neither keep another link from coming in between, nor drive it out.
+    """
+    points = []
+    for shape in shapes:
+        local, radius = support_points(shape.geometry)
+        points += [local @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3] + radius * d for d in (*np.eye(3), *-np.eye(3))]
+    whole = hull(np.concatenate(points)).geometry
+    assert whole.vertices is not None and whole.faces is not None
+    inner, radius = inscribed_balls(whole)
+    corners = whole.vertices[whole.faces]
+    share = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), (_SURFACE_SAMPLES, len(corners)))
+    surface = np.einsum("nfk,fkx->nfx", share, corners)
+    outside = np.linalg.norm(surface[:, :, None] - inner, axis=-1).min(axis=-1) - radius
+    return inner, np.full(len(inner), radius + max(float(np.quantile(outside, _COVERED)), 0.0))
 
 
 def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray:

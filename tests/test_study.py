@@ -213,19 +213,34 @@ class LaunchTest(InFolder):
         self.assertEqual(len(problems), 3)
 
     @SUBMITIT
+    def test_each_job_sees_its_own_gpus(self):
+        say = "echo $CUDA_VISIBLE_DEVICES > gpus; touch done"
+        with mock.patch("xreset.eval.study.launch.visible_gpus", return_value=(2, 5)):
+            problems, said = self.launch(
+                self.step("a", say, gpus=1), self.step("b", say, gpus=1), self.step("c", say), self.step("d", say, gpus=2)
+            )
+        self.assertEqual(problems, [])
+        a, b, c, d = ((self.folder / name / "gpus").read_text().strip() for name in "abcd")
+        self.assertEqual((sorted((a, b)), c, sorted(d.split(","))), (["2", "5"], "", ["2", "5"]))
+        self.assertTrue(any(line.startswith("d: begun on GPU ") for line in said))
+
+    @SUBMITIT
     def test_a_step_that_another_command_is_at_is_waited_for(self):
         step = self.step("a", "touch done")
         step.writes.mkdir()
         held = claim(step.writes)
         held.__enter__()
 
+        said: list[str] = []
+
         def finish():
-            time.sleep(1.0)
+            while not said:
+                time.sleep(0.05)
             (step.writes / "done").touch()
             held.__exit__(None, None, None)
 
-        threading.Thread(target=finish).start()
-        problems, said = self.launch(step)
+        threading.Thread(target=finish, daemon=True).start()
+        problems = launch(mock.Mock(spec=Plan, out=self.out, steps={"a": step}), [step], cluster="local", say=said.append)
         self.assertEqual((problems, said), ([], ["a: another command is at it; waiting for its end"]))
 
     @SUBMITIT

@@ -21,6 +21,8 @@ from xreset.eval.study.plan import Plan, Step
 Cluster = Literal["local", "slurm"]
 _POLL = 0.5
 """[s]"""
+_REQUEUES = 1000
+"""How often a job of Slurm whose time is over may go on in another."""
 _NO_LIMIT = 60 * 24 * 365
 """[min]"""
 
@@ -158,7 +160,7 @@ class Job:
         """Called by submitit when a job's time is over: the training writes its checkpoint, and the job goes on in another."""
         if self.process is not None:
             self.process.terminate()
-            self.process.wait()
+            os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOWAIT)  # a signal handler inside of wait(), which has a lock
         return _submitit().helpers.DelayedSubmission(Job(self.step, self.out))
 
     def _run(self, command: list[str]) -> int:
@@ -201,7 +203,7 @@ def _executor(submitit: Any, out: Path, cluster: Cluster, step: Step, gpus: Sequ
             visible = tuple(g for g in gpus if g != Places.CPU)
             executor.update_parameters(gpus_per_node=step.gpus, visible_gpus=visible, timeout_min=_NO_LIMIT)
         else:
-            executor = submitit.SlurmExecutor(folder)
+            executor = submitit.SlurmExecutor(folder, max_num_timeout=_REQUEUES)
             executor.update_parameters(job_name=step.name.replace(" ", "-"), gpus_per_node=step.gpus, **options)
     except (RuntimeError, ValueError, OSError) as error:
         raise RunError(f"submitit cannot start jobs ({cluster}): {error}") from error

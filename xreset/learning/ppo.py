@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Generator
-from typing import Any
+from collections.abc import Generator, Iterable
+from typing import Any, cast
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -62,6 +62,9 @@ class SequenceStorage(RolloutStorage):
                 )
 
 
+Batch = Any
+"""A :class:`RolloutStorage.Batch` whose every field is there; rsl-rl declares them optional."""
+
 BOUND = 1.1
 """Mean of an action beyond which ``bounds_loss`` pulls it back."""
 SLOWEST, FASTEST = 1e-5, 1e-2
@@ -99,7 +102,8 @@ class SequencePpo(PPO):
         rate = torch.tensor(self.learning_rate, device=self.device, dtype=torch.float32 if on_gpu else torch.float64)
         self._use_rate(rate, on_gpu)
         sums = torch.zeros(4, device=self.device)
-        for batch in storage.recurrent_mini_batch_generator(self.num_mini_batches, self.num_learning_epochs):
+        batches = storage.recurrent_mini_batch_generator(self.num_mini_batches, self.num_learning_epochs)
+        for batch in cast(Iterable[Batch], batches):
             self.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0], stochastic_output=True)
             log_prob = self.actor.get_output_log_prob(batch.actions)
             values = self.critic(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[1])
@@ -130,7 +134,7 @@ class SequencePpo(PPO):
         self.learning_rate = float(rate)
         return dict(zip(("value", "surrogate", "entropy", "bounds"), means, strict=True))
 
-    def _value_loss(self, values: Tensor, batch: RolloutStorage.Batch, unit: Tensor | float) -> Tensor:
+    def _value_loss(self, values: Tensor, batch: Batch, unit: Tensor | float) -> Tensor:
         error = (values - batch.returns) / unit
         if not self.use_clipped_value_loss:
             return error.square().mean()
@@ -138,7 +142,7 @@ class SequencePpo(PPO):
         return torch.max(error.square(), ((near - batch.returns) / unit).square()).mean()
 
     @torch.no_grad()
-    def _adapt(self, rate: Tensor, batch: RolloutStorage.Batch) -> None:
+    def _adapt(self, rate: Tensor, batch: Batch) -> None:
         """Divide (multiply) the rate by 1.5 where the policy moved more than twice (less than half) the desired divergence; in place."""
         kl = self.actor.get_kl_divergence(batch.old_distribution_params, self.actor.output_distribution_params).mean()
         if self.is_multi_gpu:

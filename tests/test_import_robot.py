@@ -4,6 +4,7 @@ import contextlib
 import io
 import lzma
 import os
+import re
 import tarfile
 import tempfile
 import unittest
@@ -112,6 +113,19 @@ class Toy(WithFolder):
         in_hand = np.linalg.inv(poses["hand_base"]) @ poses["palm_frame"]
         np.testing.assert_allclose(in_hand[:3, :3], np.stack([(1, 0, 0), (0, -1, 0), (0, 0, -1)], axis=1), atol=0.06)
         np.testing.assert_allclose(poses["palm_frame"][:3, 2], (0, 0, -1), atol=0.05)  # at home it looks down at the table
+
+    def test_check_warns_of_a_turned_palm_and_of_placeholders_for_inertias(self):
+        folder = import_robot(self.arm, self.hand, self.folder / "mine").folder
+        text = (folder / "robot.urdf").read_text()
+        turned, count = re.subn(r'(name="palm_frame_fixed"[^>]*>\s*<origin xyz="[^"]*" rpy=")[^"]*', r"\g<1>0 1.5708 0", text)
+        self.assertEqual(count, 1)
+        turned, count = re.subn(
+            r'(<link name="f1_a">[\s\S]*?<inertia )[^/]*', r'\1ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0" ', turned, count=1
+        )
+        (folder / "robot.urdf").write_text(turned)
+        warnings = "\n".join(f.message for f in check_description(folder)[1] if f.level == "warning")
+        self.assertRegex(warnings, r"lie along z of the palm 'palm_frame'")
+        self.assertRegex(warnings, r"'f1_a' has a moment of 0.1 kg m\^2; 0.05 kg of its size")
 
     def test_mjcf_is_the_same_hand(self):
         mjcf, urdf = read_source(self.file("hand.xml", MJCF)), read_source(self.hand)

@@ -14,6 +14,7 @@ from xreset.description import DESCRIPTION, load_robot
 from xreset.errors import BackendUnavailableError, XResetError
 from xreset.geometry.urdf import RobotTree, find_mesh, robot_tree
 from xreset.plugins import robot_folder
+from xreset.robot_tools.sources import largest_moment
 from xreset.spec import Geometry, ObjectSpec, RobotSpec, SceneSpec, Shape, TableSpec
 
 Level = Literal["ok", "skipped", "warning", "error"]
@@ -235,6 +236,12 @@ def _inertias(tree: RobotTree) -> Iterator[tuple[Level, str]]:
                 f"{link.name!r} has the principal moments {_numbers(moments)} kg m^2: the largest exceeds the sum of the others, which no "
                 "solid body has.",
             )
+        elif link.collisions and moments[2] > (most := largest_moment(link)):
+            yield (
+                "warning",
+                f"{link.name!r} has a moment of {moments[2]:.3g} kg m^2; {link.mass:.3g} kg of its size can have {most:.2g} at most. Is it"
+                " a placeholder? `xreset robots import` replaces such.",
+            )
 
 
 # Physics ---------------------------------------------------------------------------------------------------------------------------------
@@ -258,7 +265,7 @@ def _drives(spec: RobotSpec) -> Iterator[tuple[Level, str]]:
             yield (
                 "warning",
                 f"{joint.name!r}: kd = {joint.drive.kd:g} is more than its inertia {inertia:.3g} bears at a step of 1/{1 / step:.0f} s; "
-                "engines that integrate drives explicitly become unstable. Lower kp and kd, or add the rotor's inertia to the link.",
+                "engines that integrate drives explicitly become unstable. Lower kp and kd, or state the rotor as the joint's armature.",
             )
 
 
@@ -277,7 +284,15 @@ def _frames(spec: RobotSpec) -> Iterator[tuple[Level, str]]:
     poses = Kinematics(spec).link_poses(torch.tensor(spec.home), spec.tracked_links).numpy()
     palm, tips = poses[0], poses[1:]
     ahead = (tips[:, :3, 3] - palm[:3, 3]).mean(axis=0) @ palm[:3, 0]
-    if ahead <= 0:
+    along = (tips[1:, :3, 3] - palm[:3, 3]).mean(axis=0) @ palm[:3, :3]
+    longest = int(np.abs(along).argmax())
+    if len(tips) > 1 and longest != 0:
+        axis = "-" * bool(along[longest] < 0) + "xyz"[longest]
+        yield (
+            "warning",
+            f"the fingers lie along {axis} of the palm {spec.palm!r}: its x should point towards them, z out of its inner side.",
+        )
+    elif ahead <= 0:
         yield "warning", f"the fingertips lie {-ahead:.3f} m behind the palm {spec.palm!r}: its x should point towards the fingers."
 
 

@@ -18,6 +18,8 @@ from xreset.spec import DriveSpec, Geometry, MimicSpec, Shape
 
 _DENSITY = 1000.0
 """[kg/m^3] Of links whose mass nobody states."""
+_ROTOR_AT_MOST = 0.01
+"""[kg m^2] Reflected inertia of a rotor that descriptions add to light links."""
 _TURNS = 2 * math.pi
 """[rad] Range in either direction of a joint without limits."""
 
@@ -171,16 +173,13 @@ def plausible(link: Link) -> bool:
     moments = np.linalg.eigvalsh(link.inertia)
     if moments[0] <= 0 or moments[2] > (moments[0] + moments[1]) * 1.001:
         return False
-    reach = reach_of(link)
-    return reach is None or moments[2] <= link.mass * (2 * reach) ** 2
+    return not link.collisions or float(moments[2]) <= largest_moment(link)
 
 
-def reach_of(link: Link) -> float | None:
-    """Distance of a link's farthest shape point from its centre of mass [m]; None without shapes."""
-    if not link.collisions:
-        return None
+def largest_moment(link: Link) -> float:
+    """[kg m^2] What a link's mass at twice its shapes' reach would have, and the rotor of a joint besides."""
     vertices, _ = surface_of(link.collisions)
-    return float(np.linalg.norm(vertices - link.com, axis=1).max())
+    return link.mass * (2 * float(np.linalg.norm(vertices - link.com, axis=1).max())) ** 2 + _ROTOR_AT_MOST
 
 
 # MJCF ------------------------------------------------------------------------------------------------------------------------------------

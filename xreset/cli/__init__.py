@@ -108,6 +108,8 @@ def _run(group: str, commands: dict[str, str], argv: list[str]) -> None:
     program, description = f"xreset{group} {name}", commands[name]
     if isinstance(command, dict):
         verbs = {verb: checked(function) for verb, function in command.items()}
+        two = " ".join(arguments[:2])  # a verb may have two words
+        arguments = [two, *arguments[2:]] if two in verbs else arguments
         tyro.extras.subcommand_cli_from_dict(verbs, prog=program, description=description, args=arguments)
     else:
         tyro.cli(checked(command), prog=program, description=description, args=arguments)

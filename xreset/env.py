@@ -376,23 +376,10 @@ class ManipulationEnv:
             drawn = self.resets.sample(self.backend.object_index, self.generator)
             for f in fields(Reset):
                 getattr(start, f.name).copy_(getattr(drawn, f.name))
-        friction = sample_friction(self.num_envs, self.task.randomization, self.generator)
-        mass = self._nominal_mass * sample_mass_scale(self.num_envs, self.task.randomization, self.generator)
-        random, n, generator = self.task.randomization, self.num_envs, self.generator
-        drawn_too = []
-        if self._drives is not None:
-            drawn_too.append((sample_drives(self.actions.is_arm, n, random, generator), self._drives))
-        if self._force_gain is not None:
-            drawn_too.append((sample_range(n, random.force_gain, generator).view(-1, 1, 1), self._force_gain))
-        for line, limits in ((self._commands, random.action_latency), (self._poses, random.observation_latency)):
-            if line is not None:
-                drawn_too.append((sample_range(n, limits, generator), line.delay))
         if self._commands is not None:
-            self._commands.fill(fresh, start.joint_pos)
+            self._commands.fill(fresh, start.joint_target)
         for new, old in (
-            *drawn_too,
-            (friction, self._friction),
-            (mass, self._mass),
+            *self._drawn_parameters(),
             (start.goal_pos, self.goal_pos),
             (start.goal_quat, self.goal_quat),
             (start.gravity_fraction, self.gravity_fraction),
@@ -403,6 +390,22 @@ class ManipulationEnv:
             old.copy_(torch.where(fresh.view(-1, *[1] * (old.ndim - 1)), new, old))
         for cleared in (self._episode_length, self._previous_action, self._reward, self._reached):
             cleared.masked_fill_(fresh.view(-1, *[1] * (cleared.ndim - 1)), 0)
+
+    def _drawn_parameters(self) -> list[tuple[Tensor, Tensor]]:
+        """What is drawn for every world beside its start [N, ...], and where it is kept."""
+        c, n, generator = self.task.randomization, self.num_envs, self.generator
+        drawn = [
+            (sample_friction(n, c, generator), self._friction),
+            (self._nominal_mass * sample_mass_scale(n, c, generator), self._mass),
+        ]
+        if self._drives is not None:
+            drawn.append((sample_drives(self.actions.is_arm, n, c, generator), self._drives))
+        if self._force_gain is not None:
+            drawn.append((sample_range(n, c.force_gain, generator).view(-1, 1, 1), self._force_gain))
+        for line, limits in ((self._commands, c.action_latency), (self._poses, c.observation_latency)):
+            if line is not None:
+                drawn.append((sample_range(n, limits, generator), line.delay))
+        return drawn
 
     def _begin(self) -> None:
         """Put the fresh worlds into their new states."""

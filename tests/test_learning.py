@@ -237,7 +237,9 @@ class ExportTest(unittest.TestCase):
         cls.model = make_model()
         cls.model.update_normalization(observations(50, seed=9))
         task = TaskConfig(observation=ObservationConfig(cloud_points=10))
-        export_onnx(cls.model, cls.file, policy_contract(robots.load("openarm"), task, ()))
+        widths = {"policy": {"all": 7}, "proprio": {"all": 9}, "perception": {"cloud": 5 * 10 * 3}}  # of observations()
+        contract = policy_contract(robots.load("openarm"), task, ()) | {"observation_layout": widths, "joint_names": list("abcde")}
+        export_onnx(cls.model, cls.file, contract)
 
     def test_exported_equals_eager_over_50_steps(self):
         policy = OnnxPolicy(self.file)

@@ -77,8 +77,8 @@ class ShippedPolicyTest(unittest.TestCase):
                     demos = Path(folder) / "demos.npz"
                     write_demos(demos, synthesize(OnnxPolicy(file).contract["objects"][:1], 2))
                     (result,) = evaluate(resolve(name, None, 0), [engine("mujoco")], demos, Setting(num_envs=2), Path(folder), episodes=1)
-                self.assertEqual(result["episodes"], 2)
-                self.assertGreaterEqual(result["task_progress"]["mean"], FLOOR)
+                self.assertEqual(result.episodes, 2)
+                self.assertGreaterEqual(result.task_progress.mean, FLOOR)
 
 
 if __name__ == "__main__":

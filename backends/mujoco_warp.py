@@ -257,13 +257,12 @@ class MujocoWarpBackend(Backend):
 
     def _scaled_drives(self, scale: Tensor) -> dict[tuple[str, int], Tensor]:
         """Field and column of the model -> its values [M, J] for factors [M, 3, J] on stiffness, damping and effort limit."""
-        factors = {"actuator_gainprm": (0,), "actuator_biasprm": (0, 1), "actuator_forcerange": (2, 2)}
-        first = {"actuator_gainprm": 0, "actuator_biasprm": 1, "actuator_forcerange": 0}
-        return {
-            (field, first[field] + i): scale[:, row] * self._nominal[field][:, first[field] + i]
-            for field, rows in factors.items()
-            for i, row in enumerate(rows)
-        }
+        stiffness, damping, effort = scale.unbind(1)
+        factors = {
+            ("actuator_gainprm", 0): stiffness, ("actuator_biasprm", 1): stiffness, ("actuator_biasprm", 2): damping,
+            ("actuator_forcerange", 0): effort, ("actuator_forcerange", 1): effort,
+        }  # fmt: skip
+        return {(field, column): factor * self._nominal[field][:, column] for (field, column), factor in factors.items()}
 
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         """See :meth:`Backend.set_object_wrench`."""

@@ -10,6 +10,7 @@ from unittest import mock
 
 import numpy as np
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
@@ -17,6 +18,7 @@ from xreset.env import ManipulationEnv, make_scene
 from xreset.eval.rollout import roll_out
 from xreset.eval.trial import Engine, Trial
 from xreset.geometry.rotations import quat_rotate
+from xreset.learning.recipes import RECIPES
 from xreset.objects import keypoints, load_objects
 from xreset.physics import State
 from xreset.policy import ZeroPolicy
@@ -67,6 +69,23 @@ class BreakableBackend(MujocoBackend):
     def health(self):
         health = super().health()
         return replace(health, nonfinite=health.nonfinite | self.broken)
+
+
+class Waiting(TorchDispatchMode):
+    """Takes note of operations whose result decides what the host does next: a number read, a number of rows that depends on values."""
+
+    NAMES = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "is_nonzero")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.operations, self.found = 0, []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.operations += 1
+        indices = args[1] if "index" in str(func) and len(args) > 1 and isinstance(args[1], (list, tuple)) else ()
+        if any(name in str(func) for name in self.NAMES) or any(isinstance(i, torch.Tensor) and i.dtype == torch.bool for i in indices):
+            self.found.append(str(func))
+        return func(*args, **(kwargs or {}))
 
 
 class WithEnv(unittest.TestCase):
@@ -314,6 +333,20 @@ class RobustnessTest(WithEnv):
             (one, *_), (two, *_) = env.step(action), other.step(action)
         torch.testing.assert_close(one["policy"], two["policy"], atol=1e-4, rtol=0)
         torch.testing.assert_close(env._drives, other._drives)
+
+    def test_a_step_with_all_of_it_never_waits_for_the_device(self):
+        """As on a GPU, where any of these operations would stop the host until the device is done, and could not be captured."""
+        task = RECIPES["robust"].config.task
+        env = self.make(task)
+        waiting = Waiting()
+        with mock.patch.object(env._graphs, "active", True), mock.patch.object(env._graphs, "run", lambda part: part()):
+            with mock.patch.object(env.backend, "set_where"), waiting:
+                env.step(self.actions(1)[0])
+            self.assertGreater(waiting.operations, 500)
+            self.assertEqual(waiting.found, [])
+            with waiting:
+                env.step(self.actions(1)[0])  # an engine on the CPU asks which worlds begin anew: that must show
+            self.assertEqual(waiting.found, ["aten.nonzero.default"])
 
 
 class FailureTest(WithEnv):

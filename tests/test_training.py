@@ -11,7 +11,7 @@ import threading
 import time
 import unittest
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from unittest import mock
@@ -26,12 +26,13 @@ from xreset.cli import main
 from xreset.errors import BackendUnavailableError, FileFormatError, PolicyError, RunError, XResetError
 from xreset.files import claim, file_hash
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
+from xreset.learning.recipes import RECIPES
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt, read_checkpoint
 from xreset.learning.train import ensure_policy, load_inputs, resumed, start_run, train
 from xreset.policy import OnnxPolicy, check_contract
 from xreset.resets.bank import write_bank
-from xreset.task.config import ObservationConfig, TaskConfig
+from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfig
 
 try:
     import xreset.backends.mujoco  # noqa: F401
@@ -199,6 +200,13 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual(parsed(), TrainConfig())
         minutes = parsed("--like", "minutes", "--config.ppo.entropy", "0.001")
         self.assertEqual((minutes.ppo.desired_kl, minutes.ppo.entropy, minutes.model.initial_std), (0.02, 0.001, 0.3))
+        robust = parsed("--like", "robust")
+        self.assertEqual(replace(robust, task=replace(robust.task, randomization=RandomizationConfig())), RECIPES["minutes"].config)
+        random = robust.task.randomization
+        for f in fields(RandomizationConfig):  # all that is off by default is on
+            if getattr(RandomizationConfig(), f.name) in (None, (0.0, 0.0), (1.0, 1.0)):
+                low, high = getattr(random, f.name)
+                self.assertLess(low, high, f.name)
         self.assertEqual(parsed(f"--like={self.out}", "--config.save-interval", "7"), replace(CONFIG, save_interval=7))
         for arguments, problem in (
             (("--like", "nothing"), "no recipe and no run folder 'nothing'. Recipes: paper, the paper's tables .*; minutes, what taught"),

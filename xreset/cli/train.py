@@ -41,7 +41,7 @@ def train(
             Compiling kernels is not counted.
         seed: Seed of every random number.
         resume: Continue the run in --out from its newest checkpoint.
-        like: Where the configuration starts from: a recipe (paper, minutes) or another run's folder. Flags change what they name.
+        like: Where the configuration starts from: a recipe (paper, minutes, robust) or another run's folder. Flags change what they name.
         weights: Another run's folder: begin with the networks of its newest checkpoint, and not with new ones; with their standard
             deviation and, where it adapts, their learning rate.
         config: Task, model and algorithm. The defaults shown are those of --like.

@@ -103,12 +103,13 @@ def draw_clip(engine: str, episode: Episode, trace: Trace, robot: RobotSpec, obj
     return Clip(engine=engine, episode=episode, frames=frames, fps=1.0 / (every * interval), finite=bool(sound.all()))
 
 
-def encode_mp4(frames: np.ndarray, fps: float) -> bytes:
+def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) -> bytes:
     """H.264 in an mp4 file that every browser plays.
 
     Args:
         frames: [T, H, W, 3] uint8 with even H and W.
         fps: frames per second.
+        keyframes: how many frames lie between two that can be shown without others; None: the encoder's choice.
 
     Raises:
         XResetError: the encoder is not installed or fails.
@@ -120,6 +121,7 @@ def encode_mp4(frames: np.ndarray, fps: float) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "clip.mp4"
         settings = ["-crf", "24", "-preset", "veryfast", "-movflags", "+faststart", "-threads", "1", "-bitexact"]
+        settings += [] if keyframes is None else ["-g", str(keyframes)]
         writer = imageio_ffmpeg.write_frames(  # its annotations are narrower than what it takes
             str(path),
             frames.shape[2:0:-1],

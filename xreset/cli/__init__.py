@@ -26,6 +26,7 @@ COMMANDS: dict[str, str] = {
     "stress": "Tell what a policy bears: stiffness, latency, friction and more, swept one at a time.",
     "compare": "Put several trainings side by side: curves, results in every engine, and what differs between them.",
     "study": "Run a study: trainings by object and seed, evaluations, and tables beside the paper's.",
+    "export": "Write evaluation episodes as a LeRobot data set, or as plain arrays.",
     "report": "Make a self-contained HTML page of a run's evaluations.",
 }
 """Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``, a function or a dictionary of sub-commands; or ``command_for``,

@@ -1,0 +1,149 @@
+"""Episodes for others: a LeRobot data set, which that package reads back, and plain arrays."""
+
+import importlib.util
+import json
+import tempfile
+import unittest
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from tests.toy_results import toy_rollouts, toy_summary
+from xreset.description import load_robot
+from xreset.errors import FileFormatError, RunError, XResetError
+from xreset.eval.export import read_recorded, write_arrays, write_lerobot
+from xreset.eval.results import write_results
+
+PARQUET = importlib.util.find_spec("pyarrow") is not None
+FILMS = PARQUET and importlib.util.find_spec("imageio_ffmpeg") is not None
+LEROBOT = importlib.util.find_spec("lerobot") is not None
+
+
+class Case(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.robot = load_robot("ur7e-sharpa")
+
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name)
+
+    def evaluate(self, name="eval", engines=("mujoco", "sapien"), change=lambda rollouts: rollouts):
+        rollouts = change(toy_rollouts(np.array([joint.home for joint in self.robot.joints])))
+        for engine in engines:
+            write_results(self.folder / name, toy_summary(engine, rollouts, robot="ur7e-sharpa"), rollouts, self.robot.joint_names)
+        return self.folder / name
+
+    def change_first(self, **changes):
+        return lambda rollouts: replace(rollouts, traces=(replace(rollouts.traces[0], **changes), *rollouts.traces[1:]))
+
+
+class Episodes(Case):
+    def test_states_with_the_action_that_is_in_force_before_the_next(self):
+        recording = read_recorded([self.evaluate()])
+        self.assertEqual(recording.fps, 20.0)
+        self.assertEqual([e.engine for e in recording.episodes], ["mujoco", "mujoco", "sapien", "sapien"])
+        np.testing.assert_array_equal(recording.offsets, [0, 5, 10, 15, 20])
+        steps = (recording.episodes[0].action - recording.robot.home)[:, 0] / 0.01  # 12 control steps between 5 states
+        np.testing.assert_allclose(steps, [2, 5, 8, 11, 11], atol=1e-4)
+        self.assertEqual(recording.episodes[0].task, "Grasp the tomato soup can and bring it to the goal pose.")
+        self.assertEqual([e.episode.repetition for e in recording.episodes], [0] * 4)
+
+    def test_only_some_engines_of_several_folders(self):
+        folders = [self.evaluate("a"), self.evaluate("b")]
+        self.assertEqual(len(read_recorded(folders, backends=["sapien"]).episodes), 4)
+        with self.assertRaisesRegex(RunError, "no recorded episodes of pybullet"):
+            read_recorded(folders, backends=["pybullet"])
+
+    def test_an_episode_ends_where_its_engine_broke_down(self):
+        broken = toy_rollouts(self.robot.home).traces[0].object_pos.copy()
+        broken[3:] = np.nan
+        with self.assertLogs("xreset.eval.export.recorded", "WARNING") as log:
+            recording = read_recorded([self.evaluate(change=self.change_first(object_pos=broken))], backends=["mujoco"])
+        self.assertIn("ends at 0.10 s", log.output[0])
+        self.assertEqual([len(e.action) for e in recording.episodes], [3, 5])
+
+    def test_refusals(self):
+        without = self.evaluate("without", change=lambda r: replace(r, traces=tuple(replace(t, joint_target=None) for t in r.traces)))
+        with self.assertRaisesRegex(FileFormatError, "without the actions"):
+            read_recorded([without])
+        slower = self.evaluate("slower", change=lambda r: replace(r, traces=tuple(replace(t, time=2 * t.time) for t in r.traces)))
+        with self.assertRaisesRegex(RunError, "different rates.*20 in.*10 in"):
+            read_recorded([self.evaluate(), slower])
+        with self.assertRaisesRegex(RunError, "no folder"):
+            read_recorded([self.folder / "nowhere"])
+
+
+class Arrays(Case):
+    def test_every_array_of_the_documentation(self):
+        recording = read_recorded([self.evaluate()])
+        write_arrays(self.folder / "out.npz", recording)
+        with np.load(self.folder / "out.npz") as file:
+            arrays = dict(file)
+        page = (Path(__file__).parents[1] / "docs/rollouts.md").read_text().split("## npz")[1]
+        documented = {name for line in page.splitlines() if line.startswith("| `") for name in line.split("|")[1].split("`")[1::2]}
+        self.assertEqual(documented, set(arrays) - {"meta"})
+        self.assertEqual(str(arrays["schema"]), "xreset-rollouts/1")
+        self.assertEqual(arrays["joint_pos"].shape, (20, len(self.robot.joints)))
+        np.testing.assert_allclose(arrays["object_pos"][5:10], recording.episodes[1].trace.object_pos, atol=1e-7)
+        self.assertEqual(arrays["engine"].tolist(), ["mujoco", "mujoco", "sapien", "sapien"])
+        self.assertEqual(arrays["success"].tolist(), [True, False, True, False])
+
+
+@unittest.skipUnless(PARQUET, "pyarrow is not installed")
+class LeRobot(Case):
+    def test_meta_agrees_with_the_data(self):
+        import pyarrow.parquet as parquet
+
+        recording = read_recorded([self.evaluate()])
+        root = self.folder / "set"
+        write_lerobot(root, recording, video=False)
+        info = json.loads((root / "meta/info.json").read_text())
+        self.assertEqual((info["codebase_version"], info["fps"], info["total_frames"]), ("v3.0", 20, 20))
+        data = parquet.read_table(root / info["data_path"].format(chunk_index=0, file_index=0)).to_pydict()
+        self.assertEqual(set(data), set(info["features"]))
+        self.assertEqual(data["index"], list(range(20)))
+        np.testing.assert_allclose(data["action"][5], recording.episodes[1].action[0], rtol=1e-6)
+        np.testing.assert_allclose(data["observation.environment_state"][19][7:], [0.5, 0.35, 0.15, 1, 0, 0, 0], rtol=1e-6)
+        stats = json.loads((root / "meta/stats.json").read_text())
+        np.testing.assert_allclose(stats["action"]["mean"], np.mean(data["action"], axis=0), rtol=1e-6)
+        episodes = parquet.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+        self.assertEqual([(e["dataset_from_index"], e["dataset_to_index"]) for e in episodes], [(0, 5), (5, 10), (10, 15), (15, 20)])
+        self.assertEqual([(e["engine"], e["success"]) for e in episodes][1:3], [("mujoco", False), ("sapien", True)])
+        self.assertEqual([p.name for p in self.folder.iterdir() if p.name.startswith(".")], [])
+
+    def test_refuses_without_a_trace(self):
+        recording = read_recorded([self.evaluate()])
+        for words, options in (("is there already", {"folder": self.folder / "eval"}), ("must be even", {"size": (321, 240)})):
+            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
+                write_lerobot(options.pop("folder", self.folder / "set"), recording, **options)
+        lost = replace(recording, episodes=(replace(recording.episodes[0], objects=self.folder / "nowhere"),))
+        with self.assertRaisesRegex(XResetError, "no folder"):
+            write_lerobot(self.folder / "set", lost)
+        self.assertEqual([p.name for p in self.folder.iterdir()], ["eval"])
+
+    @unittest.skipUnless(LEROBOT and FILMS, "the package lerobot is not installed")
+    def test_the_package_reads_it_back(self):
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset  # pyright: ignore[reportMissingImports]
+
+        recording = read_recorded([self.evaluate()], backends=["sapien"])
+        root = self.folder / "set"
+        write_lerobot(root, recording, size=(64, 48))
+        found = LeRobotDataset("xreset/test", root=root, delta_timestamps={"action": [0.0, 0.05]}, video_backend="pyav")
+        self.assertEqual((found.num_episodes, found.num_frames, found.fps), (2, 10, 20))
+        for i in range(10):
+            item, (episode, frame) = found[i], divmod(i, 5)
+            expected = recording.episodes[episode]
+            np.testing.assert_allclose(item["observation.state"], expected.trace.joint_pos[frame], atol=1e-6)
+            np.testing.assert_allclose(item["action"][0], expected.action[frame], atol=1e-6)
+            np.testing.assert_allclose(item["action"][1], expected.action[min(frame + 1, 4)], atol=1e-6)
+            np.testing.assert_allclose(item["observation.environment_state"][:3], expected.trace.object_pos[frame], atol=1e-6)
+            self.assertEqual((item["task"], item["engine"]), (expected.task, "sapien"))
+            self.assertEqual(tuple(item["observation.images.front"].shape), (3, 48, 64))
+        self.assertEqual(set(found.meta.stats), set(found.meta.features) - {"engine"})
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,91 @@
+"""``xreset export``: lerobot, npz."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from xreset.eval.export import Recording
+
+Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
+Backends = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+
+
+def lerobot(
+    folders: Folders,
+    *,
+    out: Path,
+    backend: Backends = (),
+    robot: str | None = None,
+    objects: Path | None = None,
+    task: str | None = None,
+    video: bool = True,
+    size: tuple[int, int] = (320, 240),
+) -> None:
+    """Write recorded evaluation episodes as a LeRobot data set (v3.0): the first episode of each demonstration and engine.
+
+    Args:
+        folders: Run folders, or folders that xreset eval wrote into.
+        out: Folder to write; must not exist.
+        backend: Only of this engine; give it again for more. Default: all.
+        robot: Name or folder of the robot; default: as the results name it.
+        objects: Folder of meshes; default: as the results name it.
+        task: The task in words; {object} stands for the object's name.
+        video: Draw a film of each episode.
+        size: Width and height of the films, pixels.
+    """
+    from xreset.cli._terminal import Console, Progress
+    from xreset.eval.export import write_lerobot
+
+    recording = _recording(folders, backend, robot, objects, task)
+    with Progress(Console(stderr=True)) as bar:
+        item = bar.add_task("writing episodes", total=None)
+        write_lerobot(out, recording, video=video, size=size, progress=lambda done, total: bar.update(item, completed=done, total=total))
+    _say(recording, out)
+
+
+def npz(folders: Folders, *, out: Path, backend: Backends = (), robot: str | None = None, task: str | None = None) -> None:
+    """Write recorded evaluation episodes as plain arrays in one npz file (docs/rollouts.md has the schema).
+
+    Args:
+        folders: Run folders, or folders that xreset eval wrote into.
+        out: File to write.
+        backend: Only of this engine; give it again for more. Default: all.
+        robot: Name or folder of the robot; default: as the results name it.
+        task: The task in words; {object} stands for the object's name.
+    """
+    from xreset.eval.export import write_arrays
+
+    recording = _recording(folders, backend, robot, None, task)
+    write_arrays(out, recording)
+    _say(recording, out)
+
+
+def _recording(
+    folders: tuple[Path, ...], backends: tuple[str, ...], robot: str | None, objects: Path | None, task: str | None
+) -> Recording:
+    from xreset.errors import RunError
+    from xreset.eval.export import read_recorded
+    from xreset.eval.export.recorded import TASK
+
+    if not folders:
+        raise RunError("give a run folder, or a folder that xreset eval wrote into.")
+    return read_recorded(folders, backends=backends, robot=robot, objects=objects, task=task or TASK)
+
+
+def _say(recording: Recording, out: Path) -> None:
+    from xreset.cli._terminal import Console
+
+    engines = ", ".join(dict.fromkeys(e.engine for e in recording.episodes))
+    Console().print(
+        f"{out}: {len(recording.episodes)} episodes of {recording.robot.name} in {engines},"
+        f" {recording.offsets[-1]} frames at {recording.fps:g} per second",
+        soft_wrap=True,
+        highlight=False,
+    )
+
+
+COMMAND = {"lerobot": lerobot, "npz": npz}

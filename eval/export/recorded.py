@@ -129,7 +129,7 @@ def _actions(trace: Trace, results: Path, engine: str) -> np.ndarray:
 
 def _finite(whole: Recorded, results: Path) -> list[Recorded]:
     trace = whole.trace
-    sound = np.isfinite(np.concatenate((trace.joint_pos, trace.object_pos, trace.object_quat, whole.action), axis=1)).all(axis=1)
+    sound = np.isfinite(np.concatenate((trace.joint_pos, trace.object_pos, trace.object_quat, whole.action), axis=1)).min(axis=1)
     last = len(sound) if sound.all() else int(np.argmin(sound))
     if last == len(sound):
         return [whole]

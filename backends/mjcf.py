@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import mujoco
@@ -182,6 +182,7 @@ def compile_scene(
     except ValueError as error:
         thing = scene.objects[object_index].name
         raise XResetError(f"MuJoCo refuses the robot {scene.robot.name!r} with the object {thing!r}: {error}") from error
+    _let_com_move(model, model.body("object").id)
     model.body_gravcomp[model.body("object").id] = 0.0
     return _locate(robot, model, roles, parked, sensed)
 
@@ -352,7 +353,8 @@ def _add_object(spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Se
         slots |= Counter(piece.geometry.kind for piece in scene.objects[i].pieces)  # the larger of the two counts
 
     body = spec.worldbody.add_body(name="object", gravcomp=1.0, explicitinertial=True)  # MuJoCo ignores it unless it is set while compiling
-    _set_inertia(body, object_inertia(thing))
+    inertia = object_inertia(thing)
+    _set_inertia(body, replace(inertia, com=inertia.com + _ASIDE))
     body.add_joint(name="object", type=mujoco.mjtJoint.mjJNT_FREE, align=mujoco.mjtAlignFree.mjALIGNFREE_FALSE)
     parked = set()
     common = {"contype": _HIT_OBJECT, "conaffinity": 0, **_contact(0.0, scene, settings)}
@@ -379,6 +381,20 @@ def _add_hulls(spec: mujoco.MjSpec, thing: ObjectSpec, index: int) -> list[str]:
         raise ObjectError(f"object {thing.name!r} has no collision piece; it needs at least one.")
     hulls = [piece.geometry for piece in thing.pieces if piece.geometry.kind == "hull"]
     return [_add_mesh(spec, f"object/{index}/{i}", hull) for i, hull in enumerate(hulls)]
+
+
+_ASIDE = np.full(3, 1e-3)
+"""[m] by which the object's centre of mass is beside its place while MuJoCo compiles."""
+
+
+def _let_com_move(model: mujoco.MjModel, body: int) -> None:
+    """Put the object's centre of mass into its place.
+
+    Where MuJoCo finds it in the body's origin, it makes the mass matrix diagonal for good, and reads its position no more.
+    """
+    model.body_ipos[body] -= _ASIDE
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    model.body_sameframe[body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
 # Shapes --------------------------------------------------------------------------------------------------------------------------------

@@ -68,6 +68,7 @@ class MujocoWorld(World):
         self._sum_by_tip = -(self._at.sensed_tip == np.arange(links - 1)[:, None]).astype(np.float64)  # minus: of the tip on the object
         self._full = [data.warning[int(kind)] for kind in _FULL]
         self._ones = np.ones(len(data.qpos)), np.ones(len(data.qvel))
+        self._mass_ratio = self._inertia_scale = 1.0
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """See :meth:`World.set_state`."""
@@ -144,20 +145,39 @@ class MujocoWorld(World):
 
     def set_object_mass(self, mass: float) -> None:
         """See :meth:`World.set_object_mass`."""
-        at, model, nominal = self._at, self._model, self._at.model
-        body, dofs = at.object_body, slice(at.object_dof, at.object_dof + 6)
-        ratio = mass / nominal.body_mass[body]
+        body, model, nominal = self._at.object_body, self._model, self._at.model
         model.body_mass[body] = model.body_subtreemass[body] = mass
         model.body_subtreemass[0] = nominal.body_subtreemass[0] + mass - nominal.body_mass[body]
-        model.body_inertia[body] = ratio * nominal.body_inertia[body]
-        model.body_invweight0[body] = nominal.body_invweight0[body] / ratio  # of a free body: the inverse of mass and inertia
-        model.dof_invweight0[dofs] = nominal.dof_invweight0[dofs] / ratio
+        self._mass_ratio = mass / nominal.body_mass[body]
+        self._weigh_object()
+
+    def set_object_inertia(self, scale: float) -> None:
+        """See :meth:`World.set_object_inertia`."""
+        self._inertia_scale = scale
+        self._weigh_object()
+
+    def _weigh_object(self) -> None:
+        """What follows from the object's mass and inertia; of a free body, the solver's weights are the inverse of either."""
+        body, model, nominal = self._at.object_body, self._model, self._at.model
+        turning = self._mass_ratio * self._inertia_scale
+        model.body_inertia[body] = turning * nominal.body_inertia[body]
+        model.body_invweight0[body] = nominal.body_invweight0[body] / (self._mass_ratio, turning)
+        self._ahead = False
+
+    def set_object_com(self, offset: np.ndarray) -> None:
+        """See :meth:`World.set_object_com`."""
+        self._model.body_ipos[self._at.object_body] = self._at.model.body_ipos[self._at.object_body] + offset
         self._ahead = False
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
         pairs = np.maximum((*friction, 0.0), MIN_FRICTION)
         self._model.geom_friction[:, 0] = pairs[self._at.friction_column]
+        self._ahead = False
+
+    def set_torsional_friction(self, torsional: float) -> None:
+        """See :meth:`World.set_torsional_friction`."""
+        self._model.geom_friction[:, 1] = torsional
         self._ahead = False
 
     def set_object_gravity(self, fraction: float) -> None:

@@ -16,7 +16,19 @@ from torch import Tensor
 from xreset.backends.pool import initial_state
 from xreset.errors import BackendUnavailableError, XResetError
 from xreset.geometry.rotations import quat_to_matrix
-from xreset.physics import Backend, Capability, Contacts, Health, KnownDifference, Links, MassProperties, State, unavailable
+from xreset.physics import (
+    Backend,
+    Capability,
+    Contacts,
+    Health,
+    KnownDifference,
+    Links,
+    MassProperties,
+    Parameter,
+    Parameters,
+    State,
+    unavailable,
+)
 from xreset.spec import SceneSpec
 
 try:
@@ -33,7 +45,7 @@ _WRONG_DEPTHS = ("4.0.0",)
 unread; ``tests/test_mujoco_warp_depth.py`` says whether they need it too."""
 
 _SET_PER_WORLD = (
-    "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "body_gravcomp", "geom_friction",
+    "body_mass", "body_inertia", "body_ipos", "body_subtreemass", "body_invweight0", "body_gravcomp", "geom_friction",
     "actuator_gainprm", "actuator_biasprm", "actuator_forcerange",
 )  # fmt: skip
 """Model fields that the setters change: they and all that MuJoCo derives from them must be batched, or every world gets world 0's."""
@@ -98,7 +110,7 @@ class MujocoWarpBackend(Backend):
         self._streams: dict[int, Any] = {}
         held = self.object_index.unique().tolist()
         scenes = {i: compile_scene(scene, i, slots_for=held, settings=settings or MujocoSettings()) for i in held}
-        at = max(scenes.values(), key=lambda s: s.model.nC)  # the mass matrix with the fullest structure has room for every object's
+        at = next(iter(scenes.values()))
         at.model.opt.iterations = solver_iterations
         self._at = at
         with self._on_stream():
@@ -182,28 +194,16 @@ class MujocoWarpBackend(Backend):
         self._must_be_open()
         return Health(nonfinite=self._nonfinite, overflow=(self._overflow & _OVERFLOW) != 0)
 
-    def set_where(
-        self,
-        mask: Tensor,
-        *,
-        state: State,
-        friction: Tensor,
-        object_mass: Tensor,
-        object_gravity: Tensor,
-        drives: Tensor | None = None,
-    ) -> None:
+    def set_where(self, mask: Tensor, state: State, parameters: Parameters) -> None:
         """See :meth:`Backend.set_where`: a few copies and one graph."""
         self._must_be_open()
-        if drives is not None:
-            scaled = self._scaled_drives(self._rows(drives, (self.num_worlds, 3, self._ctrl.shape[1])))
-            for (field, column), value in scaled.items():
-                present = self._field[field][:, :, column]
-                present.copy_(torch.where(mask[:, None], value, present))
-        self._coming["mask"].copy_(mask)
+        self._mask.copy_(mask)
+        for name, value in parameters.given().items():
+            present = self._parameters[name]
+            mine = self._mask.view(-1, *[1] * (present.ndim - 1))
+            torch.where(mine, self._rows(value, present.shape), present, out=present)
         for f in fields(State):
             self._coming[f.name].copy_(self._checked(f.name, getattr(state, f.name), self.num_worlds))
-        for name, value in (("friction", friction), ("mass", object_mass), ("gravity", object_gravity)):
-            self._coming[name].copy_(self._rows(value, self._coming[name].shape))
         with self._on_stream():
             self._run("begin")
 
@@ -220,49 +220,43 @@ class MujocoWarpBackend(Backend):
 
     # Physical parameters ---------------------------------------------------------------------------------------------------------
 
-    def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_mass`."""
-        index = self._selected(worlds)
-        nominal = {name: value[index] for name, value in self._nominal.items()}
-        mass = self._rows(mass, nominal["mass"].shape)
-        ratio = (mass / nominal["mass"])[:, None]
-        body, dofs = self._at.object_body, slice(self._at.object_dof, self._at.object_dof + 6)
-        view = self._field
-        view["body_mass"][index, body] = mass
-        view["body_inertia"][index, body] = nominal["inertia"] * ratio
-        view["body_subtreemass"][index, body] = mass
-        view["body_subtreemass"][index, 0] = nominal["total_mass"] + mass - nominal["mass"]
-        view["body_invweight0"][index, body] = nominal["body_invweight"] / ratio  # of a free body: the inverse of mass and inertia
-        view["dof_invweight0"][index, dofs] = nominal["dof_invweight"] / ratio
-
     def set_friction(self, friction: Tensor, worlds: Tensor | None = None) -> None:
         """See :meth:`Backend.set_friction`."""
-        index = self._selected(worlds)
-        friction = self._rows(friction, (len(self._nominal["mass"][index]), 3))
-        pairs = torch.nn.functional.pad(friction, (0, 1)).clamp_min(MIN_FRICTION)
-        self._field["geom_friction"][index, :, 0] = pairs[:, self._friction_column]
+        self._set("friction", friction, worlds)
+
+    def set_torsional_friction(self, torsional: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_torsional_friction`."""
+        self._set("torsional_friction", torsional, worlds)
+
+    def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_object_mass`."""
+        self._set("object_mass", mass, worlds)
+
+    def set_object_inertia(self, scale: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_object_inertia`."""
+        self._set("object_inertia", scale, worlds)
+
+    def set_object_com(self, offset: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_object_com`."""
+        self._set("object_com", offset, worlds)
 
     def set_object_gravity(self, fraction: Tensor, worlds: Tensor | None = None) -> None:
         """See :meth:`Backend.set_object_gravity`."""
-        index = self._selected(worlds)
-        fraction = self._rows(fraction, self._nominal["mass"][index].shape)
-        self._field["body_gravcomp"][index, self._at.object_body] = 1.0 - fraction
+        self._set("object_gravity", fraction, worlds)
 
     def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
         """See :meth:`Backend.set_drives`."""
-        index = self._selected(worlds)
-        scale = self._rows(scale, (len(self._nominal["mass"][index]), 3, self._ctrl.shape[1]))
-        for (field, column), value in self._scaled_drives(scale).items():
-            self._field[field][index, :, column] = value
+        self._set("drives", scale, worlds)
 
-    def _scaled_drives(self, scale: Tensor) -> dict[tuple[str, int], Tensor]:
-        """Field and column of the model -> its values [M, J] for factors [M, 3, J] on stiffness, damping and effort limit."""
-        stiffness, damping, effort = scale.unbind(1)
-        factors = {
-            ("actuator_gainprm", 0): stiffness, ("actuator_biasprm", 1): stiffness, ("actuator_biasprm", 2): damping,
-            ("actuator_forcerange", 0): effort, ("actuator_forcerange", 1): effort,
-        }  # fmt: skip
-        return {(field, column): factor * self._nominal[field][:, column] for (field, column), factor in factors.items()}
+    def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
+        self._must_be_open()
+        index = self._every_world if worlds is None else torch.as_tensor(worlds, dtype=torch.int64, device=self.device)
+        present = self._parameters[name]
+        present[index] = self._rows(value, (len(index), *present.shape[1:]))
+        self._mask.zero_()
+        self._mask[index] = True
+        with self._on_stream():
+            self._run("parameters")
 
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         """See :meth:`Backend.set_object_wrench`."""
@@ -335,21 +329,34 @@ class MujocoWarpBackend(Backend):
         self._contacts = Contacts(tip_force=view["tip_force"], tip_touch=view["tip_touch"], table_force=view["table_force"])
         self._every_world = torch.arange(n, device=self.device)
         self._everything = torch.ones(n, dtype=torch.bool, device=self.device)
+        self._mask = torch.zeros_like(self._everything)
         self._coming = {f.name: torch.zeros_like(getattr(self._state, f.name)) for f in fields(State)}
-        self._coming |= {"mask": torch.zeros_like(self._everything), "friction": torch.ones(n, 3, device=self.device)}
-        self._coming |= {name: torch.ones(n, device=self.device) for name in ("mass", "gravity")}
         self._coming["object_quat"][:, 0] = 1.0
-        self._field = {name: wp.to_torch(getattr(self._model, name)) for name in _SET_PER_WORLD}
-        self._friction_column = torch.as_tensor(at.friction_column, device=self.device)
-        body, dofs = at.object_body, slice(at.object_dof, at.object_dof + 6)
-        self._nominal = {
-            "mass": self._field["body_mass"][:, body].clone(),
-            "inertia": self._field["body_inertia"][:, body].clone(),
-            "total_mass": self._field["body_subtreemass"][:, 0].clone(),
-            "body_invweight": self._field["body_invweight0"][:, body].clone(),
-            "dof_invweight": self._field["dof_invweight0"][:, dofs].clone(),
-            **{name: self._field[name][0].clone() for name in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")},
+        field, body = {name: wp.to_torch(getattr(self._model, name)) for name in _SET_PER_WORLD}, at.object_body
+        self._drive_fields = [wp.from_torch(field[f"actuator_{name}"]) for name in ("gainprm", "biasprm", "forcerange")]
+        gain, bias, force_range = (field[f"actuator_{name}"][0] for name in ("gainprm", "biasprm", "forcerange"))
+        nominal = {
+            "mass": field["body_mass"][:, body],
+            "inertia": field["body_inertia"][:, body],
+            "com": field["body_ipos"][:, body],
+            "total": field["body_subtreemass"][:, 0],
+            "invweight": field["body_invweight0"][:, body],
+            "drive": torch.stack((gain[:, 0], -bias[:, 2], force_range[:, 1]), dim=1),  # stiffness, damping, effort limit
         }
+        self._nominal = {name: value.clone() for name, value in nominal.items()}
+        friction = self.scene.friction
+        pairs = torch.tensor([friction.tip, friction.link, friction.table], device=self.device)
+        one = torch.ones(n, device=self.device)
+        self._parameters: dict[Parameter, Tensor] = {
+            "friction": pairs.repeat(n, 1),
+            "torsional_friction": friction.torsional * one,
+            "object_mass": self._nominal["mass"].clone(),
+            "object_inertia": one.clone(),
+            "object_com": torch.zeros_like(self._nominal["com"]),
+            "object_gravity": one.clone(),
+            "drives": torch.ones(n, 3, joints, device=self.device),
+        }
+        """What each world has now."""
 
     def _prepare(self) -> None:
         """Run each sequence of kernels once, which compiles it, then capture it as a graph: even on the CPU that saves most of the time."""
@@ -358,6 +365,7 @@ class MujocoWarpBackend(Backend):
             "contacts": self._read_contacts,
             "refresh": self._refresh,
             "begin": self._begin,
+            "parameters": self._write_parameters,
         }
         for sequence in sequences.values():
             sequence()
@@ -419,24 +427,26 @@ class MujocoWarpBackend(Backend):
         )
 
     def _begin(self) -> None:
-        """Give the worlds of a mask what is coming to them."""
-        new, m, nominal, at = self._coming, self._model, self._nominal, self._at
-        self._write_state(self._every_world, new["mask"], new)
+        """Give the worlds of the mask what is coming to them."""
+        self._write_state(self._every_world, self._mask, self._coming)
+        self._write_parameters()
+        self._refresh()
+
+    def _write_parameters(self) -> None:
+        """Have the engine take over the parameters of the worlds of the mask."""
+        m, nominal = self._model, self._nominal
+        vectors = {"friction": wp.vec3, "object_com": wp.vec3, "inertia": wp.vec3, "com": wp.vec3, "invweight": wp.vec2}
+        given = [wp.from_torch(self._parameters[name], dtype=vectors.get(name)) for name in get_args(Parameter)]
+        start = [wp.from_torch(value, dtype=vectors.get(name)) for name, value in nominal.items()]
         wp.launch(
             kernels.write_parameters,
             dim=self.num_worlds,
-            inputs=[
-                wp.from_torch(self._every_world), wp.from_torch(new["mask"]), wp.from_torch(new["mass"]), wp.from_torch(new["gravity"]),
-                wp.from_torch(new["friction"], dtype=wp.vec3), wp.from_torch(nominal["mass"]),
-                wp.from_torch(nominal["inertia"], dtype=wp.vec3), wp.from_torch(nominal["total_mass"]),
-                wp.from_torch(nominal["body_invweight"], dtype=wp.vec2), wp.from_torch(nominal["dof_invweight"]),
-                self._friction_columns, MIN_FRICTION, at.object_body, at.object_dof,
-            ],
+            inputs=[wp.from_torch(self._mask), *given, *start, self._friction_columns, MIN_FRICTION, self._at.object_body],
             outputs=[
-                m.body_mass, m.body_inertia, m.body_subtreemass, m.body_invweight0, m.dof_invweight0, m.body_gravcomp, m.geom_friction,
+                m.body_mass, m.body_inertia, m.body_ipos, m.body_subtreemass, m.body_invweight0, m.body_gravcomp, m.geom_friction,
+                *self._drive_fields,
             ],
         )  # fmt: skip
-        self._refresh()
 
     def _write_state(self, worlds: Tensor, chosen: Tensor, new: dict[str, Tensor]) -> None:
         """Write the chosen ones of M new states into ``worlds`` [M]."""
@@ -475,10 +485,6 @@ class MujocoWarpBackend(Backend):
                 yield
 
     # Checking ----------------------------------------------------------------------------------------------------------------------
-
-    def _selected(self, worlds: Tensor | None) -> Tensor | slice:
-        self._must_be_open()
-        return slice(None) if worlds is None else torch.as_tensor(worlds, dtype=torch.int64, device=self.device)
 
     def _rows(self, value: Tensor, shape: tuple[int, ...]) -> Tensor:
         value = torch.as_tensor(value, dtype=torch.float32, device=self.device).detach()

@@ -109,52 +109,66 @@ def write_state(
 
 @wp.kernel(enable_backward=False)
 def write_parameters(
-    # The new parameters of M worlds; only the chosen ones take them.
-    worlds: wp.array[wp.int64],
+    # Which worlds take the parameters that there are for each.
     chosen: wp.array[wp.bool],
-    mass: wp.array[float],
-    gravity_fraction: wp.array[float],
     friction: wp.array[wp.vec3],
+    torsional_friction: wp.array[float],
+    object_mass: wp.array[float],
+    object_inertia: wp.array[float],
+    object_com: wp.array[wp.vec3],
+    object_gravity: wp.array[float],
+    drives: wp.array3d[float],
     # What they start from.
     nominal_mass: wp.array[float],
     nominal_inertia: wp.array[wp.vec3],
+    nominal_com: wp.array[wp.vec3],
     nominal_total: wp.array[float],
-    nominal_body_invweight: wp.array[wp.vec2],
-    nominal_dof_invweight: wp.array2d[float],
+    nominal_invweight: wp.array[wp.vec2],
+    nominal_drive: wp.array2d[float],
     friction_column: wp.array[int],
     min_friction: float,
     object_body: int,
-    object_dof: int,
     # Out.
     body_mass: wp.array2d[float],
     body_inertia: wp.array2d[wp.vec3],
+    body_ipos: wp.array2d[wp.vec3],
     body_subtreemass: wp.array2d[float],
     body_invweight: wp.array2d[wp.vec2],
-    dof_invweight: wp.array2d[float],
     body_gravcomp: wp.array2d[float],
     geom_friction: wp.array2d[wp.vec3],
+    gain: wp.array3d[float],
+    bias: wp.array3d[float],
+    force_range: wp.array3d[float],
 ):
-    """Set mass, gravity fraction and pair friction of some worlds' objects, and all that MuJoCo derives from them."""
-    m = wp.tid()
-    if not chosen[m]:
+    """Set the physical parameters of some worlds, and all that MuJoCo derives from them."""
+    world = wp.tid()
+    if not chosen[world]:
         return
-    world = int(worlds[m])
-    ratio = mass[m] / nominal_mass[world]
-    body_mass[world, object_body] = mass[m]
-    body_inertia[world, object_body] = nominal_inertia[world] * ratio
-    body_subtreemass[world, object_body] = mass[m]
-    body_subtreemass[world, 0] = nominal_total[world] + mass[m] - nominal_mass[world]
-    body_invweight[world, object_body] = nominal_body_invweight[world] / ratio  # of a free body: the inverse of mass and inertia
-    for k in range(6):
-        dof_invweight[world, object_dof + k] = nominal_dof_invweight[world, k] / ratio
-    body_gravcomp[world, object_body] = 1.0 - gravity_fraction[m]
+    mass = object_mass[world]
+    ratio = mass / nominal_mass[world]
+    turning = ratio * object_inertia[world]
+    body_mass[world, object_body] = mass
+    body_inertia[world, object_body] = nominal_inertia[world] * turning
+    body_ipos[world, object_body] = nominal_com[world] + object_com[world]
+    body_subtreemass[world, object_body] = mass
+    body_subtreemass[world, 0] = nominal_total[world] + mass - nominal_mass[world]
+    weight = nominal_invweight[world]  # of a free body: the inverse of mass and inertia
+    body_invweight[world, object_body] = wp.vec2(weight[0] / ratio, weight[1] / turning)
+    body_gravcomp[world, object_body] = 1.0 - object_gravity[world]
     for g in range(friction_column.shape[0]):
         column = friction_column[g]
         slide = min_friction
         if column < 3:
-            slide = wp.max(friction[m][column], min_friction)
-        value = geom_friction[world, g]
-        geom_friction[world, g] = wp.vec3(slide, value[1], value[2])
+            slide = wp.max(friction[world][column], min_friction)
+        geom_friction[world, g] = wp.vec3(slide, torsional_friction[world], geom_friction[world, g][2])
+    for j in range(nominal_drive.shape[0]):
+        stiffness = drives[world, 0, j] * nominal_drive[j, 0]
+        effort = drives[world, 2, j] * nominal_drive[j, 2]
+        gain[world, j, 0] = stiffness
+        bias[world, j, 1] = -stiffness
+        bias[world, j, 2] = -drives[world, 1, j] * nominal_drive[j, 1]
+        force_range[world, j, 0] = -effort
+        force_range[world, j, 1] = effort
 
 
 @wp.kernel(enable_backward=False)

@@ -37,7 +37,7 @@ from torch import Tensor
 
 from xreset.backends.rigid import Inertia
 from xreset.errors import CapabilityError, XResetError
-from xreset.physics import Backend, Contacts, Health, Links, MassProperties, State
+from xreset.physics import Backend, Contacts, Health, Links, MassProperties, Parameter, State
 from xreset.spec import RobotSpec, SceneSpec, Shape
 
 STATE_FIELDS = tuple(field.name for field in fields(State))
@@ -111,8 +111,22 @@ class World(ABC):
     def set_object_gravity(self, fraction: float) -> None:
         """Set the object's gravity fraction."""
 
+    # The next four are called only where the backend has the capability.
+
+    def set_torsional_friction(self, torsional: float) -> None:
+        """Set the torsional friction of the object's pairs [m]."""
+        raise NotImplementedError
+
+    def set_object_inertia(self, scale: float) -> None:
+        """Set the factor on the object's inertia beside what its mass does."""
+        raise NotImplementedError
+
+    def set_object_com(self, offset: np.ndarray) -> None:
+        """Move the object's centre of mass by (3,) m from where its spec has it."""
+        raise NotImplementedError
+
     def set_drives(self, scale: np.ndarray) -> None:
-        """Set factors (3, J) on the drives' stiffness, damping and effort limit; called only with the capability ``drives``."""
+        """Set factors (3, J) on the drives' stiffness, damping and effort limit."""
         raise NotImplementedError
 
     @abstractmethod
@@ -257,27 +271,35 @@ class PoolBackend(Backend):
 
     def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
         """See :meth:`Backend.set_object_mass`."""
-        self._require("object_mass", "build a scene whose objects have the mass.")
         self._set_parameter("object_mass", mass, worlds)
 
     def set_friction(self, friction: Tensor, worlds: Tensor | None = None) -> None:
         """See :meth:`Backend.set_friction`."""
-        self._require("friction", "build a scene with that friction.")
         self._set_parameter("friction", friction, worlds)
+
+    def set_torsional_friction(self, torsional: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_torsional_friction`."""
+        self._set_parameter("torsional_friction", torsional, worlds)
+
+    def set_object_inertia(self, scale: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_object_inertia`."""
+        self._set_parameter("object_inertia", scale, worlds)
+
+    def set_object_com(self, offset: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_object_com`."""
+        self._set_parameter("object_com", offset, worlds)
 
     def set_object_gravity(self, fraction: Tensor, worlds: Tensor | None = None) -> None:
         """See :meth:`Backend.set_object_gravity`."""
-        self._require("object_gravity", "use another backend for gravity fractions.")
         self._set_parameter("object_gravity", fraction, worlds)
 
     def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
         """See :meth:`Backend.set_drives`."""
-        self._require("drives", "build a scene whose robot has such drives.")
         self._set_parameter("drives", scale, worlds)
 
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         """See :meth:`Backend.set_object_wrench`; the worlds read it at the next step."""
-        self._require("object_wrench", "use another backend for external wrenches.")
+        self._require("object_wrench")
         self._must_be_open()
         wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
         self._arrays["wrench"][:] = self._checked("wrench", wrench, self.num_worlds)
@@ -286,12 +308,13 @@ class PoolBackend(Backend):
         """End the workers. Calling it twice does no harm."""
         self._close()
 
-    def _set_parameter(self, name: str, value: Tensor, worlds: Tensor | None) -> None:
+    def _set_parameter(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
+        self._require(name)
         index = self._selected(worlds)
         given = self._checked(name, value, len(index))
         self._bring(_READINGS)  # they are of the last step, and an engine may work them out from its parameters
         self._arrays[name][index] = given
-        self._command(f"set_{name}", index)
+        self._command("set_parameter", index, name)
 
     def _move(self, method: str, worlds: np.ndarray | None = None, argument: Any = None, *, readings: frozenset[str]) -> None:
         """Run a command that changes what worlds report; these readings are present afterwards."""
@@ -407,8 +430,11 @@ def _layout(n: int, robot: RobotSpec) -> Layout:
         "table_force": ((n, 3), f),
         "nonfinite": ((n,), np.bool_),
         "overflow": ((n,), np.bool_),
-        "object_mass": ((n,), f),
         "friction": ((n, 3), f),
+        "torsional_friction": ((n,), f),
+        "object_mass": ((n,), f),
+        "object_inertia": ((n,), f),
+        "object_com": ((n, 3), f),
         "object_gravity": ((n,), f),
         "drives": ((n, 3, joints), f),
         "wrench": ((n, 6), f),
@@ -475,10 +501,6 @@ _GIVEN = {
     "build": STATE_FIELDS,
     "set_state": STATE_FIELDS,
     "step": ("joint_target", "wrench"),
-    "set_object_mass": ("object_mass",),
-    "set_friction": ("friction",),
-    "set_object_gravity": ("object_gravity",),
-    "set_drives": ("drives",),
 }
 """Arrays that a command's worlds are given, in double precision."""
 
@@ -548,17 +570,9 @@ class _Local:
             self._arrays["body_mass"][i, k], self._arrays["body_com"][i, k] = body.mass, body.com
             self._arrays["body_inertia"][i, k] = body.matrix
 
-    def _set_object_mass(self, i: int, _) -> None:
-        self._worlds[i].set_object_mass(float(self._given["object_mass"][i]))
-
-    def _set_friction(self, i: int, _) -> None:
-        self._worlds[i].set_friction(self._given["friction"][i])
-
-    def _set_object_gravity(self, i: int, _) -> None:
-        self._worlds[i].set_object_gravity(float(self._given["object_gravity"][i]))
-
-    def _set_drives(self, i: int, _) -> None:
-        self._worlds[i].set_drives(self._given["drives"][i])
+    def _set_parameter(self, i: int, name: Parameter) -> None:
+        value = self._arrays[name][i].astype(np.float64)
+        getattr(self._worlds[i], f"set_{name}")(value if value.ndim else float(value))
 
     def _publish(self, i: int) -> None:
         world, arrays = self._worlds[i], self._arrays

@@ -65,6 +65,7 @@ class PybulletWorld(World):
 
     def __init__(self, scene: SceneSpec, object_index: int, *, settings: PybulletSettings = _DEFAULTS) -> None:
         self._arguments = scene, object_index, settings
+        self._com_offset = np.zeros(3)
         self._build()
 
     def _build(self) -> None:
@@ -72,6 +73,7 @@ class PybulletWorld(World):
         self._mechanism = robot = mechanism(scene.robot)
         thing = scene.objects[object_index]
         self._inertia = object_inertia(thing)
+        self._inertia = replace(self._inertia, com=self._inertia.com + self._com_offset)
         self._p = p = _engine()
         self._client = p.connect(p.DIRECT)
         if self._client < 0:
@@ -104,9 +106,9 @@ class PybulletWorld(World):
         self._frames = TrackedFrames(robot)
         self._arm = Arms(self._inertia.com[None])
         self._from_principal = conjugate(self._inertia.quat)
-        self._mass, self._fraction = self._inertia.mass, 1.0
+        self._mass, self._inertia_scale, self._fraction = self._inertia.mass, 1.0, 1.0
         self._force, self._torque = np.zeros(3), np.zeros(3)
-        self._torsional = scene.friction.torsional
+        self._torsional, self._drive_scale = scene.friction.torsional, None
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
         self._fresh = True
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
@@ -210,9 +212,22 @@ class PybulletWorld(World):
     def set_object_mass(self, mass: float) -> None:
         """See :meth:`World.set_object_mass`."""
         self._mass = mass
-        moments = self._inertia.moments * (mass / self._inertia.mass)
         self._p.changeDynamics(self._object.body, -1, mass=mass, physicsClientId=self._client)  # also invents an inertia
+        self.set_object_inertia(self._inertia_scale)
+
+    def set_object_inertia(self, scale: float) -> None:
+        """See :meth:`World.set_object_inertia`."""
+        self._inertia_scale = scale
+        moments = self._inertia.moments * (scale * self._mass / self._inertia.mass)
         self._p.changeDynamics(self._object.body, -1, localInertiaDiagonal=moments, physicsClientId=self._client)
+
+    def set_object_com(self, offset: np.ndarray) -> None:
+        """See :meth:`World.set_object_com`. Bullet's bodies have their origin there, so the object is made anew."""
+        if not np.array_equal(offset, self._com_offset):
+            state = self.get_state()
+            self._com_offset = offset
+            self._rebuild()
+            self.set_state(state)
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
@@ -222,12 +237,18 @@ class PybulletWorld(World):
         self._set_surface(self._table, {None: table}, torsional=self._torsional)
         self._set_surface(self._robot, {None: link} | dict.fromkeys(range(len(self._mechanism.robot.fingertips)), tip), self._torsional)
 
+    def set_torsional_friction(self, torsional: float) -> None:
+        """See :meth:`World.set_torsional_friction`."""
+        self._torsional = torsional
+        self.set_friction(self._friction)
+
     def set_object_gravity(self, fraction: float) -> None:
         """See :meth:`World.set_object_gravity`."""
         self._fraction = fraction
 
     def set_drives(self, scale: np.ndarray) -> None:
         """See :meth:`World.set_drives`."""
+        self._drive_scale = scale
         self._drives.scale(scale.astype(np.float64))
 
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
@@ -242,12 +263,16 @@ class PybulletWorld(World):
 
     def _rebuild(self) -> None:
         """Begin with a new client: in Bullet's broad phase, numbers that are not finite stay, and the body touches nothing any more."""
-        mass, friction, fraction = self._mass, self._friction, self._fraction
+        mass, inertia, fraction, drives = self._mass, self._inertia_scale, self._fraction, self._drive_scale
+        friction, torsional = self._friction, self._torsional
         self.close()
         self._build()
+        self._inertia_scale, self._torsional = inertia, torsional
         self.set_object_mass(mass)
         self.set_friction(friction)
         self.set_object_gravity(fraction)
+        if drives is not None:
+            self.set_drives(drives)
 
     # Building ----------------------------------------------------------------------------------------------------------------------------
 

@@ -80,6 +80,7 @@ class SapienWorld(World):
         self._arm = Arms(self._inertia.com[None])
         self._axes = Arms(np.array([rotate(self._inertia.quat, axis) for axis in np.eye(3)]))
         self._mass, self._moments, self._fraction = self._inertia.mass, self._inertia.moments, 1.0
+        self._inertia_scale, self._com = 1.0, self._inertia.com
         self._force, self._torque = np.zeros(3), np.zeros(3)
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
@@ -92,7 +93,7 @@ class SapienWorld(World):
         self._quat = np.array(state["object_quat"])
         self._object.entity.pose = self._sapien.Pose(state["object_pos"], self._quat)
         omega = state["object_angvel"]
-        self._object.linear_velocity = state["object_linvel"] + cross(omega, rotate(self._quat, self._inertia.com))
+        self._object.linear_velocity = state["object_linvel"] + cross(omega, rotate(self._quat, self._com))
         self._object.angular_velocity = omega
         self._force, self._torque = np.zeros(3), np.zeros(3)
         self._last_step = None
@@ -174,16 +175,32 @@ class SapienWorld(World):
     def set_object_mass(self, mass: float) -> None:
         """See :meth:`World.set_object_mass`."""
         self._object.mass = self._mass = mass
-        self._object.inertia = self._moments = self._inertia.moments * (mass / self._inertia.mass)
+        self.set_object_inertia(self._inertia_scale)
+
+    def set_object_inertia(self, scale: float) -> None:
+        """See :meth:`World.set_object_inertia`."""
+        self._inertia_scale = scale
+        self._object.inertia = self._moments = self._inertia.moments * (scale * self._mass / self._inertia.mass)
+
+    def set_object_com(self, offset: np.ndarray) -> None:
+        """See :meth:`World.set_object_com`."""
+        self._com = self._inertia.com + offset
+        self._arm = Arms(self._com[None])
+        self._object.cmass_local_pose = self._sapien.Pose(self._com, self._inertia.quat)
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
         self._pair_friction = dict(zip(("tip", "link", "table"), (float(mu) for mu in friction), strict=True))
         for role, mu in self._pair_friction.items():
             self._materials[role].static_friction = self._materials[role].dynamic_friction = 2.0 * mu
+        self.set_torsional_friction(self._torsional)
+
+    def set_torsional_friction(self, torsional: float) -> None:
+        """See :meth:`World.set_torsional_friction`."""
+        self._torsional = torsional
         for shape, surface in self._surfaces.items():
             mu = self._pair_friction[surface.role]
-            shape.min_patch_radius = self._torsional / mu if mu > 0 else 0.0
+            shape.min_patch_radius = torsional / mu if mu > 0 else 0.0
 
     def set_object_gravity(self, fraction: float) -> None:
         """See :meth:`World.set_object_gravity`."""

@@ -57,6 +57,9 @@ PROPERTIES = (
     Property(name="force-gain", field="force_gain", values=(0.5, 2.0)),
     Property(name="object-friction", field="friction", values=(0.4, 0.55, 0.95, 1.2), nominal=0.75, unit="coefficient", needs="friction"),
     Property(name="hand-friction", field="hand_friction", values=(0.4, 0.8), nominal=0.1, unit="coefficient", needs="friction"),
+    Property(name="torsional-friction", field="torsional_friction", values=(0.0, 0.3, 2.0), needs="torsional_friction"),
+    Property(name="object-inertia", field="object_inertia", values=(0.5, 2.0), needs="object_inertia"),
+    Property(name="object-com", field="object_com", values=(0.005, 0.01, 0.02), nominal=0.0, unit="m", needs="object_com"),
     Property(name="object-mass", field="mass_scale", values=(0.5, 0.7, 1.3, 2.0), needs="object_mass"),
 )
 """What can be swept. Nominal values of the frictions are those of an evaluation with the default materials."""
@@ -143,16 +146,16 @@ def stressed(task: TaskConfig, prop: Property | None = None, value: float = 1.0)
     """An evaluation's task with one property at a value, and nothing drawn at random; None: as evaluations are.
 
     Raises:
-        XResetError: a latency is longer than an episode.
+        XResetError: the property cannot have the value.
     """
     r = task.randomization
     middle = sum(r.friction) / 2
     still = RandomizationConfig(friction=(middle, middle), mass_scale=(1.0, 1.0), elastomer=r.elastomer, metal=r.metal, table=r.table)
     if prop is not None:
-        steps = task.termination.episode_seconds / (task.timestep * task.substeps)
-        if prop.field.endswith("latency") and value >= steps:
-            raise XResetError(f"{prop.name} of {value:g} control steps is no shorter than an episode, which has {steps:.0f}.")
-        still = replace(still, **{prop.field: (value, value)})
+        try:
+            return replace(task, randomization=replace(still, **{prop.field: (value, value)}))
+        except ValueError as error:
+            raise XResetError(f"{prop.name} cannot be {value:g} {prop.unit}: {error}.") from None
     return replace(task, randomization=still)
 
 

@@ -182,14 +182,14 @@ class SettingOneWorldBrakesTheOthers(MujocoWorld):
 
 @breaks("masked_set")
 class MaskIgnored(MujocoBackend):
-    def set_where(self, mask, **values):
-        super().set_where(mask | True, **values)
+    def set_where(self, mask, state, parameters):
+        super().set_where(mask | True, state, parameters)
 
 
 @breaks("masked_set")
 class MaskedValuesInTheOrderOfTheMask(MujocoBackend):
-    def set_where(self, mask, *, state, **values):
-        super().set_where(mask, state=state[mask.long().argsort(descending=True)], **values)
+    def set_where(self, mask, state, parameters):
+        super().set_where(mask, state[mask.long().argsort(descending=True)], parameters)
 
 
 @breaks("twins", "repeatable")
@@ -383,10 +383,33 @@ class MassWithoutInertia(MujocoWorld):
 @breaks("set_as_built")
 class MassWithoutTheSolversWeights(MujocoWorld):
     def set_object_mass(self, mass):
-        m, body, dofs = self._model, self._at.object_body, slice(self._at.object_dof, self._at.object_dof + 6)
-        kept = m.body_invweight0[body].copy(), m.dof_invweight0[dofs].copy()
+        body = self._at.object_body
+        kept = self._model.body_invweight0[body].copy()
         super().set_object_mass(mass)
-        m.body_invweight0[body], m.dof_invweight0[dofs] = kept
+        self._model.body_invweight0[body] = kept
+
+
+@breaks("object_inertia_set")
+class InertiaScaledTwice(MujocoWorld):
+    def set_object_inertia(self, scale):
+        super().set_object_inertia(scale * scale)
+
+
+@breaks("object_inertia_set")
+class InertiaWithoutTheSolversWeights(MujocoWorld):
+    def set_object_inertia(self, scale):
+        body = self._at.object_body
+        kept = self._model.body_invweight0[body].copy()
+        super().set_object_inertia(scale)
+        self._model.body_invweight0[body] = kept
+
+
+@breaks("object_com_set")
+class ShapesMoveWithTheCentreOfMass(MujocoWorld):
+    def set_object_com(self, offset):
+        super().set_object_com(offset)
+        mine = self._model.geom_bodyid == self._at.object_body
+        self._model.geom_pos[mine] = self._at.model.geom_pos[mine] + offset
 
 
 # Contact ---------------------------------------------------------------------------------------------------------------------------------
@@ -460,10 +483,18 @@ class FrictionPyramid(_Remodelled):
         model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
 
 
-@breaks("torsional_friction")
+@breaks("torsional_friction", "torsional_friction_set")
 class NoTorsionalFriction(_Remodelled):
     def change(self, model):
         model.geom_condim[:] = 3
+
+
+@breaks("torsional_friction_set")
+class TorsionalFrictionAtLeastAsBuilt(MujocoWorld):
+    """Set on one of two surfaces whose larger value counts."""
+
+    def set_torsional_friction(self, torsional):
+        self._model.geom_friction[1:, 1] = torsional
 
 
 @breaks("torsional_friction")

@@ -15,6 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.env import ManipulationEnv, make_scene
+from xreset.errors import CapabilityError
 from xreset.eval.rollout import roll_out
 from xreset.eval.trial import Engine, Trial
 from xreset.geometry.rotations import quat_rotate
@@ -322,8 +323,31 @@ class RobustnessTest(WithEnv):
             plain.reset(torch.tensor([1]))
         self.assertFalse(drives.called)
 
+    def test_the_objects_body_is_set_for_the_worlds_that_begin(self):
+        env = self.make(self.task(torsional_friction=(0.5, 2.0), object_inertia=(0.5, 2.0), object_com=(0.01, 0.01)))
+        found = {}
+        for name in ("torsional_friction", "object_inertia", "object_com"):
+            patch = mock.patch.object(env.backend, f"set_{name}", side_effect=lambda value, worlds, name=name: found.update({name: value}))
+            self.enterContext(patch)
+        env.reset(torch.tensor([0, 2]))
+        torsional = found["torsional_friction"] / env.backend.scene.friction.torsional
+        for factor in (torsional, found["object_inertia"]):
+            self.assertTrue(bool(((factor >= 0.5) & (factor <= 2.0)).all()) and float(factor[0]) != float(factor[1]))
+        torch.testing.assert_close(found["object_com"].norm(dim=-1), torch.tensor([0.01, 0.01]))
+        self.assertNotAlmostEqual(float(found["object_com"][0, 0]), float(found["object_com"][1, 0]), places=4)
+
+    def test_an_engine_that_cannot_do_it_is_named(self):
+        able = MujocoBackend.capabilities - {"drives", "object_com"}
+        task = self.task(effort=(0.5, 1.0), object_com=(0.0, 0.01))
+        with mock.patch.object(MujocoBackend, "capabilities", able):
+            self.make()
+            with self.assertRaisesRegex(CapabilityError, "'mujoco' cannot set drives, object com world by world, which this task draws"):
+                self.make(task)
+
     def test_a_snapshot_holds_what_is_late_and_scaled(self):
-        task = self.task(action_latency=(0.0, 2.0), observation_latency=(0.0, 2.0), effort=(0.5, 1.0), force_gain=(0.5, 1.0))
+        task = self.task(
+            action_latency=(0.0, 2.0), observation_latency=(0.0, 2.0), effort=(0.5, 1.0), force_gain=(0.5, 1.0), object_com=(0.0, 0.01)
+        )
         env, other = self.make(task), self.make(task, seed=1)
         for action in self.actions(5):
             env.step(action)
@@ -332,7 +356,7 @@ class RobustnessTest(WithEnv):
         for action in self.actions(5, seed=1):
             (one, *_), (two, *_) = env.step(action), other.step(action)
         torch.testing.assert_close(one["policy"], two["policy"], atol=1e-4, rtol=0)
-        torch.testing.assert_close(env._drives, other._drives)
+        torch.testing.assert_close(env._parameters, other._parameters)
 
     def test_a_step_with_all_of_it_never_waits_for_the_device(self):
         """As on a GPU, where any of these operations would stop the host until the device is done, and could not be captured."""

@@ -60,8 +60,11 @@ class StressedTest(unittest.TestCase):
             with self.subTest(text), self.assertRaisesRegex(XResetError, words):
                 chosen([text])
         (late,) = chosen(["action-latency=300"])
-        with self.assertRaisesRegex(XResetError, "action-latency of 300 control steps is no shorter than an episode, which has 300"):
+        with self.assertRaisesRegex(XResetError, "action-latency cannot be 300 control steps: .* fewer than an episode has, which are 300"):
             stressed(TaskConfig(), late, 300.0)
+        (light,) = chosen(["object-mass=0"])
+        with self.assertRaisesRegex(XResetError, "object-mass cannot be 0 x: mass_scale begins with 0"):
+            stressed(TaskConfig(), light, 0.0)
 
 
 class CurveTest(unittest.TestCase):

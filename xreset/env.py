@@ -15,17 +15,18 @@ import torch
 from torch import Tensor
 
 from xreset.capture import GraphRunner
+from xreset.errors import CapabilityError
 from xreset.faults import FaultRecorder
 from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.objects import keypoints, surface_points
-from xreset.physics import Backend, Contacts, Health, Links, State
+from xreset.physics import Backend, Contacts, Health, Links, Parameters, State
 from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
 from xreset.task.latency import DelayLine
-from xreset.task.randomization import sample_drives, sample_friction, sample_mass_scale, sample_range
+from xreset.task.randomization import sample_drives, sample_friction, sample_mass_scale, sample_offset, sample_range
 from xreset.task.rewards import Reward, RewardInput, compute_reward
 from xreset.task.terminations import episode_steps, out_of_bounds
 
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 
 _LASTING = (
     "goal_pos", "goal_quat", "gravity_fraction", "sequence", "bank_state", "_episode_length", "_target", "_previous_action", "_best_reach",
-    "_reached", "_reward", "_cloud", "_friction", "_mass",
+    "_reached", "_reward", "_cloud",
 )  # fmt: skip
 """What an environment keeps of each world from step to step, besides the engine's state."""
 
@@ -138,11 +139,21 @@ class ManipulationEnv:
             state=torch.full_like(self.bank_state, -1),
             sequence=zeros(dtype=torch.long),
         )
-        self._friction, self._mass = zeros(3), zeros()
+        self._parameters = {"friction": zeros(3), "object_mass": zeros()}
+        """Physical parameters of each world, by name; its gravity fraction is :attr:`gravity_fraction`."""
         # What differs between one robot and the next is None where it does not: then it costs nothing, and draws no random number.
         random = task.randomization
-        self._drives = torch.ones(n, 3, self.num_actions, device=self.device) if random.scales_drives else None
-        self._force_gain = torch.ones(n, 1, 1, device=self.device) if random.enabled and random.force_gain != (1.0, 1.0) else None
+        if random.scales_drives:
+            self._parameters["drives"] = zeros(3, self.num_actions)
+        for name, shape in (("torsional_friction", ()), ("object_inertia", ()), ("object_com", (3,))):
+            if random.draws(name):
+                self._parameters[name] = zeros(*shape)
+        if missing := [name.replace("_", " ") for name in self._parameters if name not in backend.capabilities]:
+            raise CapabilityError(
+                f"the backend {backend.name!r} cannot set {', '.join(missing)} world by world, which this task draws at random: leave "
+                "those ranges of task.randomization as they are by default, or use another backend."
+            )
+        self._force_gain = torch.ones(n, 1, 1, device=self.device) if random.draws("force_gain") else None
         late_actions, late_poses = (limits[1] if random.enabled else 0.0 for limits in (random.action_latency, random.observation_latency))
         self._commands = DelayLine(self._target, late_actions) if late_actions else None
         self._poses = DelayLine(zeros(7), late_poses) if late_poses else None
@@ -266,10 +277,7 @@ class ManipulationEnv:
         self.backend.set_where(
             self._fresh,
             state=State(**{f.name: snapshot[f"state.{f.name}"].to(self.device) for f in fields(State)}),
-            friction=self._friction,
-            object_mass=self._mass,
-            object_gravity=self.gravity_fraction,
-            drives=self._drives,
+            parameters=Parameters(**self._parameters, object_gravity=self.gravity_fraction),
         )
         self._fresh.zero_()
         for name in set(self._observations.keys()):
@@ -281,7 +289,9 @@ class ManipulationEnv:
     def _lasting(self) -> dict[str, Tensor]:
         """What is kept of each world from step to step, besides the engine's state."""
         lasting = {name: getattr(self, name) for name in _LASTING}
-        lasting |= {name: value for name in ("_drives", "_force_gain") if (value := getattr(self, name)) is not None}
+        lasting |= {f"_parameters.{name}": value for name, value in self._parameters.items()}
+        if self._force_gain is not None:
+            lasting["_force_gain"] = self._force_gain
         for name in ("_commands", "_poses"):
             if (line := getattr(self, name)) is not None:
                 lasting |= {f"{name}.values": line.values, f"{name}.delay": line.delay}
@@ -362,8 +372,7 @@ class ManipulationEnv:
             "from_bank": self.from_bank,
             "episode_step": self._episode_length,
             "gravity_fraction": self.gravity_fraction,
-            "friction": self._friction,
-            "object_mass": self._mass,
+            **self._parameters,
             "target": self._target,
             **{f"before_{name}": value for name, value in self._before.items()},
             **{f"after_{name}": getattr(after, name) for name in self._before},
@@ -394,12 +403,15 @@ class ManipulationEnv:
     def _drawn_parameters(self) -> list[tuple[Tensor, Tensor]]:
         """What is drawn for every world beside its start [N, ...], and where it is kept."""
         c, n, generator = self.task.randomization, self.num_envs, self.generator
-        drawn = [
-            (sample_friction(n, c, generator), self._friction),
-            (self._nominal_mass * sample_mass_scale(n, c, generator), self._mass),
-        ]
-        if self._drives is not None:
-            drawn.append((sample_drives(self.actions.is_arm, n, c, generator), self._drives))
+        samples: dict[str, Callable[[], Tensor]] = {
+            "friction": lambda: sample_friction(n, c, generator),
+            "object_mass": lambda: self._nominal_mass * sample_mass_scale(n, c, generator),
+            "drives": lambda: sample_drives(self.actions.is_arm, n, c, generator),
+            "torsional_friction": lambda: self.backend.scene.friction.torsional * sample_range(n, c.torsional_friction, generator),
+            "object_inertia": lambda: sample_range(n, c.object_inertia, generator),
+            "object_com": lambda: sample_offset(n, c.object_com, generator),
+        }
+        drawn = [(samples[name](), kept) for name, kept in self._parameters.items()]
         if self._force_gain is not None:
             drawn.append((sample_range(n, c.force_gain, generator).view(-1, 1, 1), self._force_gain))
         for line, limits in ((self._commands, c.action_latency), (self._poses, c.observation_latency)):
@@ -414,10 +426,7 @@ class ManipulationEnv:
         self.backend.set_where(
             self._fresh,
             state=State.at_rest(start.joint_pos, start.object_pos, start.object_quat, start.joint_target),
-            friction=self._friction,
-            object_mass=self._mass,
-            object_gravity=start.gravity_fraction,
-            drives=self._drives,
+            parameters=Parameters(**self._parameters, object_gravity=start.gravity_fraction),
         )
 
     def _read(self) -> Reading:

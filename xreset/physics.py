@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self, get_args
 
 import torch
 from torch import Tensor
@@ -17,9 +17,11 @@ from xreset.errors import BackendUnavailableError, CapabilityError
 from xreset.spec import SceneSpec
 from xreset.tensors import Tensors
 
-Capability = Literal["object_mass", "friction", "object_gravity", "drives", "object_wrench", "overflow", "mass_properties"]
-"""What a backend may be unable to do: per-world object mass, pair friction, gravity fraction or drives; a wrench; counting overflows;
-reading back masses, centres of mass and inertias."""
+Parameter = Literal["friction", "torsional_friction", "object_mass", "object_inertia", "object_com", "object_gravity", "drives"]
+"""A physical parameter that each world has its own value of: ``Backend.set_...`` sets it."""
+Capability = Literal[Parameter, "object_wrench", "overflow", "mass_properties"]
+"""What a backend may be unable to do: setting a parameter world by world; a wrench; counting overflows; reading back masses, centres of
+mass and inertias."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +51,30 @@ class State(Tensors):
             joint_pos=q, joint_vel=torch.zeros_like(q), joint_target=q.clone() if joint_target is None else joint_target.float(),
             object_pos=pos, object_quat=object_quat.float(), object_linvel=still, object_angvel=still.clone(),
         )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameters(Tensors):
+    """Physical parameters of worlds, each as its setter takes it; None leaves it as it is."""
+
+    friction: Tensor | None = None
+    """[N, 3] of the pairs object-fingertip, object-other link, object-table."""
+    torsional_friction: Tensor | None = None
+    """[N] m."""
+    object_mass: Tensor | None = None
+    """[N] kg."""
+    object_inertia: Tensor | None = None
+    """[N] factor."""
+    object_com: Tensor | None = None
+    """[N, 3] m."""
+    object_gravity: Tensor | None = None
+    """[N] fraction."""
+    drives: Tensor | None = None
+    """[N, 3, J] factors."""
+
+    def given(self) -> dict[Parameter, Tensor]:
+        """Those that are not None, by name."""
+        return {name: value for name in get_args(Parameter) if (value := getattr(self, name)) is not None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +241,7 @@ class Backend(ABC):
         """Masses, centres of mass and inertias read back from the engine; the present ones, of objects whose mass was set too."""
         raise CapabilityError(f"the backend {self.name!r} cannot read back mass properties: trust what the scene says.")
 
-    # Physical parameters: each stays through set_state, except the wrench ----------------------------------------------------------
+    # Physical parameters: each stays through set_state, except the wrench; CapabilityError where the backend lacks it -----------------
 
     @abstractmethod
     def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
@@ -225,6 +251,21 @@ class Backend(ABC):
     def set_friction(self, friction: Tensor, worlds: Tensor | None = None) -> None:
         """Set the friction of the pairs object-fingertip, object-other link, object-table: [M, 3]."""
 
+    def set_torsional_friction(self, torsional: Tensor, worlds: Tensor | None = None) -> None:
+        """Set the torsional friction of the object's pairs: [M], a length as in :class:`~xreset.spec.PairFriction`."""
+        self._cannot("torsional_friction")
+
+    def set_object_inertia(self, scale: Tensor, worlds: Tensor | None = None) -> None:
+        """Set the factor [M] on the object's inertia about its centre of mass, beside what its mass does; 1 is what the spec says."""
+        self._cannot("object_inertia")
+
+    def set_object_com(self, offset: Tensor, worlds: Tensor | None = None) -> None:
+        """Move the object's centre of mass by [M, 3] m from where its spec has it, in its mesh frame; its inertia about it stays.
+
+        Of an object that moves, set the state anew.
+        """
+        self._cannot("object_com")
+
     @abstractmethod
     def set_object_gravity(self, fraction: Tensor, worlds: Tensor | None = None) -> None:
         """Set the object's gravity fraction [M]: an upward force (1 - fraction) m g acts at its centre of mass.
@@ -233,13 +274,8 @@ class Backend(ABC):
         """
 
     def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """Set factors on the drives: [M, 3, J] of stiffness, damping and effort limit; 1 is what the robot spec says.
-
-        Raises:
-            CapabilityError: the backend lacks ``drives``.
-        """
-        self._require("drives", "build a scene whose robot has such drives.")
-        raise NotImplementedError(f"the backend {self.name!r} says that it can set drives, and does not")
+        """Set factors on the drives: [M, 3, J] of stiffness, damping and effort limit; 1 is what the robot spec says."""
+        self._cannot("drives")
 
     @abstractmethod
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
@@ -250,16 +286,7 @@ class Backend(ABC):
 
     # Many worlds at once --------------------------------------------------------------------------------------------------------------
 
-    def set_where(
-        self,
-        mask: Tensor,
-        *,
-        state: State,
-        friction: Tensor,
-        object_mass: Tensor,
-        object_gravity: Tensor,
-        drives: Tensor | None = None,
-    ) -> None:
+    def set_where(self, mask: Tensor, state: State, parameters: Parameters) -> None:
         """Set state and physical parameters of the worlds of a mask, as the single setters do.
 
         Values are given for all worlds, and those outside the mask are ignored: a backend on a GPU overrides this so that nothing waits
@@ -268,19 +295,13 @@ class Backend(ABC):
         Args:
             mask: [N] bool.
             state: [N, ...]
-            friction: [N, 3]
-            object_mass: [N] kg.
-            object_gravity: [N]
-            drives: [N, 3, J] factors; None leaves the drives as they are.
+            parameters: [N, ...]
         """
         worlds = mask.nonzero().squeeze(-1)
         if not len(worlds):
             return
-        self.set_friction(friction[worlds], worlds)
-        self.set_object_mass(object_mass[worlds], worlds)
-        self.set_object_gravity(object_gravity[worlds], worlds)
-        if drives is not None:
-            self.set_drives(drives[worlds], worlds)
+        for name, value in parameters.given().items():
+            getattr(self, f"set_{name}")(value[worlds], worlds)
         self.set_state(state[worlds], worlds)
 
     # The end ---------------------------------------------------------------------------------------------------------------------
@@ -297,10 +318,26 @@ class Backend(ABC):
 
     # For implementers ------------------------------------------------------------------------------------------------------------
 
-    def _require(self, capability: Capability, remedy: str) -> None:
+    def _require(self, capability: Capability) -> None:
         """Raise the error that the contract asks for if a capability is missing."""
         if capability not in self.capabilities:
-            raise CapabilityError(f"the backend {self.name!r} cannot set {capability.replace('_', ' ')}: {remedy}")
+            raise CapabilityError(f"the backend {self.name!r} cannot set {capability.replace('_', ' ')}: {_REMEDIES[capability]}")
+
+    def _cannot(self, capability: Capability) -> None:
+        self._require(capability)
+        raise NotImplementedError(f"the backend {self.name!r} says that it can set {capability.replace('_', ' ')}, and does not")
+
+
+_REMEDIES: dict[str, str] = {
+    "friction": "build a scene with that friction.",
+    "torsional_friction": "build a scene with that friction.",
+    "object_mass": "build a scene whose objects have the mass.",
+    "object_inertia": "build a scene whose objects have the inertia.",
+    "object_com": "build a scene whose objects have their centre of mass there.",
+    "object_gravity": "use another backend for gravity fractions.",
+    "drives": "build a scene whose robot has such drives.",
+    "object_wrench": "use another backend for external wrenches.",
+}
 
 
 def unavailable(package: str, extra: str, error: Exception) -> BackendUnavailableError:

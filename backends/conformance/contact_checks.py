@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 
-from xreset.backends.conformance.harness import Bench, largest, replace_fields, rotation_angle, snapshot, start_state
+from xreset.backends.conformance.harness import Bench, largest, random_state, replace_fields, rotation_angle, snapshot, start_state
 from xreset.backends.conformance.results import Check, Measure
 from xreset.backends.conformance.scene import flat_objects
 from xreset.backends.pool import lowest_point
@@ -148,6 +148,67 @@ def _slide(bench: Bench, backend: Backend, worlds: Sequence[int]) -> tuple[State
     return snapshot(backend.state()), backend.contacts().table_force.cpu().clone()
 
 
+def object_inertia_set(bench: Bench) -> list[Measure]:
+    """Set the inertia of some worlds' objects, and build others so: tumbling and sliding objects must do the same in both."""
+    factors = torch.tensor([2.0, 0.5, 4.0, 0.25])
+
+    def built(thing: ObjectSpec, i: int) -> ObjectSpec:
+        return replace(thing, inertia=float(factors[i]) * np.asarray(thing.inertia))
+
+    return _compared(bench, lambda backend, worlds: backend.set_object_inertia(factors[worlds].to(backend.device), worlds), built)
+
+
+def object_com_set(bench: Bench) -> list[Measure]:
+    """Move the centre of mass of some worlds' objects, and build others so: tumbling and sliding objects must do the same in both."""
+    offsets = torch.tensor([[0.0078125, 0.0, 0.0], [0.0, -0.0078125, 0.00390625], [0.00390625, 0.00390625, -0.00390625], [0.0, 0.0, 0.0]])
+
+    def built(thing: ObjectSpec, i: int) -> ObjectSpec:
+        return replace(thing, com=np.asarray(thing.com) + offsets[i].numpy())
+
+    return _compared(bench, lambda backend, worlds: backend.set_object_com(offsets[worlds].to(backend.device), worlds), built)
+
+
+def _compared(
+    bench: Bench, change: Callable[[Backend, torch.Tensor], None], built: Callable[[ObjectSpec, int], ObjectSpec]
+) -> list[Measure]:
+    """Worlds in two batches are changed, and compared with worlds that were built as world i's object should be."""
+    backend = bench.altered()
+    for worlds in ([3, 0], [1, 2]):
+        change(backend, torch.tensor(worlds, device=backend.device))
+    everyone = range(bench.NUM_WORLDS)
+    found = _tumble(bench, backend, everyone), *_slide(bench, backend, everyone)
+    errors = {"tumbling, pos": 0.0, "tumbling, angle": 0.0, "sliding, pos": 0.0, "sliding, force": 0.0}
+    for i, thing in enumerate(bench.objects):
+        with bench.other(replace(bench.scene, objects=(built(thing, i),)), 1) as other:
+            tumbled, (slid, force) = _tumble(bench, other, [i]), _slide(bench, other, [i])
+        new = {
+            "tumbling, pos": largest(found[0].object_pos[i] - tumbled.object_pos[0]),
+            "tumbling, angle": largest(rotation_angle(found[0].object_quat[i], tumbled.object_quat[0])),
+            "sliding, pos": largest(found[1].object_pos[i] - slid.object_pos[0]),
+            "sliding, force": largest(found[2][i] - force[0]) / (GRAVITY * thing.mass),
+        }
+        errors = {what: max(error, new[what]) for what, error in errors.items()}
+    limits = {
+        "tumbling, pos": (1e-5, "m"),
+        "tumbling, angle": (2e-4, "rad"),
+        "sliding, pos": (1e-5, "m"),
+        "sliding, force": (0.01, "of m g"),
+    }
+    return [Measure(what=what, measured=error, tolerance=limits[what][0], unit=limits[what][1]) for what, error in errors.items()]
+
+
+def _tumble(bench: Bench, backend: Backend, worlds: Sequence[int]) -> State:
+    """State after the objects of some of the bench's worlds have tumbled through the air for a moment, under a torque."""
+    n = len(worlds)
+    start = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=21)[list(worlds)]
+    backend.set_state(start.to(backend.device))
+    size = torch.tensor([float(np.trace(bench.objects[i].inertia)) for i in worlds])
+    torque = size[:, None] * torch.tensor([20.0, -10.0, 5.0])  # some rad/s^2
+    backend.set_object_wrench(torch.zeros(n, 3, device=backend.device), torque.float().to(backend.device))
+    backend.step(24)
+    return snapshot(backend.state())
+
+
 CHECKS = (
     Check(
         name="resting_weight",
@@ -186,5 +247,21 @@ CHECKS = (
         cause="inertia, the solver's inverse weights, torsional friction or another quantity that derives from mass or friction is stale",
         run=set_as_built,
         capabilities=("object_mass", "friction"),
+    ),
+    Check(
+        name="object_inertia_set",
+        group="contact",
+        statement="a world whose object's inertia was set does what a world built with it does, in the air and on the table",
+        cause="the inertia is shared by all worlds or set once and scaled again, or the solver's inverse weights are stale",
+        run=object_inertia_set,
+        capabilities=("object_inertia", "object_wrench"),
+    ),
+    Check(
+        name="object_com_set",
+        group="contact",
+        statement="a world whose object's centre of mass was moved does what a world built so does, in the air and on the table",
+        cause="the shapes move with the centre of mass, weight acts at the former one, or velocities are converted with it",
+        run=object_com_set,
+        capabilities=("object_com", "object_wrench"),
     ),
 )

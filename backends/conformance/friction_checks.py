@@ -94,6 +94,29 @@ def torsional_friction(bench: Bench) -> list[Measure]:
     return [Measure(what="spin lost", measured=largest(lost / expected - 1.0), tolerance=0.01, unit="of t m g / I")]
 
 
+def torsional_friction_set(bench: Bench) -> list[Measure]:
+    """Spin balls whose torsional friction was set world by world, then a state: each is braked by its own.
+
+    I domega/dt = -t m g, with none, half, all and twice of what the scene says.
+    """
+    thing = ball()
+    scene = replace(bench.scene, objects=(thing,))
+    factors = torch.tensor([0.0, 0.5, 1.0, 2.0])
+    which = torch.zeros(len(factors), dtype=torch.long)
+    start = replace_fields(bench.placed(start_state(scene, which)), object_angvel=torch.tensor([0.0, 0.0, 10.0]))
+    steps = round(0.4 / scene.timestep)
+    with bench.other(scene, len(factors), which) as backend:
+        torsional = (factors * scene.friction.torsional).to(backend.device)
+        for worlds in ([3, 1], [0]):
+            index = torch.tensor(worlds, device=backend.device)
+            backend.set_torsional_friction(torsional[index], index)
+        backend.set_state(start.to(backend.device))
+        backend.step(steps)
+        lost = 10.0 - snapshot(backend.state()).object_angvel[:, 2]
+    expected = scene.friction.torsional * thing.mass * GRAVITY / float(thing.inertia[2, 2]) * steps * scene.timestep
+    return [Measure(what="spin lost", measured=largest(lost / expected - factors), tolerance=0.02, unit="of t m g / I")]
+
+
 def _cases(bench: Bench, each: int) -> tuple[Tensor, Tensor]:
     """Coefficient [N] and direction [N, 3], towards the table's middle, of the worlds, ``each`` of them a case."""
     (x, y), (px, py) = bench.scene.table.center, bench.place
@@ -135,6 +158,15 @@ CHECKS = (
         cause="torsional friction is missing, is multiplied by the sliding friction, or comes from the size of a contact patch",
         run=torsional_friction,
         capabilities=("friction",),
+        own_robot_only=True,
+    ),
+    Check(
+        name="torsional_friction_set",
+        group="contact",
+        statement="torsional friction is set world by world, none too, and setting a state keeps it",
+        cause="torsional friction is shared by all worlds, is set on one of two surfaces, or is lost with the state",
+        run=torsional_friction_set,
+        capabilities=("torsional_friction",),
         own_robot_only=True,
     ),
 )

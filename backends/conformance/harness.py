@@ -16,7 +16,7 @@ from xreset.backends.conformance.scene import gripper
 from xreset.backends.pool import initial_state
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_normalize
-from xreset.physics import Backend, State
+from xreset.physics import Backend, Parameter, State
 from xreset.spec import SceneSpec
 
 
@@ -210,10 +210,16 @@ ROUND_TRIP: dict[str, tuple[float, str]] = {
 
 def _set_nominal(backend: Backend, objects: list, scene: SceneSpec) -> None:
     n, device = backend.num_worlds, backend.device
-    if "object_mass" in backend.capabilities:
-        backend.set_object_mass(torch.tensor([o.mass for o in objects], dtype=torch.float32, device=device))
-    if "friction" in backend.capabilities:
-        pair = torch.tensor([scene.friction.tip, scene.friction.link, scene.friction.table], device=device)
-        backend.set_friction(pair.expand(n, 3).contiguous())
-    if "object_gravity" in backend.capabilities:
-        backend.set_object_gravity(torch.ones(n, device=device))
+    friction, one = scene.friction, torch.ones(n)
+    nominal: dict[Parameter, Tensor] = {
+        "friction": torch.tensor([friction.tip, friction.link, friction.table]).repeat(n, 1),
+        "torsional_friction": friction.torsional * one,
+        "object_mass": torch.tensor([o.mass for o in objects]),
+        "object_inertia": one,
+        "object_com": torch.zeros(n, 3),
+        "object_gravity": one,
+        "drives": torch.ones(n, 3, len(scene.robot.joints)),
+    }
+    for name, value in nominal.items():
+        if name in backend.capabilities:
+            getattr(backend, f"set_{name}")(value.float().to(device))

@@ -19,7 +19,7 @@ from xreset.backends.conformance.scene import without_collisions
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.urdf import robot_tree
-from xreset.physics import Backend, State
+from xreset.physics import Backend, Parameters, State
 from xreset.spec import GRAVITY, RobotSpec, SceneSpec
 
 _CONFIGURATIONS = 200
@@ -250,10 +250,8 @@ def drive_scale(bench: Bench) -> list[Measure]:
         ones = torch.ones(count, device=backend.device)
         mass = torch.full_like(ones, scene.objects[0].mass)
         friction = torch.tensor([[scene.friction.tip, scene.friction.link, scene.friction.table]], device=backend.device).expand(count, 3)
-        backend.set_where(
-            mask, state=start.to(backend.device), friction=friction, object_mass=mass, object_gravity=ones,
-            drives=factors.to(backend.device),
-        )  # fmt: skip
+        parameters = Parameters(friction=friction, object_mass=mass, object_gravity=ones, drives=factors.to(backend.device))
+        backend.set_where(mask, start.to(backend.device), parameters)
         masked = path(backend, slice(None))
     return [
         Measure(what="set at once", measured=largest(at_once - torch.cat(expected)), tolerance=1e-4, unit="rad, m"),

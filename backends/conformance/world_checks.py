@@ -6,6 +6,7 @@ import math
 from dataclasses import fields
 
 import torch
+from torch import Tensor
 
 from xreset.backends.conformance.harness import (
     ROUND_TRIP,
@@ -19,7 +20,7 @@ from xreset.backends.conformance.harness import (
     start_state,
 )
 from xreset.backends.conformance.results import Check, Measure, Skipped
-from xreset.physics import Backend, State
+from xreset.physics import Backend, Parameter, Parameters, State
 
 _SAME: dict[str, tuple[float, str]] = {
     "joint_pos": (1e-5, "rad, m"),
@@ -88,24 +89,31 @@ def masked_set(bench: Bench) -> list[Measure]:
     """Set state, mass, friction and gravity of the worlds of a mask in the middle of a motion: as the single setters do."""
     chosen = [3, 1]
     new = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=11)
-    mass = torch.tensor([thing.mass for thing in bench.objects]) * torch.tensor([2.0, 0.5, 1.5, 0.7])
-    friction = torch.tensor([[0.8, 0.4, 0.3], [0.7, 0.5, 0.9], [0.6, 0.3, 0.45], [0.9, 0.6, 0.2]])
-    gravity = torch.tensor([0.9, 0.5, 0.1, 0.0])
+    scale = torch.tensor([2.0, 0.5, 1.5, 0.7])
+    parameters: dict[Parameter, Tensor] = {
+        "object_mass": torch.tensor([thing.mass for thing in bench.objects]) * scale,
+        "object_inertia": scale.flip(0),
+        "object_com": 0.01 * scale[:, None] * torch.tensor([1.0, -1.0, 0.5]),
+        "friction": torch.tensor([[0.8, 0.4, 0.3], [0.7, 0.5, 0.9], [0.6, 0.3, 0.45], [0.9, 0.6, 0.2]]),
+        "torsional_friction": 2e-3 * scale,
+        "object_gravity": torch.tensor([0.9, 0.5, 0.1, 0.0]),
+        "drives": scale[:, None, None].expand(-1, 3, len(bench.scene.robot.joints)),
+    }
 
     def run(masked: bool) -> State:
         backend = bench.altered()
         backend.set_state(random_state(bench, bench.scene, bench.NUM_WORLDS, seed=12).to(backend.device))
         backend.step(4)
-        values = [value.float().to(backend.device) for value in (friction, mass, gravity)]
+        values = {name: value for name, value in parameters.items() if name in backend.capabilities}
+        values = {name: value.float().to(backend.device) for name, value in values.items()}
         if masked:
             mask = torch.zeros(bench.NUM_WORLDS, dtype=torch.bool, device=backend.device)
             mask[chosen] = True
-            backend.set_where(mask, state=new.to(backend.device), friction=values[0], object_mass=values[1], object_gravity=values[2])
+            backend.set_where(mask, new.to(backend.device), Parameters(**values))
         else:
             worlds = torch.tensor(chosen, device=backend.device)
-            backend.set_friction(values[0][worlds], worlds)
-            backend.set_object_mass(values[1][worlds], worlds)
-            backend.set_object_gravity(values[2][worlds], worlds)
+            for name, value in values.items():
+                getattr(backend, f"set_{name}")(value[worlds], worlds)
             backend.set_state(new[chosen].to(backend.device), worlds)
         backend.step(12)
         return snapshot(backend.state())

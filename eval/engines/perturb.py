@@ -169,6 +169,18 @@ class AlteredBackend(Backend):
         factors = torch.tensor([a.tip_friction, a.link_friction, a.table_friction]).to(friction)
         self._inner.set_friction(friction * factors, worlds)
 
+    def set_torsional_friction(self, torsional: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_torsional_friction`."""
+        self._inner.set_torsional_friction(torsional * self._alteration.torsional_friction, worlds)
+
+    def set_object_inertia(self, scale: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_object_inertia`; the altered inertia is what counts as 1."""
+        self._inner.set_object_inertia(scale, worlds)
+
+    def set_object_com(self, offset: Tensor, worlds: Tensor | None = None) -> None:
+        """See :meth:`Backend.set_object_com`."""
+        self._inner.set_object_com(offset, worlds)
+
     def set_object_gravity(self, fraction: Tensor, worlds: Tensor | None = None) -> None:
         """See :meth:`Backend.set_object_gravity`."""
         self._inner.set_object_gravity(fraction, worlds)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 from xreset.checks import check_numbers
@@ -238,6 +238,12 @@ class RandomizationConfig:
     """Coefficient of the table's material. Not in the paper."""
     mass_scale: tuple[float, float] = (0.7, 1.3)
     """Range of the factor on the object's mass."""
+    torsional_friction: tuple[float, float] = (1.0, 1.0)
+    """Range of the factor on the torsional friction of the object's pairs."""
+    object_inertia: tuple[float, float] = (1.0, 1.0)
+    """Range of the factor on the object's inertia, beside what its mass does."""
+    object_com: tuple[float, float] = (0.0, 0.0)
+    """Range of the distance [m] by which the object's centre of mass is off, in any direction."""
     hand_friction: tuple[float, float] | None = None
     """Range of the coefficient of every link's material beside the fingertips'; None: ``metal``."""
     arm_stiffness: tuple[float, float] = (1.0, 1.0)
@@ -255,21 +261,23 @@ class RandomizationConfig:
     """Range of the factor on the fingertips' force readings."""
 
     def __post_init__(self) -> None:
-        scales = ("arm_stiffness", "arm_damping", "hand_stiffness", "hand_damping", "effort", "force_gain")
-        check_numbers(
-            self,
-            positive=("friction_buckets",),
-            not_negative=("elastomer", "metal", "table"),
-            ranges=("friction", "mass_scale", "action_latency", "observation_latency", *scales),
-        )
-        if self.hand_friction is not None:
-            check_numbers(self, ranges=("hand_friction",))
+        ranges = [f.name for f in fields(self) if isinstance(getattr(self, f.name), tuple)]
+        check_numbers(self, positive=("friction_buckets",), not_negative=("elastomer", "metal", "table"), ranges=ranges)
+        for name in ("mass_scale", "object_inertia"):
+            if not getattr(self, name)[0] > 0:
+                raise ValueError(f"{name} begins with {getattr(self, name)[0]}, expected factors above 0")
+
+    def draws(self, *names: str) -> bool:
+        """Whether one of these ranges is another than its default."""
+        return self.enabled and any(getattr(self, name) != getattr(_AS_STATED, name) for name in names)
 
     @property
     def scales_drives(self) -> bool:
         """Whether drives differ from what the robot spec says."""
-        names = ("arm_stiffness", "arm_damping", "hand_stiffness", "hand_damping", "effort")
-        return self.enabled and any(getattr(self, name) != (1.0, 1.0) for name in names)
+        return self.draws("arm_stiffness", "arm_damping", "hand_stiffness", "hand_damping", "effort")
+
+
+_AS_STATED = RandomizationConfig()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,6 +299,10 @@ class TaskConfig:
 
     def __post_init__(self) -> None:
         check_numbers(self, positive=("timestep", "substeps", "distance_points"), finite=("timestep",))
+        steps = self.termination.episode_seconds / (self.timestep * self.substeps)
+        for name in ("action_latency", "observation_latency"):
+            if (longest := getattr(self.randomization, name)[1]) >= steps:
+                raise ValueError(f"{name} goes up to {longest:g} control steps, expected fewer than an episode has, which are {steps:.0f}")
 
 
 EVALUATION_TIMESTEP = 1.0 / 240.0

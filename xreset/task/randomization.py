@@ -41,6 +41,12 @@ def sample_mass_scale(count: int, c: RandomizationConfig, generator: torch.Gener
     return sample_range(count, c.mass_scale if c.enabled else (1.0, 1.0), generator)
 
 
+def sample_offset(count: int, limits: tuple[float, float], generator: torch.Generator) -> Tensor:
+    """[M, 3] vectors in any direction, of uniform lengths of a range."""
+    direction = torch.randn(count, 3, generator=generator, device=generator.device)
+    return sample_range(count, limits, generator)[:, None] * torch.nn.functional.normalize(direction, dim=-1)
+
+
 def sample_drives(is_arm: Tensor, count: int, c: RandomizationConfig, generator: torch.Generator) -> Tensor:
     """[M, 3, J] factors on the drives' stiffness, damping and effort limit.
 

@@ -70,6 +70,7 @@ class DrakeWorld(World):
         self._target = scene.robot.home
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
         self._mass, self._fraction = self._inertia.mass, 1.0
+        self._com, self._inertia_scale = self._inertia.com, 1.0
         self._force, self._torque = np.zeros(3), np.zeros(3)
         self._steps = 0
         self._friction: dict[str, float] = {}
@@ -125,7 +126,7 @@ class DrakeWorld(World):
             return
         at = self._at
         load = ExternallyAppliedSpatialForce()
-        load.body_index, load.p_BoBq_B = at.object.index(), self._inertia.com
+        load.body_index, load.p_BoBq_B = at.object.index(), self._com
         load.F_Bq_W = SpatialForce(self._torque, self._force - np.array([0.0, 0.0, self._mass * GRAVITY * self._fraction]))
         at.plant.get_applied_spatial_force_input_port().FixValue(self._context, Value[list[ExternallyAppliedSpatialForce]]([load]))
         for count in [1] * (n * self._internal_steps) if self._brake.needed else [n * self._internal_steps]:
@@ -189,10 +190,24 @@ class DrakeWorld(World):
 
     def set_object_mass(self, mass: float) -> None:
         """See :meth:`World.set_object_mass`."""
-        nominal = self._inertia
-        scaled = Inertia(mass=mass, com=nominal.com, quat=nominal.quat, moments=nominal.moments * (mass / nominal.mass))
         self._mass = mass
-        self._at.object.SetSpatialInertiaInBodyFrame(self._context, spatial_inertia(scaled))
+        self._weigh_object()
+
+    def set_object_inertia(self, scale: float) -> None:
+        """See :meth:`World.set_object_inertia`."""
+        self._inertia_scale = scale
+        self._weigh_object()
+
+    def set_object_com(self, offset: np.ndarray) -> None:
+        """See :meth:`World.set_object_com`."""
+        self._com = self._inertia.com + offset
+        self._weigh_object()
+
+    def _weigh_object(self) -> None:
+        nominal = self._inertia
+        moments = nominal.moments * (self._inertia_scale * self._mass / nominal.mass)
+        inertia = Inertia(mass=self._mass, com=self._com, quat=nominal.quat, moments=moments)
+        self._at.object.SetSpatialInertiaInBodyFrame(self._context, spatial_inertia(inertia))
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
@@ -249,7 +264,7 @@ class DrakeBackend(PoolBackend):
     """N worlds of Drake; the keyword ``settings`` takes :class:`DrakeSettings`."""
 
     name = "drake"
-    capabilities = frozenset(get_args(Capability)) - {"drives"}
+    capabilities = frozenset(get_args(Capability)) - {"drives", "torsional_friction"}
     known_differences = _KNOWN_DIFFERENCES
     world_class = DrakeWorld
 

@@ -395,15 +395,6 @@ class InertiaScaledTwice(MujocoWorld):
         super().set_object_inertia(scale * scale)
 
 
-@breaks("object_inertia_set")
-class InertiaWithoutTheSolversWeights(MujocoWorld):
-    def set_object_inertia(self, scale):
-        body = self._at.object_body
-        kept = self._model.body_invweight0[body].copy()
-        super().set_object_inertia(scale)
-        self._model.body_invweight0[body] = kept
-
-
 @breaks("object_com_set")
 class ShapesMoveWithTheCentreOfMass(MujocoWorld):
     def set_object_com(self, offset):

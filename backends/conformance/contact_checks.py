@@ -252,7 +252,7 @@ CHECKS = (
         name="object_inertia_set",
         group="contact",
         statement="a world whose object's inertia was set does what a world built with it does, in the air and on the table",
-        cause="the inertia is shared by all worlds or set once and scaled again, or the solver's inverse weights are stale",
+        cause="the inertia is shared by all worlds, set once and scaled again, or forgotten when the mass is set",
         run=object_inertia_set,
         capabilities=("object_inertia", "object_wrench"),
     ),

@@ -20,7 +20,7 @@ from xreset.backends.conformance.harness import (
     start_state,
 )
 from xreset.backends.conformance.results import Check, Measure, Skipped
-from xreset.physics import Backend, Parameter, Parameters, State
+from xreset.physics import Backend, Parameters, State
 
 _SAME: dict[str, tuple[float, str]] = {
     "joint_pos": (1e-5, "rad, m"),
@@ -90,7 +90,7 @@ def masked_set(bench: Bench) -> list[Measure]:
     chosen = [3, 1]
     new = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=11)
     scale = torch.tensor([2.0, 0.5, 1.5, 0.7])
-    parameters: dict[Parameter, Tensor] = {
+    parameters: dict[str, Tensor] = {
         "object_mass": torch.tensor([thing.mass for thing in bench.objects]) * scale,
         "object_inertia": scale.flip(0),
         "object_com": 0.01 * scale[:, None] * torch.tensor([1.0, -1.0, 0.5]),

@@ -1,9 +1,10 @@
 """The task's pure functions, and what a policy is refused for. Expected numbers come from the paper's formulas, not from the code."""
 
+import json
 import math
 import tempfile
 import unittest
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
-from xreset.errors import DemoError, PolicyError
+from xreset.errors import DemoError, PolicyError, RunError
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_rotate
 from xreset.policy import OnnxPolicy, RandomPolicy, ZeroPolicy, check_contract, policy_contract
 from xreset.resets.distribution import Reset, ResetDistribution
@@ -33,6 +34,7 @@ from xreset.task.latency import DelayLine
 from xreset.task.randomization import pair_friction, sample_drives, sample_friction, sample_mass_scale
 from xreset.task.rewards import RewardInput, compute_reward, contact_gate
 from xreset.task.terminations import episode_steps, out_of_bounds
+from xreset.typed import from_dict
 
 IDENTITY = torch.tensor([1.0, 0, 0, 0])
 
@@ -43,6 +45,14 @@ def generator(seed: int = 0) -> torch.Generator:
 
 def turned(degrees: float, axis=(0.0, 0.0, 1.0)) -> torch.Tensor:
     return quat_from_axis_angle(torch.tensor(axis) * math.radians(degrees))
+
+
+def height(x: RewardInput) -> torch.Tensor:
+    return x.object_pos[:, 2]
+
+
+def one_number(x: RewardInput) -> torch.Tensor:
+    return x.object_pos[:, 2].mean()
 
 
 class WithRobot(unittest.TestCase):
@@ -142,6 +152,27 @@ class RewardTest(unittest.TestCase):
             reward = self.reward(config, tip_force=self.PRESS, object_pos=at, start_pos=start)
             known = max(0.02, float((start - torch.tensor([0.5, 0.3, 0.1])).norm()))
             self.assertAlmostEqual(float(reward.terms["progress"]), 8 * (1 - math.tanh(0.04 / 0.15) / math.tanh(known / 0.15)), places=4)
+
+    def test_a_term_of_the_users_own_is_added(self):
+        config = RewardConfig(own={f"{__name__}:height": 0.5})
+        reward = self.reward(config, best_reach=torch.tensor(1e3))
+        self.assert_terms(reward, **{f"{__name__}:height": 0.05})
+        task = TaskConfig(reward=config)
+        self.assertEqual(from_dict(TaskConfig, json.loads(json.dumps(asdict(task)))), task)
+        self.assertEqual(evaluation_task(task).reward, RewardConfig())
+
+    def test_a_term_that_is_none_is_refused(self):
+        for name, problem in (
+            ("no_such_module:f", "No module named"),
+            (f"{__name__}:no_such_function", "no attribute"),
+            (f"{__name__}:IDENTITY", "expected a function"),
+            (f"{__name__}:one_number", r"gave \(\), expected a tensor of one value for each world, \(1,\)"),
+        ):
+            with self.subTest(name), self.assertRaisesRegex(RunError, problem):
+                self.reward(RewardConfig(own={name: 1.0}))
+        for own in ({"height": 1.0}, {"module:": 1.0}, {"a:b": math.nan}):
+            with self.subTest(own), self.assertRaisesRegex(ValueError, "expected module:function and a finite number"):
+                RewardConfig(own=own)
 
     def test_a_quaternion_and_its_negative_are_one_rotation(self):
         a = self.reward(tip_force=self.PRESS, object_quat=turned(40))

@@ -7,6 +7,7 @@
     demos = xreset.synthesize([can.name], 4)                       # or xreset.read_demos("demos.npz")
     motion = xreset.retarget_demos(demos, robot, [can])            # robot states that follow the human's hand
     bank = xreset.make_bank(motion, robot, [can], ["mujoco"])      # those that a physics engine finds stable
+    env = xreset.make_env(robot, [can], bank, engine="mujoco")     # N worlds that begin there
 
 Importing this package loads nothing heavy: no torch, no physics engine, no display. A name is imported when it is first used.
 """
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from xreset.demos.archive import read_demos
     from xreset.demos.synth import synthesize
     from xreset.description import load_robot
-    from xreset.env import ManipulationEnv
+    from xreset.env import ManipulationEnv, make_env
     from xreset.eval.evaluate import evaluate
     from xreset.learning.train import train
     from xreset.objects.catalogue import load_object
@@ -39,6 +40,7 @@ _HOMES = {
     "load_robot": "xreset.description",
     "make_backend": "xreset.plugins",
     "make_bank": "xreset.resets.filter",
+    "make_env": "xreset.env",
     "read_bank": "xreset.resets.bank",
     "read_demos": "xreset.demos.archive",
     "retarget_demos": "xreset.retarget.pipeline",  # xreset.retarget is the package
@@ -57,6 +59,7 @@ __all__ = [
     "load_robot",
     "make_backend",
     "make_bank",
+    "make_env",
     "read_bank",
     "read_demos",
     "retarget_demos",

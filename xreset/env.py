@@ -6,9 +6,9 @@ same class, with another configuration, runs evaluations.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -20,6 +20,8 @@ from xreset.faults import FaultRecorder
 from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.objects import keypoints, surface_points
 from xreset.physics import Backend, Contacts, Health, Links, Parameters, State
+from xreset.plugins import make_backend
+from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task import observations as obs
@@ -27,7 +29,7 @@ from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
 from xreset.task.latency import DelayLine
 from xreset.task.randomization import sample_drives, sample_friction, sample_mass_scale, sample_offset, sample_range
-from xreset.task.rewards import Reward, RewardInput, compute_reward
+from xreset.task.rewards import Reward, RewardInput, compute_reward, own_term
 from xreset.task.terminations import episode_steps, out_of_bounds
 
 if TYPE_CHECKING:
@@ -44,6 +46,39 @@ _LASTING = (
 def make_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
     """The scene that a task is played in."""
     return SceneSpec(robot=robot, objects=objects, timestep=task.timestep, substeps=task.substeps)
+
+
+def make_env(
+    robot: RobotSpec,
+    objects: Sequence[ObjectSpec],
+    bank: ResetBank,
+    task: TaskConfig | None = None,
+    *,
+    engine: str = "mujoco",
+    num_envs: int = 16,
+    device: str = "cpu",
+    seed: int = 0,
+) -> ManipulationEnv:
+    """N worlds of the task in an engine. Close it, or use it as a context manager.
+
+    Args:
+        robot: the robot.
+        objects: those of the bank; world i holds object i modulo their number.
+        bank: where episodes begin, and their goals.
+        task: what to observe, reward and end on; None: the paper's.
+        engine: its name, as ``xreset engines list`` prints it.
+        num_envs: N.
+        device: where the engine and all tensors live.
+        seed: of every random number that the environment draws.
+    """
+    task, objects = task or TaskConfig(), tuple(objects)
+    backend = make_backend(engine, make_scene(robot, objects, task), num_envs, device=device)
+    try:
+        resets = ResetDistribution(bank, robot, tuple(o.name for o in objects), task.reset, backend.device)
+        return ManipulationEnv(backend, task, resets, seed=seed)
+    except BaseException:
+        backend.close()
+        raise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +123,8 @@ class ManipulationEnv:
         """
         from tensordict import TensorDict
 
+        for name in task.reward.own:
+            own_term(name)  # what cannot be loaded is refused now, not after the first step
         self.backend, self.task, self.resets = backend, task, resets
         self.cfg = task
         self.device = backend.device
@@ -168,6 +205,16 @@ class ManipulationEnv:
         self._log_values = torch.zeros(0, device=self.device)
         self._observations = TensorDict({}, batch_size=[n], device=self.device)
         self.reset()
+
+    def close(self) -> None:
+        """Close the engine."""
+        self.backend.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     # rsl-rl's contract -------------------------------------------------------------------------------------------------------------
 
@@ -520,4 +567,4 @@ class ManipulationEnv:
         return (*rows, *totals), torch.cat((means, torch.stack([value.float() for value in totals.values()])))
 
 
-__all__ = ["ManipulationEnv", "Reading", "make_scene"]
+__all__ = ["ManipulationEnv", "Reading", "make_env", "make_scene"]

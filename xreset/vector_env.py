@@ -75,7 +75,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def close_extras(self, **_: Any) -> None:
         """Close the engine."""
-        self.env.backend.close()
+        self.env.close()
 
     def _observations(self) -> dict[str, np.ndarray]:
         return {name: _numpy(value) for name, value in self.env.get_observations().items()}

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from xreset.description import load_robot
-from xreset.env import ManipulationEnv, make_scene
+from xreset.env import make_env
 from xreset.errors import RunError
 from xreset.files import claim, file_hash
 from xreset.learning.config import TrainConfig
@@ -19,10 +19,9 @@ from xreset.learning.export import export_onnx
 from xreset.learning.run import RunInfo, checkpoints, latest_checkpoint, read_run, write_run
 from xreset.learning.runner import TrainingRunner
 from xreset.objects import load_objects
-from xreset.plugins import backend_class, device_for, make_backend
+from xreset.plugins import backend_class, device_for
 from xreset.policy import check_contract, policy_contract
 from xreset.resets.bank import ResetBank, check_objects, read_bank
-from xreset.resets.distribution import ResetDistribution
 from xreset.spec import ObjectSpec, RobotSpec
 
 
@@ -163,12 +162,9 @@ def _train(processes: Processes, out: Path, info: RunInfo, inputs: RunInputs | N
     inputs = inputs or load_inputs(info.robot, info.resets, info.objects)
     if inputs.resets_hash != info.resets_hash:
         raise RunError(f"{info.resets} is not the file that this run was started with. Put it back, or start a new run.")
-    config, names = info.config, tuple(o.name for o in inputs.objects)
+    config, world = info.config, (inputs.robot, inputs.objects, inputs.bank)
     torch.manual_seed(seed)
-    scene = make_scene(inputs.robot, inputs.objects, config.task)
-    with make_backend(info.backend, scene, info.num_envs, device=device) as backend:
-        resets = ResetDistribution(inputs.bank, inputs.robot, names, config.task.reset, backend.device)
-        env = ManipulationEnv(backend, config.task, resets, seed=seed)
+    with make_env(*world, config.task, engine=info.backend, num_envs=info.num_envs, device=device, seed=seed) as env:
         runner = TrainingRunner(env, config, out)
         if resume and checkpoints(out):
             runner.load_checkpoint(latest_checkpoint(out))

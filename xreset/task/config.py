@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from math import isfinite
 from typing import Literal
 
 from xreset.checks import check_numbers
@@ -123,10 +124,15 @@ class RewardConfig:
     raw_actions: bool = False
     """Whether ``action`` and ``action_rate`` take actions as the policy gave them, and not as limited to [-1, 1]. Where a mean lies beyond
     the limit, noise explores nothing, and only a penalty of the raw action pulls it back (as in Isaac Lab's action terms)."""
+    own: dict[str, float] = field(default_factory=dict)
+    """Terms of your own: ``module:function`` -> weight (:func:`xreset.task.rewards.own_term`)."""
     scale: float = 0.01
     """Factor on the total (Table VIII)."""
 
     def __post_init__(self) -> None:
+        for name, weight in self.own.items():
+            if not all(name.partition(":")[::2]) or not isfinite(weight):
+                raise ValueError(f"own holds {name!r} with weight {weight}, expected module:function and a finite number")
         check_numbers(
             self,
             positive=(
@@ -312,7 +318,8 @@ EVALUATION_TIMESTEP = 1.0 / 240.0
 def evaluation_task(task: TaskConfig) -> TaskConfig:
     """The task as a policy is evaluated: from home at full gravity, nominal physics, no observation noise; spawns stay perturbed.
 
-    Physics takes steps of :data:`EVALUATION_TIMESTEP`, if whole ones make a control step.
+    Physics takes steps of :data:`EVALUATION_TIMESTEP`, if whole ones make a control step. Reward terms of the user's own are left out: no
+    figure rests on them, and their module need not be where a policy is evaluated.
     """
     zero = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
     substeps = round(task.timestep * task.substeps / EVALUATION_TIMESTEP)
@@ -321,6 +328,7 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
     return replace(
         task,
         observation=replace(task.observation, noise=zero),
+        reward=replace(task.reward, own={}),
         reset=replace(task.reset, demo_probability=0.0, frontier=0.0, home_gravity_std=0.0),
         randomization=replace(task.randomization, enabled=False),
     )

@@ -8,11 +8,16 @@ of the object's keypoints to the goal now and at the demonstration's start, f(x)
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
+from xreset.errors import RunError
 from xreset.geometry.rotations import quat_angle, quat_rotate
 from xreset.task.config import RewardConfig
 
@@ -55,6 +60,29 @@ class Reward:
     """[N] bool: the thumb and at least one other finger press on the object."""
     success: Tensor
     """[N] bool, contact-gated pose success."""
+
+
+OwnTerm = Callable[[RewardInput], Tensor]
+"""A reward term of the user's own: what the reward looks at -> [N] before its weight. On a GPU it is replayed as part of a graph, so it
+must not ask what a tensor holds (``if``, ``item``, ``nonzero``)."""
+
+
+@cache
+def own_term(name: str) -> OwnTerm:
+    """The function ``module:function`` of ``task.reward.own``.
+
+    Raises:
+        RunError: the module cannot be imported, or has no such function.
+    """
+    module, _, function = name.partition(":")
+    try:
+        found: Any = getattr(import_module(module), function)
+    except Exception as error:  # a user's module may fail in any way
+        reason = f"{type(error).__name__}: {error}"
+        raise RunError(f"the reward term {name!r} cannot be loaded ({reason}). Is its folder in PYTHONPATH?") from error
+    if not callable(found):
+        raise RunError(f"the reward term {name!r} is {found!r}, expected a function of a RewardInput.")
+    return cast(OwnTerm, found)
 
 
 def contact_gate(tip_force: Tensor, threshold: float, *, opposing: bool = False) -> Tensor:
@@ -116,5 +144,14 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
         "action_rate": c.action_rate * (x.action - x.previous_action).square().sum(dim=-1),
         "out_of_bounds": c.out_of_bounds * x.out_of_bounds.to(gate_f.dtype),
     }
+    for name, weight in c.own.items():
+        terms[name] = weight * _checked(name, own_term(name)(x), position_error)
     total = c.scale * torch.stack(list(terms.values())).sum(dim=0)
     return Reward(total=total, terms=terms, grasped=grasped, success=success)
+
+
+def _checked(name: str, value: Tensor, like: Tensor) -> Tensor:
+    if not isinstance(value, Tensor) or value.shape != like.shape:
+        found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        raise RunError(f"the reward term {name!r} gave {found}, expected a tensor of one value for each world, {tuple(like.shape)}.")
+    return value.to(like.dtype)

@@ -1,21 +1,87 @@
 """The environment as Gymnasium knows it."""
 
 import unittest
+import warnings
 from dataclasses import replace
-from importlib.util import find_spec
 
 import numpy as np
 
 from tests.test_env import TASK, WithEnv
 from xreset.task.config import TerminationConfig
 
+try:
+    import gymnasium
+    from gymnasium.utils.env_checker import check_env
+    from gymnasium.vector.utils import iterate
+    from gymnasium.wrappers.vector import RecordEpisodeStatistics
+except ImportError as error:
+    raise unittest.SkipTest("gymnasium is not installed") from error
 
-@unittest.skipUnless(find_spec("gymnasium"), "gymnasium is not installed")
+from xreset.vector_env import VectorEnv
+
+
+class OneWorld(gymnasium.Env):
+    """World ``index`` of a vector environment as the single environment that Gymnasium's checker takes; the others stand still."""
+
+    def __init__(self, envs: VectorEnv, index: int) -> None:
+        self.envs, self.index, self.metadata = envs, index, {"render_modes": []}
+        self.observation_space, self.action_space = envs.single_observation_space, envs.single_action_space
+
+    def mine(self, batch):
+        return list(iterate(self.envs.observation_space, batch))[self.index]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        observations, infos = self.envs.reset(seed=seed, options=options)
+        return self.mine(observations), infos
+
+    def step(self, action):
+        actions = np.zeros(self.envs.action_space.shape, np.float32)
+        actions[self.index] = action
+        observations, reward, terminated, truncated, _ = self.envs.step(actions)
+        i = self.index
+        return self.mine(observations), float(reward[i]), bool(terminated[i]), bool(truncated[i]), {}
+
+
 class VectorEnvTest(WithEnv):
-    def vector_env(self, seconds: float):
-        from xreset.vector_env import VectorEnv
+    def vector_env(self, seconds: float) -> VectorEnv:
+        envs = VectorEnv(self.make(replace(TASK, termination=TerminationConfig(episode_seconds=seconds))))
+        self.addCleanup(envs.close)
+        return envs
 
-        return VectorEnv(self.make(replace(TASK, termination=TerminationConfig(episode_seconds=seconds))))
+    def test_gymnasiums_checker_finds_nothing_in_any_world(self):
+        """Gymnasium has no checker of vector environments: its ``check_env`` sees each world as an environment of its own."""
+        envs = self.vector_env(0.5)
+        for world in range(envs.num_envs):
+            with warnings.catch_warnings(record=True) as found:
+                warnings.simplefilter("always")
+                check_env(OneWorld(envs, world))
+            expected = ("spec", "infinity")  # it was not made by gymnasium.make; and joint speeds and forces have no bounds
+            self.assertEqual([str(w.message) for w in found if not any(word in str(w.message) for word in expected)], [])
+
+    def test_the_batch_is_what_gymnasium_makes_of_the_single_spaces(self):
+        envs = self.vector_env(0.5)
+        self.assertEqual(envs.observation_space, gymnasium.vector.utils.batch_space(envs.single_observation_space, envs.num_envs))
+        self.assertEqual(envs.action_space, gymnasium.vector.utils.batch_space(envs.single_action_space, envs.num_envs))
+        first, _ = envs.reset(seed=0)
+        kept = {name: value.copy() for name, value in first.items()}
+        _, reward, terminated, truncated, _ = envs.step(envs.action_space.sample())
+        for values, kind in ((reward, np.floating), (terminated, np.bool_), (truncated, np.bool_)):
+            self.assertEqual(values.shape, (envs.num_envs,))
+            self.assertTrue(np.issubdtype(values.dtype, kind), values.dtype)
+        for name, value in first.items():  # what was returned is not written to again
+            np.testing.assert_array_equal(value, kept[name])
+
+    def test_gymnasiums_wrappers_count_episodes(self):
+        envs = RecordEpisodeStatistics(self.vector_env(0.1))
+        length = envs.unwrapped.env.max_episode_length
+        envs.reset(seed=0)
+        for step in range(1, 2 * length + 2):
+            infos = envs.step(envs.action_space.sample())[4]
+            if step in (length, 2 * length + 1):
+                np.testing.assert_array_equal(infos["episode"]["l"], length)
+            else:
+                self.assertNotIn("episode", infos)
 
     def test_episodes_are_truncated_and_begin_anew_a_step_later(self):
         env = self.vector_env(0.1)
@@ -30,7 +96,6 @@ class VectorEnvTest(WithEnv):
             if step == length + 1:
                 np.testing.assert_array_equal(reward, 0.0)
                 np.testing.assert_array_equal(env.env.episode_length_buf.numpy(), 0)
-        env.close()
 
     def test_the_seed_decides(self):
         runs = []
@@ -39,7 +104,6 @@ class VectorEnvTest(WithEnv):
             env.reset(seed=seed)
             actions = np.zeros(env.action_space.shape, np.float32)
             runs.append(np.concatenate([env.step(actions)[0]["policy"] for _ in range(3)]))
-            env.close()
         np.testing.assert_array_equal(runs[0], runs[1])
         self.assertFalse(np.array_equal(runs[0], runs[2]))
 

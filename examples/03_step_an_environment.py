@@ -1,4 +1,4 @@
-"""An environment is stepped by hand: N worlds of the task in any engine, which reset themselves."""
+"""N worlds of the task in any engine, stepped by hand; a world whose episode has ended begins the next by itself."""
 
 import sys
 from pathlib import Path
@@ -6,29 +6,23 @@ from pathlib import Path
 import torch
 
 import xreset
-from xreset.env import make_scene
-from xreset.eval.evaluate import load_motion
-from xreset.resets.distribution import ResetDistribution
-from xreset.task.config import ResetConfig, TaskConfig
-
-NUM_WORLDS, STEPS = 4, 20
 
 
-def main(demos: str | Path) -> None:
-    """Act at random for a third of a second, from home; ``demos``: a file of ``xreset demos``."""
-    robot = xreset.load_robot("openarm")
-    bank, _ = load_motion(Path(demos), robot, None, trajectories=False)  # starts and goals; a reset bank has states to start from, too
-    objects = tuple(xreset.load_object(name) for name in bank.object_names)
-    task = TaskConfig(reset=ResetConfig(demo_probability=0.0))
-    worlds = torch.arange(NUM_WORLDS) % len(objects)
-    with xreset.make_backend("mujoco", make_scene(robot, objects, task), NUM_WORLDS, object_index=worlds) as backend:
-        env = xreset.ManipulationEnv(backend, task, ResetDistribution(bank, robot, bank.object_names, task.reset), seed=0)
-        total = torch.zeros(NUM_WORLDS)
-        for _ in range(STEPS):
-            observations, reward, *_ = env.step(2 * torch.rand(NUM_WORLDS, env.num_actions) - 1)
+def main(bank: Path, engine: str = "mujoco", steps: int = 60) -> None:
+    """Act at random; ``bank``: a file of ``xreset resets``, or of example 02."""
+    robot, states = xreset.load_robot("openarm"), xreset.read_bank(bank)
+    objects = [xreset.load_object(name) for name in states.object_names]
+    with xreset.make_env(robot, objects, states, engine=engine, num_envs=4) as env:
+        print("observations:", {name: tuple(value.shape) for name, value in env.get_observations().items()})
+        total = torch.zeros(env.num_envs)
+        for _ in range(steps):
+            action = 2 * torch.rand(env.num_envs, env.num_actions) - 1
+            _observations, reward, _done, _extras = env.step(action)
             total += reward
-    print(f"groups of observations: {', '.join(map(str, observations.keys()))}; return after {STEPS} steps: {total.mean():.3f}")
+        state = env.backend.state()  # everything in SI units; quaternions are (w, x, y, z)
+        print(f"heights of the objects [m]: {[round(z, 3) for z in state.object_pos[:, 2].tolist()]}")
+    print(f"return after {steps} steps of {env.backend.scene.control_dt * 1e3:.1f} ms: {total.mean():.3f}")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "bank.npz"))

@@ -1,0 +1,59 @@
+"""An engine of your own: one world in numpy, of which a pool makes N. `examples/xreset-drake` is a real one, with forces."""
+
+import numpy as np
+import torch
+
+from xreset.backends import conformance
+from xreset.backends.pool import PoolBackend, World, is_finite
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import matrix_to_quat
+
+
+class KinematicWorld(World):
+    """A robot that follows its targets at once, beside an object that nothing moves."""
+
+    def __init__(self, scene, object_index):
+        self._robot, self._kinematics = scene.robot, Kinematics(scene.robot)
+
+    def set_state(self, state):
+        self._state = {name: np.array(value) for name, value in state.items()}
+
+    def get_state(self):
+        return self._state
+
+    def set_joint_targets(self, targets):
+        self._state["joint_target"] = np.array(targets)
+
+    def step(self, n):
+        self._state |= {"joint_pos": self._state["joint_target"], "joint_vel": np.zeros(len(self._robot.joints))}
+
+    def links(self):
+        q, velocity, links = torch.as_tensor(self._state["joint_pos"]), self._state["joint_vel"], self._robot.tracked_links
+        T, J = self._kinematics.link_poses(q, links), self._kinematics.jacobian(q, links)
+        return T[:, :3, 3].numpy(), matrix_to_quat(T[:, :3, :3]).numpy(), J.linear.numpy() @ velocity, J.angular.numpy() @ velocity
+
+    def contacts(self):
+        fingers = len(self._robot.fingertips)
+        return np.zeros((fingers, 3)), np.zeros(fingers, dtype=bool), np.zeros(3)
+
+    def health(self, state):
+        return not is_finite(state), False
+
+    set_object_mass = set_friction = set_object_gravity = set_object_wrench = lambda self, *_: None  # they move nothing here
+
+
+class KinematicBackend(PoolBackend):
+    name, capabilities, world_class = "kinematic", frozenset(), KinematicWorld
+    engine_version = classmethod(lambda cls: "1")
+
+
+def main() -> None:
+    """What `xreset engines check` does. The first three checks pass; nothing falls in this engine, and the fourth says so."""
+    make = lambda *scene, **options: KinematicBackend(*scene, workers=0, **options)  # noqa: E731 (in this process)
+    checks = ("state_round_trip", "links_after_set", "forward_kinematics", "free_fall")
+    for result in conformance.run(make, only=checks):
+        print(f"{result.verdict:8} {result.check.name} {result.problem}")
+
+
+if __name__ == "__main__":
+    main()

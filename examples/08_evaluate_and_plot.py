@@ -1,0 +1,38 @@
+"""A trained policy is evaluated in several engines from the same starts, and what it reaches is plotted."""
+
+import sys
+from pathlib import Path
+
+import xreset
+from xreset.demos import write_demos
+from xreset.eval.evaluate import resolve
+from xreset.eval.setting import Setting
+from xreset.eval.trial import engine
+
+
+def main(out: Path, engines: tuple[str, ...] = ("mujoco", "sapien")) -> None:
+    """Write ``eval/`` (results, episode by episode) and ``progress.png``."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    write_demos(out / "unseen.npz", xreset.synthesize(["005_tomato_soup_can"], 1, seed=1))
+    subject = resolve("soup-can", None, 0)  # a policy that ships with xreset; a run folder or a .onnx file will do
+    setting = Setting(num_envs=1)
+    results = xreset.evaluate(subject, [engine(name) for name in engines], out / "unseen.npz", setting, out / "eval", episodes=1)
+
+    figure, axes = pyplot.subplots(figsize=(5, 3), layout="constrained")
+    parts = ("approach_rate", "grasp_rate", "reorient_rate", "reorientation_progress")
+    for number, result in enumerate(results):
+        means = [getattr(result, part) for part in parts]
+        axes.bar([i + 0.4 * number for i in range(len(parts))], means, width=0.38, label=f"{result.backend} {result.backend_version}")
+        print(f"{result.policy} in {result.backend}: task progress {result.task_progress.mean:.0%} in {result.episodes} episodes")
+    axes.set_xticks([i + 0.2 for i in range(len(parts))], [part.replace("_", "\n") for part in parts])
+    axes.set(ylim=(0, 1), ylabel="share")
+    axes.legend(loc="lower left")
+    figure.savefig(out / "progress.png", dpi=150)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."))

@@ -49,6 +49,12 @@ class Subject:
     objects_folder: str | None
     """Folder of meshes that it was trained with."""
     inputs: dict[str, str]
+    trained_on: tuple[str, ...] | None = None
+    """Names of the objects that it was trained with; None: a baseline, which was not trained."""
+
+    def unseen(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Those of some objects that are outside of its training, sorted."""
+        return () if self.trained_on is None else tuple(sorted({*names} - {*self.trained_on}))
 
     def meshes(self, given: Path | None) -> Path | None:
         """The folder of meshes to use: the given one, else its own; None: the stand-ins."""
@@ -113,6 +119,7 @@ def resolve(policy: str, robot: str | None, seed: int) -> Subject:
         folder=folder,
         objects_folder=objects_folder,
         inputs={"policy": file_hash(file)},
+        trained_on=tuple(contract["objects"]),
     )
 
 
@@ -183,6 +190,7 @@ def evaluate(
             repetitions=episodes,
             inputs=inputs,
             objects_folder=str(folder) if folder else None,
+            unseen=subject.unseen(trial.names),
         )
         write_results(out, summary, rollouts, subject.robot.joint_names)
         summaries.append(summary)

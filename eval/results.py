@@ -106,6 +106,8 @@ class EvalResult:
     control_steps_per_second: float
     inputs: dict[str, str]
     """SHA-256 by name."""
+    unseen: tuple[str, ...] = ()
+    """Those of the objects that the policy was not trained with, sorted; none of a baseline's."""
 
     def __post_init__(self) -> None:
         check_numbers(
@@ -122,7 +124,7 @@ class EvalResult:
 
 def summarize(
     rollouts: Rollouts, *, backend: str, backend_version: str, robot: str, policy: str, seed: int, repetitions: int, inputs: dict[str, str],
-    objects_folder: str | None,
+    objects_folder: str | None, unseen: tuple[str, ...] = (),
 ) -> EvalResult:  # fmt: skip
     """What the episodes come to."""
     episodes = rollouts.episodes
@@ -153,6 +155,7 @@ def summarize(
         health=EpisodeFaults(**{f.name: sum(getattr(e, f.name) for e in episodes) for f in fields(EpisodeFaults)}),
         control_steps_per_second=round(rollouts.control_steps_per_second, 1),
         inputs=inputs,
+        unseen=unseen,
     )
 
 

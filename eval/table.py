@@ -20,11 +20,18 @@ def rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
     def rate(name: str) -> list[str]:
         return [f"{getattr(s, name):.0%}" for s in summaries]
 
-    intervals = [s.task_progress.ci95 for s in summaries]
+    def over(part: str, objects: Sequence[str]) -> tuple[str, ...]:
+        means = [[d.task_progress for d in s.per_demo if d.object in objects] for s in summaries]
+        return (part, *(f"{sum(values) / len(values):.1%}" for values in means))
+
+    intervals, first = [s.task_progress.ci95 for s in summaries], summaries[0]
+    known = [name for name in first.objects if name not in first.unseen]
+    parts = [over("  trained objects", known), over("  unseen objects", first.unseen)] if known and first.unseen else []
     return [
         ("version", *(s.backend_version for s in summaries)),
         ("task progress", *(f"{s.task_progress.mean:.1%}" for s in summaries)),
         ("  95 % interval", *(f"{100 * low:.0f}-{100 * high:.0f}%" for low, high in intervals)),
+        *parts,
         ("approach", *rate("approach_rate")),
         ("grasp", *rate("grasp_rate")),
         ("reorient", *rate("reorient_rate")),
@@ -42,7 +49,10 @@ def rich_table(summaries: Sequence[EvalResult]) -> Table:
 
     first = summaries[0]
     count = f"{first.episodes} episodes of {len(first.per_demo)} demonstrations"
-    table = Table(title=f"{first.policy} on {first.robot}\n{count}, seed {first.seed}", title_justify="left")
+    title = f"{first.policy} on {first.robot}\n{count}, seed {first.seed}"
+    if first.unseen:
+        title += f"\nnot in its training: {', '.join(first.unseen)}"
+    table = Table(title=title, title_justify="left")
     table.add_column("", no_wrap=True)
     for s in summaries:
         table.add_column(s.backend, justify="right", no_wrap=True)

@@ -4,23 +4,25 @@ import json
 import math
 import tempfile
 import unittest
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from tests.toy_bank import SOUP, SPAM
-from tests.toy_results import toy_rollouts, toy_summary
+from tests.toy_results import OBJECTS, toy_rollouts, toy_summary
 from xreset.env import Reading
 from xreset.errors import FileFormatError
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
-from xreset.eval.results import read_results, read_traces, write_results
+from xreset.eval.results import EvalResult, read_results, read_traces, write_results
 from xreset.eval.rollout import Episode
 from xreset.eval.stats import bootstrap_ci95
+from xreset.eval.table import rich_table, rows
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import Contacts, Health, Links, State
 from xreset.task.rewards import keypoint_distance
+from xreset.typed import from_dict
 
 CORNERS = torch.tensor([[-1.0, -1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]]) * 0.05
 IDENTITY = torch.tensor([1.0, 0, 0, 0])
@@ -207,6 +209,15 @@ class BootstrapTest(unittest.TestCase):
 
 
 class ResultsTest(unittest.TestCase):
+    def test_the_table_tells_trained_objects_from_unseen_ones(self):
+        summary = toy_summary(unseen=(OBJECTS[1],))
+        table = {row[0].strip(): row[1] for row in rows([summary])}
+        self.assertEqual((table["trained objects"], table["unseen objects"]), ("66.5%", "33.0%"))
+        self.assertIn(f"not in its training: {OBJECTS[1]}", str(rich_table([summary]).title))
+        for same in (toy_summary(), toy_summary(unseen=OBJECTS)):
+            self.assertNotIn("unseen objects", {row[0].strip() for row in rows([same])})
+        self.assertEqual(from_dict(EvalResult, json.loads(json.dumps(asdict(summary)))), summary)
+
     JOINTS = ("a", "b", "c")
 
     def setUp(self):

@@ -234,6 +234,32 @@ class ShippedTest(WithPolicy):
         self.assertEqual(subject.task, TASK)
         self.assertEqual(subject.inputs, resolve(str(self.file), None, 0).inputs)
 
+    def test_the_list_is_of_cards(self):
+        code, _, err = run("policies", "list")
+        self.assertEqual(code, 1)
+        self.assertIn("skilled.toml cannot be read as the card of skilled.onnx", err)
+        card = policies.FOLDER / "skilled.toml"
+        text = (
+            'schema = "xreset-policy-card/1"\nabout = "Lifts."\ndata = "four demonstrations"\nrecipe = "one minute"\nlicence = "MIT"\n'
+            '[results.seen]\nmujoco = "90 %"\n[results.others]\nsapien = "70 %"\n'
+        )
+        card.write_text(text)
+        code, out, err = run("policies", "list")
+        self.assertEqual((code, err), (0, ""))
+        for part in ("skilled: Lifts.", "four demonstrations", "one minute", "MIT", "openarm", SOUP, "mujoco", "90 %", "sapien", "70 %"):
+            self.assertIn(part, out)
+        for wrong, problem in (
+            (text.replace("card/1", "card/9"), "states schema"),
+            (text + "[more]\n", "unknown: more"),
+            ("= 1", "cannot be"),
+        ):
+            card.write_text(wrong)
+            self.assertIn(problem, run("policies", "list")[2])
+
+    def test_it_knows_which_objects_it_was_not_trained_with(self):
+        self.assertEqual(resolve("skilled", None, 0).unseen((SOUP, "mug", "bowl")), ("bowl", "mug"))
+        self.assertEqual(resolve("zero", "openarm", 0).unseen((SOUP, "mug")), ())
+
     def test_what_lies_at_a_path_wins(self):
         Path("skilled").write_text("mine")
         with self.assertRaisesRegex(PolicyError, "skilled cannot be read as an ONNX policy"):

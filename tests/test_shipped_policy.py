@@ -14,7 +14,7 @@ from xreset.eval.evaluate import BASELINES, evaluate, resolve
 from xreset.eval.setting import Setting
 from xreset.eval.trial import engine
 from xreset.objects import object_names
-from xreset.policies import shipped
+from xreset.policies import card, shipped
 from xreset.policy import OnnxPolicy, check_contract
 from xreset.task.config import TaskConfig
 
@@ -63,6 +63,15 @@ class ShippedPolicyTest(unittest.TestCase):
                 self.assertLess(len(content), LARGEST)
                 self.assertNotIn(b".py", content)
                 self.assertNotIn(name, BASELINES)
+
+    def test_its_card_tells_of_engines_and_licence(self):
+        for name, file in shipped().items():
+            with self.subTest(name):
+                found = card(file)
+                self.assertTrue(found.licence and found.data and found.recipe)
+                self.assertLessEqual(
+                    {"mujoco", "mujoco-warp", "pybullet", "sapien"}, {e for figures in found.results.values() for e in figures}
+                )
 
     def test_its_objects_have_stand_ins(self):
         for name, file in shipped().items():

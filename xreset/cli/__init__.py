@@ -20,7 +20,7 @@ COMMANDS: dict[str, str] = {
     "resets": "Try retargeted states in physics and keep the stable ones.",
     "view": "Look at demonstrations, robot trajectories or a reset bank in a browser, or as pictures.",
     "train": "Train a policy.",
-    "policies": "List the policies that ship with xreset, and make exported ones smaller.",
+    "policies": "Show the policies that ship with xreset, and make exported ones smaller.",
     "eval": "Evaluate a policy, or a baseline, in one or several engines.",
     "frontier": "Tell from which demonstrated states a policy reaches the goal, and where its training is stuck.",
     "stress": "Tell what a policy bears: stiffness, latency, friction and more, swept one at a time.",

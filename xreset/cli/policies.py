@@ -1,4 +1,4 @@
-"""``xreset policies``: those that ship with xreset, and exported ones as files."""
+"""``xreset policies``: the cards of those that ship with xreset, and exported ones as files."""
 
 from __future__ import annotations
 
@@ -9,18 +9,31 @@ import tyro
 
 
 def list_() -> None:
-    """List the policies that ship with xreset; wherever a policy is asked for, their names will do."""
+    """Show the cards of the policies that ship with xreset; wherever a policy is asked for, their names will do."""
     from rich.table import Table
 
     from xreset.cli._terminal import Console
-    from xreset.policies import shipped
+    from xreset.policies import card, shipped
     from xreset.policy import OnnxPolicy
 
-    table = Table("policy", "robot", "objects", "MB")
+    console = Console()
     for name, file in shipped().items():
-        contract = OnnxPolicy(file).contract
-        table.add_row(name, contract["robot"], ", ".join(contract["objects"]), f"{file.stat().st_size / 1e6:.1f}")
-    Console().print(table)
+        contract, about = OnnxPolicy(file).contract, card(file)
+        console.print(f"{name}: {about.about}", highlight=False)
+        facts = {
+            "robot": contract["robot"],
+            "objects": ", ".join(contract["objects"]),
+            "data": about.data,
+            "recipe": about.recipe,
+            "licence": f"{about.licence}; {file.stat().st_size / 1e6:.1f} MB",
+        }
+        for what, text in facts.items():
+            console.print(f"  {what + ':':9} {text}", highlight=False, soft_wrap=True)
+        engines = list(dict.fromkeys(engine for by_engine in about.results.values() for engine in by_engine))
+        table = Table("task progress", *engines)
+        for episodes, by_engine in about.results.items():
+            table.add_row(episodes, *(by_engine.get(engine, "") for engine in engines))
+        console.print(table)
 
 
 def shrink(policy: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, tyro.conf.Positional]) -> None:

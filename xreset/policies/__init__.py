@@ -1,16 +1,49 @@
-"""Trained policies that ship with xreset: one exported file each, ``NAME.onnx`` in this folder, known to the command line as NAME."""
+"""Trained policies that ship with xreset: ``NAME.onnx`` in this folder, known to the command line as NAME, and its card ``NAME.toml``."""
 
 from __future__ import annotations
 
+import tomllib
+from dataclasses import dataclass
 from pathlib import Path
+
+from xreset.errors import FileFormatError
+from xreset.typed import from_dict
 
 FOLDER = Path(__file__).parent
 """Where they lie."""
+SCHEMA = "xreset-policy-card/1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Card:
+    """What a policy is, and what it was seen to do."""
+
+    schema: str
+    about: str
+    data: str
+    """What it was trained with."""
+    recipe: str
+    """How, and for how long."""
+    licence: str
+    results: dict[str, dict[str, str]]
+    """Episodes -> engine -> task progress with its interval."""
 
 
 def shipped() -> dict[str, Path]:
     """Name -> file of every policy that ships with this installation, in order of name."""
     return {file.stem: file for file in sorted(FOLDER.glob("*.onnx"))}
+
+
+def card(file: Path) -> Card:
+    """The card of a policy's file; ``FileFormatError`` if it is missing or damaged."""
+    path = file.with_suffix(".toml")
+    try:
+        found = from_dict(Card, tomllib.loads(path.read_text(encoding="utf-8")), str(path))
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"{path} cannot be read as the card of {file.name}: {error}.") from error
+    if found.schema != SCHEMA:
+        raise FileFormatError(f"{path} states schema {found.schema!r}, expected {SCHEMA!r}.")
+    return found
 
 
 def results_folder(name: str) -> Path:

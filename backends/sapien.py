@@ -6,7 +6,7 @@ What differs from SAPIEN's defaults, and why:
   0.05 is no torque, and brakes).
 - Friction of a pair is the *average* of its materials. With 0 on the object, the other material has twice the pair's coefficient.
   Torsional friction is mu times ``min_patch_radius``, so that radius is torsional / mu. PhysX leaves it out where a patch has two points
-  and lets half of the sliding friction act at each (``docs/sim-to-sim.md``; ``docs/results.md`` has what that costs a policy).
+  and lets half of the sliding friction act at each (``docs/sim-to-sim.md``; ``docs/lab-book.md`` has what that costs a policy).
 - The robot feels no gravity (if it is compensated). The object's weight is applied as a force, which gives gravity fractions.
 - PhysX reports the normal forces of contacts only; friction is worked out from the object's momentum (:func:`_friction`).
 - Linear velocities refer to the centre of mass; they are converted here. PhysX computes in single precision.

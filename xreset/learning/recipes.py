@@ -31,7 +31,7 @@ _MINUTES = TrainConfig(
     ppo=PpoConfig(precision="bfloat16", desired_kl=0.02, entropy=0.0),
 )
 """The paper's entropy bonus of 0.005 makes the standard deviation grow; one that only shrinks, and steps of twice the size, learn in a
-fraction of the iterations. What the task's levers are for stands with their fields, what they did in docs/results.md."""
+fraction of the iterations. What the task's levers are for stands with their fields, what they did in docs/lab-book.md."""
 
 _ROBUST = replace(
     _MINUTES,
@@ -64,7 +64,7 @@ RECIPES: dict[str, Recipe] = {
     "paper": Recipe(config=TrainConfig(), about="the paper's tables VIII and IX, for hours on several GPUs"),
     "minutes": Recipe(
         config=_MINUTES,
-        about="what taught an object alone in minutes on one GPU (docs/results.md): --num-envs 8192, and a bank with closing states",
+        about="what taught an object alone in minutes on one GPU (docs/lab-book.md): --num-envs 8192, and a bank with closing states",
     ),
     "robust": Recipe(
         config=_ROBUST,

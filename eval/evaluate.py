@@ -19,7 +19,7 @@ from xreset.eval.results import EvalResult, mesh_folder, summarize, write_result
 from xreset.eval.rollout import roll_out
 from xreset.eval.setting import Setting
 from xreset.eval.trial import Engine, Trial
-from xreset.files import file_hash, npz_schema
+from xreset.files import claim_folder, file_hash, npz_schema
 from xreset.objects import load_objects
 from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
@@ -173,27 +173,31 @@ def evaluate(
 
     Returns:
         The summaries that were written, in the order of the engines.
+
+    Raises:
+        XResetError: another command is writing into the folder.
     """
     trial, trajectories = subject.episodes(demos, setting)
     folder, inputs = subject.meshes(setting.objects), subject.inputs | {"demos": file_hash(demos)}
     summaries = []
-    for engine in engines:
-        policy = subject.policy(subject.robot, trajectories)
-        rollouts = roll_out(policy, engine, trial, repetitions=episodes, progress=partial(progress, engine.name))
-        summary = summarize(
-            rollouts,
-            backend=engine.name,
-            backend_version=engine.version,
-            robot=subject.robot.name,
-            policy=subject.label,
-            seed=setting.seed,
-            repetitions=episodes,
-            inputs=inputs,
-            objects_folder=str(folder) if folder else None,
-            unseen=subject.unseen(trial.names),
-        )
-        write_results(out, summary, rollouts, subject.robot.joint_names)
-        summaries.append(summary)
+    with claim_folder(out):
+        for engine in engines:
+            policy = subject.policy(subject.robot, trajectories)
+            rollouts = roll_out(policy, engine, trial, repetitions=episodes, progress=partial(progress, engine.name))
+            summary = summarize(
+                rollouts,
+                backend=engine.name,
+                backend_version=engine.version,
+                robot=subject.robot.name,
+                policy=subject.label,
+                seed=setting.seed,
+                repetitions=episodes,
+                inputs=inputs,
+                objects_folder=str(folder) if folder else None,
+                unseen=subject.unseen(trial.names),
+            )
+            write_results(out, summary, rollouts, subject.robot.joint_names)
+            summaries.append(summary)
     return summaries
 
 

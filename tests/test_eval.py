@@ -6,6 +6,7 @@ import tempfile
 import unittest
 from dataclasses import asdict, replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import torch
@@ -13,12 +14,15 @@ import torch
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_results import OBJECTS, toy_rollouts, toy_summary
 from xreset.env import Reading
-from xreset.errors import FileFormatError
+from xreset.errors import FileFormatError, XResetError
+from xreset.eval.evaluate import evaluate
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
 from xreset.eval.results import EvalResult, read_results, read_traces, write_results
 from xreset.eval.rollout import Episode
+from xreset.eval.setting import Setting
 from xreset.eval.stats import bootstrap_ci95
 from xreset.eval.table import rich_table, rows
+from xreset.files import claim_folder
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import Contacts, Health, Links, State
 from xreset.task.rewards import keypoint_distance
@@ -294,6 +298,16 @@ class ResultsTest(unittest.TestCase):
         (self.folder / "sapien.json").write_text('{"schema": "xreset-eval/0"}')
         with self.assertRaisesRegex(FileFormatError, "schema version 'xreset-eval/0'"):
             read_results(self.folder)
+
+    def test_two_evaluations_are_not_written_into_one_folder(self):
+        subject = mock.Mock(inputs={})
+        subject.episodes.return_value = mock.Mock(), None
+        demos = self.folder / "demos.npz"
+        demos.write_bytes(b"")
+        out = self.folder / "eval"
+        with claim_folder(out), self.assertRaisesRegex(XResetError, "another command is writing .*eval"):
+            evaluate(subject, [], demos, Setting(), out, episodes=1)
+        self.assertEqual(evaluate(subject, [], demos, Setting(), out, episodes=1), [])
 
     def test_a_result_that_is_not_a_number_is_not_written(self):
         rollouts = toy_rollouts()

@@ -24,6 +24,7 @@ from xreset.eval.report.failures import Strip, choose_failures, count_failures, 
 from xreset.eval.report.page import headline, page
 from xreset.eval.results import EvalResult, TaskProgress, write_results
 from xreset.eval.table import rich_table
+from xreset.files import claim_folder
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import RunInfo, write_run
 from xreset.objects import load_object
@@ -413,6 +414,13 @@ class CommandTest(InFolder):
         self.assertEqual(made.html, self.folder / "elsewhere" / "index.html")
         self.assertIn("There are no clips", made.html.read_text())
         self.assertTrue(made.overview.is_file())
+
+    def test_two_reports_are_not_written_into_one_folder(self):
+        self.write(("mujoco",))
+        with claim_folder(self.folder / "report"):
+            code, printed = self.run_command(str(self.folder))
+        self.assertEqual((code, list((self.folder / "report").iterdir())), (1, []))
+        self.assertRegex(printed, "another command is writing .*report. Wait for its end, or choose another --out")
 
     def test_mistakes_are_one_line(self):
         code, printed = self.run_command(str(self.folder))

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -316,6 +317,30 @@ class TrainingTest(unittest.TestCase):
         with claim(out), self.assertRaisesRegex(XResetError, "another command is writing"):
             train_only(out, info)
         train_only(out, info)
+
+    def test_a_full_disk_ends_a_training_in_one_sentence_and_it_goes_on(self):
+        out = self.folder / "full"
+        config = replace(CONFIG, iterations=1)
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        self.addCleanup(resource.setrlimit, resource.RLIMIT_FSIZE, limits)
+
+        def full_at(size: int) -> None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+
+        full_at(20_000)  # enough for the description and the curves, not for a checkpoint
+        with self.assertRaisesRegex(XResetError, "cannot write .*worlds.pt: File too large. Nothing was changed"):
+            train_only(out, self.start(out, config=config))
+        full_at(limits[0])
+        train_only(out, self.start(out, config=config))
+        for size, said in ((20_000, "cannot write .*worlds.pt"), (200, "cannot write the learning curves.*--resume")):
+            full_at(size)
+            with self.subTest(size), mock.patch("xreset.learning.train.write_run"), self.assertRaisesRegex(XResetError, said):
+                train_only(out, resumed(out, iterations=3), resume=True)
+            full_at(limits[0])
+            self.assertEqual(read_checkpoint(latest_checkpoint(out))["iteration"], 1)
+            self.assertFalse([f.name for f in out.rglob("*.part")])
+        train_only(out, resumed(out, iterations=2), resume=True)
+        self.assertEqual(read_checkpoint(latest_checkpoint(out))["iteration"], 2)
 
     def test_too_little_memory_is_said(self):
         out = self.folder / "memory"

@@ -116,6 +116,22 @@ def claim(path: str | Path) -> Iterator[None]:
         os.close(descriptor)
 
 
+@contextmanager
+def claim_folder(path: str | Path) -> Iterator[None]:
+    """Make a folder, if it is not there, and :func:`claim` it.
+
+    Raises:
+        XResetError: another command is writing into it, or it cannot be made.
+    """
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise XResetError(f"cannot make the folder {path}: {error.strerror or error}. Choose another place.") from error
+    with claim(path):
+        yield
+
+
 def _locked(path: Path, lock: Path) -> int:
     try:
         while True:
@@ -317,7 +333,8 @@ class _Header:
 
     @property
     def bytes(self) -> int:
-        return math.prod(self.shape) * self.dtype.itemsize
+        """What it takes as :func:`_read` gives it: integers of one byte become eight."""
+        return math.prod(self.shape) * max(self.dtype.itemsize, {"i": 8, "u": 8, "f": 4}.get(self.dtype.kind, 1))
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from xreset.eval.report.failures import Strip, choose_failures, draw_strip
 from xreset.eval.report.page import headline, page
 from xreset.eval.report.plots import short_name, write_overview
 from xreset.eval.results import EvalResult, mesh_folder, read_traces
-from xreset.files import atomic_write
+from xreset.files import atomic_write, claim_folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,10 +50,15 @@ def make_report(
     Raises:
         RunError: there are no results.
         FileFormatError: a file of the results is damaged.
-        XResetError: the page cannot be written, or a package for plots is missing.
+        XResetError: the page cannot be written, another command is writing it, or a package for plots is missing.
     """
     out = folder / "report" if out is None else out
     data = collect(folder)
+    with claim_folder(out):
+        return _make(data, out, robot, objects, progress)
+
+
+def _make(data: ReportData, out: Path, robot: str | None, objects: Path | None, progress: Callable[[int, int], None]) -> Report:
     clips, strips = [], []
     try:
         clips, strips = _draw(data, robot, objects, progress)

@@ -22,6 +22,7 @@ from xreset.errors import RunError
 from xreset.files import atomic_write
 from xreset.learning.clock import LiftClock
 from xreset.learning.config import TrainConfig, rsl_rl_config
+from xreset.learning.curves import CurveFile
 from xreset.learning.distributed import Processes
 from xreset.learning.faults import FaultBudget, FaultCounts, dump_faults, too_many_faults
 from xreset.learning.synergies import hand_synergies
@@ -278,10 +279,9 @@ class _Log:
 
     def __init__(self, folder: Path, num_envs: int, device: str, total: int) -> None:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-        from torch.utils.tensorboard import SummaryWriter
 
         self.clock = LiftClock(folder)
-        self._writer = SummaryWriter(log_dir=str(folder), flush_secs=10)
+        self._curves = CurveFile(folder)
         self._returns, self._lengths = torch.zeros(num_envs, device=device), torch.zeros(num_envs, device=device)
         self._finished = torch.zeros(3, device=device)  # sum of returns, sum of lengths, number of episodes
         self._recent: deque[list[float]] = deque(maxlen=20)
@@ -340,8 +340,7 @@ class _Log:
         }
         if episodes:
             scalars |= {"episode/return": returns / episodes, "episode/length": lengths / episodes}
-        for name, value in scalars.items():
-            self._writer.add_scalar(name, value, it)
+        self._curves.write(it, scalars)
         from_home = means["task/success_from_home"]
         self.clock.tick(from_home, iteration=it, env_steps=runner.env_steps, seconds=runner.elapsed)
         text = (
@@ -357,7 +356,7 @@ class _Log:
 
     def close(self, *, stopped: bool) -> None:
         self._progress.stop()
-        self._writer.close()
+        self._curves.close()
         self.clock.write()
         if stopped:
             self._console.print("stopped after the current iteration; a checkpoint is written.")

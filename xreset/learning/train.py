@@ -12,7 +12,7 @@ import torch
 from xreset.description import load_robot
 from xreset.env import make_env
 from xreset.errors import RunError
-from xreset.files import claim, file_hash
+from xreset.files import claim_folder, file_hash
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx
@@ -128,13 +128,11 @@ def train(out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: 
     Raises:
         RunError: another command trains here, the bank is not the run's, the newest checkpoint does not fit, or there is too little memory.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "checkpoints").mkdir(exist_ok=True)
     processes = Processes.of_environment()
     with ExitStack() as claims:
         if processes.is_main:
-            claims.enter_context(claim(out))
-            claims.enter_context(claim(out / "checkpoints"))
+            claims.enter_context(claim_folder(out))
+            claims.enter_context(claim_folder(out / "checkpoints"))
         try:
             _train(processes, out, info, inputs, resume=resume, seconds=seconds)
         except (MemoryError, torch.OutOfMemoryError) as error:

@@ -1,0 +1,61 @@
+"""Learning curves as TensorBoard reads them, written in this thread: a full disk is an error of the training, and said as one."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from xreset.errors import XResetError
+
+
+class CurveFile:
+    """An event file of a training; each start of it writes its own."""
+
+    def __init__(self, folder: Path) -> None:
+        """Begin the file.
+
+        Raises:
+            XResetError: it cannot be written.
+        """
+        from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportMissingImports]
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        self._folder, self._event = folder, Event
+        name = f"events.out.tfevents.{time.time_ns()}.{socket.gethostname()}.{os.getpid()}"
+        with self._writing():
+            self._records = RecordWriter(open(folder / name, "xb"))  # noqa: SIM115
+        self._add(Event(wall_time=time.time(), file_version="brain.Event:2"))
+
+    def write(self, step: int, scalars: Mapping[str, float]) -> None:
+        """Add values by tag.
+
+        Raises:
+            XResetError: they cannot be written.
+        """
+        event = self._event(wall_time=time.time(), step=step)
+        for tag, value in scalars.items():
+            event.summary.value.add(tag=tag, simple_value=value)
+        self._add(event)
+
+    def close(self) -> None:
+        """End the file."""
+        self._records.close()
+
+    def _add(self, event) -> None:
+        with self._writing():
+            self._records.write(event.SerializeToString())
+            self._records.flush()
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise XResetError(
+                f"cannot write the learning curves in {self._folder}: {error.strerror or error}. Free some space, then go on from the last "
+                f"checkpoint: xreset train --out {self._folder} --resume"
+            ) from error

@@ -17,13 +17,17 @@ import numpy as np
 import yaml
 from hypothesis import strategies as st
 
+from tests.test_import_robot import HAND, MJCF
+from tests.test_keypoints import PLAIN, write_csv
 from tests.test_view import toy_demos, toy_retargeted
-from tests.toy_bank import toy_bank
+from tests.toy_bank import SOUP, toy_bank
+from tests.toy_policy import write_policy
 from tests.toy_results import toy_rollouts, toy_summary
 from tests.toy_robot import toy_hand_arm
 from xreset.demos import read_demos, write_demos
 from xreset.errors import XResetError
-from xreset.files import write_json
+from xreset.files import read_json, write_json
+from xreset.geometry import urdf
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import RunInfo, read_run, write_run
 from xreset.physics import State
@@ -55,21 +59,29 @@ class Reader:
 def readers() -> Iterator[dict[str, Reader]]:
     """All of them, over files in a temporary folder."""
     import torch
+    from scipy.spatial.transform import Rotation
+    from torch.utils.tensorboard import SummaryWriter
 
     from xreset.backends.conformance import SCHEMA as CONFORMANCE
     from xreset.demos.dexycb import _extrinsics, _meta, _npz
+    from xreset.demos.keypoints import read_keypoints, read_transform
+    from xreset.demos.synth import synthesize
     from xreset.description import load_robot, read_description
     from xreset.eval.engines.actions import Actions, read_actions, write_actions
     from xreset.eval.engines.page import page
     from xreset.eval.engines.page import read as read_page
+    from xreset.eval.report.data import read_scalars
+    from xreset.eval.report.trainings import run_facts
     from xreset.eval.results import read_episodes, read_result, read_traces, write_results
-    from xreset.geometry.urdf import load_urdf
+    from xreset.eval.study.file import SHIPPED, read_study
+    from xreset.learning.clock import LiftClock, read_lift
     from xreset.learning.runner import read_checkpoint
     from xreset.objects import load_object
     from xreset.objects.meshes import _load
-    from xreset.policies import shipped
-    from xreset.policy import OnnxPolicy
+    from xreset.policy import OnnxPolicy, policy_contract
+    from xreset.robot_tools.sources import read_source
     from xreset.spec import PairFriction
+    from xreset.task.config import ObservationConfig, TaskConfig
 
     logging.disable(logging.WARNING)  # what is left aside of a file is said; here it would be said ten thousand times
     with tempfile.TemporaryDirectory() as name:
@@ -111,24 +123,31 @@ def readers() -> Iterator[dict[str, Reader]]:
         may = ("joint_pos", "object_pos", "object_quat", "joint_target")
         add("trace", "mujoco.trace.npz", lambda p: read_traces(p.parent, "mujoco", ("a", "b", "c")), "npz", may)
 
-        contract = {
-            "schema": "xreset-policy/1", "robot": "toy", "robot_fingerprint": "aa", "joint_names": ["a"], "fingertip_names": ["thumb"],
-            "objects": ["soup"], "observation_layout": {"policy": {"x": 1}, "proprio": {"y": 1}}, "control_dt": 1 / 60, "task": {},
-        }  # fmt: skip
+        contract = policy_contract(robot, TaskConfig(observation=ObservationConfig(cloud_points=16)), (SOUP,))
         info = RunInfo(
             robot="toy", resets="b.npz", resets_hash="ab", objects=None, backend="mujoco", backend_version="4", device="cpu", num_envs=4,
             seed=3, config=TrainConfig(), contract=contract,
         )  # fmt: skip
         write_run(folder, info)
         add("run.json", "run.json", lambda p: read_run(p.parent), "json")
+        (folder / "compared.json").write_bytes((folder / "run.json").read_bytes())
+        add("run.json, compared", "compared.json", lambda p: run_facts(read_json(p), p), "json")
+        add("lift.json", "lift.json", lambda p: read_lift(p.parent), "json")
+        LiftClock(folder).tick(0.2, iteration=10, env_steps=1000, seconds=60.0)
+        writer = SummaryWriter(log_dir=str(folder / "curves"))
+        for step in range(4):
+            writer.add_scalar("episode/return", 0.1 * step, step)
+        writer.close()
+        (events,) = (folder / "curves").iterdir()
+        add("event file", f"curves/{events.name}", lambda p: read_scalars(p.parent), "bytes", may_hold=("value",))
+        add("study", "study.toml", read_study, "text", ("config",)).write_bytes((SHIPPED / "first_grasp.toml").read_bytes())
 
         stored = json.loads((Path(__file__).with_name("engines") / "conformance.json").read_text())
         stored["runs"] = [run | {"checks": run["checks"][:4]} for run in stored["runs"][:2]]
         assert stored["schema"] == CONFORMANCE
         write_json(add("conformance", "conformance.json", lambda p: page(read_page([p])), "json"), stored)
 
-        (folder / "policy.onnx").write_bytes(next(iter(shipped().values())).read_bytes())
-        add("policy", "policy.onnx", OnnxPolicy, "bytes")
+        write_policy(add("policy", "policy.onnx", OnnxPolicy, "bytes"), contract)
         path = add("checkpoint", "000001.pt", read_checkpoint, "bytes")
         keys = ("actor_state_dict", "critic_state_dict", "optimizer_state_dict", "random")
         torch.save({**{k: {} for k in keys}, "iteration": 1, "env_steps": 1, "elapsed": 0.1, "learning_rate": 1e-3}, path)
@@ -136,7 +155,9 @@ def readers() -> Iterator[dict[str, Reader]]:
         described = openarm.urdf.with_name("robot.toml")
         (folder / "robot.toml").write_bytes(described.read_bytes())
         add("robot.toml", "robot.toml", read_description, "text")
-        add("URDF", robot.urdf.name, load_urdf, "text")
+        add("URDF", robot.urdf.name, urdf.load_urdf, "text")
+        add("URDF, imported", "hand.urdf", read_source, "text").write_text(HAND)
+        add("MJCF, imported", "hand.xml", read_source, "text").write_text(MJCF)
 
         calibration = folder / "calibration" / "extrinsics_1" / "extrinsics.yml"
         calibration.parent.mkdir(parents=True)
@@ -147,15 +168,37 @@ def readers() -> Iterator[dict[str, Reader]]:
         add("DexYCB meta", "meta.yml", _meta, "yaml").write_text(yaml.safe_dump(meta))
         np.savez(add("DexYCB poses", "pose.npz", lambda p: _npz(p, ("pose_y",)), "npz", ("pose_y",)), pose_y=np.zeros((4, 1, 7)))
 
+        once = synthesize(["soup"], per_object=1, fps=5)
+        turn = Rotation.from_quat(once.object_quat_wxyz, scalar_first=True)
+        path = add("tracker's npz", "tracked.npz", lambda p: read_keypoints(p, PLAIN), "npz", ("hand_keypoints", "wrist_quat_wxyz"))
+        texts = {"object": np.array(SOUP), "side": np.array("right")}
+        arrays = {"keypoints": once.hand_keypoints, "object_pos": once.object_pos, "object_quat_wxyz": once.object_quat_wxyz}
+        np.savez(path, **arrays, **texts)
+        path = add("tracker's CSV", "tracked.csv", lambda p: read_keypoints(p, PLAIN), "text", ("hand_keypoints", "wrist_quat_wxyz"))
+        write_csv(path, once.hand_keypoints, once.object_pos, turn, columns=[("object", SOUP), ("side", "right")])
+        np.savetxt(add("camera, text", "camera.txt", read_transform, "text"), np.eye(4))
+        np.save(add("camera, npy", "camera.npy", read_transform, "bytes"), np.eye(4))
+
         import trimesh
 
         for suffix in ("stl", "obj", "ply", "off"):
             path = add(f"mesh .{suffix}", f"box.{suffix}", _load, "bytes" if suffix == "stl" else "text")
             trimesh.creation.box((0.1, 0.06, 0.04)).export(path)
+        with_mesh = folder / "meshed" / "robot.urdf"
+        with_mesh.parent.mkdir()
+        geometry = '<collision><geometry><mesh filename="box.stl"/></geometry></collision>'
+        with_mesh.write_text(f'<robot name="x"><link name="a">{geometry}</link></robot>')
+        path = add("mesh of a URDF", "meshed/box.stl", lambda p: _fresh_urdf(with_mesh), "bytes")
+        path.write_bytes((folder / "box.stl").read_bytes())
         try:
             yield found
         finally:
             logging.disable(logging.NOTSET)
+
+
+def _fresh_urdf(path: Path) -> urdf.RobotTree:
+    urdf._load.cache_clear()  # which goes by the URDF alone
+    return urdf.load_urdf(path)
 
 
 def outcome(reader: Reader, damaged: bytes) -> str:

@@ -14,7 +14,7 @@ from tests.toy_results import toy_rollouts, toy_summary
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.report import plots as report_plots
 from xreset.eval.report.compare import choose_curves, compare
-from xreset.eval.report.data import Curve, read_curves
+from xreset.eval.report.data import Curve, read_curves, read_scalars
 from xreset.eval.report.groups import grouped
 from xreset.eval.report.lifting import Fate, fates, lift_of, share_of_runs
 from xreset.eval.report.progress import Line, amounts, line, processes
@@ -26,6 +26,7 @@ from xreset.eval.rollout import Rollouts
 from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95, wilson_ci95
 from xreset.learning.clock import Lift, LiftClock, Passing
 from xreset.learning.config import TrainConfig
+from xreset.learning.curves import CurveFile
 from xreset.learning.run import RunInfo, write_run
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
 
@@ -177,6 +178,27 @@ class ReadTest(InFolder):
             curves, note = read_curves(a)
             self.assertEqual(curves, ())
             self.assertIn("is damaged", note or "")
+
+    def test_event_files_whose_head_or_tail_is_cut(self):
+        """Cut anywhere: the head is missed, what is left of a tail is read as it was."""
+        a = self.write_run("a")
+        curves = CurveFile(a)
+        for step in range(1, 5):
+            curves.write(step, {"task/success": step / 8, "task/grasped": 0.5})
+        curves.close()
+        (file,) = a.glob("events*")
+        whole = file.read_bytes()
+        self.assertEqual(len(read_scalars(a)["task/success"].value), 4)
+        for at in range(1, len(whole)):
+            file.write_bytes(whole[at:])
+            if at <= len(whole) - 16:  # less is no record at all
+                with self.assertRaisesRegex(FileFormatError, "is damaged", msg=f"without the first {at} bytes"):
+                    read_scalars(a)
+            file.write_bytes(whole[:-at])
+            found = read_scalars(a)
+            if found:  # else the first values are gone, too
+                values = found["task/success"].value
+                np.testing.assert_array_equal(values, np.arange(1, 1 + len(values)) / 8)
 
     def test_configurations_of_other_versions_are_read(self):
         a = self.write_run("a")

@@ -17,6 +17,7 @@ from tensordict import TensorDict
 
 from tests.test_cli import run
 from tests.toy_bank import SOUP
+from tests.toy_policy import write_policy
 from xreset import policies, robots
 from xreset.demos import synthesize, write_demos
 from xreset.errors import PolicyError
@@ -130,31 +131,8 @@ class ShrinkTest(WithPolicy):
 
     def test_what_cannot_act_is_refused_before_work_begins(self):
         """One step with zeros at loading: whatever the graph is like, evaluation meets no surprise."""
-        flat = sum(sum(self.contract["observation_layout"][g].values()) for g in ("policy", "proprio"))
-        joints, width = len(self.contract["joint_names"]), 128
-
-        def write(*, lstm=width, actions=joints, kind=TensorProto.FLOAT, outputs=3, value=0.5, contract=self.contract, metadata=None):
-            inputs = [
-                helper.make_tensor_value_info(name, kind if name == "flat" else TensorProto.FLOAT, shape)
-                for name, shape in (("flat", ["n", flat]), ("cloud", ["n", 2, 8, 3]), ("h_in", [1, "n", lstm]), ("c_in", [1, "n", lstm]))
-            ]
-            given = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in ("actions", "h_out", "c_out")[:outputs]]
-            weights = numpy_helper.from_array(np.full((flat, actions), value, dtype=np.float32), "w")
-            nodes = [
-                helper.make_node("Cast", ["flat"], ["x"], to=TensorProto.FLOAT),
-                helper.make_node("MatMul", ["x", "w"], ["actions"]),
-                helper.make_node("Identity", ["h_in"], ["h_out"]),
-                helper.make_node("Identity", ["c_in"], ["c_out"]),
-            ]
-            graph = helper.make_graph(nodes, "policy", inputs, given, [weights])
-            model = helper.make_model(graph, ir_version=9, opset_imports=[helper.make_opsetid("", 18)])
-            entry = model.metadata_props.add()
-            entry.key, entry.value = "xreset", json.dumps(contract) if metadata is None else metadata
-            path = self.folder / "tried.onnx"
-            path.write_bytes(model.SerializeToString())
-            return path
-
-        OnnxPolicy(write())
+        path = self.folder / "tried.onnx"
+        OnnxPolicy(write_policy(path, self.contract))
         layout = self.contract["observation_layout"]
         for words, changes in (
             ("numbers that are not finite", {"value": np.nan}),
@@ -167,14 +145,17 @@ class ShrinkTest(WithPolicy):
             ("nested too deeply", {"metadata": '{"a": ' + "[" * 100_000}),
             (
                 "observation_layout is missing",
-                {"contract": self.contract | {"observation_layout": {"policy": 3, "proprio": 4}}},
+                {"metadata": json.dumps(self.contract | {"observation_layout": {"policy": 3, "proprio": 4}})},
             ),
-            ("observation_layout is missing", {"contract": self.contract | {"observation_layout": layout | {"policy": {"x": -1}}}}),
-            ("joint_names is missing", {"contract": self.contract | {"joint_names": [1, 2]}}),
+            (
+                "observation_layout is missing",
+                {"metadata": json.dumps(self.contract | {"observation_layout": layout | {"policy": {"x": -1}}})},
+            ),
+            ("joint_names is missing", {"metadata": json.dumps(self.contract | {"joint_names": [1, 2]})}),
         ):
             with self.subTest(words, **{k: str(v)[:40] for k, v in changes.items()}), self.assertRaisesRegex(PolicyError, words):
-                OnnxPolicy(write(**changes))
-        path = write()
+                OnnxPolicy(write_policy(path, self.contract, **changes))
+        write_policy(path, self.contract)
         path.write_bytes(path.read_bytes().replace(b'"schema"', b"\xff\xfe\xff\xfe\xff\xfe\xff\xfe"))
         with self.assertRaises(PolicyError):
             OnnxPolicy(path)

@@ -103,6 +103,10 @@ class Convention:
     """Who demonstrated."""
 
 
+_MATRIX_BYTES = 1 << 16
+"""Largest file of a matrix of 4 x 4 numbers."""
+
+
 def read_keypoints(
     path: str | Path, convention: Convention | None = None, *, progress: Callable[[int, int, str], None] | None = None
 ) -> Demos:
@@ -145,10 +149,14 @@ def read_transform(path: str | Path) -> np.ndarray:
     Raises:
         DemoError: it cannot be read, or is no rotation and translation in metres.
     """
+    path = Path(path)
     try:
-        T = np.load(path, allow_pickle=False) if Path(path).suffix == ".npy" else np.loadtxt(path, delimiter=None, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise DemoError(f"{path} cannot be read as a matrix: {error}. Write its four rows as four lines of four numbers.") from error
+        if path.stat().st_size > _MATRIX_BYTES:
+            raise ValueError(f"it has {path.stat().st_size} bytes")
+        T = np.load(path, mmap_mode="r", allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, ndmin=2)
+    except Exception as error:  # numpy's own parsers raise whatever they meet
+        problem = shown(str(error))
+        raise DemoError(f"{path} cannot be read as a matrix: {problem}. Write its four rows as four lines of four numbers.") from error
     if T.shape != (4, 4) or not is_rigid(T):
         raise DemoError(
             f"{path} holds no 4x4 matrix of a rotation and a translation (last row 0 0 0 1), but {T.shape}: {shown(T.tolist())}."

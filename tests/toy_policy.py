@@ -1,0 +1,61 @@
+"""A policy of one matrix, written as ONNX by hand: in every way that an exported one could be wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from onnx import TensorProto, helper, numpy_helper
+
+from xreset.task.config import TaskConfig
+from xreset.typed import from_dict
+
+
+def write_policy(
+    path: Path,
+    contract: dict[str, Any],
+    *,
+    lstm: int | str = 8,
+    actions: int | None = None,
+    kind: int = TensorProto.FLOAT,
+    outputs: int = 3,
+    value: float = 0.5,
+    metadata: str | None = None,
+) -> Path:
+    """Write it; without options it is sound.
+
+    Args:
+        path: file.
+        contract: says how wide its inputs and actions are.
+        lstm: units.
+        actions: how many it gives, if not those of the contract.
+        kind: type of its first input.
+        outputs: how many of the three it has.
+        value: of every weight.
+        metadata: in place of the contract.
+    """
+    layout, cloud = contract["observation_layout"], from_dict(TaskConfig, json.loads(json.dumps(contract["task"]))).observation
+    flat = sum(width for terms in (layout["policy"], layout["proprio"]) for width in terms.values())
+    shapes = {
+        "flat": ["n", flat],
+        "cloud": ["n", cloud.cloud_history, cloud.cloud_points, 3],
+        "h_in": [1, "n", lstm],
+        "c_in": [1, "n", lstm],
+    }
+    inputs = [helper.make_tensor_value_info(name, kind if name == "flat" else TensorProto.FLOAT, shape) for name, shape in shapes.items()]
+    given = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in ("actions", "h_out", "c_out")[:outputs]]
+    width = len(contract["joint_names"]) if actions is None else actions
+    weights = numpy_helper.from_array(np.full((flat, width), value, dtype=np.float32), "w")
+    nodes = [
+        helper.make_node("Cast", ["flat"], ["x"], to=TensorProto.FLOAT),
+        helper.make_node("MatMul", ["x", "w"], ["actions"]),
+        helper.make_node("Identity", ["h_in"], ["h_out"]),
+        helper.make_node("Identity", ["c_in"], ["c_out"]),
+    ]
+    graph = helper.make_graph(nodes, "policy", inputs, given, [weights])
+    model = helper.make_model(graph, ir_version=9, opset_imports=[helper.make_opsetid("", 18)])
+    helper.set_model_props(model, {"xreset": json.dumps(contract) if metadata is None else metadata})
+    path.write_bytes(model.SerializeToString())
+    return path

@@ -23,7 +23,7 @@ from xreset.files import claim_folder, file_hash, npz_schema
 from xreset.objects import load_objects
 from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
-from xreset.resets.bank import ResetBank, check_robot
+from xreset.resets.bank import ResetBank, check_retargeted
 from xreset.retarget.pipeline import SCHEMA as RETARGETED
 from xreset.retarget.pipeline import Retargeted, read_retargeted, rest_on_table, retarget
 from xreset.spec import RobotSpec
@@ -135,8 +135,7 @@ def load_motion(path: Path, robot: RobotSpec, objects_folder: Path | None, *, tr
     schema = npz_schema(path)
     if schema == RETARGETED:
         data = read_retargeted(path)
-        names = tuple(data.joint_names)
-        check_robot(path, "retargeted file", robot, name=data.robot, joint_names=names, fingerprint=data.robot_fingerprint)
+        check_retargeted(path, data, robot)
     elif schema == DEMOS:
         demos = read_demos(path)
         objects = tuple(demo_objects(demos, objects_folder).values())

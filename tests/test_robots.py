@@ -16,7 +16,7 @@ from xreset.cli import main
 from xreset.errors import RobotError
 from xreset.geometry.dynamics import damping_ratio, mass_matrix
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.urdf import load_urdf
+from xreset.geometry.urdf import find_mesh, load_urdf
 from xreset.robot_tools.check import check_description
 from xreset.robots import load, robot_names
 from xreset.robots.openarm import build as openarm
@@ -251,6 +251,20 @@ class Registry(unittest.TestCase):
         self.edit("robot.urdf", '<box size="0.05 0.14 0.04" />', '<mesh filename="package://a/body.stl" />')
         self.edit("robot.urdf", '<cylinder radius="0.05" length="0.055" />', '<mesh filename="base.stl" />')
         self.assertRegex(self.errors(), r"base\.stl[\s\S]*body\.stl")
+
+    def test_a_mesh_name_does_not_lead_out_of_the_robots_folders(self):
+        deep = self.folder / "a" / "b" / "c" / "d"
+        (deep / "meshes").mkdir(parents=True)
+        places = (
+            (deep / "x.stl", ("x.stl", "meshes/../x.stl", str(deep / "x.stl"), "package://d/x.stl")),
+            (self.folder / "a" / "y.stl", ("../../../y.stl", "package://any/y.stl", f"file://{self.folder}/a/y.stl")),
+            (self.folder / "z.stl", ("../../../../z.stl", str(self.folder / "z.stl"), "package://../../../../z.stl")),
+        )
+        for i, (file, names) in enumerate(places):
+            file.write_bytes(b"")
+            for name in names:
+                with self.subTest(name):
+                    self.assertEqual(find_mesh(name, deep / "robot.urdf"), file if i < 2 else None)
 
     def test_check_finds_home_in_the_table_and_in_itself(self):
         self.edit("robot.toml", "pos = [0.45, 0.60, 0.55]", "pos = [0.45, 0.60, 0.10]")

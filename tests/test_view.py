@@ -124,6 +124,16 @@ class WithFiles(unittest.TestCase):
 
 
 class Data(WithFiles):
+    def test_trajectories_beyond_the_joints_limits_are_refused(self):
+        data, file = toy_retargeted(self.robot), self.folder / "beyond.npz"
+        data.joint_pos[1, 2] += 50.0  # in a frame that is not valid, and so is not used
+        write_retargeted(file, data, config={}, inputs={})
+        load_view(file)
+        data.joint_pos[6, 2] += 50.0
+        write_retargeted(file, data, config={}, inputs={})
+        with self.assertRaisesRegex(FileFormatError, "beyond.npz holds joint3 = 50.08 in frame 6, but it goes from -1.571 to 1.571. Make"):
+            load_view(file)
+
     def test_demonstrations(self):
         view = load_view(self.demos)
         self.assertEqual((view.kind, view.robot, view.rate), ("demonstrations", None, 30.0))

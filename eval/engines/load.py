@@ -12,7 +12,7 @@ from xreset.eval.engines.grasps import Frames
 from xreset.files import npz_schema
 from xreset.objects import canonical_name, load_objects
 from xreset.resets.bank import SCHEMA as BANK
-from xreset.resets.bank import check_objects, check_robot, read_bank
+from xreset.resets.bank import check_objects, check_retargeted, check_robot, read_bank
 from xreset.retarget.file import SCHEMA as RETARGETED
 from xreset.retarget.file import read_retargeted
 from xreset.spec import ObjectSpec, RobotSpec
@@ -42,7 +42,7 @@ def load_frames(
     if schema == RETARGETED:
         data = read_retargeted(path)
         spec = load_robot(robot or data.robot)
-        check_robot(path, "retargeted file", spec, name=data.robot, joint_names=data.joint_names, fingerprint=data.robot_fingerprint)
+        check_retargeted(path, data, spec)
         frames = Frames.of_retargeted(data)
         return spec, _objects(data.object_name.tolist(), only, objects_folder, path), frames
     if schema == BANK:

@@ -47,7 +47,7 @@ def resets(
     from xreset.description import load_robot
     from xreset.files import file_hash
     from xreset.objects import load_objects
-    from xreset.resets.bank import check_robot, write_bank
+    from xreset.resets.bank import check_retargeted, write_bank
     from xreset.resets.filter import make_bank
     from xreset.resets.hold import hold_bank
     from xreset.retarget.pipeline import read_retargeted
@@ -56,9 +56,7 @@ def resets(
     console = Console(width=None if sys.stdout.isatty() else 160)  # a file or a pipe has no width of its own
     data = read_retargeted(retargeted)
     spec = load_robot(robot or data.robot)
-    check_robot(
-        retargeted, "retargeted file", spec, name=data.robot, joint_names=tuple(data.joint_names), fingerprint=data.robot_fingerprint
-    )
+    check_retargeted(retargeted, data, spec)
     loaded = load_objects(sorted({*map(str, data.object_name)}), objects)
     with Progress(console) as bar:
         task = bar.add_task(f"states in {', '.join(backends)}")

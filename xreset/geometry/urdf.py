@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -109,7 +110,7 @@ def load_urdf(path: str | Path) -> RobotTree:
     """Read a URDF.
 
     ``<capsule radius length/>`` is understood in addition to the standard shapes. Mesh files are looked for beside the URDF
-    (``package://NAME/`` is tried below the URDF's folder and each folder above it).
+    (``package://NAME/`` is tried there and in the three folders above it).
 
     Raises:
         RobotError: the file is missing or damaged, a mesh is missing, the links form no tree, or a joint type is not supported.
@@ -238,8 +239,10 @@ def _hull(mesh, link: str, path: Path) -> Geometry:
 
     file = find_mesh(mesh.filename, path)
     if file is None:
-        raise RobotError(f"{path}: link {link!r} uses the mesh {mesh.filename!r}, which is not there. Put it beside the URDF.")
+        raise RobotError(f"{path}: link {link!r} uses the mesh {shown(mesh.filename)}, which is not in its folders. Put it there.")
     try:
+        if file.stat().st_size > max_bytes():
+            raise ValueError(f"it has {file.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows")
         loaded = trimesh.load(file, force="mesh", process=False)
         if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.vertices):
             raise ValueError("it holds no triangles")
@@ -251,14 +254,18 @@ def _hull(mesh, link: str, path: Path) -> Geometry:
         raise RobotError(f"{path}: link {link!r} uses the mesh {mesh.filename!r}, which cannot be read: {shown(str(error))}") from error
 
 
+_ABOVE = 3
+"""Folders above a URDF's own in which its meshes may lie: those of a ROS package and of its workspace, never the root."""
+
+
 def find_mesh(name: str, urdf: Path) -> Path | None:
-    """The file that a URDF's mesh name means, or None."""
+    """The file that a URDF's mesh name means, or None: a name cannot lead out of the robot's folders."""
     relative = Path(name.split("://", 1)[1]) if "://" in name else Path(name)
-    candidates = [relative] if relative.is_absolute() else [folder / relative for folder in urdf.parents]
-    if name.startswith("package://"):  # the package's own folder may be one of the URDF's ancestors
-        candidates += [folder / Path(*relative.parts[1:]) for folder in urdf.parents]
+    folders = [folder for folder in urdf.parents[: _ABOVE + 1] if folder != folder.parent]
+    names = [relative, Path(*relative.parts[1:])] if name.startswith("package://") else [relative]  # a package's own folder may be above
+    candidates = (Path(os.path.normpath(folder / each)) for each in names for folder in folders)
     try:
-        return next((file for file in candidates if file.is_file()), None)
+        return next((file for file in candidates if file.is_relative_to(folders[-1]) and file.is_file()), None)
     except (OSError, ValueError):  # a name too long, or with a zero in it
         return None
 

@@ -17,6 +17,8 @@ import numpy as np
 from xreset.accounts import Account, accounts
 from xreset.errors import FileFormatError
 from xreset.files import JOINT, POSITION, Field, Schema, read_npz, unique_problem, write_npz
+from xreset.geometry.urdf import robot_tree
+from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec
 
 SCHEMA = "xreset-resets/1"
@@ -218,6 +220,24 @@ def check_robot(path: str | Path, what: str, robot: RobotSpec, *, name: str, joi
         )
     if fingerprint != robot.fingerprint:
         raise FileFormatError(f"{path} is a {what} for another version of {name!r}: its URDF or robot.toml has changed. Make it again.")
+
+
+def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> None:
+    """Refuse trajectories of another robot, or with joints outside this one's limits; ``FileFormatError``."""
+    check_robot(path, "retargeted file", robot, name=data.robot, joint_names=data.joint_names, fingerprint=data.robot_fingerprint)
+    tree = robot_tree(robot)
+    lower, upper = np.array([(tree.joint(name).lower, tree.joint(name).upper) for name in data.joint_names]).T
+    beyond = np.where(data.valid[:, None], np.maximum(lower - data.joint_pos, data.joint_pos - upper), -np.inf)
+    frame, joint = np.unravel_index(int(beyond.argmax()), beyond.shape)
+    if beyond[frame, joint] > _BEYOND:
+        raise FileFormatError(
+            f"{path} holds {data.joint_names[joint]} = {data.joint_pos[frame, joint]:.4g} in frame {frame}, but it goes from "
+            f"{lower[joint]:.4g} to {upper[joint]:.4g}. Make the file again: xreset retarget."
+        )
+
+
+_BEYOND = 1e-4
+"""[rad or m] How far single precision may carry a joint beyond its limits."""
 
 
 def check_objects(path: str | Path, bank: ResetBank, objects: tuple[ObjectSpec, ...]) -> None:

@@ -86,12 +86,12 @@ def _demos_view(path: Path, folder: Path | None) -> View:
 def _retargeted_view(path: Path, folder: Path | None, robot: str | None, demos: Path | None) -> View:
     from xreset.description import load_robot
     from xreset.objects import load_objects
-    from xreset.resets.bank import check_robot
+    from xreset.resets.bank import check_retargeted
     from xreset.retarget.file import read_retargeted
 
     data = read_retargeted(path)
     spec = load_robot(robot or data.robot)
-    check_robot(path, "retargeted file", spec, name=data.robot, joint_names=data.joint_names, fingerprint=data.robot_fingerprint)
+    check_retargeted(path, data, spec)
     objects = load_objects(sorted(set(data.object_name.tolist())), folder)
     names = [o.name for o in objects]
     owner = np.repeat(np.arange(len(data.sequence_name)), np.diff(data.frame_offsets))

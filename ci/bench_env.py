@@ -30,7 +30,7 @@ def run(options: Options, console: Console) -> None:
     columns = ["engine", "device", "backend", "env (of backend)"]
     table = Table(*columns, title=f"env: control steps per second, {options.robot}, {options.num_envs} worlds")
     with tempfile.TemporaryDirectory() as folder:
-        bank = _motion(robot, Path(folder))
+        bank = motion(robot, Path(folder))
         for name, device in engines(options, console):
             with make_backend(name, scene, options.num_envs, device=device) as backend:
                 wrapped = rate(backend.step, options.seconds, device) * options.num_envs
@@ -41,7 +41,7 @@ def run(options: Options, console: Console) -> None:
     console.print(table)
 
 
-def _motion(robot: RobotSpec, folder: Path) -> ResetBank:
+def motion(robot: RobotSpec, folder: Path) -> ResetBank:
     """Starts and goals of one synthetic demonstration."""
     from xreset.demos.archive import write_demos
     from xreset.demos.synth import synthesize

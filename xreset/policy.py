@@ -170,7 +170,9 @@ class OnnxPolicy:
         if path.stat().st_size > max_bytes():
             raise PolicyError(f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
         try:
-            self._session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+            self._session = onnxruntime.InferenceSession(
+                path.read_bytes(), options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )  # to nothing else, which it would announce
             metadata = self._session.get_modelmeta().custom_metadata_map
         except Exception as error:
             raise PolicyError(f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?") from error

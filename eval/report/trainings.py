@@ -123,14 +123,18 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, Fact]:
         run: content.
         file: named in messages.
     """
-    missing = [name for name in ("robot", "resets", "resets_hash", "device", "seed", "config") if name not in run]
-    if missing or not isinstance(run["config"], dict):
-        raise FileFormatError(f"{file} lacks {', '.join(missing) or 'a configuration'}. It is damaged; train again, or leave this run out.")
-    contract, meshes, device = run.get("contract") or {}, run.get("objects"), str(run["device"])
+    kinds = {"robot": str, "resets": str, "resets_hash": str, "device": str, "seed": int, "config": dict}
+    wrong = [name for name, kind in kinds.items() if not isinstance(run.get(name), kind)]
+    contract, meshes, device = run.get("contract") or {}, run.get("objects"), str(run.get("device"))
+    names = contract.get("objects") or [] if isinstance(contract, dict) else None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        wrong.append("contract")
+    if wrong:
+        raise FileFormatError(f"{file} lacks {', '.join(wrong)}, or holds it as another type. Train again, or leave this run out.")
     bank = str(run["resets_hash"])
     facts = {
         "robot": Fact((run["robot"], contract.get("robot_fingerprint")), str(run["robot"])),
-        "objects": Fact(contract.get("objects"), ", ".join(map(short_name, contract.get("objects") or ())) or "-"),
+        "objects": Fact(names, ", ".join(map(short_name, names or ())) or "-"),
         "meshes": Fact(meshes is None, "stand-ins" if meshes is None else str(meshes)),
         "bank": Fact(bank, f"{Path(run['resets']).name} ({bank[:8]})"),
         "weights": Fact(run.get("weights_hash"), str(run.get("weights") or "new")),

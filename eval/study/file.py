@@ -174,7 +174,7 @@ def read_study(path: Path) -> Study:
     """
     try:
         raw = tomllib.loads(path.read_bytes().decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # of tomllib, of decoding, of integers of thousands of digits
         raise FileFormatError(f"{path} is not valid TOML: {error}.") from error
     if raw.get("schema") != SCHEMA:
         raise FileFormatError(f"{path} states schema {raw.get('schema')!r}, expected {SCHEMA!r}. Is it a study?")

@@ -181,7 +181,7 @@ def _load(path: Path, _modified: int) -> RobotTree:
         )
     except (ValueError, TypeError, IndexError) as error:  # vectors of two numbers, texts for numbers
         raise RobotError(f"{path} has numbers that make no sense: {shown(str(error))}") from error
-    _check_numbers(tree, path)
+    check_tree(tree, path)
     return tree
 
 
@@ -189,8 +189,8 @@ _LARGEST = 1e6
 """Of any number of a URDF but limits: masses [kg], positions [m], inertias [kg m^2]. No robot comes near."""
 
 
-def _check_numbers(tree: RobotTree, path: Path) -> None:
-    """Refuse numbers that are not finite or beyond anything real; the limits of continuous joints are infinite on purpose."""
+def check_tree(tree: RobotTree, path: Path) -> None:
+    """Refuse numbers that are not finite or beyond anything real (``RobotError``); continuous joints' limits are infinite on purpose."""
     for link in tree.links:
         parts = [link.com, link.inertia, np.array([link.mass])]
         for shape in link.collisions:
@@ -220,7 +220,10 @@ def _link(link, path: Path) -> Link:
         T = np.eye(4) if collision.origin is None else np.asarray(collision.origin, dtype=float)
         geometry = collision.geometry
         if geometry.box is not None:
-            shape = Geometry(kind="box", size=tuple(float(s) / 2 for s in geometry.box.size))
+            size = tuple(float(s) / 2 for s in geometry.box.size)
+            if len(size) != 3:
+                raise ValueError(f"link {link.name!r} has a box of {len(size)} numbers")
+            shape = Geometry(kind="box", size=size)
         elif geometry.sphere is not None:
             shape = Geometry(kind="sphere", size=(float(geometry.sphere.radius),))
         elif geometry.cylinder is not None:

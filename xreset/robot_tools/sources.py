@@ -12,9 +12,10 @@ import numpy as np
 
 from xreset.errors import ObjectError, RobotError
 from xreset.geometry.shapes import hull, mass_properties, surface_of
-from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree, load_urdf
+from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree, check_tree, load_urdf
 from xreset.geometry.urdf_writer import FRAME_INERTIA, FRAME_MASS, fixed
 from xreset.spec import DriveSpec, Geometry, MimicSpec, Shape
+from xreset.text import shown
 
 _DENSITY = 1000.0
 """[kg/m^3] Of links whose mass nobody states."""
@@ -50,19 +51,30 @@ def read_source(path: str | Path) -> Source:
     except (OSError, ElementTree.ParseError) as error:
         raise RobotError(f"{path} cannot be read as URDF or MJCF: {error}.") from error
     source = _read_mjcf(path) if root.tag == "mujoco" else _read_urdf(path, root)
+    check_tree(source.tree, path)
+    drives = [number for drive in source.drives.values() for number in (drive.kp, drive.kd, drive.effort, drive.armature)]
+    if not np.isfinite([*drives, *(number for mimic in source.mimics for number in (mimic.multiplier, mimic.offset))]).all():
+        raise RobotError(f"{path} has a drive or a mimicking joint with a number that is not finite.")
     return _with_masses(_with_limits(source))
 
 
 def _read_urdf(path: Path, root: ElementTree.Element) -> Source:
-    mimics, effort = [], {}
+    tree, mimics, effort = load_urdf(path), [], {}
+
+    def number(tag: ElementTree.Element, name: str, default: float) -> float:
+        try:
+            return float(tag.get(name, default))
+        except ValueError as error:
+            raise RobotError(f"{path}: {tag.tag} has the {name} {shown(tag.get(name))}, expected a number.") from error
+
     for joint in root.findall("joint"):
         name, tag, limit = joint.get("name", ""), joint.find("mimic"), joint.find("limit")
         if tag is not None:
-            numbers = (float(tag.get("multiplier", 1)), float(tag.get("offset", 0)))
-            mimics.append(MimicSpec(joint=name, source=tag.get("joint", ""), multiplier=numbers[0], offset=numbers[1]))
-        if limit is not None and float(limit.get("effort", 0)) > 0:
-            effort[name] = float(limit.get("effort", 0))
-    return Source(tree=load_urdf(path), mimics=tuple(mimics), effort=effort)
+            of = {"multiplier": number(tag, "multiplier", 1), "offset": number(tag, "offset", 0)}
+            mimics.append(MimicSpec(joint=name, source=tag.get("joint", ""), **of))
+        if limit is not None and 0 < number(limit, "effort", 0) < math.inf:
+            effort[name] = number(limit, "effort", 0)
+    return Source(tree=tree, mimics=tuple(mimics), effort=effort)
 
 
 def combined(arm: Source, hand: Source, *, flange: str | None, T_flange_hand: np.ndarray, name: str) -> Source:

@@ -41,6 +41,7 @@ class EveryReader(unittest.TestCase):
             ("URDF, imported", lambda whole: whole.replace(b'"0.08 0.08 0.02"', b'"0.08 0.08"')),
             ("URDF, imported", lambda whole: whole.replace(b'multiplier="0.8"', b'multiplier="x"', 1)),
             ("URDF, imported", lambda whole: whole.replace(b'multiplier="0.8"', b'multiplier="inf"', 1)),
+            ("URDF, imported", lambda whole: b'<?xml version="1.0" encoding="utf-7"?>' + whole),
             ("MJCF, imported", lambda whole: whole.replace(b'axis="0 1 0"', b'axis="0 nan 0"', 1)),
             ("MJCF, imported", lambda whole: whole.replace(b'mass="0.4"', b'mass="inf"')),
         )

@@ -179,7 +179,7 @@ class Toy(WithFolder):
                 self.file("one.urdf", f'<robot name="hand">{_PALM}{_FINGER.format("f1", *_PLACES["f1"])}</robot>'),
                 self.folder / "x",
             )
-        with self.assertRaisesRegex(RobotError, "cannot be read as URDF or MJCF"):
+        with self.assertRaisesRegex(RobotError, "cannot be read as XML"):
             import_robot(self.arm, self.folder / "nothing.urdf", self.folder / "x")
         with self.assertRaisesRegex(RobotError, "--thumb 'f9' is in 0 fingers"):
             import_robot(self.arm, self.hand, self.folder / "x", thumb="f9")

@@ -123,24 +123,37 @@ def load_urdf(path: str | Path) -> RobotTree:
     return _load(path, path.stat().st_mtime_ns)
 
 
+def parse_xml(path: Path) -> ElementTree.ElementTree:
+    """Parse a file.
+
+    Raises:
+        RobotError: it cannot be read.
+    """
+    try:
+        return ElementTree.parse(path)
+    except (OSError, ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: encodings
+        raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
+
+
 @lru_cache(maxsize=16)
 def _load(path: Path, _modified: int) -> RobotTree:
     import yourdfpy
 
+    xml = parse_xml(path)
     try:
-        xml = ElementTree.parse(path)
         if xml.getroot().tag == "mujoco":
             raise RobotError(f"{path} is MJCF, not URDF; `xreset robots import` makes a robot of it.")
         for element in xml.iter("geometry"):  # yourdfpy knows no capsules: they travel as negative cylinders
             for capsule in element.findall("capsule"):
                 capsule.tag = "cylinder"
                 capsule.set("radius", f"-{capsule.get('radius')}")
-        robot = yourdfpy.URDF.load(
-            io.BytesIO(ElementTree.tostring(xml.getroot())),
-            build_scene_graph=False,
-            load_meshes=False,
-            filename_handler=lambda name: name,
-        ).robot
+        with np.errstate(invalid="ignore"):
+            robot = yourdfpy.URDF.load(
+                io.BytesIO(ElementTree.tostring(xml.getroot())),
+                build_scene_graph=False,
+                load_meshes=False,
+                filename_handler=lambda name: name,
+            ).robot
     except RobotError:
         raise
     except Exception as error:  # yourdfpy raises whatever its parsing meets
@@ -173,12 +186,13 @@ def _load(path: Path, _modified: int) -> RobotTree:
         if not isinstance(name, str) or not is_plain(name):
             raise RobotError(f"{path}: the name {shown(name)} holds characters that control a terminal, or is none.")
     try:
-        tree = RobotTree(
-            name=robot.name or path.stem,
-            root=roots[0],
-            links=tuple(_link(by_name[name], path) for name in order),
-            joints=tuple(_joint(joints[name], path) for name in order[1:]),
-        )
+        with np.errstate(invalid="ignore"):  # what is not finite is refused below
+            tree = RobotTree(
+                name=robot.name or path.stem,
+                root=roots[0],
+                links=tuple(_link(by_name[name], path) for name in order),
+                joints=tuple(_joint(joints[name], path) for name in order[1:]),
+            )
     except (ValueError, TypeError, IndexError) as error:  # vectors of two numbers, texts for numbers
         raise RobotError(f"{path} has numbers that make no sense: {shown(str(error))}") from error
     check_tree(tree, path)

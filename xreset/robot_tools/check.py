@@ -6,16 +6,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
-from xml.etree import ElementTree
 
 import numpy as np
 
 from xreset.description import DESCRIPTION, load_robot
-from xreset.errors import BackendUnavailableError, XResetError
-from xreset.geometry.urdf import RobotTree, find_mesh, robot_tree
+from xreset.errors import BackendUnavailableError, RobotError, XResetError
+from xreset.geometry.urdf import RobotTree, find_mesh, parse_xml, robot_tree
 from xreset.plugins import robot_folder
 from xreset.robot_tools.sources import largest_moment
 from xreset.spec import Geometry, ObjectSpec, RobotSpec, SceneSpec, Shape, TableSpec
+from xreset.text import shown
 
 Level = Literal["ok", "skipped", "warning", "error"]
 
@@ -138,12 +138,12 @@ def _summary(spec: RobotSpec) -> str:
 def _missing_meshes(urdf: Path) -> list[str]:
     """Every mesh of a collision shape that is not there (reading the URDF stops at the first)."""
     try:
-        xml = ElementTree.parse(urdf)
-    except (OSError, ElementTree.ParseError):
+        xml = parse_xml(urdf)
+    except RobotError:
         return []  # load_urdf says so
     names = [mesh.get("filename", "") for collision in xml.iter("collision") for mesh in collision.iter("mesh")]
     return [
-        f"{urdf.name} uses {name!r}, which is not there. Put it beside the URDF."
+        f"{urdf.name} uses {shown(name)}, which is not in its folders. Put it there."
         for name in dict.fromkeys(names)
         if not find_mesh(name, urdf)
     ]
@@ -187,7 +187,7 @@ def _mimics(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
 
 def _mimic_tags(urdf: Path) -> dict[str, tuple[str, float, float]]:
     found = {}
-    for joint in ElementTree.parse(urdf).getroot().findall("joint"):
+    for joint in parse_xml(urdf).getroot().findall("joint"):
         tag = joint.find("mimic")
         if tag is not None:
             found[joint.get("name", "")] = (tag.get("joint", ""), float(tag.get("multiplier", 1)), float(tag.get("offset", 0)))

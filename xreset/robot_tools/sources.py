@@ -12,7 +12,7 @@ import numpy as np
 
 from xreset.errors import ObjectError, RobotError
 from xreset.geometry.shapes import hull, mass_properties, surface_of
-from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree, check_tree, load_urdf
+from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree, check_tree, load_urdf, parse_xml
 from xreset.geometry.urdf_writer import FRAME_INERTIA, FRAME_MASS, fixed
 from xreset.spec import DriveSpec, Geometry, MimicSpec, Shape
 from xreset.text import shown
@@ -46,10 +46,7 @@ def read_source(path: str | Path) -> Source:
         RobotError: it cannot be read, or uses what xreset does not have; the message names all of it.
     """
     path = Path(path)
-    try:
-        root = ElementTree.parse(path).getroot()
-    except (OSError, ElementTree.ParseError) as error:
-        raise RobotError(f"{path} cannot be read as URDF or MJCF: {error}.") from error
+    root = parse_xml(path).getroot()
     source = _read_mjcf(path) if root.tag == "mujoco" else _read_urdf(path, root)
     check_tree(source.tree, path)
     drives = [number for drive in source.drives.values() for number in (drive.kp, drive.kd, drive.effort, drive.armature)]

@@ -1,0 +1,53 @@
+"""learning: whether a small training learns as it did, as JSON beside the stored band (ci/learning.json); exit status 1 if it does not.
+
+A gripper takes a brick between its jaws and lifts it (tests/toy_learning.py). --device cpu: MuJoCo, 60 iterations, half a minute.
+--device cuda: mujoco-warp, the paper's networks in bfloat16, three minutes of iterations; compiling comes before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from benchlib import Options
+from rich.console import Console
+
+from xreset.learning.config import ModelConfig
+from xreset.plugins import make_backend
+
+BAND = Path(__file__).with_name("learning.json")
+_GPU_WORLDS, _GPU_SECONDS = 4096, 180.0
+
+
+def add_arguments(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--seed", type=int, default=0)
+
+
+def run(options: Options, console: Console) -> None:
+    sys.path.append(str(BAND.parents[1]))  # for tests/, behind an installed xreset
+    from tests.toy_learning import CONFIG, WORLDS, scene, trained
+
+    seed, gpu = int(str(options.extra["seed"])), options.device.startswith("cuda")
+    if gpu:
+        ppo = replace(CONFIG.ppo, minibatch_size=32768, precision="bfloat16")
+        config = replace(CONFIG, model=ModelConfig(initial_std=CONFIG.model.initial_std), ppo=ppo, iterations=1_000_000)
+        backend = make_backend("mujoco-warp", scene(), _GPU_WORLDS, device=options.device)
+    else:
+        config, backend = CONFIG, make_backend("mujoco", scene(), WORLDS, workers=0)
+    with backend:
+        began = time.perf_counter()
+        shares, steps = trained(seed, backend, config, seconds=_GPU_SECONDS if gpu else float("inf"))
+    figures = asdict(shares) | {"env_steps": steps, "seconds": round(time.perf_counter() - began, 1)}
+    kind = options.device.partition(":")[0]
+    band: dict[str, list[float]] | None = json.loads(BAND.read_text()).get(kind)
+    outside = [name for name, (low, high) in (band or {}).items() if not low <= figures[name] <= high]
+    verdict = "no band is stored" if band is None else f"outside: {', '.join(outside)}" if outside else "inside"
+    print(json.dumps({"device": kind, "seed": seed, "worlds": backend.num_worlds} | figures | {"band": band, "verdict": verdict}, indent=2))
+    if band is None:
+        console.print(f"There is no band for {kind} yet: put one into {BAND.name}, from three seeds or more.")
+    if outside:
+        raise SystemExit(1)

@@ -1,0 +1,121 @@
+"""A training of half a minute on one core: the conformance suite's gripper learns to take a brick between its jaws and to lift it.
+
+Everything is as in real trainings but small: environment, resets from a bank, PPO on sequences, curves.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests import toy_grasp
+from xreset.env import ManipulationEnv, make_scene
+from xreset.eval.report.data import read_scalars
+from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
+from xreset.learning.runner import TrainingRunner
+from xreset.physics import Backend
+from xreset.policy import RandomPolicy
+from xreset.resets.bank import ResetBank
+from xreset.resets.distribution import ResetDistribution
+from xreset.spec import SceneSpec
+from xreset.task.config import ActionConfig, ObservationConfig, ResetConfig, RewardConfig, TaskConfig, TerminationConfig
+
+WORLDS = 64
+LAST = 10
+"""Iterations at the end over which a training is judged."""
+CONFIG = TrainConfig(
+    task=TaskConfig(
+        timestep=1 / 120,
+        substeps=2,
+        action=ActionConfig(arm_step=0.01, hand_zero="home"),
+        observation=ObservationConfig(cloud_points=8, cloud_history=1),
+        reward=RewardConfig(reach_near=1.0),
+        termination=TerminationConfig(episode_seconds=1.0),
+        reset=ResetConfig(demo_probability=1.0),
+        distance_points=32,
+    ),
+    model=ModelConfig(pointnet=(8, 8), lstm=32, mlp=(64,), initial_std=0.5),
+    ppo=PpoConfig(mini_epochs=4, minibatch_size=512, desired_kl=0.05, entropy=0.0),
+    iterations=60,
+    save_interval=1000,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shares:
+    """Of all worlds' control steps."""
+
+    grasped: float
+    """With both fingers on the brick."""
+    success: float
+    """At the goal besides."""
+
+
+def bank() -> ResetBank:
+    """States in which the brick hangs between the jaws, which are told to close."""
+    robot, (pos, quat) = toy_grasp.robot(), toy_grasp.brick_pose()
+    closing = robot.home.copy()
+    closing[robot.joint_names.index("jaw_a_slide")] = toy_grasp.CLOSED
+
+    def six(row: np.ndarray) -> np.ndarray:
+        return np.tile(row, (6, 1)).astype(np.float32)
+
+    return replace(toy_grasp.bank(), joint_pos=six(robot.home), joint_target=six(closing), object_pos=six(pos), object_quat_wxyz=six(quat))
+
+
+def random_policy(seed: int, backend: Backend) -> Shares:
+    """What uniform actions do in two episodes."""
+    env = environment(seed, backend)
+    policy, found = RandomPolicy(env.num_actions, seed), []
+    policy.begin(env)
+    for _ in range(2 * env.max_episode_length):
+        log = env.step(policy.act(env.get_observations()))[-1]["log"]
+        found.append([float(log[f"task/{name}"]) for name in ("grasped", "success")])
+    grasped, success = np.mean(found, axis=0)
+    return Shares(grasped=float(grasped), success=float(success))
+
+
+def trained(
+    seed: int,
+    backend: Backend,
+    config: TrainConfig = CONFIG,
+    *,
+    seconds: float = math.inf,
+    change: Callable[[TrainingRunner], None] = lambda runner: None,
+) -> tuple[Shares, int]:
+    """What a training does in its last iterations, and its steps in all worlds.
+
+    Args:
+        seed: of all that is random.
+        backend: worlds of :func:`scene`.
+        config: of the training.
+        seconds: most that its iterations may take.
+        change: called with the runner before it begins: to break it.
+    """
+    torch.manual_seed(seed)
+    with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()):
+        runner = TrainingRunner(environment(seed, backend), config, Path(folder))
+        change(runner)
+        runner.learn(config.iterations, init_at_random_ep_len=True, seconds=seconds)
+        curves = read_scalars(Path(folder))
+    grasped, success = (float(curves[f"task/{name}"].value[-LAST:].mean()) for name in ("grasped", "success"))
+    return Shares(grasped=grasped, success=success), runner.env_steps
+
+
+def scene() -> SceneSpec:
+    """Gripper and brick."""
+    return make_scene(toy_grasp.robot(), (toy_grasp.brick(),), CONFIG.task)
+
+
+def environment(seed: int, backend: Backend) -> ManipulationEnv:
+    """The task in the backend's worlds."""
+    resets = ResetDistribution(bank(), toy_grasp.robot(), (toy_grasp.brick().name,), CONFIG.task.reset, backend.device)
+    return ManipulationEnv(backend, CONFIG.task, resets, seed=seed)

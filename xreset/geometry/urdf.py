@@ -123,14 +123,14 @@ def load_urdf(path: str | Path) -> RobotTree:
     return _load(path, path.stat().st_mtime_ns)
 
 
-def parse_xml(path: Path) -> ElementTree.ElementTree:
-    """Parse a file.
+def parse_xml(path: Path) -> ElementTree.Element:
+    """The root of a file.
 
     Raises:
         RobotError: it cannot be read.
     """
     try:
-        return ElementTree.parse(path)
+        return ElementTree.parse(path).getroot()
     except (OSError, ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: encodings
         raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
 
@@ -141,7 +141,7 @@ def _load(path: Path, _modified: int) -> RobotTree:
 
     xml = parse_xml(path)
     try:
-        if xml.getroot().tag == "mujoco":
+        if xml.tag == "mujoco":
             raise RobotError(f"{path} is MJCF, not URDF; `xreset robots import` makes a robot of it.")
         for element in xml.iter("geometry"):  # yourdfpy knows no capsules: they travel as negative cylinders
             for capsule in element.findall("capsule"):
@@ -149,7 +149,7 @@ def _load(path: Path, _modified: int) -> RobotTree:
                 capsule.set("radius", f"-{capsule.get('radius')}")
         with np.errstate(invalid="ignore"):
             robot = yourdfpy.URDF.load(
-                io.BytesIO(ElementTree.tostring(xml.getroot())),
+                io.BytesIO(ElementTree.tostring(xml)),
                 build_scene_graph=False,
                 load_meshes=False,
                 filename_handler=lambda name: name,

@@ -187,7 +187,7 @@ def _mimics(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
 
 def _mimic_tags(urdf: Path) -> dict[str, tuple[str, float, float]]:
     found = {}
-    for joint in parse_xml(urdf).getroot().findall("joint"):
+    for joint in parse_xml(urdf).findall("joint"):
         tag = joint.find("mimic")
         if tag is not None:
             found[joint.get("name", "")] = (tag.get("joint", ""), float(tag.get("multiplier", 1)), float(tag.get("offset", 0)))

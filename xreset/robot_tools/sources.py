@@ -46,7 +46,7 @@ def read_source(path: str | Path) -> Source:
         RobotError: it cannot be read, or uses what xreset does not have; the message names all of it.
     """
     path = Path(path)
-    root = parse_xml(path).getroot()
+    root = parse_xml(path)
     source = _read_mjcf(path) if root.tag == "mujoco" else _read_urdf(path, root)
     check_tree(source.tree, path)
     drives = [number for drive in source.drives.values() for number in (drive.kp, drive.kd, drive.effort, drive.armature)]

@@ -56,7 +56,7 @@ class FileTest(InFolder):
         for text, message in (
             ("schema = ", "is not valid TOML"),
             ("about = 'x'", "states schema None, expected 'xreset-study/1'"),
-            (HEAD + DATA + RUN + run + "minuets = 3\n", r"runs\.a does not fit Runs \(unknown: minuets\)"),
+            (HEAD + DATA + RUN + run + "minuets = 3\n", r"runs\.a does not fit Runs \(unknown: minuets \(minutes\?\)\)"),
             (HEAD + DATA + RUN + "[runs.a]\nseeds = [0, 0]\n", r"runs\.a: seeds is \[0, 0\]"),
             (HEAD + DATA + RUN + "[runs.a]\nminutes = 0\n", r"runs\.a: minutes is 0"),
             (HEAD + DATA + RUN + "[runs.a]\npolicy = 'best'\n", r"runs\.a\.policy is 'best'"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import types
 import typing
 from dataclasses import MISSING, fields, is_dataclass
+from difflib import get_close_matches
 from typing import Any, TypeVar
 
 from xreset.errors import FileFormatError
@@ -27,7 +28,10 @@ def from_dict(cls: type[T], data: Any, where: str = "configuration") -> T:
     needed = {f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(cls)}  # pyright: ignore[reportArgumentType]
     unknown, missing = sorted(set(data) - set(needed)), sorted(name for name in needed if needed[name] and name not in data)
     if unknown or missing:
-        problems = [f"unknown: {', '.join(map(str, unknown))}"] * bool(unknown) + [f"missing: {', '.join(missing)}"] * bool(missing)
+        named = [
+            f"{name} ({guess[0]}?)" if (guess := get_close_matches(str(name), list(needed), cutoff=0.75)) else str(name) for name in unknown
+        ]
+        problems = [f"unknown: {', '.join(named)}"] * bool(unknown) + [f"missing: {', '.join(missing)}"] * bool(missing)
         raise FileFormatError(f"{where} does not fit {cls.__name__} ({'; '.join(problems)}). Was it written by another version of xreset?")
     values = {name: _value(hints[name], value, f"{where}.{name}") for name, value in data.items()}
     try:

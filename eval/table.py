@@ -49,10 +49,7 @@ def rich_table(summaries: Sequence[EvalResult]) -> Table:
 
     first = summaries[0]
     count = f"{first.episodes} episodes of {len(first.per_demo)} demonstrations"
-    title = f"{first.policy} on {first.robot}\n{count}, seed {first.seed}"
-    if first.unseen:
-        title += f"\nnot in its training: {', '.join(first.unseen)}"
-    table = Table(title=title, title_justify="left")
+    table = Table(title=f"{first.policy} on {first.robot}\n{count}, seed {first.seed}", title_justify="left")
     table.add_column("", no_wrap=True)
     for s in summaries:
         table.add_column(s.backend, justify="right", no_wrap=True)

@@ -44,6 +44,8 @@ def evaluate(
     with engine_bars(console, [e.name for e in engines]) as progress:
         summaries = evaluate(subject, engines, demos, setting, folder, episodes=episodes, progress=progress)
     console.print(rich_table(summaries))
+    if unseen := summaries[0].unseen:
+        console.print(f"not in the policy's training: {', '.join(unseen)}", highlight=False, soft_wrap=True)
     console.print(f"results in {folder}")
 
 

@@ -275,6 +275,19 @@ class ActionTest(WithRobot):
         again = space.targets(space.action_for(wanted, wanted), wanted, wanted)
         torch.testing.assert_close(again, wanted, atol=1e-5, rtol=0)
 
+    def test_a_relative_hand_that_does_nothing_holds_its_targets(self):
+        space = self.space(hand="relative", hand_step=0.05, hand_lead=0.4)
+        target = torch.tensor([[0.1, 0.5, -0.5, -0.2, 0.4, 0.3, 0.01]])
+        pressed = target - 0.1  # joints that an object keeps from following
+        torch.testing.assert_close(space.targets(torch.zeros(1, 7), target, pressed)[:, 3:], target[:, 3:])
+        moved = space.targets(torch.tensor([[0.0, 0, 0, 1, -1, 0.5, 1]]), target, pressed)
+        torch.testing.assert_close(moved[:, 3:], torch.tensor([[-0.15, 0.35, 0.325, 0.04]]))  # the last at its limit
+        for _ in range(20):
+            moved = space.targets(torch.ones(1, 7), moved, pressed)
+        torch.testing.assert_close(moved[:, 3:6], pressed[:, 3:6] + 0.4, msg="it presses no harder than its lead allows")
+        action = space.action_for(target + 0.02, target)
+        torch.testing.assert_close(action[:, 3:], torch.full((1, 4), 0.4))
+
     def test_smoothing_takes_a_share_of_the_way(self):
         target = torch.zeros(1, 7)
         moved = self.space(hand_smoothing=0.25).targets(torch.ones(1, 7), target, target)
@@ -562,7 +575,8 @@ class ObservationTest(unittest.TestCase):
             return torch.nn.functional.normalize(rand(4), dim=-1)
 
         self.x = obs.ObservationInput(
-            joint_pos=rand(self.J), joint_vel=rand(self.J), joint_lower=torch.full((self.J,), -2.0), joint_upper=torch.full((self.J,), 3.0),
+            joint_pos=rand(self.J), joint_vel=rand(self.J), joint_target=rand(self.J), joint_lower=torch.full((self.J,), -2.0),
+            joint_upper=torch.full((self.J,), 3.0),
             seen_pos=rand(3), seen_quat=quat(), object_pos=rand(3), object_quat=quat(), object_linvel=rand(3), object_angvel=rand(3),
             goal_pos=rand(3), goal_quat=quat(),
             gravity_fraction=rand(), previous_action=rand(self.J), palm_pos=rand(3), palm_quat=quat(), palm_linvel=rand(3),
@@ -592,6 +606,12 @@ class ObservationTest(unittest.TestCase):
         self.assertEqual(float(force.abs().max()), 1.0)
         small = self.x.tip_force.abs() < 10
         torch.testing.assert_close(force.view(self.N, self.E, 3)[small], 0.1 * self.x.tip_force[small])
+
+    def test_how_far_targets_are_ahead_is_shown_if_asked_for(self):
+        config = replace(self.config, joint_target=True)
+        terms = self.split(obs.proprio_group(self.x, config, generator()), obs.layout(self.J, self.E, config)["proprio"])
+        torch.testing.assert_close(terms["joint_target"], self.x.joint_target - self.x.joint_pos)
+        torch.testing.assert_close(terms["tip_force"], self.proprio["tip_force"])
 
     def test_one_rotation_is_one_observation(self):
         negated = replace(

@@ -496,6 +496,7 @@ class ManipulationEnv:
         x = obs.ObservationInput(
             joint_pos=state.joint_pos,
             joint_vel=state.joint_vel,
+            joint_target=self._target,
             joint_lower=self._limits[0],
             joint_upper=self._limits[1],
             seen_pos=seen_pos,

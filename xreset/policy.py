@@ -236,7 +236,7 @@ class OnnxPolicy:
 
 
 class ZeroPolicy:
-    """Action zero: the arm stays, the hand goes to the middle of its range. A baseline and a smoke test."""
+    """Action zero: the arm stays, the hand goes where action zero sends it. A baseline and a smoke test."""
 
     name = "zero"
 

@@ -24,7 +24,7 @@ MOST = 6
 
 
 def hand_synergies(joint_pos: Tensor, actions: ActionSpace) -> Tensor:
-    """[J, K] principal directions of demonstrated hand poses, as actions; a column's length is the standard deviation along it.
+    """[J, K] principal directions of demonstrated hand poses, as absolute actions; a column's length is the standard deviation along it.
 
     Args:
         joint_pos: [L, J] robot states.
@@ -34,8 +34,7 @@ def hand_synergies(joint_pos: Tensor, actions: ActionSpace) -> Tensor:
         K is the least number of directions that span :data:`EXPLAINED` of the variance, at most :data:`MOST`, and 0 where the hand does
         not move. Arm rows are 0.
     """
-    pose = actions.action_for(joint_pos, joint_pos)
-    pose = torch.where(actions.is_arm, 0.0, pose)
+    pose = torch.where(actions.is_arm, 0.0, actions.within_limits(joint_pos).clamp(-1.0, 1.0))
     if len(pose) < 2:
         return pose.new_zeros(pose.shape[-1], 0)
     _, scale, directions = torch.linalg.svd(pose - pose.mean(dim=0), full_matrices=False)

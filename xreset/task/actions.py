@@ -14,9 +14,10 @@ from xreset.task.config import ActionConfig
 
 @dataclass(frozen=True, kw_only=True)
 class ActionSpace:
-    """Maps actions [N, J] in [-1, 1] to joint targets [N, J]: arm joints relative, hand joints absolute within their limits.
+    """Maps actions [N, J] in [-1, 1] to joint targets [N, J]: arm joints relative, hand joints absolute within their limits
+    or, if so configured, relative as well.
 
-    A hand joint's target is piecewise linear in its action: the lower limit at -1, :attr:`zero` at 0, the upper limit at +1.
+    An absolute target is piecewise linear in its action: the lower limit at -1, :attr:`zero` at 0, the upper limit at +1.
     """
 
     lower: Tensor
@@ -24,8 +25,12 @@ class ActionSpace:
     upper: Tensor
     is_arm: Tensor
     """[J] bool"""
+    step: Tensor
+    """[J] how far a relative target moves under action 1 [rad]; 0 for joints with absolute targets."""
+    lead: Tensor
+    """[J] farthest that a relative target may be ahead of its joint [rad]."""
     zero: Tensor
-    """[J] a hand joint's target under action 0; 0 for arm joints."""
+    """[J] a hand joint's absolute target under action 0; 0 for arm joints."""
     below: Tensor
     """[J] from ``zero`` down to the lower limit, reached at -1; 1 for arm joints."""
     above: Tensor
@@ -46,28 +51,35 @@ class ActionSpace:
         else:
             zero = (lower + upper) / 2
             below = above = (upper - lower) / 2
+        hand_step = config.hand_step if config.hand == "relative" else 0.0
+        step = torch.where(is_arm, config.arm_step, hand_step)
+        lead = torch.where(is_arm, config.arm_lead, config.hand_lead)
         # Continuous arm joints have infinite limits; where() must not see inf * 0 from them.
         zero, below, above = (torch.where(is_arm, other, value) for value, other in ((zero, 0.0), (below, 1.0), (above, 1.0)))
-        return cls(lower=lower, upper=upper, is_arm=is_arm, zero=zero, below=below, above=above, config=config)
+        return cls(lower=lower, upper=upper, is_arm=is_arm, step=step, lead=lead, zero=zero, below=below, above=above, config=config)
 
     def targets(self, action: Tensor, target: Tensor, joint_pos: Tensor) -> Tensor:
         """[N, J] new joint targets.
 
-        Arm: the old target plus ``arm_step`` times the action, at most ``arm_lead`` away from the joint. Starting from the old target, not
+        Relative: the old target plus ``step`` times the action, at most ``lead`` away from the joint. Starting from the old target, not
         from the joint, keeps a loaded arm from sagging a little further at every step.
         """
-        c = self.config
         action = action.clamp(-1.0, 1.0)
-        arm = target + c.arm_step * action
-        arm = torch.minimum(torch.maximum(arm, joint_pos - c.arm_lead), joint_pos + c.arm_lead)
-        hand = self.zero + torch.where(action < 0, self.below, self.above) * action
-        hand = target + c.hand_smoothing * (hand - target)
-        return torch.minimum(torch.maximum(torch.where(self.is_arm, arm, hand), self.lower), self.upper)
+        new = target + self.step * action
+        new = torch.minimum(torch.maximum(new, joint_pos - self.lead), joint_pos + self.lead)
+        if self.config.hand == "absolute":
+            hand = self.zero + torch.where(action < 0, self.below, self.above) * action
+            new = torch.where(self.is_arm, new, target + self.config.hand_smoothing * (hand - target))
+        return torch.minimum(torch.maximum(new, self.lower), self.upper)
 
     def action_for(self, wanted: Tensor, target: Tensor) -> Tensor:
         """[N, J] the action whose targets come nearest to ``wanted`` [N, J], given the present targets."""
-        c = self.config
-        arm = (wanted - target) / c.arm_step
-        hand = target + (wanted - target) / c.hand_smoothing - self.zero
-        hand = hand / torch.where(hand < 0, self.below, self.above).clamp_min(1e-9)
-        return torch.where(self.is_arm, arm, hand).clamp(-1.0, 1.0)
+        action = (wanted - target) / self.step.clamp_min(1e-9)
+        if self.config.hand == "absolute":
+            action = torch.where(self.is_arm, action, self.within_limits(target + (wanted - target) / self.config.hand_smoothing))
+        return action.clamp(-1.0, 1.0)
+
+    def within_limits(self, joint_pos: Tensor) -> Tensor:
+        """[N, J] where between their limits hand joints [N, J] stand: -1, 0 and +1 as for absolute targets; of no meaning for the arm."""
+        above_zero = joint_pos - self.zero
+        return above_zero / torch.where(above_zero < 0, self.below, self.above).clamp_min(1e-9)

@@ -20,15 +20,25 @@ class ActionConfig:
     """Largest change of an arm joint's target per control step [rad]: 1.8 rad/s at 60 Hz. Not in the paper."""
     arm_lead: float = 0.15
     """Farthest that an arm target may run ahead of the joint [rad], so that a blocked arm does not wind up. Not in the paper."""
+    hand: Literal["absolute", "relative"] = "absolute"
+    """``absolute``: an action says where between its limits a hand joint is to go (the paper). ``relative``: how far its target moves, as
+    for the arm, so that a policy that does nothing holds what it was given: with absolute targets a new policy opens the hand in every
+    demonstrated grasp and has to learn to hold before it can learn to lift. In-hand manipulation is commonly learned so (Qi et al. 2022,
+    In-Hand Object Rotation via Rapid Motor Adaptation)."""
+    hand_step: float = 0.05
+    """``relative`` only: largest change of a hand joint's target per control step [rad]: 3 rad/s at 60 Hz."""
+    hand_lead: float = 0.4
+    """``relative`` only: farthest that a hand joint's target may run ahead of the joint [rad], which is how hard it can press: drives of
+    the Sharpa hand reach their effort limits at 0.3 to 0.7."""
     hand_zero: Literal["middle", "home"] = "middle"
-    """Where a hand joint is sent by action 0: to the middle of its limits, which is a half-closed fist, or to the robot's home pose, from
+    """``absolute`` only. Where a hand joint is sent by action 0: to the middle of its limits, which is a half-closed fist, or to the robot's home pose, from
     which -1 and +1 lead to the limits along two slopes. A new policy's mean is 0: with ``middle`` it closes the open hand at once and comes
     down on the object with its knuckles. Not in the paper."""
     hand_smoothing: float = 1.0
-    """Share of the new hand target that is taken per control step, in (0, 1]; 1 is the paper's plain absolute target."""
+    """``absolute`` only. Share of the new hand target that is taken per control step, in (0, 1]; 1 is the paper's plain target."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, positive=("arm_step", "arm_lead", "hand_smoothing"), share=("hand_smoothing",))
+        check_numbers(self, positive=("arm_step", "arm_lead", "hand_step", "hand_lead", "hand_smoothing"), share=("hand_smoothing",))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +75,9 @@ class ObservationConfig:
     """Factor on the clouds' coordinates [1/m]."""
     contact_force_scale: float = 0.1
     """Factor on fingertip forces [1/N] before they are limited to [-1, 1]."""
+    joint_target: bool = False
+    """Whether the policy sees how far each drive's target is ahead of its joint [rad]. With absolute hand targets the previous action says
+    so; with relative ones nothing does."""
     joint_vel_scale: float = 0.1
     """Factor on joint velocities [s/rad]."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)

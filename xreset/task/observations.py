@@ -24,6 +24,8 @@ class ObservationInput:
     """[N, J]"""
     joint_vel: Tensor
     """[N, J]"""
+    joint_target: Tensor
+    """[N, J] of the drives."""
     joint_lower: Tensor
     """[J]"""
     joint_upper: Tensor
@@ -79,6 +81,7 @@ def layout(num_joints: int, num_tips: int, c: ObservationConfig) -> dict[str, di
             "palm_angvel": 3,
             "tip_pos": 3 * num_tips,
             "tip_force": 3 * num_tips,
+            **({"joint_target": num_joints} if c.joint_target else {}),
         },
         "perception": {"cloud": c.cloud_history * c.cloud_points * 3},
     }
@@ -96,7 +99,7 @@ def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Gen
 def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
     """[N, 2 J + 13 + 6 E] joints (position within the limits as [-1, 1], scaled velocity), palm, fingertips, limited contact forces.
 
-    With ``rotation="matrix"`` there are two numbers more.
+    With ``rotation="matrix"`` there are two numbers more, with ``joint_target`` J.
     """
     pos = x.joint_pos + c.noise.joint_pos * _normal(x.joint_pos, generator)
     vel = x.joint_vel + c.noise.joint_vel * _normal(x.joint_vel, generator)
@@ -111,6 +114,7 @@ def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Ge
             x.palm_angvel,
             x.tip_pos.flatten(1),
             force.flatten(1),
+            *((x.joint_target - x.joint_pos,) if c.joint_target else ()),
         ),
         dim=-1,
     )

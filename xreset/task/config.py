@@ -31,9 +31,9 @@ class ActionConfig:
     """``relative`` only: farthest that a hand joint's target may run ahead of the joint [rad], which is how hard it can press: drives of
     the Sharpa hand reach their effort limits at 0.3 to 0.7."""
     hand_zero: Literal["middle", "home"] = "middle"
-    """``absolute`` only. Where a hand joint is sent by action 0: to the middle of its limits, which is a half-closed fist, or to the robot's home pose, from
-    which -1 and +1 lead to the limits along two slopes. A new policy's mean is 0: with ``middle`` it closes the open hand at once and comes
-    down on the object with its knuckles. Not in the paper."""
+    """``absolute`` only. Where a hand joint is sent by action 0: to the middle of its limits, which is a half-closed fist, or to the robot's
+    home pose, from which -1 and +1 lead to the limits along two slopes. A new policy's mean is 0: with ``middle`` it closes the open hand at
+    once and comes down on the object with its knuckles. Not in the paper."""
     hand_smoothing: float = 1.0
     """``absolute`` only. Share of the new hand target that is taken per control step, in (0, 1]; 1 is the paper's plain target."""
 
@@ -103,6 +103,9 @@ class RewardConfig:
     0.4 m the last centimetres, in which fingers wrap around the object, are worth less than what moving costs."""
     reach_near_width: float = 0.05
     """[m]"""
+    reach_distance: Literal["best", "present"] = "best"
+    """What both reach terms are paid for: the episode's smallest distance so far (the paper), also while the hand moves away again, or the
+    present one (as in Isaac Lab's dexterous lift), so that a hand that has missed stays near and tries again."""
     grasp: float = 1.0
     tracking: Literal["presence", "progress"] = "presence"
     """What pays for the object's pose while the contact gate is open. ``presence``: how near it is to the goal, in position and in rotation

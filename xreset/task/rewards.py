@@ -127,6 +127,7 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     rotation_error = quat_angle(x.object_quat, x.goal_quat)
     success = gate & (position_error < c.success_position) & (rotation_error < c.success_rotation)
     gate_f = gate.to(position_error.dtype)
+    reach = x.best_reach if c.reach_distance == "best" else x.tip_distance.mean(dim=-1)
     if c.tracking == "progress":
         tracking = {"progress": c.progress * gate_f * progress(x, c)}
     else:
@@ -135,8 +136,8 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
             "rotation": c.rotation * gate_f * (1.0 - torch.tanh(rotation_error / c.rotation_width)),
         }
     terms = {
-        "reach": c.reach * (1.0 - torch.tanh(x.best_reach / c.reach_width)),
-        "reach_near": c.reach_near * (1.0 - torch.tanh(x.best_reach / c.reach_near_width)),
+        "reach": c.reach * (1.0 - torch.tanh(reach / c.reach_width)),
+        "reach_near": c.reach_near * (1.0 - torch.tanh(reach / c.reach_near_width)),
         "grasp": c.grasp * grasped.to(gate_f.dtype),
         **tracking,
         "success": c.success * success.to(gate_f.dtype),

@@ -94,6 +94,11 @@ class RewardTest(unittest.TestCase):
         self.assert_terms(self.reward(), reach=1 - math.tanh(2.0))
         self.assert_terms(self.reward(best_reach=torch.tensor(0.03)), reach=1 - math.tanh(0.3))
 
+    def test_reach_may_be_paid_for_the_present_distance(self):
+        gone = {"best_reach": torch.tensor(0.01), "tip_distance": torch.tensor([0.1, 0.2, 0.3])}
+        self.assert_terms(self.reward(**gone), reach=1 - math.tanh(0.1))
+        self.assert_terms(self.reward(RewardConfig(reach_distance="present"), **gone), reach=1 - math.tanh(2.0))
+
     def test_a_second_reach_term_has_its_own_width(self):
         config = RewardConfig(reach_width=0.4, reach_near=0.5, reach_near_width=0.1)
         self.assert_terms(self.reward(config), reach=1 - math.tanh(0.5), reach_near=0.5 * (1 - math.tanh(2.0)))
@@ -277,15 +282,16 @@ class ActionTest(WithRobot):
 
     def test_a_relative_hand_that_does_nothing_holds_its_targets(self):
         space = self.space(hand="relative", hand_step=0.05, hand_lead=0.4)
-        target = torch.tensor([[0.1, 0.5, -0.5, -0.2, 0.4, 0.3, 0.01]])
-        pressed = target - 0.1  # joints that an object keeps from following
+        target = torch.tensor([[0.1, 0.5, -0.5, -0.2, 0.4, 0.3, 0.01]])  # the last one slides, by 4 cm in all
+        pressed = target - torch.tensor([0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.004])  # joints that an object keeps from following
         torch.testing.assert_close(space.targets(torch.zeros(1, 7), target, pressed)[:, 3:], target[:, 3:])
         moved = space.targets(torch.tensor([[0.0, 0, 0, 1, -1, 0.5, 1]]), target, pressed)
-        torch.testing.assert_close(moved[:, 3:], torch.tensor([[-0.15, 0.35, 0.325, 0.04]]))  # the last at its limit
+        torch.testing.assert_close(moved[:, 3:], torch.tensor([[-0.15, 0.35, 0.325, 0.012]]))
         for _ in range(20):
             moved = space.targets(torch.ones(1, 7), moved, pressed)
-        torch.testing.assert_close(moved[:, 3:6], pressed[:, 3:6] + 0.4, msg="it presses no harder than its lead allows")
-        action = space.action_for(target + 0.02, target)
+        held = pressed[:, 3:] + torch.tensor([0.4, 0.4, 0.4, 0.016])
+        torch.testing.assert_close(moved[:, 3:], held, msg="it presses no harder than its lead allows")
+        action = space.action_for(target + torch.tensor([0.02] * 6 + [0.0008]), target)
         torch.testing.assert_close(action[:, 3:], torch.full((1, 4), 0.4))
 
     def test_smoothing_takes_a_share_of_the_way(self):

@@ -23,9 +23,9 @@ _MINUTES = TrainConfig(
     task=TaskConfig(
         timestep=1 / 120,
         substeps=2,
-        action=ActionConfig(hand_zero="home"),
-        observation=ObservationConfig(rotation="matrix", cloud_scale=5.0, contact_force_scale=0.03),
-        reward=RewardConfig(reach_width=0.4, reach_near=1.0, contact="opposing", raw_actions=True),
+        action=ActionConfig(hand="relative"),
+        observation=ObservationConfig(rotation="matrix", cloud_scale=5.0, contact_force_scale=0.03, joint_target=True),
+        reward=RewardConfig(reach_width=0.4, reach_near=1.0, reach_distance="present", contact="opposing", raw_actions=True),
     ),
     model=ModelConfig(initial_std=0.3),
     ppo=PpoConfig(precision="bfloat16", desired_kl=0.02, entropy=0.0),
@@ -64,7 +64,7 @@ RECIPES: dict[str, Recipe] = {
     "paper": Recipe(config=TrainConfig(), about="the paper's tables VIII and IX, for hours on several GPUs"),
     "minutes": Recipe(
         config=_MINUTES,
-        about="what taught an object alone in minutes on one GPU (docs/lab-book.md): --num-envs 8192, and a bank with closing states",
+        about="what taught an object alone in minutes on one GPU (docs/lab-book.md): --num-envs 8192, with closing states that press",
     ),
     "robust": Recipe(
         config=_ROBUST,

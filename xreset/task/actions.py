@@ -11,6 +11,9 @@ from xreset.geometry.urdf import robot_tree
 from xreset.spec import RobotSpec
 from xreset.task.config import ActionConfig
 
+FINGER = 0.04
+"""A hand joint that slides moves as far [m] as a point at this distance from a joint that turns: the length of a finger's link."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ActionSpace:
@@ -26,9 +29,9 @@ class ActionSpace:
     is_arm: Tensor
     """[J] bool"""
     step: Tensor
-    """[J] how far a relative target moves under action 1 [rad]; 0 for joints with absolute targets."""
+    """[J] how far a relative target moves under action 1 [rad, m]; 0 for joints with absolute targets."""
     lead: Tensor
-    """[J] farthest that a relative target may be ahead of its joint [rad]."""
+    """[J] farthest that a relative target may be ahead of its joint [rad, m]."""
     zero: Tensor
     """[J] a hand joint's absolute target under action 0; 0 for arm joints."""
     below: Tensor
@@ -51,9 +54,10 @@ class ActionSpace:
         else:
             zero = (lower + upper) / 2
             below = above = (upper - lower) / 2
-        hand_step = config.hand_step if config.hand == "relative" else 0.0
-        step = torch.where(is_arm, config.arm_step, hand_step)
-        lead = torch.where(is_arm, config.arm_lead, config.hand_lead)
+        slides = torch.tensor([tree.joint(name).type == "prismatic" for name in robot.joint_names], device=device)
+        unit = torch.where(slides & ~is_arm, FINGER, 1.0)
+        step = torch.where(is_arm, config.arm_step, unit * (config.hand_step if config.hand == "relative" else 0.0))
+        lead = torch.where(is_arm, config.arm_lead, unit * config.hand_lead)
         # Continuous arm joints have infinite limits; where() must not see inf * 0 from them.
         zero, below, above = (torch.where(is_arm, other, value) for value, other in ((zero, 0.0), (below, 1.0), (above, 1.0)))
         return cls(lower=lower, upper=upper, is_arm=is_arm, step=step, lead=lead, zero=zero, below=below, above=above, config=config)

@@ -26,14 +26,15 @@ class ActionConfig:
     demonstrated grasp and has to learn to hold before it can learn to lift. In-hand manipulation is commonly learned so (Qi et al. 2022,
     In-Hand Object Rotation via Rapid Motor Adaptation)."""
     hand_step: float = 0.05
-    """``relative`` only: largest change of a hand joint's target per control step [rad]: 3 rad/s at 60 Hz."""
+    """``relative`` only: largest change of a hand joint's target per control step [rad]: 3 rad/s at 60 Hz. Joints that slide move 4 cm
+    for every radian."""
     hand_lead: float = 0.4
     """``relative`` only: farthest that a hand joint's target may run ahead of the joint [rad], which is how hard it can press: drives of
     the Sharpa hand reach their effort limits at 0.3 to 0.7."""
     hand_zero: Literal["middle", "home"] = "middle"
-    """``absolute`` only. Where a hand joint is sent by action 0: to the middle of its limits, which is a half-closed fist, or to the robot's
-    home pose, from which -1 and +1 lead to the limits along two slopes. A new policy's mean is 0: with ``middle`` it closes the open hand at
-    once and comes down on the object with its knuckles. Not in the paper."""
+    """``absolute`` only. Where a hand joint is sent by action 0: to the middle of its limits, which is a half-closed fist, or to the
+    robot's home pose, from which -1 and +1 lead to the limits along two slopes. A new policy's mean is 0: with ``middle`` it closes the
+    open hand at once and comes down on the object with its knuckles. Not in the paper."""
     hand_smoothing: float = 1.0
     """``absolute`` only. Share of the new hand target that is taken per control step, in (0, 1]; 1 is the paper's plain target."""
 

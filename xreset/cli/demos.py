@@ -38,6 +38,24 @@ def dexycb(
     _print_summary(demos, out)
 
 
+def ho3d(folder: Annotated[Path, tyro.conf.Positional], *, out: Path, fps: float, cameras: Path) -> None:
+    """Read HO-3D (versions 2 and 3) in its own layout and write an archive of demonstrations. Not yet tried on the original files.
+
+    Args:
+        folder: The folder that holds `train`.
+        out: Archive to write.
+        fps: Frames per second, which the files do not say.
+        cameras: File with the camera's pose in the table frame (4x4, metres, as text or npy; x right, y down, z where it looks) for all
+            sequences; or a folder with SEQUENCE.txt, where sequences without one are left out.
+    """
+    from xreset.demos import read_ho3d, write_demos
+
+    with _progress("reading HO-3D") as progress:
+        demos = read_ho3d(folder, fps=fps, cameras=cameras, progress=progress)
+    write_demos(out, demos, config={"dataset": "ho3d", "fps": fps})
+    _print_summary(demos, out)
+
+
 def keypoints(
     path: Annotated[Path, tyro.conf.Positional],
     *,
@@ -204,4 +222,4 @@ def _print_summary(demos: Demos, path: Path) -> None:
         console.print(f"note: {doubt}", style="yellow", soft_wrap=True, highlight=False)
 
 
-COMMAND = {"import dexycb": dexycb, "import keypoints": keypoints, "synth": synth, "mirror": mirror, "info": info}
+COMMAND = {"import dexycb": dexycb, "import ho3d": ho3d, "import keypoints": keypoints, "synth": synth, "mirror": mirror, "info": info}

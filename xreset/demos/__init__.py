@@ -1,4 +1,4 @@
-"""Human hand-object demonstrations: the archive, DexYCB, other trackers, and synthetic ones.
+"""Human hand-object demonstrations: the archive, DexYCB, HO-3D, other trackers, and synthetic ones.
 
 .. code-block:: python
 
@@ -10,6 +10,7 @@
 from xreset.demos.align import grounded, levelled
 from xreset.demos.archive import Demos, concatenate, demo_objects, read_demos, write_demos
 from xreset.demos.dexycb import read_dexycb
+from xreset.demos.ho3d import read_ho3d
 from xreset.demos.keypoints import Convention, read_keypoints, read_transform
 from xreset.demos.mirror import Symmetry, mirrored, symmetry
 from xreset.demos.synth import synthesize
@@ -25,6 +26,7 @@ __all__ = [
     "mirrored",
     "read_demos",
     "read_dexycb",
+    "read_ho3d",
     "read_keypoints",
     "read_transform",
     "symmetry",

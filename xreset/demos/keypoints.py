@@ -139,7 +139,7 @@ def read_keypoints(
         if progress is not None:
             progress(done, len(files), name)
         sequences = _read_csv(file, name) if file.suffix == ".csv" else [_read_npz(file, name)]
-        parts += [_sequence(arrays, f"{file}, sequence {arrays['sequence']}", convention) for arrays in sequences]
+        parts += [sequence_of(arrays, f"{file}, sequence {arrays['sequence']}", convention) for arrays in sequences]
     return concatenate(parts)
 
 
@@ -256,7 +256,8 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
 # One sequence ----------------------------------------------------------------------------------------------------------------------------
 
 
-def _sequence(arrays: Mapping[str, np.ndarray], what: str, convention: Convention) -> Demos:
+def sequence_of(arrays: Mapping[str, np.ndarray], what: str, convention: Convention) -> Demos:
+    """One sequence from the arrays of a file; see :func:`read_keypoints`, whose errors it raises. ``what`` names it in them."""
     assert convention.order is not None
     scale = 1e-3 if convention.units == "mm" else 1.0
     points = np.asarray(arrays["keypoints"], dtype=float) * scale

@@ -1,0 +1,164 @@
+"""HO-3D's layout, with small files made here; and pickles that want to do more than hold arrays."""
+
+import os
+import pickle
+import tempfile
+import unittest
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tests.test_keypoints import CAMERA, seen_from, written
+from xreset.demos import read_ho3d, synthesize
+from xreset.demos.pickles import read_pickle
+from xreset.errors import DemoError
+
+OPENGL = np.diag([1.0, -1.0, -1.0])
+
+
+class Case(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name)
+
+
+class Ho3d(Case):
+    """A synthetic demonstration as HO-3D would hold it comes back as it was."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.demos = synthesize(["soup"], per_object=1, seed=1, fps=10)
+
+    def setUp(self):
+        super().setUp()
+        self.cameras = self.folder / "cameras"
+        self.cameras.mkdir()
+        np.savetxt(self.cameras / "SM2.txt", CAMERA)
+
+    def write(self, leave_out=(), protocol=2, **changes):
+        meta = self.folder / "ho3d/train/SM2/meta"
+        meta.mkdir(parents=True, exist_ok=True)
+        points, pos, turn = seen_from(CAMERA, self.demos)
+        points = written(points, "mano") @ OPENGL
+        for i in range(self.demos.num_frames):
+            path = meta / f"{i:04d}.pkl"
+            path.unlink(missing_ok=True)
+            if i in leave_out:
+                continue
+            data = {
+                "handJoints3D": points[i] if self.demos.hand_valid[i] else None,
+                "objRot": Rotation.from_matrix(OPENGL @ turn[i].as_matrix()).as_rotvec()[:, None],
+                "objTrans": OPENGL @ pos[i],
+                "objName": str(self.demos.object_name[0]),
+                "handBeta": np.zeros(10),
+                "objLabel": np.int64(5),
+            }
+            data |= {name: change(i, data[name]) for name, change in changes.items()}
+            path.write_bytes(pickle.dumps(data, protocol=protocol))
+
+    def read(self, **options):
+        return read_ho3d(self.folder / "ho3d", **{"fps": 10.0, "cameras": self.cameras, **options})
+
+    def test_back_as_it_was(self):
+        for protocol in (2, 4, 5):
+            with self.subTest(protocol=protocol):
+                self.write(protocol=protocol)
+                found = self.read()
+                np.testing.assert_allclose(found.hand_keypoints, self.demos.hand_keypoints, atol=1e-5)
+                np.testing.assert_allclose(found.object_pos, self.demos.object_pos, atol=1e-5)
+                same = np.abs((found.object_quat_wxyz * self.demos.object_quat_wxyz).sum(axis=1))
+                np.testing.assert_allclose(same, 1, atol=1e-5)
+                np.testing.assert_array_equal(found.hand_valid, self.demos.hand_valid)
+        self.assertEqual((found.sequence_name[0], found.object_name[0], found.hand_side[0]), ("SM2", self.demos.object_name[0], "right"))
+
+    def test_a_frame_that_is_missing_is_interpolated(self):
+        self.write(leave_out=(7,))
+        found = self.read()
+        self.assertEqual(found.num_frames, self.demos.num_frames)
+        middle = (self.demos.object_pos[6] + self.demos.object_pos[8]) / 2
+        np.testing.assert_allclose(found.object_pos[7], middle, atol=1e-5)
+
+    def test_objects_not_annotated_at_the_ends_are_cut_off(self):
+        self.write(objRot=lambda i, value: None if i < 2 else value)
+        self.assertEqual(self.read().num_frames, self.demos.num_frames - 2)
+
+    def test_refusals(self):
+        cases = (
+            ("amid others, first in 0005", {"objTrans": lambda i, v: None if i == 5 else v}),
+            ("evaluation split gives the wrist alone", {"handJoints3D": lambda i, v: np.zeros(3)}),
+            (r"shape \[2\], expected \[3\]", {"objTrans": lambda i, v: np.zeros(2)}),
+            ("not finite", {"objTrans": lambda i, v: v * np.nan}),
+            ("object changes", {"objName": lambda i, v: f"thing_{i}"}),
+            ("Say --order", {"handJoints3D": lambda i, v: None if v is None else v[[0, 13, 14, 15, 16, *range(1, 13), *range(17, 21)]]}),
+        )
+        for words, changes in cases:
+            self.write(**changes)
+            with self.subTest(words), self.assertRaisesRegex(DemoError, words):
+                self.read()
+        self.write()
+        with self.assertRaisesRegex(DemoError, "of no sequence where its camera stands; expected SM2.txt"):
+            self.read(cameras=self.folder / "ho3d")
+        with self.assertRaisesRegex(DemoError, "no HO-3D sequence"):
+            read_ho3d(self.folder, fps=30.0, cameras=self.cameras)
+        np.savetxt(self.cameras / "SM2.txt", np.linalg.inv(CAMERA))
+        with self.assertRaisesRegex(DemoError, "inverse of what it should be"):
+            self.read()
+
+
+class Evil:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+class Pickles(Case):
+    def load(self, content):
+        path = self.folder / "x.pkl"
+        path.write_bytes(content)
+        return read_pickle(path)
+
+    def test_arrays_of_every_protocol_and_order(self):
+        arrays = {
+            "c": np.arange(6.0).reshape(2, 3), "f": np.asfortranarray(np.arange(6).reshape(2, 3)), "b": np.array([True, False]),
+            "big": np.array([1.5, 2.5], dtype=">f4"), "scalar": np.float64(2.5), "none": None, "text": "a", "empty": np.zeros((0, 3)),
+        }  # fmt: skip
+        for protocol in range(6):
+            with self.subTest(protocol=protocol):
+                found = self.load(pickle.dumps(arrays, protocol=protocol))
+                for name, value in arrays.items():
+                    np.testing.assert_array_equal(found[name], value)
+
+    def test_a_pickle_of_python_2(self):
+        kind = b"cnumpy\ndtype\n(S'f8'\nI0\nI1\ntR(I3\nS'<'\nNNNI-1\nI-1\nI0\ntb"
+        data = b"(dS'a'\ncnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR(I1\n(I1\nt" + kind
+        data += b"I00\nS'\\x00\\x00\\x00\\x00\\x00\\x00\\xf8?'\ntbs."
+        np.testing.assert_array_equal(self.load(data)["a"], [1.5])
+
+    def test_nothing_but_arrays_is_built(self):
+        target = self.folder / "made"
+        cases = {
+            "it asks for": pickle.dumps({"a": Evil(target)}),
+            "builtins.eval": b"cbuiltins\neval\n(S'1'\ntR.",
+            "expected numbers": pickle.dumps({"a": np.array([Evil(target)], dtype=object)}),
+            "outside": b"Pname\n.",
+            "expected a dictionary": pickle.dumps([1]),
+            "cannot be read": pickle.dumps({"a": np.zeros(100)})[:200],
+            "encoded": b"c_codecs\nencode\n(S'x'\nS'zlib'\ntR.",
+        }
+        for words, content in cases.items():
+            with self.subTest(words), self.assertRaisesRegex(DemoError, words):
+                self.load(content)
+        self.assertFalse(target.exists())
+
+    def test_a_shape_that_the_data_does_not_have(self):
+        content = pickle.dumps({"a": np.zeros(3)}, protocol=2).replace(b"K\x03\x85", b"J\xff\xff\xff\x7f\x85")
+        with self.assertRaisesRegex(DemoError, "cannot be read as pickled arrays"):
+            self.load(content)
+
+
+if __name__ == "__main__":
+    unittest.main()

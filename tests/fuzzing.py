@@ -77,7 +77,7 @@ def readers() -> Iterator[dict[str, Reader]]:
     from xreset.learning.clock import LiftClock, read_lift
     from xreset.learning.runner import read_checkpoint
     from xreset.objects import load_object
-    from xreset.objects.meshes import _load
+    from xreset.objects.meshes import read_mesh
     from xreset.policy import OnnxPolicy, policy_contract
     from xreset.robot_tools.sources import read_source
     from xreset.spec import PairFriction
@@ -182,7 +182,7 @@ def readers() -> Iterator[dict[str, Reader]]:
         import trimesh
 
         for suffix in ("stl", "obj", "ply", "off"):
-            path = add(f"mesh .{suffix}", f"box.{suffix}", _load, "bytes" if suffix == "stl" else "text")
+            path = add(f"mesh .{suffix}", f"box.{suffix}", read_mesh, "bytes" if suffix == "stl" else "text")
             trimesh.creation.box((0.1, 0.06, 0.04)).export(path)
         with_mesh = folder / "meshed" / "robot.urdf"
         with_mesh.parent.mkdir()

@@ -1,6 +1,8 @@
 """Objects: stand-ins, sampling, rest, and the import of meshes."""
 
+import contextlib
 import importlib.util
+import io
 import os
 import tempfile
 import unittest
@@ -9,13 +11,15 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
+import torch
 import trimesh
 from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
 
 from tests.data import data_dir
-from xreset.errors import ObjectError
-from xreset.geometry.shapes import half_spaces, hull
+from xreset.cli import main
+from xreset.errors import ObjectError, XResetError
+from xreset.geometry.shapes import half_spaces, hull, shell_properties
 from xreset.objects import (
     bounding_box,
     bounding_radius,
@@ -29,11 +33,15 @@ from xreset.objects import (
     shape_mesh,
     surface_points,
 )
-from xreset.objects.decompose import limited_hull
-from xreset.objects.meshes import DEFAULT_DENSITY, import_with_notes, mesh_files
+from xreset.objects.decompose import Settings, as_solid, decompose, limited_hull
+from xreset.objects.meshes import DEFAULT_DENSITY, add_mesh, import_with_notes, mesh_files
+from xreset.objects.properties import Properties
 from xreset.objects.sampling import sample_surface, winding_number
+from xreset.task.config import RandomizationConfig
+from xreset.task.randomization import own_friction
 
 Z = np.array([0.0, 0.0, 1.0])
+CUTS = unittest.skipUnless(importlib.util.find_spec("manifold3d"), "manifold3d is not installed")
 
 
 def distance_to_pieces(points, obj):
@@ -238,7 +246,7 @@ class MeshImport(unittest.TestCase):
         self.assertEqual(result.obj.mass, 0.118)
         self.assertEqual(result.notes, ())
 
-    @unittest.skipUnless(importlib.util.find_spec("coacd"), "CoACD is not installed")
+    @CUTS
     def test_concave_mesh_is_cut_and_cached(self):
         path = self.write(self.bracket())
         first = import_with_notes(path, "bracket", mass=0.1)
@@ -258,9 +266,9 @@ class MeshImport(unittest.TestCase):
         self.assertFalse(import_with_notes(path, "bracket", mass=0.1).cached)  # a damaged cache is made again
         self.assertTrue(import_with_notes(path, "bracket", mass=0.1).cached)
 
-    def test_without_coacd_the_error_names_the_remedy(self):
+    def test_without_manifold3d_the_error_names_the_remedy(self):
         path = self.write(self.bracket())
-        with mock.patch.dict("sys.modules", {"coacd": None}), self.assertRaisesRegex(ObjectError, r"pip install 'xreset\[objects\]'"):
+        with mock.patch.dict("sys.modules", {"manifold3d": None}), self.assertRaisesRegex(ObjectError, r"pip install 'xreset\[objects\]'"):
             import_with_notes(path, "bracket")
 
     def test_an_unwritable_cache_does_no_harm(self):
@@ -275,6 +283,85 @@ class MeshImport(unittest.TestCase):
         result = import_with_notes(path, "thing", mass=1.0)
         self.assertIn("not closed", result.notes[0])
         np.testing.assert_allclose(np.diag(result.obj.inertia), 0.01 / 6, rtol=1e-6)
+
+    @CUTS
+    def test_a_concave_mesh_with_a_hole_is_filled(self):
+        whole = self.bracket().subdivide().subdivide()
+        path = self.write(trimesh.Trimesh(whole.vertices, whole.faces[1:]))
+        result = import_with_notes(path, "thing", mass=1.0)
+        self.assertIn("holes were filled", result.notes[0])
+        np.testing.assert_allclose(result.obj.com[:2], (0.003 * 0.05 + 0.0021 * 0.015) / 0.0051, atol=5e-4)
+
+    def test_a_hollow_objects_mass_is_on_its_surface(self):
+        mesh = trimesh.creation.icosphere(4, 0.1)
+        com, inertia = shell_properties(mesh.vertices + np.array([1, 2, 3]), mesh.faces, 0.3)
+        np.testing.assert_allclose(com, (1, 2, 3), atol=1e-9)
+        np.testing.assert_allclose(inertia, 2 / 3 * 0.3 * 0.01 * np.eye(3), rtol=0.005, atol=1e-8)
+        found = import_with_notes(self.write(mesh), "ball", mass=0.3).obj  # 0.3 kg in 4.2 l
+        np.testing.assert_allclose(np.diag(found.inertia), 0.002, rtol=0.005)
+        found = import_with_notes(self.folder / "thing.obj", "ball", mass=3.0).obj
+        np.testing.assert_allclose(np.diag(found.inertia), 0.012, rtol=0.01)  # solid: 2/5 m r^2
+
+    def test_a_mesh_in_millimetres_with_what_it_is_made_of(self):
+        path = self.write(trimesh.creation.box((100, 60, 40)))
+        out = self.folder / "objects"
+        result = add_mesh(path, out, "brick", scale=0.001, properties=Properties(density=700, friction=0.4))
+        self.assertAlmostEqual(result.obj.mass, 700 * 0.1 * 0.06 * 0.04, places=6)
+        self.assertEqual(result.notes, ())
+        found = load_object("brick", out)
+        self.assertEqual((found.friction, found.source), (0.4, result.obj.source))
+        np.testing.assert_allclose(np.ptp(found.vertices, axis=0), (0.1, 0.06, 0.04), atol=1e-9)
+        with self.assertRaisesRegex(ObjectError, "there already"):
+            add_mesh(path, out, "brick", scale=0.001)
+        with self.assertRaisesRegex(ObjectError, "millimetres"):
+            add_mesh(path, out, "other")
+        with self.assertRaisesRegex(ObjectError, "is no name"):
+            add_mesh(path, out, "../other", scale=0.001)
+        with mock.patch("xreset.objects.meshes.cached_pieces", side_effect=ObjectError("no")), self.assertRaises(ObjectError):
+            add_mesh(path, out, "other", scale=0.001, properties=Properties(mass=1.0))
+        self.assertEqual(sorted(p.name for p in out.iterdir()), ["brick.obj", "brick.toml"])
+
+    def test_the_command_puts_a_mesh_into_a_folder_and_draws_it(self):
+        path, out, png = self.write(trimesh.creation.box((100, 60, 40)), "a brick"), self.folder / "objects", self.folder / "a.png"
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            main(
+                [
+                    "objects",
+                    "import",
+                    str(path),
+                    "--out",
+                    str(out),
+                    "--name",
+                    "brick",
+                    "--scale",
+                    "0.001",
+                    "--mass",
+                    "0.2",
+                    "--png",
+                    str(png),
+                ]
+            )
+        self.assertIn("brick", said.getvalue())
+        self.assertTrue(png.read_bytes().startswith(b"\x89PNG"))
+        self.assertEqual(load_object("brick", out).mass, 0.2)
+        for words, options in (("say which with --out", []), ("is no name", ["--out", str(out), "--scale", "0.001"])):
+            with self.subTest(words), contextlib.redirect_stderr(io.StringIO()) as said, self.assertRaises(SystemExit):
+                main(["objects", "import", str(path), *options])
+            self.assertIn(words, said.getvalue())
+
+    def test_what_an_object_is_made_of_is_checked(self):
+        path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)))
+        for text, words in (
+            ("mass = -1", "mass is -1.0"), ("mass = 1\ndensity = 2", "one follows"), ("weight = 1", "unknown: weight"),
+            ("friction = 'high'", "friction is 'high'"), ("mass", "TOML"), ("mass = nan", "mass is nan"),
+        ):  # fmt: skip
+            path.with_suffix(".toml").write_text(text)
+            with self.subTest(text), self.assertRaisesRegex(XResetError, words):
+                import_with_notes(path, "thing")
+
+    def test_own_friction_takes_the_place_of_the_middle(self):
+        c = RandomizationConfig(friction=(0.5, 1.0))
+        torch.testing.assert_close(own_friction([None, 0.95, 0.35], c), torch.tensor([[0.0], [0.1], [-0.2]]))
 
     def test_mesh_inside_out(self):
         box = trimesh.creation.box((0.1, 0.1, 0.1))
@@ -325,6 +412,60 @@ class MeshImport(unittest.TestCase):
             outside = distance_to_pieces(obj.vertices, obj)
             self.assertLess(outside.max(), 0.002)  # 64 vertices are enough
             self.assertLess(np.linalg.norm(load_object(name).com - obj.com), 0.003)
+
+
+@CUTS
+class ThinWalls(unittest.TestCase):
+    """Pieces keep to the surface, measured here apart from the importer's own account."""
+
+    def off(self, mesh, pieces):
+        """[m] Largest distance of points of the pieces outside the mesh from it, and of points of the mesh from the pieces."""
+        own = trimesh.sample.sample_surface(mesh, 60000, seed=1)[0]
+        faces = [trimesh.sample.sample_surface(shape_mesh(p), 400, seed=1)[0] for p in pieces.shapes]
+        points = np.concatenate(faces)
+        points = points[winding_number(points, mesh.vertices, mesh.faces) < 0.5]
+        planes = [half_spaces(piece) for piece in pieces.shapes]
+        bare = np.min([(own[:5000] @ p[:, :3].T + p[:, 3]).max(axis=1) for p in planes], axis=0)
+        return cKDTree(own).query(points)[0].max(), bare.max()
+
+    def room(self, point, pieces):
+        """[m] From a point to the nearest piece, at least."""
+        return min(float((half_spaces(p)[:, :3] @ point + half_spaces(p)[:, 3]).max()) for p in pieces.shapes)
+
+    def test_a_finger_fits_into_a_mug_and_its_handle(self):
+        outline = [[0, 0], [0.04, 0], [0.04, 0.09], [0.0365, 0.09], [0.0365, 0.004], [0, 0.004]]
+        cup = trimesh.creation.revolve(np.array(outline), sections=40)
+        turn = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
+        turn[:3, 3] = 0.042, 0, 0.045
+        ring = trimesh.creation.torus(0.024, 0.004, major_sections=24, minor_sections=8, transform=turn)
+        bore = trimesh.creation.cylinder(0.038, 0.3, sections=40)
+        mug = trimesh.boolean.union([cup, trimesh.boolean.difference([ring, bore])])
+        seen = []
+        pieces = decompose(mug, progress=lambda parts, worst: seen.append((parts, worst)))
+        self.assertLess(max(self.off(mug, pieces)), 0.0021)
+        self.assertLess(pieces.deviation, 0.002)
+        self.assertLess(len(pieces.shapes), 40)
+        self.assertGreater(len(seen), 5)
+        self.assertGreater(self.room(np.array([0, 0, 0.05]), pieces), 0.030)  # the cup's inner radius is 36.5 mm
+        self.assertGreater(self.room(np.array([0.051, 0, 0.045]), pieces), 0.008)  # a finger of 16 mm through the handle
+        self.assertAlmostEqual(pieces.volume, mug.volume, delta=1e-9)
+
+    def test_an_open_sheet_becomes_a_thin_wall(self):
+        angle = np.linspace(0, 1.0, 6)
+        sheet = trimesh.creation.revolve(np.column_stack((0.05 * np.sin(angle), 0.05 - 0.05 * np.cos(angle))), sections=16)
+        self.assertFalse(sheet.is_volume)
+        solid = as_solid(sheet)
+        self.assertAlmostEqual(solid.volume(), sheet.area * 0.001, delta=0.1 * sheet.area * 0.001)
+        pieces = decompose(sheet)
+        self.assertGreater(self.room(np.array([0, 0, 0.02]), pieces), 0.012)  # 20 mm above the bottom
+        self.assertLess(pieces.deviation, 0.002)
+
+    def test_as_many_pieces_as_allowed_and_no_more(self):
+        ring = trimesh.creation.annulus(0.036, 0.04, 0.02, sections=32)
+        few = decompose(ring, Settings(max_pieces=6))
+        self.assertLessEqual(len(few.shapes), 6)
+        self.assertGreater(few.deviation, 0.002)
+        self.assertLess(decompose(ring).deviation, 0.002)
 
 
 class SpecIsFrozen(unittest.TestCase):

@@ -28,7 +28,7 @@ from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
 from xreset.task.latency import DelayLine
-from xreset.task.randomization import sample_drives, sample_friction, sample_mass_scale, sample_offset, sample_range
+from xreset.task.randomization import own_friction, sample_drives, sample_friction, sample_mass_scale, sample_offset, sample_range
 from xreset.task.rewards import Reward, RewardInput, compute_reward, own_term
 from xreset.task.terminations import episode_steps, out_of_bounds
 
@@ -145,6 +145,7 @@ class ManipulationEnv:
         self._surface_points = per_object(lambda o: surface_points(o, task.distance_points))
         self._keypoints = per_object(keypoints)
         self._nominal_mass = torch.tensor([o.mass for o in scene.objects], device=self.device)[backend.object_index]
+        self._own_friction = own_friction([o.friction for o in scene.objects], task.randomization).to(self.device)[backend.object_index]
         self._limits = tuple(
             torch.where(limit.isfinite(), limit, sign * torch.pi) for limit, sign in ((self.actions.lower, -1.0), (self.actions.upper, 1.0))
         )
@@ -451,7 +452,7 @@ class ManipulationEnv:
         """What is drawn for every world beside its start [N, ...], and where it is kept."""
         c, n, generator = self.task.randomization, self.num_envs, self.generator
         samples: dict[str, Callable[[], Tensor]] = {
-            "friction": lambda: sample_friction(n, c, generator),
+            "friction": lambda: (sample_friction(n, c, generator) + self._own_friction).clamp(min=0.05),
             "object_mass": lambda: self._nominal_mass * sample_mass_scale(n, c, generator),
             "drives": lambda: sample_drives(self.actions.is_arm, n, c, generator),
             "torsional_friction": lambda: self.backend.scene.friction.torsional * sample_range(n, c.torsional_friction, generator),

@@ -216,6 +216,8 @@ class ObjectSpec:
     """[F, 3] triangles, outward."""
     source: str = "stand-in"
     """Where the geometry comes from: ``stand-in`` or the mesh file's SHA-256."""
+    friction: float | None = None
+    """Coefficient of its material: the middle of what the task draws for it. None: as the task draws."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,28 +28,80 @@ def list_(*, objects: Path | None = None) -> None:
     Console().print(table)
 
 
-def import_(folder: Annotated[Path, tyro.conf.Positional]) -> None:
-    """Cut every mesh of a folder into convex pieces, and keep them for later runs.
+def import_(
+    path: Annotated[Path, tyro.conf.Positional],
+    *,
+    out: Path | None = None,
+    name: str | None = None,
+    scale: float = 1.0,
+    mass: float | None = None,
+    density: float | None = None,
+    friction: float | None = None,
+    png: Path | None = None,
+) -> None:
+    """Cut a mesh, or every mesh of a folder, into convex pieces that keep to its surface, and keep them for later runs.
+
+    A mesh file goes into a folder of objects (--out), which other commands take as --objects; there, NAME.toml holds what it is made of.
 
     Args:
-        folder: Folder with NAME.obj, NAME/textured_simple.obj or NAME/textured.obj; in metres, in the frame of the object poses.
+        path: A mesh file; or a folder with NAME.obj, NAME/textured_simple.obj or NAME/textured.obj, in metres, in the frame of the object
+            poses.
+        out: Folder of objects that a mesh file goes into.
+        name: The object's name there; default: the file's.
+        scale: Metres in a unit of the file: 0.001 for millimetres.
+        mass: kg.
+        density: kg/m^3, in place of the mass.
+        friction: Coefficient of its material: the middle of what training and evaluation draw.
+        png: Picture of the meshes beside their pieces, with the deviation in millimetres.
     """
     from xreset.cli._terminal import Console
-    from xreset.objects.meshes import import_with_notes, mesh_files
+    from xreset.errors import ObjectError
+    from xreset.objects.meshes import add_mesh, import_with_notes, mesh_files
+    from xreset.objects.properties import Properties
 
+    try:
+        properties = Properties(mass=mass, density=density, friction=friction)
+    except ValueError as error:
+        raise ObjectError(f"{error}.") from error
+    if path.is_dir():
+        if (out, name, scale, properties) != (None, None, 1.0, Properties()):
+            raise ObjectError(
+                f"{path} is a folder, whose meshes stay as they are: --out, --name, --scale, --mass, --density and --friction"
+                " are for one mesh file. NAME.toml beside a mesh may say mass, density and friction."
+            )
+        files = mesh_files(path)
+    elif out is None:
+        raise ObjectError("a mesh file goes into a folder of objects: say which with --out.")
+    else:
+        files = {name or path.stem: path}
     console = Console()
-    table = _table("time")
-    notes = []
-    files = mesh_files(folder)
+    table = _table("off surface, mm", "time")
+    found, notes = [], []
     with console.status("") as status:
-        for name, path in files.items():
-            status.update(f"{name} ({path})")
-            result = import_with_notes(path, name)
-            table.add_row(*_cells(result.obj), "cached" if result.cached else f"{result.seconds:.1f} s")
-            notes += [f"{name}: {note}" for note in result.notes]
+        for object_name, file in files.items():
+
+            def progress(parts: int, worst: float, object_name: str = object_name) -> None:
+                status.update(f"{object_name}: {parts} parts, the worst {1e3 * worst:.1f} mm off the surface")
+
+            status.update(f"{object_name} ({file})")
+            if out is None:
+                result = import_with_notes(file, object_name, progress=progress)
+            else:
+                result = add_mesh(file, out, object_name, scale=scale, properties=properties, progress=progress)
+            seconds = "cached" if result.cached else f"{result.seconds:.1f} s"
+            table.add_row(*_cells(result.obj), f"{1e3 * result.deviation:.1f}", seconds)
+            notes += [f"{object_name}: {note}" for note in result.notes]
+            found.append(result)
     console.print(table)
     for note in notes:
         console.print(note, highlight=False)
+    if png is not None:
+        from xreset.pictures.pieces import draw_pieces
+        from xreset.pictures.raster import write_png
+
+        captions = [f"{r.obj.name}: {len(r.obj.pieces)} pieces, at most {1e3 * r.deviation:.1f} mm off the surface" for r in found]
+        write_png(png, draw_pieces([r.obj for r in found], captions))
+        console.print(f"{png}: meshes and their pieces", soft_wrap=True, highlight=False)
 
 
 def _table(*more: str) -> Table:

@@ -147,6 +147,19 @@ def mass_properties(vertices: np.ndarray, faces: np.ndarray, mass: float) -> tup
     return np.asarray(solid.center_mass), np.asarray(solid.inertia) * (mass / solid.mass)
 
 
+def shell_properties(vertices: np.ndarray, faces: np.ndarray, mass: float) -> tuple[np.ndarray, np.ndarray]:
+    """Centre of mass [3] and inertia [3, 3] about it of a thin wall along the triangles, of the same thickness everywhere."""
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    weight = mass * area / area.sum()
+    com = np.einsum("f,fi->i", weight, corners.mean(axis=1)) / mass
+    local = corners - com
+    total = local.sum(axis=1)
+    second = np.einsum("f,fki,fkj->ij", weight, local, local) + np.einsum("f,fi,fj->ij", weight, total, total)
+    second /= 12  # of x x^T over a triangle: (the corners' + that of their sum) / 12
+    return com, np.trace(second) * np.eye(3) - second
+
+
 def _translation(center: ArrayLike) -> np.ndarray:
     T = np.eye(4)
     T[:3, 3] = center

@@ -1,37 +1,63 @@
-"""A mesh as few convex pieces, small enough for every engine, kept in a cache because it takes seconds.
+"""A mesh as few convex pieces that keep to its surface, small enough for every engine, kept in a cache because it takes seconds.
 
-PhysX takes hulls of at most 64 vertices in its fast path, and contact cost grows with the number of pieces.
+The mesh is made a solid, cut by planes wherever the convex hull of a part stands too far off the surface, and pieces whose common hull
+does not are joined again. PhysX takes hulls of at most 64 vertices in its fast path, and contact cost grows with the number of pieces.
 """
 
 from __future__ import annotations
 
 import hashlib
+import heapq
 import json
 import os
+import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from xreset.errors import FileFormatError, ObjectError, XResetError
 from xreset.files import POSITION, Field, read_npz, write_npz
-from xreset.geometry.shapes import hull
+from xreset.geometry.shapes import half_spaces, hull, mass_properties, shape_mesh
 from xreset.spec import Shape
 
 if TYPE_CHECKING:
     import trimesh
+    from manifold3d import Manifold
 
-SCHEMA_NAME = "xreset-pieces/1"
-SCHEMA = {"vertices": Field(("V", 3), "f", within=POSITION), "offsets": Field(("K+1",), "i")}
+SCHEMA_NAME = "xreset-pieces/2"
+SCHEMA = {
+    "vertices": Field(("V", 3), "f", within=POSITION),
+    "offsets": Field(("K+1",), "i"),
+    "deviation": Field((), "f", within=POSITION),
+    "volume": Field((), "f"),
+    "com": Field((3,), "f", within=POSITION),
+    "inertia": Field((3, 3), "f"),
+}
+
+_CUTS = 7
+"""Planes that are tried along each direction, evenly spaced."""
+_CROSSES = ((0, 1), (0, 2), (1, 2), (3, 4), (3, 5), (4, 5))
+"""Pairs of directions whose middle planes are tried together: halves of a ring are as convex as the ring, quarters are not."""
+_SPECK = 1e-11
+"""[m^3] Parts smaller than a cube of 0.2 mm are dropped."""
+_SAMPLES = 20_000
+"""Points at which pieces are compared with the mesh."""
+_SMALL_HOLE = 0.03
+"""Holes of at most so much of the mesh's area are closed; larger ones are openings."""
+_FACES = 3000
+"""Meshes that are not closed are thinned out to about so many triangles before they are made solids."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How a mesh is decomposed. Every field is part of the cache's key."""
+    """How a mesh is decomposed. Every field but ``seconds`` is part of the cache's key."""
 
-    max_pieces: int = 16
+    max_pieces: int = 80
+    """If the tolerance asks for more, it is widened."""
     max_vertices: int = 64
     """Of each piece."""
     hull_depth: float = 0.05
@@ -39,64 +65,94 @@ class Settings:
 
     The volume ratio would be no good measure: the recessed lids of a tuna can cost as much volume as a pitcher's handle.
     """
-    threshold: float = 0.08
-    """CoACD's concavity threshold, relative to a mesh scaled to [-1, 1]."""
-    seed: int = 0
+    tolerance: float = 0.0017
+    """[m] How far pieces may stand off the surface of a mesh that is more than one."""
+    thickness: float = 0.001
+    """[m] Of the sheet that stands for a mesh that is not closed."""
+    seconds: float = 50.0
+    """Of processor time; after that, the pieces so far are taken. So the pieces of a mesh do not depend on what else the machine does."""
 
 
-def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> tuple[Shape, ...]:
+@dataclass(frozen=True, kw_only=True)
+class Pieces:
+    """What stands for a mesh in physics."""
+
+    shapes: tuple[Shape, ...]
+    deviation: float
+    """[m] Largest distance between their common surface and the mesh's (sampled)."""
+    volume: float
+    """[m^3] Of the solid."""
+    com: np.ndarray
+    """[3] its centre of mass."""
+    inertia: np.ndarray
+    """[3, 3] about that, of 1 kg of uniform density [m^2]."""
+    cached: bool = False
+    in_time: bool = True
+
+
+Progress = Callable[[int, float], None]
+"""Called with the number of parts so far and how far the worst stands off the surface [m]."""
+
+
+def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings(), progress: Progress = lambda parts, worst: None) -> Pieces:
     """Convex pieces that together have the mesh's shape.
 
+    Args:
+        mesh: closed or not (:func:`as_solid`).
+        settings: how.
+        progress: is told how it goes.
+
     Raises:
-        ObjectError: the mesh is concave and CoACD, which decomposes it, is not installed.
+        ObjectError: the mesh is concave and manifold3d, which cuts it, is not installed.
     """
+    end = time.process_time() + settings.seconds
     if _depth(mesh) <= settings.hull_depth:
-        return (limited_hull(mesh.vertices, settings.max_vertices),)
-    try:
-        import coacd
-    except ImportError as error:
-        raise ObjectError(
-            f"a concave mesh needs CoACD to be cut into convex pieces ({error}). Install it: pip install 'xreset[objects]'"
-        ) from error
-    coacd.set_log_level("error")
-    parts = coacd.run_coacd(
-        coacd.Mesh(np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int32)),
-        threshold=settings.threshold,
-        max_convex_hull=settings.max_pieces,
-        preprocess_mode="off" if mesh.is_watertight else "on",
-        preprocess_resolution=30,
-        mcts_nodes=10,
-        mcts_iterations=60,
-        decimate=True,
-        max_ch_vertex=settings.max_vertices,
-        seed=settings.seed,
-    )
-    return tuple(limited_hull(vertices, settings.max_vertices) for vertices, _ in parts)
+        hulls = [np.asarray(mesh.vertices)]
+        solid = mesh if mesh.is_volume else shape_mesh(hull(mesh.vertices))
+        vertices, faces = np.asarray(solid.vertices), np.asarray(solid.faces)
+    else:
+        whole = as_solid(mesh, settings.thickness)
+        vertices, faces = _arrays(whole)
+        hulls = [_arrays(piece)[0] for piece in _convex(_Solid(whole.simplify(settings.tolerance / 10)), settings, end, progress)]
+    shapes = tuple(limited_hull(points, settings.max_vertices) for points in hulls)
+    com, inertia = mass_properties(vertices, faces, 1.0)
+    corners = vertices[faces]
+    volume = float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
+    deviation = _deviation(vertices, faces, shapes)
+    return Pieces(shapes=shapes, deviation=deviation, volume=volume, com=com, inertia=inertia, in_time=bool(time.process_time() < end))
 
 
-def cached_pieces(mesh: trimesh.Trimesh, source: str, settings: Settings = Settings()) -> tuple[tuple[Shape, ...], bool]:
-    """The pieces of a mesh, from the cache if they are there, and whether they were.
+def cached_pieces(
+    mesh: trimesh.Trimesh, source: str, settings: Settings = Settings(), progress: Progress = lambda parts, worst: None
+) -> Pieces:
+    """The pieces of a mesh, from the cache if they are there. Those of a decomposition that time cut short are not kept.
 
     Args:
         mesh: the mesh.
         source: SHA-256 of what it was read from.
         settings: how to decompose it.
+        progress: see :func:`decompose`.
     """
-    key = hashlib.sha256(json.dumps([SCHEMA_NAME, source, asdict(settings)], sort_keys=True).encode()).hexdigest()
+    config = asdict(replace(settings, seconds=0.0))
+    key = hashlib.sha256(json.dumps([SCHEMA_NAME, source, config], sort_keys=True).encode()).hexdigest()
     path = cache_folder() / "objects" / f"{key}.npz"
     if path.is_file():
         try:
             arrays = read_npz(path, SCHEMA_NAME, SCHEMA, what="cached convex pieces")
-            return tuple(hull(part) for part in np.split(arrays["vertices"], arrays["offsets"][1:-1])), True
+            shapes = tuple(hull(part) for part in np.split(arrays["vertices"], arrays["offsets"][1:-1]))
+            deviation, volume = float(arrays["deviation"]), float(arrays["volume"])
+            return Pieces(shapes=shapes, deviation=deviation, volume=volume, com=arrays["com"], inertia=arrays["inertia"], cached=True)
         except (FileFormatError, ObjectError):
             path.unlink(missing_ok=True)  # damaged: make it again
-    pieces = decompose(mesh, settings)
-    parts = [piece.geometry.vertices for piece in pieces if piece.geometry.vertices is not None]
+    pieces = decompose(mesh, settings, progress)
+    parts = [piece.geometry.vertices for piece in pieces.shapes if piece.geometry.vertices is not None]
     offsets = np.cumsum([0, *map(len, parts)])
-    config, inputs = asdict(settings), {"mesh": source}
+    numbers = {name: np.asarray(getattr(pieces, name)) for name in ("deviation", "volume", "com", "inertia")}
+    arrays = {"vertices": np.concatenate(parts), "offsets": offsets, **numbers}
     with suppress(XResetError):  # a cache that cannot be written costs time, nothing else
-        write_npz(path, SCHEMA_NAME, {"vertices": np.concatenate(parts), "offsets": offsets}, config=config, inputs=inputs)
-    return pieces, False
+        if pieces.in_time:
+            write_npz(path, SCHEMA_NAME, arrays, config=config, inputs={"mesh": source})
+    return pieces
 
 
 def cache_folder() -> Path:
@@ -104,6 +160,235 @@ def cache_folder() -> Path:
     if os.environ.get("XRESET_CACHE"):
         return Path(os.environ["XRESET_CACHE"])
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "xreset"
+
+
+# Solids ----------------------------------------------------------------------------------------------------------------------------------
+
+
+def as_solid(mesh: trimesh.Trimesh, thickness: float = Settings.thickness) -> Manifold:
+    """The mesh as a solid that can be cut.
+
+    If it is not closed, its small holes are capped. If that does not make it a volume, it becomes a wall of that thickness [m] along its
+    triangles. Where more than two of them share an edge, each becomes a plate, and what the plates enclose is filled: a scan with cracks
+    becomes a solid, half the thickness larger.
+
+    Raises:
+        ObjectError: it encloses nothing.
+    """
+    if not mesh.is_volume:
+        mesh = _capped(_thinned(mesh))
+    for make in (lambda: mesh, lambda: _wall(mesh, thickness)):
+        solid = _manifold(make())
+        if solid is not None:
+            return solid
+    m3 = _manifold3d()
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    half = (normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12) * (thickness / 2))[:, None]
+    plates = [m3.Manifold.hull_points(points) for points in np.concatenate((corners + half, corners - half), axis=1)]
+    union = m3.Manifold.batch_boolean(plates, m3.OpType.Add)
+    outer = [part for part in union.decompose() if part.volume() > 0]  # surfaces of cavities have negative volume
+    if not outer:
+        raise ObjectError("the mesh encloses no solid, however its holes are closed; repair it, for example in MeshLab or Blender.")
+    return m3.Manifold.batch_boolean(outer, m3.OpType.Add)
+
+
+def _manifold(mesh: trimesh.Trimesh) -> Manifold | None:
+    """The closed mesh as a solid; None if it is not closed."""
+    m3 = _manifold3d()
+    if not mesh.is_volume:
+        return None
+    arrays = np.ascontiguousarray(mesh.vertices, dtype=np.float64), np.ascontiguousarray(mesh.faces, dtype=np.uint64)
+    solid = m3.Manifold(m3.Mesh64(*arrays))
+    return solid if solid.status() == m3.Error.NoError and solid.volume() > 0 else None
+
+
+def _wall(mesh: trimesh.Trimesh, thickness: float) -> trimesh.Trimesh:
+    """A wall along the triangles; closed if no more than two of them share an edge."""
+    import trimesh
+
+    mesh = mesh.copy()
+    trimesh.repair.fix_winding(mesh)
+    half, count = mesh.vertex_normals * (thickness / 2), len(mesh.vertices)
+    rim = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
+    a, b = rim.T
+    sides = np.concatenate((np.column_stack((b, a, a + count)), np.column_stack((b, a + count, b + count))))
+    faces = np.concatenate((mesh.faces, mesh.faces[:, ::-1] + count, sides))
+    return trimesh.Trimesh(np.concatenate((mesh.vertices + half, mesh.vertices - half)), faces, process=False)
+
+
+def _thinned(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh with at most about ``_FACES`` triangles, by rounding its vertices to a grid."""
+    import trimesh
+
+    if len(mesh.faces) <= _FACES:
+        return mesh
+    cell = np.sqrt(2 * mesh.area / _FACES)
+    mesh = trimesh.Trimesh(np.round(mesh.vertices / cell) * cell, mesh.faces)
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    return mesh
+
+
+def _capped(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh with its small holes closed by triangles to their centres."""
+    import trimesh
+
+    edges = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
+    vertices, faces = [np.asarray(mesh.vertices)], [np.asarray(mesh.faces)]
+    for loop in trimesh.graph.connected_components(edges, min_len=3):
+        center = mesh.vertices[loop].mean(axis=0)
+        a, b = edges[np.isin(edges[:, 0], loop)].T
+        area = np.linalg.norm(np.cross(mesh.vertices[a] - center, mesh.vertices[b] - center), axis=1).sum() / 2
+        if area <= _SMALL_HOLE * mesh.area:
+            faces.append(np.column_stack((b, a, np.full(len(a), sum(map(len, vertices))))))
+            vertices.append(center[None])
+    return trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
+
+
+class _Solid:
+    """A solid, and how far a convex piece stands off its surface."""
+
+    def __init__(self, solid: Manifold) -> None:
+        from scipy.spatial import cKDTree
+
+        self.solid = solid
+        vertices, faces = _arrays(solid)
+        self._tree = cKDTree(np.concatenate((vertices, _samples(vertices, faces, 60_000)[0])))
+
+    def excess(self, piece: Manifold) -> float:
+        """[m] How far the farthest point of a piece outside the solid is from its surface (sampled)."""
+        outside = piece - self.solid
+        if outside.is_empty() or outside.volume() < _SPECK / 100:
+            return 0.0
+        vertices, faces = _arrays(outside)
+        return float(self._tree.query(np.concatenate((vertices, _samples(vertices, faces, 400)[0])))[0].max())
+
+
+def _convex(solid: _Solid, settings: Settings, end: float, progress: Progress) -> list[Manifold]:
+    """Convex pieces of a solid, at most as many as allowed."""
+    pieces = [part.hull() for part in _cut(solid, settings, end, progress)]
+    tolerance = max(settings.tolerance, *(solid.excess(piece) for piece in pieces))
+    pieces = _joined(solid, pieces, tolerance, end)
+    while len(pieces) > settings.max_pieces and time.process_time() < end:
+        tolerance *= 1.25
+        progress(len(pieces), tolerance)
+        pieces = _joined(solid, pieces, tolerance, end)
+    return pieces
+
+
+def _cut(solid: _Solid, settings: Settings, end: float, progress: Progress) -> list[Manifold]:
+    """Parts of a solid whose hulls keep to its surface: the worst one is cut first."""
+    queue: list[tuple[float, int, Manifold]] = []
+    done: list[Manifold] = []
+    count = 0
+
+    def add(part: Manifold) -> None:
+        nonlocal count
+        excess = solid.excess(part.hull())
+        if excess <= settings.tolerance:
+            done.append(part)
+        else:
+            heapq.heappush(queue, (-excess, count, part))
+        count += 1
+
+    for part in solid.solid.decompose():
+        add(part)
+    while queue and len(queue) + len(done) < 2 * settings.max_pieces and time.process_time() < end:
+        excess, _, worst = heapq.heappop(queue)
+        progress(len(queue) + len(done) + 1, -excess)
+        parts = _best_cut(worst)
+        if len(parts) < 2:
+            done.append(worst)
+            continue
+        for part in parts:
+            add(part)
+    return done + [part for _, _, part in queue]
+
+
+def _best_cut(part: Manifold) -> list[Manifold]:
+    """The parts by the planes that take away most of the hulls' volume for each further part; one if none cuts it."""
+    vertices, faces = _arrays(part)
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    middle = corners.mean(axis=1)
+    spread = middle - np.average(middle, axis=0, weights=area)
+    directions = np.vstack((np.linalg.eigh((spread * area[:, None]).T @ spread)[1].T, np.eye(3)))
+    along = vertices @ directions.T
+    low, high = along.min(axis=0), along.max(axis=0)
+    offsets = low + (high - low) * np.arange(1, _CUTS + 1)[:, None] / (_CUTS + 1)
+    singles = [[(directions[i], float(offset))] for i in range(6) for offset in offsets[:, i]]
+    crosses = [[(directions[i], float(offsets[_CUTS // 2, i])) for i in pair] for pair in _CROSSES]
+    whole, best, best_gain = part.hull().volume(), [part], -np.inf
+    for planes in singles + crosses:
+        parts = [part]
+        for normal, offset in planes:
+            parts = [half for one in parts for half in one.split_by_plane(tuple(normal), offset)]
+        parts = [one for half in parts for one in half.decompose() if one.volume() > _SPECK]
+        if len(parts) > 1:
+            gain = (whole - sum(one.hull().volume() for one in parts)) / (len(parts) - 1)
+            if gain > best_gain:
+                best, best_gain = parts, gain
+    return best
+
+
+def _joined(solid: _Solid, hulls: Sequence[Manifold], tolerance: float, end: float) -> list[Manifold]:
+    """Pieces joined wherever the hull of two keeps to the surface; those first that lose least volume by it."""
+    batch_hull = _manifold3d().Manifold.batch_hull
+    alive: dict[int, Manifold] = {}
+    boxes: dict[int, np.ndarray] = {}
+    queue: list[tuple[float, int, int, Manifold]] = []
+
+    def add(number: int, piece: Manifold) -> None:
+        boxes[number] = np.array(piece.bounding_box()).reshape(2, 3)
+        for other, neighbour in alive.items():
+            (low, high), (low2, high2) = boxes[number], boxes[other]
+            if ((low <= high2 + 2e-4) & (low2 <= high + 2e-4)).all() and time.process_time() < end:
+                both = batch_hull([piece, neighbour])
+                if solid.excess(both) <= tolerance:
+                    heapq.heappush(queue, (both.volume() - piece.volume() - neighbour.volume(), other, number, both))
+        alive[number] = piece
+
+    for number, piece in enumerate(hulls):
+        add(number, piece)
+    number = len(hulls)
+    while queue:
+        _, one, other, both = heapq.heappop(queue)
+        if one in alive and other in alive:
+            del alive[one], alive[other]
+            add(number, both)
+            number += 1
+    return list(alive.values())
+
+
+def _arrays(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and triangles [F, 3]."""
+    mesh = solid.to_mesh64()
+    return np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts).astype(np.int64)
+
+
+def _samples(vertices: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points [count, 3] uniform over the triangles' area, and their triangles [count]; the same for the same mesh."""
+    rng = np.random.default_rng(0)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    face = rng.choice(len(faces), count, p=area / area.sum())
+    u, v = rng.random((2, count, 1))
+    fold = u + v > 1
+    u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
+    return a[face] + u * (b - a)[face] + v * (c - a)[face], face
+
+
+def _manifold3d() -> Any:
+    try:
+        import manifold3d
+    except ImportError as error:
+        raise ObjectError(
+            f"a concave mesh needs manifold3d to be cut into convex pieces ({error}). Install it: pip install 'xreset[objects]'"
+        ) from error
+    return manifold3d
+
+
+# Hulls ---------------------------------------------------------------------------------------------------------------------------------
 
 
 def limited_hull(points: np.ndarray, max_vertices: int) -> Shape:
@@ -133,6 +418,35 @@ def _farthest_from_span(vertices: np.ndarray, chosen: list[int]) -> int:
     rest = vertices - vertices[chosen[0]]
     basis = np.linalg.qr((vertices[chosen[1:]] - vertices[chosen[0]]).T)[0]
     return int(np.linalg.norm(rest - rest @ basis @ basis.T, axis=1).argmax())
+
+
+# Deviation -------------------------------------------------------------------------------------------------------------------------------
+
+
+def _deviation(vertices: np.ndarray, faces: np.ndarray, shapes: Sequence[Shape]) -> float:
+    """[m] How far pieces stand off the surface of a solid, or leave it bare, at the worst of points on both (sampled)."""
+    from scipy.spatial import cKDTree
+
+    planes = [half_spaces(shape) for shape in shapes]
+
+    def beyond(points: np.ndarray, skip: int | None = None) -> np.ndarray:
+        """[n] how far points are outside the nearest piece: exact next to a face, too little next to an edge."""
+        others = [piece for i, piece in enumerate(planes) if i != skip]
+        return np.min([np.full(len(points), np.inf), *((points @ p[:, :3].T + p[:, 3]).max(axis=1) for p in others)], axis=0)
+
+    bare = beyond(_samples(vertices, faces, _SAMPLES)[0]).max()
+    own, face = _samples(vertices, faces, 10 * _SAMPLES)
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[face]
+    tree, worst = cKDTree(own), 0.0
+    for i, shape in enumerate(shapes):
+        mesh = shape_mesh(shape)
+        points = _samples(np.asarray(mesh.vertices), np.asarray(mesh.faces), max(200, _SAMPLES // len(shapes)))[0]
+        points = points[beyond(points, i) > 0]
+        off, nearest = tree.query(points)
+        outside = ((points - own[nearest]) * normals[nearest]).sum(axis=1) > 0  # those inside the solid are where pieces meet
+        worst = max(worst, float(off[outside].max(initial=0.0)))
+    return float(max(worst, bare, 0.0))
 
 
 def _depth(mesh: trimesh.Trimesh) -> float:

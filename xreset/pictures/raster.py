@@ -170,6 +170,16 @@ class Renderer:
         return Frames(poses=self._kinematics.link_poses(q, links).numpy(), length=length)
 
 
+def draw_bodies(
+    meshes: Sequence[tuple[np.ndarray, np.ndarray]], colors: Sequence[Color], camera: Camera, size: tuple[int, int]
+) -> np.ndarray:
+    """[H, W, 3] uint8 picture of meshes (vertices [V, 3], outward triangles [F, 3]), each in its colour, without table."""
+    bodies = _Bodies([_mesh(vertices, faces) for vertices, faces in meshes], colors).placed(np.tile(np.eye(4), (len(meshes), 1, 1)))
+    width, height = size
+    picture, _ = _shade(_View(camera, (2 * width, 2 * height)), bodies, _Shadow(bodies))
+    return (picture.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)).clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+
 def pose_matrix(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
     """[4, 4] pose from a position [3] and a quaternion [4] (w, x, y, z)."""
     from scipy.spatial.transform import Rotation

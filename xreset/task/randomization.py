@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -28,6 +30,13 @@ def sample_friction(count: int, c: RandomizationConfig, generator: torch.Generat
     bucket = torch.randint(c.friction_buckets, (count,), generator=generator, device=generator.device)
     link = None if c.hand_friction is None else sample_range(count, c.hand_friction, generator)
     return pair_friction(low + (high - low) * (bucket + 0.5) / c.friction_buckets, c, link)
+
+
+def own_friction(materials: Sequence[float | None], c: RandomizationConfig) -> Tensor:
+    """[n, 1] what is to be added to pair friction that was drawn, for objects whose materials' coefficients are known: they take the place
+    of the middle of the range, and a pair's coefficient is the mean of two. None: nothing."""
+    middle = sum(c.friction) / 2
+    return torch.tensor([[0.0 if material is None else (material - middle) / 2] for material in materials])
 
 
 def sample_range(count: int, limits: tuple[float, float], generator: torch.Generator) -> Tensor:

@@ -91,7 +91,7 @@ def draw_sheet(
     Raises:
         XResetError: Pillow, which writes the captions, is not installed.
     """
-    font = _font()
+    face = font()
     drawer = Drawer(view, size=size, smooth=True)
     width, height = size
     full = height + _LINE * max((len(tile.caption) for tile in tiles), default=0) + _LINE // 2
@@ -101,7 +101,7 @@ def draw_sheet(
         picture = np.full((height, width, 3), 240, np.uint8) if tile.row is None else drawer.draw(tile.row, near=True)
         sheet[top : top + height, left : left + width] = picture
         progress(i + 1, len(tiles))
-    return _written(sheet, font, [(i % columns * width + 6, i // columns * full + height, tile.caption) for i, tile in enumerate(tiles)])
+    return written(sheet, face, [(i % columns * width + 6, i // columns * full + height, tile.caption) for i, tile in enumerate(tiles)])
 
 
 def _caption(first: str, view: View, row: int | None) -> tuple[str, ...]:
@@ -111,7 +111,8 @@ def _caption(first: str, view: View, row: int | None) -> tuple[str, ...]:
     return first, state, f"{sequence}, {frame}", *others
 
 
-def _font() -> Any:
+def font() -> Any:
+    """For :func:`written`; ``XResetError`` if Pillow is not installed."""
     try:
         from PIL import ImageFont
     except ImportError as error:
@@ -119,7 +120,7 @@ def _font() -> Any:
     return ImageFont.load_default(13)
 
 
-def _written(picture: np.ndarray, font: Any, captions: Sequence[tuple[int, int, tuple[str, ...]]]) -> np.ndarray:
+def written(picture: np.ndarray, face: Any, captions: Sequence[tuple[int, int, tuple[str, ...]]]) -> np.ndarray:
     """A picture with lines of text at some (x, y)."""
     from PIL import Image, ImageDraw
 
@@ -127,5 +128,5 @@ def _written(picture: np.ndarray, font: Any, captions: Sequence[tuple[int, int, 
     pen = ImageDraw.Draw(image)
     for x, y, lines in captions:
         for i, line in enumerate(lines):
-            pen.text((x, y + 3 + i * _LINE), line, fill=(0, 0, 0) if i == 0 else (70, 70, 70), font=font)
+            pen.text((x, y + 3 + i * _LINE), line, fill=(0, 0, 0) if i == 0 else (70, 70, 70), font=face)
     return np.asarray(image)

@@ -569,7 +569,12 @@ class Plausible(unittest.TestCase):
         from xreset.demos.plausible import doubts
 
         for name in ("dexycb_right_9x20.npz", "dexycb_left_9x10.npz"):
-            self.assertEqual(doubts(read_demos(data_dir() / name)), [])
+            demos = read_demos(data_dir() / name)
+            objects = demo_objects(demos)
+            self.assertEqual(doubts(demos, objects), [])
+            for field, words in (("object_quat_wxyz", "of the objects stand on the table if"), ("wrist_quat_wxyz", "put w first")):
+                (doubt,) = doubts(replace(demos, **{field: getattr(demos, field)[:, [1, 2, 3, 0]]}), objects)
+                self.assertIn(words, doubt)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import tyro
 
 if TYPE_CHECKING:
     from xreset.demos import Demos
+    from xreset.spec import ObjectSpec
 
 Side = Literal["right", "left", "both"]
 
@@ -164,15 +165,24 @@ def mirror(
     _print_summary(result, out)
 
 
-def info(file: Annotated[Path, tyro.conf.Positional]) -> None:
-    """Say what an archive of demonstrations contains, object by object.
+def info(file: Annotated[Path, tyro.conf.Positional], *, objects: Path | None = None) -> None:
+    """Say what an archive of demonstrations contains, object by object, and what is odd about it.
 
     Args:
         file: The archive.
+        objects: Folder of meshes; default: the built-in stand-ins. Without meshes it is not seen whether objects stand on the table.
     """
-    from xreset.demos import read_demos
+    from xreset.demos import demo_objects, read_demos
+    from xreset.errors import DemoError
 
-    _print_summary(read_demos(file), file)
+    demos = read_demos(file)
+    try:
+        known = demo_objects(demos, objects)
+    except DemoError:
+        if objects is not None:
+            raise
+        known = None
+    _print_summary(demos, file, known)
 
 
 def _sides(side: Side) -> tuple[Literal["right", "left"], ...]:
@@ -188,7 +198,7 @@ def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
         yield lambda done, total, name: bar.update(task, completed=done, total=total, description=f"{what}: {name}")
 
 
-def _print_summary(demos: Demos, path: Path) -> None:
+def _print_summary(demos: Demos, path: Path, objects: dict[str, ObjectSpec] | None = None) -> None:
     from math import degrees
 
     from rich.table import Table
@@ -218,7 +228,7 @@ def _print_summary(demos: Demos, path: Path) -> None:
     console.print(
         f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second", soft_wrap=True, highlight=False
     )
-    for doubt in doubts(demos):
+    for doubt in doubts(demos, objects):
         console.print(f"note: {doubt}", style="yellow", soft_wrap=True, highlight=False)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -30,6 +31,12 @@ _TRACE_FIELDS = {
     "sequence_index": Field(("K",), "i", within=(0, 2**31)),
     "joint_target": Field(("K", "C", "J"), "f", required=False, within=None),
 }
+
+_STACKED = {
+    "joint_pos": "joint_pos", "object_pos": "object_pos", "object_quat": "object_quat_wxyz", "goal_pos": "goal_pos",
+    "goal_quat": "goal_quat_wxyz",
+}  # fmt: skip
+"""Field of :class:`~xreset.eval.rollout.Trace` -> array."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,13 +135,8 @@ def summarize(
 ) -> EvalResult:  # fmt: skip
     """What the episodes come to."""
     episodes = rollouts.episodes
-    progress = np.array([e.task_progress for e in episodes])
-    groups = np.array([e.sequence for e in episodes])
+    progress, groups = (np.array([getattr(e, name) for e in episodes]) for name in ("task_progress", "sequence"))
     low, high = (round(x, 6) for x in bootstrap_ci95(progress, groups))
-
-    def rate(name: str) -> float:
-        return round(float(np.mean([getattr(e, name) for e in episodes])), 6)
-
     return EvalResult(
         backend=backend,
         backend_version=backend_version,
@@ -145,17 +147,34 @@ def summarize(
         episodes=len(episodes),
         episodes_per_demo=repetitions,
         seed=seed,
-        task_progress=TaskProgress(mean=round(float(progress.mean()), 6), ci95=(low, high)),
-        approach_rate=rate("approach"),
-        grasp_rate=rate("grasp"),
-        reorient_rate=rate("reorient"),
-        reorient_once_rate=rate("reorient_once"),
-        reorientation_progress=rate("reorientation_progress"),
+        task_progress=TaskProgress(mean=mean(episodes, "task_progress"), ci95=(low, high)),
+        reorient_once_rate=mean(episodes, "reorient_once"),
         per_demo=tuple(_per_demo([e for e in episodes if e.sequence == s]) for s in dict.fromkeys(groups.tolist())),
         health=EpisodeFaults(**{f.name: sum(getattr(e, f.name) for e in episodes) for f in fields(EpisodeFaults)}),
         control_steps_per_second=round(rollouts.control_steps_per_second, 1),
         inputs=inputs,
         unseen=unseen,
+        **_rates(episodes),
+    )
+
+
+def mean(episodes: Sequence[Episode], metric: str) -> float:
+    """Of a field of episodes, to six digits."""
+    return round(float(np.mean([getattr(e, metric) for e in episodes])), 6)
+
+
+def _rates(episodes: Sequence[Episode]) -> dict[str, float]:
+    rates = {f"{stage}_rate": mean(episodes, stage) for stage in ("approach", "grasp", "reorient")}
+    return rates | {"reorientation_progress": mean(episodes, "reorientation_progress")}
+
+
+def _per_demo(episodes: Sequence[Episode]) -> DemoResult:
+    return DemoResult(
+        sequence=episodes[0].sequence_name,
+        object=episodes[0].object,
+        episodes=len(episodes),
+        task_progress=mean(episodes, "task_progress"),
+        **_rates(episodes),
     )
 
 
@@ -177,11 +196,7 @@ def write_results(folder: Path, summary: EvalResult, rollouts: Rollouts, joint_n
         {
             "time": traces[0].time,
             "joint_names": np.array(joint_names),
-            "joint_pos": np.stack([t.joint_pos for t in traces]),
-            "object_pos": np.stack([t.object_pos for t in traces]),
-            "object_quat_wxyz": np.stack([t.object_quat for t in traces]),
-            "goal_pos": np.stack([t.goal_pos for t in traces]),
-            "goal_quat_wxyz": np.stack([t.goal_quat for t in traces]),
+            **{key: np.stack([getattr(t, name) for t in traces]) for name, key in _STACKED.items()},
             "object_name": np.array([t.object for t in traces]),
             "sequence_index": np.array([t.sequence for t in traces]),
             **({} if targets is None else {"joint_target": targets}),
@@ -233,13 +248,9 @@ def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tup
         Trace(
             sequence=int(a["sequence_index"][i]),
             object=str(a["object_name"][i]),
-            goal_pos=a["goal_pos"][i],
-            goal_quat=a["goal_quat_wxyz"][i],
             time=a["time"],
-            joint_pos=a["joint_pos"][i],
-            object_pos=a["object_pos"][i],
-            object_quat=a["object_quat_wxyz"][i],
             joint_target=a["joint_target"][i] if "joint_target" in a else None,
+            **{name: a[key][i] for name, key in _STACKED.items()},
         )
         for i in range(len(a["object_name"]))
     )
@@ -265,19 +276,3 @@ def _check_traces(a: dict[str, np.ndarray]) -> str | None:
     if targets is not None and not (np.abs(targets[sound.min(axis=1)]) <= _FAR).all():
         return "array 'joint_target' holds numbers that are not finite, or far too large."
     return None
-
-
-def _per_demo(episodes: list[Episode]) -> DemoResult:
-    def mean(name: str) -> float:
-        return round(float(np.mean([getattr(e, name) for e in episodes])), 6)
-
-    return DemoResult(
-        sequence=episodes[0].sequence_name,
-        object=episodes[0].object,
-        episodes=len(episodes),
-        task_progress=mean("task_progress"),
-        approach_rate=mean("approach"),
-        grasp_rate=mean("grasp"),
-        reorient_rate=mean("reorient"),
-        reorientation_progress=mean("reorientation_progress"),
-    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -164,22 +165,23 @@ def episode_starts(distribution: ResetDistribution, sequence: np.ndarray, repeti
     return Reset.cat(parts)
 
 
+_REACHED = ("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow")
+_PROGRESS = ("reorientation_progress", "task_progress")
+
+
 def _episode(result: EpisodeMetrics, world: int, sequence: int, repetition: int, demos: ResetBank) -> Episode:
+    outcome: dict[str, Any] = {name: bool(getattr(result, name)[world]) for name in _REACHED}
+    outcome |= {name: round(float(getattr(result, name)[world]), 6) for name in _PROGRESS}
     return Episode(
         sequence=sequence,
         sequence_name=str(demos.sequence_name[sequence]),
         object=str(demos.sequence_object[sequence]),
         repetition=repetition,
-        approach=bool(result.approach[world]),
-        grasp=bool(result.grasp[world]),
-        reorient=bool(result.reorient[world]),
-        reorient_once=bool(result.reorient_once[world]),
-        reorientation_progress=round(float(result.reorientation_progress[world]), 6),
-        task_progress=round(float(result.task_progress[world]), 6),
-        out_of_bounds=bool(result.out_of_bounds[world]),
-        nonfinite=bool(result.nonfinite[world]),
-        overflow=bool(result.overflow[world]),
+        **outcome,
     )
+
+
+_STATES = ("joint_pos", "object_pos", "object_quat")
 
 
 class _Recorder:
@@ -190,29 +192,23 @@ class _Recorder:
 
     def add(self, time: float, reading: Reading) -> None:
         if self._worlds:
-            s = reading.state
             self._time.append(time)
-            self._frames.append([x[self._worlds].cpu().numpy().copy() for x in (s.joint_pos, s.object_pos, s.object_quat)])
+            self._frames.append({name: getattr(reading.state, name)[self._worlds].cpu().numpy().copy() for name in _STATES})
 
     def add_targets(self, targets: torch.Tensor) -> None:
         if self._worlds:
             self._targets.append(targets[self._worlds].cpu().numpy().copy())
 
     def traces(self, env: ManipulationEnv, names: tuple[str, ...]) -> list[Trace]:
-        out = []
-        for i, world in enumerate(self._worlds):
-            joint_pos, object_pos, object_quat = (np.stack([frame[part][i] for frame in self._frames]) for part in range(3))
-            out.append(
-                Trace(
-                    sequence=int(env.sequence[world]),
-                    object=names[int(env.backend.object_index[world])],
-                    goal_pos=env.goal_pos[world].cpu().numpy().copy(),  # the environment writes the next round's goals in place
-                    goal_quat=env.goal_quat[world].cpu().numpy().copy(),
-                    time=np.array(self._time),
-                    joint_pos=joint_pos,
-                    object_pos=object_pos,
-                    object_quat=object_quat,
-                    joint_target=np.stack([targets[i] for targets in self._targets]),
-                )
+        return [
+            Trace(
+                sequence=int(env.sequence[world]),
+                object=names[int(env.backend.object_index[world])],
+                goal_pos=env.goal_pos[world].cpu().numpy().copy(),  # the environment writes the next round's goals in place
+                goal_quat=env.goal_quat[world].cpu().numpy().copy(),
+                time=np.array(self._time),
+                joint_target=np.stack([targets[i] for targets in self._targets]),
+                **{name: np.stack([frame[name][i] for frame in self._frames]) for name in _STATES},
             )
-        return out
+            for i, world in enumerate(self._worlds)
+        ]

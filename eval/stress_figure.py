@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from xreset.eval.report.plots import COLORS, figure_style
+from xreset.eval.plots import COLORS, picture
 from xreset.eval.stress import COSTLY, Stress
-from xreset.files import atomic_write
 
 
 def write_plot(path: Path, found: Sequence[Stress], title: str) -> None:
@@ -17,8 +15,7 @@ def write_plot(path: Path, found: Sequence[Stress], title: str) -> None:
     names = list(dict.fromkeys(curve.property for stress in found for curve in stress.curves))
     columns = min(4, len(names))
     rows = math.ceil(len(names) / columns)
-    with figure_style({"font.size": 9}) as figure_class:
-        figure = figure_class(figsize=(2.9 * columns, 0.8 + 2.3 * rows), layout="constrained", facecolor="white")
+    with picture(path, (2.9 * columns, 0.8 + 2.3 * rows), dpi=110, font_size=9) as figure:
         axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
         for ax, name in zip(axes.flat, names, strict=False):
             for stress, color in zip(found, COLORS, strict=False):
@@ -39,7 +36,3 @@ def write_plot(path: Path, found: Sequence[Stress], title: str) -> None:
         for row in axes:
             row[0].set_ylabel("task progress [%]")
         figure.suptitle(f"{title}\n(shaded: 95 % interval; dashed: ten points less)", fontsize="medium", fontweight="bold")
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=110)
-    with atomic_write(path) as file:
-        file.write(buffer.getbuffer())

@@ -1,58 +1,93 @@
-"""The result matrix for a terminal: engines side by side."""
+"""Tables: for a terminal, and as Markdown like that of ``docs/results.md``."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
 
 from xreset.eval.results import EvalResult
 
-if TYPE_CHECKING:
-    from rich.table import Table
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """A table of text."""
+
+    title: str = ""
+    head: tuple[str, ...]
+    body: tuple[tuple[str, ...], ...]
 
 
-def rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
+def escape(text: str) -> str:
+    """Text that Markdown shows as it is, in one line."""
+    for special in "\\|*_<>`[]":
+        text = text.replace(special, f"\\{special}")
+    return " ".join(text.split())
+
+
+def markdown(rows: Rows, escape: Callable[[str], str] = escape) -> str:
+    """As a table in Markdown."""
+    lines = [rows.head, ("---",) * len(rows.head), *rows.body]
+    return "\n".join("| " + " | ".join(escape(cell) for cell in line) + " |" for line in lines) + "\n"
+
+
+def rich_table(rows: Rows) -> Table:
+    """For a terminal. If two columns describe a row, they become one, so that four engines fit into 80 characters."""
+    grouped = not any(rows.head[:2])
+    table = Table(title=rows.title, title_justify="left")
+    for i, name in enumerate(rows.head[grouped:]):
+        table.add_column(_cell(name), justify="right" if i else "left", overflow="fold")
+    for line in rows.body:
+        if grouped and line[0]:
+            table.add_section()
+            table.add_row(_cell(line[0]), style="bold")
+        table.add_row(*map(_cell, line[grouped:]))
+    return table
+
+
+def _cell(text: str) -> Text:
+    """As it is, without markup; a number stays beside its unit, and three shares on one line."""
+    return Text(text.replace(" / ", "/").replace(" %", "\N{NO-BREAK SPACE}%"))
+
+
+_RESULTS: dict[str, Callable[[EvalResult], str]] = {
+    "version": lambda s: s.backend_version,
+    "task progress": lambda s: f"{s.task_progress.mean:.1%}",
+    "  95 % interval": lambda s: "{:.0f}-{:.0f}%".format(*(100 * x for x in s.task_progress.ci95)),
+    "approach": lambda s: f"{s.approach_rate:.0%}",
+    "grasp": lambda s: f"{s.grasp_rate:.0%}",
+    "reorient": lambda s: f"{s.reorient_rate:.0%}",
+    "reorientation progress": lambda s: f"{s.reorientation_progress:.1%}",
+    "not finite": lambda s: str(s.health.nonfinite),
+    "overflow": lambda s: str(s.health.overflow),
+    "left the scene": lambda s: str(s.health.out_of_bounds),
+    "control steps/s": lambda s: f"{s.control_steps_per_second:,.0f}",
+}
+"""Rows of an evaluation's table."""
+
+
+def result_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
     """One row of text per quantity: its name, then its value in each engine."""
-
-    def health(name: str) -> list[str]:
-        return [str(getattr(s.health, name)) for s in summaries]
-
-    def rate(name: str) -> list[str]:
-        return [f"{getattr(s, name):.0%}" for s in summaries]
-
-    def over(part: str, objects: Sequence[str]) -> tuple[str, ...]:
-        means = [[d.task_progress for d in s.per_demo if d.object in objects] for s in summaries]
-        return (part, *(f"{sum(values) / len(values):.1%}" for values in means))
-
-    intervals, first = [s.task_progress.ci95 for s in summaries], summaries[0]
+    found, first = [(name, *map(text, summaries)) for name, text in _RESULTS.items()], summaries[0]
     known = [name for name in first.objects if name not in first.unseen]
-    parts = [over("  trained objects", known), over("  unseen objects", first.unseen)] if known and first.unseen else []
-    return [
-        ("version", *(s.backend_version for s in summaries)),
-        ("task progress", *(f"{s.task_progress.mean:.1%}" for s in summaries)),
-        ("  95 % interval", *(f"{100 * low:.0f}-{100 * high:.0f}%" for low, high in intervals)),
-        *parts,
-        ("approach", *rate("approach_rate")),
-        ("grasp", *rate("grasp_rate")),
-        ("reorient", *rate("reorient_rate")),
-        ("reorientation progress", *(f"{s.reorientation_progress:.1%}" for s in summaries)),
-        ("not finite", *health("nonfinite")),
-        ("overflow", *health("overflow")),
-        ("left the scene", *health("out_of_bounds")),
-        ("control steps/s", *(f"{s.control_steps_per_second:,.0f}" for s in summaries)),
-    ]
+    parts = {"  trained objects": known, "  unseen objects": first.unseen} if known and first.unseen else {}
+    for place, (part, objects) in enumerate(parts.items(), 3):
+        means = [np.mean([d.task_progress for d in s.per_demo if d.object in objects]) for s in summaries]
+        found.insert(place, (part, *(f"{value:.1%}" for value in means)))
+    return found
 
 
-def rich_table(summaries: Sequence[EvalResult]) -> Table:
-    """The matrix: one column per engine; four of them fit into 80 characters."""
-    from rich.table import Table
-
+def results_table(summaries: Sequence[EvalResult]) -> Table:
+    """An evaluation: one column per engine; four of them fit into 80 characters."""
     first = summaries[0]
-    count = f"{first.episodes} episodes of {len(first.per_demo)} demonstrations"
-    table = Table(title=f"{first.policy} on {first.robot}\n{count}, seed {first.seed}", title_justify="left")
-    table.add_column("", no_wrap=True)
+    title = f"{first.policy} on {first.robot}\n{first.episodes} episodes of {len(first.per_demo)} demonstrations, seed {first.seed}"
+    table = Table("", title=title, title_justify="left")
+    table.columns[0].no_wrap = True
     for s in summaries:
         table.add_column(s.backend, justify="right", no_wrap=True)
-    for row in rows(summaries):
+    for row in result_rows(summaries):
         table.add_row(*row, style="bold" if row[0] == "task progress" else None)
     return table

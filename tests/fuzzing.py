@@ -70,8 +70,7 @@ def readers() -> Iterator[dict[str, Reader]]:
     from xreset.eval.engines.actions import Actions, read_actions, write_actions
     from xreset.eval.engines.page import page
     from xreset.eval.engines.page import read as read_page
-    from xreset.eval.report.data import read_scalars
-    from xreset.eval.report.trainings import run_facts
+    from xreset.eval.report.read import read_scalars, run_facts
     from xreset.eval.results import read_episodes, read_result, read_traces, write_results
     from xreset.eval.study.file import SHIPPED, read_study
     from xreset.learning.clock import LiftClock, read_lift
@@ -80,7 +79,7 @@ def readers() -> Iterator[dict[str, Reader]]:
     from xreset.objects.meshes import read_mesh
     from xreset.policy import OnnxPolicy, policy_contract
     from xreset.robot_tools.sources import read_source
-    from xreset.spec import PairFriction
+    from xreset.spec import SceneSpec
     from xreset.task.config import ObservationConfig, TaskConfig
 
     logging.disable(logging.WARNING)  # what is left aside of a file is said; here it would be said ten thousand times
@@ -111,7 +110,7 @@ def readers() -> Iterator[dict[str, Reader]]:
         write_actions(
             path,
             Actions(
-                robot=openarm, object=soup, label="x", timestep=1 / 240, substeps=4, friction=PairFriction(), start=start,
+                scene=SceneSpec(robot=openarm, objects=(soup,)), label="x", start=start,
                 joint_target=home.repeat(3, 1), phases=(("a", 0.0),),
             ),
         )  # fmt: skip

@@ -15,11 +15,10 @@ from tests import toy_grasp
 from xreset.cli import main
 from xreset.errors import CapabilityError, XResetError
 from xreset.eval.engines.attribution import Attribution, Row, attribute
-from xreset.eval.engines.figures import write_plot
+from xreset.eval.engines.attribution_view import amount, label, not_tried, rich_table, verdict, write_plot
 from xreset.eval.engines.measure import Measured, measure
 from xreset.eval.engines.perturb import Alteration, altered_engine
 from xreset.eval.engines.properties import PROPERTIES
-from xreset.eval.engines.tables import amount, label, not_tried, rich_table, verdict
 from xreset.eval.rollout import Episode
 from xreset.eval.trial import Engine, engine
 from xreset.physics import State

@@ -12,18 +12,17 @@ import numpy as np
 from tests.test_cli import run
 from tests.toy_results import toy_rollouts, toy_summary
 from xreset.errors import FileFormatError, RunError, XResetError
-from xreset.eval.report import plots as report_plots
-from xreset.eval.report.compare import choose_curves, compare
-from xreset.eval.report.data import Curve, read_curves, read_scalars
-from xreset.eval.report.groups import grouped
+from xreset.eval.plots import COLORS, figure_style
+from xreset.eval.report.figures import draw_lines, draw_scores
+from xreset.eval.report.groups import grouped, score
 from xreset.eval.report.lifting import Fate, fates, lift_of, share_of_runs
+from xreset.eval.report.make import choose_curves, compare
 from xreset.eval.report.progress import Line, amounts, line, processes
-from xreset.eval.report.score import score
-from xreset.eval.report.tables import escape
-from xreset.eval.report.trainings import read_training, read_trainings
+from xreset.eval.report.read import Curve, read_curves, read_scalars, read_training, read_trainings
 from xreset.eval.results import write_results
 from xreset.eval.rollout import Rollouts
 from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95, wilson_ci95
+from xreset.eval.table import escape
 from xreset.learning.clock import Lift, LiftClock, Passing
 from xreset.learning.config import TrainConfig
 from xreset.learning.curves import CurveFile
@@ -347,11 +346,10 @@ class LiftTest(InFolder):
         self.assertIn("neither lift.json nor the curve task/success_from_home: b.", "\n".join(self.compare("a", "b").notes))
 
     def test_steps_are_drawn_as_steps(self):
-        from xreset.eval.report.compare_plots import draw_lifted
-
-        with report_plots.figure_style({}) as figure_class:
+        with figure_style({}) as figure_class:
             ax = figure_class().subplots()
-            draw_lifted(ax, {"a": share_of_runs([Fate(2e6, True, 3e6), Fate(4e6, False, 4e6)])}, 0.1, "steps", ["a"])
+            lines = {"a": share_of_runs([Fate(2e6, True, 3e6), Fate(4e6, False, 4e6)])}
+            draw_lines(ax, lines, "runs past 10 % from home", "steps", ["a"], percent=True, of="runs", steps=True)
         (curve,) = ax.lines
         np.testing.assert_allclose(curve.get_xydata(), [[0, 0], [2, 50], [4, 50]])
         self.assertEqual(curve.get_drawstyle(), "steps-post")
@@ -639,32 +637,36 @@ SPEED = ("speed/collect_seconds", "speed/learn_seconds")
 
 
 class DrawTest(InFolder):
-    def draw(self, function, *arguments):
-        with report_plots.figure_style({}) as figure_class:
+    def draw(self, function, *arguments, **options):
+        with figure_style({}) as figure_class:
             ax = figure_class().subplots()
-            function(ax, *arguments)
+            function(ax, *arguments, **options)
         return ax
 
     def test_lines_and_bands(self):
         from matplotlib.collections import PolyCollection
 
-        from xreset.eval.report.compare_plots import draw_lines
-
         x, mean = np.array([1e6, 3e6]), np.array([0.1, 0.3])
         lines = {"a": Line(x=x, mean=mean, low=mean, high=mean), "c": Line(x=x, mean=mean, low=mean - 0.1, high=mean + 0.1)}
-        ax = self.draw(draw_lines, lines, "task/success", "steps", ["a", "b", "c"])
+        ax = self.draw(draw_lines, lines, "at the goal", "steps", ["a", "b", "c"], percent=True, of="worlds")
         np.testing.assert_allclose(ax.lines[0].get_xydata(), [[1, 10], [3, 30]])
-        self.assertEqual([curve.get_color() for curve in ax.lines], [report_plots.COLORS[0], report_plots.COLORS[2]])
+        self.assertEqual([curve.get_color() for curve in ax.lines], [COLORS[0], COLORS[2]])
         (band,) = (c for c in ax.collections if isinstance(c, PolyCollection))
         np.testing.assert_allclose(band.get_datalim(ax.transData).intervaly, (0, 40), atol=1e-9)
         self.assertEqual((ax.get_xlabel(), ax.get_title(loc="left")), ("million environment steps", "at the goal"))
 
     def test_the_ninth_training_has_another_line_and_hatch(self):
-        from xreset.eval.report.compare_plots import draw_lines, draw_scores
 
         values = np.array([0.1, 0.3])
         names = [f"n{i}" for i in range(9)]
-        ax = self.draw(draw_lines, {n: Line(x=values, mean=values, low=values, high=values) for n in names}, "loss/value", "minutes", names)
+        ax = self.draw(
+            draw_lines,
+            {n: Line(x=values, mean=values, low=values, high=values) for n in names},
+            "loss/value",
+            "minutes",
+            names,
+            percent=False,
+        )
         self.assertEqual(ax.lines[0].get_color(), ax.lines[8].get_color())
         self.assertNotEqual(ax.lines[0].get_linestyle(), ax.lines[8].get_linestyle())
         self.write_results("a")
@@ -676,7 +678,6 @@ class DrawTest(InFolder):
         self.assertTrue(all(a[1] < b[0] for a, b in pairwise(edges)), "bars do not overlap")
 
     def test_bars_are_as_long_as_the_results(self):
-        from xreset.eval.report.compare_plots import draw_scores
 
         self.write_results("a", rollouts_with(1.0, 0.5, 0.5, 0.0), ("mujoco", "sapien"))
         self.write_results("b", rollouts_with(0.2, 0.2, 0.2, 0.2), ("sapien",))

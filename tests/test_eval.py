@@ -21,7 +21,7 @@ from xreset.eval.results import EvalResult, read_results, read_traces, write_res
 from xreset.eval.rollout import Episode
 from xreset.eval.setting import Setting
 from xreset.eval.stats import bootstrap_ci95
-from xreset.eval.table import rows
+from xreset.eval.table import result_rows
 from xreset.files import claim_folder
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import Contacts, Health, Links, State
@@ -215,10 +215,10 @@ class BootstrapTest(unittest.TestCase):
 class ResultsTest(unittest.TestCase):
     def test_the_table_tells_trained_objects_from_unseen_ones(self):
         summary = toy_summary(unseen=(OBJECTS[1],))
-        table = {row[0].strip(): row[1] for row in rows([summary])}
+        table = {row[0].strip(): row[1] for row in result_rows([summary])}
         self.assertEqual((table["trained objects"], table["unseen objects"]), ("66.5%", "33.0%"))
         for same in (toy_summary(), toy_summary(unseen=OBJECTS)):
-            self.assertNotIn("unseen objects", {row[0].strip() for row in rows([same])})
+            self.assertNotIn("unseen objects", {row[0].strip() for row in result_rows([same])})
         self.assertEqual(from_dict(EvalResult, json.loads(json.dumps(asdict(summary)))), summary)
 
     JOINTS = ("a", "b", "c")

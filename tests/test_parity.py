@@ -17,9 +17,19 @@ from tests.toy_bank import toy_bank
 from xreset import cli, robots
 from xreset.backends import backend_status
 from xreset.errors import DemoError
-from xreset.eval.engines.agreement import compare
+from xreset.eval.engines.agreement import (
+    Metric,
+    carried,
+    compare,
+    outcome_metric,
+    palm_distance,
+    path_difference,
+    path_metrics,
+    press_metrics,
+)
 from xreset.eval.engines.episodes import (
     Motion,
+    Recording,
     carried_palm,
     closing_episode,
     lifting_episode,
@@ -28,9 +38,7 @@ from xreset.eval.engines.episodes import (
     squeezing_state,
 )
 from xreset.eval.engines.grasps import NEAR, Frames, find_grasps
-from xreset.eval.engines.load import load_frames
-from xreset.eval.engines.metrics import Metric, carried, outcome_metric, palm_distance, path_difference, path_metrics, press_metrics
-from xreset.eval.engines.recording import Recording
+from xreset.eval.engines.sources import load_frames
 from xreset.eval.engines.trials import ParityConfig
 from xreset.eval.trial import Engine, engine
 from xreset.geometry.kinematics import Kinematics

@@ -17,13 +17,23 @@ from tests.toy_results import toy_rollouts, toy_summary
 from tests.toy_robot import toy_hand_arm
 from xreset import robots
 from xreset.errors import FileFormatError, RunError
-from xreset.eval.report import make_report, plots
-from xreset.eval.report.clips import Clip, camera_for, choose_sequence, draw_clip, encode_mp4, recorded_episode
-from xreset.eval.report.data import Curve, collect, differences, read_curves
-from xreset.eval.report.failures import Strip, choose_failures, count_failures, draw_strip
+from xreset.eval.report import figures, make_report
+from xreset.eval.report.clips import (
+    Clip,
+    Strip,
+    camera_for,
+    choose_failures,
+    choose_sequence,
+    count_failures,
+    draw_clip,
+    draw_strip,
+    encode_mp4,
+    recorded_episode,
+)
 from xreset.eval.report.page import headline, page
+from xreset.eval.report.read import Curve, collect, differences, read_curves
 from xreset.eval.results import EvalResult, TaskProgress, write_results
-from xreset.eval.table import rich_table
+from xreset.eval.table import results_table
 from xreset.files import claim_folder
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import RunInfo, write_run
@@ -260,33 +270,33 @@ class PlotTest(unittest.TestCase):
             replace(any_demo, object=name, task_progress=progress, episodes=episodes)
             for name, progress, episodes in ((SOUP, 1.0, 3), (SOUP, 0.0, 1), (SPAM, 0.5, 2))
         )
-        self.assertEqual(plots.object_progress(replace(toy_summary(), per_demo=rows)), {SOUP: 0.75, SPAM: 0.5})
+        self.assertEqual(figures.object_progress(replace(toy_summary(), per_demo=rows)), {SOUP: 0.75, SPAM: 0.5})
 
     def test_bars_are_as_long_as_the_results(self):
         from matplotlib.figure import Figure
 
         low, high = (with_progress(toy_summary(name), m, 0.1) for name, m in (("a", 0.2), ("b", 0.7)))
         axes = Figure().subplots()
-        plots.draw_progress(axes, [low, high])
+        figures.draw_progress(axes, [low, high])
         np.testing.assert_allclose([bar.get_width() for bar in axes.patches], [20.0, 70.0])
         self.assertEqual([label.get_text() for label in axes.get_yticklabels()], ["a", "b"])
         axes = Figure().subplots()
-        plots.draw_stages(axes, [low])
+        figures.draw_stages(axes, [low])
         np.testing.assert_allclose([bar.get_height() for bar in axes.patches], [75.0, 50.0, 25.0])
 
     def test_drawings_take_the_pages_colour_and_size(self):
-        drawing = plots.figure_progress([toy_summary()], "salt")
+        drawing = figures.figure_progress([toy_summary()])
         self.assertTrue(drawing.startswith("<svg") and drawing.endswith("</svg>"))
         opening = drawing[: drawing.index(">")]
         self.assertIn("viewBox", opening)
         self.assertNotRegex(opening, r"\b(width|height)=")
         self.assertIn("currentColor", drawing)
         self.assertNotIn("#010203", drawing)
-        self.assertEqual(drawing, plots.figure_progress([toy_summary()], "salt"))
+        self.assertEqual(drawing, figures.figure_progress([toy_summary()]))
 
     def test_more_engines_than_colours(self):
         many = [toy_summary(f"engine-{i}") for i in range(10)]
-        self.assertIn("engine-9", plots.figure_stages(many, "s"))
+        self.assertIn("engine-9", figures.figure_stages(many))
 
 
 class PageTest(InFolder):
@@ -431,7 +441,7 @@ class CommandTest(InFolder):
         from rich.console import Console
 
         out = io.StringIO()
-        Console(file=out, width=80).print(rich_table([toy_summary(name) for name in ENGINES]))
+        Console(file=out, width=80).print(results_table([toy_summary(name) for name in ENGINES]))
         for expected in (*ENGINES, "4 episodes of 2 demonstrations", "reorientation progress", "33-66%"):
             self.assertIn(expected, out.getvalue())
 

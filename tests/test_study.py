@@ -367,7 +367,10 @@ class WholeTest(unittest.TestCase):
         for change, message in (
             (("lstm = 12", "lstm = 16"), r"x-reset-seed0 holds a run of another configuration: config\.model\.lstm is 12 there and 16"),
             (("num_envs = 8", "num_envs = 16"), "num_envs is 8 there and 16 in the study"),
-            (("synthetic_per_object = 1", "synthetic_per_object = 2"), r"was made otherwise: synthetic_per_object was 1 and is 2"),
+            (
+                ("synthetic_per_object = 1", "synthetic_per_object = 2"),
+                r"was made otherwise: synthetic_per_object is 1 there and 2 in",
+            ),
         ):
             with self.subTest(message), self.assertRaisesRegex(RunError, message):
                 self.plan(change)

@@ -18,12 +18,11 @@ from xreset.cli import main
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.eval.engines.actions import Actions, play_policy, read_actions, recorded_actions, write_actions
 from xreset.eval.engines.divergence import Parting, Thresholds, differences, first_of, partings
+from xreset.eval.engines.episodes import Recording
 from xreset.eval.engines.film import write_strip
-from xreset.eval.engines.recording import Recording
 from xreset.eval.engines.replay import TraceResult, trace, write_trace
 from xreset.eval.engines.sources import from_file
-from xreset.eval.engines.trace_figure import write_plot
-from xreset.eval.engines.trace_table import rich_table, sentences
+from xreset.eval.engines.trace_view import rich_table, sentences, write_plot
 from xreset.eval.results import write_results
 from xreset.eval.rollout import roll_out
 from xreset.eval.setting import Place, Sequence
@@ -31,7 +30,7 @@ from xreset.eval.trial import engine
 from xreset.files import npz_schema, read_json
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import State
-from xreset.spec import PairFriction
+from xreset.spec import PairFriction, SceneSpec
 from xreset.task.config import RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
 
 DT = 1 / 60
@@ -40,12 +39,8 @@ DT = 1 / 60
 def grasp_actions(steps: int = 60) -> Actions:
     """The toy grasp: close and lift."""
     return Actions(
-        robot=toy_grasp.robot(),
-        object=toy_grasp.brick(),
+        scene=SceneSpec(robot=toy_grasp.robot(), objects=(toy_grasp.brick(),), friction=toy_grasp.FRICTION),
         label="toy grasp",
-        timestep=1 / 240,
-        substeps=4,
-        friction=toy_grasp.FRICTION,
         start=toy_grasp.start(),
         joint_target=torch.as_tensor(np.stack([toy_grasp.targets(i) for i in range(steps)]), dtype=torch.float32),
         phases=(("close", 0.0), ("lift", 0.25), ("hold", 0.75)),
@@ -256,13 +251,15 @@ class ActionsTest(unittest.TestCase):
         folder = tempfile.TemporaryDirectory()
         self.addCleanup(folder.cleanup)
         self.path = Path(folder.name) / "actions.npz"
-        self.actions = replace(grasp_actions(), friction=PairFriction(tip=0.7, link=0.4, table=0.3))
+        actions = grasp_actions()
+        self.actions = replace(actions, scene=replace(actions.scene, friction=PairFriction(tip=0.7, link=0.4, table=0.3)))
         write_actions(self.path, self.actions)
 
     def test_round_trip(self):
         found = read_actions(self.path, self.actions.robot, lambda _: self.actions.object)
-        for name in ("label", "timestep", "substeps", "friction", "phases"):
-            self.assertEqual(getattr(found, name), getattr(self.actions, name), name)
+        for name in ("timestep", "substeps", "friction"):
+            self.assertEqual(getattr(found.scene, name), getattr(self.actions.scene, name), name)
+        self.assertEqual((found.label, found.phases), (self.actions.label, self.actions.phases))
         torch.testing.assert_close(found.joint_target, self.actions.joint_target, rtol=0, atol=0)
         for name, value in vars(self.actions.start).items():
             torch.testing.assert_close(getattr(found.start, name), value, rtol=0, atol=0)

@@ -18,7 +18,7 @@ import torch
 
 from tests import toy_grasp
 from xreset.env import ManipulationEnv, make_scene
-from xreset.eval.report.data import read_scalars
+from xreset.eval.report.read import read_scalars
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.runner import TrainingRunner
 from xreset.physics import Backend

@@ -29,15 +29,9 @@ from xreset.errors import BackendUnavailableError, CapabilityError
 from xreset.physics import KnownDifference
 from xreset.spec import RobotSpec
 
-CHECKS: tuple[Check, ...] = (
-    *state_checks.CHECKS,
-    *world_checks.CHECKS,
-    *robot_checks.CHECKS,
-    *motion_checks.CHECKS,
-    *contact_checks.CHECKS,
-    *friction_checks.CHECKS,
-    *grasp_checks.CHECKS,
-    *world_checks.LAST,
+_MODULES = (state_checks, world_checks, robot_checks, motion_checks, contact_checks, friction_checks, grasp_checks)
+CHECKS: tuple[Check, ...] = tuple(
+    sorted((c for module in _MODULES for c in vars(module).values() if isinstance(c, Check)), key=lambda c: c.last)
 )
 """All checks, in the order in which they run."""
 

@@ -8,16 +8,32 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from xreset.backends.conformance.harness import Bench, largest, random_state, replace_fields, rotation_angle, snapshot, start_state
-from xreset.backends.conformance.results import Check, Measure
+from xreset.backends.conformance.harness import (
+    Bench,
+    advanced,
+    largest,
+    random_state,
+    replace_fields,
+    rotation_angle,
+    snapshot,
+    start_state,
+    worst_of,
+)
+from xreset.backends.conformance.results import Measure, checks_of
 from xreset.backends.conformance.scene import flat_objects
 from xreset.backends.pool import lowest_point
 from xreset.physics import Backend, State
 from xreset.spec import GRAVITY, ObjectSpec, PairFriction, Shape
 
+check = checks_of("contact")
+
 _SETTLE = 120  # steps
 
 
+@check(
+    "the table pushes a resting object up with m g; nothing else does, and nothing right after setting",
+    "a contact force has the wrong sign, frame, scale or step; or readings survive setting a state; or contacts overflow",
+)
 def resting_weight(bench: Bench) -> list[Measure]:
     """Put objects on the table: no force right after setting, and after half a second the table pushes them up with their weight."""
     backend = bench.backend()
@@ -28,31 +44,33 @@ def resting_weight(bench: Bench) -> list[Measure]:
     weight = GRAVITY * torch.tensor([o.mass for o in bench.objects])
     force = contacts.table_force.cpu()
     return [
-        Measure(what="force right after setting", measured=at_once, tolerance=1e-6, unit="N"),
-        Measure(what="vertical force", measured=largest(force[:, 2] / weight - 1.0), tolerance=0.02, unit="of m g"),
-        Measure(what="horizontal force", measured=largest(force[:, :2] / weight[:, None]), tolerance=0.02, unit="of m g"),
-        Measure(what="force of the fingers", measured=largest(contacts.tip_force), tolerance=1e-6, unit="N"),
-        Measure(what="fingers that say they touch", measured=float(contacts.tip_touch.sum()), tolerance=0.5),
-        Measure(what="sinking", measured=largest(state.object_pos[:, 2] - bench.start().object_pos[:, 2]), tolerance=2e-3, unit="m"),
-        Measure(what="sliding", measured=largest(state.object_pos[:, :2] - bench.start().object_pos[:, :2]), tolerance=2e-3, unit="m"),
+        Measure("force right after setting", at_once, 1e-6, "N"),
+        Measure("vertical force", largest(force[:, 2] / weight - 1.0), 0.02, "of m g"),
+        Measure("horizontal force", largest(force[:, :2] / weight[:, None]), 0.02, "of m g"),
+        Measure("force of the fingers", largest(contacts.tip_force), 1e-6, "N"),
+        Measure("fingers that say they touch", float(contacts.tip_touch.sum()), 0.5),
+        Measure("sinking", largest(state.object_pos[:, 2] - bench.start().object_pos[:, 2]), 2e-3, "m"),
+        Measure("sliding", largest(state.object_pos[:, :2] - bench.start().object_pos[:, :2]), 2e-3, "m"),
     ]
 
 
+@check(
+    "the force of the table is along the world's z, however the object lies",
+    "contact forces are given in the frame of the object or of the contact",
+)
 def resting_on_a_side(bench: Bench) -> list[Measure]:
     """Lay objects on one of their sides: the table's force is m g along the world's z, not along the object's."""
     backend = bench.backend()
     turn = torch.tensor([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # by 90 degrees about x
-    start = bench.start()
-    start = replace_fields(start, object_quat=turn)
+    start = replace_fields(bench.start(), object_quat=turn)
     start.object_pos[:, 2] = torch.tensor([_height_on_side(thing) for thing in bench.objects])
-    backend.set_state(start.to(backend.device))
-    backend.step(_SETTLE)
+    advanced(backend, start, _SETTLE)
     weight = GRAVITY * torch.tensor([o.mass for o in bench.objects])
     stable = [i for i, thing in enumerate(bench.objects) if thing.name != "can"]  # a can rolls
     force = (backend.contacts().table_force.cpu() / weight[:, None])[stable]
     return [
-        Measure(what="vertical force", measured=largest(force[:, 2] - 1.0), tolerance=0.02, unit="of m g"),
-        Measure(what="horizontal force", measured=largest(force[:, :2]), tolerance=0.02, unit="of m g"),
+        Measure("vertical force", largest(force[:, 2] - 1.0), 0.02, "of m g"),
+        Measure("horizontal force", largest(force[:, :2]), 0.02, "of m g"),
     ]
 
 
@@ -61,6 +79,11 @@ def _height_on_side(thing: ObjectSpec) -> float:
     return -lowest_point([Shape(geometry=piece.geometry, T_body_shape=T @ piece.T_body_shape) for piece in thing.pieces])
 
 
+@check(
+    "flat objects rest at their height and hardly bounce",
+    "collision margins or contact offsets lift objects, soft contacts let them sink; restitution is not 0 by default",
+    own_robot_only=True,
+)
 def rest_and_bounce(bench: Bench) -> list[Measure]:
     """Put flat objects on the table, then drop them from 30 mm: their height after a second, and how far they bounce up."""
     objects = flat_objects()
@@ -82,30 +105,35 @@ def rest_and_bounce(bench: Bench) -> list[Measure]:
         resting, dropped = heights(0.0), heights(0.03)
     lowest = dropped.argmin(dim=0)
     bounce = torch.stack([dropped[first:, i].max() - height[i] for i, first in enumerate(lowest.tolist())])
-
-    def measure(what: str, values: torch.Tensor, tolerance: float) -> Measure:
-        worst = int(values.nan_to_num(torch.inf).argmax())
-        return Measure(what=what, measured=float(values[worst]), tolerance=tolerance, unit="m", where=objects[worst].name)
-
+    names = [thing.name for thing in objects]
     return [
-        measure("height after 1 s", (resting[-1] - height).abs(), 2e-4),
-        measure("height 1 s after a drop", (dropped[-1] - height).abs(), 2e-4),
-        measure("bounce", bounce, 2e-3),
+        worst_of("height after 1 s", (resting[-1] - height).abs(), 2e-4, "m", names),
+        worst_of("height 1 s after a drop", (dropped[-1] - height).abs(), 2e-4, "m", names),
+        worst_of("bounce", bounce, 2e-3, "m", names),
     ]
 
 
+@check(
+    "the object's mass is set world by world, and setting a state keeps it",
+    "mass is shared by all worlds or lost with the state, or what derives from it is stale",
+    capabilities=("object_mass",),
+)
 def object_mass(bench: Bench) -> list[Measure]:
     """Give the objects other masses, then set a state: the table must carry those."""
     backend = bench.altered()
     mass = torch.tensor([o.mass for o in bench.objects]).float() * torch.tensor([2.0, 0.5, 1.5, 0.7])
     backend.set_object_mass(mass[[0, 2, 3]].to(backend.device), torch.tensor([0, 2, 3], device=backend.device))
     backend.set_object_mass(mass[[1]].to(backend.device), torch.tensor([1], device=backend.device))
-    backend.set_state(bench.start(backend.device))
-    backend.step(_SETTLE)
+    advanced(backend, bench.start(), _SETTLE)
     force = backend.contacts().table_force[:, 2].cpu()
-    return [Measure(what="vertical force", measured=largest(force / (GRAVITY * mass) - 1.0), tolerance=0.02, unit="of m g")]
+    return [Measure("vertical force", largest(force / (GRAVITY * mass) - 1.0), 0.02, "of m g")]
 
 
+@check(
+    "a world whose mass and friction were set does what a world built with them does, contacts included",
+    "inertia, the solver's inverse weights, torsional friction or another quantity that derives from mass or friction is stale",
+    capabilities=("object_mass", "friction"),
+)
 def set_as_built(bench: Bench) -> list[Measure]:
     """Set mass and friction in some worlds, and build others with them: an object that slides and turns must do the same in both.
 
@@ -119,35 +147,34 @@ def set_as_built(bench: Bench) -> list[Measure]:
     backend.set_object_mass(mass.to(backend.device))
     backend.set_friction(friction.to(backend.device))
     found = _slide(bench, backend, range(bench.NUM_WORLDS))
-    worst = {"pos": (0.0, ""), "angle": (0.0, ""), "force": (0.0, "")}
-    for i, thing in enumerate(bench.objects[: len(bench.scene.objects)]):
+    errors: dict[str, list[float]] = {"pos": [], "angle": [], "force": []}
+    things = bench.scene.objects
+    for i, thing in enumerate(things):
         built = replace(thing, mass=float(mass[i]), inertia=float(factors[i]) * np.asarray(thing.inertia))
         tip, link, table = friction[i].tolist()
         pairs = PairFriction(tip=tip, link=link, table=table, torsional=bench.scene.friction.torsional)
         with bench.other(replace(bench.scene, objects=(built,), friction=pairs), 1) as other:
             expected = _slide(bench, other, [i])
-        for what, error in {
-            "pos": largest(found[0].object_pos[i] - expected[0].object_pos[0]),
-            "angle": largest(rotation_angle(found[0].object_quat[i], expected[0].object_quat[0])),
-            "force": largest(found[1][i] - expected[1][0]) / (GRAVITY * float(mass[i])),
-        }.items():
-            worst[what] = worst[what] if error <= worst[what][0] else (error, thing.name)
+        errors["pos"].append(largest(found[0].object_pos[i] - expected[0].object_pos[0]))
+        errors["angle"].append(largest(rotation_angle(found[0].object_quat[i], expected[0].object_quat[0])))
+        errors["force"].append(largest(found[1][i] - expected[1][0]) / (GRAVITY * float(mass[i])))
     limits = {"pos": (1e-5, "m"), "angle": (2e-4, "rad"), "force": (0.01, "of m g")}
-    return [
-        Measure(what=what, measured=error, tolerance=limits[what][0], unit=limits[what][1], where=name)
-        for what, (error, name) in worst.items()
-    ]
+    return [worst_of(what, errors[what], *limit, [thing.name for thing in things]) for what, limit in limits.items()]
 
 
 def _slide(bench: Bench, backend: Backend, worlds: Sequence[int]) -> tuple[State, torch.Tensor]:
     """State and table force after the objects of some of the bench's worlds have slid and turned on the table for a moment."""
     start = bench.start()[list(worlds)]
     start = replace_fields(start, object_linvel=torch.tensor([0.25, 0.1, 0.0]), object_angvel=torch.tensor([0.0, 0.0, 3.0]))
-    backend.set_state(start.to(backend.device))
-    backend.step(4)  # later, the patter of contacts has made much of a difference in the last bit
-    return snapshot(backend.state()), backend.contacts().table_force.cpu().clone()
+    end = advanced(backend, start, 4)  # later, the patter of contacts has made much of a difference in the last bit
+    return end, backend.contacts().table_force.cpu().clone()
 
 
+@check(
+    "a world whose object's inertia was set does what a world built with it does, in the air and on the table",
+    "the inertia is shared by all worlds, set once and scaled again, or forgotten when the mass is set",
+    capabilities=("object_inertia", "object_wrench"),
+)
 def object_inertia_set(bench: Bench) -> list[Measure]:
     """Set the inertia of some worlds' objects, and build others so: tumbling and sliding objects must do the same in both."""
     factors = torch.tensor([2.0, 0.5, 4.0, 0.25])
@@ -158,6 +185,11 @@ def object_inertia_set(bench: Bench) -> list[Measure]:
     return _compared(bench, lambda backend, worlds: backend.set_object_inertia(factors[worlds].to(backend.device), worlds), built)
 
 
+@check(
+    "a world whose object's centre of mass was moved does what a world built so does, in the air and on the table",
+    "the shapes move with the centre of mass, weight acts at the former one, or velocities are converted with it",
+    capabilities=("object_com", "object_wrench"),
+)
 def object_com_set(bench: Bench) -> list[Measure]:
     """Move the centre of mass of some worlds' objects, and build others so: tumbling and sliding objects must do the same in both."""
     offsets = torch.tensor([[0.0078125, 0.0, 0.0], [0.0, -0.0078125, 0.00390625], [0.00390625, 0.00390625, -0.00390625], [0.0, 0.0, 0.0]])
@@ -177,24 +209,23 @@ def _compared(
         change(backend, torch.tensor(worlds, device=backend.device))
     everyone = range(bench.NUM_WORLDS)
     found = _tumble(bench, backend, everyone), *_slide(bench, backend, everyone)
-    errors = {"tumbling, pos": 0.0, "tumbling, angle": 0.0, "sliding, pos": 0.0, "sliding, force": 0.0}
+    errors = []
     for i, thing in enumerate(bench.objects):
         with bench.other(replace(bench.scene, objects=(built(thing, i),)), 1) as other:
             tumbled, (slid, force) = _tumble(bench, other, [i]), _slide(bench, other, [i])
-        new = {
-            "tumbling, pos": largest(found[0].object_pos[i] - tumbled.object_pos[0]),
-            "tumbling, angle": largest(rotation_angle(found[0].object_quat[i], tumbled.object_quat[0])),
-            "sliding, pos": largest(found[1].object_pos[i] - slid.object_pos[0]),
-            "sliding, force": largest(found[2][i] - force[0]) / (GRAVITY * thing.mass),
-        }
-        errors = {what: max(error, new[what]) for what, error in errors.items()}
-    limits = {
-        "tumbling, pos": (1e-5, "m"),
-        "tumbling, angle": (2e-4, "rad"),
-        "sliding, pos": (1e-5, "m"),
-        "sliding, force": (0.01, "of m g"),
-    }
-    return [Measure(what=what, measured=error, tolerance=limits[what][0], unit=limits[what][1]) for what, error in errors.items()]
+        errors.append((
+            largest(found[0].object_pos[i] - tumbled.object_pos[0]),
+            largest(rotation_angle(found[0].object_quat[i], tumbled.object_quat[0])),
+            largest(found[1].object_pos[i] - slid.object_pos[0]),
+            largest(found[2][i] - force[0]) / (GRAVITY * thing.mass),
+        ))  # fmt: skip
+    tumbling, tumbling_angle, sliding, sliding_force = np.max(errors, axis=0).tolist()
+    return [
+        Measure("tumbling, pos", tumbling, 1e-5, "m"),
+        Measure("tumbling, angle", tumbling_angle, 2e-4, "rad"),
+        Measure("sliding, pos", sliding, 1e-5, "m"),
+        Measure("sliding, force", sliding_force, 0.01, "of m g"),
+    ]
 
 
 def _tumble(bench: Bench, backend: Backend, worlds: Sequence[int]) -> State:
@@ -207,61 +238,3 @@ def _tumble(bench: Bench, backend: Backend, worlds: Sequence[int]) -> State:
     backend.set_object_wrench(torch.zeros(n, 3, device=backend.device), torque.float().to(backend.device))
     backend.step(24)
     return snapshot(backend.state())
-
-
-CHECKS = (
-    Check(
-        name="resting_weight",
-        group="contact",
-        statement="the table pushes a resting object up with m g; nothing else does, and nothing right after setting",
-        cause="a contact force has the wrong sign, frame, scale or step; or readings survive setting a state; or contacts overflow",
-        run=resting_weight,
-    ),
-    Check(
-        name="resting_on_a_side",
-        group="contact",
-        statement="the force of the table is along the world's z, however the object lies",
-        cause="contact forces are given in the frame of the object or of the contact",
-        run=resting_on_a_side,
-    ),
-    Check(
-        name="rest_and_bounce",
-        group="contact",
-        statement="flat objects rest at their height and hardly bounce",
-        cause="collision margins or contact offsets lift objects, soft contacts let them sink; restitution is not 0 by default",
-        run=rest_and_bounce,
-        own_robot_only=True,
-    ),
-    Check(
-        name="object_mass",
-        group="contact",
-        statement="the object's mass is set world by world, and setting a state keeps it",
-        cause="mass is shared by all worlds or lost with the state, or what derives from it is stale",
-        run=object_mass,
-        capabilities=("object_mass",),
-    ),
-    Check(
-        name="set_as_built",
-        group="contact",
-        statement="a world whose mass and friction were set does what a world built with them does, contacts included",
-        cause="inertia, the solver's inverse weights, torsional friction or another quantity that derives from mass or friction is stale",
-        run=set_as_built,
-        capabilities=("object_mass", "friction"),
-    ),
-    Check(
-        name="object_inertia_set",
-        group="contact",
-        statement="a world whose object's inertia was set does what a world built with it does, in the air and on the table",
-        cause="the inertia is shared by all worlds, set once and scaled again, or forgotten when the mass is set",
-        run=object_inertia_set,
-        capabilities=("object_inertia", "object_wrench"),
-    ),
-    Check(
-        name="object_com_set",
-        group="contact",
-        statement="a world whose object's centre of mass was moved does what a world built so does, in the air and on the table",
-        cause="the shapes move with the centre of mass, weight acts at the former one, or velocities are converted with it",
-        run=object_com_set,
-        capabilities=("object_com", "object_wrench"),
-    ),
-)

@@ -8,10 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, largest, replace_fields, snapshot, start_state
-from xreset.backends.conformance.results import Check, Measure
+from xreset.backends.conformance.harness import Bench, advanced, largest, replace_fields, snapshot, start_state, worst_of
+from xreset.backends.conformance.results import Measure, checks_of
 from xreset.backends.conformance.scene import ball, flat_objects
 from xreset.spec import GRAVITY
+
+check = checks_of("contact")
 
 _COEFFICIENTS = (0.2, 0.5, 0.8, 1.2)
 _DEGREES = (0, 45)
@@ -19,6 +21,12 @@ _DISTANCE = 0.2  # m that every object slides
 _CASES = [(mu, degrees) for mu in _COEFFICIENTS for degrees in _DEGREES]
 
 
+@check(
+    "sliding objects stop after v^2 / (2 mu g), with mu that of the pair, from 0.2 to 1.2, along the axes and diagonally",
+    "friction is combined (product, average) from coefficients not solved for the pair, shared by all worlds, or a pyramid's",
+    capabilities=("friction",),
+    own_robot_only=True,
+)
 def sliding_distance(bench: Bench) -> list[Measure]:
     """Push boxes off at the speed with which Coulomb friction stops them after 0.2 m, over several coefficients, along and across.
 
@@ -32,18 +40,22 @@ def sliding_distance(bench: Bench) -> list[Measure]:
     speed = (2.0 * mu * GRAVITY * _DISTANCE).sqrt()
     with bench.other(scene, len(which), which) as backend:
         backend.set_friction(_pairs(bench, mu).to(backend.device))
-        backend.set_state(replace_fields(start, object_linvel=speed[:, None] * direction).to(backend.device))
-        backend.step(round(1.0 / scene.timestep))
-        way = ((snapshot(backend.state()).object_pos - start.object_pos) * direction).sum(-1)
+        end = advanced(backend, replace_fields(start, object_linvel=speed[:, None] * direction), round(1.0 / scene.timestep))
+    way = ((end.object_pos - start.object_pos) * direction).sum(-1)
     off = (way / _DISTANCE - 1.0).abs().view(len(_CASES), len(shapes))
-    worst = off.nan_to_num(torch.inf).argmax(dim=1).tolist()
+    names = [shape.name for shape in shapes]
     return [
-        Measure(what=f"mu {mu}, {degrees} degrees", measured=float(off[i, worst[i]]), tolerance=0.06, unit="of v^2 / (2 mu g)",
-                where=shapes[worst[i]].name)
-        for i, (mu, degrees) in enumerate(_CASES)
-    ]  # fmt: skip
+        worst_of(f"mu {mu}, {degrees} degrees", row, 0.06, "of v^2 / (2 mu g)", names)
+        for row, (mu, degrees) in zip(off, _CASES, strict=True)
+    ]
 
 
+@check(
+    "an object stays on a slope of 0.95 of the friction cone and slides down one of 1.05",
+    "friction is regularised so that objects creep, is a pyramid, or is shared by all worlds or lost with the state",
+    capabilities=("friction", "object_wrench"),
+    own_robot_only=True,
+)
 def slope(bench: Bench) -> list[Measure]:
     """Load a box sideways, as a slope does, with 0.95 and 1.05 of mu m g: it must stay, and slide with 0.05 mu g, in every direction."""
     box = flat_objects()[0]
@@ -55,8 +67,7 @@ def slope(bench: Bench) -> list[Measure]:
     start = bench.placed(start_state(scene, which))
     with bench.other(scene, n, which) as backend:
         backend.set_friction(_pairs(bench, mu).to(backend.device))
-        backend.set_state(start.to(backend.device))
-        backend.step(round(0.25 / scene.timestep))
+        advanced(backend, start, round(0.25 / scene.timestep))
         force = (ratio * mu * box.mass * GRAVITY)[:, None] * direction
         backend.set_object_wrench(force.to(backend.device), torch.zeros(n, 3, device=backend.device))
         backend.step(round(0.25 / scene.timestep))
@@ -70,11 +81,17 @@ def slope(bench: Bench) -> list[Measure]:
     measures = []
     for i, (value, degrees) in enumerate(_CASES):
         case = f"mu {value}, {degrees} degrees"
-        measures.append(Measure(what=f"creep, {case}", measured=float(creep[2 * i]), tolerance=5e-4, unit="m/s"))
-        measures.append(Measure(what=f"acceleration, {case}", measured=float(off[2 * i + 1]), tolerance=1 / 3, unit="of 0.05 mu g"))
+        measures.append(Measure(f"creep, {case}", float(creep[2 * i]), 5e-4, "m/s"))
+        measures.append(Measure(f"acceleration, {case}", float(off[2 * i + 1]), 1 / 3, "of 0.05 mu g"))
     return measures
 
 
+@check(
+    "torsional friction brakes a spinning ball as stated for the pair, whatever its sliding friction",
+    "torsional friction is missing, is multiplied by the sliding friction, or comes from the size of a contact patch",
+    capabilities=("friction",),
+    own_robot_only=True,
+)
 def torsional_friction(bench: Bench) -> list[Measure]:
     """Spin a ball on the table, with two coefficients of sliding friction: torsional friction brakes it with the same torque in both.
 
@@ -87,13 +104,17 @@ def torsional_friction(bench: Bench) -> list[Measure]:
     steps = round(0.8 / scene.timestep)  # long enough for what a contact that patters takes and gives to even out
     with bench.other(scene, 2, which) as backend:
         backend.set_friction(_pairs(bench, torch.tensor([0.3, 1.0])).to(backend.device))
-        backend.set_state(start.to(backend.device))
-        backend.step(steps)
-        lost = 10.0 - snapshot(backend.state()).object_angvel[:, 2]
+        lost = 10.0 - advanced(backend, start, steps).object_angvel[:, 2]
     expected = scene.friction.torsional * thing.mass * GRAVITY / float(thing.inertia[2, 2]) * steps * scene.timestep
-    return [Measure(what="spin lost", measured=largest(lost / expected - 1.0), tolerance=0.01, unit="of t m g / I")]
+    return [Measure("spin lost", largest(lost / expected - 1.0), 0.01, "of t m g / I")]
 
 
+@check(
+    "torsional friction is set world by world, none too, and setting a state keeps it",
+    "torsional friction is shared by all worlds, is set on one of two surfaces, or is lost with the state",
+    capabilities=("torsional_friction",),
+    own_robot_only=True,
+)
 def torsional_friction_set(bench: Bench) -> list[Measure]:
     """Spin balls whose torsional friction was set world by world, then a state: each is braked by its own.
 
@@ -110,11 +131,9 @@ def torsional_friction_set(bench: Bench) -> list[Measure]:
         for worlds in ([3, 1], [0]):
             index = torch.tensor(worlds, device=backend.device)
             backend.set_torsional_friction(torsional[index], index)
-        backend.set_state(start.to(backend.device))
-        backend.step(steps)
-        lost = 10.0 - snapshot(backend.state()).object_angvel[:, 2]
+        lost = 10.0 - advanced(backend, start, steps).object_angvel[:, 2]
     expected = scene.friction.torsional * thing.mass * GRAVITY / float(thing.inertia[2, 2]) * steps * scene.timestep
-    return [Measure(what="spin lost", measured=largest(lost / expected - factors), tolerance=0.02, unit="of t m g / I")]
+    return [Measure("spin lost", largest(lost / expected - factors), 0.02, "of t m g / I")]
 
 
 def _cases(bench: Bench, each: int) -> tuple[Tensor, Tensor]:
@@ -130,43 +149,3 @@ def _pairs(bench: Bench, table: Tensor) -> Tensor:
     """[N, 3] friction of the pairs, that of the table given."""
     friction = bench.scene.friction
     return torch.stack((torch.full_like(table, friction.tip), torch.full_like(table, friction.link), table), dim=1)
-
-
-CHECKS = (
-    Check(
-        name="sliding_distance",
-        group="contact",
-        statement="sliding objects stop after v^2 / (2 mu g), with mu that of the pair, from 0.2 to 1.2, along the axes and diagonally",
-        cause="friction is combined (product, average) from coefficients not solved for the pair, shared by all worlds, or a pyramid's",
-        run=sliding_distance,
-        capabilities=("friction",),
-        own_robot_only=True,
-    ),
-    Check(
-        name="slope",
-        group="contact",
-        statement="an object stays on a slope of 0.95 of the friction cone and slides down one of 1.05",
-        cause="friction is regularised so that objects creep, is a pyramid, or is shared by all worlds or lost with the state",
-        run=slope,
-        capabilities=("friction", "object_wrench"),
-        own_robot_only=True,
-    ),
-    Check(
-        name="torsional_friction",
-        group="contact",
-        statement="torsional friction brakes a spinning ball as stated for the pair, whatever its sliding friction",
-        cause="torsional friction is missing, is multiplied by the sliding friction, or comes from the size of a contact patch",
-        run=torsional_friction,
-        capabilities=("friction",),
-        own_robot_only=True,
-    ),
-    Check(
-        name="torsional_friction_set",
-        group="contact",
-        statement="torsional friction is set world by world, none too, and setting a state keeps it",
-        cause="torsional friction is shared by all worlds, is set on one of two surfaces, or is lost with the state",
-        run=torsional_friction_set,
-        capabilities=("torsional_friction",),
-        own_robot_only=True,
-    ),
-)

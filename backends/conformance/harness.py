@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +18,7 @@ from xreset.backends.pool import initial_state
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_normalize
 from xreset.physics import Backend, Parameter, State
+from xreset.plugins import backend_status, make_backend
 from xreset.spec import SceneSpec
 
 
@@ -88,8 +90,6 @@ class Bench:
 
         The reference itself, if it is what is tested, is compared with finer steps of its own.
         """
-        from xreset.plugins import backend_status, make_backend
-
         status = backend_status(REFERENCE)
         if status.reason is not None:
             raise Skipped(f"it compares with the reference engine: {status.reason}")
@@ -104,22 +104,27 @@ class Bench:
 
     def placed(self, state: State) -> State:
         """The same states with the object moved to where the robot is not, at the same height."""
-        place = torch.tensor(self.place, dtype=torch.float32).expand(len(state.object_pos), 2)
+        place = torch.tensor(self.place).expand(len(state.object_pos), 2)
         return replace_fields(state, object_pos=torch.cat((place, state.object_pos[:, 2:]), dim=1))
 
-    @property
+    @cached_property
     def place(self) -> tuple[float, float]:
-        """A place on the table, far from the robot's base and from its hand at home."""
-        (x, y), (hx, hy, _) = self.scene.table.center, self.scene.table.half_size
-        corners = [(x + sx * (hx - 0.25), y + sy * (hy - 0.2)) for sx in (-1, 1) for sy in (-1, 1)]
-        home = self.kinematics.link_poses(torch.as_tensor(self.scene.robot.home), [self.scene.robot.palm])[0, :2, 3].numpy()
-        avoid = np.stack((home, np.array(self.scene.robot.base_pos[:2])))
-        return max(corners, key=lambda c: float(np.linalg.norm(avoid - np.array(c), axis=1).min()))
+        """See :func:`free_place`."""
+        return free_place(self.scene)
 
     def close(self) -> None:
         """Close the shared worlds."""
         if self._shared is not None:
             self._shared.close()
+
+
+def free_place(scene: SceneSpec) -> tuple[float, float]:
+    """A place on the table, far from the robot's base and from its hand at home, from which an object can slide."""
+    robot, (x, y), (hx, hy, _) = scene.robot, scene.table.center, scene.table.half_size
+    corners = [(x + sx * (hx - 0.25), y + sy * (hy - 0.2)) for sx in (-1, 1) for sy in (-1, 1)]
+    palm = Kinematics(robot).link_poses(torch.as_tensor(robot.home), [robot.palm])[0, :2, 3].numpy()
+    avoid = np.stack((palm, np.array(robot.base_pos[:2])))
+    return max(corners, key=lambda c: float(np.linalg.norm(avoid - np.array(c), axis=1).min()))
 
 
 def start_state(scene: SceneSpec, object_index: Tensor) -> State:
@@ -138,7 +143,20 @@ def replace_fields(state: State, **changes: Tensor) -> State:
 
 def snapshot(state: State) -> State:
     """A copy that later steps do not change, on the CPU."""
-    return State(**{f.name: getattr(state, f.name).detach().cpu().clone() for f in fields(State)})
+    return state.to("cpu").clone()
+
+
+def advanced(backend: Backend, start: State, steps: int) -> State:
+    """What becomes of a state [N, ...] in some physics steps, on the CPU."""
+    backend.set_state(start.to(backend.device))
+    backend.step(steps)
+    return snapshot(backend.state())
+
+
+def worst_of(what: str, values: Tensor | Sequence[float], tolerance: float, unit: str, names: Sequence[str]) -> Measure:
+    """The largest of some values [N], a NaN before all, and whose it is."""
+    worst = int(np.nan_to_num(np.asarray(values), nan=np.inf).argmax())
+    return Measure(what, float(values[worst]), tolerance, unit, names[worst])
 
 
 def largest(difference: Tensor) -> float:

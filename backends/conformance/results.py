@@ -33,7 +33,7 @@ Group = Literal["state", "worlds", "robot", "object", "contact"]
 """Part of the contract that a check belongs to."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Measure:
     """One number of a check: how far something is from what it should be."""
 
@@ -87,6 +87,15 @@ class Check:
     """Capabilities that it needs and that a backend may lack."""
     own_robot_only: bool = False
     """Whether it needs the suite's own robot."""
+    last: bool = False
+    """Whether it comes after all others, for it may take the process with it."""
+
+
+def checks_of(group: Group) -> Callable[..., Callable[[Callable[[Bench], list[Measure]]], Check]]:
+    """The decorator ``(statement, cause, **options)`` that makes a :class:`Check` of a function, under its name."""
+    return lambda statement, cause, **options: (
+        lambda run: Check(name=run.__name__, group=group, statement=statement, cause=cause, run=run, **options)
+    )
 
 
 class Skipped(Exception):

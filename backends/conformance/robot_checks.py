@@ -5,7 +5,6 @@ Joints move in free space here: the robot's links collide neither with one anoth
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,14 +12,16 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, largest, replace_fields, rotation_angle, snapshot, start_state
-from xreset.backends.conformance.results import Check, Measure, Skipped
+from xreset.backends.conformance.harness import Bench, advanced, largest, replace_fields, rotation_angle, snapshot, start_state, worst_of
+from xreset.backends.conformance.results import Measure, Skipped, checks_of
 from xreset.backends.conformance.scene import without_collisions
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import Backend, Parameters, State
 from xreset.spec import GRAVITY, RobotSpec, SceneSpec
+
+check = checks_of("robot")
 
 _CONFIGURATIONS = 200
 _WAY = 0.2  # rad, of a joint's step and of the amplitude of its sine
@@ -32,6 +33,10 @@ _FREQUENCY = 1.0  # Hz
 # Kinematics ------------------------------------------------------------------------------------------------------------------------------
 
 
+@check(
+    "palm and fingertips are where the URDF and MuJoCo have them, in 200 configurations",
+    "a joint's axis, origin, sign or offset is wrong; frames refer to a centre of mass; joints are in another order",
+)
 def forward_kinematics(bench: Bench) -> list[Measure]:
     """Set many configurations and compare palm and fingertips with the URDF's kinematics, and with the reference engine's."""
     scene, n = bench.scene, bench.NUM_WORLDS
@@ -52,48 +57,48 @@ def forward_kinematics(bench: Bench) -> list[Measure]:
     pos, quat = links_of(bench.backend())
     poses = bench.kinematics.link_poses(q, scene.robot.tracked_links)
     measures = [
-        Measure(what="pos against the URDF", measured=largest(pos - poses[..., :3, 3]), tolerance=1e-5, unit="m"),
-        Measure(what="angle against the URDF", measured=largest(rotation_angle(quat, matrix_to_quat(poses[..., :3, :3]))), tolerance=1e-5,
-                unit="rad"),
+        Measure("pos against the URDF", largest(pos - poses[..., :3, 3]), 1e-5, "m"),
+        Measure("angle against the URDF", largest(rotation_angle(quat, matrix_to_quat(poses[..., :3, :3]))), 1e-5,
+                "rad"),
     ]  # fmt: skip
     with bench.reference(scene, n, bench.object_index) as (reference, _):
         other_pos, other_quat = links_of(reference)
     return [
         *measures,
-        Measure(what="pos against MuJoCo", measured=largest(pos - other_pos), tolerance=1e-5, unit="m"),
-        Measure(what="angle against MuJoCo", measured=largest(rotation_angle(quat, other_quat)), tolerance=1e-5, unit="rad"),
+        Measure("pos against MuJoCo", largest(pos - other_pos), 1e-5, "m"),
+        Measure("angle against MuJoCo", largest(rotation_angle(quat, other_quat)), 1e-5, "rad"),
     ]
 
 
+@check(
+    "the engine holds the masses, centres of mass and inertias of the URDF and of the objects",
+    "masses are invented for links without <inertial>, fixed links are lost or counted twice, principal axes are dropped or transposed",
+    capabilities=("mass_properties",),
+)
 def mass_properties(bench: Bench) -> list[Measure]:
     """Read masses, centres of mass and inertias back from the engine, of every moving body and of the objects."""
     found = bench.backend().mass_properties()
     bodies = _bodies(bench.scene.robot)
     rows = [(0, i, name, *values) for i, (name, values) in enumerate(bodies.items())]
     rows += [(world, len(bodies), o.name, o.mass, np.asarray(o.com), np.asarray(o.inertia)) for world, o in enumerate(bench.objects)]
-    worst: dict[str, tuple[float, str]] = {}
-
-    def note(what: str, error: float, name: str) -> None:
-        if what not in worst or not error <= worst[what][0]:
-            worst[what] = (float(error), name)
-
-    for world, i, name, mass, com, inertia in rows:
-        matrix = found.inertia[world, i].double().cpu().numpy()
-        moments = np.linalg.eigvalsh(inertia)
-        note("mass", abs(float(found.mass[world, i]) / mass - 1.0), name)
-        note("centre of mass", np.abs(found.com[world, i].double().cpu().numpy() - com).max(), name)
-        note("principal inertia", np.abs(np.linalg.eigvalsh(matrix) / moments - 1.0).max(), name)
-        note("inertia matrix", np.abs(matrix - inertia).max() / moments[-1], name)
     limits = {
         "mass": (1e-5, "of it"),
         "centre of mass": (1e-6, "m"),
         "principal inertia": (1e-5, "of it"),
         "inertia matrix": (1e-5, "of it"),
     }
-    return [
-        Measure(what=what, measured=error, tolerance=limits[what][0], unit=limits[what][1], where=name)
-        for what, (error, name) in worst.items()
-    ]
+    errors = []
+    for world, i, _, mass, com, inertia in rows:
+        matrix = found.inertia[world, i].double().cpu().numpy()
+        moments = np.linalg.eigvalsh(inertia)
+        errors.append((
+            abs(float(found.mass[world, i]) / mass - 1.0),
+            np.abs(found.com[world, i].double().cpu().numpy() - com).max(),
+            np.abs(np.linalg.eigvalsh(matrix) / moments - 1.0).max(),
+            np.abs(matrix - inertia).max() / moments[-1],
+        ))  # fmt: skip
+    names = [row[2] for row in rows]
+    return [worst_of(what, values, *limits[what], names) for what, values in zip(limits, zip(*errors, strict=True), strict=True)]
 
 
 def _bodies(robot: RobotSpec) -> dict[str, tuple[float, np.ndarray, np.ndarray]]:
@@ -124,6 +129,10 @@ def _bodies(robot: RobotSpec) -> dict[str, tuple[float, np.ndarray, np.ndarray]]
 # Drives ----------------------------------------------------------------------------------------------------------------------------------
 
 
+@check(
+    "every joint by itself follows a step and a sine of 0.2 rad as in the reference (the reference: as with 8 times finer steps)",
+    "gains are scaled by the timestep, the drive is explicit or for accelerations, armature is missing, joints are damped by default",
+)
 def joint_tracking(bench: Bench) -> list[Measure]:
     """Move every joint by itself, by a step and by a sine, and compare its path with the reference engine's."""
     scene = without_collisions(bench.scene)
@@ -133,19 +142,6 @@ def joint_tracking(bench: Bench) -> list[Measure]:
     step = torch.ones(steps)
     sine = torch.sin(2.0 * torch.pi * _FREQUENCY * time)
     return _against_reference(bench, scene, start, way, {"step": step, "sine": sine})
-
-
-def effort_limit(bench: Bench) -> list[Measure]:
-    """Step every joint by itself with an effort limit of 30 % of what its drive asks for, and compare with the reference engine."""
-    scene = without_collisions(bench.scene)
-    _, way = _alone(bench, scene)
-    weak = tuple(
-        replace(joint, drive=replace(joint.drive, effort=min(joint.drive.effort, 0.3 * joint.drive.kp * abs(float(w)))))
-        for joint, w in zip(scene.robot.joints, way, strict=True)
-    )
-    scene = replace(scene, robot=replace(scene.robot, joints=weak))
-    start, way = _alone(bench, scene)
-    return _against_reference(bench, scene, start, way, {"weak step": torch.ones(round(_DURATION / scene.control_dt))})
 
 
 def _alone(bench: Bench, scene: SceneSpec) -> tuple[State, Tensor]:
@@ -186,11 +182,8 @@ def _against_reference(bench: Bench, scene: SceneSpec, start: State, way: Tensor
             mine = [i for i, joint in enumerate(scene.robot.joints) if joint.group == group]
             for kind, values, tolerance in (("rms", rms, 2.5e-3), ("peak", peak, 12e-3)):
                 if mine:
-                    worst = max(mine, key=lambda i: float(values[i]) if torch.isfinite(values[i]) else torch.inf)
-                    measures.append(
-                        Measure(what=f"{group}, {name}, {kind}", measured=float(values[worst]), tolerance=tolerance, unit="rad",
-                                where=scene.robot.joints[worst].name)
-                    )  # fmt: skip
+                    names = [scene.robot.joints[i].name for i in mine]
+                    measures.append(worst_of(f"{group}, {name}, {kind}", values[mine], tolerance, "rad", names))
     return measures
 
 
@@ -208,6 +201,49 @@ def _paths(backend: Backend, start: State, way: Tensor, signal: Tensor, substeps
 _DRIVE_SCALES = ((1.0, 1.0, 1.0), (0.7, 1.4, 1.0), (1.3, 0.8, 0.5))  # of stiffness, damping and effort limit
 
 
+@check(
+    "a drive is a PD position drive with effort limit and armature",
+    "gains are scaled, armature or effort limit are missing, joint damping or friction is added, or gravity is not compensated",
+    own_robot_only=True,
+)
+def drive_equation(bench: Bench) -> list[Measure]:
+    """Step the target of the vertical slide and compare with the drive's differential equation, effort limit and armature included.
+
+    (m + armature) x'' = clip(kp (target - x) - kd x', effort). The robot's weight is compensated, so it does not appear.
+    """
+    robot = bench.scene.robot
+    index = robot.joint_names.index("lift")
+    drive = robot.joints[index].drive
+    tree = robot_tree(robot)
+    carried = sum(tree.link(name).mass for name in ("carriage", "wrist", "palm", "jaw_a", "jaw_b", "finger_b"))
+    steps = torch.tensor([0.01, -0.01, 0.08, -0.08])  # the last two run into the effort limit
+    backend = bench.backend()
+    target = bench.start().joint_pos.clone()
+    target[:, index] += steps
+    backend.set_joint_targets(target.to(backend.device))
+    found = []
+    for _ in range(12):
+        backend.step(4)
+        found.append(snapshot(backend.state()).joint_pos[:, index].double().numpy())
+    times = 4 * bench.scene.timestep * np.arange(1, 13)
+    measures = []
+    for i, step in enumerate(steps.tolist()):
+
+        def motion(_, y: np.ndarray, goal: float = step) -> list[float]:
+            effort = np.clip(drive.kp * (goal - y[0]) - drive.kd * y[1], -drive.effort, drive.effort)
+            return [y[1], effort / (carried + drive.armature)]
+
+        exact = solve_ivp(motion, (0.0, times[-1]), [0.0, 0.0], t_eval=times, rtol=1e-6, atol=1e-9, max_step=1e-3).y[0]
+        error = np.abs(np.array([x[i] for x in found]) - robot.joints[index].home - exact).max() / abs(step)
+        measures.append(Measure(f"step of {step:+.2f} m", float(error), 0.06, "of the step"))
+    return measures
+
+
+@check(
+    "factors on stiffness, damping and effort limit act as in a robot that was built with such drives",
+    "a factor is applied to what the last one left, to all worlds, or not to what an implicit drive was factorised with",
+    capabilities=("drives",),
+)
 def drive_scale(bench: Bench) -> list[Measure]:
     """Scale the drives of some worlds, and compare with engines that were built with a robot of such drives.
 
@@ -254,47 +290,35 @@ def drive_scale(bench: Bench) -> list[Measure]:
         backend.set_where(mask, start.to(backend.device), parameters)
         masked = path(backend, slice(None))
     return [
-        Measure(what="set at once", measured=largest(at_once - torch.cat(expected)), tolerance=1e-4, unit="rad, m"),
-        Measure(what="set through a mask", measured=largest(masked - torch.cat(expected)), tolerance=1e-4, unit="rad, m"),
+        Measure("set at once", largest(at_once - torch.cat(expected)), 1e-4, "rad, m"),
+        Measure("set through a mask", largest(masked - torch.cat(expected)), 1e-4, "rad, m"),
     ]
 
 
-def drive_equation(bench: Bench) -> list[Measure]:
-    """Step the target of the vertical slide and compare with the drive's differential equation, effort limit and armature included.
-
-    (m + armature) x'' = clip(kp (target - x) - kd x', effort). The robot's weight is compensated, so it does not appear.
-    """
-    robot = bench.scene.robot
-    index = robot.joint_names.index("lift")
-    drive = robot.joints[index].drive
-    tree = robot_tree(robot)
-    carried = sum(tree.link(name).mass for name in ("carriage", "wrist", "palm", "jaw_a", "jaw_b", "finger_b"))
-    steps = torch.tensor([0.01, -0.01, 0.08, -0.08])  # the last two run into the effort limit
-    backend = bench.backend()
-    target = bench.start().joint_pos.clone()
-    target[:, index] += steps
-    backend.set_joint_targets(target.to(backend.device))
-    found = []
-    for _ in range(12):
-        backend.step(4)
-        found.append(snapshot(backend.state()).joint_pos[:, index].double().numpy())
-    times = 4 * bench.scene.timestep * np.arange(1, 13)
-    measures = []
-    for i, step in enumerate(steps.tolist()):
-
-        def motion(_, y: np.ndarray, goal: float = step) -> list[float]:
-            effort = np.clip(drive.kp * (goal - y[0]) - drive.kd * y[1], -drive.effort, drive.effort)
-            return [y[1], effort / (carried + drive.armature)]
-
-        exact = solve_ivp(motion, (0.0, times[-1]), [0.0, 0.0], t_eval=times, rtol=1e-6, atol=1e-9, max_step=1e-3).y[0]
-        error = np.abs(np.array([x[i] for x in found]) - robot.joints[index].home - exact).max() / abs(step)
-        measures.append(Measure(what=f"step of {step:+.2f} m", measured=float(error), tolerance=0.06, unit="of the step"))
-    return measures
+@check(
+    "a drive that asks for more than its effort limit gives that limit, as in the reference",
+    "the effort limit is missing, is an impulse per step instead of a torque, or limits the sum with gravity compensation",
+)
+def effort_limit(bench: Bench) -> list[Measure]:
+    """Step every joint by itself with an effort limit of 30 % of what its drive asks for, and compare with the reference engine."""
+    scene = without_collisions(bench.scene)
+    _, way = _alone(bench, scene)
+    weak = tuple(
+        replace(joint, drive=replace(joint.drive, effort=min(joint.drive.effort, 0.3 * joint.drive.kp * abs(float(w)))))
+        for joint, w in zip(scene.robot.joints, way, strict=True)
+    )
+    scene = replace(scene, robot=replace(scene.robot, joints=weak))
+    start, way = _alone(bench, scene)
+    return _against_reference(bench, scene, start, way, {"weak step": torch.ones(round(_DURATION / scene.control_dt))})
 
 
 # Limits and weight -----------------------------------------------------------------------------------------------------------------------
 
 
+@check(
+    "a joint sent beyond a limit comes to rest at it",
+    "limits are not set, are those of another joint, or so soft that the drive overcomes them",
+)
 def joint_limits(bench: Bench) -> list[Measure]:
     """Send every joint beyond its limits: it must come to rest there."""
     scene = without_collisions(bench.scene)
@@ -312,20 +336,18 @@ def joint_limits(bench: Bench) -> list[Measure]:
             inside, beyond = limit - side * 0.5 * way, limit + side * 0.5 * way
             pos[joints, joints] = torch.where(limited, inside, pos.diagonal())
             target[joints, joints] = torch.where(limited, beyond, pos.diagonal())
-            backend.set_state(replace_fields(start, joint_pos=pos, joint_target=target).to(backend.device))
-            backend.step(round(1.0 / scene.timestep))
-            end = backend.state().joint_pos.diagonal().cpu()
-            off = ((end - limit).abs() / way).where(limited, torch.tensor(0.0))
-            worst = int(off.nan_to_num(torch.inf).argmax())
-            measures.append(
-                Measure(what=f"way off the {name} limit", measured=float(off[worst]), tolerance=0.1, unit="of the way",
-                        where=scene.robot.joints[worst].name)
-            )  # fmt: skip
+            end = advanced(backend, replace_fields(start, joint_pos=pos, joint_target=target), round(1.0 / scene.timestep))
+            off = ((end.joint_pos.diagonal() - limit).abs() / way).where(limited, torch.tensor(0.0))
+            measures.append(worst_of(f"way off the {name} limit", off, 0.1, "of the way", scene.robot.joint_names))
     if not measures:
         raise Skipped("no joint of this robot has limits")
     return measures
 
 
+@check(
+    "a robot whose weight is compensated does not sag",
+    "the engine's gravity acts on the robot, or on links that were fused into others",
+)
 def gravity_compensation(bench: Bench) -> list[Measure]:
     """Hold several configurations for 2 s: an arm whose weight is compensated does not sag."""
     if not bench.scene.robot.gravity_compensated:
@@ -338,13 +360,16 @@ def gravity_compensation(bench: Bench) -> list[Measure]:
     q[0] = torch.as_tensor(scene.robot.home)
     with bench.other(scene, n, bench.object_index) as backend:
         start = replace_fields(bench.start(), joint_pos=q, joint_target=q)
-        backend.set_state(start.to(backend.device))
-        backend.step(round(2.0 / scene.timestep))
-        off = (backend.state().joint_pos.cpu() - start.joint_pos).abs().amax(dim=0)
-    worst = int(off.nan_to_num(torch.inf).argmax())
-    return [Measure(what="sag", measured=float(off[worst]), tolerance=1e-4, unit="rad, m", where=scene.robot.joints[worst].name)]
+        off = (advanced(backend, start, round(2.0 / scene.timestep)).joint_pos - start.joint_pos).abs().amax(dim=0)
+    return [worst_of("sag", off, 1e-4, "rad, m", scene.robot.joint_names)]
 
 
+@check(
+    "a robot whose weight is not compensated carries all of it, whatever gravity fraction its object has",
+    "the gravity fraction scales the gravity of the whole world; or the robot's weight is compensated although it should not be",
+    capabilities=("object_gravity",),
+    own_robot_only=True,
+)
 def own_weight(bench: Bench) -> list[Measure]:
     """Leave the weight to the drives and give the objects gravity fractions: the robot sags as its own whole weight asks, in every world.
 
@@ -355,9 +380,7 @@ def own_weight(bench: Bench) -> list[Measure]:
     with bench.other(scene, n, bench.object_index) as backend:
         backend.set_object_gravity(torch.tensor([0.0, 0.5, 1.0, 0.25], device=backend.device))
         start = bench.start()
-        backend.set_state(start.to(backend.device))
-        backend.step(round(2.0 / scene.timestep))
-        q = backend.state().joint_pos.cpu().double()
+        q = advanced(backend, start, round(2.0 / scene.timestep)).joint_pos.double()
     links = [kinematics.tree.link(name) for name in kinematics.link_names]
     com = torch.tensor(np.stack([link.com for link in links]))
     mass = torch.tensor([link.mass for link in links], dtype=torch.float64)
@@ -366,64 +389,6 @@ def own_weight(bench: Bench) -> list[Measure]:
     sag = GRAVITY * torch.einsum("l,nlj->nj", mass, rise) / stiffness
     off = start.joint_pos.double() - q - sag
     return [
-        Measure(what="sag", measured=largest(off), tolerance=1e-4, unit="rad, m"),
-        Measure(what="difference between worlds", measured=largest(q - q[:1]), tolerance=1e-6, unit="rad, m"),
+        Measure("sag", largest(off), 1e-4, "rad, m"),
+        Measure("difference between worlds", largest(q - q[:1]), 1e-6, "rad, m"),
     ]
-
-
-def _check(run: Callable[[Bench], list[Measure]], statement: str, cause: str, **options) -> Check:
-    return Check(name=run.__name__, group="robot", statement=statement, cause=cause, run=run, **options)
-
-
-CHECKS = (
-    _check(
-        forward_kinematics,
-        "palm and fingertips are where the URDF and MuJoCo have them, in 200 configurations",
-        "a joint's axis, origin, sign or offset is wrong; frames refer to a centre of mass; joints are in another order",
-    ),
-    _check(
-        mass_properties,
-        "the engine holds the masses, centres of mass and inertias of the URDF and of the objects",
-        "masses are invented for links without <inertial>, fixed links are lost or counted twice, principal axes are dropped or transposed",
-        capabilities=("mass_properties",),
-    ),
-    _check(
-        joint_tracking,
-        "every joint by itself follows a step and a sine of 0.2 rad as in the reference (the reference: as with 8 times finer steps)",
-        "gains are scaled by the timestep, the drive is explicit or for accelerations, armature is missing, joints are damped by default",
-    ),
-    _check(
-        drive_equation,
-        "a drive is a PD position drive with effort limit and armature",
-        "gains are scaled, armature or effort limit are missing, joint damping or friction is added, or gravity is not compensated",
-        own_robot_only=True,
-    ),
-    _check(
-        drive_scale,
-        "factors on stiffness, damping and effort limit act as in a robot that was built with such drives",
-        "a factor is applied to what the last one left, to all worlds, or not to what an implicit drive was factorised with",
-        capabilities=("drives",),
-    ),
-    _check(
-        effort_limit,
-        "a drive that asks for more than its effort limit gives that limit, as in the reference",
-        "the effort limit is missing, is an impulse per step instead of a torque, or limits the sum with gravity compensation",
-    ),
-    _check(
-        joint_limits,
-        "a joint sent beyond a limit comes to rest at it",
-        "limits are not set, are those of another joint, or so soft that the drive overcomes them",
-    ),
-    _check(
-        gravity_compensation,
-        "a robot whose weight is compensated does not sag",
-        "the engine's gravity acts on the robot, or on links that were fused into others",
-    ),
-    _check(
-        own_weight,
-        "a robot whose weight is not compensated carries all of it, whatever gravity fraction its object has",
-        "the gravity fraction scales the gravity of the whole world; or the robot's weight is compensated although it should not be",
-        capabilities=("object_gravity",),
-        own_robot_only=True,
-    ),
-)

@@ -11,20 +11,9 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from xreset.description import read_description
 from xreset.geometry.urdf import robot_tree
-from xreset.spec import (
-    DriveSpec,
-    FingertipSpec,
-    Geometry,
-    JointSpec,
-    KeypointSpec,
-    MimicSpec,
-    ObjectSpec,
-    PairFriction,
-    RobotSpec,
-    SceneSpec,
-    Shape,
-)
+from xreset.spec import Geometry, ObjectSpec, PairFriction, RobotSpec, SceneSpec, Shape
 
 
 @cache
@@ -33,50 +22,19 @@ def gripper() -> RobotSpec:
 
     Its joint order is neither the URDF's nor alphabetical.
     """
-    return RobotSpec(
-        name="conformance-gripper",
-        urdf=Path(__file__).with_name("gripper.urdf"),
-        joints=(
-            _joint("lift", "arm", 0.0, kp=2000.0, kd=120.0, effort=40.0, armature=0.5),
-            _joint("swing", "arm", 0.1, kp=200.0, kd=20.0, effort=60.0, armature=0.1),
-            _joint("finger_b_bend", "hand", 0.0, kp=5.0, kd=0.1, effort=5.0),
-            _joint("turn", "arm", 0.0, kp=40.0, kd=2.0, effort=20.0, armature=0.01),
-            _joint("jaw_a_slide", "hand", 0.04, kp=800.0, kd=30.0, effort=30.0),
-        ),
-        mimics=(MimicSpec(joint="jaw_b_slide", source="jaw_a_slide", multiplier=1.1, offset=-0.002),),
-        base_pos=(0.57, 0.05, 0.1),
-        base_quat=tuple(Rotation.from_euler("z", np.pi / 2 - 0.2).as_quat(scalar_first=True)),
-        palm="palm",
-        fingertips=(
-            FingertipSpec(name="thumb", link="tip_a", contact_links=("jaw_a",), keypoint="thumb4"),
-            FingertipSpec(name="index", link="tip_b", contact_links=("pad_b", "finger_b"), keypoint="index4"),
-        ),
-        keypoints=(
-            KeypointSpec(keypoint="wrist", link="palm"),
-            KeypointSpec(keypoint="thumb4", link="tip_a"),
-            KeypointSpec(keypoint="index4", link="tip_b"),
-        ),
-        hand_root="wrist",
-        self_collision_links=("jaw_a", "pad_b", "column"),
-        collision_exclude=(("jaw_a", "column"),),
-        table_exclude=("base",),
-    )
-
-
-def _joint(name: str, group: str, home: float, **drive: float) -> JointSpec:
-    return JointSpec(name=name, group=group, home=home, drive=DriveSpec(**drive))  # pyright: ignore[reportArgumentType]
+    return read_description(Path(__file__).with_name("gripper.toml"))
 
 
 @cache
 def objects() -> tuple[ObjectSpec, ...]:
     """A brick (a box), a can (a cylinder) and a bracket (two hulls); the centres of mass are off the origin of the mesh frame."""
-    brick = _shape("box", (0.02, 0.03, 0.025), (0.01, 0.005, -0.004), yaw=0.3)
-    can = _shape("cylinder", (0.033, 0.05), (0.0, 0.0, 0.01))
-    foot, arm = _shape("hull", (0.05, 0.02, 0.01), (0.0, 0.0, -0.02)), _shape("hull", (0.012, 0.02, 0.03), (-0.038, 0.0, 0.02))
+    brick = shape("box", (0.02, 0.03, 0.025), (0.01, 0.005, -0.004), yaw=0.3)
+    can = shape("cylinder", (0.033, 0.05), (0.0, 0.0, 0.01))
+    foot, arm = shape("hull", (0.05, 0.02, 0.01), (0.0, 0.0, -0.02)), shape("hull", (0.012, 0.02, 0.03), (-0.038, 0.0, 0.02))
     return (
-        _object("brick", 0.25, (brick,), shift=(0.004, -0.003, 0.002), twist=0.2),
-        _object("can", 0.35, (can,), shift=(0.002, 0.0, -0.003), twist=0.0),
-        _object("bracket", 0.30, (foot, arm), shift=(0.0, 0.001, 0.0), twist=0.0),
+        solid("brick", 0.25, (brick,), shift=(0.004, -0.003, 0.002), twist=0.2),
+        solid("can", 0.35, (can,), shift=(0.002, 0.0, -0.003), twist=0.0),
+        solid("bracket", 0.30, (foot, arm), shift=(0.0, 0.001, 0.0), twist=0.0),
     )
 
 
@@ -86,17 +44,17 @@ def flat_objects() -> tuple[ObjectSpec, ...]:
     half = (0.05, 0.06, 0.02)
     side = (half[0] / 2, half[1], half[2])
     return (
-        _object("box", 0.4, (_shape("box", half, (0, 0, 0)),)),
-        _object("hull", 0.4, (_shape("hull", half, (0, 0, 0)),)),
-        _object("two hulls", 0.4, tuple(_shape("hull", side, (x, 0, 0)) for x in (side[0], -side[0]))),
-        _object("cylinder", 0.4, (_shape("cylinder", (0.06, 0.02), (0, 0, 0)),)),
+        solid("box", 0.4, (shape("box", half, (0, 0, 0)),)),
+        solid("hull", 0.4, (shape("hull", half, (0, 0, 0)),)),
+        solid("two hulls", 0.4, tuple(shape("hull", side, (x, 0, 0)) for x in (side[0], -side[0]))),
+        solid("cylinder", 0.4, (shape("cylinder", (0.06, 0.02), (0, 0, 0)),)),
     )
 
 
 @cache
 def ball() -> ObjectSpec:
     """A ball of 30 mm radius."""
-    return replace(_object("ball", 0.4, (_shape("sphere", (0.03,), (0, 0, 0)),)), inertia=8e-4 * np.eye(3))
+    return replace(solid("ball", 0.4, (shape("sphere", (0.03,), (0, 0, 0)),)), inertia=8e-4 * np.eye(3))
 
 
 def scene(robot: RobotSpec | None = None) -> SceneSpec:
@@ -115,7 +73,8 @@ def reorder_joints(scene: SceneSpec) -> SceneSpec:
     return replace(scene, robot=replace(scene.robot, joints=scene.robot.joints[::-1]))
 
 
-def _shape(kind: str, size: tuple[float, ...], pos: tuple[float, float, float], yaw: float = 0.0) -> Shape:
+def shape(kind: str, size: tuple[float, ...], pos: tuple[float, float, float], yaw: float = 0.0) -> Shape:
+    """A box, a box as a hull (half edges), a cylinder (radius, half height) or a sphere, at a place in the mesh frame [m]."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_euler("z", yaw).as_matrix(), pos
     if kind == "hull":  # a box, given as vertices
@@ -126,7 +85,7 @@ def _shape(kind: str, size: tuple[float, ...], pos: tuple[float, float, float], 
     return Shape(geometry=geometry, T_body_shape=T)
 
 
-def _object(name: str, mass: float, pieces: tuple[Shape, ...], *, shift: Sequence[float] = (0, 0, 0), twist: float = 0.0) -> ObjectSpec:
+def solid(name: str, mass: float, pieces: tuple[Shape, ...], *, shift: Sequence[float] = (0, 0, 0), twist: float = 0.0) -> ObjectSpec:
     """An object with the inertia of its shape at even density, then its centre of mass shifted and its principal axes turned.
 
     Its mass is a number of float32, as the interface to a backend has it: no rounding comes between a mass that is set and one built.

@@ -19,13 +19,15 @@ from xreset.backends.conformance.harness import (
     snapshot,
     start_state,
 )
-from xreset.backends.conformance.results import Check, Measure, Skipped
+from xreset.backends.conformance.results import Measure, Skipped, checks_of
 from xreset.backends.conformance.scene import reorder_joints
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import Links, State
 from xreset.spec import SceneSpec
+
+check = checks_of("state")
 
 
 def link_measures(
@@ -43,13 +45,17 @@ def link_measures(
 
     angle = rotation_angle(links.quat.cpu(), matrix_to_quat(poses[..., :3, :3]))
     return [
-        Measure(what="pos", measured=off(links.pos, poses[..., :3, 3]), tolerance=tolerance, unit="m"),
-        Measure(what="angle", measured=largest(angle[:, which]), tolerance=tolerance, unit="rad"),
-        Measure(what="linvel", measured=off(links.linvel, linvel), tolerance=10.0 * tolerance, unit="m/s"),
-        Measure(what="angvel", measured=off(links.angvel, angvel), tolerance=10.0 * tolerance, unit="rad/s"),
+        Measure("pos", off(links.pos, poses[..., :3, 3]), tolerance, "m"),
+        Measure("angle", largest(angle[:, which]), tolerance, "rad"),
+        Measure("linvel", off(links.linvel, linvel), 10.0 * tolerance, "m/s"),
+        Measure("angvel", off(links.angvel, angvel), 10.0 * tolerance, "rad/s"),
     ]
 
 
+@check(
+    "a state that is set is read back, every field of it",
+    "a field is dropped, permuted or changed: velocities, quaternion order, body-frame angular velocity, joint order",
+)
 def state_round_trip(bench: Bench) -> list[Measure]:
     """Set a random state in every world and read it back."""
     backend = bench.backend()
@@ -58,6 +64,10 @@ def state_round_trip(bench: Bench) -> list[Measure]:
     return compare_states(snapshot(backend.state()), state, ROUND_TRIP)
 
 
+@check(
+    "link poses and velocities belong to the state just set, without a step",
+    "kinematics are stale after a write; a velocity is of a centre of mass or in the body's frame; a mimic joint is not set",
+)
 def links_after_set(bench: Bench) -> list[Measure]:
     """Set a random state and compare the tracked links with the URDF's kinematics, without a step."""
     backend = bench.backend()
@@ -66,11 +76,16 @@ def links_after_set(bench: Bench) -> list[Measure]:
     return link_measures(bench.kinematics, state, backend.links())
 
 
+@check("link poses belong to the joint positions after steps", "links are read before the last integration")
 def links_after_steps(bench: Bench) -> list[Measure]:
     """Move every joint and compare the tracked links with the kinematics of the joint positions on the way."""
     return _on_the_way(bench, [i for i, moved in enumerate(_moved_by_mimics(bench.scene)) if not moved], 1e-5)
 
 
+@check(
+    "links behind a mimic joint are where its source puts them, at once when set, and on the way",
+    "mimic joints are left out when a state is set; or the coupling is missing, soft, or on the wrong joint",
+)
 def mimic_joints(bench: Bench) -> list[Measure]:
     """The same for links that a mimic joint moves: it is set exactly, and then follows through a stiff coupling."""
     mine = [i for i, moved in enumerate(_moved_by_mimics(bench.scene)) if moved]
@@ -110,6 +125,7 @@ def _on_the_way(bench: Bench, which: list[int], tolerance: float) -> list[Measur
     return list(worst.values())
 
 
+@check("joints go by name, whatever order the robot spec has", "the engine's own joint order shows through in states or in targets")
 def joint_order(bench: Bench) -> list[Measure]:
     """Name the joints in another order: states still go by name, and a target moves the joint that it names."""
     scene = reorder_joints(bench.scene)
@@ -130,46 +146,7 @@ def joint_order(bench: Bench) -> list[Measure]:
         backend.step(144)  # until they rest: on the way, an arm's motion shakes its fingers
         moved = ((backend.state().joint_pos - start.joint_pos) / motion).cpu()
         wrong = moved - torch.eye(count)
-        measures.append(Measure(what="way missing of the joint named", measured=largest(wrong.diagonal()), tolerance=0.1, unit="of it"))
+        measures.append(Measure("way missing of the joint named", largest(wrong.diagonal()), 0.1, "of it"))
         others = wrong - torch.diag(wrong.diagonal())
-        measures.append(Measure(what="way of others", measured=largest(others), tolerance=0.1, unit="of theirs"))
+        measures.append(Measure("way of others", largest(others), 0.1, "of theirs"))
     return measures
-
-
-CHECKS = (
-    Check(
-        name="state_round_trip",
-        group="state",
-        statement="a state that is set is read back, every field of it",
-        cause="a field is dropped, permuted or changed: velocities, quaternion order, body-frame angular velocity, joint order",
-        run=state_round_trip,
-    ),
-    Check(
-        name="links_after_set",
-        group="state",
-        statement="link poses and velocities belong to the state just set, without a step",
-        cause="kinematics are stale after a write; a velocity is of a centre of mass or in the body's frame; a mimic joint is not set",
-        run=links_after_set,
-    ),
-    Check(
-        name="links_after_steps",
-        group="state",
-        statement="link poses belong to the joint positions after steps",
-        cause="links are read before the last integration",
-        run=links_after_steps,
-    ),
-    Check(
-        name="mimic_joints",
-        group="state",
-        statement="links behind a mimic joint are where its source puts them, at once when set, and on the way",
-        cause="mimic joints are left out when a state is set; or the coupling is missing, soft, or on the wrong joint",
-        run=mimic_joints,
-    ),
-    Check(
-        name="joint_order",
-        group="state",
-        statement="joints go by name, whatever order the robot spec has",
-        cause="the engine's own joint order shows through in states or in targets",
-        run=joint_order,
-    ),
-)

@@ -11,6 +11,7 @@ from torch import Tensor
 from xreset.backends.conformance.harness import (
     ROUND_TRIP,
     Bench,
+    advanced,
     compare_states,
     largest,
     random_state,
@@ -19,8 +20,10 @@ from xreset.backends.conformance.harness import (
     snapshot,
     start_state,
 )
-from xreset.backends.conformance.results import Check, Measure, Skipped
+from xreset.backends.conformance.results import Measure, Skipped, checks_of
 from xreset.physics import Backend, Parameters, State
+
+check = checks_of("worlds")
 
 _SAME: dict[str, tuple[float, str]] = {
     "joint_pos": (1e-5, "rad, m"),
@@ -37,6 +40,10 @@ _EXACT = {name: (0.0, unit) for name, (_, unit) in _SAME.items()}
 """The same where they are added in one order."""
 
 
+@check(
+    "setting a state leaves nothing of the past: no target, velocity, force or warm start",
+    "targets are not reset with the state; or warm starts, external forces or contact caches survive it",
+)
 def nothing_stays(bench: Bench) -> list[Measure]:
     """Disturb one world, then set it and an undisturbed one with the same object to the same state: both must go on alike."""
     backend = bench.backend()
@@ -50,16 +57,18 @@ def nothing_stays(bench: Bench) -> list[Measure]:
     if "object_wrench" in backend.capabilities:
         backend.set_object_wrench(wrench.to(backend.device), 0.01 * wrench.to(backend.device))
     backend.step(16)
-    backend.set_state(start.to(backend.device))
-    backend.step(16)
-    state = snapshot(backend.state())
+    state = advanced(backend, start, 16)
     measures = compare_states(state[[disturbed]], state[[calm]], _SAME)
     if bench.scene.robot.gravity_compensated:
         drift = largest(state.joint_pos[disturbed] - start.joint_pos[disturbed])
-        measures.append(Measure(what="drift from the target", measured=drift, tolerance=1e-3, unit="rad, m"))
+        measures.append(Measure("drift from the target", drift, 1e-3, "rad, m"))
     return measures
 
 
+@check(
+    "setting some worlds gives each its state and leaves the others alone",
+    "indices are sorted or ignored; or setting some worlds resets something of all",
+)
 def selected_worlds(bench: Bench) -> list[Measure]:
     """Set two worlds, in descending order, in the middle of a motion: they have the new state, the others go on as if nothing had been."""
     new = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=4)
@@ -67,9 +76,7 @@ def selected_worlds(bench: Bench) -> list[Measure]:
 
     def run(interfere: bool) -> tuple[State, State]:
         backend = bench.backend()
-        moving = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=5)
-        backend.set_state(moving.to(backend.device))
-        backend.step(4)
+        advanced(backend, random_state(bench, bench.scene, bench.NUM_WORLDS, seed=5), 4)
         if interfere:
             backend.set_state(new[chosen].to(backend.device), torch.tensor(chosen, device=backend.device))
         right_after = snapshot(backend.state())
@@ -85,6 +92,91 @@ def selected_worlds(bench: Bench) -> list[Measure]:
     ]
 
 
+@check(
+    "worlds do not influence one another",
+    "worlds share memory, a collision space, a random stream or a solver's convergence test",
+)
+def worlds_independent(bench: Bench) -> list[Measure]:
+    """Run twice, the second time with one world quite different: the others must not notice."""
+
+    def run(disturb: bool) -> State:
+        backend = bench.backend()
+        state = bench.start()
+        if disturb:
+            wild = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=6)
+            state = State(**{f.name: torch.cat((getattr(state, f.name)[:1], getattr(wild, f.name)[1:2], getattr(state, f.name)[2:]))
+                             for f in fields(State)})  # fmt: skip
+        return advanced(backend, state, 32)
+
+    others = [0, 2, 3]
+    return compare_states(run(True)[others], run(False)[others], _SAME)
+
+
+@check(
+    "a world with its own object in a batch does what that object does alone",
+    "a model field (shape, mass, inertia, bounds or something derived from them) is world 0's in all worlds",
+)
+def objects_in_a_batch(bench: Bench) -> list[Measure]:
+    """Drop different objects in one batch, and each of them alone: the same must happen."""
+
+    def drop(state: State) -> State:
+        return replace_fields(state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 0.002]))
+
+    backend = bench.backend()
+    together = advanced(backend, drop(bench.start()), 48)
+    weights = backend.contacts().table_force.cpu().clone()
+    measures = []
+    for i, thing in enumerate(bench.scene.objects):
+        which = torch.tensor([i])
+        with bench.other(bench.scene, 1, object_index=which) as alone:
+            state = advanced(alone, drop(bench.placed(start_state(bench.scene, which))), 48)
+            force = alone.contacts().table_force[0, 2].cpu()
+        measures.append(Measure(f"pos of {thing.name}", largest(together.object_pos[i] - state.object_pos[0]), 1e-4, "m"))
+        quat, other = together.object_quat[i], state.object_quat[0]
+        error = min(largest(quat - other), largest(quat + other))
+        measures.append(Measure(f"quat of {thing.name}", error, 2e-3))
+        weight = thing.mass * 9.81
+        measures.append(Measure(f"weight of {thing.name}", abs(float(weights[i, 2] - force)) / weight, 0.05, "of m g"))
+    return measures
+
+
+@check(
+    "two worlds in the same state stay equal, on a CPU to the last bit",
+    "worlds share a random stream; a world's number, place or neighbours enter its physics; contacts come in another order",
+)
+def twins(bench: Bench) -> list[Measure]:
+    """Set two worlds with the same object to the same state, let them go through contacts and motions alike: they must stay equal."""
+    backend = bench.backend()
+    end = _busy(bench, backend)
+    one, other = 0, len(bench.scene.objects)  # hold the same object
+    tolerances = _SAME if backend.device.type == "cuda" else _EXACT
+    return compare_states(end[[one]], end[[other]], tolerances)
+
+
+@check(
+    "on a CPU, the same input gives the same output to the last bit, whatever was before and in new worlds too",
+    "a random stream, time or memory's addresses enter the physics; contact caches or warm starts survive the setting of a state",
+)
+def repeatable(bench: Bench) -> list[Measure]:
+    """Do the same twice, with something else in between, and once more in worlds newly built: every bit must be the same.
+
+    The worlds that the checks share will not do: the masses that another check has put back in them are rounded to single precision.
+    """
+    with bench.other(bench.scene, bench.NUM_WORLDS, bench.object_index) as backend:
+        if backend.device.type != "cpu":
+            raise Skipped("only CPUs add numbers in the same order every time")
+        first = _busy(bench, backend)
+        advanced(backend, random_state(bench, bench.scene, bench.NUM_WORLDS, seed=9), 30)
+        measures = compare_states(_busy(bench, backend), first, _EXACT, "again,")
+    with bench.other(bench.scene, bench.NUM_WORLDS, bench.object_index) as new:
+        return measures + compare_states(_busy(bench, new), first, _EXACT, "newly built,")
+
+
+@check(
+    "setting the worlds of a mask does what the single setters do for those worlds, and nothing to the others",
+    "values are taken in the order of the mask instead of the worlds; the mask is ignored; derived quantities are left out",
+    capabilities=("object_mass", "friction", "object_gravity"),
+)
 def masked_set(bench: Bench) -> list[Measure]:
     """Set state, mass, friction and gravity of the worlds of a mask in the middle of a motion: as the single setters do."""
     chosen = [3, 1]
@@ -121,81 +213,6 @@ def masked_set(bench: Bench) -> list[Measure]:
     return compare_states(run(masked=True), run(masked=False), _SAME)
 
 
-def worlds_independent(bench: Bench) -> list[Measure]:
-    """Run twice, the second time with one world quite different: the others must not notice."""
-
-    def run(disturb: bool) -> State:
-        backend = bench.backend()
-        state = bench.start()
-        if disturb:
-            wild = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=6)
-            state = State(**{f.name: torch.cat((getattr(state, f.name)[:1], getattr(wild, f.name)[1:2], getattr(state, f.name)[2:]))
-                             for f in fields(State)})  # fmt: skip
-        backend.set_state(state.to(backend.device))
-        backend.step(32)
-        return snapshot(backend.state())
-
-    others = [0, 2, 3]
-    return compare_states(run(True)[others], run(False)[others], _SAME)
-
-
-def objects_in_a_batch(bench: Bench) -> list[Measure]:
-    """Drop different objects in one batch, and each of them alone: the same must happen."""
-
-    def drop(state: State) -> State:
-        return replace_fields(state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 0.002]))
-
-    backend = bench.backend()
-    backend.set_state(drop(bench.start()).to(backend.device))
-    backend.step(48)
-    together = snapshot(backend.state())
-    weights = backend.contacts().table_force.cpu().clone()
-    measures = []
-    for i, thing in enumerate(bench.scene.objects):
-        which = torch.tensor([i])
-        with bench.other(bench.scene, 1, object_index=which) as alone:
-            alone.set_state(drop(bench.placed(start_state(bench.scene, which))).to(alone.device))
-            alone.step(48)
-            state = snapshot(alone.state())
-            force = alone.contacts().table_force[0, 2].cpu()
-        measures.append(
-            Measure(what=f"pos of {thing.name}", measured=largest(together.object_pos[i] - state.object_pos[0]), tolerance=1e-4, unit="m")
-        )
-        quat, other = together.object_quat[i], state.object_quat[0]
-        error = min(largest(quat - other), largest(quat + other))
-        measures.append(Measure(what=f"quat of {thing.name}", measured=error, tolerance=2e-3))
-        weight = thing.mass * 9.81
-        measures.append(
-            Measure(what=f"weight of {thing.name}", measured=abs(float(weights[i, 2] - force)) / weight, tolerance=0.05, unit="of m g")
-        )
-    return measures
-
-
-def twins(bench: Bench) -> list[Measure]:
-    """Set two worlds with the same object to the same state, let them go through contacts and motions alike: they must stay equal."""
-    backend = bench.backend()
-    end = _busy(bench, backend)
-    one, other = 0, len(bench.scene.objects)  # hold the same object
-    tolerances = _SAME if backend.device.type == "cuda" else _EXACT
-    return compare_states(end[[one]], end[[other]], tolerances)
-
-
-def repeatable(bench: Bench) -> list[Measure]:
-    """Do the same twice, with something else in between, and once more in worlds newly built: every bit must be the same.
-
-    The worlds that the checks share will not do: the masses that another check has put back in them are rounded to single precision.
-    """
-    with bench.other(bench.scene, bench.NUM_WORLDS, bench.object_index) as backend:
-        if backend.device.type != "cpu":
-            raise Skipped("only CPUs add numbers in the same order every time")
-        first = _busy(bench, backend)
-        backend.set_state(random_state(bench, bench.scene, bench.NUM_WORLDS, seed=9).to(backend.device))
-        backend.step(30)
-        measures = compare_states(_busy(bench, backend), first, _EXACT, "again,")
-    with bench.other(bench.scene, bench.NUM_WORLDS, bench.object_index) as new:
-        return measures + compare_states(_busy(bench, new), first, _EXACT, "newly built,")
-
-
 def _busy(bench: Bench, backend: Backend) -> State:
     """[N] states after 0.4 s in which tilted, spinning objects fall on the table and every joint moves, alike in all worlds."""
     start = bench.start()
@@ -216,92 +233,27 @@ def _busy(bench: Bench, backend: Backend) -> State:
     return snapshot(backend.state())
 
 
+@check(
+    "a world that is not finite is named, harms no other, and is healed by setting it",
+    "the engine hides it (automatic reset), spreads it, or keeps it in a cache",
+    last=True,
+)
 def broken_world(bench: Bench) -> list[Measure]:
     """Give one world a velocity that is not a number: health names it and no other, the others go on, and setting it again heals it."""
     backend = bench.backend()
     good = bench.start()
-    backend.set_state(good.to(backend.device))
-    backend.step(4)
-    expected = snapshot(backend.state())
+    expected = advanced(backend, good, 4)
 
     bad = bench.start()
     bad.object_linvel[1] = float("nan")
-    backend.set_state(bad.to(backend.device))
-    backend.step(4)
+    after = advanced(backend, bad, 4)
     flags = backend.health().nonfinite.cpu()
     others = [0, 2, 3]
     wrong = (flags != torch.tensor([False, True, False, False])).float()
-    measures = [Measure(what="worlds named wrongly", measured=float(wrong.sum()), tolerance=0.5)]
-    measures += compare_states(snapshot(backend.state())[others], expected[others], _SAME, "others'")
+    measures = [Measure("worlds named wrongly", float(wrong.sum()), 0.5)]
+    measures += compare_states(after[others], expected[others], _SAME, "others'")
     backend.set_state(good[[1]].to(backend.device), torch.tensor([1], device=backend.device))
     backend.step(1)
-    measures.append(Measure(what="worlds broken after healing", measured=float(backend.health().nonfinite.sum()), tolerance=0.5))
-    measures.append(
-        Measure(what="healed object_pos", measured=largest(backend.state().object_pos[1].cpu() - good.object_pos[1]), tolerance=1e-3)
-    )
+    measures.append(Measure("worlds broken after healing", float(backend.health().nonfinite.sum()), 0.5))
+    measures.append(Measure("healed object_pos", largest(backend.state().object_pos[1].cpu() - good.object_pos[1]), 1e-3))
     return measures
-
-
-CHECKS = (
-    Check(
-        name="nothing_stays",
-        group="worlds",
-        statement="setting a state leaves nothing of the past: no target, velocity, force or warm start",
-        cause="targets are not reset with the state; or warm starts, external forces or contact caches survive it",
-        run=nothing_stays,
-    ),
-    Check(
-        name="selected_worlds",
-        group="worlds",
-        statement="setting some worlds gives each its state and leaves the others alone",
-        cause="indices are sorted or ignored; or setting some worlds resets something of all",
-        run=selected_worlds,
-    ),
-    Check(
-        name="worlds_independent",
-        group="worlds",
-        statement="worlds do not influence one another",
-        cause="worlds share memory, a collision space, a random stream or a solver's convergence test",
-        run=worlds_independent,
-    ),
-    Check(
-        name="objects_in_a_batch",
-        group="worlds",
-        statement="a world with its own object in a batch does what that object does alone",
-        cause="a model field (shape, mass, inertia, bounds or something derived from them) is world 0's in all worlds",
-        run=objects_in_a_batch,
-    ),
-    Check(
-        name="twins",
-        group="worlds",
-        statement="two worlds in the same state stay equal, on a CPU to the last bit",
-        cause="worlds share a random stream; a world's number, place or neighbours enter its physics; contacts come in another order",
-        run=twins,
-    ),
-    Check(
-        name="repeatable",
-        group="worlds",
-        statement="on a CPU, the same input gives the same output to the last bit, whatever was before and in new worlds too",
-        cause="a random stream, time or memory's addresses enter the physics; contact caches or warm starts survive the setting of a state",
-        run=repeatable,
-    ),
-    Check(
-        name="masked_set",
-        group="worlds",
-        statement="setting the worlds of a mask does what the single setters do for those worlds, and nothing to the others",
-        cause="values are taken in the order of the mask instead of the worlds; the mask is ignored; derived quantities are left out",
-        run=masked_set,
-        capabilities=("object_mass", "friction", "object_gravity"),
-    ),
-)
-
-LAST = (
-    Check(
-        name="broken_world",
-        group="worlds",
-        statement="a world that is not finite is named, harms no other, and is healed by setting it",
-        cause="the engine hides it (automatic reset), spreads it, or keeps it in a cache",
-        run=broken_world,
-    ),
-)
-"""Run at the end: an engine that cannot stand numbers that are not finite may take the process with it."""

@@ -6,8 +6,8 @@ Actions are kept as joint targets, not as a policy's outputs: what a policy's ou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ import torch
 
 from xreset.env import Reading
 from xreset.errors import FileFormatError
-from xreset.eval.engines.episodes import Episode, Motion, closing_episode
+from xreset.eval.engines.episodes import Motion, closing_episode
 from xreset.eval.engines.grasps import Grasps
 from xreset.eval.metrics import MetricsConfig
 from xreset.eval.rollout import Trace, episode_starts, play
@@ -58,15 +58,10 @@ _FIELDS: Schema = {
 class Actions:
     """One action sequence from one state."""
 
-    robot: RobotSpec
-    object: ObjectSpec
+    scene: SceneSpec
+    """With one object."""
     label: str
     """What it is, for people."""
-    timestep: float
-    """Physics timestep [s]."""
-    substeps: int
-    """Physics steps per control step."""
-    friction: PairFriction
     start: State
     """[1, ...]"""
     joint_target: torch.Tensor
@@ -75,9 +70,14 @@ class Actions:
     """Parts of the sequence: name, and when it begins [s]."""
 
     @property
-    def scene(self) -> SceneSpec:
-        """The scene that it is played in."""
-        return SceneSpec(robot=self.robot, objects=(self.object,), friction=self.friction, timestep=self.timestep, substeps=self.substeps)
+    def robot(self) -> RobotSpec:
+        """The scene's."""
+        return self.scene.robot
+
+    @property
+    def object(self) -> ObjectSpec:
+        """The scene's."""
+        return self.scene.objects[0]
 
     def phase_at(self, time: float) -> str:
         """Name of the phase at a time [s]; empty if there are none."""
@@ -111,7 +111,8 @@ def grasp_and_lift(
         "shake x": motion.shake,
         "shake y": motion.shake,
     }
-    return _of_episode(episode, scene, label=f"grasp and lift of {thing.name}, {grasps.label[number]}", phases=_phases(durations, dt))
+    label = f"grasp and lift of {thing.name}, {grasps.label[number]}"
+    return Actions(scene=scene, label=label, start=episode.start, joint_target=episode.targets[:, 0], phases=_phases(durations, dt))
 
 
 def play_policy(
@@ -145,14 +146,9 @@ def play_policy(
                 progress(step, env.max_episode_length)
 
         play(policy, env, points, MetricsConfig(), look)
-    scene = trial.nominal_scene
     return Actions(
-        robot=trial.robot,
-        object=trial.objects[thing],
+        scene=replace(trial.nominal_scene, objects=(trial.objects[thing],)),
         label=f"{policy.name} in {engine.name}, {trial.bank.sequence_name[sequence]} (perturbation {repetition}, seed {trial.seed})",
-        timestep=scene.timestep,
-        substeps=scene.substeps,
-        friction=scene.friction,
         start=State.at_rest(start.joint_pos, start.object_pos, start.object_quat),
         joint_target=torch.stack(targets),
     )
@@ -179,21 +175,13 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
             f"{len(trace.joint_target)} actions at {1 / scene.control_dt:.0f} Hz last {length:.2f} s, but the episode lasts "
             f"{trace.time[-1]:.2f} s: it was played at another control rate. Give --policy instead, which knows its own."
         )
-    return Actions(
-        robot=robot,
-        object=thing,
-        label=label,
-        timestep=scene.timestep,
-        substeps=scene.substeps,
-        friction=scene.friction,
-        start=State.at_rest(*first),
-        joint_target=torch.as_tensor(trace.joint_target, dtype=torch.float32),
-    )
+    target = torch.as_tensor(trace.joint_target, dtype=torch.float32)
+    return Actions(scene=scene, label=label, start=State.at_rest(*first), joint_target=target)
 
 
 def write_actions(path: str | Path, actions: Actions) -> None:
     """Write an action sequence; see :func:`xreset.files.write_npz`."""
-    friction = actions.friction
+    scene, friction = actions.scene, actions.scene.friction
     write_npz(
         path,
         SCHEMA,
@@ -204,8 +192,8 @@ def write_actions(path: str | Path, actions: Actions) -> None:
             "object_name": actions.object.name,
             "object_source": actions.object.source,
             "label": actions.label,
-            "timestep": np.float64(actions.timestep),
-            "substeps": np.int64(actions.substeps),
+            "timestep": np.float64(scene.timestep),
+            "substeps": np.int64(scene.substeps),
             "friction": np.array([friction.tip, friction.link, friction.table]),
             "phase_name": np.array([name for name, _ in actions.phases], dtype=np.str_),
             "phase_start": np.array([start for _, start in actions.phases], dtype=np.float64),
@@ -226,7 +214,8 @@ def read_actions(path: str | Path, robot: RobotSpec, objects: Callable[[str], Ob
     Raises:
         FileFormatError: the file is damaged, or for another robot or object geometry.
     """
-    a = read_npz(path, SCHEMA, _FIELDS, what="an action sequence", check=_check)
+    empty = "it has no control step."
+    a = read_npz(path, SCHEMA, _FIELDS, what="an action sequence", check=lambda a: None if len(a["joint_target"]) else empty)
     names = tuple(a["joint_names"].tolist())
     check_robot(path, "action sequence", robot, name=str(a["robot"]), joint_names=names, fingerprint=str(a["robot_fingerprint"]))
     thing = objects(str(a["object_name"]))
@@ -236,13 +225,10 @@ def read_actions(path: str | Path, robot: RobotSpec, objects: Callable[[str], Ob
             "Give the same --objects folder."
         )
     tip, link, table = a["friction"].tolist()
+    friction = PairFriction(tip=tip, link=link, table=table)
     return Actions(
-        robot=robot,
-        object=thing,
+        scene=SceneSpec(robot=robot, objects=(thing,), friction=friction, timestep=float(a["timestep"]), substeps=int(a["substeps"])),
         label=str(a["label"]),
-        timestep=float(a["timestep"]),
-        substeps=int(a["substeps"]),
-        friction=PairFriction(tip=tip, link=link, table=table),
         start=State(**{name: torch.as_tensor(a[key], dtype=torch.float32)[None] for name, key in _STATE_KEYS.items()}),
         joint_target=torch.as_tensor(a["joint_target"], dtype=torch.float32),
         phases=tuple(zip(a["phase_name"].tolist(), a["phase_start"].tolist(), strict=True)),
@@ -254,28 +240,7 @@ def robot_of(path: str | Path) -> str:
     return str(read_npz(path, SCHEMA, _FIELDS, what="an action sequence")["robot"])
 
 
-def _check(arrays: dict[str, np.ndarray]) -> str | None:
-    if not len(arrays["joint_target"]):
-        return "it has no control step."
-    return None
-
-
-def _of_episode(episode: Episode, scene: SceneSpec, *, label: str, phases: Sequence[tuple[str, float]]) -> Actions:
-    """The only world of an episode."""
-    return Actions(
-        robot=scene.robot,
-        object=scene.objects[0],
-        label=label,
-        timestep=scene.timestep,
-        substeps=scene.substeps,
-        friction=scene.friction,
-        start=episode.start,
-        joint_target=episode.targets[:, 0],
-        phases=tuple(phases),
-    )
-
-
-def _phases(durations: dict[str, float], dt: float) -> list[tuple[str, float]]:
+def _phases(durations: dict[str, float], dt: float) -> tuple[tuple[str, float], ...]:
     """When each part begins, in whole control steps [s]."""
     steps = [round(seconds / dt) for seconds in durations.values()]
-    return [(name, sum(steps[:i]) * dt) for i, name in enumerate(durations)]
+    return tuple((name, sum(steps[:i]) * dt) for i, name in enumerate(durations))

@@ -14,9 +14,8 @@ from typing import Any, Literal
 import numpy as np
 
 from xreset.errors import XResetError
-from xreset.eval.engines.dials import NO_CONTACT_DIAL, contact_dial
 from xreset.eval.engines.measure import Measured, measure
-from xreset.eval.engines.perturb import Alteration, altered_engine
+from xreset.eval.engines.perturb import NO_CONTACT_DIAL, Alteration, altered_engine, contact_dial
 from xreset.eval.engines.properties import PROPERTIES
 from xreset.eval.rollout import Episode, roll_out
 from xreset.eval.stats import bootstrap_ci95

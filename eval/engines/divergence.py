@@ -6,14 +6,13 @@ Shape letters: T control steps, J joints, E fingertips.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from xreset.eval.engines.recording import Recording
+from xreset.eval.engines.episodes import Recording
 from xreset.geometry.rotations import quat_angle
 from xreset.geometry.urdf import robot_tree
 from xreset.spec import RobotSpec
@@ -61,10 +60,6 @@ class Parting:
     """When it is that [s]."""
     largest_where: str
     """Where it is that."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON-able content."""
-        return {f: getattr(self, f) for f in self.__dataclass_fields__}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,10 +127,10 @@ def partings(d: Differences, robot: RobotSpec, thresholds: Thresholds) -> tuple[
     fingers = robot.fingertip_names
     return (
         _joints(d, robot.joint_names, limit, thresholds),
-        _plain("object position", "m", d.time, d.position, thresholds.position),
-        _plain("object orientation", "rad", d.time, d.angle, thresholds.angle),
+        _parting("object position", "m", d.time, d.position, thresholds.position),
+        _parting("object orientation", "rad", d.time, d.angle, thresholds.angle),
         _contacts(d, fingers, thresholds),
-        _plain("contact force", "N", d.time, d.force.max(axis=1), thresholds.force, [fingers[i] for i in d.force.argmax(axis=1)]),
+        _parting("contact force", "N", d.time, d.force.max(axis=1), thresholds.force, lambda step: fingers[int(d.force[step].argmax())]),
     )
 
 
@@ -145,19 +140,8 @@ def worst(several: Sequence[tuple[Parting, ...]]) -> tuple[Parting, ...]:
     for same in zip(*several, strict=True):
         first = min(same, key=lambda p: math.inf if p.time is None else p.time)
         most = max(same, key=lambda p: p.largest / p.threshold)
-        out.append(
-            Parting(
-                quantity=first.quantity,
-                unit=most.unit,
-                threshold=most.threshold,
-                time=first.time,
-                where=first.where,
-                end=max(p.end for p in same if p.unit == most.unit),
-                largest=most.largest,
-                largest_time=most.largest_time,
-                largest_where=most.largest_where,
-            )
-        )
+        end = max(p.end for p in same if p.unit == most.unit)
+        out.append(replace(most, quantity=first.quantity, time=first.time, where=first.where, end=end))
     return tuple(out)
 
 
@@ -167,70 +151,41 @@ def first_of(found: Sequence[Parting]) -> Parting | None:
     return min(parted, key=lambda p: p.time or 0.0, default=None)
 
 
-def _plain(quantity: str, unit: str, time: np.ndarray, value: np.ndarray, threshold: float, where: list[str] | None = None) -> Parting:
-    beyond = np.flatnonzero(value >= threshold)
-    first, most = (int(beyond[0]) if len(beyond) else None), int(value.argmax())
+def _parting(
+    quantity: str, unit: str, time: np.ndarray, value: np.ndarray, threshold: float,
+    where: Callable[[int], str] = lambda step: "", beyond: np.ndarray | None = None,
+) -> Parting:  # fmt: skip
+    """How a difference [T] parts: from the first step that is ``beyond`` [T] bool on; default: that reaches the threshold."""
+    beyond = value >= threshold if beyond is None else beyond
+    first, most = (int(beyond.argmax()) if beyond.any() else None), int(value.argmax())
     return Parting(
-        quantity=quantity,
-        unit=unit,
-        threshold=threshold,
-        time=None if first is None else float(time[first]),
-        where="" if where is None or first is None else where[first],
-        end=float(value[-1]),
-        largest=float(value[most]),
-        largest_time=float(time[most]),
-        largest_where="" if where is None else where[most],
-    )
+        quantity=quantity, unit=unit, threshold=threshold, time=None if first is None else float(time[first]),
+        where="" if first is None else where(first), end=float(value[-1]), largest=float(value[most]), largest_time=float(time[most]),
+        largest_where=where(most),
+    )  # fmt: skip
 
 
 def _joints(d: Differences, names: Sequence[str], limit: np.ndarray, thresholds: Thresholds) -> Parting:
     """In rad, or in m where the joint that differs most is prismatic; never a mixture: the joint is chosen first, then its unit."""
     share = d.joint / limit
-    which = share.argmax(axis=1)
-    beyond = np.flatnonzero(share.max(axis=1) >= 1.0)
     most = int(share.max(axis=1).argmax())
-    joint = int(which[most])
-    first = int(beyond[0]) if len(beyond) else None
-    same_kind = limit == limit[joint]
-    return Parting(
-        quantity="joints",
-        unit="rad" if limit[joint] == thresholds.joint else "m",
-        threshold=float(limit[joint]),
-        time=None if first is None else float(d.time[first]),
-        where="" if first is None else names[int(which[first])],
-        end=float(d.joint[-1, same_kind].max()),
-        largest=float(d.joint[most, joint]),
-        largest_time=float(d.time[most]),
-        largest_where=names[joint],
-    )
+    joint = int(share[most].argmax())
+    kind, unit = limit == limit[joint], "rad" if limit[joint] == thresholds.joint else "m"
+    found = _parting("joints", unit, d.time, share.max(axis=1), 1.0, lambda step: names[int(share[step].argmax())])
+    return replace(found, threshold=float(limit[joint]), end=float(d.joint[-1, kind].max()), largest=float(d.joint[most, joint]))
 
 
 def _contacts(d: Differences, fingers: Sequence[str], thresholds: Thresholds) -> Parting:
     """The difference is the number of fingers that touch in one and not in the other."""
     other = d.touch != d.reference_touch
     number = other.sum(axis=1)
-    dt = float(d.time[0])
-    need = max(1, round(thresholds.contact_time / dt))
-    lasting = _runs(number > 0, need)
-    first, most = (int(np.argmax(lasting)) if lasting.any() else None), int(number.argmax())
+    lasting = _runs(number > 0, max(1, round(thresholds.contact_time / float(d.time[0]))))
 
     def describe(step: int) -> str:
-        parts = []
-        for i in np.flatnonzero(other[step]).tolist():
-            parts.append(f"{fingers[i]} touches" if d.touch[step, i] else f"{fingers[i]} does not touch")
-        return ", ".join(parts)
+        touched = np.flatnonzero(other[step]).tolist()
+        return ", ".join(f"{fingers[i]} {'touches' if d.touch[step, i] else 'does not touch'}" for i in touched)
 
-    return Parting(
-        quantity="contacts",
-        unit="fingers",
-        threshold=1.0,
-        time=None if first is None else float(d.time[first]),
-        where="" if first is None else describe(first),
-        end=float(number[-1]),
-        largest=float(number[most]),
-        largest_time=float(d.time[most]),
-        largest_where=describe(most),
-    )
+    return _parting("contacts", "fingers", d.time, number, 1.0, describe, lasting)
 
 
 def _runs(flags: np.ndarray, need: int) -> np.ndarray:

@@ -1,7 +1,9 @@
-"""Action sequences that try a grasp: close the hand, lift, shake. Open loop, in joint targets, made without any engine.
+"""Action sequences that try a grasp: close the hand, lift, shake; and what an engine makes of them.
+
+They are open loop, in joint targets, made without any engine.
 
 The hand closes along the line between thumb and fingers, which any hand with a thumb and another finger has, whatever its joints are.
-Shape letters: G grasps, J joints, E fingertips, T control steps.
+Shape letters: G grasps (one per world), J joints, E fingertips, T control steps, P surface points.
 """
 
 from __future__ import annotations
@@ -13,7 +15,8 @@ import torch
 from torch import Tensor
 
 from xreset.geometry.kinematics import Kinematics
-from xreset.physics import State
+from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
+from xreset.physics import Backend, State
 from xreset.spec import RobotSpec
 
 
@@ -65,6 +68,63 @@ class Episode:
     def first(self, steps: int) -> Episode:
         """Its first control steps."""
         return Episode(start=self.start, targets=self.targets[:steps])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """What an engine did with an episode, after each control step, on the CPU."""
+
+    start: State
+    """[G, ...] where it began."""
+    joint_pos: Tensor
+    """[T, G, J] rad (m)"""
+    joint_target: Tensor
+    """[T, G, J]"""
+    object_pos: Tensor
+    """[T, G, 3]"""
+    object_quat: Tensor
+    """[T, G, 4]"""
+    palm_pos: Tensor
+    """[T, G, 3]"""
+    palm_quat: Tensor
+    """[T, G, 4]"""
+    tip_force: Tensor
+    """[T, G, E, 3] on the object, world frame [N]."""
+    tip_touch: Tensor
+    """[T, G, E] bool"""
+    broken: Tensor
+    """[G] bool: not finite, or contacts overflowed."""
+
+    def state_after(self, step: int) -> State:
+        """[G] the state after a control step, brought to rest: positions and targets, without velocities."""
+        return State.at_rest(self.joint_pos[step], self.object_pos[step], self.object_quat[step], self.joint_target[step])
+
+    def in_palm(self, step: int, points: Tensor) -> Tensor:
+        """[G, P, 3] where points [G, P, 3] of the objects (in their mesh frames) are in the palm's frame after a control step [m]."""
+        world = self.object_pos[step][:, None] + quat_rotate(self.object_quat[step][:, None], points)
+        return quat_rotate_inverse(self.palm_quat[step][:, None], world - self.palm_pos[step][:, None])
+
+
+def play(backend: Backend, episode: Episode) -> Recording:
+    """Set each world to its start and give the drives the episode's targets."""
+    backend.set_state(episode.start.to(backend.device))
+    rows: list[dict[str, Tensor]] = []
+    for target in episode.targets.to(backend.device):
+        backend.set_joint_targets(target)
+        backend.step()
+        state, links, contacts = backend.state(), backend.links(), backend.contacts()
+        now = {
+            "joint_pos": state.joint_pos, "object_pos": state.object_pos, "object_quat": state.object_quat, "palm_pos": links.pos[:, 0],
+            "palm_quat": links.quat[:, 0], "tip_force": contacts.tip_force, "tip_touch": contacts.tip_touch,
+        }  # fmt: skip
+        rows.append({name: value.cpu().clone() for name, value in now.items()})
+    health = backend.health()
+    return Recording(
+        start=episode.start.to("cpu"),
+        joint_target=episode.targets.cpu(),
+        broken=(health.nonfinite | health.overflow).cpu(),
+        **{name: torch.stack([row[name] for row in rows]) for name in rows[0]},
+    )
 
 
 def closing_episode(

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from xreset.eval.engines.replay import EngineTrace, TraceResult
-from xreset.eval.report.clips import encode_mp4
-from xreset.eval.report.plots import COLORS, figure_style
+from xreset.eval.plots import COLORS, figure_style, picture
+from xreset.eval.report.clips import camera_at, encode_mp4
 from xreset.files import atomic_write
-
-if TYPE_CHECKING:
-    from xreset.pictures.raster import Camera, Renderer
+from xreset.pictures.raster import Renderer, pose_matrix
 
 SIZE = (320, 300)
 """Width and height of one engine's picture [pixels]; even, as video encoders ask."""
@@ -31,10 +27,8 @@ def write_strip(
     total = len(result.actions.joint_target)
     steps = np.unique(np.linspace(0, total - 1, count).round().astype(int))
     renderer = _renderer(result)
-    dt = result.actions.timestep * result.actions.substeps
-    with figure_style({"font.size": 9}) as figure_class:
-        width = 2.0 * len(steps)
-        figure = figure_class(figsize=(width, 1.95 * len(engines) + 0.5), layout="constrained", facecolor="white")
+    dt = result.actions.scene.control_dt
+    with picture(path, (2.0 * len(steps), 1.95 * len(engines) + 0.5), dpi=110, font_size=9) as figure:
         grid = figure.subplots(len(engines), len(steps), squeeze=False)
         figure.suptitle(result.actions.label)
         for row, (engine, axes) in enumerate(zip(engines, grid, strict=True)):
@@ -47,16 +41,12 @@ def write_strip(
                     ax.set_title(f"{time:.2f} s {result.actions.phase_at(time)}".rstrip(), fontsize="medium")
                 progress(row * len(steps) + column + 1, len(engines) * len(steps))
             axes[0].set_ylabel(engine.name, color=COLORS[row % len(COLORS)], fontweight="bold")
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=110)
-    with atomic_write(path) as file:
-        file.write(buffer.getbuffer())
 
 
 def write_film(path: Path, result: TraceResult, *, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
     """Write an mp4 at the sequence's own speed, engines side by side, the reference first."""
     engines = (result.reference, *result.engines)
-    dt = result.actions.timestep * result.actions.substeps
+    dt = result.actions.scene.control_dt
     every = max(1, round(1.0 / (FRAMES_PER_SECOND * dt)))
     steps = list(range(0, len(result.actions.joint_target), every))
     renderer, banner = _renderer(result), _banner([e.name for e in engines])
@@ -72,31 +62,17 @@ def write_film(path: Path, result: TraceResult, *, progress: Callable[[int, int]
 
 def _picture(renderer: Renderer, engine: EngineTrace, step: int) -> np.ndarray:
     """[H, W, 3] the state after a control step; the last finite one where the engine's is not."""
-    from xreset.pictures.raster import pose_matrix
-
     step = min(step, max(len(engine.differences.time) - 1, 0))
     r = engine.recording
     return renderer.draw(r.joint_pos[step, 0].numpy(), pose_matrix(r.object_pos[step, 0].numpy(), r.object_quat[step, 0].numpy()))
 
 
 def _renderer(result: TraceResult) -> Renderer:
-    from xreset.pictures.raster import Renderer
-
-    return Renderer(result.actions.scene, size=SIZE, camera=_camera(result))
-
-
-def _camera(result: TraceResult) -> Camera:
     """From the front right, near enough to see fingers, and far enough for the object's path in the reference."""
-    from xreset.pictures.raster import Camera
-
     path = result.reference.recording.object_pos[:, 0].double().numpy()
     low, high = path.min(axis=0), path.max(axis=0)
-    center = (low + high) / 2 + (0.0, 0.0, 0.05)
-    default = Camera()
-    away = np.subtract(default.eye, default.target)
-    distance = 0.55 + 1.1 * float(np.linalg.norm(high - low))
-    eye = center + away / np.linalg.norm(away) * distance
-    return Camera(eye=tuple(eye.tolist()), target=tuple(center.tolist()), fov=default.fov)
+    camera = camera_at((low + high) / 2 + (0.0, 0.0, 0.05), 0.55 + 1.1 * float(np.linalg.norm(high - low)))
+    return Renderer(result.actions.scene, size=SIZE, camera=camera)
 
 
 def _banner(names: Sequence[str]) -> np.ndarray:

@@ -10,18 +10,21 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from xreset.backends.pool import initial_state
+from xreset.backends.conformance.harness import free_place, start_state
+from xreset.backends.conformance.scene import shape, solid
 from xreset.errors import XResetError
 from xreset.eval.trial import Engine
 from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate_inverse
+from xreset.geometry.shapes import hull
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import State
 from xreset.pictures.raster import link_meshes
-from xreset.spec import GRAVITY, Geometry, ObjectSpec, SceneSpec, Shape
+from xreset.spec import GRAVITY, ObjectSpec, SceneSpec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +128,7 @@ class _Bench:
         self.count, self.object_index = len(objects), torch.tensor(objects)
         self._presses = {"tip": _reachable(scene, tip=True), "link": _reachable(scene, tip=False)}
         self._dt = scene.timestep
-        self._place = _free_place(scene)
+        self._place = free_place(scene)
         _, axes = np.linalg.eigh(thing.inertia)
         self._axes = axes.T  # principal axes in the object's frame: the torque about the first acts along it, and so on
 
@@ -221,23 +224,23 @@ class _Bench:
     # What is done to the worlds ----------------------------------------------------------------------------------------------------------
 
     def _start(self) -> State:
-        rows = [initial_state(self.scene, int(i)) for i in self.object_index]
-        far = np.array([*self._place, 0.6])
-        for name, row in zip(self._names, rows, strict=True):
+        start = start_state(self.scene, self.object_index)
+        pos, quat, linvel = start.object_pos, start.object_quat, start.object_linvel
+        for i, name in enumerate(self._names):
             if name in _SLABS:
-                row["object_pos"] = np.array([*self._place, _SLAB_HALF[2]])
+                pos[i] = torch.tensor([*self._place, _SLAB_HALF[2]])
             elif name in _TOPS:
-                row["object_pos"] = np.array([*self._place, 0.0])
-                row["object_angvel"] = np.array([0.0, 0.0, self._spin()])
+                pos[i] = torch.tensor([*self._place, 0.0])
+                start.object_angvel[i, 2] = self._spin()
             elif name in self._presses:
                 point, normal, _ = self._presses[name]
-                row["object_pos"] = point + (_SLAB_HALF[2] + 5e-4) * normal
-                row["object_quat"] = _z_to(normal)
+                pos[i] = torch.as_tensor(point + (_SLAB_HALF[2] + 5e-4) * normal)
+                quat[i] = torch.as_tensor(_z_to(normal))
             else:
-                row["object_pos"] = far
-        rows[0]["object_linvel"] = np.array([_SPEED, 0.0, 0.0])
-        rows[1]["object_linvel"] = _SPEED * np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0])
-        return State(**{name: torch.as_tensor(np.stack([row[name] for row in rows]), dtype=torch.float32) for name in rows[0]})
+                pos[i] = torch.tensor([*self._place, 0.6])
+        linvel[0, 0] = _SPEED
+        linvel[1, :2] = _SPEED * np.sqrt(0.5)
+        return start
 
     def _loads(self, step: int) -> tuple[Tensor, Tensor]:
         """Force and torque [N, 3] on the objects in a physics step."""
@@ -307,54 +310,15 @@ class _Bench:
 
 
 def _block(name: str, *, inertia: np.ndarray) -> ObjectSpec:
-    x, y, z = _SLAB_HALF
-    corners = np.array([[i, j, k] for i in (-x, x) for j in (-y, y) for k in (-z, z)])
-    faces = [
-        [0, 1, 3],
-        [0, 3, 2],
-        [4, 6, 7],
-        [4, 7, 5],
-        [0, 4, 5],
-        [0, 5, 1],
-        [2, 3, 7],
-        [2, 7, 6],
-        [0, 2, 6],
-        [0, 6, 4],
-        [1, 5, 7],
-        [1, 7, 3],
-    ]
-    return ObjectSpec(
-        name=name,
-        pieces=(Shape(geometry=Geometry(kind="box", size=_SLAB_HALF)),),
-        mass=_SLAB_MASS,
-        com=np.zeros(3),
-        inertia=np.diag(inertia),
-        vertices=corners,
-        faces=np.array(faces),
-    )
+    return replace(solid(name, _SLAB_MASS, (shape("box", _SLAB_HALF, (0, 0, 0)),)), com=np.zeros(3), inertia=np.diag(inertia))
 
 
 def _top(name: str, points: Sequence[Sequence[float]]) -> ObjectSpec:
     """A cone upside down, with these points [m] at its lower end; the mesh's origin is on the floor, and so is the centre of mass."""
-    from scipy.spatial import ConvexHull
-
     angle = np.arange(8) * np.pi / 4
     rim = np.stack((_TOP_RADIUS * np.cos(angle), _TOP_RADIUS * np.sin(angle), np.full(8, _TOP_HEIGHT)), axis=1)
-    vertices = np.concatenate((np.array(points), rim))
-    hull = ConvexHull(vertices)
-    faces = hull.simplices.copy()
-    a, b, c = vertices[faces].swapaxes(0, 1)
-    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
-    faces[inward] = faces[inward, ::-1]
-    return ObjectSpec(
-        name=name,
-        pieces=(Shape(geometry=Geometry(kind="hull", vertices=vertices, faces=faces)),),
-        mass=_SLAB_MASS,
-        com=np.zeros(3),
-        inertia=np.diag(_TOP_INERTIA),
-        vertices=vertices,
-        faces=faces,
-    )
+    cone = solid(name, _SLAB_MASS, (hull(np.concatenate((np.array(points), rim))),))
+    return replace(cone, com=np.zeros(3), inertia=np.diag(_TOP_INERTIA))
 
 
 def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -400,20 +364,8 @@ def _directions(count: int) -> np.ndarray:
     return np.stack((r * np.cos(angle), r * np.sin(angle), z), axis=1)
 
 
-def _free_place(scene: SceneSpec) -> tuple[float, float]:
-    """A place on the table, far from the robot's base and hand, from which a slab can slide."""
-    robot, table = scene.robot, scene.table
-    palm = Kinematics(robot).link_poses(torch.as_tensor(robot.home), [robot.palm])[0, :2, 3].numpy()
-    avoid = np.stack((palm, np.array(robot.base_pos[:2])))
-    (x, y), (hx, hy, _) = table.center, table.half_size
-    corners = [(x + sx * (hx - 0.25), y + sy * (hy - 0.2)) for sx in (-1, 1) for sy in (-1, 1)]
-    return max(corners, key=lambda c: float(np.linalg.norm(avoid - np.array(c), axis=1).min()))
-
-
 def _z_to(direction: np.ndarray) -> np.ndarray:
     """[4] a rotation that turns z into a unit vector."""
-    from scipy.spatial.transform import Rotation
-
     x = np.cross(np.eye(3)[np.abs(direction).argmin()], direction)
     x /= np.linalg.norm(x)
     return Rotation.from_matrix(np.stack((x, np.cross(direction, x), direction), axis=1)).as_quat(scalar_first=True)

@@ -11,9 +11,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
+from jinja2 import UndefinedError
+
 from xreset.backends.conformance.results import SCHEMA as CONFORMANCE
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.engines.agreement import SCHEMA as PARITY
+from xreset.eval.pages import render
+from xreset.eval.table import Rows, markdown
 from xreset.files import read_json
 from xreset.physics import Capability
 from xreset.text import shown
@@ -41,39 +45,14 @@ class Source:
 
     name: str
     command: str
-    xreset_version: str
+    version: str
+    """Of xreset."""
     covers: str
     """What it measured, in words."""
 
 
-@dataclass(frozen=True)
-class Checks:
-    """Results of the conformance suite with one robot."""
-
-    robot: str
-    results: dict[Column, dict[str, dict[str, Any]]]
-    """Of each engine on each device, its checks by name, as in the file."""
-
-    @property
-    def columns(self) -> list[Column]:
-        """The engines, each one's devices side by side."""
-        return list(self.results)
-
-    @property
-    def rows(self) -> dict[str, dict[str, Any]]:
-        """Every check that any engine has run, in the order of the suite, with statement and group."""
-        rows: dict[str, dict[str, Any]] = {}
-        for checks in self.results.values():
-            rows |= {name: check for name, check in checks.items() if name not in rows}
-        return rows
-
-
-@dataclass(frozen=True)
-class Parity:
-    """A comparison of grasps, as in the file."""
-
-    source: Source
-    data: Mapping[str, Any]
+Checks = dict[Column, dict[str, dict[str, Any]]]
+"""Of each engine on each device, side by side, its checks by name, as in the file."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +63,8 @@ class Results:
     checks: dict[str, Checks] = field(default_factory=dict)
     """By robot."""
     capabilities: dict[Column, set[str]] = field(default_factory=dict)
-    parities: list[Parity] = field(default_factory=list)
+    parities: list[tuple[Source, Mapping[str, Any]]] = field(default_factory=list)
+    """Comparisons of grasps, as in their files."""
 
 
 def read(paths: Iterable[Path]) -> Results:
@@ -105,7 +85,7 @@ def read(paths: Iterable[Path]) -> Results:
             alone = Results()
             add(alone, path.name, data)
             page(alone)  # whatever the page asks of a file is there
-        except (KeyError, TypeError, AttributeError, ValueError, IndexError, OverflowError) as error:
+        except (KeyError, TypeError, AttributeError, ValueError, IndexError, OverflowError, UndefinedError) as error:
             what = f"{type(error).__name__} {shown(str(error))}"
             raise FileFormatError(f"{path} is no complete {schema}: {what}. Make it again.") from error
         add(results, path.name, data)
@@ -113,7 +93,7 @@ def read(paths: Iterable[Path]) -> Results:
         raise XResetError(
             "there is nothing to make a page of. Give files that `xreset engines check` or `xreset engines compare` wrote with --json."
         )
-    checks = {robot: Checks(robot, _side_by_side(found.results)) for robot, found in results.checks.items()}
+    checks = {robot: _side_by_side(found) for robot, found in results.checks.items()}
     return replace(results, checks=checks, capabilities=_side_by_side(results.capabilities))
 
 
@@ -127,8 +107,7 @@ def _add_conformance(results: Results, name: str, data: Mapping[str, Any]) -> No
     covers = []
     for run in data["runs"]:
         column = Column(run["engine"], run["engine_version"], run["device"])
-        checks = results.checks.setdefault(run["robot"], Checks(run["robot"], {}))
-        checks.results.setdefault(column, {}).update({check["check"]: check for check in run["checks"]})
+        results.checks.setdefault(run["robot"], {}).setdefault(column, {}).update({check["check"]: check for check in run["checks"]})
         results.capabilities.setdefault(column, set()).update(run["capabilities"])
         covers.append(f"{column.engine} {column.version} with {run['robot']} on {column.device}")
     results.sources.append(Source(name, data["command"], data["xreset_version"], "; ".join(covers)))
@@ -139,7 +118,7 @@ def _add_parity(results: Results, name: str, data: Mapping[str, Any]) -> None:
     covers = f"grasps of {data['robot']}: {engines} against {_column(data['reference']).title}"
     source = Source(name, data.get("command", ""), data.get("xreset_version", ""), covers)
     results.sources.append(source)
-    results.parities.append(Parity(source, data))
+    results.parities.append((source, data))
 
 
 def _column(engine: Mapping[str, Any]) -> Column:
@@ -147,61 +126,60 @@ def _column(engine: Mapping[str, Any]) -> Column:
     return Column(engine["backend"], engine["version"], engine["device"])
 
 
-# The page --------------------------------------------------------------------------------------------------------------------------------
-
-
 def page(results: Results) -> str:
     """The page, in Markdown."""
-    parts = [
-        "# Engines: what each can do, and how far they agree",
-        "Made by `xreset engines` from the results of the commands below; do not edit it, run them again.",
-        "Every check states what must hold, and compares with something independent of the engine: the URDF's kinematics, equations of "
-        "motion, m g, or MuJoCo, the reference. What cannot agree is declared by the engine's backend with a bound and a reason, is still "
-        "measured, and fails beyond the bound. Where no device is named, the engine ran on the CPU.",
-        *_commands(results),
-        *_capabilities(results),
+    found = [
+        (column.title, robot, name, check)
+        for robot, checks in results.checks.items()
+        for column, of in checks.items()
+        for name, check in of.items()
     ]
-    for checks in results.checks.values():
-        parts += _summary(checks)
-    parts += _known_differences(results)
-    parts += _not_done(results)
-    for parity in results.parities:
-        parts += _parity(parity)
-    for checks in results.checks.values():
-        parts += _every_number(checks)
-    return "\n\n".join(parts) + "\n"
-
-
-def _commands(results: Results) -> list[str]:
-    rows = [
-        [source.covers, f"`{source.command}`" if source.command else "not recorded", source.xreset_version] for source in results.sources
+    known = [
+        (title, robot, f"`{name}`: {m['what']}", *(_amount(m[key], m) for key in ("measured", "tolerance", "bound")), m["reason"])
+        for title, robot, name, check in found
+        for m in check["measures"]
+        if m["verdict"] == "known difference"
     ]
-    return ["## The commands", _table(["what", "command", "xreset"], rows)]
+    not_done = [
+        (title, robot, f"`{name}`", check["verdict"], check["problem"] or _failures(check))
+        for title, robot, name, check in found
+        if check["verdict"] in ("failed", "unsupported", "skipped")
+    ]
+    commands = [(s.covers, f"`{s.command}`" if s.command else "not recorded", s.version) for s in results.sources]
+    return render(
+        "engines.md.j2",
+        commands=_table(("what", "command", "xreset"), commands),
+        capabilities=_capabilities(results.capabilities),
+        summaries={robot: _summary(checks) for robot, checks in results.checks.items()},
+        known_differences=_table(("engine", "robot", "measure", "measured", "tolerance", "accepted up to", "why"), known),
+        not_done=_table(("engine", "robot", "check", "", "why"), not_done),
+        parities=[_parity(source, data) for source, data in results.parities],
+        numbers={robot: _every_number(checks) for robot, checks in results.checks.items()},
+    )
 
 
-def _capabilities(results: Results) -> list[str]:
-    if not results.capabilities:
-        return []
-    names = [*get_args(Capability), *sorted(set().union(*results.capabilities.values()) - set(get_args(Capability)))]
-    columns = list(results.capabilities)
-    rows = [[name.replace("_", " "), *("yes" if name in results.capabilities[column] else "no" for column in columns)] for name in names]
-    text = "States, drives, steps, links, contact forces and health every engine has. These it may lack, and then refuses."
-    return ["## Capabilities", text, _table(["", *(column.title for column in columns)], rows)]
+def _capabilities(found: Mapping[Column, set[str]]) -> str:
+    names = dict.fromkeys((*get_args(Capability), *sorted(set().union(*found.values()))))
+    rows = [(name.replace("_", " "), *("yes" if name in able else "no" for able in found.values())) for name in names]
+    return _table(("", *(column.title for column in found)), rows if found else ())
 
 
-def _summary(checks: Checks) -> list[str]:
+def _every_check(checks: Checks) -> dict[str, dict[str, Any]]:
+    """What any engine has run, in the order of the suite."""
+    found: dict[str, dict[str, Any]] = {}
+    for of in checks.values():
+        found |= {name: check for name, check in of.items() if name not in found}
+    return found
+
+
+def _summary(checks: Checks) -> str:
     rows, group = [], None
-    for name, check in checks.rows.items():
+    for name, check in _every_check(checks).items():
         if check["group"] != group:
             group = check["group"]
-            rows.append([f"**{group}**", *[""] * (1 + len(checks.columns))])
-        rows.append([f"`{name}`", check["statement"], *(_verdict(found.get(name)) for found in checks.results.values())])
-    text = (
-        "The number is what was measured as a share of its tolerance, of the measure that came nearest to it: up to 1 is passed. "
-        "*Known*: beyond the tolerance, within the bound declared below. *None*: the engine lacks the capability, and says so. "
-        "A hyphen: not done with this robot or on this device."
-    )
-    return [f"## Conformance with {checks.robot}", text, _table(["check", "what must hold", *(c.title for c in checks.columns)], rows)]
+            rows.append((f"**{group}**", *[""] * (1 + len(checks))))
+        rows.append((f"`{name}`", check["statement"], *(_verdict(of.get(name)) for of in checks.values())))
+    return _table(("check", "what must hold", *(c.title for c in checks)), rows)
 
 
 def _verdict(check: Mapping[str, Any] | None) -> str:
@@ -214,72 +192,41 @@ def _verdict(check: Mapping[str, Any] | None) -> str:
     return {"passed": share, "known difference": f"known, {share}"}.get(check["verdict"], f"**failed, {share}**")
 
 
-def _known_differences(results: Results) -> list[str]:
-    rows = []
-    for checks, column, name, check in _all(results):
-        for m in check["measures"]:
-            if m["verdict"] == "known difference":
-                sizes = [_amount(m[key], m) for key in ("measured", "tolerance", "bound")]
-                rows.append([column.title, checks.robot, f"`{name}`: {m['what']}", *sizes, m["reason"]])
-    header = ["engine", "robot", "measure", "measured", "tolerance", "accepted up to", "why"]
-    return ["## Known differences", _table(header, rows) if rows else "None was measured."]
-
-
-def _not_done(results: Results) -> list[str]:
-    wanted = ("failed", "unsupported", "skipped")
-    rows = [
-        [column.title, checks.robot, f"`{name}`", check["verdict"], check["problem"] or _failures(check)]
-        for checks, column, name, check in _all(results)
-        if check["verdict"] in wanted
-    ]
-    return ["## Failed, unsupported or left out", _table(["engine", "robot", "check", "", "why"], rows)] if rows else []
-
-
 def _failures(check: Mapping[str, Any]) -> str:
     failed = [m for m in check["measures"] if m["verdict"] == "failed"]
     return "; ".join(f"{m['what']}: {_amount(m['measured'], m)}, tolerance {_amount(m['tolerance'], m)}" for m in failed)
 
 
-def _parity(parity: Parity) -> list[str]:
-    data = parity.data
+def _parity(source: Source, data: Mapping[str, Any]) -> dict[str, Any]:
     columns = [data["floor"], *data["engines"]]
     known = {metric["metric"]: metric for engine in columns for metric in engine["metrics"]}
     rows = []
     for name, metric in known.items():
         found = [next((m for m in engine["metrics"] if m["metric"] == name), None) for engine in columns]
         cells = [_NONE if m is None else _missed(m, f"{_amount(m['measured'], m)} ({m['n']})") for m in found]
-        rows.append([metric["claim"], f"{metric['sense']} {_amount(metric['target'], metric)}", *cells])
-    objects = ", ".join(thing["name"] for thing in data["objects"])
-    text = (
-        f"{len(data['grasps']['closing'])} closings and {len(data['grasps']['hold'])} holds of {objects}, against "
-        f"{_column(data['reference']).title}. In brackets: how many numbers it is taken over. *{data['floor']['backend']}* shows how far "
-        f"two honest solutions of the same equations differ. Made by `{parity.source.command or parity.source.name}`."
-    )
+        rows.append((metric["claim"], f"{metric['sense']} {_amount(metric['target'], metric)}", *cells))
     titles = [_column(engine).title for engine in columns]
-    heading = f"## Agreement on grasps: {data['robot']} in {' and '.join(titles[1:])}"
-    return [heading, text, _table(["what is compared", "target", *titles], rows)]
+    return {
+        "robot": data["robot"], "engines": titles[1:], "closings": len(data["grasps"]["closing"]), "holds": len(data["grasps"]["hold"]),
+        "objects": [thing["name"] for thing in data["objects"]], "reference": _column(data["reference"]).title,
+        "floor": data["floor"]["backend"], "source": source.command or source.name,
+        "table": _table(("what is compared", "target", *titles), rows),
+    }  # fmt: skip
 
 
 def _missed(metric: Mapping[str, Any], text: str) -> str:
     return text if metric["verdict"] == "met" else f"**missed: {text}**"
 
 
-def _every_number(checks: Checks) -> list[str]:
+def _every_number(checks: Checks) -> tuple[int, str]:
+    """How many, and the table."""
     rows = []
-    for name in checks.rows:
-        by_column = [{m["what"]: m for m in found[name]["measures"]} if name in found else {} for found in checks.results.values()]
+    for name in _every_check(checks):
+        by_column = [{m["what"]: m for m in of[name]["measures"]} if name in of else {} for of in checks.values()]
         for what, measure in {what: m for measures in by_column for what, m in measures.items()}.items():
             cells = [_number(measures[what]["measured"]) if what in measures else _NONE for measures in by_column]
-            rows.append([f"`{name}`", what, _amount(measure["tolerance"], measure), *cells])
-    table = _table(["check", "measure", "tolerance", *(c.title for c in checks.columns)], rows)
-    return [f"## Every number with {checks.robot}", f"<details><summary>{len(rows)} measures</summary>", table, "</details>"]
-
-
-def _all(results: Results) -> Iterable[tuple[Checks, Column, str, Mapping[str, Any]]]:
-    for checks in results.checks.values():
-        for column, found in checks.results.items():
-            for name, check in found.items():
-                yield checks, column, name, check
+            rows.append((f"`{name}`", what, _amount(measure["tolerance"], measure), *cells))
+    return len(rows), _table(("check", "measure", "tolerance", *(c.title for c in checks)), rows)
 
 
 def _share(measure: Mapping[str, Any]) -> float:
@@ -301,6 +248,6 @@ def _number(value: Any) -> str:
 _NONE = "-"
 
 
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(" ".join(cell.replace("|", "\\|").split()) for cell in line) + " |" for line in lines)
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    """In Markdown, which cells may hold; empty without a row."""
+    return markdown(Rows(head=head, body=tuple(rows)), escape=lambda cell: " ".join(cell.replace("|", "\\|").split())) if rows else ""

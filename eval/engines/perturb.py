@@ -3,16 +3,49 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from xreset.backends.mjcf import MIN_TIME_CONSTANT_STEPS, MujocoSettings
 from xreset.errors import CapabilityError
-from xreset.eval.engines.dials import contact_dial
 from xreset.eval.trial import Engine, engine
-from xreset.physics import Backend, Contacts, Health, Links, MassProperties, State
+from xreset.physics import Backend, State
 from xreset.spec import JointSpec, SceneSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactDial:
+    """How an engine's contacts are made softer."""
+
+    options: Callable[[float], dict[str, Any]]
+    """Keywords of the backend for a factor on the time constant."""
+    smallest: float
+    """The smallest factor that the engine allows."""
+    limit: str
+    """Why it does not allow less."""
+
+
+NO_CONTACT_DIAL = {
+    "pybullet": "Bullet's sequential impulses have no stiffness: how much a contact gives follows from its iterations and steps",
+    "sapien": "PhysX's contacts are rigid: how much one gives follows from its solver's iterations",
+}
+"""Why an engine has no dial for contacts."""
+
+
+def contact_dial(backend: str) -> ContactDial | None:
+    """The dial of a backend; None if there is none."""
+    if backend not in ("mujoco", "mujoco-warp"):
+        return None
+    nominal = MujocoSettings().time_constant_steps
+    return ContactDial(
+        options=lambda factor: {"settings": MujocoSettings(time_constant_steps=nominal * factor)},
+        smallest=MIN_TIME_CONSTANT_STEPS / nominal,
+        limit="MuJoCo's contacts are as stiff as its timestep allows (a time constant of two timesteps)",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +75,7 @@ class Alteration:
     timestep: float = 1.0
     """Factor on the physics timestep; the nearest that divides a control step is taken."""
     contact_time: float = 1.0
-    """Factor on the time constant of contacts: the engine's own dial (:mod:`xreset.eval.engines.dials`)."""
+    """Factor on the time constant of contacts: the engine's own dial (:func:`contact_dial`)."""
     delay: int = 0
     """Control steps by which joint targets come late."""
 
@@ -94,6 +127,11 @@ def altered_engine(base: Engine, alteration: Alteration) -> Engine:
     return replace(base, make=make)
 
 
+def _of_inner(name: str) -> Any:
+    """A method that does what that of the worlds inside does."""
+    return lambda self, *arguments: getattr(self._inner, name)(*arguments)
+
+
 class AlteredBackend(Backend):
     """A backend that shows the scene that was asked for, and whose worlds are of another one."""
 
@@ -143,22 +181,6 @@ class AlteredBackend(Backend):
         inner, outer = self._inner.scene.substeps, self.scene.substeps
         self._inner.step(None if substeps is None else max(1, round(substeps * inner / outer)))
 
-    def links(self) -> Links:
-        """See :meth:`Backend.links`."""
-        return self._inner.links()
-
-    def contacts(self) -> Contacts:
-        """See :meth:`Backend.contacts`."""
-        return self._inner.contacts()
-
-    def health(self) -> Health:
-        """See :meth:`Backend.health`."""
-        return self._inner.health()
-
-    def mass_properties(self) -> MassProperties:
-        """See :meth:`Backend.mass_properties`: what the engine holds, altered."""
-        return self._inner.mass_properties()
-
     def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
         """See :meth:`Backend.set_object_mass`."""
         self._inner.set_object_mass(mass * self._alteration.mass, worlds)
@@ -173,26 +195,9 @@ class AlteredBackend(Backend):
         """See :meth:`Backend.set_torsional_friction`."""
         self._inner.set_torsional_friction(torsional * self._alteration.torsional_friction, worlds)
 
-    def set_object_inertia(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_inertia`; the altered inertia is what counts as 1."""
-        self._inner.set_object_inertia(scale, worlds)
-
-    def set_object_com(self, offset: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_com`."""
-        self._inner.set_object_com(offset, worlds)
-
-    def set_object_gravity(self, fraction: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_gravity`."""
-        self._inner.set_object_gravity(fraction, worlds)
-
-    def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_drives`."""
-        self._inner.set_drives(scale, worlds)
-
-    def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
-        """See :meth:`Backend.set_object_wrench`."""
-        self._inner.set_object_wrench(force, torque)
-
-    def close(self) -> None:
-        """See :meth:`Backend.close`."""
-        self._inner.close()
+    links, contacts, health, mass_properties, set_object_wrench, close = map(
+        _of_inner, ("links", "contacts", "health", "mass_properties", "set_object_wrench", "close")
+    )
+    set_object_inertia, set_object_com, set_object_gravity, set_drives = map(  # the altered inertia is what counts as 1
+        _of_inner, ("set_object_inertia", "set_object_com", "set_object_gravity", "set_drives")
+    )

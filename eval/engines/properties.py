@@ -4,32 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
-from xreset.eval.engines.dials import NO_CONTACT_DIAL, contact_dial
 from xreset.eval.engines.measure import Measured
-from xreset.eval.engines.perturb import Alteration
+from xreset.eval.engines.perturb import NO_CONTACT_DIAL, Alteration, contact_dial
 from xreset.spec import SceneSpec
 
 Change = Alteration | str
 """How an engine is changed, or why it cannot be."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Property:
     """One property."""
 
     name: str
     field: str
     """Where it is in :class:`Measured`, and in :class:`Alteration` unless ``towards`` says otherwise."""
-    unit: str
-    scale: float
-    """Factor from the measured number to the unit."""
     resolution: float
     """Differences below this are not told apart: a share of the larger value, for ``absolute`` a number in the measured unit."""
-    absolute: bool = False
-    what_if: tuple[Alteration, ...]
+    what_if: tuple[Alteration, ...] = ()
     """Changes of a usual size, to see how much the skill depends on the property; none where another property has them."""
+    _: KW_ONLY
+    unit: str = ""
+    scale: float = 1.0
+    """Factor from the measured number to the unit."""
+    absolute: bool = False
     towards: Callable[[float, float, str, SceneSpec], Change] | None = None
     """From the values in A and B, A's name and the scene to the change; None: the ratio B / A as the factor ``field``."""
     at_most: str = ""
@@ -104,59 +104,27 @@ def _delay(a: float, b: float, engine: str, scene: SceneSpec) -> Change:
     return Alteration(delay=round(b - a))
 
 
+_FARTHER = "changed in every contact, where the engines differ only beside a second point"
 PROPERTIES = (
-    Property(name="tip friction", field="tip_friction", unit="", scale=1.0, resolution=0.03, what_if=(Alteration(tip_friction=0.8),)),
-    Property(name="link friction", field="link_friction", unit="", scale=1.0, resolution=0.03, what_if=(Alteration(link_friction=0.8),)),
-    Property(name="table friction", field="table_friction", unit="", scale=1.0, resolution=0.03, what_if=(Alteration(table_friction=0.8),)),
+    Property("tip friction", "tip_friction", 0.03, (Alteration(tip_friction=0.8),)),
+    Property("link friction", "link_friction", 0.03, (Alteration(link_friction=0.8),)),
+    Property("table friction", "table_friction", 0.03, (Alteration(table_friction=0.8),)),
     Property(
-        name="torsional friction",
-        field="torsional_friction",
-        unit="mm",
-        scale=1e3,
-        resolution=5e-5,
-        absolute=True,
-        what_if=(Alteration(torsional_friction=0.0), Alteration(torsional_friction=2.0)),
-        towards=_torsion,
+        "torsional friction", "torsional_friction", 5e-5, (Alteration(torsional_friction=0.0), Alteration(torsional_friction=2.0)),
+        unit="mm", scale=1e3, absolute=True, towards=_torsion,
     ),
+    Property("patch torsional friction", "patch_torsional_friction", 0.05, absolute=True, towards=_patch_torsion, at_most=_FARTHER),
+    Property("object mass", "mass", 0.005, (Alteration(mass=1.2),)),
+    Property("object inertia", "inertia", 0.02, (Alteration(inertia=1.2),)),
+    Property("arm stiffness", "arm_stiffness", 0.02, (Alteration(arm_stiffness=0.8),)),
+    Property("arm damping", "arm_damping", 0.02, (Alteration(arm_damping=0.8),)),
+    Property("hand stiffness", "hand_stiffness", 0.03, (Alteration(hand_stiffness=0.8),)),
+    Property("hand damping", "hand_damping", 0.02, (Alteration(hand_damping=0.8),)),
+    Property("timestep", "timestep", 0.05, (Alteration(timestep=0.5),), unit="ms", scale=1e3, towards=_timestep),
     Property(
-        name="patch torsional friction",
-        field="patch_torsional_friction",
-        unit="",
-        scale=1.0,
-        resolution=0.05,
-        absolute=True,
-        what_if=(),
-        towards=_patch_torsion,
-        at_most="changed in every contact, where the engines differ only beside a second point",
+        "contact softness", "contact_give", 2e-5, (Alteration(contact_time=1.5),),
+        unit="mm", scale=1e3, absolute=True, towards=_contact_give,
     ),
-    Property(name="object mass", field="mass", unit="", scale=1.0, resolution=0.005, what_if=(Alteration(mass=1.2),)),
-    Property(name="object inertia", field="inertia", unit="", scale=1.0, resolution=0.02, what_if=(Alteration(inertia=1.2),)),
-    Property(name="arm stiffness", field="arm_stiffness", unit="", scale=1.0, resolution=0.02, what_if=(Alteration(arm_stiffness=0.8),)),
-    Property(name="arm damping", field="arm_damping", unit="", scale=1.0, resolution=0.02, what_if=(Alteration(arm_damping=0.8),)),
-    Property(name="hand stiffness", field="hand_stiffness", unit="", scale=1.0, resolution=0.03, what_if=(Alteration(hand_stiffness=0.8),)),
-    Property(name="hand damping", field="hand_damping", unit="", scale=1.0, resolution=0.02, what_if=(Alteration(hand_damping=0.8),)),
-    Property(
-        name="timestep", field="timestep", unit="ms", scale=1e3, resolution=0.05, what_if=(Alteration(timestep=0.5),), towards=_timestep
-    ),
-    Property(
-        name="contact softness",
-        field="contact_give",
-        unit="mm",
-        scale=1e3,
-        resolution=2e-5,
-        absolute=True,
-        what_if=(Alteration(contact_time=1.5),),
-        towards=_contact_give,
-    ),
-    Property(
-        name="latency",
-        field="delay",
-        unit="control steps",
-        scale=1.0,
-        resolution=0.5,
-        absolute=True,
-        what_if=(Alteration(delay=1),),
-        towards=_delay,
-    ),
-)
+    Property("latency", "delay", 0.5, (Alteration(delay=1),), unit="control steps", absolute=True, towards=_delay),
+)  # fmt: skip
 """In the order of the table. Contacts and timestep aside, every engine can be changed in all of them, for they are in the scene."""

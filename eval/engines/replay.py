@@ -14,8 +14,7 @@ import torch
 from xreset.errors import XResetError
 from xreset.eval.engines.actions import Actions
 from xreset.eval.engines.divergence import Differences, Parting, Thresholds, differences, first_of, lifted, partings, worst
-from xreset.eval.engines.episodes import Episode
-from xreset.eval.engines.recording import Recording, play
+from xreset.eval.engines.episodes import Episode, Recording, play
 from xreset.eval.trial import Engine
 from xreset.files import write_json, write_npz
 from xreset.physics import State
@@ -78,7 +77,7 @@ class TraceResult:
                 "finite_until": float(e.differences.time[-1]) if len(e.differences.time) else 0.0,
                 "broken": bool(e.recording.broken[0]),
                 "parts_first": None if first is None else first.quantity,
-                "partings": [p.as_dict() | {"within_noise": self.within_noise(p)} for p in e.partings],
+                "partings": [asdict(p) | {"within_noise": self.within_noise(p)} for p in e.partings],
             }
 
         return {
@@ -89,9 +88,9 @@ class TraceResult:
                 "object": actions.object.name,
                 "object_source": actions.object.source,
                 "steps": len(actions.joint_target),
-                "timestep": actions.timestep,
-                "substeps": actions.substeps,
-                "friction": asdict(actions.friction),
+                "timestep": actions.scene.timestep,
+                "substeps": actions.scene.substeps,
+                "friction": asdict(actions.scene.friction),
                 "phases": [{"name": name, "start": start} for name, start in actions.phases],
             },
             "thresholds": asdict(self.thresholds),
@@ -101,7 +100,7 @@ class TraceResult:
             "noise": {
                 "perturbation": self.perturbation,
                 "starts": len(self.noise_differences),
-                "partings": [p.as_dict() for p in self.noise],
+                "partings": [asdict(p) for p in self.noise],
             },
             "engines": [engine(e) for e in self.engines],
         }
@@ -137,7 +136,7 @@ def trace(
     thresholds = thresholds or Thresholds()
     if perturbed < 0 or not perturbation > 0:
         raise XResetError(f"the number of perturbed starts is {perturbed} and their size {perturbation}; expected at least 0, and above 0.")
-    dt = actions.timestep * actions.substeps
+    dt = actions.scene.control_dt
     progress(reference.name)
     theirs = _replay(actions, reference, _perturbed(actions.start, perturbed, perturbation, seed))
     base = _engine_trace(reference, theirs, theirs, actions, thresholds)
@@ -197,7 +196,7 @@ def _replay(actions: Actions, engine: Engine, start: State) -> Recording:
 
 
 def _engine_trace(engine: Engine, found: Recording, reference: Recording, actions: Actions, thresholds: Thresholds) -> EngineTrace:
-    d = differences(found, reference, actions.timestep * actions.substeps, thresholds)
+    d = differences(found, reference, actions.scene.control_dt, thresholds)
     return EngineTrace(
         name=engine.name,
         version=engine.version,

@@ -1,28 +1,78 @@
-"""Action sequences from files: what the arguments of ``xreset engines trace`` mean."""
+"""Grasps and action sequences from files: what the arguments of ``xreset engines compare`` and ``... trace`` mean."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 
 from xreset.demos.archive import SCHEMA_NAME as DEMOS
+from xreset.demos.archive import read_demos
 from xreset.description import load_robot
-from xreset.errors import DemoError, FileFormatError, XResetError
+from xreset.errors import DemoError, FileFormatError
 from xreset.eval.engines.actions import SCHEMA as ACTIONS
 from xreset.eval.engines.actions import Actions, grasp_and_lift, play_policy, read_actions, recorded_actions, robot_of
 from xreset.eval.engines.grasps import Frames, find_grasps
-from xreset.eval.evaluate import load_motion, resolve
+from xreset.eval.evaluate import resolve
 from xreset.eval.results import TRACE_SCHEMA, mesh_folder, read_result, read_traces
 from xreset.eval.setting import Place, Sequence, Setting
 from xreset.eval.trial import Engine
 from xreset.files import npz_schema
-from xreset.objects import load_object
+from xreset.objects import canonical_name, load_object, load_objects
 from xreset.resets.bank import SCHEMA as BANK
-from xreset.resets.bank import read_bank
+from xreset.resets.bank import ResetBank, check_objects, check_retargeted, check_robot, read_bank
+from xreset.retarget.file import SCHEMA as RETARGETED
 from xreset.retarget.file import read_retargeted
-from xreset.retarget.pipeline import SCHEMA as RETARGETED
+from xreset.retarget.pipeline import retarget
+from xreset.spec import ObjectSpec, RobotSpec
+
+
+def load_frames(
+    path: Path,
+    *,
+    robot: str | None = None,
+    objects_folder: Path | None = None,
+    only: Iterable[str] = (),
+    progress: Callable[[str, float, int], None] = lambda doing, done, total: None,
+) -> tuple[RobotSpec, tuple[ObjectSpec, ...], Frames]:
+    """Robot, objects and frames of retargeted trajectories, a reset bank, or demonstrations, which are retargeted here.
+
+    Args:
+        path: file.
+        robot: name or folder; default: the file's. Demonstrations need it.
+        objects_folder: folder of real meshes; None for the stand-ins.
+        only: names of the objects to use; default: all of the file.
+        progress: called with (what is being done, sequences retargeted, sequences in all).
+
+    Raises:
+        XResetError: the file, the robot or an object cannot be used, or they do not belong together.
+    """
+
+    def wanted(there: Iterable[str]) -> tuple[ObjectSpec, ...]:
+        names = sorted(set(there))
+        return load_objects(dict.fromkeys([canonical_name(name, names) for name in only] or names), objects_folder)
+
+    schema = npz_schema(path)
+    if schema == DEMOS:
+        if robot is None:
+            raise DemoError(f"{path} holds human demonstrations, which are for no robot yet: give --robot.")
+        demos, spec = read_demos(path), load_robot(robot)
+        objects = wanted(demos.object_name.tolist())
+        demos = demos.select(objects=[o.name for o in objects])
+        data = retarget(demos, spec, objects, progress=lambda done, total: progress("retargeting", done, total))
+        return spec, objects, Frames.of_retargeted(data)
+    if schema not in (RETARGETED, BANK):
+        raise FileFormatError(f"{path} states schema {schema!r}; grasps come from {RETARGETED!r}, {BANK!r} or {DEMOS!r}.")
+    data = read_retargeted(path) if schema == RETARGETED else read_bank(path)
+    spec = load_robot(robot or data.robot)
+    if not isinstance(data, ResetBank):
+        check_retargeted(path, data, spec)
+        return spec, wanted(np.asarray(data.object_name).tolist()), Frames.of_retargeted(data)
+    check_robot(path, "reset bank", spec, name=data.robot, joint_names=data.joint_names, fingerprint=data.robot_fingerprint)
+    objects = wanted(data.object_names)
+    check_objects(path, data, objects)
+    return spec, objects, Frames.of_bank(data)
 
 
 def from_file(source: Path, sequence: Sequence, place: Place) -> Actions:
@@ -37,28 +87,20 @@ def from_file(source: Path, sequence: Sequence, place: Place) -> Actions:
         FileFormatError: the file is of another kind, or for another robot.
         DemoError: there is no such grasp.
     """
-    robot, objects = place.robot, place.objects
     schema = npz_schema(source)
     if schema == ACTIONS:
-        return read_actions(source, load_robot(robot or robot_of(source)), lambda name: load_object(name, objects))
-    if schema == BANK:
-        bank = read_bank(source)
-        spec = load_robot(robot or bank.robot)
-        frames = Frames.of_bank(read_bank(source, robot=spec))
-    elif schema in (DEMOS, RETARGETED):
-        spec = load_robot(robot or _robot_of_retargeted(source, schema))
-        _, trajectories = load_motion(source, spec, objects, trajectories=True)
-        assert trajectories is not None
-        frames = Frames.of_retargeted(trajectories)
-    elif schema == TRACE_SCHEMA:
+        return read_actions(source, load_robot(place.robot or robot_of(source)), lambda name: load_object(name, place.objects))
+    if schema == TRACE_SCHEMA:
         return _from_evaluation(source, sequence, place)
-    else:
+    if schema not in (DEMOS, RETARGETED, BANK):
         raise FileFormatError(
             f"{source} states schema {schema!r}, expected {DEMOS!r} (xreset demos), {RETARGETED!r} (xreset retarget), {BANK!r} "
             f"(xreset resets), {TRACE_SCHEMA!r} (xreset eval) or {ACTIONS!r} (xreset engines trace)."
         )
-    name = _object(source, sequence.object, frames.object_name.tolist())
-    thing = load_object(name, objects)
+    only = () if sequence.object is None else (sequence.object,)
+    spec, objects, frames = load_frames(source, robot=place.robot, objects_folder=place.objects, only=only)
+    name = _object(source, objects[0].name if only else None, frames.object_name.tolist())
+    thing = next(o for o in objects if o.name == name)
     grasps = find_grasps(frames, spec, (thing,), len(frames.frame), where="table")
     if sequence.episode >= len(grasps):
         raise DemoError(f"{source} shows {len(grasps)} grasps of {name} on the table, so --episode is at most {len(grasps) - 1}.")
@@ -104,12 +146,6 @@ def _from_evaluation(source: Path, sequence: Sequence, place: Place) -> Actions:
     folder = mesh_folder(place.objects, summary.objects_folder)
     thing = load_object(found.object, folder)
     return recorded_actions(spec, thing, found, label=f"{summary.policy} in {name}, demonstration {found.sequence}")
-
-
-def _robot_of_retargeted(source: Path, schema: str) -> str:
-    if schema == DEMOS:
-        raise XResetError(f"{source} holds human demonstrations, which are for no robot yet: give --robot.")
-    return read_retargeted(source).robot
 
 
 def _object(source: Path, wanted: str | None, there: list[str]) -> str:

@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from xreset.eval.engines.episodes import Motion, closing_episode, holding_episode, lifting_episode, squeezing_state
+from xreset.eval.engines.episodes import Motion, Recording, closing_episode, holding_episode, lifting_episode, play, squeezing_state
 from xreset.eval.engines.grasps import Grasps
-from xreset.eval.engines.recording import Recording, play
 from xreset.eval.trial import Engine
 from xreset.physics import State
 from xreset.spec import RobotSpec, SceneSpec

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from xreset.eval.report.data import ASPECTS, differences
-from xreset.eval.report.groups import Group
-from xreset.eval.report.plots import short_name
-from xreset.eval.report.score import Scores
-from xreset.eval.report.trainings import Training
+from xreset.eval.pages import short_name
+from xreset.eval.report.groups import Group, Scores
+from xreset.eval.report.read import ASPECTS, Training, differences
 from xreset.eval.results import EvalResult
 
 _OF_EVALUATION = ("task.termination.", "task.reset.spawn_", "task.reset.home_noise", "task.timestep")

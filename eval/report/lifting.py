@@ -14,7 +14,7 @@ import numpy as np
 from xreset.errors import RunError
 from xreset.eval.report.groups import Group
 from xreset.eval.report.progress import Line, X, amounts
-from xreset.eval.report.trainings import Training
+from xreset.eval.report.read import Training
 from xreset.eval.stats import wilson_ci95
 from xreset.learning.clock import SHARES, Lift, Passing
 

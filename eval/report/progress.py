@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from xreset.errors import RunError
-from xreset.eval.report.trainings import Training
+from xreset.eval.report.read import Training
 
 X = Literal["minutes", "steps", "iterations"]
 """What the horizontal axis of a learning curve may be."""

@@ -1,30 +1,16 @@
-"""The comparison as tables: for a terminal, and as Markdown like that of ``docs/results.md``."""
+"""The tables of a comparison."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from xreset.errors import RunError
-from xreset.eval.report.groups import Group
+from xreset.eval.report.groups import Group, Scores, engines_of
 from xreset.eval.report.lifting import Fate, fates, share_of_runs
 from xreset.eval.report.progress import X, amounts, processes
-from xreset.eval.report.score import Scores, engines_of
-from xreset.eval.report.trainings import Fact, Training
+from xreset.eval.report.read import Fact, Training
+from xreset.eval.table import Rows
 from xreset.learning.clock import SHARES
-
-if TYPE_CHECKING:
-    from rich.table import Table
-    from rich.text import Text
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rows:
-    """A table of text."""
-
-    head: tuple[str, ...]
-    body: tuple[tuple[str, ...], ...]
 
 
 def results(groups: Sequence[Group], found: Scores) -> Rows:
@@ -47,7 +33,7 @@ def results(groups: Sequence[Group], found: Scores) -> Rows:
         }
         for i, (name, text) in enumerate(lines.items()):
             body.append(("" if i else label, name, *(text(row[e]) if e in row else "-" for e in engines)))
-    return Rows(head=("", "", *(f"{e} {', '.join(sorted(versions[e]))}" for e in engines)), body=tuple(body))
+    return Rows(title="evaluation", head=("", "", *(f"{e} {', '.join(sorted(versions[e]))}" for e in engines)), body=tuple(body))
 
 
 LIFTED = (
@@ -65,7 +51,7 @@ def lifted(groups: Sequence[Group], x: X) -> Rows:
         known = [fates(group.members, share, x) for share in SHARES]
         if any(known):
             body.append((group.label, str(len(group.members)), *(_lifted(found, scale, digits) for found in known)))
-    return Rows(head=("", "runs", *(f"{100 * share:g} % [{unit}]" for share in SHARES)), body=tuple(body))
+    return Rows(title="first success from home", head=("", "runs", *(f"{100 * share:g} % [{unit}]" for share in SHARES)), body=tuple(body))
 
 
 def _lifted(found: Sequence[Fate], scale: float, digits: int) -> str:
@@ -90,63 +76,7 @@ def different(groups: Sequence[Group]) -> Rows:
         if any(fact.value != facts[0].value for fact in facts):
             body.append((name, *(_values(m.facts.get(name, _ABSENT).text for m in g.members) for g in columns)))
     body += [(name, *(_values(cells) for cells in column)) for name, column in _extent(columns)]
-    return Rows(head=("", *(g.label for g in columns)), body=tuple(body))
-
-
-def markdown(rows: Rows) -> str:
-    """As a table in Markdown."""
-    lines = [rows.head, ("---",) * len(rows.head), *rows.body]
-    return "\n".join("| " + " | ".join(escape(cell) for cell in line) + " |" for line in lines) + "\n"
-
-
-def escape(text: str) -> str:
-    """Text that Markdown shows as it is, in one line."""
-    for special in "\\|*_<>`[]":
-        text = text.replace(special, f"\\{special}")
-    return " ".join(text.split())
-
-
-def rich_results(rows: Rows) -> Table:
-    """:func:`results` for a terminal: what describes a row is in one column, so that four engines fit into 80 characters."""
-    table = _rich_table(("", *rows.head[2:]), "evaluation")
-    for label, name, *cells in rows.body:
-        if label:
-            table.add_section()
-            table.add_row(_cell(label), style="bold")
-        table.add_row(_cell(name), *map(_cell, cells))
-    return table
-
-
-def rich_lifted(rows: Rows) -> Table:
-    """:func:`lifted` for a terminal."""
-    table = _rich_table(rows.head, "first success from home")
-    for line in rows.body:
-        table.add_row(*map(_cell, line))
-    return table
-
-
-def rich_different(rows: Rows) -> Table:
-    """:func:`different` for a terminal."""
-    table = _rich_table(rows.head, "what differs between the trainings")
-    for line in rows.body:
-        table.add_row(*map(_cell, line))
-    return table
-
-
-def _rich_table(head: Sequence[str], title: str) -> Table:
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left")
-    for i, name in enumerate(head):
-        table.add_column(_cell(name), justify="right" if i else "left", overflow="fold")
-    return table
-
-
-def _cell(text: str) -> Text:
-    """As it is, without markup; a number stays beside its unit, and three shares on one line."""
-    from rich.text import Text
-
-    return Text(text.replace(" / ", "/").replace(" %", "\N{NO-BREAK SPACE}%"))
+    return Rows(title="what differs between the trainings", head=("", *(g.label for g in columns)), body=tuple(body))
 
 
 _ABSENT = Fact(None, "-")

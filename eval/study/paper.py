@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -79,7 +79,6 @@ def paper_training() -> str:
 
 def _official(table: PaperTable) -> PaperTable:
     """With the official names of the objects."""
-    from dataclasses import replace
 
     def name(axis: str, text: str) -> str:
         return canonical_name(text) if axis == "object" and text != ALL else text

@@ -13,108 +13,28 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from xreset.demos import Demos, read_demos, synthesize, write_demos
+from xreset.demos import read_demos
 from xreset.errors import DemoError, FileFormatError, RunError, XResetError
 from xreset.eval.study.file import Data, Evaluation, Runs, Study, merged
-from xreset.files import claim, file_hash, read_json, write_json
+from xreset.eval.study.subset import Subset, refuse_other, short
+from xreset.files import claim, file_hash
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import starting_config
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.objects import canonical_name, object_names
-from xreset.text import shown
 from xreset.typed import from_dict
 
 if TYPE_CHECKING:
     from xreset.eval.results import EvalResult
 
-SUBSET_SCHEMA = "xreset-subset/1"
 Kind = Literal["data", "train", "eval"]
 _ENOUGH = 0.97
 """Share of the minutes from which a training counts as done: what is left would cost more to start than it is."""
 _XRESET = [sys.executable, "-m", "xreset"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Subset:
-    """Demonstrations of some objects of a study's data."""
-
-    name: str
-    """Of the data."""
-    data: Data
-    given: Path
-    """Folder that the data's files are relative to."""
-    out: Path
-    objects: tuple[str, ...]
-    """Empty: all."""
-    per_object: int | None
-
-    @property
-    def folder(self) -> Path:
-        """Named after what it holds."""
-        parts = [self.name, "+".join(map(short, self.objects)), str(self.per_object or "")]
-        return self.out / "data" / "-".join(filter(None, parts))
-
-    @property
-    def demos(self) -> Path:
-        """The archive."""
-        return self.folder / "demos.npz"
-
-    @property
-    def meshes(self) -> list[str]:
-        """``--objects``."""
-        return ["--objects", str(self.given / self.data.meshes)] if self.data.meshes else []
-
-    @cached_property
-    def definition(self) -> dict[str, Any]:
-        """All that its files depend on."""
-        source = (
-            {"demos": file_hash(self.given / self.data.demos)}
-            if self.data.demos
-            else {"synthetic_per_object": self.data.synthetic_per_object, "synthetic_seed": self.data.synthetic_seed}
-        )
-        options = {name: list(getattr(self.data, name)) for name in ("retarget", "resets")}
-        return source | options | {"objects": list(self.objects), "per_object": self.per_object, "meshes": self.data.meshes}
-
-    def check(self) -> None:
-        """Refuse files that were made of something else."""
-        file = self.folder / "subset.json"
-        if not file.is_file():
-            return
-        made = {k: v for k, v in read_json(file, SUBSET_SCHEMA).items() if k != "schema"}
-        if different := [k for k in sorted({*made, *self.definition}) if made.get(k) != self.definition.get(k)]:
-            k = different[0]
-            raise RunError(
-                f"{self.folder} was made otherwise: {k} was {shown(made.get(k))} and is {shown(self.definition.get(k))} in the study. "
-                "Nothing was changed; give the data another name, or choose another --out."
-            )
-
-    def make(self) -> None:
-        """Write the archive, if it is not there."""
-        if self.demos.is_file() and (self.folder / "subset.json").is_file():
-            return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        demos = source_demos(self.data, self.given, self.objects)
-        chosen = demos.select(objects=self.objects or None, max_per_object=self.per_object)
-        write_demos(self.demos, chosen, config=self.definition)
-        write_json(self.folder / "subset.json", {"schema": SUBSET_SCHEMA} | self.definition)
-
-
-def source_demos(data: Data, given: Path, objects: tuple[str, ...]) -> Demos:
-    """All demonstrations of the data, or the synthetic ones of some objects."""
-    if data.demos:
-        return read_demos(given / data.demos)
-    return synthesize(objects or None, data.synthetic_per_object, data.synthetic_seed)
-
-
-def short(name: str) -> str:
-    """``005_tomato_soup_can`` -> ``tomato_soup_can``."""
-    number, _, rest = name.partition("_")
-    return rest if number.isdecimal() and rest else name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,23 +93,11 @@ class Run:
         }  # fmt: skip
         if self.bank.is_file():
             wanted["reset bank"], found["reset bank"] = file_hash(self.bank)[:12], info.resets_hash[:12]
-        for name, there, here in _differences(found, wanted):
-            raise RunError(
-                f"{self.folder} holds a run of another configuration: {name} is {shown(there)} there and {shown(here)} in the study. "
-                "Nothing was changed; give the runs another name, or choose another --out."
-            )
+        refuse_other(f"{self.folder} holds a run of another configuration", "runs", found, wanted)
 
 
 def _lasting(config: TrainConfig) -> dict[str, Any]:
     return asdict(replace(config, iterations=1, save_interval=1))
-
-
-def _differences(a: dict[str, Any], b: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
-    for name in b:
-        if isinstance(b[name], dict):
-            yield from _differences(a[name], b[name], f"{prefix}{name}.")
-        elif a[name] != b[name]:
-            yield prefix + name, a[name], b[name]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -326,11 +234,7 @@ class EvalStep(Step):
             }  # fmt: skip
             if self.demos.is_file():
                 settings["demos"], wanted["demos"] = result.inputs.get("demos", "")[:12], file_hash(self.demos)[:12]
-            for name, there, here in _differences(settings, wanted):
-                raise RunError(
-                    f"{self.writes / engine}.json is an evaluation of another kind: {name} is {shown(there)} there and {shown(here)} in "
-                    "the study. Nothing was changed; give the evaluation another name, or choose another --out."
-                )
+            refuse_other(f"{self.writes / engine}.json is an evaluation of another kind", "evaluation", settings, wanted)
 
     def missing(self) -> list[str]:
         """Engines that are there and have no result of this policy."""
@@ -464,25 +368,21 @@ def _named(where: str, objects: tuple[str, ...], there: tuple[str, ...]) -> tupl
 
 def _runs(study: Study, group: str, spec: Runs, objects: tuple[str, ...], out: Path, subset: Any) -> Iterator[Run]:
     """The runs of a group."""
-    if spec.policy is not None:
-        yield Run(
-            group=group, runs=spec, seed=0, objects=objects, folder=out / group, subset=subset(spec.data, objects, spec.per_object),
-            config=None, weights=None,
-        )  # fmt: skip
-        return
-    base = asdict(starting_config(spec.recipe))
-    config = from_dict(TrainConfig, merged(base, spec.config), f"runs.{group}.config")
-    if spec.steps is not None:
-        config = replace(config, iterations=max(1, round(spec.steps / (spec.num_envs * spec.gpus * config.ppo.horizon))))
-    for chosen in [(name,) for name in objects] if spec.alone else [objects]:
-        for seed in spec.seeds:
-            weights = study.runs[spec.weights] if spec.weights else None
+    config, seeds = None, (0,)
+    if spec.policy is None:
+        base = asdict(starting_config(spec.recipe))
+        config, seeds = from_dict(TrainConfig, merged(base, spec.config), f"runs.{group}.config"), spec.seeds
+        if spec.steps is not None:
+            config = replace(config, iterations=max(1, round(spec.steps / (spec.num_envs * spec.gpus * config.ppo.horizon))))
+    weights = study.runs[spec.weights] if spec.weights and config else None
+    for chosen in [(name,) for name in objects] if spec.alone and config else [objects]:
+        for seed in seeds:
             yield Run(
                 group=group,
                 runs=spec,
                 seed=seed,
                 objects=chosen,
-                folder=_folder(out, group, spec, chosen, seed),
+                folder=_folder(out, group, spec, chosen, seed) if config else out / group,
                 subset=subset(spec.data, chosen, spec.per_object),
                 config=config,
                 weights=_folder(out, str(spec.weights), weights, chosen, seed) if weights else None,

@@ -6,14 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from xreset import __version__
+from xreset.eval.pages import render, short_name
 from xreset.eval.report import fairness
-from xreset.eval.report.compare import compare
-from xreset.eval.report.plots import short_name
-from xreset.eval.report.tables import Rows, escape, markdown
+from xreset.eval.report.make import compare
 from xreset.eval.study.paper import paper_training
 from xreset.eval.study.plan import EvalStep, Plan, Run, TrainStep, short
 from xreset.eval.study.tables import Made, as_rows, broken, draw, fill, versions
+from xreset.eval.table import Rows
 from xreset.files import atomic_write
 from xreset.learning.clock import Lift, read_lift
 
@@ -43,29 +42,12 @@ def write_page(plan: Plan, out: Path) -> Page:
     tables = tuple(fill(plan, table) for table in plan.study.tables)
     notes = tuple(dict.fromkeys([*_incomplete(plan), *(note for made in tables for note in _unfair(plan, made, amounts))]))
     made = Page(path=out / "study.md", tables=tables, notes=notes, runs=_runs(plan, amounts))
-    pictures = {}
-    for i, table in enumerate(tables):
+    for i, table in enumerate(tables, 1):
         if table.cells:
-            pictures[i] = f"table-{i + 1}.png"
-            draw(out / pictures[i], table)
-    compared = _compare(plan, out)
-    parts = [f"# Study {escape(plan.name)}\n", f"{escape(plan.study.about)}\n", *(f"> **Note:** {escape(note)}\n" for note in notes)]
-    for i, table in enumerate(tables):
-        parts.append(f"## {escape(table.title)}\n")
-        for engine in table.cells:
-            parts += [f"### {escape(engine)} {escape(versions(table, engine))}\n", markdown(as_rows(table, engine))]
-        parts.append(f"![{escape(table.title)}]({pictures[i]})\n" if i in pictures else "Nothing is evaluated yet.\n")
-    parts += [
-        "Percent, mean and in brackets the 95 % interval: a bootstrap over demonstrations and, where there are several, over seeds, too; "
-        "over two or three seeds it is too narrow. What the paper reports stands behind, with its standard error where it states one. "
-        "All of them: the mean over all episodes; it is left out while an object is missing.\n",
-        "## Runs\n",
-        markdown(made.runs),
-    ]
-    parts += [f"![{escape(name)}]({name}/compare.png)\n\n[Comparison of the trainings]({name}/compare.md)\n" for name in compared]
-    parts.append(f"xreset {__version__}\n")
+            draw(out / f"table-{i}.png", table)
+    text = render("study.md.j2", plan=plan, compared=_compare(plan, out), as_rows=as_rows, versions=versions, **vars(made))
     with atomic_write(made.path) as file:
-        file.write("\n".join(parts).encode())
+        file.write(text.encode())
     return made
 
 

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from xreset.eval.report.groups import Group
-from xreset.eval.report.plots import COLORS, INK, figure_style, percent_axis, short_name, write_png
-from xreset.eval.report.score import Scores, estimate, scores
-from xreset.eval.report.tables import Rows
-from xreset.eval.report.trainings import Training, read_training
+from xreset.eval.pages import short_name
+from xreset.eval.plots import COLORS, INK, percent_axis, picture
+from xreset.eval.report.groups import Group, Scores, estimate, scores
+from xreset.eval.report.read import Training, read_training
 from xreset.eval.rollout import Episode
 from xreset.eval.study.file import Table
 from xreset.eval.study.paper import ALL, METRICS, PaperTable, paper_tables
 from xreset.eval.study.plan import Plan
+from xreset.eval.table import Rows
+from xreset.objects import canonical_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,8 +127,6 @@ def objects_of(plan: Plan, group: str, table: Table) -> tuple[str, ...]:
 
 def _axes(plan: Plan, table: Table, paper: PaperTable | None) -> tuple[tuple[str, list[str]], tuple[str, list[str]], dict[str, str]]:
     """Rows, columns, and what is the same in all cells."""
-    from xreset.objects import canonical_name
-
     there = sorted({o for name in table.runs for o in objects_of(plan, name, table)})
     methods, metrics = list(table.runs.values()), list(METRICS)
     if paper is not None:
@@ -171,9 +169,8 @@ def cell_text(cell: Cell) -> str:
 def draw(path: Path, made: Made) -> None:
     """Bars with intervals, a panel for each engine; the paper's figures are black lines across them."""
     engines = list(made.cells)
-    with figure_style({"text.parse_math": False}) as figure_class:
-        size = (max(7.0, 1.1 * len(made.rows) + 2), 2.6 * len(engines) + 0.4)
-        figure: Any = figure_class(figsize=size, layout="constrained", facecolor="white")
+    size = (max(7.0, 1.1 * len(made.rows) + 2), 2.6 * len(engines) + 0.4)
+    with picture(path, size, text_parse_math=False) as figure:
         for ax, engine in zip(figure.subplots(len(engines), 1, squeeze=False)[:, 0], engines, strict=True):
             width = 0.8 / len(made.columns)
             for j, column in enumerate(made.columns):
@@ -195,7 +192,6 @@ def draw(path: Path, made: Made) -> None:
             ax.plot([], [], color="black", linewidth=2, label=" the paper")
         handles, labels = ax.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 5), frameon=False)
-        write_png(path, figure)
 
 
 def versions(made: Made, engine: str) -> str:

@@ -31,18 +31,15 @@ def compare(
         out: Folder for compare.png and compare.md.
     """
     from xreset.cli._terminal import Console
-    from xreset.eval.report.compare import compare as make
-    from xreset.eval.report.tables import rich_different, rich_lifted, rich_results
+    from xreset.eval.report.make import compare as make
+    from xreset.eval.table import rich_table
 
     console = Console()
     with console.status("reading"):
         made = make(runs, out, x=x, curves=curve, apart=apart)
-    if made.results.body:
-        console.print(rich_results(made.results))
-    if made.lifted.body:
-        console.print(rich_lifted(made.lifted))
-    if made.different.body:
-        console.print(rich_different(made.different))
+    for rows in (made.results, made.lifted, made.different):
+        if rows.body:
+            console.print(rich_table(rows))
     for caption in made.captions:
         console.print(caption, highlight=False)
     for note in made.notes:

@@ -34,7 +34,7 @@ def evaluate(
     from xreset.cli._common import engine_bars
     from xreset.cli._terminal import Console
     from xreset.eval.evaluate import evaluate, resolve
-    from xreset.eval.table import rich_table
+    from xreset.eval.table import results_table
     from xreset.eval.trial import engine
 
     engines = [engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
@@ -43,7 +43,7 @@ def evaluate(
     folder = out or subject.folder
     with engine_bars(console, [e.name for e in engines]) as progress:
         summaries = evaluate(subject, engines, demos, setting, folder, episodes=episodes, progress=progress)
-    console.print(rich_table(summaries))
+    console.print(results_table(summaries))
     if unseen := summaries[0].unseen:
         console.print(f"not in the policy's training: {', '.join(unseen)}", highlight=False, soft_wrap=True)
     console.print(f"results in {folder}")

@@ -21,7 +21,7 @@ def report(
     """
     from xreset.cli._terminal import Console, Progress
     from xreset.eval.report import make_report
-    from xreset.eval.table import rich_table
+    from xreset.eval.table import results_table
     from xreset.policies import results_folder, shipped
 
     if not run.exists() and str(run) in shipped():
@@ -32,7 +32,7 @@ def report(
         made = make_report(
             run, out, robot=robot, objects=objects, progress=lambda done, total: bar.update(task, completed=done, total=total)
         )
-    console.print(rich_table(made.summaries))
+    console.print(results_table(made.summaries))
     console.print(made.headline)
     for note in made.notes:
         console.print(f"note: {note}", style="yellow")

@@ -60,8 +60,7 @@ def attribute(
     from xreset.cli._terminal import Console, Progress
     from xreset.errors import DemoError
     from xreset.eval.engines.attribution import attribute as experiment
-    from xreset.eval.engines.figures import write_plot
-    from xreset.eval.engines.tables import not_tried, rich_table, verdict
+    from xreset.eval.engines.attribution_view import not_tried, rich_table, verdict, write_plot
     from xreset.eval.evaluate import resolve
     from xreset.eval.trial import engine
     from xreset.files import file_hash, write_json

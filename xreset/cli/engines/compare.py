@@ -11,8 +11,7 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-    from xreset.eval.engines.agreement import EngineParity, Parity
-    from xreset.eval.engines.metrics import Metric
+    from xreset.eval.engines.agreement import EngineParity, Metric, Parity
 
 
 def compare(
@@ -48,7 +47,7 @@ def compare(
     from xreset.cli._terminal import Console, Progress
     from xreset.eval.engines.agreement import REFERENCE
     from xreset.eval.engines.agreement import compare as agreement
-    from xreset.eval.engines.load import load_frames
+    from xreset.eval.engines.sources import load_frames
     from xreset.eval.trial import engine
     from xreset.files import file_hash, write_json
 

@@ -84,8 +84,7 @@ def trace(
     from xreset.eval.engines.replay import trace as replay
     from xreset.eval.engines.replay import write_trace
     from xreset.eval.engines.sources import from_file, from_policy
-    from xreset.eval.engines.trace_figure import write_plot
-    from xreset.eval.engines.trace_table import rich_table, sentences
+    from xreset.eval.engines.trace_view import rich_table, sentences, write_plot
     from xreset.eval.trial import engine
 
     thresholds = Thresholds(

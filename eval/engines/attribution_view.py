@@ -1,26 +1,24 @@
-"""The attribution for a terminal."""
+"""The attribution for a terminal, and as a picture: task progress of every run, with its interval, between A and B."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from pathlib import Path
+
+from rich.table import Table
 
 from xreset.eval.engines.attribution import Attribution, Row
 from xreset.eval.engines.measure import Measured
 from xreset.eval.engines.properties import PROPERTIES, Property
+from xreset.eval.plots import COLORS, picture
 from xreset.eval.stats import bootstrap_ci95
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 _BY_NAME = {p.name: p for p in PROPERTIES}
 
 
 def rich_table(found: Attribution, title: str) -> Table:
     """One row per run: what was changed, the score, and how much that differs from A as it is. Bold: the interval leaves out zero."""
-    from rich.table import Table
-
     table = Table(title=title, title_justify="left")
     table.add_column("")
     for name in ("value", "task progress", "grasp", "reorient", f"against {found.a}", "of gap"):
@@ -97,3 +95,28 @@ def _change(row: Row, found: Attribution) -> str:
     if row.kind in ("towards", "at most"):
         return f"{p.value(found.measured_a) * p.scale:.3g} -> {_value(p, found.measured_b)}"
     return amount(row)
+
+
+_COLOR = {"as it is": COLORS[0], "towards": COLORS[4], "at most": COLORS[5], "all": COLORS[2], "what if": COLORS[7], "other": COLORS[1]}
+
+
+def write_plot(path: Path, found: Attribution, title: str) -> None:
+    """Write the plot as PNG."""
+    with picture(path, (8, 1.3 + 0.36 * len(found.rows)), font_size=10) as figure:
+        ax = figure.subplots()
+        for y, row in enumerate(found.rows):
+            mean = 100 * row.score().mean()
+            low, high = (100 * x for x in bootstrap_ci95(row.score(), row.sequences))
+            ax.barh(y, mean, color=_COLOR[row.kind], height=0.62)
+            ax.errorbar(mean, y, xerr=[[max(mean - low, 0)], [max(high - mean, 0)]], color="black", capsize=3, linewidth=1.2)
+            d, _ = found.difference(row)
+            text = f"{mean:.0f} %" if row.kind == "as it is" else f"{mean:.0f} % ({100 * d:+.1f})"
+            ax.text(high + 1.5, y, text, va="center", fontweight="bold" if found.matters(row) else "normal")
+        labels = [f"{label(row)}, {amount(row)}" if row.kind == "what if" else label(row) for row in found.rows]
+        ax.set_yticks(range(len(labels)), labels)
+        ax.invert_yaxis()
+        for row in (found.rows[0], found.rows[-1]):
+            ax.axvline(100 * row.score().mean(), color=_COLOR[row.kind], linestyle="--", linewidth=0.9)
+        ax.set_xlim(0, 118)
+        ax.set_xlabel("task progress [%], 95 % interval")
+        figure.suptitle(title, fontweight="bold", fontsize="medium")

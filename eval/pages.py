@@ -1,0 +1,38 @@
+"""Pages from the templates in ``eval/templates``."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from xreset import __version__
+from xreset.eval.table import escape, markdown
+
+
+def short_name(name: str) -> str:
+    """``005_tomato_soup_can`` -> ``tomato soup can``."""
+    return re.sub(r"^\d+_", "", name).replace("_", " ")
+
+
+def percent(share: float, digits: int = 0) -> str:
+    """``0.345`` -> ``34%``."""
+    return f"{share:.{digits}%}"
+
+
+@cache
+def _environment() -> Environment:
+    made = Environment(
+        loader=PackageLoader("xreset.eval"), autoescape=lambda name: name is not None and ".html" in name, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+    )  # fmt: skip
+    made.filters |= {"percent": percent, "short_name": short_name, "md": escape, "table": markdown}
+    made.globals["version"] = __version__
+    return made
+
+
+def render(template: str, **values: Any) -> str:
+    """A page; in HTML, what could be read as markup is escaped."""
+    return _environment().get_template(template).render(values)

@@ -1,0 +1,85 @@
+"""Drawing with matplotlib in the project's style: as SVG that takes the page's text colour, or as a picture. No window, no global state."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from xreset.errors import XResetError
+from xreset.files import atomic_write
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d3b", "#666666")
+"""Colour of each engine, in their order: Okabe and Ito's palette, told apart with colour-blind eyes and on light and dark ground."""
+INK = "#010203"
+"""Text colour; in an SVG it is replaced by ``currentColor``."""
+
+
+@contextmanager
+def picture(path: Path, size: tuple[float, float], *, dpi: int = 120, **style: Any) -> Iterator[Figure]:
+    """A figure of a size [inches] that is written as PNG at the end of the block; ``style``: matplotlib's settings with _ for a dot."""
+    with figure_style({name.replace("_", ".", 1): value for name, value in style.items()}) as figure_class:
+        figure = figure_class(figsize=size, layout="constrained", facecolor="white")
+        yield figure
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=dpi)
+    with atomic_write(path) as file:
+        file.write(buffer.getbuffer())
+
+
+def svg(draw: Callable[[Figure], None], size: tuple[float, float], salt: str) -> str:
+    """An ``<svg>`` element that scales with the page and takes its text colour.
+
+    Args:
+        draw: fills the figure.
+        size: width and height [inches].
+        salt: keeps its identifiers apart from those of other figures on the page; the same salt and drawing give the same text.
+    """
+    with figure_style({"svg.hashsalt": salt, "svg.fonttype": "none"}) as figure_class:
+        figure = figure_class(figsize=size, layout="constrained")
+        draw(figure)
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :].replace(INK, "currentColor")
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    used = set(re.findall(r"#([\w.-]+)", text))
+    text = re.sub(r' id="([\w.-]+)"', lambda m: m[0] if m[1] in used else "", text)
+    return re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1), count=1).strip()
+
+
+def percent_axis(ax: Axes, which: str) -> None:
+    """Make an axis, ``x`` or ``y``, go from 0 to 100 percent, with lines across."""
+    axis = ax.xaxis if which == "x" else ax.yaxis
+    (ax.set_xlim if which == "x" else ax.set_ylim)(0, 104)
+    axis.set_ticks(range(0, 101, 25))
+    axis.set_major_formatter(lambda value, _: f"{value:.0f} %")
+    ax.grid(axis="x" if which == "x" else "y", color=INK, alpha=0.12)
+
+
+@contextmanager
+def figure_style(style: dict[str, Any]) -> Iterator[type[Figure]]:
+    """matplotlib's ``Figure`` class within the style of the project's plots; no window, no global state."""
+    try:
+        import matplotlib
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise XResetError(f"matplotlib cannot be imported ({error}). Install it with: pip install 'xreset[eval]'") from error
+    base = {
+        "font.family": "sans-serif",
+        "font.sans-serif": ["DejaVu Sans"],
+        "font.size": 10.5,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.axisbelow": True,
+    }
+    base |= dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK)
+    with matplotlib.rc_context(base | style):  # pyright: ignore[reportArgumentType]
+        yield Figure

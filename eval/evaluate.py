@@ -20,6 +20,7 @@ from xreset.eval.rollout import roll_out
 from xreset.eval.setting import Setting
 from xreset.eval.trial import Engine, Trial
 from xreset.files import claim_folder, file_hash, npz_schema
+from xreset.learning.choice import read_choice
 from xreset.objects import load_objects
 from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
@@ -176,6 +177,9 @@ def evaluate(
     Raises:
         XResetError: another command is writing into the folder.
     """
+    choice = read_choice(subject.folder.parent) if subject.inputs else None
+    if choice is not None and choice.policy_hash == subject.inputs["policy"] and choice.seed == setting.seed:
+        raise PolicyError(f"the starts of seed {setting.seed} are those by which this policy was chosen: evaluate it with another --seed.")
     trial, trajectories = subject.episodes(demos, setting)
     folder, inputs = subject.meshes(setting.objects), subject.inputs | {"demos": file_hash(demos)}
     summaries = []

@@ -4,6 +4,7 @@ import io
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,11 +27,12 @@ from xreset.backends import make_backend
 from xreset.cli import main
 from xreset.errors import BackendUnavailableError, FileFormatError, PolicyError, RunError, XResetError
 from xreset.files import claim, file_hash
+from xreset.learning.choice import read_choice, write_choice
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.recipes import RECIPES
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt, read_checkpoint
-from xreset.learning.train import ensure_policy, load_inputs, resumed, start_run, train
+from xreset.learning.train import current_choice, ensure_policy, export_checkpoint, load_inputs, resumed, start_run, train
 from xreset.policy import OnnxPolicy, check_contract
 from xreset.resets.bank import write_bank
 from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfig
@@ -235,6 +237,24 @@ class TrainingTest(unittest.TestCase):
                     torch.testing.assert_close(content[networks][name], value, msg=name)
         count = next(name for name in before["actor_state_dict"] if name.endswith("normalizer.count"))
         self.assertEqual(int(content["actor_state_dict"][count]), int(before["actor_state_dict"][count]) + 8 * 4)
+
+    def test_a_chosen_checkpoint_is_the_runs_policy_until_there_are_newer_ones(self):
+        out, demos = self.folder / "chosen", self.folder / "demos.npz"
+        shutil.copytree(self.out, out)
+        with redirect_stdout(io.StringIO()) as said:
+            main(["demos", "synth", "--objects", SOUP, "--per-object", "1", "--out", str(demos)])
+            main(["select", str(out), "--demos", str(demos), "--backend", "mujoco", "--episodes", "1"])
+        self.assertRegex(said.getvalue(), "chosen: 000002.pt, 0.0 % in its worst engine .mujoco., of 2 checkpoints in 1 engines")
+        choice = read_choice(out)
+        assert choice is not None
+        self.assertEqual(file_hash(out / "policy.onnx"), choice.policy_hash)
+        write_choice(out, replace(choice, chosen="000001.pt", policy_hash="of another file"))
+        before = file_hash(out / "policy.onnx")
+        self.assertNotEqual(file_hash(ensure_policy(out)), before)
+        export_checkpoint(out, out / "checkpoints" / "000001.pt", self.folder / "first.onnx")
+        self.assertEqual(file_hash(ensure_policy(out)), file_hash(self.folder / "first.onnx"))
+        shutil.copy(out / "checkpoints" / "000002.pt", out / "checkpoints" / "000003.pt")
+        self.assertIsNone(current_choice(out))
 
     def test_an_adaptive_learning_rate_goes_on_with_the_networks(self):
         runner = mock.Mock(device="cpu", train_config=CONFIG)

@@ -24,6 +24,7 @@ COMMANDS: dict[str, str] = {
     "eval": "Evaluate a policy, or a baseline, in one or several engines.",
     "frontier": "Tell from which demonstrated states a policy reaches the goal, and where its training is stuck.",
     "stress": "Tell what a policy bears: stiffness, latency, friction and more, swept one at a time.",
+    "select": "Choose among a training's checkpoints by all engines: the best in its worst engine.",
     "compare": "Put several trainings side by side: curves, results in every engine, and what differs between them.",
     "study": "Run a study: trainings by object and seed, evaluations, and tables beside the paper's.",
     "export": "Write evaluation episodes as a LeRobot data set, or as plain arrays.",

@@ -6,6 +6,7 @@ RUN/worlds.pt                the worlds at the newest checkpoint, so that a resu
 RUN/lift.json                when success from home passed 1, 10 and 50 %
 RUN/faults.npz               the last worlds whose simulation failed, if the run ended because of too many
 RUN/policy.onnx              the policy, with its contract
+RUN/choice.json              which checkpoint it is, if ``xreset select`` chose one
 RUN/events.out.tfevents.*    TensorBoard
 RUN/eval/, RUN/report/       made by ``xreset eval`` and ``xreset report``
 """

@@ -13,6 +13,7 @@ from xreset.description import load_robot
 from xreset.env import make_env
 from xreset.errors import RunError
 from xreset.files import claim_folder, file_hash
+from xreset.learning.choice import Choice, read_choice
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx
@@ -199,10 +200,26 @@ def resumed(out: Path, *, iterations: int | None) -> RunInfo:
 
 
 def ensure_policy(out: Path) -> Path:
-    """The run's ``policy.onnx``, exported from the newest checkpoint if it is missing or older."""
+    """The run's ``policy.onnx``, exported if it is missing or old: the checkpoint that was chosen among all, else the newest one."""
     policy, checkpoint = out / "policy.onnx", latest_checkpoint(out)
-    if policy.exists() and policy.stat().st_mtime >= checkpoint.stat().st_mtime:
+    if choice := current_choice(out):
+        if policy.exists() and file_hash(policy) == choice.policy_hash:
+            return policy
+        checkpoint = checkpoint.with_name(choice.chosen)
+    elif policy.exists() and policy.stat().st_mtime >= checkpoint.stat().st_mtime:
         return policy
+    export_checkpoint(out, checkpoint, policy)
+    return policy
+
+
+def current_choice(out: Path) -> Choice | None:
+    """What ``xreset select`` chose, while the run has no newer checkpoint than it knew, and still has the chosen one."""
+    choice, names = read_choice(out), [c.name for c in checkpoints(out)]
+    return choice if choice is not None and names and names[-1] == choice.candidates[0].name and choice.chosen in names else None
+
+
+def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
+    """Write the policy of one of a run's checkpoints as an ONNX file."""
     from tensordict import TensorDict
 
     from xreset.learning.config import rsl_rl_config
@@ -226,4 +243,3 @@ def ensure_policy(out: Path) -> Path:
     actor = PointNetLstmModel(example, {"actor": cfg["obs_groups"]["actor"]}, "actor", len(info.contract["joint_names"]), **actor_cfg)
     actor.load_state_dict(weights)
     export_onnx(actor, policy, info.contract)
-    return policy

@@ -1,0 +1,119 @@
+"""Choosing among a training's checkpoints: the one that does best in the engine in which it does worst.
+
+A policy that was picked by one engine's score has been fitted to that engine's habits. The episodes that decide are not those that are
+reported: they begin with other starts, and ``xreset eval`` refuses the seed that they were drawn with.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from xreset.errors import RunError
+from xreset.eval.evaluate import resolve
+from xreset.eval.results import mesh_folder
+from xreset.eval.rollout import roll_out
+from xreset.eval.setting import Setting
+from xreset.eval.trial import Engine
+from xreset.files import atomic_write, file_hash
+from xreset.learning.choice import Candidate, Choice, write_choice
+from xreset.learning.run import checkpoints, read_run
+from xreset.learning.train import export_checkpoint
+
+SEED = 1_000_003
+"""Of the starts that decide; evaluations use 0 unless they are told otherwise."""
+
+
+def candidates_in(folder: Path, most: int) -> list[Path]:
+    """Checkpoints of a run folder, or exported policies of another folder, the newest first.
+
+    Args:
+        folder: where.
+        most: how many at most, spread evenly over all; the newest is among them.
+
+    Raises:
+        RunError: there is none.
+    """
+    is_run = (folder / "run.json").is_file()
+    found = checkpoints(folder) if is_run else sorted(folder.glob("*.onnx"))
+    if not found:
+        what = "checkpoints in it" if is_run else "run.json and no exported policies (.onnx) in it"
+        raise RunError(f"{folder} has no {what}: there is nothing to choose from.")
+    picks = np.linspace(len(found) - 1, 0, min(most, len(found))).round().astype(int)
+    return [found[i] for i in picks]
+
+
+def select(
+    folder: Path,
+    engines: Sequence[Engine],
+    demos: Path,
+    setting: Setting,
+    *,
+    most: int = 8,
+    episodes: int = 2,
+    progress: Callable[[str, str, float | None], None] = lambda name, engine, score: None,
+) -> Choice:
+    """Play the checkpoints and write ``FOLDER/choice.json``; a run's ``policy.onnx`` becomes the chosen one.
+
+    The newest is played in all engines. Another is given up as soon as one engine puts it below the best so far, for its worst can only
+    become worse; and the engine in which the best does worst comes first.
+
+    Args:
+        folder: run folder, or a folder of exported policies.
+        engines: where.
+        demos: demonstrations whose starts and goals are played.
+        setting: robot, meshes, seed of the starts, worlds.
+        most: checkpoints at most.
+        episodes: of each demonstration.
+        progress: called with (candidate, engine, task progress) before (None) and after each.
+
+    Raises:
+        RunError: there is nothing to choose from.
+    """
+    found, is_run = candidates_in(folder, most), (folder / "run.json").is_file()
+    if is_run:
+        setting = replace(setting, objects=mesh_folder(setting.objects, read_run(folder).objects))
+    played: list[Candidate] = []
+    best: Candidate | None = None
+    with tempfile.TemporaryDirectory(prefix="xreset-") as scratch:
+        files: dict[str, Path] = {}
+        for path in found:
+            file = files[path.name] = Path(scratch) / f"{path.stem}.onnx" if is_run else path
+            if is_run:
+                export_checkpoint(folder, path, file)
+            subject = resolve(str(file), setting.robot, setting.seed)
+            trial, _ = subject.episodes(demos, setting)
+            scores: dict[str, float] = {}
+            bar = best.worst if best else -1.0
+            order = engines if best is None else sorted(engines, key=lambda e, b=best: b.task_progress[e.name])
+            for engine in order:
+                progress(path.name, engine.name, None)
+                rollouts = roll_out(subject.policy(subject.robot, None), engine, trial, repetitions=episodes)
+                scores[engine.name] = float(np.mean([e.task_progress for e in rollouts.episodes]))
+                progress(path.name, engine.name, scores[engine.name])
+                if scores[engine.name] <= bar:  # of two that are equal, the newer one
+                    break
+            candidate = Candidate(name=path.name, task_progress=scores)
+            played.append(candidate)
+            if candidate.worst > bar:
+                best = candidate
+        assert best is not None
+        choice = Choice(
+            chosen=best.name,
+            policy_hash=file_hash(files[best.name]),
+            candidates=tuple(played),
+            engines={e.name: e.version for e in engines},
+            seed=setting.seed,
+            episodes_per_demo=episodes,
+            demos=file_hash(demos),
+        )
+        if is_run:
+            with atomic_write(folder / "policy.onnx") as out, open(files[best.name], "rb") as chosen:
+                shutil.copyfileobj(chosen, out)
+        write_choice(folder, choice)
+    return choice

@@ -1,0 +1,110 @@
+"""Choosing among checkpoints: the best in its worst engine, what is played for it, and what the choice does afterwards."""
+
+from __future__ import annotations
+
+import io
+import json
+import tempfile
+import unittest
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+from tests.test_stress import episodes
+from xreset.cli import main
+from xreset.errors import FileFormatError, PolicyError, RunError
+from xreset.eval import evaluate as evaluating
+from xreset.eval.select import SEED, candidates_in, select
+from xreset.eval.setting import Setting
+from xreset.learning.choice import Choice, read_choice
+
+SCORES = {
+    "300.onnx": {"a": 0.90, "b": 0.60, "c": 0.80},
+    "200.onnx": {"a": 0.80, "b": 0.75, "c": 0.75},
+    "100.onnx": {"a": 0.95, "b": 0.95, "c": 0.70},
+    "050.onnx": {"a": 0.99, "b": 0.10, "c": 0.99},
+}
+
+
+class SelectTest(unittest.TestCase):
+    def setUp(self):
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        for name in SCORES:
+            (self.folder / name).write_bytes(name.encode())
+        self.demos = self.folder / "demos.npz"
+        self.demos.write_bytes(b"demos")
+        self.played: list[tuple[str, str, int]] = []
+
+    def choose(self, **options) -> Choice:
+        def resolved(path: str, robot: str | None, seed: int):
+            name = Path(path).name
+            trial = SimpleNamespace(name=name, seed=seed)
+            return SimpleNamespace(robot=None, policy=lambda *_: name, episodes=lambda demos, setting: (trial, None))
+
+        def rolled(policy, engine, trial, *, repetitions):
+            self.played.append((policy, engine.name, trial.seed))
+            return SimpleNamespace(episodes=episodes([SCORES[policy][engine.name]] * repetitions))
+
+        engines = [SimpleNamespace(name=name, version="1") for name in "abc"]
+        with mock.patch("xreset.eval.select.resolve", resolved), mock.patch("xreset.eval.select.roll_out", rolled):
+            return select(self.folder, engines, self.demos, Setting(seed=SEED), **options)  # pyright: ignore[reportArgumentType]
+
+    def test_the_best_worst_engine_decides(self):
+        choice = self.choose()
+        self.assertEqual(choice.chosen, "200.onnx")
+        self.assertEqual(choice, read_choice(self.folder))
+        self.assertEqual({seed for *_, seed in self.played}, {SEED})
+        self.assertEqual(
+            choice.sentence(), "200.onnx, 75.0 % in its worst engine (b), of 4 checkpoints in 3 engines; the newest, 300.onnx, has 60.0 %."
+        )
+
+    def test_one_that_cannot_win_is_given_up(self):
+        self.choose()
+        self.assertEqual([e for name, e, _ in self.played if name == "300.onnx"], ["a", "b", "c"])
+        self.assertEqual([e for name, e, _ in self.played if name == "200.onnx"], ["b", "c", "a"])  # where the best is worst first
+        self.assertEqual([e for name, e, _ in self.played if name == "050.onnx"], ["b"])
+
+    def test_of_equals_the_newer_one(self):
+        with mock.patch.dict(SCORES, {"100.onnx": SCORES["200.onnx"]}):
+            self.assertEqual(self.choose().chosen, "200.onnx")
+
+    def test_some_of_many_are_spread_over_all(self):
+        names = [path.name for path in candidates_in(self.folder, 2)]
+        self.assertEqual(names, ["300.onnx", "050.onnx"])
+        self.assertEqual(len(candidates_in(self.folder, 9)), 4)
+        with self.assertRaisesRegex(RunError, "has no run.json and no exported policies"):
+            candidates_in(self.folder / "nowhere", 2)
+
+    def test_the_starts_that_decided_are_not_reported(self):
+        choice = self.choose()
+        inputs = {"policy": choice.policy_hash}
+        subject = SimpleNamespace(folder=self.folder / "eval", inputs=inputs, episodes=mock.Mock(side_effect=InterruptedError))
+        with self.assertRaisesRegex(PolicyError, f"the starts of seed {SEED} are those by which this policy was chosen"):
+            evaluating.evaluate(subject, [], self.demos, Setting(seed=SEED), self.folder, episodes=1)  # pyright: ignore[reportArgumentType]
+        for seed, policy in ((0, choice.policy_hash), (SEED, "another")):
+            subject.inputs = {"policy": policy}
+            with self.assertRaises(InterruptedError):
+                evaluating.evaluate(subject, [], self.demos, Setting(seed=seed), self.folder, episodes=1)  # pyright: ignore[reportArgumentType]
+
+    def test_a_damaged_choice_is_refused(self):
+        self.choose()
+        file = self.folder / "choice.json"
+        content = json.loads(file.read_text())
+        for changes, problem in (
+            ({"chosen": "7.onnx"}, "chosen is '7.onnx', expected one"),
+            ({"seed": -1}, "seed is -1"),
+        ):
+            file.write_text(json.dumps(content | changes))
+            with self.assertRaisesRegex(FileFormatError, problem):
+                read_choice(self.folder)
+
+    def test_bad_options(self):
+        for options, problem in ((["--most", "0"], "--most is 0, expected 1 or more"), (["--episodes", "0"], "--episodes is 0")):
+            with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as said, self.assertRaises(SystemExit):
+                main(["select", str(self.folder), "--demos", str(self.demos), *options])
+            self.assertIn(problem, said.getvalue())
+
+
+if __name__ == "__main__":
+    unittest.main()

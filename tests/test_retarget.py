@@ -18,11 +18,11 @@ from tests.toy_robot import toy_hand_arm, toy_motion
 from xreset import robots
 from xreset.demos import demo_objects, read_demos, synthesize, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError
-from xreset.geometry.balls import SPACING, filling, inscribed_balls, sharp_points
+from xreset.geometry.balls import BARE, SPACING, filling, inscribed_balls, shape_balls, sharp_points
 from xreset.geometry.collision import SelfCollision, height_above_table, support_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_matrix
-from xreset.geometry.shapes import box, surface_of
+from xreset.geometry.shapes import box, half_spaces, hull, shape_mesh, surface_of
 from xreset.geometry.surface import Surface, keypoint_contacts, solid_nodes
 from xreset.retarget import pipeline as pipeline_module
 from xreset.retarget.arm import cost as arm_cost
@@ -38,7 +38,7 @@ from xreset.retarget.least_squares import solve_chain
 from xreset.retarget.partial import discard, run_key
 from xreset.retarget.pipeline import RetargetConfig, rest_on_table, retarget
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
-from xreset.spec import KEYPOINTS, Geometry, ObjectSpec, TableSpec
+from xreset.spec import KEYPOINTS, Geometry, ObjectSpec, Shape, TableSpec
 
 FLOAT = torch.float64
 
@@ -216,6 +216,21 @@ class CollisionTest(unittest.TestCase):
         lonely = np.linalg.norm(points[:, None] - points, axis=-1) + np.eye(len(points))
         self.assertLessEqual(lonely.min(axis=1).max(), 0.01 + 1e-12)
         self.assertEqual(len(sharp_points(self.SHAPES[1], 0.01)) + len(sharp_points(self.SHAPES[2], 0.01)), 0)
+
+    def test_no_surface_of_a_thick_shape_lies_bare(self):
+        """The OpenArm's gripper: 7 mm deep between its balls, before balls lay under its surface, and bananas sank in."""
+        import trimesh
+
+        for shape in (box((0, 0, 0), (0.05, 0.14, 0.04)), hull(trimesh.creation.cone(0.04, 0.08).vertices)):
+            centers, radii, fills = shape_balls(shape)
+            surface = trimesh.sample.sample_surface(shape_mesh(shape), 4000, seed=0)[0]
+            bare = (np.linalg.norm(surface[:, None] - centers, axis=-1) - radii).min(axis=1)
+            self.assertLess(np.quantile(bare, 0.98), BARE + SPACING / 2)
+            planes = half_spaces(shape)
+            outside = (centers @ planes[:, :3].T + planes[:, 3]).max(axis=1) + radii
+            self.assertLess(outside[~fills].max(), 1e-3)
+        capsule = Shape(geometry=self.SHAPES[2])
+        self.assertTrue(shape_balls(capsule)[2].all())
 
     def test_height_counts_only_above_the_table(self):
         table = TableSpec(center=(0.0, 0.0), half_size=(0.5, 0.5, 0.02))

@@ -1,7 +1,8 @@
 """A hand as balls: what keeps it out of the object, the table and itself while it is being retargeted.
 
 Balls make distances and their derivatives cheap over whole trajectories. They are exact for capsules and spheres, and inscribed in other
-shapes, whose edges and corners balls of radius 0 stand for; what they miss is for the exact checks that follow (coal, then physics).
+shapes; smaller ones lie under the surface that those do not reach, and balls of radius 0 stand for edges and corners. What they miss is
+for the exact checks that follow (coal, then physics).
 """
 
 from __future__ import annotations
@@ -16,17 +17,22 @@ from torch import Tensor
 
 from xreset.geometry.collision import SelfCollision, support_points
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import hull
+from xreset.geometry.shapes import half_spaces, hull, shape_mesh
 from xreset.spec import Geometry, RobotSpec, Shape
 from xreset.tensors import Tensors
 
 SPACING = 4e-3
 """[m] Balls need not be closer to each other than this, however thin the shape: from 2.8 mm on they leave no hole, and thinner ones lack no
 more than their own thickness."""
+BARE = 2.5e-3
+"""[m] Where a shape's surface is farther than this from the balls that fill it, smaller ones lie under it. A box of 5 x 14 x 4 cm is bare
+up to 8 mm deep near its edges: enough for a banana."""
 MAX_PAIRS = 6000
 """Pairs of balls of one hand at most. Beyond, balls that fill each link's hull stand for its shapes where the hand is kept out of itself,
 and large ones for their neighbours; what that misses is for the exact check that follows."""
 
+_INWARD = 8
+"""Steps by which a point of a surface moves inwards from one face after the other."""
 _SURFACE_SAMPLES = 8
 """Points on every triangle of a hull."""
 _COVERED = 0.9
@@ -89,14 +95,15 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
     links: list[str] = []
     centers: list[np.ndarray] = []
     radii: list[np.ndarray] = []
+    fills: list[np.ndarray] = []
     for name in hand.link_names:
         shapes = hand.tree.link(name).collisions
         if not shapes:
             continue
         links.append(name)
-        parts = [shape_balls(shape) for shape in shapes]
-        centers.append(np.concatenate([points for points, _ in parts]))
-        radii.append(np.concatenate([radius for _, radius in parts]))
+        parts = zip(*(shape_balls(shape) for shape in shapes), strict=True)
+        for values, part in zip((centers, radii, fills), parts, strict=True):
+            values.append(np.concatenate(part))
     counts = np.array([len(part) for part in radii], dtype=np.int64)
     owner = np.repeat(np.arange(len(links)), counts)
     radius = np.concatenate([np.zeros(0), *radii])
@@ -105,7 +112,8 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
 
     named = [(hand.link_names[a], hand.link_names[b]) for a, b in collision.link_pairs]
     candidates = [(links.index(a), links.index(b)) for a, b in named if {a, b} <= set(links)]
-    solid = [np.flatnonzero((owner == g) & (radius > 0)) for g in range(len(links))]
+    inside = np.concatenate([np.zeros(0, dtype=bool), *fills])
+    solid = [np.flatnonzero((owner == g) & inside) for g in range(len(links))]
     spacing, all_centers = 0.0, np.concatenate([np.zeros((0, 3)), *centers])
     standing = solid
     if sum(len(standing[a]) * len(standing[b]) for a, b in candidates) > MAX_PAIRS:
@@ -161,7 +169,7 @@ def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray
     for ball in np.argsort(-radii, kind="stable").tolist():
         if not kept or np.linalg.norm(centers[kept] - centers[ball], axis=1).min() > spacing:
             kept.append(ball)
-    return np.sort(kept)
+    return np.sort(np.array(kept, dtype=np.int64))
 
 
 def inscribed_balls(geometry: Geometry) -> tuple[np.ndarray, float]:
@@ -208,12 +216,34 @@ def sharp_points(geometry: Geometry, spacing: float) -> np.ndarray:
     return np.unique(np.concatenate(edges), axis=0)
 
 
-def shape_balls(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """Centres [n, 3] in the link's frame and radii [n] of the balls of one shape."""
+def shell_balls(geometry: Geometry, centers: np.ndarray, radius: float) -> tuple[np.ndarray, float]:
+    """Balls under the surface of a shape where it is farther than :data:`BARE` from those of a radius about given centres [m, 3]: centres
+    [n, 3] and their radius, with which they come that near to a right-angled edge."""
+    from trimesh.remesh import subdivide_to_size
+
+    small = BARE / (2**0.5 - 1)
+    if geometry.kind in ("sphere", "capsule") or radius <= small:
+        return np.zeros((0, 3)), small
+    shape = Shape(geometry=geometry)
+    mesh, planes = shape_mesh(shape), half_spaces(shape)
+    surface = np.unique(subdivide_to_size(mesh.vertices, mesh.faces, SPACING)[0].round(9), axis=0)
+    bare = surface[np.linalg.norm(surface[:, None] - centers, axis=-1).min(axis=-1) > radius + BARE]
+    for _ in range(_INWARD):  # from the surface to where the ball lies inside
+        beyond = np.maximum(bare @ planes[:, :3].T + planes[:, 3] + small, 0.0)
+        worst = beyond.argmax(axis=1)
+        bare = bare - beyond.max(axis=1)[:, None] * planes[worst, :3]
+    bare = np.unique(bare[(bare @ planes[:, :3].T + planes[:, 3]).max(axis=1) < -0.9 * small].round(6), axis=0)
+    return bare[_apart(bare, np.zeros(len(bare)), small)], small
+
+
+def shape_balls(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Balls of one shape: centres [n, 3] in the link's frame, radii [n], and which of them [n] fill it; the others stand at its surface."""
     inner, radius = inscribed_balls(shape.geometry)
-    sharp = sharp_points(shape.geometry, max(radius, SPACING))
-    points = np.concatenate((inner, sharp)) @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
-    return points, np.concatenate((np.full(len(inner), radius), np.zeros(len(sharp))))
+    shell, small = shell_balls(shape.geometry, inner, radius)
+    sharp = sharp_points(shape.geometry, max(min(radius, small), SPACING))
+    points = np.concatenate((inner, shell, sharp)) @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
+    sizes = [np.full(len(part), r) for part, r in ((inner, radius), (shell, small), (sharp, 0.0))]
+    return points, np.concatenate(sizes), np.arange(len(points)) < len(inner)
 
 
 def _spans(counts: np.ndarray) -> Spans:

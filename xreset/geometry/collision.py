@@ -131,7 +131,7 @@ class SelfCollision:
                 continue
             for shape in tree.link(name).collisions:
                 self._link.append(index)
-                self._geometry.append(_coal_geometry(coal, shape.geometry))
+                self._geometry.append(coal_geometry(coal, shape.geometry))
                 points, radius = support_points(shape.geometry)
                 centre = (points.max(axis=0) + points.min(axis=0)) / 2
                 local.append(shape.T_body_shape)
@@ -237,7 +237,8 @@ def _may_collide(robot: RobotSpec, tree: RobotTree, a: str, b: str, moved_by_arm
     return arm_joints(a) != arm_joints(b)
 
 
-def _coal_geometry(coal, geometry: Geometry):
+def coal_geometry(coal, geometry: Geometry):
+    """A shape as coal knows it."""
     if geometry.kind == "box":
         return coal.Box(*(2 * s for s in geometry.size))
     if geometry.kind == "sphere":

@@ -106,6 +106,42 @@ class Toy(WithFolder):
         keypoints = {point.keypoint: point.link for point in spec.keypoints}
         self.assertEqual([keypoints[f"index{i}"] for i in (1, 2, 4)], ["f1_a", "f1_b", "index_tip_frame"])
 
+    def test_a_coupled_joint_has_the_limits_that_its_source_gives_it(self):
+        narrow = HAND.replace(
+            '<limit lower="0" upper="1.5" effort="1" velocity="5"/><mimic', '<limit lower="0" upper="1" effort="1"/><mimic'
+        )
+        folder = import_robot(self.arm, self.file("narrow.urdf", narrow), self.folder / "mine").folder
+        tree = load_urdf(folder / "robot.urdf")
+        np.testing.assert_allclose((tree.joint("f1_2").lower, tree.joint("f1_2").upper), (0.1, 1.3))
+        text = (folder / "robot.urdf").read_text()
+        (folder / "robot.urdf").write_text(text.replace('upper="1.3"', 'upper="1"'))
+        found = [f.message for f in check_description(folder)[1] if f.level == "error"]
+        self.assertEqual(len(found), 4, found)
+        self.assertIn("'f1_2' goes from 0.1 to 1.3 with 'f1_1', beyond its own limits", found[0])
+
+    def test_origins_beside_a_finger_do_not_turn_its_palm(self):
+        beside = HAND
+        for name, (xyz, rpy) in _PLACES.items():  # every knuckle's origin 15 mm along its axis; the links stay where they are
+            x, y, z = (float(v) for v in xyz.split())
+            if rpy == "0 0 0":
+                beside = beside.replace(
+                    f'<child link="{name}_a"/><origin xyz="{xyz}"', f'<child link="{name}_a"/><origin xyz="{x} {y + 0.015} {z}"'
+                )
+                head, tail = beside.split(f'<link name="{name}_a">')
+                link, rest = tail.split("</link>", 1)
+                beside = f'{head}<link name="{name}_a">{link.replace("0.02 0 0", "0.02 -0.015 0")}</link>{rest}'
+                beside = beside.replace(
+                    f'<parent link="{name}_a"/><child link="{name}_b"/><origin xyz="0.045 0 0"',
+                    f'<parent link="{name}_a"/><child link="{name}_b"/><origin xyz="0.045 -0.015 0"',
+                )
+        spec = load_robot(import_robot(self.arm, self.file("beside.urdf", beside), self.folder / "mine").folder)
+        kinematics = Kinematics(spec)
+        poses = dict(zip(kinematics.link_names, kinematics.link_poses(torch.tensor(spec.home)).numpy(), strict=True))
+        in_hand = np.linalg.inv(poses["hand_base"]) @ poses["palm_frame"]
+        self.assertAlmostEqual(in_hand[1, 0], 0.0, delta=0.01)
+        knuckle = np.linalg.inv(poses["hand_base"]) @ poses[{p.keypoint: p.link for p in spec.keypoints}["index1"]]
+        np.testing.assert_allclose(knuckle[:3, 3], (0.085, 0.03, 0), atol=1e-6)
+
     def test_the_palm_looks_where_the_fingers_bend(self):
         spec = load_robot(import_robot(self.arm, self.hand, self.folder / "mine").folder)
         kinematics = Kinematics(spec)

@@ -25,6 +25,8 @@ _ROUNDING = 1e-3
 """Relative slack of the triangle inequality: published inertias are rounded."""
 _SAMPLES = 200
 _POSE_TOLERANCE = 1e-3
+_LIMIT_SLACK = 1e-3
+"""[rad or m] By which a mimic joint's limits may fall short of its source's: published figures are rounded."""
 _HOLD_STEPS = 30
 _HOLD_TOLERANCE = 0.02
 
@@ -172,7 +174,7 @@ def _joints(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
 
 
 def _mimics(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
-    known = {joint.name for joint in tree.joints if joint.type != "fixed"}
+    known = {joint.name: joint for joint in tree.joints if joint.type != "fixed"}
     stated = _mimic_tags(spec.urdf)
     for mimic in spec.mimics:
         if mimic.joint not in known:
@@ -181,6 +183,15 @@ def _mimics(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
             here, there = (mimic.source, mimic.multiplier, mimic.offset), stated[mimic.joint]
             described, tagged = (f"{factor:g} {source} + {offset:g}" for source, factor, offset in (here, there))
             yield "error", f"{mimic.joint!r} = {described} in the description, but {tagged} in the URDF."
+        elif mimic.source in known:
+            source, own = known[mimic.source], known[mimic.joint]
+            low, high = sorted(mimic.multiplier * limit + mimic.offset for limit in (source.lower, source.upper))
+            if low < own.lower - _LIMIT_SLACK or high > own.upper + _LIMIT_SLACK:
+                yield (
+                    "error",
+                    f"{mimic.joint!r} goes from {low:.4g} to {high:.4g} with {mimic.source!r}, beyond its own limits "
+                    f"{own.lower:.4g}..{own.upper:.4g}: the two would hold each other up. Widen its limits, or narrow those of the source.",
+                )
     for name in stated.keys() - {mimic.joint for mimic in spec.mimics}:
         yield "error", f"the URDF lets {name!r} mimic {stated[name][0]!r}, but the description has no such entry in mimics."
 

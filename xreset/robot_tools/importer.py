@@ -29,6 +29,8 @@ from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, Mimic
 _FINGERS = ("index", "middle", "ring", "little")
 _HUMAN = (0.0, 0.45, 0.73)
 """Where a human finger's joints lie between its first one and its tip: knuckle, middle joint, last joint (rounded averages)."""
+_BESIDE = 0.003
+"""[m] A joint's origin that lies farther from the middle of the finger, along the joint's axis, gets a frame there for its keypoint."""
 _WRIST_BEHIND = 0.095
 """[m] The human wrist behind the knuckles."""
 _PALM_BEHIND = 0.04
@@ -309,9 +311,22 @@ def _end(tree: RobotTree, finger: _Finger, at: dict[str, np.ndarray]) -> np.ndar
     if not points:
         raise RobotError(f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing.")
     cloud = np.concatenate(points)
-    away = cloud.mean(axis=0) - at[last][:3, 3]
+    middle = (cloud.max(axis=0) + cloud.min(axis=0)) / 2
+    away = middle - _on_axis(tree, last, at, middle)
     away /= max(float(np.linalg.norm(away)), 1e-9)
-    return at[last][:3, 3] + away * float(((cloud - at[last][:3, 3]) @ away).max())
+    return middle + away * float(((cloud - middle) @ away).max())
+
+
+def _on_axis(tree: RobotTree, link: str, at: dict[str, np.ndarray], near: np.ndarray | None = None) -> np.ndarray:
+    """[3] the point of the axis before a link that is nearest to the middle of its shapes: makers put origins anywhere along an axis."""
+    shapes = tree.link(link).collisions
+    if near is None:
+        if not shapes:
+            return at[link][:3, 3]
+        cloud = surface_of(shapes)[0] @ at[link][:3, :3].T + at[link][:3, 3]
+        near = (cloud.max(axis=0) + cloud.min(axis=0)) / 2
+    axis = at[link][:3, :3] @ next(joint.axis for joint in tree.joints if joint.child == link)
+    return at[link][:3, 3] + axis * float((near - at[link][:3, 3]) @ axis)
 
 
 def _palm(
@@ -321,7 +336,7 @@ def _palm(
     spec = _spec(tree, mimics, hand_root, folder)
     straight = _places(spec, {})
     others = fingers[1:]
-    bases = np.array([straight[finger.links[0]][:3, 3] for finger in others])
+    bases = np.array([_on_axis(tree, finger.links[0], straight) for finger in others])
     ends = np.array([_end(tree, finger, straight) for finger in others])
     x = ((ends - bases) / np.linalg.norm(ends - bases, axis=1, keepdims=True)).mean(axis=0)
     x /= np.linalg.norm(x)
@@ -377,7 +392,7 @@ def _with_frames(
             keypoint=f"{finger.name}4",
         )
         tips.append(tip)
-        points = np.array([*(straight[name][:3, 3] for name in finger.links), end])
+        points = np.array([*(_on_axis(tree, name, straight) for name in finger.links), end])
         along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
         share = along[:-1] / along[-1]
         taken: set[int] = set()
@@ -385,7 +400,14 @@ def _with_frames(
             near = min((i for i in range(len(share)) if i not in taken), key=lambda i: (round(abs(share[i] - human), 2), -i), default=None)
             if near is not None and abs(share[near] - human) < 0.2:
                 taken |= set(range(near + 1))
-                keypoints.append(KeypointSpec(keypoint=f"{finger.name}{number}", link=finger.links[near]))
+                link, keypoint = finger.links[near], f"{finger.name}{number}"
+                beside = straight[link][:3, :3].T @ (points[near] - straight[link][:3, 3])
+                if np.linalg.norm(beside) > _BESIDE:
+                    T = np.eye(4)
+                    T[:3, 3] = beside
+                    frames.append((f"{keypoint}_frame", link, T))
+                    link = frames[-1][0]
+                keypoints.append(KeypointSpec(keypoint=keypoint, link=link))
         keypoints.append(KeypointSpec(keypoint=f"{finger.name}4", link=tip.link))
     for name, parent, T in frames:
         if name in tree.link_names:

@@ -153,6 +153,16 @@ def _with_limits(source: Source) -> Source:
         if joint.type != "fixed" and not 0 < joint.velocity < math.inf:
             joint = replace(joint, velocity=math.pi)
         joints.append(joint)
+    limits = {joint.name: np.array((joint.lower, joint.upper)) for joint in joints}
+    for mimic in source.mimics:
+        if mimic.source not in limits:
+            raise RobotError(f"{mimic.joint!r} mimics {mimic.source!r}, which is no joint of the same file.")
+        low, high = sorted((mimic.multiplier * limits[mimic.source] + mimic.offset).tolist())
+        row = next(i for i, joint in enumerate(joints) if joint.name == mimic.joint)
+        if low < joints[row].lower or high > joints[row].upper:
+            stated = f"{joints[row].lower:.4g}..{joints[row].upper:.4g}"
+            notes.append(f"{mimic.joint!r} has the limits {low:.4g}..{high:.4g} that {mimic.source!r} gives it, in place of {stated}")
+            joints[row] = replace(joints[row], lower=low, upper=high)
     return replace(source, tree=replace(source.tree, joints=tuple(joints)), notes=tuple(notes))
 
 

@@ -6,8 +6,9 @@ list. Everything else is as in an evaluation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,11 @@ from xreset.eval.rollout import Episode, roll_out
 from xreset.eval.setting import Setting
 from xreset.eval.stats import bootstrap_ci95
 from xreset.eval.trial import Engine
-from xreset.files import file_hash, write_json
+from xreset.files import file_hash, read_json, write_json
 from xreset.physics import Capability
 from xreset.plugins import backend_class
 from xreset.task.config import RandomizationConfig, TaskConfig
+from xreset.typed import from_dict
 
 SCHEMA = "xreset-stress/1"
 COSTLY = 0.10
@@ -91,6 +93,13 @@ class Curve:
     upper: float | None
     """The same above it."""
 
+    def bears(self) -> str:
+        """The range in which fewer than ten points are lost, as far as was tried."""
+        low, high = self.points[0].value, self.points[-1].value
+        below = f"from {self.lower:.2g}" if self.lower is not None else f"from {low:g} or less" if low < self.nominal else ""
+        above = f"up to {self.upper:.2g}" if self.upper is not None else f"up to {high:g} or more" if high > self.nominal else ""
+        return " ".join(filter(None, (below, above, "" if self.unit == "x" else self.unit)))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Stress:
@@ -106,15 +115,28 @@ class Stress:
     """Properties that the engine cannot set."""
 
     def sentence(self) -> str:
-        """What it bears, in one line."""
-        parts = []
-        for curve in self.curves:
-            low, high = curve.points[0].value, curve.points[-1].value
-            below = f"from {curve.lower:.2g}" if curve.lower is not None else f"from {low:g} or less" if low < curve.nominal else ""
-            above = f"up to {curve.upper:.2g}" if curve.upper is not None else f"up to {high:g} or more" if high > curve.nominal else ""
-            bounds = " ".join(filter(None, (below, above)))
-            parts.append(f"{curve.property} {bounds}{'' if curve.unit == 'x' else ' ' + curve.unit}")
-        return f"{self.backend}: {100 * self.task_progress:.0f} %, and at most {100 * COSTLY:.0f} points less with {'; '.join(parts)}."
+        """What it bears, in one line: the smallest changes that cost ten points, and what costs less as far as was tried."""
+        limits = [
+            (abs(math.log(value)) if curve.unit == "x" else math.inf, f"{curve.property} {_amount(curve, value)}")
+            for curve in self.curves
+            for value in (curve.lower, curve.upper)
+            if value is not None
+        ]
+        costs = ", or ".join(text for _, text in sorted(limits, key=lambda limit: limit[0]))
+        bears = [
+            f"{curve.property} {_amount(curve, curve.points[0].value, curve.points[-1].value)}"
+            for curve in self.curves
+            if curve.lower is None and curve.upper is None
+        ]
+        text = f"{self.backend}: {100 * self.task_progress:.0f} %"
+        text += f"; {100 * COSTLY:.0f} points less with {costs}" if costs else ""
+        return text + (f"; less than that with {', '.join(bears)}." if bears else ".")
+
+
+def _amount(curve: Curve, *values: float) -> str:
+    """A value of a property, or the range between two."""
+    text = " to ".join(f"{v:.2g}" for v in values)
+    return f"x {text}" if curve.unit == "x" else f"of {text} {curve.unit}"
 
 
 def chosen(wanted: Sequence[str]) -> tuple[Property, ...]:
@@ -228,6 +250,19 @@ def stress(
         write_json(out / f"{engine.name}.json", about | asdict(result))
         found.append(result)
     return found
+
+
+def read_stress(folder: Path) -> tuple[Stress, ...]:
+    """The cards ``FOLDER/ENGINE.json``, in order of name; none if there is no such folder.
+
+    Raises:
+        FileFormatError: a file is damaged, or of another version.
+    """
+    names, found = {f.name for f in fields(Stress)}, []
+    for path in sorted(folder.glob("*.json")):
+        data = read_json(path, SCHEMA)
+        found.append(from_dict(Stress, {name: value for name, value in data.items() if name in names}, str(path)))
+    return tuple(found)
 
 
 def _scores(episodes: Sequence[Episode]) -> tuple[np.ndarray, np.ndarray]:

@@ -34,7 +34,8 @@ from xreset.eval.report.page import headline, page
 from xreset.eval.report.read import Curve, collect, differences, read_curves
 from xreset.eval.results import EvalResult, TaskProgress, write_results
 from xreset.eval.table import results_table
-from xreset.files import claim_folder
+from xreset.files import claim_folder, write_json
+from xreset.learning.choice import Candidate, Choice, write_choice
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import RunInfo, write_run
 from xreset.objects import load_object
@@ -148,6 +149,34 @@ class CollectTest(InFolder):
             notes = differences((toy_summary("mujoco"), toy_summary("sapien", **change)))
             self.assertEqual(len(notes), 1)
             self.assertRegex(notes[0], f"not comparable: the {what} differs .mujoco: .*sapien: ")
+
+    def test_what_it_bears_and_how_it_was_chosen(self):
+        policy = {"policy": "ab12"}
+        self.write(inputs=policy)
+        (self.folder / "stress").mkdir()
+        for i, engine in enumerate(("mujoco", "sapien")):
+            point = {"task_progress": 0.8, "ci95": (0.7, 0.9), "difference_ci95": (-0.3, 0.1)}
+            points = [point | {"value": v, "difference": d} for v, d in ((0.6, -0.3), (1.0, 0.0), (1.6, -0.05))]
+            curve = {"property": "arm-stiffness", "unit": "x", "nominal": 1.0, "points": points, "lower": 0.8 + i / 10, "upper": None}
+            card = {"backend": engine, "backend_version": "4", "episodes": 4, "task_progress": 0.8, "ci95": (0.7, 0.9)}
+            card |= {"schema": "xreset-stress/1", "curves": [curve], "left_out": []}
+            write_json(self.folder / "stress" / f"{engine}.json", card)
+        tried = (Candidate(name="2.pt", task_progress={"mujoco": 0.5}), Candidate(name="1.pt", task_progress={"mujoco": 0.7}))
+        choice = Choice(
+            chosen="1.pt", policy_hash="ab12", candidates=tried, engines={"mujoco": "4"}, seed=9, episodes_per_demo=2, demos="cd",
+        )  # fmt: skip
+        write_choice(self.folder, choice)
+        data = collect(self.folder)
+        text = Outline(page(data, [])).text
+        for words in (
+            "What it bears",
+            "mujoco: 80 %; 10 points less with arm-stiffness x 0.8.",
+            "from 0.9 up to 1.6 or more",
+            choice.sentence(),
+        ):
+            self.assertIn(words, text)
+        write_choice(self.folder, replace(choice, policy_hash="another"))
+        self.assertIsNone(collect(self.folder).choice)
 
     def test_learning_curves(self):
         from torch.utils.tensorboard import SummaryWriter

@@ -16,7 +16,7 @@ import numpy as np
 from xreset.cli import main
 from xreset.errors import XResetError
 from xreset.eval.rollout import Episode
-from xreset.eval.stress import PROPERTIES, Stress, _curve, chosen, stressed
+from xreset.eval.stress import PROPERTIES, Stress, _curve, chosen, read_stress, stressed
 from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
 
 
@@ -84,7 +84,17 @@ class CurveTest(unittest.TestCase):
         card = Stress(
             backend="mujoco", backend_version="4", episodes=4, task_progress=0.8, ci95=(0.7, 0.9), curves=(curve,), left_out=(),
         )  # fmt: skip
-        self.assertEqual(card.sentence(), "mujoco: 80 %, and at most 10 points less with arm-stiffness from 0.74 up to 2 or more.")
+        self.assertEqual(card.sentence(), "mujoco: 80 %; 10 points less with arm-stiffness x 0.74.")
+        (latency,) = chosen(["action-latency=1,2"])
+        late = _curve(latency, {v: episodes([p - v * 0.15 for p in base]) for v in (0.0, 1.0, 2.0)})
+        (mass,) = chosen(["object-mass=0.5,2"])
+        borne = _curve(mass, {v: episodes(base) for v in (0.5, 1.0, 2.0)})
+        soft = replace(curve, property="hand-stiffness", lower=0.9)
+        self.assertEqual(
+            replace(card, curves=(curve, late, borne, soft)).sentence(),
+            "mujoco: 80 %; 10 points less with hand-stiffness x 0.9, or arm-stiffness x 0.74, or action-latency of 0.67 control steps; "
+            "less than that with object-mass x 0.5 to 2.",
+        )
 
 
 class CommandTest(unittest.TestCase):
@@ -104,6 +114,8 @@ class CommandTest(unittest.TestCase):
             self.assertEqual((found["schema"], found["episodes"], found["left_out"]), ("xreset-stress/1", 2, ["arm-stiffness"]))
             (curve,) = found["curves"]
             self.assertEqual([p["value"] for p in curve["points"]], [0.0, 1.0])
+            (card,) = read_stress(folder)
+            self.assertEqual((card.left_out, card.curves[0].property), (("arm-stiffness",), "action-latency"))
             self.assertEqual(curve["points"][0]["task_progress"], found["task_progress"])
             self.assertTrue((folder / "stress.png").read_bytes().startswith(b"\x89PNG"))
             self.assertIn("left out in mujoco, which cannot set them: arm-stiffness", out.getvalue())

@@ -30,6 +30,10 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) 
         png=lambda strip: base64.b64encode(encode_png(strip.picture)).decode(),
         failures={what: count for what, count in count_failures(data.episodes[data.engines[0]]).items() if count},
         charts=_charts(data),
+        stressed={
+            name: [next((c for c in card.curves if c.property == name), None) for card in data.stress]
+            for name in dict.fromkeys(curve.property for card in data.stress for curve in card.curves)
+        },
         demonstrations={name: [of.get(name) for of in found] for name in dict.fromkeys(name for of in found for name in of)},
         inputs=_inputs(data),
     )  # fmt: skip
@@ -71,6 +75,8 @@ def _facts(data: ReportData) -> dict[str, str]:
         facts["Trained in"] = f"{run.backend} {run.backend_version} on {run.device}, {run.num_envs:,} worlds"
         done = f"{int(data.curves[0].iteration[-1]):,} of " if data.curves else ""
         facts["Training"] = f"{done}{run.config.iterations:,} iterations, seed {run.seed}, xreset {data.trained_with}"
+    if data.choice is not None:
+        facts["Checkpoint"] = data.choice.sentence()
     return facts | {"Report by": f"xreset {__version__}"}
 
 

@@ -13,7 +13,9 @@ from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.pages import short_name
 from xreset.eval.results import EvalResult, read_episodes, read_results
 from xreset.eval.rollout import Episode
+from xreset.eval.stress import Stress, read_stress
 from xreset.files import read_json
+from xreset.learning.choice import Choice, read_choice
 from xreset.learning.clock import FILE as LIFT_FILE
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
@@ -68,6 +70,10 @@ class ReportData:
     trained_with: str | None
     """Version of xreset that the policy was trained with."""
     curves: tuple[Curve, ...]
+    choice: Choice | None = None
+    """How the policy that was evaluated was chosen among the run's checkpoints."""
+    stress: tuple[Stress, ...] = ()
+    """What the policy bears, in every engine in which that was tried."""
     notes: tuple[str, ...]
     """What the reader must know before comparing engines, or what is missing."""
 
@@ -104,6 +110,7 @@ def collect(folder: Path) -> ReportData:
             run, trained_with = read_run(folder), str(read_json(folder / "run.json", RUN_SCHEMA).get("xreset"))
         except FileFormatError as error:  # results outlive a change of the training's configuration
             notes.append(f"The training is not described here: {error}")
+    choice = read_choice(results.parent)
     return ReportData(
         name=name_of(folder),
         results=results,
@@ -112,6 +119,8 @@ def collect(folder: Path) -> ReportData:
         run=run,
         trained_with=trained_with,
         curves=curves,
+        choice=choice if choice and choice.policy_hash in {s.inputs.get("policy") for s in summaries} else None,
+        stress=read_stress(results.parent / "stress"),
         notes=tuple(notes),
     )
 

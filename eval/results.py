@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.checks import check_numbers
+from xreset.checks import Checked, NotNegative, Positive, Range, Share
 from xreset.errors import FileFormatError
 from xreset.eval.rollout import Episode, Rollouts, Trace
 from xreset.eval.stats import bootstrap_ci95
-from xreset.files import POSITION, UNIT_TOLERANCE, Field, read_json, read_npz, write_json, write_npz
+from xreset.files import read_json, write_json
+from xreset.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
 from xreset.typed import from_dict
 
 SCHEMA = "xreset-eval/1"
@@ -40,55 +41,42 @@ _STACKED = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class TaskProgress:
+class TaskProgress(Checked):
     """Mean score of the highest stage of the episodes."""
 
-    mean: float
-    ci95: tuple[float, float]
+    mean: Share[float]
+    ci95: Range
     """95 % bootstrap interval over demonstrations."""
-
-    def __post_init__(self) -> None:
-        check_numbers(self, share=("mean",), ranges=("ci95",))
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoResult:
+class DemoResult(Checked):
     """The episodes of one demonstration."""
 
     sequence: str
     object: str
-    episodes: int
-    task_progress: float
-    approach_rate: float
-    grasp_rate: float
-    reorient_rate: float
-    reorientation_progress: float
-
-    def __post_init__(self) -> None:
-        check_numbers(
-            self,
-            positive=("episodes",),
-            share=("task_progress", "approach_rate", "grasp_rate", "reorient_rate", "reorientation_progress"),
-        )
+    episodes: Positive[int]
+    task_progress: Share[float]
+    approach_rate: Share[float]
+    grasp_rate: Share[float]
+    reorient_rate: Share[float]
+    reorientation_progress: Share[float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class EpisodeFaults:
+class EpisodeFaults(Checked):
     """Episodes that ended early."""
 
-    nonfinite: int
+    nonfinite: NotNegative[int]
     """Because a number was not finite: the engine broke down, or the policy's action was none."""
-    overflow: int
+    overflow: NotNegative[int]
     """In which the engine dropped contacts or constraints."""
-    out_of_bounds: int
+    out_of_bounds: NotNegative[int]
     """Because the object left the scene."""
-
-    def __post_init__(self) -> None:
-        check_numbers(self, not_negative=("nonfinite", "overflow", "out_of_bounds"))
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalResult:
+class EvalResult(Checked):
     """Contents of ``eval/BACKEND.json``: one policy in one engine."""
 
     backend: str
@@ -99,30 +87,25 @@ class EvalResult:
     objects_folder: str | None
     """Folder of meshes; None: the stand-ins."""
     policy: str
-    episodes: int
-    episodes_per_demo: int
-    seed: int
+    episodes: Positive[int]
+    episodes_per_demo: Positive[int]
+    seed: NotNegative[int]
     task_progress: TaskProgress
-    approach_rate: float
-    grasp_rate: float
-    reorient_rate: float
-    reorient_once_rate: float
-    reorientation_progress: float
+    approach_rate: Share[float]
+    grasp_rate: Share[float]
+    reorient_rate: Share[float]
+    reorient_once_rate: Share[float]
+    reorientation_progress: Share[float]
     per_demo: tuple[DemoResult, ...]
     health: EpisodeFaults
-    control_steps_per_second: float
+    control_steps_per_second: Positive[float]
     inputs: dict[str, str]
     """SHA-256 by name."""
     unseen: tuple[str, ...] = ()
     """Those of the objects that the policy was not trained with, sorted; none of a baseline's."""
 
     def __post_init__(self) -> None:
-        check_numbers(
-            self,
-            positive=("episodes", "episodes_per_demo", "control_steps_per_second"),
-            not_negative=("seed",),
-            share=("approach_rate", "grasp_rate", "reorient_rate", "reorient_once_rate", "reorientation_progress"),
-        )
+        super().__post_init__()
         if not self.objects or not self.per_demo:
             raise ValueError("it tells of no object or no demonstration")
         if "/" in self.backend or not self.backend:

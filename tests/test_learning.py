@@ -295,7 +295,7 @@ class ConfigTest(unittest.TestCase):
             (lambda: ModelConfig(mlp=(64, 0)), "mlp is .*expected one width or more"),
             (lambda: TrainConfig(save_interval=0), "save_interval is 0"),
             (lambda: ResetConfig(demo_probability=50.0), "demo_probability is 50.0, expected a number from 0 to 1"),
-            (lambda: RandomizationConfig(friction=(1.0, 0.5)), "friction is 1.0 to 0.5, expected two finite numbers"),
+            (lambda: RandomizationConfig(friction=(1.0, 0.5)), "friction is \\(1.0, 0.5\\), expected two finite numbers"),
             (lambda: TerminationConfig(object_low=2.0), "object_low is 2.0, expected less than object_high, which is 1.0"),
             (lambda: TaskConfig(substeps=0), "substeps is 0"),
         ):

@@ -1,51 +1,61 @@
-"""Numbers of a configuration that make no sense are refused when it is made, not met as NaN some minutes later."""
+"""Numbers of a configuration that make no sense are refused when it is made, not met as NaN some minutes later: rules at the field."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
 from math import inf, isfinite
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 
-def check_numbers(
-    config: object,
-    *,
-    positive: Iterable[str] = (),
-    not_negative: Iterable[str] = (),
-    finite: Iterable[str] = (),
-    share: Iterable[str] = (),
-    ranges: Iterable[str] = (),
-) -> None:
-    """Refuse fields that are out of range.
+@dataclass(frozen=True)
+class Rule:
+    """What a field's value must be like: metadata of its annotation."""
 
-    Args:
-        config: any dataclass.
-        positive: fields that must be above 0; infinity will do, where it means that there is no limit.
-        not_negative: fields that must be finite and at least 0.
-        finite: fields that must be finite.
-        share: fields that must be between 0 and 1.
-        ranges: fields that hold two finite numbers, 0 or more, the lower one first.
+    expected: str
+    holds: Callable[[Any], bool]
 
-    Raises:
-        ValueError: says which field is what, and what was expected. NaN is never in range.
+
+T = TypeVar("T")
+Positive = Annotated[T, Rule("a number above 0", lambda x: 0 < x <= inf)]
+"""Infinity will do, where it means that there is no limit: else ``Positive[Finite[float]]``."""
+NotNegative = Annotated[T, Rule("a finite number, 0 or more", lambda x: 0 <= x < inf)]
+Finite = Annotated[T, Rule("a finite number", isfinite)]
+Share = Annotated[T, Rule("a number from 0 to 1", lambda x: 0 <= x <= 1)]
+Range = Annotated[tuple[float, float], Rule("two finite numbers, 0 or more, the lower one first", lambda x: 0 <= x[0] <= x[1] < inf)]
+
+
+class Checked:
+    """Base of dataclasses whose fields' annotations hold rules, as in ``width: Positive[float] = 0.1``. None meets every rule.
+
+    Making one raises ``ValueError``, which says of all fields that break a rule what they are and what was expected. NaN is never in range.
     """
-    for name in positive:
-        if not 0 < getattr(config, name) <= inf:
-            raise ValueError(f"{name} is {getattr(config, name)}, expected a number above 0")
-    for name in not_negative:
-        if not 0 <= getattr(config, name) < inf:
-            raise ValueError(f"{name} is {getattr(config, name)}, expected a finite number, 0 or more")
-    for name in finite:
-        if not isfinite(getattr(config, name)):
-            raise ValueError(f"{name} is {getattr(config, name)}, expected a finite number")
-    for name in share:
-        if not 0 <= getattr(config, name) <= 1:
-            raise ValueError(f"{name} is {getattr(config, name)}, expected a number from 0 to 1")
-    for name in ranges:
-        low, high = getattr(config, name)
-        if not 0 <= low <= high < inf:
-            raise ValueError(f"{name} is {low} to {high}, expected two finite numbers, 0 or more, the lower one first")
+
+    def __post_init__(self) -> None:
+        wrong = [
+            f"{name} is {value}, expected {rule.expected}"
+            for name, rules in _rules(type(self)).items()
+            if (value := getattr(self, name)) is not None
+            for rule in rules
+            if not rule.holds(value)
+        ]
+        if wrong:
+            raise ValueError("; ".join(wrong))
+
+
+@cache
+def _rules(cls: type) -> dict[str, list[Rule]]:
+    hints = get_type_hints(cls, include_extras=True)
+    return {name: rules for name, hint in hints.items() if (rules := _rules_in(hint))}
+
+
+def _rules_in(hint: Any) -> list[Rule]:
+    inside = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    return [rule for part in inside for rule in getattr(part, "__metadata__", ()) if isinstance(rule, Rule)]
 
 
 def is_rigid(T: np.ndarray) -> bool:

@@ -35,7 +35,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from xreset.checks import check_numbers
+from xreset.checks import Checked, NotNegative, Positive
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.paper import METRICS, paper_tables
 from xreset.typed import from_dict
@@ -49,13 +49,13 @@ Axis = Literal["run", "object", "metric"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Data:
+class Data(Checked):
     """Demonstrations, and how states to reset to are made of them."""
 
     demos: str | None = None
     """An archive (``xreset demos``), relative to ``--data``. None: synthetic ones of the stand-ins."""
-    synthetic_per_object: int = 4
-    synthetic_seed: int = 0
+    synthetic_per_object: Positive[int] = 4
+    synthetic_seed: NotNegative[int] = 0
     meshes: str | None = None
     """Folder of meshes, relative to ``--data``; None: the stand-ins."""
     retarget: tuple[str, ...] = ()
@@ -63,12 +63,9 @@ class Data:
     resets: tuple[str, ...] = ()
     """Further options of ``xreset resets``."""
 
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("synthetic_per_object",), not_negative=("synthetic_seed",))
-
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluation:
+class Evaluation(Checked):
     """From where, how often and in what a policy is tried."""
 
     data: str | None = None
@@ -77,19 +74,16 @@ class Evaluation:
     """Only these, where a run has them; empty: all of the run's."""
     per_object: int | None = None
     """Only the first so many demonstrations of each; None: all (of the run's own data: as many as it was trained with)."""
-    episodes: int = 5
+    episodes: Positive[int] = 5
     """Perturbed starts of each demonstration."""
-    seed: int = 0
+    seed: NotNegative[int] = 0
     engines: tuple[str, ...] = ("mujoco", "mujoco-warp", "pybullet", "sapien")
     """Those that are not there are left out, and that is said."""
-    num_envs: int = 64
-
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("episodes", "num_envs"), not_negative=("seed",))
+    num_envs: Positive[int] = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class Runs:
+class Runs(Checked):
     """Trainings that differ in seed (and, with ``alone``, object), or a baseline."""
 
     data: str
@@ -98,7 +92,7 @@ class Runs:
     """Empty: all that the data have."""
     alone: bool = False
     """A training for each object, not one for all."""
-    per_object: int | None = None
+    per_object: Positive[int] | None = None
     """Only the first so many demonstrations of each object."""
     policy: Literal["ik", "zero", "random"] | None = None
     """A baseline that is evaluated and not trained."""
@@ -106,9 +100,9 @@ class Runs:
     config: dict[str, Any] = field(default_factory=dict)
     """Changes of the recipe, nested as the configuration is."""
     seeds: tuple[int, ...] = (0,)
-    minutes: float | None = None
+    minutes: Positive[float] | None = None
     """Minutes of training, without compiling."""
-    steps: float | None = None
+    steps: Positive[float] | None = None
     """Environment steps of all worlds; of both the one that is reached first. Neither: the recipe's iterations."""
     weights: str | None = None
     """Other runs of the study, whose networks these begin with: those of the same seed, and of the same object if they are alone, too."""
@@ -122,7 +116,7 @@ class Runs:
     """Names of those that are done; none: all."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, positive=("gpus", "num_envs", *(n for n in ("minutes", "steps", "per_object") if getattr(self, n) is not None)))
+        super().__post_init__()
         if not self.seeds or len(set(self.seeds)) < len(self.seeds) or min(self.seeds) < 0:
             raise ValueError(f"seeds is {list(self.seeds)}, expected one or more, each once and 0 or more")
 

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from xreset.checks import check_numbers
+from xreset.checks import Checked, NotNegative, Positive, Rule, Share
 from xreset.task.config import TaskConfig
+
+Widths = Annotated[tuple[int, ...], Rule("one width or more, each above 0", lambda widths: min(widths, default=0) >= 1)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelConfig:
+class ModelConfig(Checked):
     """Actor and critic: PointNet per cloud frame, LSTM with layer norm on its output, MLP."""
 
-    pointnet: tuple[int, ...] = (64, 128, 64)
+    pointnet: Widths = (64, 128, 64)
     """Widths of the per-point MLP 3 -> 64 -> 128 -> 64; the maximum over points is the frame's embedding."""
-    lstm: int = 512
+    lstm: Positive[int] = 512
     """Units of the LSTM."""
-    mlp: tuple[int, ...] = (512, 256, 128)
+    mlp: Widths = (512, 256, 128)
     activation: str = "elu"
-    initial_std: float = 1.0
+    initial_std: Positive[float] = 1.0
     """Initial standard deviation of the Gaussian policy. Its logarithm does not depend on the state and is learned. Not in the paper."""
-    initial_hand_std: float | None = None
+    initial_hand_std: Positive[float] | None = None
     """The same for the hand's joints, whose actions are absolute: 0.3 shakes each by a third of half its range, and grasps fall apart.
     None: ``initial_std``."""
-    synergy_std: float | None = None
+    synergy_std: Positive[float] | None = None
     """Initial standard deviation of the exploration along the hand's synergies, in units of the demonstrated spread; beside it, each joint
     keeps its own. None: no such noise (:mod:`xreset.learning.synergies`)."""
     normalize_returns: bool = False
@@ -39,77 +41,60 @@ class ModelConfig:
         names = ("pointnet", "lstm", "mlp", "activation", "normalize_observations", "normalize_returns")
         return {name: getattr(self, name) for name in names} | {"synergies": self.synergy_std is not None}
 
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("lstm", "initial_std"))
-        check_numbers(self, positive=[name for name in ("initial_hand_std", "synergy_std") if getattr(self, name) is not None])
-        for name in ("pointnet", "mlp"):
-            if not getattr(self, name) or min(getattr(self, name)) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected one width or more, each above 0")
-
 
 @dataclass(frozen=True, kw_only=True)
-class PpoConfig:
+class PpoConfig(Checked):
     """Proximal policy optimisation."""
 
-    horizon: int = 16
+    horizon: Positive[int] = 16
     """Control steps per world and iteration."""
-    sequence_length: int = 4
+    sequence_length: Positive[int] = 4
     """Length of truncated back-propagation through time; divides the horizon."""
-    mini_epochs: int = 5
-    minibatch_size: int = 32768
+    mini_epochs: Positive[int] = 5
+    minibatch_size: Positive[int] = 32768
     """Transitions per minibatch. With fewer transitions per iteration than two of these, an iteration is one minibatch."""
-    discount: float = 0.99
-    gae_lambda: float = 0.95
-    learning_rate: float = 1e-3
+    discount: Share[float] = 0.99
+    gae_lambda: Share[float] = 0.95
+    learning_rate: Positive[float] = 1e-3
     """Of the actor, and of the critic if that has none of its own."""
-    critic_learning_rate: float | None = None
+    critic_learning_rate: Positive[float] | None = None
     """A fixed rate of the critic's own. None: the actor's, which adapts to how far the *policy* moves."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """``adaptive``: the rate is divided (multiplied) by 1.5 where the policy moved more than twice (less than half) ``desired_kl``."""
-    desired_kl: float = 0.01
-    clip: float = 0.2
-    entropy: float = 0.005
-    bounds_loss: float = 0.0
+    desired_kl: Positive[float] = 0.01
+    clip: Positive[float] = 0.2
+    entropy: NotNegative[float] = 0.005
+    bounds_loss: NotNegative[float] = 0.0
     """Weight of the squared excess of the actions' means over +-1.1, summed over actions: beyond the limit noise explores nothing. The
     paper's library has it, with 1e-4."""
-    value_loss: float = 1.0
+    value_loss: NotNegative[float] = 1.0
     """Weight of the value loss. Not in the paper."""
     clip_values: bool = True
     """Whether values, too, move by at most ``clip`` per iteration. Returns of trained policies have a standard deviation of 6 to 9, so it
     takes a critic some hundred iterations to learn that range. Not in the paper; a usual setting, where returns are normalised."""
-    grad_norm: float = 1.0
+    grad_norm: Positive[float] = 1.0
     precision: Literal["float32", "tf32", "bfloat16"] = "tf32"
     """Arithmetic of matrix products on a GPU. ``bfloat16``: factors of point-cloud encoder and LSTM in bfloat16 (sums in float32), all else
     in TF32. The CPU and the exported policy use float32. Not in the paper."""
 
     def __post_init__(self) -> None:
-        check_numbers(
-            self,
-            positive=("horizon", "sequence_length", "mini_epochs", "minibatch_size", "learning_rate", "desired_kl", "clip", "grad_norm"),
-            not_negative=("entropy", "value_loss", "bounds_loss"),
-            share=("discount", "gae_lambda"),
-        )
-        if self.critic_learning_rate is not None:
-            check_numbers(self, positive=("critic_learning_rate",))
+        super().__post_init__()
         if self.horizon % self.sequence_length:
             raise ValueError(f"sequence_length is {self.sequence_length}, expected a divisor of the horizon, which is {self.horizon}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainConfig:
+class TrainConfig(Checked):
     """A whole training run: all that is saved in the run folder before it starts."""
 
     task: TaskConfig = field(default_factory=TaskConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     ppo: PpoConfig = field(default_factory=PpoConfig)
-    iterations: int = 10000
-    save_interval: int = 50
+    iterations: Positive[int] = 10000
+    save_interval: Positive[int] = 50
     """Iterations between checkpoints."""
     random_episode_start: bool = True
     """Start the first episodes at random times, so that worlds do not end in step."""
-
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("iterations", "save_interval"))
 
 
 def rsl_rl_config(config: TrainConfig, num_envs: int, synergies: Any = None) -> dict[str, Any]:

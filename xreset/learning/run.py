@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from xreset import __version__
-from xreset.checks import check_numbers
+from xreset.checks import Checked, NotNegative, Positive
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.files import read_json, write_json
 from xreset.learning.config import TrainConfig
@@ -29,7 +29,7 @@ SCHEMA = "xreset-run/1"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunInfo:
+class RunInfo(Checked):
     """Contents of ``run.json``."""
 
     robot: str
@@ -43,8 +43,8 @@ class RunInfo:
     backend: str
     backend_version: str
     device: str
-    num_envs: int
-    seed: int
+    num_envs: Positive[int]
+    seed: NotNegative[int]
     config: TrainConfig
     contract: dict[str, Any]
     """:func:`xreset.policy.policy_contract`."""
@@ -52,9 +52,6 @@ class RunInfo:
     """Path of the checkpoint whose networks the training began with; None: new ones."""
     weights_hash: str | None = None
     """Its SHA-256."""
-
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("num_envs",), not_negative=("seed",))
 
 
 def write_run(folder: Path, info: RunInfo) -> None:

@@ -5,287 +5,236 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from math import isfinite
 from typing import Literal
 
-from xreset.checks import check_numbers
+from xreset.checks import Checked, Finite, NotNegative, Positive, Range, Share
 
 
 @dataclass(frozen=True, kw_only=True)
-class ActionConfig:
+class ActionConfig(Checked):
     """How a policy's output in [-1, 1] becomes joint targets (Table VIII: relative arm commands, absolute hand targets)."""
 
-    arm_step: float = 0.03
+    arm_step: Positive[float] = 0.03
     """Largest change of an arm joint's target per control step [rad]: 1.8 rad/s at 60 Hz. Not in the paper."""
-    arm_lead: float = 0.15
+    arm_lead: Positive[float] = 0.15
     """Farthest that an arm target may run ahead of the joint [rad], so that a blocked arm does not wind up. Not in the paper."""
     hand: Literal["absolute", "relative"] = "absolute"
     """``absolute``: an action says where between its limits a hand joint is to go (the paper). ``relative``: how far its target moves, as
     for the arm, so that a policy that does nothing holds what it was given: with absolute targets a new policy opens the hand in every
     demonstrated grasp and has to learn to hold before it can learn to lift. In-hand manipulation is commonly learned so (Qi et al. 2022,
     In-Hand Object Rotation via Rapid Motor Adaptation)."""
-    hand_step: float = 0.05
+    hand_step: Positive[float] = 0.05
     """``relative`` only: largest change of a hand joint's target per control step [rad]: 3 rad/s at 60 Hz. Joints that slide move 4 cm
     for every radian."""
-    hand_lead: float = 0.4
+    hand_lead: Positive[float] = 0.4
     """``relative`` only: farthest that a hand joint's target may run ahead of the joint [rad], which is how hard it can press: drives of
     the Sharpa hand reach their effort limits at 0.3 to 0.7."""
     hand_zero: Literal["middle", "home"] = "middle"
     """``absolute`` only. Where a hand joint is sent by action 0: to the middle of its limits, which is a half-closed fist, or to the
     robot's home pose, from which -1 and +1 lead to the limits along two slopes. A new policy's mean is 0: with ``middle`` it closes the
     open hand at once and comes down on the object with its knuckles. Not in the paper."""
-    hand_smoothing: float = 1.0
+    hand_smoothing: Positive[Share[float]] = 1.0
     """``absolute`` only. Share of the new hand target that is taken per control step, in (0, 1]; 1 is the paper's plain target."""
 
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("arm_step", "arm_lead", "hand_step", "hand_lead", "hand_smoothing"), share=("hand_smoothing",))
-
 
 @dataclass(frozen=True, kw_only=True)
-class NoiseConfig:
+class NoiseConfig(Checked):
     """Standard deviations of the observation noise. The paper says what is noisy, not how much."""
 
-    joint_pos: float = 0.005
+    joint_pos: NotNegative[float] = 0.005
     """[rad]"""
-    joint_vel: float = 0.05
+    joint_vel: NotNegative[float] = 0.05
     """[rad/s]"""
-    object_pos: float = 0.003
+    object_pos: NotNegative[float] = 0.003
     """[m]"""
-    object_rot: float = 0.02
+    object_rot: NotNegative[float] = 0.02
     """[rad], about a random axis."""
-    cloud: float = 0.002
+    cloud: NotNegative[float] = 0.002
     """[m], per point."""
-
-    def __post_init__(self) -> None:
-        check_numbers(self, not_negative=("joint_pos", "joint_vel", "object_pos", "object_rot", "cloud"))
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObservationConfig:
+class ObservationConfig(Checked):
     """What the policy sees (appendix C): groups ``policy``, ``proprio``, ``perception``; the critic's ``privileged``."""
 
-    cloud_points: int = 64
+    cloud_points: Positive[int] = 64
     """Points per cloud (P)."""
-    cloud_history: int = 5
+    cloud_history: Positive[int] = 5
     """Frames of cloud history (H), oldest first."""
     rotation: Literal["quaternion", "matrix"] = "quaternion"
     """How orientations are shown: a quaternion with w >= 0, which jumps where w is 0, or the first two columns of the rotation matrix,
     which never do (Zhou et al. 2019, On the Continuity of Rotation Representations)."""
-    cloud_scale: float = 1.0
+    cloud_scale: Positive[Finite[float]] = 1.0
     """Factor on the clouds' coordinates [1/m]."""
-    contact_force_scale: float = 0.1
+    contact_force_scale: NotNegative[float] = 0.1
     """Factor on fingertip forces [1/N] before they are limited to [-1, 1]."""
     joint_target: bool = False
     """Whether the policy sees how far each drive's target is ahead of its joint [rad]. With absolute hand targets the previous action says
     so; with relative ones nothing does."""
-    joint_vel_scale: float = 0.1
+    joint_vel_scale: NotNegative[float] = 0.1
     """Factor on joint velocities [s/rad]."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
 
-    def __post_init__(self) -> None:
-        check_numbers(
-            self,
-            positive=("cloud_points", "cloud_history", "cloud_scale"),
-            finite=("cloud_scale",),
-            not_negative=("contact_force_scale", "joint_vel_scale"),
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
-class RewardConfig:
+class RewardConfig(Checked):
     """Weights and widths of the reward (appendix D.d)."""
 
-    reach: float = 1.0
-    reach_width: float = 0.1
+    reach: Finite[float] = 1.0
+    reach_width: Positive[float] = 0.1
     """Distance [m] at which 1 - tanh(d / width) falls to 0.24. Not in the paper."""
-    reach_near: float = 0.0
+    reach_near: Finite[float] = 0.0
     """Weight of a second reach term with its own width. One width cannot do both: 0.1 m pays nothing 36 cm away, where home is, and with
     0.4 m the last centimetres, in which fingers wrap around the object, are worth less than what moving costs."""
-    reach_near_width: float = 0.05
+    reach_near_width: Positive[float] = 0.05
     """[m]"""
     reach_distance: Literal["best", "present"] = "best"
     """What both reach terms are paid for: the episode's smallest distance so far (the paper), also while the hand moves away again, or the
     present one (as in Isaac Lab's dexterous lift), so that a hand that has missed stays near and tries again."""
-    grasp: float = 1.0
+    grasp: Finite[float] = 1.0
     tracking: Literal["presence", "progress"] = "presence"
     """What pays for the object's pose while the contact gate is open. ``presence``: how near it is to the goal, in position and in rotation
     (the paper), also of an object that is only pressed down where it stands. ``progress``: how much nearer than at the demonstration's
     start, which pays nothing for that. Isaac Lab came to reward lifting so (isaac-sim/IsaacLab#6155); this form is our own."""
-    position: float = 4.0
+    position: Finite[float] = 4.0
     """``presence`` only."""
-    position_width: float = 0.2
+    position_width: Positive[float] = 0.2
     """[m]"""
-    rotation: float = 4.0
+    rotation: Finite[float] = 4.0
     """``presence`` only."""
-    rotation_width: float = 1.5
+    rotation_width: Positive[float] = 1.5
     """[rad]"""
-    progress: float = 8.0
+    progress: Finite[float] = 8.0
     """``progress`` only: paid in full at the goal, nothing at the start, and less than nothing farther away."""
-    progress_width: float = 0.15
+    progress_width: Positive[float] = 0.15
     """[m]"""
-    success: float = 10.0
-    success_position: float = 0.02
+    success: Finite[float] = 10.0
+    success_position: Positive[float] = 0.02
     """[m] (section V)"""
-    success_rotation: float = 0.2617993877991494
+    success_rotation: Positive[float] = 0.2617993877991494
     """[rad], 15 degrees (section V)"""
-    action: float = -0.005
-    action_rate: float = -0.005
-    out_of_bounds: float = -500.0
+    action: Finite[float] = -0.005
+    action_rate: Finite[float] = -0.005
+    out_of_bounds: Finite[float] = -500.0
     contact: Literal["any", "opposing"] = "any"
     """What opens the gate of ``position``, ``rotation`` and ``success``: thumb and another finger press (the paper), or press against each
     other: their forces on the object are more than 90 degrees apart. A hand that presses an object down from above pushes with both in one
     direction; one that holds it does not. ``grasp`` is paid for either."""
-    contact_threshold: float = 0.1
+    contact_threshold: NotNegative[float] = 0.1
     """Force [N] from which a finger counts as in contact. Not in the paper."""
     raw_actions: bool = False
     """Whether ``action`` and ``action_rate`` take actions as the policy gave them, and not as limited to [-1, 1]. Where a mean lies beyond
     the limit, noise explores nothing, and only a penalty of the raw action pulls it back (as in Isaac Lab's action terms)."""
     own: dict[str, float] = field(default_factory=dict)
     """Terms of your own: ``module:function`` -> weight (:func:`xreset.task.rewards.own_term`)."""
-    scale: float = 0.01
+    scale: Positive[Finite[float]] = 0.01
     """Factor on the total (Table VIII)."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, weight in self.own.items():
             if not all(name.partition(":")[::2]) or not isfinite(weight):
                 raise ValueError(f"own holds {name!r} with weight {weight}, expected module:function and a finite number")
-        check_numbers(
-            self,
-            positive=(
-                "reach_width",
-                "reach_near_width",
-                "position_width",
-                "rotation_width",
-                "progress_width",
-                "success_position",
-                "success_rotation",
-                "scale",
-            ),
-            not_negative=("contact_threshold",),
-            finite=(
-                "reach",
-                "reach_near",
-                "grasp",
-                "position",
-                "rotation",
-                "progress",
-                "success",
-                "action",
-                "action_rate",
-                "out_of_bounds",
-                "scale",
-            ),
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
-class TerminationConfig:
+class TerminationConfig(Checked):
     """When an episode ends. The paper names the out-of-bounds termination, not its bounds."""
 
-    episode_seconds: float = 5.0
+    episode_seconds: Positive[Finite[float]] = 5.0
     """Time limit [s]; not a failure: its value is bootstrapped."""
-    object_low: float = -0.05
+    object_low: Finite[float] = -0.05
     """The object is out of bounds when its origin is below this height [m]: it has left the table."""
-    object_high: float = 1.0
+    object_high: Finite[float] = 1.0
     """... or above this height [m]."""
-    margin: float = 0.10
+    margin: Finite[float] = 0.10
     """... or farther than this outside the table's edges [m]."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, positive=("episode_seconds",), finite=("episode_seconds", "object_low", "object_high", "margin"))
+        super().__post_init__()
         if not self.object_low < self.object_high:
             raise ValueError(f"object_low is {self.object_low}, expected less than object_high, which is {self.object_high}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResetConfig:
+class ResetConfig(Checked):
     """The reset mixture (sections IV-B, appendix D.c, D.e, Table IX)."""
 
-    demo_probability: float = 0.5
+    demo_probability: Share[float] = 0.5
     """p: share of resets from the bank; 0 is X-Sim."""
-    frontier: float = 0.0
+    frontier: Share[float] = 0.0
     """Share of resets drawn where the policy sometimes reaches the goal and sometimes does not: in proportion to (s (1 - s)) ^
     ``frontier_power``, s being the share of recent episodes from a start that reached it. The others are drawn evenly, as in the paper."""
     frontier_over: Literal["bank", "all"] = "bank"
     """``bank``: only bank states are drawn so, and ``demo_probability`` stays their share of all resets. ``all``: bank states and home
     starts, one of each demonstration, are one table; a start's weight is its chance in the even mixture times the one above, so
     that resets come from the bank until home is where there is something to learn, and then from home."""
-    frontier_power: float = 1.0
+    frontier_power: Positive[Finite[float]] = 1.0
     """Of 1, the weight is the learnability of Tzannetos et al. 2023 (Proximal Curriculum) and Rutherford et al. 2024 (No Regrets): a start
     solved in 1 % of episodes has 4 % of the greatest weight. Flatter: with 0.5 it has 20 %, with 0.25 it has 45 %."""
-    frontier_rate: float = 0.1
+    frontier_rate: Positive[Share[float]] = 0.1
     """Weight of an episode in s."""
     pre_contact_only: bool = False
     """Use only bank states before first contact."""
     random_gravity: bool = True
     """Bank resets: gravity fraction U(0, 1); False: 1 (the fixed-gravity ablation)."""
-    home_gravity_std: float = 1.0
+    home_gravity_std: NotNegative[float] = 1.0
     """Home resets: standard deviation of the object's gravity [m/s^2] around 9.81; 0 is exactly full gravity."""
-    home_gravity_clip: float = 0.3
+    home_gravity_clip: NotNegative[float] = 0.3
     """Home resets: the gravity fraction stays within 1 +- this. The paper clips and does not say where."""
-    spawn_xy: float = 0.02
+    spawn_xy: NotNegative[float] = 0.02
     """Home resets: the object is moved by U(-x, x) in both directions [m]."""
-    spawn_yaw: float = 0.4363323129985824
+    spawn_yaw: NotNegative[float] = 0.4363323129985824
     """Home resets: the object is turned about the vertical by U(-y, y) [rad], 25 degrees."""
     home_noise: bool = True
     """Home resets: joints start around home with the robot's ``home_std``."""
 
-    def __post_init__(self) -> None:
-        check_numbers(
-            self,
-            positive=("frontier_power", "frontier_rate"),
-            finite=("frontier_power",),
-            share=("demo_probability", "frontier", "frontier_rate"),
-            not_negative=("home_gravity_std", "home_gravity_clip", "spawn_xy", "spawn_yaw"),
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
-class RandomizationConfig:
+class RandomizationConfig(Checked):
     """Physical parameters drawn at each reset (Table IX), and what else differs between one robot and the next (not in the paper).
 
     The second kind is off by default: what a policy loses to it between engines is measured in docs/sim-to-sim.md.
     """
 
     enabled: bool = True
-    friction: tuple[float, float] = (0.5, 1.0)
+    friction: Range = (0.5, 1.0)
     """Range of the object material's coefficient."""
-    friction_buckets: int = 250
+    friction_buckets: Positive[int] = 250
     """Number of distinct materials."""
-    elastomer: float = 0.8
+    elastomer: NotNegative[float] = 0.8
     """Coefficient of the fingertips' material. A pair's friction is the mean of its two materials, the rule of the paper's simulator."""
-    metal: float = 0.1
+    metal: NotNegative[float] = 0.1
     """Coefficient of every other link's material."""
-    table: float = 0.5
+    table: NotNegative[float] = 0.5
     """Coefficient of the table's material. Not in the paper."""
-    mass_scale: tuple[float, float] = (0.7, 1.3)
+    mass_scale: Range = (0.7, 1.3)
     """Range of the factor on the object's mass."""
-    torsional_friction: tuple[float, float] = (1.0, 1.0)
+    torsional_friction: Range = (1.0, 1.0)
     """Range of the factor on the torsional friction of the object's pairs."""
-    object_inertia: tuple[float, float] = (1.0, 1.0)
+    object_inertia: Range = (1.0, 1.0)
     """Range of the factor on the object's inertia, beside what its mass does."""
-    object_com: tuple[float, float] = (0.0, 0.0)
+    object_com: Range = (0.0, 0.0)
     """Range of the distance [m] by which the object's centre of mass is off, in any direction."""
-    hand_friction: tuple[float, float] | None = None
+    hand_friction: Range | None = None
     """Range of the coefficient of every link's material beside the fingertips'; None: ``metal``."""
-    arm_stiffness: tuple[float, float] = (1.0, 1.0)
+    arm_stiffness: Range = (1.0, 1.0)
     """Range of the factor on the stiffness of the arm's drives, one for all of them; likewise the next four."""
-    arm_damping: tuple[float, float] = (1.0, 1.0)
-    hand_stiffness: tuple[float, float] = (1.0, 1.0)
-    hand_damping: tuple[float, float] = (1.0, 1.0)
-    effort: tuple[float, float] = (1.0, 1.0)
+    arm_damping: Range = (1.0, 1.0)
+    hand_stiffness: Range = (1.0, 1.0)
+    hand_damping: Range = (1.0, 1.0)
+    effort: Range = (1.0, 1.0)
     """Of every drive's effort limit."""
-    action_latency: tuple[float, float] = (0.0, 0.0)
+    action_latency: Range = (0.0, 0.0)
     """Range of the control steps by which drives hear of an action late; between whole ones the two targets are mixed."""
-    observation_latency: tuple[float, float] = (0.0, 0.0)
+    observation_latency: Range = (0.0, 0.0)
     """Range of the control steps by which the object's pose and cloud are seen late."""
-    force_gain: tuple[float, float] = (1.0, 1.0)
+    force_gain: Range = (1.0, 1.0)
     """Range of the factor on the fingertips' force readings."""
 
     def __post_init__(self) -> None:
-        ranges = [f.name for f in fields(self) if isinstance(getattr(self, f.name), tuple)]
-        check_numbers(self, positive=("friction_buckets",), not_negative=("elastomer", "metal", "table"), ranges=ranges)
+        super().__post_init__()
         for name in ("mass_scale", "object_inertia"):
             if not getattr(self, name)[0] > 0:
                 raise ValueError(f"{name} begins with {getattr(self, name)[0]}, expected factors above 0")
@@ -304,7 +253,7 @@ _AS_STATED = RandomizationConfig()
 
 
 @dataclass(frozen=True, kw_only=True)
-class TaskConfig:
+class TaskConfig(Checked):
     """Everything that defines the task apart from robot, objects and reset bank."""
 
     action: ActionConfig = field(default_factory=ActionConfig)
@@ -313,15 +262,15 @@ class TaskConfig:
     termination: TerminationConfig = field(default_factory=TerminationConfig)
     reset: ResetConfig = field(default_factory=ResetConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
-    timestep: float = 1.0 / 240.0
+    timestep: Positive[Finite[float]] = 1.0 / 240.0
     """Physics timestep [s]."""
-    substeps: int = 4
+    substeps: Positive[int] = 4
     """Physics steps per control step: control at 60 Hz. Not in the paper."""
-    distance_points: int = 256
+    distance_points: Positive[int] = 256
     """Surface points per object for fingertip distances."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, positive=("timestep", "substeps", "distance_points"), finite=("timestep",))
+        super().__post_init__()
         steps = self.termination.episode_seconds / (self.timestep * self.substeps)
         for name in ("action_latency", "observation_latency"):
             if (longest := getattr(self.randomization, name)[1]) >= steps:

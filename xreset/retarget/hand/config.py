@@ -4,59 +4,52 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf
+from typing import Annotated
 
-from xreset.checks import check_numbers
+from xreset.checks import Checked, Finite, NotNegative, Positive, Rule
+
+Shares = Annotated[tuple[float, ...], Rule("finite numbers, 0 or more", lambda x: all(0 <= share < inf for share in x))]
 
 
 @dataclass(frozen=True, kw_only=True)
-class HandConfig:
+class HandConfig(Checked):
     """Weights and limits of hand retargeting; weights as in the paper's appendix D.b unless a field says otherwise."""
 
-    local_weight: float = 10.0
+    local_weight: NotNegative[float] = 10.0
     """Bone vectors and bone directions, averaged over the pairs of keypoints."""
-    global_weight: float = 1.0
+    global_weight: NotNegative[float] = 1.0
     """Positions of the keypoints, per keypoint."""
-    tip_factor: float = 10.0
+    tip_factor: NotNegative[float] = 10.0
     """How much more the position of a fingertip counts than that of another keypoint (not the paper's)."""
-    contact_weight: float = 5.0
+    contact_weight: NotNegative[float] = 5.0
     """Contact points, per keypoint in contact."""
-    contact_margin: float = 0.01
+    contact_margin: NotNegative[float] = 0.01
     """Distance between contact link and contact point that costs nothing [m]."""
-    contact_knee: float = 0.002
+    contact_knee: Positive[float] = 0.002
     """Excess over the margin below which the contact cost is quadratic [m]."""
-    clearance_weight: float = 2000.0
+    clearance_weight: NotNegative[float] = 2000.0
     """Depth of the hand in the object, the table and itself, beyond what is allowed (not the paper's)."""
-    object_clearance: float = 0.0005
+    object_clearance: Finite[float] = 0.0005
     """Distance that the hand keeps from the object [m]. Deeper grasps are pushed apart in physics: at -0.001 a third fewer are accepted."""
-    self_depth: float = 0.002
+    self_depth: Finite[float] = 0.002
     """Depth of the hand's links in one another that is allowed [m]."""
-    smoothness_weight: float = 2.0
+    smoothness_weight: Positive[float] = 2.0
     """Change of joints and root between neighbouring frames. Positive: it alone holds what no keypoint determines."""
-    jump_limit: float = 0.17
+    jump_limit: Positive[float] = 0.17
     """Change of a hand joint between neighbouring frames beyond which ``jump_weight`` applies [rad or m] (not the paper's)."""
-    jump_weight: float = 1000.0
+    jump_weight: NotNegative[float] = 1000.0
     """Change of a hand joint between neighbouring frames beyond ``jump_limit``."""
-    length_scale: float = 0.10
+    length_scale: Positive[float] = 0.10
     """Length that counts as much as one radian [m]: about a finger's length."""
-    clearance_growth: tuple[float, ...] = (0.01, 0.1)
+    clearance_growth: Shares = (
+        0.01,
+        0.1,
+    )
     """Shares of ``clearance_weight`` that the cost is minimised with first, each from the result before: a hand that may pass through the
     object at first finds the right side of a handle or a rim. Empty: none."""
-    growth_iterations: int = 6
+    growth_iterations: NotNegative[int] = 6
     """Most Levenberg-Marquardt steps with each of those."""
-    iterations: int = 40
+    iterations: NotNegative[int] = 40
     """Most Levenberg-Marquardt steps with the whole weight."""
-    tolerance: float = 1e-3
+    tolerance: NotNegative[float] = 1e-3
     """A sequence is done when a step lowers its cost by less than this fraction."""
-
-    def __post_init__(self) -> None:
-        check_numbers(
-            self,
-            positive=("smoothness_weight", "contact_knee", "jump_limit", "length_scale"),
-            not_negative=(
-                "local_weight", "global_weight", "tip_factor", "contact_weight", "contact_margin", "clearance_weight", "jump_weight",
-                "growth_iterations", "iterations", "tolerance",
-            ),
-            finite=("object_clearance", "self_depth"),
-        )  # fmt: skip
-        if not all(0 <= share < inf for share in self.clearance_growth):
-            raise ValueError(f"clearance_growth is {self.clearance_growth}, expected finite numbers, 0 or more")

@@ -19,7 +19,8 @@ from xreset.eval.results import EvalResult, mesh_folder, summarize, write_result
 from xreset.eval.rollout import roll_out
 from xreset.eval.setting import Setting
 from xreset.eval.trial import Engine, Trial
-from xreset.files import claim_folder, file_hash, npz_schema
+from xreset.files import claim_folder, file_hash
+from xreset.records import npz_schema
 from xreset.learning.choice import read_choice
 from xreset.objects import load_objects
 from xreset.policies import results_folder, shipped

@@ -20,7 +20,8 @@ import numpy as np
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import Field, atomic_write, claim, meta_of, read_json, read_npz, write_json, write_npz
+from xreset.files import atomic_write, claim, read_json, write_json
+from xreset.records import Field, meta_of, read_npz, write_npz
 from xreset.resets.bank import check_objects, read_bank, write_bank
 from xreset.spec import ObjectSpec
 from xreset.task.config import TaskConfig
@@ -106,7 +107,7 @@ class AtomicWriteTest(InFolder):
         program = (
             "import resource, signal, sys, numpy as np\n"
             "from xreset.errors import XResetError\n"
-            "from xreset.files import write_npz\n"
+            "from xreset.records import write_npz\n"
             "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
             "resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536))\n"
             "try:\n"
@@ -283,7 +284,7 @@ class NpzTest(InFolder):
 
     def test_what_no_schema_asks_for_is_never_unpacked(self):
         self.write(bomb=np.zeros(200_000_000, dtype=np.uint8))
-        with self.assertLogs("xreset.files", "WARNING") as said, limited_memory(self, 100):
+        with self.assertLogs("xreset.records", "WARNING") as said, limited_memory(self, 100):
             self.assertNotIn("bomb", self.read())
         self.assertIn("also holds ['bomb'], which this xreset", said.output[0])
 

@@ -27,7 +27,8 @@ from xreset.eval.results import write_results
 from xreset.eval.rollout import roll_out
 from xreset.eval.setting import Place, Sequence
 from xreset.eval.trial import engine
-from xreset.files import npz_schema, read_json
+from xreset.files import read_json
+from xreset.records import npz_schema
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import State
 from xreset.spec import PairFriction, SceneSpec

@@ -16,8 +16,9 @@ from xreset.eval.engines.actions import Actions
 from xreset.eval.engines.divergence import Differences, Parting, Thresholds, differences, first_of, lifted, partings, worst
 from xreset.eval.engines.episodes import Episode, Recording, play
 from xreset.eval.trial import Engine
-from xreset.files import write_json, write_npz
+from xreset.files import write_json
 from xreset.physics import State
+from xreset.records import write_npz
 
 SCHEMA = "xreset-partings/1"
 REPLAYS_SCHEMA = "xreset-replays/1"

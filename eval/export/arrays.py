@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from xreset.eval.export.recorded import Recording
-from xreset.files import write_npz
+from xreset.records import write_npz
 
 SCHEMA_NAME = "xreset-rollouts/1"
 

@@ -7,34 +7,19 @@ are in the table frame: z up, table top at z = 0, the person at +y.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from xreset.checks import is_rigid
 from xreset.errors import DemoError, ObjectError
-from xreset.files import POSITION, RATE, UNIT_TOLERANCE, Field, offsets_problem, read_npz, write_npz
-from xreset.objects import canonical_name, load_object
+from xreset.objects import canonical_name, load_object, object_names
+from xreset.records import POSITION, RATE, UNIT_TOLERANCE, Field, arrays_of, offsets_problem, read_record, write_record
 from xreset.spec import ObjectSpec
 
 SCHEMA_NAME = "xreset-demos/1"
-SCHEMA = {
-    "sequence_name": Field(("S",), "U"),
-    "subject": Field(("S",), "U"),
-    "object_name": Field(("S",), "U"),
-    "hand_side": Field(("S",), "U"),
-    "frame_offsets": Field(("S+1",), "i"),
-    "hand_keypoints": Field(("F", 21, 3), "f", within=None),
-    "hand_valid": Field(("F",), "b"),
-    "wrist_quat_wxyz": Field(("F", 4), "f", within=None),
-    "object_pos": Field(("F", 3), "f", within=None),
-    "object_quat_wxyz": Field(("F", 4), "f", within=None),
-    "fps": Field((), "f", within=None),
-    "subjects": Field(("B",), "U", required=False),
-    "T_level_from_table": Field(("B", 4, 4), "f", required=False, within=POSITION),
-}
 SIDES = ("right", "left")
 
 _HAND = 0.5
@@ -45,31 +30,31 @@ _HAND = 0.5
 class Demos:
     """Demonstrations of one or several objects; the attributes are the arrays of the file."""
 
-    sequence_name: np.ndarray
+    sequence_name: Annotated[np.ndarray, Field(("S",), "U")]
     """[S] text; unique."""
-    subject: np.ndarray
+    subject: Annotated[np.ndarray, Field(("S",), "U")]
     """[S] text: who demonstrated."""
-    object_name: np.ndarray
+    object_name: Annotated[np.ndarray, Field(("S",), "U")]
     """[S] text: the grasped object's official name."""
-    hand_side: np.ndarray
+    hand_side: Annotated[np.ndarray, Field(("S",), "U")]
     """[S] ``right`` or ``left``."""
-    frame_offsets: np.ndarray
+    frame_offsets: Annotated[np.ndarray, Field(("S+1",), "i", dtype=np.int32)]
     """[S+1] sequence i owns frames ``frame_offsets[i] : frame_offsets[i + 1]``; see :meth:`frames`."""
-    hand_keypoints: np.ndarray
+    hand_keypoints: Annotated[np.ndarray, Field(("F", 21, 3), "f", within=None)]
     """[F, 21, 3] NaN where the hand was not annotated."""
-    hand_valid: np.ndarray
+    hand_valid: Annotated[np.ndarray, Field(("F",), "b")]
     """[F] bool: whether the hand was annotated."""
-    wrist_quat_wxyz: np.ndarray
+    wrist_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", within=None)]
     """[F, 4] orientation of MANO's root: a right hand's fingers point along its -x, its palm faces -y; NaN where not annotated."""
-    object_pos: np.ndarray
+    object_pos: Annotated[np.ndarray, Field(("F", 3), "f", within=None)]
     """[F, 3] origin of the object's mesh frame."""
-    object_quat_wxyz: np.ndarray
+    object_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", within=None)]
     """[F, 4]"""
-    fps: float
+    fps: Annotated[float, Field((), "f", within=None, dtype=np.float32)]
     """Frames per second."""
-    subjects: np.ndarray | None = None
+    subjects: Annotated[np.ndarray, Field(("B",), "U")] | None = None
     """[B] the subjects that ``T_level_from_table`` is given for."""
-    T_level_from_table: np.ndarray | None = None
+    T_level_from_table: Annotated[np.ndarray, Field(("B", 4, 4), "f", within=POSITION)] | None = None
     """[B, 4, 4] per subject: takes poses to a frame whose z axis is the true table's normal; see :func:`xreset.demos.levelled`."""
 
     @property
@@ -185,8 +170,7 @@ def concatenate(parts: Sequence[Demos]) -> Demos:
         T_level_from_table=np.array(list(levels.values())) if levels else None,
         **joined,
     )
-    problem = _problem(_arrays(demos))
-    if problem:
+    if problem := _problem(arrays_of(demos)):
         raise DemoError(f"the demonstrations do not fit together: {problem}")
     return demos
 
@@ -197,25 +181,20 @@ def read_demos(path: str | Path) -> Demos:
     Raises:
         FileFormatError: the file is missing, damaged or not an archive, or a value in it is wrong: the message names sequence and frame.
     """
-    arrays = read_npz(path, SCHEMA_NAME, SCHEMA, what="an archive of demonstrations", check=_problem)
-    values: dict[str, Any] = {field.name: arrays.get(field.name) for field in fields(Demos)}
-    values["fps"] = float(arrays["fps"])
-    return Demos(**values)
+    return read_record(Demos, path, SCHEMA_NAME, what="an archive of demonstrations", check=_problem)
 
 
 def write_demos(
     path: str | Path, demos: Demos, *, config: Mapping[str, Any] | None = None, inputs: Mapping[str, str] | None = None
 ) -> None:
-    """Write an archive (see :func:`xreset.files.write_npz` for ``config`` and ``inputs``).
+    """Write an archive (see :func:`xreset.records.write_npz` for ``config`` and ``inputs``).
 
     Raises:
         DemoError: the demonstrations hold a value that the archive may not hold.
     """
-    arrays = _arrays(demos)
-    problem = _problem(arrays)
-    if problem:
+    if problem := _problem(arrays_of(demos)):
         raise DemoError(f"these demonstrations cannot be written: {problem}")
-    write_npz(path, SCHEMA_NAME, arrays, config=config, inputs=inputs)
+    write_record(path, SCHEMA_NAME, demos, config=config, inputs=inputs)
 
 
 def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSpec]:
@@ -225,8 +204,6 @@ def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSp
         DemoError: an object is unknown; the message names a sequence that needs it, and the objects that there are.
         ObjectError: a mesh cannot be used.
     """
-    from xreset.objects import object_names
-
     known = object_names(folder)
     objects: dict[str, ObjectSpec] = {}
     for name, sequence in zip(demos.object_name.tolist(), demos.sequence_name.tolist(), strict=True):
@@ -239,12 +216,6 @@ def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSp
             raise DemoError(f"sequence {sequence!r} needs the object {name!r}, which is not {where}: {error}") from None
         objects[name] = load_object(name, folder)
     return objects
-
-
-def _arrays(demos: Demos) -> dict[str, Any]:
-    values = {field.name: getattr(demos, field.name) for field in fields(Demos)}
-    values["fps"], values["frame_offsets"] = np.float32(demos.fps), demos.frame_offsets.astype(np.int32)
-    return {name: value for name, value in values.items() if value is not None}
 
 
 def _offsets(lengths: np.ndarray) -> np.ndarray:

@@ -21,7 +21,8 @@ from xreset.checks import is_rigid
 from xreset.demos import hand
 from xreset.demos.archive import SIDES, Demos, concatenate
 from xreset.errors import DemoError
-from xreset.files import RATE, UNIT_TOLERANCE, Field, max_bytes, read_npz
+from xreset.files import max_bytes
+from xreset.records import RATE, UNIT_TOLERANCE, Field, read_npz
 from xreset.text import is_plain, shown
 
 Order = Literal["mano", "mediapipe", "openpose"]

@@ -10,8 +10,8 @@ import numpy as np
 
 from xreset.env import ManipulationEnv
 from xreset.errors import RunError
-from xreset.files import write_npz
 from xreset.learning.config import TrainConfig
+from xreset.records import write_npz
 
 MAX_SHARE = 1e-3
 """Largest share of world-steps that may break; the run ends beyond it."""

@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial import ConvexHull, cKDTree
 
 from xreset.errors import FileFormatError, ObjectError, XResetError
-from xreset.files import POSITION, Field, read_npz, write_npz
 from xreset.geometry.shapes import half_spaces, hull, mass_properties, shape_mesh
+from xreset.records import POSITION, Field, read_npz, write_npz
 from xreset.spec import Shape
 
 if TYPE_CHECKING:
@@ -396,8 +397,6 @@ def limited_hull(points: np.ndarray, max_vertices: int) -> Shape:
 
     Vertices are chosen one after the other, each the one farthest outside the hull of those before.
     """
-    from scipy.spatial import ConvexHull
-
     full = hull(points)
     vertices = full.geometry.vertices
     assert vertices is not None
@@ -452,7 +451,6 @@ def _deviation(vertices: np.ndarray, faces: np.ndarray, shapes: Sequence[Shape])
 def _depth(mesh: trimesh.Trimesh) -> float:
     """Largest distance of the convex hull's surface from the mesh's, as a fraction of the bounding box's diagonal (sampled)."""
     import trimesh
-    from scipy.spatial import cKDTree
 
     hull_points = trimesh.sample.sample_surface(mesh.convex_hull, 2000, seed=0)[0]
     own_points = trimesh.sample.sample_surface(mesh, 40000, seed=0)[0]

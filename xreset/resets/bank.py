@@ -7,54 +7,22 @@ Object poses are kept apart from the states: a demonstration whose every robot s
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from xreset.accounts import Account, accounts
 from xreset.errors import FileFormatError
-from xreset.files import JOINT, POSITION, Field, Schema, read_npz, unique_problem, write_npz
 from xreset.geometry.urdf import robot_tree
+from xreset.records import JOINT, POSITION, Field, read_record, schema_of, unique_problem, write_record
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec
 
 SCHEMA = "xreset-resets/1"
 
-_FIELDS: Schema = {
-    "robot": Field((), "U"),
-    "robot_fingerprint": Field((), "U"),
-    "backends": Field(("B",), "U"),
-    "joint_names": Field(("J",), "U"),
-    "joint_pos": Field(("L", "J"), "f", within=JOINT),
-    "object_pos": Field(("L", 3), "f", within=POSITION),
-    "object_quat_wxyz": Field(("L", 4), "f", unit=True),
-    "object_name": Field(("L",), "U"),
-    "sequence_index": Field(("L",), "i"),
-    "frame_index": Field(("L",), "i"),
-    "post_contact": Field(("L",), "b"),
-    "sequence_name": Field(("S",), "U"),
-    "sequence_object": Field(("S",), "U"),
-    "start_pos": Field(("S", 3), "f", within=POSITION),
-    "start_quat_wxyz": Field(("S", 4), "f", unit=True),
-    "goal_pos": Field(("S", 3), "f", within=POSITION),
-    "goal_quat_wxyz": Field(("S", 4), "f", unit=True),
-    "object_names": Field(("O",), "U"),
-    "object_sources": Field(("O",), "U"),
-    "rejected_sequence_index": Field(("C",), "i"),
-    "rejected_frame_index": Field(("C",), "i"),
-    "rejected_post_contact": Field(("C",), "b"),
-    "rejected_reason": Field(("C",), "i"),
-    "reason_names": Field(("R",), "U"),
-    "joint_target": Field(("L", "J"), "f", required=False, within=JOINT),
-    "frame_part": Field(("L",), "f", required=False, within=(0.0, 1.0)),
-    "rejected_frame_part": Field(("C",), "f", required=False, within=(0.0, 1.0)),
-    "finger_gap": Field(("L",), "f", required=False, within=POSITION),
-    "rejected_finger_gap": Field(("C",), "f", required=False, within=POSITION),
-}
-_OF_STATES = tuple(name for name, field in _FIELDS.items() if field.shape[:1] == ("L",))
 BANDS = (0.10, 0.05, 0.02, 0.01, 0.001)
 """Distances [m] between a finger and the object by which states are counted where the hand closes in; nearer is contact."""
 
@@ -77,49 +45,49 @@ class Band:
 
 @dataclass(frozen=True, kw_only=True)
 class ResetBank:
-    """Contents of a reset bank; array shapes as in this module's schema."""
+    """Contents of a reset bank."""
 
-    robot: str
-    robot_fingerprint: str
+    robot: Annotated[str, Field((), "U")]
+    robot_fingerprint: Annotated[str, Field((), "U")]
     """:attr:`xreset.spec.RobotSpec.fingerprint` of the robot that it was made for."""
-    backends: tuple[str, ...]
+    backends: Annotated[tuple[str, ...], Field(("B",), "U")]
     """Engines in which every state was stable."""
-    joint_names: tuple[str, ...]
-    joint_pos: np.ndarray
-    object_pos: np.ndarray
-    object_quat_wxyz: np.ndarray
-    object_name: np.ndarray
-    sequence_index: np.ndarray
-    frame_index: np.ndarray
-    post_contact: np.ndarray
+    joint_names: Annotated[tuple[str, ...], Field(("J",), "U")]
+    joint_pos: Annotated[np.ndarray, Field(("L", "J"), "f", within=JOINT)]
+    object_pos: Annotated[np.ndarray, Field(("L", 3), "f", within=POSITION)]
+    object_quat_wxyz: Annotated[np.ndarray, Field(("L", 4), "f", unit=True)]
+    object_name: Annotated[np.ndarray, Field(("L",), "U")]
+    sequence_index: Annotated[np.ndarray, Field(("L",), "i")]
+    frame_index: Annotated[np.ndarray, Field(("L",), "i")]
+    post_contact: Annotated[np.ndarray, Field(("L",), "b")]
     """[L] bool: whether the human hand had touched the object by that frame."""
-    sequence_name: np.ndarray
-    sequence_object: np.ndarray
-    start_pos: np.ndarray
+    sequence_name: Annotated[np.ndarray, Field(("S",), "U")]
+    sequence_object: Annotated[np.ndarray, Field(("S",), "U")]
+    start_pos: Annotated[np.ndarray, Field(("S", 3), "f", within=POSITION)]
     """[S, 3] object position in frame 0."""
-    start_quat_wxyz: np.ndarray
-    goal_pos: np.ndarray
+    start_quat_wxyz: Annotated[np.ndarray, Field(("S", 4), "f", unit=True)]
+    goal_pos: Annotated[np.ndarray, Field(("S", 3), "f", within=POSITION)]
     """[S, 3] object position in the last frame."""
-    goal_quat_wxyz: np.ndarray
-    object_names: tuple[str, ...]
+    goal_quat_wxyz: Annotated[np.ndarray, Field(("S", 4), "f", unit=True)]
+    object_names: Annotated[tuple[str, ...], Field(("O",), "U")]
     """Objects of the sequences, sorted."""
-    object_sources: tuple[str, ...]
+    object_sources: Annotated[tuple[str, ...], Field(("O",), "U")]
     """Where each object's geometry came from (:attr:`xreset.spec.ObjectSpec.source`)."""
-    rejected_sequence_index: np.ndarray
-    rejected_frame_index: np.ndarray
-    rejected_post_contact: np.ndarray
-    rejected_reason: np.ndarray
+    rejected_sequence_index: Annotated[np.ndarray, Field(("C",), "i")]
+    rejected_frame_index: Annotated[np.ndarray, Field(("C",), "i")]
+    rejected_post_contact: Annotated[np.ndarray, Field(("C",), "b")]
+    rejected_reason: Annotated[np.ndarray, Field(("C",), "i")]
     """[C] index into ``reason_names``."""
-    reason_names: tuple[str, ...]
-    joint_target: np.ndarray | None = None
+    reason_names: Annotated[tuple[str, ...], Field(("R",), "U")]
+    joint_target: Annotated[np.ndarray, Field(("L", "J"), "f", within=JOINT)] | None = None
     """[L, J] drive targets; None: they are the joints' positions, as in files of earlier versions (:attr:`targets`)."""
-    frame_part: np.ndarray | None = None
+    frame_part: Annotated[np.ndarray, Field(("L",), "f", within=(0.0, 1.0))] | None = None
     """[L] how far a state lies on the way from its frame to the next, in [0, 1); None: every state is a frame."""
-    rejected_frame_part: np.ndarray | None = None
+    rejected_frame_part: Annotated[np.ndarray, Field(("C",), "f", within=(0.0, 1.0))] | None = None
     """[C]"""
-    finger_gap: np.ndarray | None = None
+    finger_gap: Annotated[np.ndarray, Field(("L",), "f", within=POSITION)] | None = None
     """[L] distance of the nearest finger from the object [m] (:mod:`xreset.resets.fingers`); None in files of earlier versions."""
-    rejected_finger_gap: np.ndarray | None = None
+    rejected_finger_gap: Annotated[np.ndarray, Field(("C",), "f", within=POSITION)] | None = None
     """[C]"""
 
     @property
@@ -179,13 +147,13 @@ class ResetBank:
             keep &= sequences[self.sequence_index]
         if pre_contact_only:
             keep &= ~self.post_contact
-        return replace(self, **{name: value[keep] for name in _OF_STATES if (value := getattr(self, name)) is not None})
+        of_states = [name for name, field in schema_of(ResetBank).items() if field.shape[:1] == ("L",)]
+        return replace(self, **{name: value[keep] for name in of_states if (value := getattr(self, name)) is not None})
 
 
 def write_bank(path: str | Path, bank: ResetBank, *, config: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
-    """Write a bank; see :func:`xreset.files.write_npz`."""
-    arrays = {f.name: _array(value) for f in fields(bank) if (value := getattr(bank, f.name)) is not None}
-    write_npz(path, SCHEMA, arrays, config=config, inputs=inputs)
+    """Write a bank; see :func:`xreset.records.write_record`."""
+    write_record(path, SCHEMA, bank, config=config, inputs=inputs)
 
 
 def read_bank(path: str | Path, *, robot: RobotSpec | None = None) -> ResetBank:
@@ -198,14 +166,7 @@ def read_bank(path: str | Path, *, robot: RobotSpec | None = None) -> ResetBank:
     Raises:
         FileFormatError: the file is damaged, inconsistent, or for another robot.
     """
-    arrays = read_npz(path, SCHEMA, _FIELDS, what="a reset bank", check=_check)
-    values: dict[str, Any] = {}
-    for f in fields(ResetBank):
-        if f.name not in arrays:
-            continue
-        value = arrays[f.name]
-        values[f.name] = str(value) if value.ndim == 0 else tuple(value.tolist()) if f.type == "tuple[str, ...]" else value
-    bank = ResetBank(**values)
+    bank = read_record(ResetBank, path, SCHEMA, what="a reset bank", check=_check)
     if robot is not None:
         check_robot(path, "reset bank", robot, name=bank.robot, joint_names=bank.joint_names, fingerprint=bank.robot_fingerprint)
     return bank
@@ -250,10 +211,6 @@ def check_objects(path: str | Path, bank: ResetBank, objects: tuple[ObjectSpec, 
                 f"{path} was made with {described[source == 'stand-in']} of {name}, but here is {described[found[name] == 'stand-in']}"
                 " (or another one). Give the same --objects folder, or make the bank again."
             )
-
-
-def _array(value: Any) -> np.ndarray:
-    return np.asarray(value, dtype=np.str_) if isinstance(value, str) or (isinstance(value, tuple) and not value) else np.asarray(value)
 
 
 def _check(arrays: dict[str, np.ndarray]) -> str | None:

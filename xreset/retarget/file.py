@@ -6,90 +6,62 @@ Shape letters: S sequences, F frames of all sequences, J joints, E fingertips, R
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from xreset.accounts import Account, accounts
 from xreset.demos.archive import SIDES
-from xreset.files import JOINT, POSITION, RATE, Field, Schema, offsets_problem, read_npz, write_npz
+from xreset.records import JOINT, POSITION, RATE, Field, offsets_problem, read_record, write_record
 from xreset.text import shown
 
 SCHEMA = "xreset-retargeted/1"
 
-_FIELDS: Schema = {
-    "robot": Field((), "U"),
-    "robot_fingerprint": Field((), "U"),
-    "sequence_name": Field(("S",), "U"),
-    "object_name": Field(("S",), "U"),
-    "hand_side": Field(("S",), "U"),
-    "frame_offsets": Field(("S+1",), "i"),
-    "fps": Field((), "f", within=RATE),
-    "joint_names": Field(("J",), "U"),
-    "joint_pos": Field(("F", "J"), "f", within=JOINT),
-    "palm_pos": Field(("F", 3), "f", within=POSITION),
-    "palm_quat_wxyz": Field(("F", 4), "f", unit=True),
-    "fingertip_names": Field(("E",), "U"),
-    "fingertip_pos": Field(("F", "E", 3), "f", within=POSITION),
-    "object_pos": Field(("F", 3), "f", within=POSITION),
-    "object_quat_wxyz": Field(("F", 4), "f", unit=True),
-    "goal_pos": Field(("S", 3), "f", within=POSITION),
-    "goal_quat_wxyz": Field(("S", 4), "f", unit=True),
-    "annotated": Field(("F",), "b"),
-    "valid": Field(("F",), "b"),
-    "reason": Field(("F",), "i"),
-    "reason_names": Field(("R",), "U"),
-    "contact": Field(("F",), "b"),
-    "first_contact": Field(("S",), "i"),
-    "hand_error": Field(("F",), "f", within=None),
-    "wrist_error": Field(("F",), "f", within=None),
-}
-
 
 @dataclass(frozen=True, kw_only=True)
 class Retargeted:
-    """Robot trajectories of demonstrations, in the table frame; array shapes as in this module's schema."""
+    """Robot trajectories of demonstrations, in the table frame."""
 
-    robot: str
-    robot_fingerprint: str
+    robot: Annotated[str, Field((), "U")]
+    robot_fingerprint: Annotated[str, Field((), "U")]
     """:attr:`xreset.spec.RobotSpec.fingerprint` of the robot that they were made for."""
-    sequence_name: np.ndarray
-    object_name: np.ndarray
-    hand_side: np.ndarray
+    sequence_name: Annotated[np.ndarray, Field(("S",), "U")]
+    object_name: Annotated[np.ndarray, Field(("S",), "U")]
+    hand_side: Annotated[np.ndarray, Field(("S",), "U")]
     """Side of the human hand: ``right`` or ``left``."""
-    frame_offsets: np.ndarray
+    frame_offsets: Annotated[np.ndarray, Field(("S+1",), "i")]
     """Sequence i owns frames ``frame_offsets[i] : frame_offsets[i + 1]``."""
-    fps: float
+    fps: Annotated[float, Field((), "f", within=RATE)]
     """Frames per second."""
-    joint_names: tuple[str, ...]
-    joint_pos: np.ndarray
+    joint_names: Annotated[tuple[str, ...], Field(("J",), "U")]
+    joint_pos: Annotated[np.ndarray, Field(("F", "J"), "f", within=JOINT)]
     """[F, J] within the joint limits; meaningful where ``valid``."""
-    palm_pos: np.ndarray
-    palm_quat_wxyz: np.ndarray
-    fingertip_names: tuple[str, ...]
-    fingertip_pos: np.ndarray
-    object_pos: np.ndarray
+    palm_pos: Annotated[np.ndarray, Field(("F", 3), "f", within=POSITION)]
+    palm_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", unit=True)]
+    fingertip_names: Annotated[tuple[str, ...], Field(("E",), "U")]
+    fingertip_pos: Annotated[np.ndarray, Field(("F", "E", 3), "f", within=POSITION)]
+    object_pos: Annotated[np.ndarray, Field(("F", 3), "f", within=POSITION)]
     """[F, 3] the demonstration's, put onto the table; meaningful in every frame, whether ``valid`` or not."""
-    object_quat_wxyz: np.ndarray
-    goal_pos: np.ndarray
+    object_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", unit=True)]
+    goal_pos: Annotated[np.ndarray, Field(("S", 3), "f", within=POSITION)]
     """[S, 3] object position in the last frame."""
-    goal_quat_wxyz: np.ndarray
-    annotated: np.ndarray
+    goal_quat_wxyz: Annotated[np.ndarray, Field(("S", 4), "f", unit=True)]
+    annotated: Annotated[np.ndarray, Field(("F",), "b")]
     """[F] whether the human hand was annotated."""
-    valid: np.ndarray
+    valid: Annotated[np.ndarray, Field(("F",), "b")]
     """[F] whether the frame may be used as a reset."""
-    reason: np.ndarray
+    reason: Annotated[np.ndarray, Field(("F",), "i")]
     """[F] index into ``reason_names``; 0 where valid."""
-    reason_names: tuple[str, ...]
-    contact: np.ndarray
+    reason_names: Annotated[tuple[str, ...], Field(("R",), "U")]
+    contact: Annotated[np.ndarray, Field(("F",), "b")]
     """[F] whether a human keypoint touches the object."""
-    first_contact: np.ndarray
+    first_contact: Annotated[np.ndarray, Field(("S",), "i")]
     """[S] frame within the sequence in which the human first touches the object; -1 if never."""
-    hand_error: np.ndarray
+    hand_error: Annotated[np.ndarray, Field(("F",), "f", within=None)]
     """[F] mean distance of the robot's fingertips from the human's [m]; infinite where not annotated."""
-    wrist_error: np.ndarray
+    wrist_error: Annotated[np.ndarray, Field(("F",), "f", within=None)]
     """[F] distance of the hand root from where hand retargeting wants it [m]; infinite where not annotated."""
 
     @property
@@ -111,8 +83,8 @@ class Retargeted:
 
 
 def write_retargeted(path: str | Path, retargeted: Retargeted, *, config: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
-    """Write trajectories; see :func:`xreset.files.write_npz` for ``config`` and ``inputs``."""
-    write_npz(path, SCHEMA, {f.name: np.asarray(getattr(retargeted, f.name)) for f in fields(retargeted)}, config=config, inputs=inputs)
+    """Write trajectories; see :func:`xreset.records.write_record` for ``config`` and ``inputs``."""
+    write_record(path, SCHEMA, retargeted, config=config, inputs=inputs)
 
 
 def read_retargeted(path: str | Path) -> Retargeted:
@@ -121,13 +93,7 @@ def read_retargeted(path: str | Path) -> Retargeted:
     Raises:
         FileFormatError: the file is missing, damaged, of another kind, or inconsistent.
     """
-    arrays = read_npz(path, SCHEMA, _FIELDS, what="retargeted trajectories", check=_check)
-    values: dict[str, Any] = {name: arrays[name] for name in _FIELDS}
-    for name in ("joint_names", "fingertip_names", "reason_names"):
-        values[name] = tuple(values[name].tolist())
-    return Retargeted(
-        **values | {"robot": str(values["robot"]), "robot_fingerprint": str(values["robot_fingerprint"]), "fps": float(values["fps"])}
-    )
+    return read_record(Retargeted, path, SCHEMA, what="retargeted trajectories", check=_check)
 
 
 def _check(arrays: dict[str, np.ndarray]) -> str | None:

@@ -11,38 +11,31 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from xreset import __version__
 from xreset.demos.archive import Demos
 from xreset.errors import FileFormatError
-from xreset.files import JOINT, Field, Schema, read_npz, write_npz
+from xreset.records import JOINT, Field, read_npz, schema_of, write_npz
 from xreset.retarget.validity import REASONS
 from xreset.spec import ObjectSpec, RobotSpec
 
 _SCHEMA_NAME = "xreset-retargeted-batch/1"
-_SCHEMA: Schema = {
-    "key": Field((), "U"),
-    "joint_pos": Field(("F", "J"), "f", within=JOINT),
-    "reason": Field(("F",), "i", within=(0, len(REASONS) - 1)),
-    "hand_error": Field(("F",), "f", within=None),
-    "wrist_error": Field(("F",), "f", within=None),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
     """What solving a batch gives, the frames of its sequences behind one another; see :class:`xreset.retarget.file.Retargeted`."""
 
-    joint_pos: np.ndarray
+    joint_pos: Annotated[np.ndarray, Field(("F", "J"), "f", within=JOINT)]
     """[F, J]"""
-    reason: np.ndarray
+    reason: Annotated[np.ndarray, Field(("F",), "i", within=(0, len(REASONS) - 1))]
     """[F]"""
-    hand_error: np.ndarray
+    hand_error: Annotated[np.ndarray, Field(("F",), "f", within=None)]
     """[F] [m]"""
-    wrist_error: np.ndarray
+    wrist_error: Annotated[np.ndarray, Field(("F",), "f", within=None)]
     """[F] [m]"""
 
 
@@ -60,7 +53,7 @@ class Partial:
         if not path.exists():
             return None
         try:
-            arrays = read_npz(path, _SCHEMA_NAME, _SCHEMA, what="a finished batch")
+            arrays = read_npz(path, _SCHEMA_NAME, {"key": Field((), "U"), **schema_of(Batch)}, what="a finished batch")
         except FileFormatError:
             return None  # it costs a minute to make it again, and asking the user to delete it costs more
         if str(arrays["key"]) != self.key:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import npz_schema
+from xreset.records import npz_schema
 from xreset.pictures.view.data import Human, View
 from xreset.spec import ObjectSpec
 

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.pool import initial_state
 from xreset.errors import BackendUnavailableError, XResetError
 from xreset.geometry.rotations import quat_to_matrix
 from xreset.physics import (
@@ -128,7 +127,7 @@ class MujocoWarpBackend(Backend):
             self._allocate()
             with _announced(self._warp_device):
                 self._prepare()
-        self._set_initial_state()
+        self.set_state(State.initial(scene, self.object_index).to(self.device))
 
     # Availability ----------------------------------------------------------------------------------------------------------------
 
@@ -378,11 +377,6 @@ class MujocoWarpBackend(Backend):
                     sequence()
                 self._graphs[name] = capture.graph
         wp.synchronize_device(self._warp_device)
-
-    def _set_initial_state(self) -> None:
-        states = [initial_state(self.scene, i) for i in range(len(self.scene.objects))]
-        rows = {name: torch.as_tensor(np.stack([s[name] for s in states]), dtype=torch.float32).to(self.device) for name in states[0]}
-        self.set_state(State(**{name: value[self.object_index] for name, value in rows.items()}))
 
     # What the graphs hold -----------------------------------------------------------------------------------------------------------
 

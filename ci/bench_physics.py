@@ -33,7 +33,8 @@ from rich.console import Console
 from rich.table import Table
 
 from xreset import robots
-from xreset.backends.pool import PoolBackend, World, usable_cores
+from xreset.backends.pool import PoolBackend, World
+from xreset.backends.workers import usable_cores
 from xreset.env import make_scene
 from xreset.objects import load_objects
 from xreset.physics import Backend, State

@@ -18,7 +18,7 @@ import torch
 from benchlib import Options
 from rich.console import Console
 
-from xreset.backends.pool import usable_cores
+from xreset.backends.workers import usable_cores
 
 _NUM_ENVS = 8
 """Worlds of a section that does not say otherwise."""

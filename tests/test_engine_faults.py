@@ -8,7 +8,6 @@ from dataclasses import fields
 import torch
 
 from tests.test_conformance_engines import BACKENDS, make_local
-from xreset.backends.conformance.harness import start_state
 from xreset.backends.conformance.scene import scene
 from xreset.physics import State
 from xreset.plugins import backend_status
@@ -28,7 +27,7 @@ class NotFinite(unittest.TestCase):
     def check(self, name: str) -> None:
         spec = scene()
         index = torch.arange(WORLDS) % len(spec.objects)
-        start = start_state(spec, index)
+        start = State.initial(spec, index)
         with make_local(name)(spec, WORLDS, object_index=index) as backend, make_local(name)(spec, WORLDS, object_index=index) as same:
             begin = start.to(backend.device)
             for worlds in (backend, same):

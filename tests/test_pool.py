@@ -19,10 +19,11 @@ from unittest import mock
 import numpy as np
 import torch
 
-from xreset.backends.pool import STATE_FIELDS, PoolBackend, World, _sweep, _Worker, initial_state, is_finite, lowest_point
+from xreset.backends.pool import PoolBackend, World, is_finite
+from xreset.backends.workers import STATE_FIELDS, _sweep, _Worker
 from xreset.errors import CapabilityError, RobotError, XResetError
 from xreset.physics import State
-from xreset.spec import DriveSpec, FingertipSpec, Geometry, JointSpec, ObjectSpec, RobotSpec, SceneSpec, Shape
+from xreset.spec import DriveSpec, FingertipSpec, Geometry, JointSpec, ObjectSpec, RobotSpec, SceneSpec, Shape, lowest_point
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -399,9 +400,6 @@ class RestHeightTest(unittest.TestCase):
         for geometry, points, margin in cases:
             expected = (points @ T[:3, :3].T + T[:3, 3])[:, 2].min() - margin
             self.assertAlmostEqual(lowest_point([Shape(geometry=geometry, T_body_shape=T)]), expected, places=5, msg=geometry.kind)
-
-    def test_initial_state_has_every_field(self):
-        self.assertEqual(set(initial_state(toy_scene(), 0)), {f.name for f in fields(State)})
 
 
 class LeftBehind(unittest.TestCase):

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import BackendUnavailableError, CapabilityError
-from xreset.spec import SceneSpec
+from xreset.spec import SceneSpec, lowest_point
 from xreset.tensors import Tensors
 
 Parameter = Literal["friction", "torsional_friction", "object_mass", "object_inertia", "object_com", "object_gravity", "drives"]
@@ -51,6 +51,14 @@ class State(Tensors):
             joint_pos=q, joint_vel=torch.zeros_like(q), joint_target=q.clone() if joint_target is None else joint_target.float(),
             object_pos=pos, object_quat=object_quat.float(), object_linvel=still, object_angvel=still.clone(),
         )  # fmt: skip
+
+    @classmethod
+    def initial(cls, scene: SceneSpec, object_index: Tensor) -> Self:
+        """What worlds with these objects [N] begin with: nothing moves, the robot is at home, the object upright at the table's centre."""
+        places = torch.tensor([(*scene.table.center, -lowest_point(thing.pieces)) for thing in scene.objects])
+        home = torch.as_tensor(scene.robot.home).repeat(len(object_index), 1)
+        upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(object_index), 1)
+        return cls.at_rest(home, places[object_index.cpu()], upright)
 
 
 @dataclass(frozen=True, kw_only=True)

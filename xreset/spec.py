@@ -7,6 +7,7 @@ table's top at z = 0. Shape letters: J actuated joints, E fingertips.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -263,3 +264,23 @@ class SceneSpec:
     def control_dt(self) -> float:
         """Duration of a control step [s]."""
         return self.timestep * self.substeps
+
+
+def lowest_point(shapes: Sequence[Shape]) -> float:
+    """Smallest z of the shapes, in the frame of their body [m]."""
+    return min(_lowest(shape) for shape in shapes)
+
+
+def _lowest(shape: Shape) -> float:
+    geometry, z = shape.geometry, shape.T_body_shape[2, 3]
+    row = shape.T_body_shape[2, :3]  # height of a point p of the shape's own frame: z + row . p
+    if geometry.kind == "hull":
+        return float(z + (geometry.vertices @ row).min())
+    if geometry.kind == "box":
+        return float(z - np.abs(row) @ geometry.size)
+    if geometry.kind == "sphere":
+        return float(z - geometry.size[0])
+    radius, half = geometry.size
+    if geometry.kind == "capsule":
+        return float(z - abs(row[2]) * half - radius)
+    return float(z - abs(row[2]) * half - radius * np.hypot(row[0], row[1]))

@@ -21,9 +21,8 @@ from xreset.backends.conformance.harness import (
 )
 from xreset.backends.conformance.results import Measure, checks_of
 from xreset.backends.conformance.scene import flat_objects
-from xreset.backends.pool import lowest_point
 from xreset.physics import Backend, State
-from xreset.spec import GRAVITY, ObjectSpec, PairFriction, Shape
+from xreset.spec import GRAVITY, ObjectSpec, PairFriction, Shape, lowest_point
 
 check = checks_of("contact")
 

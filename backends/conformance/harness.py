@@ -14,7 +14,6 @@ from torch import Tensor
 
 from xreset.backends.conformance.results import Measure, Skipped
 from xreset.backends.conformance.scene import gripper
-from xreset.backends.pool import initial_state
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_normalize
 from xreset.physics import Backend, Parameter, State
@@ -129,8 +128,7 @@ def free_place(scene: SceneSpec) -> tuple[float, float]:
 
 def start_state(scene: SceneSpec, object_index: Tensor) -> State:
     """[N] the states that a new backend begins with."""
-    rows = [initial_state(scene, i) for i in object_index.tolist()]
-    return State(**{name: torch.as_tensor(np.stack([row[name] for row in rows]), dtype=torch.float32) for name in rows[0]})
+    return State.initial(scene, object_index)
 
 
 def replace_fields(state: State, **changes: Tensor) -> State:

@@ -17,7 +17,6 @@ from xreset.backends.conformance.harness import (
     rotation_angle,
     small_motion,
     snapshot,
-    start_state,
 )
 from xreset.backends.conformance.results import Measure, Skipped, checks_of
 from xreset.backends.conformance.scene import reorder_joints
@@ -139,7 +138,7 @@ def joint_order(bench: Bench) -> list[Measure]:
         measures = link_measures(kinematics, state, links)[:2]
         measures += compare_states(snapshot(backend.state()), state, {name: ROUND_TRIP[name] for name in ("joint_pos", "joint_vel")})
 
-        start = bench.placed(start_state(scene, which)).to(backend.device)
+        start = bench.placed(State.initial(scene, which)).to(backend.device)
         motion = small_motion(kinematics).to(backend.device)
         backend.set_state(start)
         backend.set_joint_targets(start.joint_pos + torch.diag(motion))  # world i moves joint i

@@ -6,10 +6,12 @@ where every link has gone. Also numpy operations on a few quaternions (w, x, y, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from xreset.errors import ObjectError, RobotError, XResetError
 from xreset.geometry.urdf import Joint, Link, RobotTree, robot_tree
@@ -164,6 +166,37 @@ class TrackedFrames:
         return pos + arm, (quat[:, None] @ self._turns)[:, 0], com_velocity + cross(angvel, lever), angvel
 
 
+class MovingJoints:
+    """The actuated and the mimic joints among all that an engine moves, and the robot's drives. D moving joints, J actuated, Q mimics."""
+
+    def __init__(self, robot: RobotSpec, names: Sequence[str]) -> None:
+        """Take a robot and the names [D] of the moving joints in the engine's order."""
+        at = {name: i for i, name in enumerate(names)}
+        self.count = len(at)
+        """D"""
+        self.driven = np.array([at[name] for name in robot.joint_names])
+        """[J] where each actuated joint is."""
+        self.mimic = np.array([at[mimic.joint] for mimic in robot.mimics], dtype=int)
+        """[Q] where each mimic joint is."""
+        self.source = np.array([robot.joint_names.index(mimic.source) for mimic in robot.mimics], dtype=int)
+        """[Q] the actuated joint that it follows."""
+        self.multiplier = np.array([mimic.multiplier for mimic in robot.mimics])
+        self.offset = np.array([mimic.offset for mimic in robot.mimics])
+        drives = [joint.drive for joint in robot.joints]
+        self.nominal = np.array([(drive.kp, drive.kd, drive.effort) for drive in drives]).T
+        """[3, J] stiffness, damping and effort limit."""
+        self.armature = np.array([drive.armature for drive in drives])
+        self.friction_loss = np.array([drive.friction_loss for drive in drives])
+
+    def spread(self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities [D] of all moving joints, given those [J] of the actuated ones."""
+        q, v = np.zeros(self.count), np.zeros(self.count)
+        q[self.driven], v[self.driven] = position, velocity
+        q[self.mimic] = self.multiplier * position[self.source] + self.offset
+        v[self.mimic] = self.multiplier * velocity[self.source]
+        return q, v
+
+
 class Arms:
     """Vectors that are fixed in bodies, to be seen from the world in every step: as :func:`rotate`, in fewer calls of numpy.
 
@@ -281,8 +314,6 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 def matrix_to_quat(R: np.ndarray) -> np.ndarray:
     """[4] unit quaternion of a rotation matrix [3, 3]."""
-    from scipy.spatial.transform import Rotation
-
     return Rotation.from_matrix(R).as_quat(scalar_first=True)
 
 

@@ -12,8 +12,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.engine_checks import EngineChecks, hull_box
+from xreset.backends.bullet_models import _origin
 from xreset.backends.conformance.scene import gripper, objects, scene
-from xreset.backends.pybullet import PybulletBackend, PybulletSettings, PybulletWorld, _origin
+from xreset.backends.pybullet import PybulletBackend, PybulletSettings, PybulletWorld
 from xreset.backends.rigid import mechanism
 from xreset.errors import BackendUnavailableError, ObjectError
 from xreset.geometry.dynamics import mass_matrix
@@ -30,9 +31,9 @@ class PybulletTest(EngineChecks, unittest.TestCase):
         robot = gripper()
         q = robot.home + np.array([0.02, -0.1, 0.3, 0.2, 0.005])
         drives = world._drives
-        full = drives._mass_matrix(drives._all(q, drives._offset))
+        full = drives._mass_matrix(drives._joints.spread(q, q)[0])
         # Mimic joints move with their source: M = S^T M_all S with q_all = S q + constant.
-        S = np.stack([drives._all(e, np.zeros(1)) for e in np.eye(5)], axis=1)
+        S = np.stack([drives._joints.spread(q, e)[1] for e in np.eye(5)], axis=1)
         np.testing.assert_allclose(S.T @ full @ S, mass_matrix(robot, q), rtol=1e-6, atol=1e-9)
 
     def test_roll_pitch_yaw(self):

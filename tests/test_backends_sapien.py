@@ -13,7 +13,8 @@ import numpy as np
 from tests.engine_checks import EngineChecks
 from xreset.backends.conformance.scene import gripper, scene
 from xreset.backends.rigid import mechanism
-from xreset.backends.sapien import SapienBackend, _friction, _self_collision_bits
+from xreset.backends.sapien import SapienBackend, _friction
+from xreset.backends.sapien_robot import self_collision_bits
 from xreset.errors import BackendUnavailableError, RobotError
 from xreset.spec import MimicSpec
 
@@ -42,7 +43,7 @@ class CollisionBitsTest(unittest.TestCase):
             gripper(), self_collision_links=("base", "column", "wrist", "jaw_a", "pad_b"), collision_exclude=(("base", "jaw_a"),)
         )
         mech = mechanism(robot)
-        bits = _self_collision_bits(mech)
+        bits = self_collision_bits(mech)
         hits = {
             frozenset((a, b))
             for a, b in itertools.combinations(robot.self_collision_links, 2)

@@ -1,0 +1,117 @@
+"""Joint torques for Bullet: what :mod:`xreset.backends.pybullet` drives robots with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from xreset.backends.rigid import Mechanism, MovingJoints
+
+
+class BulletDrives:
+    """Joint torques: PD drives with effort limits, armature, dry friction and mimic couplings.
+
+    Arrays are over the D moving joints in the order of the bodies, which is Bullet's link order. With M the mass matrix and c the Coriolis
+    torque, drives that have armature A and are implicit in their damping give the acceleration a = (M + B)^-1 (tau - c), where tau is the
+    PD torque and B = diag(A + dt kd). Bullet integrates a = M^-1 (tau' - c), so it does the same when given tau' = tau - B a. Mimic joints
+    are coupled by a stiff spring and damper, which add J^T (dt^2 k + dt b) J to B.
+
+    In contact that alone is wrong: a held joint does not move with a, and would lack the torque B a. So the torque r of contacts and limits
+    in the last step, seen as r = M dv / dt - (tau' - c), is expected again: a = (M + B)^-1 (tau - c + r). A held joint then gets the whole
+    of tau, and an impact delivers the momentum of M + B, both after about 1 + B / M steps. That is one or two for ordinary drives; it is
+    far too many where B dwarfs M, as with armature on the light links of a hand.
+    """
+
+    def __init__(self, engine: Any, client: int, body: int, robot: Mechanism, dt: float, mass_matrix_steps: int) -> None:
+        self._p, self._client, self._body, self._dt = engine, client, body, dt
+        self._mass_matrix_age, self._mass_matrix_steps = 0, mass_matrix_steps
+        spec, names = robot.robot, robot.joint_names
+        self._links = list(range(1, len(names) + 1))  # link 0 is the base
+        self._joints = MovingJoints(spec, names)
+        self.driven = self._joints.driven
+        """[J] position of each actuated joint among the moving ones."""
+        self.target = spec.home
+        """[J] drive targets."""
+        self._mimic, self._source, self._multiplier = self._joints.mimic, self._joints.source, self._joints.multiplier
+        self._kp, self._kd, self._effort = self._joints.nominal
+        self._brakes = bool(self._joints.friction_loss.any())
+
+        self.reset(spec.home, np.zeros_like(spec.home), spec.home)
+        M = self._mass_matrix(spec.home)
+        self._J = np.zeros((len(self._mimic), len(names)))
+        """Rate of each mimic joint's lag behind its source, by joint."""
+        rows = np.arange(len(self._mimic))
+        self._J[rows, self._mimic] = -1.0
+        self._J[rows, self.driven[self._source]] = self._multiplier
+        inertia = 1.0 / np.diag(np.linalg.inv(M))[self._mimic]
+        self._stiffness, self._damping = inertia / dt**2, 2.0 * inertia / dt  # critically damped, as stiff as one step can feel
+        self._coupling = self._J.T @ ((dt**2 * self._stiffness + dt * self._damping)[:, None] * self._J)
+        self._M, self._added, self._inverse = M, np.zeros_like(M), np.zeros_like(M)
+        self._saturated = np.zeros(0, dtype=bool)
+
+        # Bullet's joints start with a motor that brakes them.
+        engine.setJointMotorControlArray(body, self._links, engine.VELOCITY_CONTROL, forces=np.zeros(len(names)), physicsClientId=client)
+
+    def reset(self, position: np.ndarray, velocity: np.ndarray, target: np.ndarray) -> None:
+        """Set positions, velocities and targets [J] of the actuated joints; mimic joints follow."""
+        q, v = self._joints.spread(position, velocity)
+        self._p.resetJointStatesMultiDof(
+            self._body, self._links, [[x] for x in q], targetVelocities=[[x] for x in v], physicsClientId=self._client
+        )
+        self.target = target
+        self._mass_matrix_age = 0
+        self._last_step: tuple[np.ndarray, np.ndarray] | None = None
+
+    def scale(self, factors: np.ndarray) -> None:
+        """Set factors (3, J) on stiffness, damping and effort limit."""
+        self._kp, self._kd, self._effort = factors * self._joints.nominal
+        self._mass_matrix_age = 0  # what is implicit in the damping has to be factorised anew
+
+    def read(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities [D] of all moving joints."""
+        states = self._p.getJointStates(self._body, self._links, physicsClientId=self._client)
+        return np.array([state[0] for state in states]), np.array([state[1] for state in states])
+
+    def apply(self) -> None:
+        """Apply the torques of one Bullet step."""
+        q, v = self.read()
+        dt, driven = self._dt, self.driven
+        wanted = self._kp * (self.target - q[driven]) - self._kd * v[driven]
+        tau = np.zeros(len(q))
+        tau[driven] = np.minimum(np.maximum(wanted, -self._effort), self._effort)  # np.clip takes three times as long
+        if len(self._mimic):
+            lag = self._multiplier * q[driven[self._source]] + self._joints.offset - q[self._mimic]
+            rate = self._J @ v
+            tau -= self._J.T @ (self._stiffness * (lag + dt * rate) + self._damping * rate)
+        bias = np.array(self._p.calculateInverseDynamics(self._body, q.tolist(), v.tolist(), [0.0] * len(q), physicsClientId=self._client))
+        net = tau - bias
+        if self._last_step is not None:
+            last_velocity, last_net = self._last_step
+            net += self._M @ (v - last_velocity) / dt - last_net
+        saturated = np.abs(wanted) > self._effort
+        if self._mass_matrix_age == 0 or saturated.tobytes() != self._saturated.tobytes():
+            self._factorise(q, saturated)
+        self._mass_matrix_age = (self._mass_matrix_age + 1) % self._mass_matrix_steps
+        if self._brakes:
+            stopping = -(v / dt + self._inverse @ net)[driven] / np.diag(self._inverse)[driven]
+            brake = np.clip(stopping, -self._joints.friction_loss, self._joints.friction_loss)
+            tau[driven] += brake
+            net[driven] += brake
+        tau -= self._added @ (self._inverse @ net)
+        self._last_step = v, tau - bias
+        self._p.setJointMotorControlArray(
+            self._body, self._links, self._p.TORQUE_CONTROL, forces=tau.tolist(), physicsClientId=self._client
+        )
+
+    def _mass_matrix(self, q: np.ndarray) -> np.ndarray:
+        return np.array(self._p.calculateMassMatrix(self._body, q.tolist(), physicsClientId=self._client))
+
+    def _factorise(self, q: np.ndarray, saturated: np.ndarray) -> None:
+        """Invert M + B; a drive at its effort limit has no damping left to be implicit in."""
+        added = np.zeros(len(q))
+        added[self.driven] = self._joints.armature + np.where(saturated, 0.0, self._dt * self._kd)
+        self._added = self._coupling + np.diag(added)
+        self._M = self._mass_matrix(q)
+        self._inverse = np.linalg.inv(self._M + self._added)
+        self._saturated = saturated

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.test_env import TASK, WithEnv
-from xreset.task.config import TerminationConfig
+from tests.test_env import TASK, BreakableBackend, N, WithEnv
+from xreset.task.config import ResetConfig, TerminationConfig
 
 try:
     import gymnasium
@@ -96,6 +96,28 @@ class VectorEnvTest(WithEnv):
             if step == length + 1:
                 np.testing.assert_array_equal(reward, 0.0)
                 np.testing.assert_array_equal(env.env.episode_length_buf.numpy(), 0)
+
+    def test_an_episode_counts_once(self):
+        """The frontier learns from it, and a broken world is counted, in the step that ends it; not again in the one that resets it."""
+        from xreset.vector_env import VectorEnv
+
+        task = replace(TASK, reset=ResetConfig(demo_probability=1.0, frontier=0.5), termination=TerminationConfig(episode_seconds=0.1))
+        inner = self.make(task, kind=BreakableBackend)
+        env, still = VectorEnv(inner), np.zeros((N, inner.num_actions), np.float32)
+        inner.backend.broken[0] = True
+        _, _, _, truncated, infos = env.step(still)
+        self.assertEqual((truncated.tolist(), infos["faulty"].tolist()), ([True, False, False],) * 2)
+        _, _, _, truncated, infos = env.step(still)
+        self.assertFalse(truncated.any() or infos["faulty"].any())
+        self.assertEqual(int(inner.nonfinite_count), 1)
+        for _ in range(inner.max_episode_length - 2):
+            *_, truncated, _ = env.step(still)
+        self.assertEqual(truncated.tolist(), [False, True, True])
+        learned = inner.resets.reached.clone()
+        self.assertTrue((learned < 0.5).any())
+        env.step(still)
+        self.assertEqual(inner.resets.reached.tolist(), learned.tolist())
+        env.close()
 
     def test_the_seed_decides(self):
         runs = []

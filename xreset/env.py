@@ -121,15 +121,13 @@ class ManipulationEnv:
             resets: where episodes start, on the backend's device.
             seed: of every random number that the environment draws.
         """
-        from tensordict import TensorDict
-
         for name in task.reward.own:
             own_term(name)  # what cannot be loaded is refused now, not after the first step
         self.backend, self.task, self.resets = backend, task, resets
         self.cfg = task
         self.device = backend.device
         scene = backend.scene
-        n = self.num_envs = backend.num_worlds
+        self.num_envs = backend.num_worlds
         self.num_actions = len(scene.robot.joints)
         self.max_episode_length = episode_steps(task.termination, scene.control_dt)
         self.generator = torch.Generator(device=self.device)
@@ -150,6 +148,15 @@ class ManipulationEnv:
             torch.where(limit.isfinite(), limit, sign * torch.pi) for limit, sign in ((self.actions.lower, -1.0), (self.actions.upper, 1.0))
         )
 
+        self._allocate()
+        self.reset()
+
+    def _allocate(self) -> None:
+        """Make every buffer that a step writes to."""
+        from tensordict import TensorDict
+
+        n, task = self.num_envs, self.task
+
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(n, *shape, dtype=dtype, device=self.device)
 
@@ -163,20 +170,10 @@ class ManipulationEnv:
         self._best_reach, self._reward, self._time_out = zeros(), zeros(), zeros(dtype=torch.bool)
         self._reached = zeros(dtype=torch.bool)
         self._cloud = zeros(task.observation.cloud_history, task.observation.cloud_points, 3)
-        # What a step puts down for the next part of it: which worlds begin anew, how, and what there is to log.
-        self._fresh = zeros(dtype=torch.bool)
-        self._no_action = zeros(dtype=torch.bool)
-        self._start = Reset(
-            joint_pos=zeros(self.num_actions),
-            joint_target=zeros(self.num_actions),
-            object_pos=zeros(3),
-            object_quat=zeros(4),
-            goal_pos=zeros(3),
-            goal_quat=zeros(4),
-            gravity_fraction=zeros(),
-            state=torch.full_like(self.bank_state, -1),
-            sequence=zeros(dtype=torch.long),
-        )
+        # What a step puts down for the next part of it: which worlds are reset, to what, and which are over and wait for it.
+        self._reset_mask, self._over = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
+        self._bad_action = zeros(dtype=torch.bool)
+        self._new_start = self.resets.sample(self.backend.object_index, torch.Generator(device=self.device)).clone()
         self._parameters = {"friction": zeros(3), "object_mass": zeros()}
         """Physical parameters of each world, by name; its gravity fraction is :attr:`gravity_fraction`."""
         # What differs between one robot and the next is None where it does not: then it costs nothing, and draws no random number.
@@ -186,26 +183,25 @@ class ManipulationEnv:
         for name, shape in (("torsional_friction", ()), ("object_inertia", ()), ("object_com", (3,))):
             if random.draws(name):
                 self._parameters[name] = zeros(*shape)
-        if missing := [name.replace("_", " ") for name in self._parameters if name not in backend.capabilities]:
+        if missing := [name.replace("_", " ") for name in self._parameters if name not in self.backend.capabilities]:
             raise CapabilityError(
-                f"the backend {backend.name!r} cannot set {', '.join(missing)} world by world, which this task draws at random: leave "
+                f"the backend {self.backend.name!r} cannot set {', '.join(missing)} world by world, which this task draws at random: leave "
                 "those ranges of task.randomization as they are by default, or use another backend."
             )
         self._force_gain = torch.ones(n, 1, 1, device=self.device) if random.draws("force_gain") else None
         late_actions, late_poses = (limits[1] if random.enabled else 0.0 for limits in (random.action_latency, random.observation_latency))
         self._commands = DelayLine(self._target, late_actions) if late_actions else None
         self._poses = DelayLine(zeros(7), late_poses) if late_poses else None
-        self._heard = zeros(self.num_actions)
+        self._sent_target = zeros(self.num_actions)
         # What is kept of a step in case that it breaks a world.
-        state = backend.state()
-        self._before = {f.name: getattr(state, f.name).clone() for f in fields(state)}
+        state = self.backend.state()
+        self._state_before = {f.name: getattr(state, f.name).clone() for f in fields(state)}
         self._faulty = zeros(dtype=torch.bool)
         self._worlds = torch.arange(n, device=self.device)
         self.faults = FaultRecorder({name: tuple(value.shape[1:]) for name, value in self._fault_values(state).items()}, self.device)
         self._log_names: tuple[str, ...] = ()
         self._log_values = torch.zeros(0, device=self.device)
         self._observations = TensorDict({}, batch_size=[n], device=self.device)
-        self.reset()
 
     def close(self) -> None:
         """Close the engine."""
@@ -242,33 +238,35 @@ class ManipulationEnv:
 
         Args:
             action: [N, J] in [-1, 1] (limited to it). A world that is given numbers that are not finite ends as if its engine had failed.
-            begin: [N] bool, worlds that are reset instead; None: those whose episode has ended.
+            begin: [N] bool, worlds that are reset instead; None: those whose episode has ended. A world whose episode has ended and that is
+                not reset yet counts no more: it does not end again, and nothing is learned from it.
 
         Returns:
             Observations (of the new episode where one has begun), reward [N], done [N] (0 or 1), extras with ``time_outs`` [N] (ended
             without failing: the value is to be bootstrapped), ``faulty`` [N] bool (ended because the simulation failed: nothing is to be
             learned from this step) and ``log``.
         """
-        self._move(action)
-        self._graphs.run(self._judge)
-        reward, done, time_out, faulty = self._reward.clone(), self._fresh.long(), self._time_out.float(), self._faulty.clone()
+        self._apply_action(action)
+        self._graphs.run(self._compute_rewards)
+        reward, done, time_out, faulty = self._reward.clone(), self._reset_mask.long(), self._time_out.float(), self._faulty.clone()
         log = dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True))
         if begin is not None:
-            self._fresh.copy_(begin)
-        if self._graphs.active or bool(self._fresh.any()):
-            self._graphs.run(self._draw)
-            self._begin()
-        self._graphs.run(self._observe)
+            self._over |= self._reset_mask
+            self._reset_mask.copy_(begin)
+        if self._graphs.active or bool(self._reset_mask.any()):
+            self._graphs.run(self._sample_resets)
+            self._write_resets()
+        self._graphs.run(self._compute_observations)
         return self.get_observations(), reward, done, {"time_outs": time_out, "faulty": faulty, "log": log}
 
     # Stepping and resetting --------------------------------------------------------------------------------------------------------
 
     def advance(self, action: Tensor) -> tuple[Reading, Reward]:
         """One control step without any reset: for evaluation, which ends episodes by itself."""
-        self._move(action)
-        reading, reward = self._judge()
-        self._fresh.zero_()
-        self._observe()
+        self._apply_action(action)
+        reading, reward = self._compute_rewards()
+        self._reset_mask.zero_()
+        self._compute_observations()
         return reading, reward
 
     def reset(self, worlds: Tensor | None = None, start: Reset | None = None) -> None:
@@ -280,14 +278,14 @@ class ManipulationEnv:
         """
         if worlds is None:
             worlds = torch.arange(self.num_envs, device=self.device)
-        self._fresh.zero_()
-        self._fresh[worlds] = True
+        self._reset_mask.zero_()
+        self._reset_mask[worlds] = True
         if start is not None:
             for f in fields(Reset):
-                getattr(self._start, f.name)[worlds] = getattr(start, f.name)
-        self._draw(start is None)
-        self._begin()
-        self._observe()
+                getattr(self._new_start, f.name)[worlds] = getattr(start, f.name)
+        self._sample_resets(start is None)
+        self._write_resets()
+        self._compute_observations()
 
     def reading(self) -> Reading:
         """The present physical state and what follows from it."""
@@ -321,13 +319,9 @@ class ManipulationEnv:
             return False
         for name, value in self._lasting.items():
             value.copy_(snapshot[f"env.{name}"])
-        self._fresh.fill_(True)
-        self.backend.set_where(
-            self._fresh,
-            state=State(**{f.name: snapshot[f"state.{f.name}"].to(self.device) for f in fields(State)}),
-            parameters=Parameters(**self._parameters, object_gravity=self.gravity_fraction),
-        )
-        self._fresh.zero_()
+        self._reset_mask.fill_(True)
+        self._set_worlds(State(**{f.name: snapshot[f"state.{f.name}"] for f in fields(State)}).to(self.device))
+        self._reset_mask.zero_()
         for name in set(self._observations.keys()):
             self._observations[name].copy_(snapshot[f"observed.{name}"])
         self.resets.reached.copy_(snapshot["resets.reached"])
@@ -347,32 +341,32 @@ class ManipulationEnv:
 
     # Parts -------------------------------------------------------------------------------------------------------------------------
 
-    def _move(self, action: Tensor) -> None:
+    def _apply_action(self, action: Tensor) -> None:
         self._action.copy_(action)
-        self._graphs.run(self._aim)
-        self.backend.set_joint_targets(self._heard)
+        self._graphs.run(self._process_action)
+        self.backend.set_joint_targets(self._sent_target)
         self.backend.step()
 
-    def _aim(self) -> None:
+    def _process_action(self) -> None:
         """From the action to the drives' targets."""
         state = self.backend.state()
-        for name, value in self._before.items():
+        for name, value in self._state_before.items():
             value.copy_(getattr(state, name))
-        self._no_action |= ~self._action.isfinite().all(dim=1)  # a world without an action ends as one whose engine failed
+        self._bad_action |= ~self._action.isfinite().all(dim=1)  # a world without an action ends as one whose engine failed
         self._action.nan_to_num_(0.0, 0.0, 0.0)
         if not self.task.reward.raw_actions:
             self._action.clamp_(-1.0, 1.0)
         self._target.copy_(self.actions.targets(self._action, self._target, state.joint_pos))
-        self._heard.copy_(self._target if self._commands is None else self._commands.push(self._target))
+        self._sent_target.copy_(self._target if self._commands is None else self._commands.push(self._target))
 
-    def _judge(self) -> tuple[Reading, Reward]:
+    def _compute_rewards(self) -> tuple[Reading, Reward]:
         """What the step has brought: reward, ends of episodes, numbers to log."""
         reading = self._read()
         # What failed in the simulation ends, is counted and kept, and is not learned from. Numbers that are not finite say nothing at all.
-        broken = reading.health.nonfinite
-        self._faulty.copy_(broken | reading.health.overflow)
-        self.nonfinite_count += broken.sum()
-        self.overflow_count += (reading.health.overflow & ~broken).sum()
+        broken, live = reading.health.nonfinite, ~self._over
+        self._faulty.copy_((broken | reading.health.overflow) & live)
+        self.nonfinite_count += (self._faulty & broken).sum()
+        self.overflow_count += (self._faulty & ~broken).sum()
         self.faults.record(self._faulty, self._fault_values(reading.state))
         lost = out_of_bounds(reading.state.object_pos, self.backend.scene.table, self.task.termination) & ~broken
         reach = reading.tip_distance.mean(dim=-1)
@@ -401,11 +395,11 @@ class ManipulationEnv:
         self._episode_length += 1
         time_out = (self._episode_length >= self.max_episode_length) | self._faulty
         self._time_out.copy_(time_out & ~lost)
-        self._fresh.copy_(lost | time_out)
+        self._reset_mask.copy_((lost | time_out) & live)
         self._reached |= reward.success
         if self.resets.config.frontier > 0:
-            self.resets.learn(self.bank_state, self.sequence, self._fresh & ~self._faulty, self._reached)
-        names, values = self._log(reward, self._fresh, sound=~broken)
+            self.resets.learn(self.bank_state, self.sequence, self._reset_mask & ~self._faulty, self._reached)
+        names, values = self._log(reward, self._reset_mask, sound=~broken)
         if not self._log_names:
             self._log_names, self._log_values = names, torch.zeros_like(values)
         self._log_values.copy_(values)
@@ -422,13 +416,13 @@ class ManipulationEnv:
             "gravity_fraction": self.gravity_fraction,
             **self._parameters,
             "target": self._target,
-            **{f"before_{name}": value for name, value in self._before.items()},
-            **{f"after_{name}": getattr(after, name) for name in self._before},
+            **{f"before_{name}": value for name, value in self._state_before.items()},
+            **{f"after_{name}": getattr(after, name) for name in self._state_before},
         }
 
-    def _draw(self, from_distribution: bool = True) -> None:
+    def _sample_resets(self, from_distribution: bool = True) -> None:
         """Draw how every world would begin anew, so that nothing waits for their number, and let the fresh ones take it over."""
-        fresh, start = self._fresh, self._start
+        fresh, start = self._reset_mask, self._new_start
         if from_distribution:
             drawn = self.resets.sample(self.backend.object_index, self.generator)
             for f in fields(Reset):
@@ -445,7 +439,7 @@ class ManipulationEnv:
             (start.joint_target, self._target),
         ):
             old.copy_(torch.where(fresh.view(-1, *[1] * (old.ndim - 1)), new, old))
-        for cleared in (self._episode_length, self._previous_action, self._reward, self._reached):
+        for cleared in (self._episode_length, self._previous_action, self._reward, self._reached, self._over):
             cleared.masked_fill_(fresh.view(-1, *[1] * (cleared.ndim - 1)), 0)
 
     def _drawn_parameters(self) -> list[tuple[Tensor, Tensor]]:
@@ -467,15 +461,15 @@ class ManipulationEnv:
                 drawn.append((sample_range(n, limits, generator), line.delay))
         return drawn
 
-    def _begin(self) -> None:
+    def _write_resets(self) -> None:
         """Put the fresh worlds into their new states."""
-        start = self._start
-        self._no_action &= ~self._fresh
-        self.backend.set_where(
-            self._fresh,
-            state=State.at_rest(start.joint_pos, start.object_pos, start.object_quat, start.joint_target),
-            parameters=Parameters(**self._parameters, object_gravity=start.gravity_fraction),
-        )
+        start = self._new_start
+        self._bad_action &= ~self._reset_mask
+        self._set_worlds(State.at_rest(start.joint_pos, start.object_pos, start.object_quat, start.joint_target))
+
+    def _set_worlds(self, state: State) -> None:
+        """Give the worlds of the mask states [N, ...] and their physical parameters."""
+        self.backend.set_where(self._reset_mask, state, Parameters(**self._parameters, object_gravity=self.gravity_fraction))
 
     def _read(self) -> Reading:
         state, links, health = self.backend.state(), self.backend.links(), self.backend.health()
@@ -484,44 +478,35 @@ class ManipulationEnv:
             state=state,
             links=links,
             contacts=self.backend.contacts(),
-            health=replace(health, nonfinite=health.nonfinite | self._no_action),
+            health=replace(health, nonfinite=health.nonfinite | self._bad_action),
             tip_distance=torch.cdist(local, self._surface_points).amin(dim=-1),
         )
 
-    def _observe(self) -> None:
+    def _compute_observations(self) -> None:
         """Refresh the observations; fresh worlds start with a cloud history of copies, and with this reach as their best."""
         reading = self._read()
         c, state, links = self.task.observation, reading.state, reading.links
-        self._best_reach.copy_(torch.where(self._fresh, reading.tip_distance.mean(dim=-1), self._best_reach))
-        seen_pos, seen_quat = self._seen(state)
+        self._best_reach.copy_(torch.where(self._reset_mask, reading.tip_distance.mean(dim=-1), self._best_reach))
+        seen_pos, seen_quat = self._delayed_pose(state)
         x = obs.ObservationInput(
-            joint_pos=state.joint_pos,
-            joint_vel=state.joint_vel,
+            state=state,
+            links=links,
             joint_target=self._target,
             joint_lower=self._limits[0],
             joint_upper=self._limits[1],
             seen_pos=seen_pos,
             seen_quat=seen_quat,
-            object_pos=state.object_pos,
-            object_quat=state.object_quat,
-            object_linvel=state.object_linvel,
-            object_angvel=state.object_angvel,
             goal_pos=self.goal_pos,
             goal_quat=self.goal_quat,
             gravity_fraction=self.gravity_fraction,
             previous_action=self._previous_action.clamp(-1.0, 1.0),
-            palm_pos=links.pos[:, 0],
-            palm_quat=links.quat[:, 0],
-            palm_linvel=links.linvel[:, 0],
-            palm_angvel=links.angvel[:, 0],
-            tip_pos=links.pos[:, 1:],
             tip_force=reading.contacts.tip_force * (1.0 if self._force_gain is None else self._force_gain),
             tip_distance=reading.tip_distance,
             reward=self._reward,
         )
         frame = obs.cloud_frame(self._cloud_points, seen_pos, seen_quat, c, self.generator)[:, None]
         history = torch.cat((self._cloud[:, 1:], frame), dim=1)
-        self._cloud.copy_(torch.where(self._fresh.view(-1, 1, 1, 1), frame, history))
+        self._cloud.copy_(torch.where(self._reset_mask.view(-1, 1, 1, 1), frame, history))
         groups = {
             "policy": obs.policy_group(x, c, self.generator),
             "proprio": obs.proprio_group(x, c, self.generator),
@@ -533,14 +518,14 @@ class ManipulationEnv:
                 self._observations[name] = torch.zeros_like(value)
             self._observations[name].copy_(value)
 
-    def _seen(self, state: State) -> tuple[Tensor, Tensor]:
+    def _delayed_pose(self, state: State) -> tuple[Tensor, Tensor]:
         """[N, 3], [N, 4] the object's pose as it is seen, which may be late."""
         if self._poses is None:
             return state.object_pos, state.object_quat
         last = self._poses.values[:, 0, 3:]
         facing = (state.object_quat * last).sum(dim=-1, keepdim=True) < 0  # of a rotation's two quaternions, the one near the last
         pose = torch.cat((state.object_pos, torch.where(facing, -state.object_quat, state.object_quat)), dim=-1)
-        self._poses.fill(self._fresh, pose)
+        self._poses.fill(self._reset_mask, pose)
         pos, quat = self._poses.push(pose).split((3, 4), dim=-1)
         return pos, torch.nn.functional.normalize(quat, dim=-1)
 

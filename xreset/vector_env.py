@@ -64,14 +64,12 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """Observations, reward [N], terminated [N] and truncated [N], and ``faulty`` [N]: whether the simulation has failed."""
         action = torch.as_tensor(np.asarray(actions), dtype=torch.float32, device=self.env.device)
         action = torch.where(self._ended[:, None], 0.0, action)  # ignored: the world begins anew
-        began = self._ended.clone()
-        _, reward, done, extras = self.env.step(action, begin=began)
-        over = done.bool() & ~began
-        truncated = over & extras["time_outs"].bool()
-        self._ended.copy_(over)
-        reward = torch.where(began, 0.0, reward)
-        infos = {"faulty": _numpy(extras["faulty"] & ~began)}
-        return self._observations(), _numpy(reward), _numpy(over & ~truncated), _numpy(truncated), infos
+        _, reward, done, extras = self.env.step(action, begin=self._ended)
+        reward = torch.where(self._ended, 0.0, reward)
+        self._ended = done.bool()
+        truncated = self._ended & extras["time_outs"].bool()
+        infos = {"faulty": _numpy(extras["faulty"])}
+        return self._observations(), _numpy(reward), _numpy(self._ended & ~truncated), _numpy(truncated), infos
 
     def close_extras(self, **_: Any) -> None:
         """Close the engine."""

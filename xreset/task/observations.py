@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from xreset.geometry.rotations import quat_conjugate, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_axis_angle, quat_to_matrix
+from xreset.physics import Links, State
 from xreset.task.config import ObservationConfig
 
 
@@ -20,10 +21,8 @@ from xreset.task.config import ObservationConfig
 class ObservationInput:
     """What observations are made of: world frame, quaternions (w, x, y, z)."""
 
-    joint_pos: Tensor
-    """[N, J]"""
-    joint_vel: Tensor
-    """[N, J]"""
+    state: State
+    links: Links
     joint_target: Tensor
     """[N, J] of the drives."""
     joint_lower: Tensor
@@ -33,22 +32,12 @@ class ObservationInput:
     seen_pos: Tensor
     """[N, 3] object position as the policy sees it, which may be late."""
     seen_quat: Tensor
-    object_pos: Tensor
-    object_quat: Tensor
-    object_linvel: Tensor
-    object_angvel: Tensor
     goal_pos: Tensor
     goal_quat: Tensor
     gravity_fraction: Tensor
     """[N]"""
     previous_action: Tensor
     """[N, J]"""
-    palm_pos: Tensor
-    palm_quat: Tensor
-    palm_linvel: Tensor
-    palm_angvel: Tensor
-    tip_pos: Tensor
-    """[N, E, 3]"""
     tip_force: Tensor
     """[N, E, 3] force on the object [N]."""
     tip_distance: Tensor
@@ -101,20 +90,20 @@ def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Ge
 
     With ``rotation="matrix"`` there are two numbers more, with ``joint_target`` J.
     """
-    pos = x.joint_pos + c.noise.joint_pos * _normal(x.joint_pos, generator)
-    vel = x.joint_vel + c.noise.joint_vel * _normal(x.joint_vel, generator)
+    pos = x.state.joint_pos + c.noise.joint_pos * _normal(x.state.joint_pos, generator)
+    vel = x.state.joint_vel + c.noise.joint_vel * _normal(x.state.joint_vel, generator)
     force = (c.contact_force_scale * x.tip_force).clamp(-1.0, 1.0)
     return torch.cat(
         (
             2.0 * (pos - x.joint_lower) / (x.joint_upper - x.joint_lower) - 1.0,
             c.joint_vel_scale * vel,
-            x.palm_pos,
-            _shown(x.palm_quat, c),
-            x.palm_linvel,
-            x.palm_angvel,
-            x.tip_pos.flatten(1),
+            x.links.pos[:, 0],
+            _shown(x.links.quat[:, 0], c),
+            x.links.linvel[:, 0],
+            x.links.angvel[:, 0],
+            x.links.pos[:, 1:].flatten(1),
             force.flatten(1),
-            *((x.joint_target - x.joint_pos,) if c.joint_target else ()),
+            *((x.joint_target - x.state.joint_pos,) if c.joint_target else ()),
         ),
         dim=-1,
     )
@@ -122,12 +111,12 @@ def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Ge
 
 def privileged_group(x: ObservationInput) -> Tensor:
     """[N, 15] object velocities, pose error to the goal, closest fingertip distance, gravity fraction, current reward (critic only)."""
-    rotation_error = quat_to_axis_angle(quat_multiply(x.goal_quat, quat_conjugate(x.object_quat)))
+    rotation_error = quat_to_axis_angle(quat_multiply(x.goal_quat, quat_conjugate(x.state.object_quat)))
     return torch.cat(
         (
-            x.object_linvel,
-            x.object_angvel,
-            x.goal_pos - x.object_pos,
+            x.state.object_linvel,
+            x.state.object_angvel,
+            x.goal_pos - x.state.object_pos,
             rotation_error,
             x.tip_distance.min(dim=-1, keepdim=True).values,
             x.gravity_fraction[:, None],

@@ -10,7 +10,7 @@ import torch
 from xreset import robots
 from xreset.errors import DemoError
 from xreset.objects import load_objects, rest_height
-from xreset.physics import Health
+from xreset.physics import Health, State
 from xreset.resets.filter import REASONS, FilterConfig, make_bank, try_states
 from xreset.retarget.pipeline import Retargeted
 from xreset.spec import SceneSpec
@@ -37,7 +37,7 @@ class FilterTest(unittest.TestCase):
         joint_pos = self.robot.home if joint_pos is None else joint_pos
         rows = [torch.as_tensor(np.asarray(v)[None], dtype=torch.float32) for v in (joint_pos, pos, UPRIGHT)]
         with backend_class(scene, 1, workers=0) as backend:
-            reason = int(try_states(backend, *rows, config or FilterConfig()))
+            reason = int(try_states(backend, State.at_rest(*rows), config or FilterConfig()))
         return None if reason < 0 else REASONS[reason]
 
     def test_an_object_at_rest_is_accepted(self):

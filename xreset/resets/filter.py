@@ -6,7 +6,7 @@ rejected if it leaves the scene or still moves: object faster than 0.10 m/s or 1
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,30 +44,54 @@ class FilterConfig:
     """Largest residual joint speed [rad/s or m/s]."""
 
 
-def try_states(
-    backend: Backend,
-    joint_pos: torch.Tensor,
-    object_pos: torch.Tensor,
-    object_quat: torch.Tensor,
-    config: FilterConfig,
-    joint_target: torch.Tensor | None = None,
-) -> torch.Tensor:
-    """Spawn one state per world and let the steps pass.
+def spawn(
+    name: str,
+    scene: SceneSpec,
+    object_index: np.ndarray,
+    states: Sequence[np.ndarray],
+    *,
+    num_envs: int,
+    device: str,
+    progress: Callable[[int], None],
+) -> Iterator[tuple[Backend, State, np.ndarray, np.ndarray]]:
+    """Let an engine have states, as many at a time as there are worlds.
+
+    Args:
+        name: the engine.
+        scene: what to build.
+        object_index: [M] which of the scene's objects each state has.
+        states: joint positions [M, J], object positions [M, 3] and orientations [M, 4], drive targets [M, J].
+        num_envs: worlds at a time.
+        device: where the engine runs if it can.
+        progress: called with the number of states done.
+
+    Yields:
+        The engine, one state at rest for each of its N worlds, which states those are [N], and [N] False where one is only repeated.
+    """
+    plan, done = schedule(object_index, num_envs), 0
+    worlds = torch.as_tensor(plan.object_index)
+    with make_backend(name, scene, len(worlds), object_index=worlds, device=device_for(name, device)) as backend:
+        for items, fresh in plan:
+            start = (torch.as_tensor(array[items], dtype=torch.float32, device=backend.device) for array in states)
+            yield backend, State.at_rest(*start), items, fresh
+            done += int(fresh.sum())
+            progress(done)
+
+
+def try_states(backend: Backend, start: State, config: FilterConfig) -> torch.Tensor:
+    """Spawn one state per world, let the steps pass, and look at what moves.
 
     Args:
         backend: N worlds.
-        joint_pos: [N, J]
-        object_pos: [N, 3]
-        object_quat: [N, 4]
+        start: [N, ...] at rest.
         config: steps and thresholds.
-        joint_target: [N, J] drive targets; None: the joints' positions.
 
     Returns:
         [N] long: index into :data:`REASONS`, -1 where the state is accepted.
     """
     n = backend.num_worlds
     backend.set_object_gravity(torch.zeros(n, device=backend.device))
-    backend.set_state(State.at_rest(joint_pos, object_pos, object_quat, joint_target))
+    backend.set_state(start)
     for _ in range(config.steps):
         backend.step()
     state, health = backend.state(), backend.health()
@@ -139,23 +163,15 @@ def make_bank(
             left = np.flatnonzero(reason < 0)
             if not len(left):
                 break
-            plan = schedule(object_index[rows[left]], num_envs)
-            worlds = torch.as_tensor(plan.object_index)
-            with make_backend(name, scene, len(worlds), object_index=worlds, device=device_for(name, device)) as backend:
-                done = 0
-                for items, fresh in plan:
-                    chosen = rows[left[items]]
-                    joint_pos, object_pos, object_quat, joint_target = (
-                        torch.as_tensor(array, dtype=torch.float32, device=backend.device)
-                        for array in (
-                            *(array[frames[chosen]] for array in (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz)),
-                            target[chosen],
-                        )
-                    )
-                    found = try_states(backend, joint_pos, object_pos, object_quat, config, joint_target).cpu().numpy()
-                    reason[left[items[fresh]]] = found[fresh]
-                    done += int(fresh.sum())
-                    report(number * len(rows) + done)
+            chosen = rows[left]
+            states = [array[frames[chosen]] for array in (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz)]
+
+            def begun(done: int, before: int = number * len(rows)) -> None:
+                report(before + done)
+
+            rounds = spawn(name, scene, object_index[chosen], (*states, target[chosen]), num_envs=num_envs, device=device, progress=begun)
+            for backend, start, items, fresh in rounds:
+                reason[left[items[fresh]]] = try_states(backend, start, config).cpu().numpy()[fresh]
         return reason
 
     work = len(backends) * len(frames)

@@ -9,11 +9,9 @@ import numpy as np
 import torch
 
 from xreset.geometry.rotations import quat_angle
-from xreset.physics import State
-from xreset.plugins import device_for, make_backend
 from xreset.resets.bank import ResetBank
 from xreset.resets.config import HoldConfig
-from xreset.schedule import schedule
+from xreset.resets.filter import spawn
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
 
@@ -62,25 +60,22 @@ def hold_bank(
     for number, name in enumerate(backends):
         held = np.zeros(len(lifted), dtype=bool)
         if len(lifted):
-            plan = schedule(np.array([[o.name for o in used].index(n) for n in names]), num_envs)
-            worlds, scene, done = torch.as_tensor(plan.object_index), SceneSpec(robot=robot, objects=used), 0
-            with make_backend(name, scene, len(worlds), object_index=worlds, device=device_for(name, device)) as backend:
-                for items, fresh in plan:
-                    rows = lifted[items]
-                    joint_pos, pos, quat, target = (
-                        torch.as_tensor(array[rows], dtype=torch.float32, device=backend.device)
-                        for array in (bank.joint_pos, bank.object_pos, bank.object_quat_wxyz, bank.targets)
-                    )
-                    backend.set_object_gravity(torch.ones(len(rows), device=backend.device))
-                    backend.set_state(State.at_rest(joint_pos, pos, quat, target))
-                    for _ in range(round(config.seconds / scene.control_dt)):
-                        backend.step()
-                    state, health = backend.state(), backend.health()
-                    stays = (state.object_pos - pos).norm(dim=-1) < config.distance
-                    stays &= (quat_angle(state.object_quat, quat) < config.angle) & ~health.nonfinite & ~health.overflow
-                    held[items[fresh]] = stays.cpu().numpy()[fresh]
-                    done += int(fresh.sum())
-                    progress(number * len(lifted) + done, len(backends) * len(lifted))
+            scene, index = SceneSpec(robot=robot, objects=used), np.array([[o.name for o in used].index(n) for n in names])
+            states = [array[lifted] for array in (bank.joint_pos, bank.object_pos, bank.object_quat_wxyz, bank.targets)]
+
+            def report(done: int, before: int = number * len(lifted)) -> None:
+                progress(before + done, len(backends) * len(lifted))
+
+            rounds = spawn(name, scene, index, states, num_envs=num_envs, device=device, progress=report)
+            for backend, start, items, fresh in rounds:
+                backend.set_object_gravity(torch.ones(len(items), device=backend.device))
+                backend.set_state(start)
+                for _ in range(round(config.seconds / scene.control_dt)):
+                    backend.step()
+                state, health = backend.state(), backend.health()
+                stays = (state.object_pos - start.object_pos).norm(dim=-1) < config.distance
+                stays &= (quat_angle(state.object_quat, start.object_quat) < config.angle) & ~health.nonfinite & ~health.overflow
+                held[items[fresh]] = stays.cpu().numpy()[fresh]
         found += [
             Held(backend=name, object_name=label, lifted=int(mine.sum()), held=int(held[mine].sum()))
             for label, mine in [*((n, names == n) for n in np.unique(names).tolist()), ("all", np.ones(len(lifted), dtype=bool))]

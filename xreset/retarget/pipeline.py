@@ -106,28 +106,18 @@ def retarget(
         RobotError: the robot's description does not allow retargeting.
     """
     config = config or RetargetConfig()
-    by_name = _by_name(demos, objects)
-    demos = rest_on_table(demos, objects)
-    hand, arm = HandModel(robot, device=device), ArmModel(robot)
-    surfaces = {name: Surface(spec) for name, spec in by_name.items()}
-
-    touched, touches = _contacts(demos, surfaces, config.contact_distance)
+    work = _Work(demos, objects, config)
+    demos, hand, arm = work.demos, HandModel(robot, device=device), ArmModel(robot)
     kept = None
     if partial is not None:
-        kept = Partial(partial, run_key(demos, robot, list(by_name.values()), config, _SEQUENCES_PER_BATCH, device))
+        kept = Partial(partial, run_key(demos, robot, list(work.objects.values()), config, _SEQUENCES_PER_BATCH, device))
     joint_pos = np.tile(robot.home, (demos.num_frames, 1))
     reason = np.full(demos.num_frames, REASONS.index("not annotated"), dtype=np.int32)
     hand_error, wrist_error = np.full(demos.num_frames, np.inf), np.full(demos.num_frames, np.inf)
-    todo = [i for i in range(demos.num_sequences) if demos.hand_valid[demos.frames(i)].any()]
-    for number, begin in enumerate(range(0, len(todo), _SEQUENCES_PER_BATCH)):
-        sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
+    for number, (sequences, report) in enumerate(work.batches(progress)):
         solved = kept.read(number) if kept else None
         if solved is None:
-
-            def report(share: float, start: int = begin, size: int = len(sequences)) -> None:
-                progress(start + share * size, len(todo))
-
-            targets = _hand_targets(demos, hand, sequences, surfaces, touched, touches)
+            targets = work.hand_targets(hand, sequences)
             with _one_thread():
                 solved = _solve(demos, sequences, hand, arm, targets, config, report, timing or Timing())
             if kept:
@@ -135,10 +125,10 @@ def retarget(
         rows = np.concatenate([np.arange(demos.num_frames)[demos.frames(i)] for i in sequences])
         joint_pos[rows], reason[rows] = solved.joint_pos, solved.reason
         hand_error[rows], wrist_error[rows] = solved.hand_error, solved.wrist_error
-        progress(begin + len(sequences), len(todo))
+        report(1.0)
 
     links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
-    contact = np.asarray(touches.any(axis=1))
+    contact = np.asarray(work.touches.any(axis=1))
     return Retargeted(
         robot=robot.name,
         robot_fingerprint=robot.fingerprint,
@@ -179,19 +169,9 @@ def hand_motions(
 ) -> Iterator[tuple[list[int], HandTargets, HandMotion]]:
     """Hand retargeting alone, in batches: which sequences, what the hand was to follow, what it does. Arguments as in :func:`retarget`."""
     config = config or RetargetConfig()
-    by_name = _by_name(demos, objects)
-    demos = rest_on_table(demos, objects)
-    hand = HandModel(robot, device=device)
-    surfaces = {name: Surface(spec) for name, spec in by_name.items()}
-    touched, touches = _contacts(demos, surfaces, config.contact_distance)
-    todo = [i for i in range(demos.num_sequences) if demos.hand_valid[demos.frames(i)].any()]
-    for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
-        sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
-        targets = _hand_targets(demos, hand, sequences, surfaces, touched, touches)
-
-        def report(share: float, start: int = begin, size: int = len(sequences)) -> None:
-            progress(start + share * size, len(todo))
-
+    work, hand = _Work(demos, objects, config), HandModel(robot, device=device)
+    for sequences, report in work.batches(progress):
+        targets = work.hand_targets(hand, sequences)
         yield sequences, targets, retarget_hand(hand, targets, config.hand, report)
 
 
@@ -216,41 +196,55 @@ def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpe
     return {name: by_name[name] for name in sorted(set(demos.object_name.tolist()))}
 
 
-def _contacts(demos: Demos, surfaces: dict[str, Surface], distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Contact points [F, 21, 3] and contact [F, 21] of all human keypoints."""
-    points, contact = np.zeros((demos.num_frames, 21, 3)), np.zeros((demos.num_frames, 21), dtype=bool)
-    for i, name in enumerate(demos.object_name.tolist()):
-        rows = demos.frames(i)
-        keypoints = np.where(demos.hand_valid[rows, None, None], demos.hand_keypoints[rows].astype(np.float64), np.nan)
-        points[rows], contact[rows] = keypoint_contacts(
-            surfaces[name], keypoints, demos.object_pos[rows].astype(np.float64), demos.object_quat_wxyz[rows].astype(np.float64), distance
+class _Work:
+    """Demonstrations on the table, what their hands touch, and the batches in which they are retargeted."""
+
+    def __init__(self, demos: Demos, objects: Sequence[ObjectSpec], config: RetargetConfig) -> None:
+        self.objects = _by_name(demos, objects)
+        self.demos = demos = rest_on_table(demos, objects)
+        self._surfaces = {name: Surface(spec) for name, spec in self.objects.items()}
+        self._touched, self.touches = np.zeros((demos.num_frames, 21, 3)), np.zeros((demos.num_frames, 21), dtype=bool)
+        """Contact points [F, 21, 3] and contact [F, 21] of all human keypoints."""
+        for i, name in enumerate(demos.object_name.tolist()):
+            rows = demos.frames(i)
+            keypoints = np.where(demos.hand_valid[rows, None, None], demos.hand_keypoints[rows].astype(np.float64), np.nan)
+            pos, quat = demos.object_pos[rows].astype(np.float64), demos.object_quat_wxyz[rows].astype(np.float64)
+            contacts = keypoint_contacts(self._surfaces[name], keypoints, pos, quat, config.contact_distance)
+            self._touched[rows], self.touches[rows] = contacts
+
+    def batches(self, progress: Callable[[float, int], None]) -> Iterator[tuple[list[int], Callable[[float], None]]]:
+        """Sequences that have a hand, some at a time, each time with a function that takes the share of them that is done."""
+        todo = [i for i in range(self.demos.num_sequences) if self.demos.hand_valid[self.demos.frames(i)].any()]
+        for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
+            sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
+
+            def report(share: float, start: int = begin, size: int = len(sequences)) -> None:
+                progress(start + share * size, len(todo))
+
+            yield sequences, report
+
+    def hand_targets(self, hand: HandModel, sequences: Sequence[int]) -> HandTargets:
+        """Targets of some sequences, padded with frames that are not annotated."""
+        demos = self.demos
+        keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0)[:, hand.keypoint_indices]
+
+        def padded(values: np.ndarray) -> Tensor:
+            rows = [demos.frames(i) for i in sequences]
+            out = np.zeros((len(rows), max(row.stop - row.start for row in rows), *values.shape[1:]), dtype=values.dtype)
+            for s, row in enumerate(rows):
+                out[s, : row.stop - row.start] = values[row]
+            return torch.as_tensor(out)
+
+        return HandTargets(
+            keypoints=padded(keypoints.astype(np.float64)),
+            annotated=padded(demos.hand_valid),
+            contact_points=padded(self._touched[:, hand.keypoint_indices]),
+            in_contact=padded(self.touches[:, hand.keypoint_indices]),
+            object_pos=padded(demos.object_pos.astype(np.float64)),
+            object_quat=padded(demos.object_quat_wxyz.astype(np.float64)),
+            object_index=torch.tensor([list(self._surfaces).index(name) for name in demos.object_name[list(sequences)].tolist()]),
+            fields=DistanceFields.join([surface.field for surface in self._surfaces.values()]),
         )
-    return points, contact
-
-
-def _hand_targets(
-    demos: Demos, hand: HandModel, sequences: Sequence[int], surfaces: dict[str, Surface], touched: np.ndarray, touches: np.ndarray
-) -> HandTargets:
-    """Targets of some sequences, padded with frames that are not annotated."""
-    keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0)[:, hand.keypoint_indices]
-
-    def padded(values: np.ndarray) -> Tensor:
-        rows = [demos.frames(i) for i in sequences]
-        out = np.zeros((len(rows), max(row.stop - row.start for row in rows), *values.shape[1:]), dtype=values.dtype)
-        for s, row in enumerate(rows):
-            out[s, : row.stop - row.start] = values[row]
-        return torch.as_tensor(out)
-
-    return HandTargets(
-        keypoints=padded(keypoints.astype(np.float64)),
-        annotated=padded(demos.hand_valid),
-        contact_points=padded(touched[:, hand.keypoint_indices]),
-        in_contact=padded(touches[:, hand.keypoint_indices]),
-        object_pos=padded(demos.object_pos.astype(np.float64)),
-        object_quat=padded(demos.object_quat_wxyz.astype(np.float64)),
-        object_index=torch.tensor([list(surfaces).index(name) for name in demos.object_name[list(sequences)].tolist()]),
-        fields=DistanceFields.join([surface.field for surface in surfaces.values()]),
-    )
 
 
 def _solve(

@@ -20,11 +20,11 @@ from xreset.eval.rollout import roll_out
 from xreset.eval.setting import Setting
 from xreset.eval.trial import Engine, Trial
 from xreset.files import claim_folder, file_hash
-from xreset.records import npz_schema
 from xreset.learning.choice import read_choice
 from xreset.objects import load_objects
 from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
+from xreset.records import npz_schema
 from xreset.resets.bank import ResetBank, check_retargeted
 from xreset.retarget.pipeline import SCHEMA as RETARGETED
 from xreset.retarget.pipeline import Retargeted, read_retargeted, rest_on_table, retarget

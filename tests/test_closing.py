@@ -14,8 +14,8 @@ from tests import toy_grasp
 from tests.test_cli import run
 from tests.toy_bank import toy_bank
 from xreset.accounts import accounts_path
-from xreset.records import meta_of
 from xreset.geometry.kinematics import Kinematics
+from xreset.records import meta_of
 from xreset.resets.bank import read_bank, write_bank
 from xreset.resets.closing import with_closing_frames
 from xreset.resets.config import ClosingConfig, HoldConfig, SqueezeConfig

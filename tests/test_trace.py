@@ -28,9 +28,9 @@ from xreset.eval.rollout import roll_out
 from xreset.eval.setting import Place, Sequence
 from xreset.eval.trial import engine
 from xreset.files import read_json
-from xreset.records import npz_schema
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import State
+from xreset.records import npz_schema
 from xreset.spec import PairFriction, SceneSpec
 from xreset.task.config import RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
 

@@ -20,9 +20,9 @@ from xreset.eval.engines.grasps import Grasps
 from xreset.eval.metrics import MetricsConfig
 from xreset.eval.rollout import Trace, episode_starts, play
 from xreset.eval.trial import Engine, Trial, nominal_scene
-from xreset.records import JOINT, POSITION, Field, Schema, read_npz, write_npz
 from xreset.physics import State
 from xreset.policy import Policy
+from xreset.records import JOINT, POSITION, Field, Schema, read_npz, write_npz
 from xreset.resets.bank import check_robot
 from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
 from xreset.task.config import TaskConfig

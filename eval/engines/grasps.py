@@ -14,14 +14,13 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from xreset.backends.pool import lowest_point
 from xreset.errors import DemoError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.geometry.surface import Surface
 from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
-from xreset.spec import ObjectSpec, RobotSpec
+from xreset.spec import ObjectSpec, RobotSpec, lowest_point
 
 REST_DISTANCE, REST_ANGLE = 0.010, np.radians(10.0)
 """How far [m, rad] an object may be from where it started and still count as at rest on the table."""

@@ -18,8 +18,8 @@ from xreset.eval.evaluate import resolve
 from xreset.eval.results import TRACE_SCHEMA, mesh_folder, read_result, read_traces
 from xreset.eval.setting import Place, Sequence, Setting
 from xreset.eval.trial import Engine
-from xreset.records import npz_schema
 from xreset.objects import canonical_name, load_object, load_objects
+from xreset.records import npz_schema
 from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import ResetBank, check_objects, check_retargeted, check_robot, read_bank
 from xreset.retarget.file import SCHEMA as RETARGETED

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from xreset import __version__
-from xreset.checks import check_numbers
+from xreset.checks import Checked, NotNegative, Positive
 from xreset.files import read_json, write_json
 from xreset.typed import from_dict
 
@@ -34,7 +34,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choice:
+class Choice(Checked):
     """What was tried, and what was taken: the best in its worst engine."""
 
     chosen: str
@@ -45,14 +45,14 @@ class Choice:
     """The newest first."""
     engines: dict[str, str]
     """Name -> version."""
-    seed: int
+    seed: NotNegative[int]
     """Of the starts that were played; results with another seed are of other starts."""
-    episodes_per_demo: int
+    episodes_per_demo: Positive[int]
     demos: str
     """SHA-256 of the demonstrations."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, positive=("episodes_per_demo",), not_negative=("seed",))
+        super().__post_init__()
         if self.chosen not in [c.name for c in self.candidates]:
             raise ValueError(f"chosen is {self.chosen!r}, expected one of the candidates")
 

@@ -138,6 +138,7 @@ class RewardConfig(Checked):
             if not all(name.partition(":")[::2]) or not isfinite(weight):
                 raise ValueError(f"own holds {name!r} with weight {weight}, expected module:function and a finite number")
 
+
 @dataclass(frozen=True, kw_only=True)
 class TerminationConfig(Checked):
     """When an episode ends. The paper names the out-of-bounds termination, not its bounds."""

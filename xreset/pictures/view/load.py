@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from xreset.errors import FileFormatError, XResetError
-from xreset.records import npz_schema
 from xreset.pictures.view.data import Human, View
+from xreset.records import npz_schema
 from xreset.spec import ObjectSpec
 
 if TYPE_CHECKING:

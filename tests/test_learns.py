@@ -2,7 +2,7 @@
 
 import unittest
 
-from tests.toy_learning import WORLDS, random_policy, scene, trained
+from tests.toy_learning import CONFIG, WORLDS, random_policy, scene, trained
 
 try:
     from xreset.backends.mujoco import MujocoBackend
@@ -16,7 +16,8 @@ MARGIN = 0.4
 class Learns(unittest.TestCase):
     def test_a_training_beats_a_random_policy(self):
         with MujocoBackend(scene(), WORLDS, workers=0) as backend:
-            by_chance, (learned, _) = random_policy(0, backend), trained(0, backend)
+            by_chance, (learned, steps) = random_policy(0, backend), trained(0, backend)
+        self.assertEqual(steps, CONFIG.iterations * CONFIG.ppo.horizon * WORLDS, "it was stopped")
         self.assertGreater(learned.grasped, by_chance.grasped + MARGIN, f"a random policy: {by_chance}; trained: {learned}")
 
 

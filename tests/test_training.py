@@ -53,7 +53,7 @@ CONFIG = TrainConfig(
 
 def train_only(*args, **options) -> None:
     """Training without what takes longer than all the rest here: processes for the engine, and the export at the end."""
-    in_this_process = mock.patch("xreset.learning.train.make_backend", partial(make_backend, workers=0))
+    in_this_process = mock.patch("xreset.env.make_backend", partial(make_backend, workers=0))
     with in_this_process, mock.patch("xreset.learning.train.export_onnx"):
         train(*args, **options)
 
@@ -318,7 +318,7 @@ class TrainingTest(unittest.TestCase):
 
     def test_an_engine_that_does_not_stand_leaves_no_run(self):
         out = self.folder / "nothing"
-        broken = mock.patch("xreset.learning.train.make_backend", side_effect=BackendUnavailableError("no GPU"))
+        broken = mock.patch("xreset.env.make_backend", side_effect=BackendUnavailableError("no GPU"))
         with broken, self.assertRaisesRegex(BackendUnavailableError, "no GPU"):
             train(out, self.start(out))
         self.assertFalse((out / "run.json").exists())

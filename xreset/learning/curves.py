@@ -27,6 +27,7 @@ class CurveFile:
         self._folder, self._event = folder, Event
         name = f"events.out.tfevents.{time.time_ns()}.{socket.gethostname()}.{os.getpid()}"
         with self._writing():
+            folder.mkdir(parents=True, exist_ok=True)
             self._records = RecordWriter(open(folder / name, "xb"))  # noqa: SIM115
         self._add(Event(wall_time=time.time(), file_version="brain.Event:2"))
 

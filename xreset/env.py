@@ -446,7 +446,7 @@ class ManipulationEnv:
         """What is drawn for every world beside its start [N, ...], and where it is kept."""
         c, n, generator = self.task.randomization, self.num_envs, self.generator
         samples: dict[str, Callable[[], Tensor]] = {
-            "friction": lambda: (sample_friction(n, c, generator) + self._own_friction).clamp(min=0.05),
+            "friction": lambda: (sample_friction(n, c, generator) + self._own_friction).clamp(min=0.05),  # slippery, not negative
             "object_mass": lambda: self._nominal_mass * sample_mass_scale(n, c, generator),
             "drives": lambda: sample_drives(self.actions.is_arm, n, c, generator),
             "torsional_friction": lambda: self.backend.scene.friction.torsional * sample_range(n, c.torsional_friction, generator),

@@ -14,6 +14,7 @@ import numpy as np
 
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError
+from xreset.eval.pages import short_name
 from xreset.eval.report.clips import recorded_episode
 from xreset.eval.report.read import results_in
 from xreset.eval.results import mesh_folder, read_episodes, read_results, read_traces
@@ -88,13 +89,15 @@ def read_recorded(
         for summary in read_results(results):
             if backends and summary.backend not in backends:
                 continue
-            spec = robots.setdefault(robot or summary.robot, load_robot(robot or summary.robot))
+            name = robot or summary.robot
+            if name not in robots:
+                robots[name] = load_robot(name)
             episodes = read_episodes(results, summary.backend)
-            for trace in read_traces(results, summary.backend, spec.joint_names):
+            for trace in read_traces(results, summary.backend, robots[name].joint_names):
                 action = _actions(trace, results, summary.backend)
                 intervals.setdefault(round(float(np.median(np.diff(trace.time))), 6), results)
                 episode = recorded_episode(episodes, trace.sequence)
-                words = task.replace("{object}", _words(trace.object))
+                words = task.replace("{object}", short_name(trace.object))
                 whole = Recorded(
                     engine=summary.backend,
                     policy=summary.policy,
@@ -146,8 +149,3 @@ def _finite(whole: Recorded, results: Path) -> list[Recorded]:
 def _rate(interval: float) -> float:
     rate = 1 / interval
     return float(round(rate)) if abs(rate - round(rate)) < 1e-3 else rate
-
-
-def _words(name: str) -> str:
-    """``005_tomato_soup_can``: tomato soup can."""
-    return (name.split("_", 1)[1] if name.split("_", 1)[0].isdecimal() and "_" in name else name).replace("_", " ")

@@ -149,7 +149,8 @@ class StorageTest(unittest.TestCase):
             storage.add_transition(tr)
         storage.returns, storage.advantages = code.clone(), code.clone()
         seen = []
-        for batch in storage.recurrent_mini_batch_generator(2, 1):
+        for worlds in torch.randperm(N).tensor_split(2):
+            batch = storage.minibatch(worlds)
             seen += batch.values.flatten().tolist()
             torch.testing.assert_close(batch.values[1:] - batch.values[:-1], torch.full_like(batch.values[1:], N))
             torch.testing.assert_close(batch.hidden_states[0][0][0, :, 0], batch.values[::L, :, 0].flatten())
@@ -159,24 +160,24 @@ class StorageTest(unittest.TestCase):
             self.assertTrue(torch.equal(batch.masks, expected))
         self.assertEqual(sorted(seen), list(range(T * N)))
 
-    def bandit(self, target: float = 0.5, iterations: int = 40, bias: float = 0.0, **ppo) -> tuple[SequencePpo, torch.Tensor, torch.Tensor]:
+    def bandit(
+        self, target: float = 0.5, iterations: int = 40, bias: float = 0.0, device: str = "cpu", capture: bool = True, **ppo
+    ) -> tuple[SequencePpo, torch.Tensor, torch.Tensor]:
         """The algorithm, and the mean actions before and after it, on an environment whose reward is -|action - target|.
 
-        ``bias`` is added to the first policy's means.
+        ``bias`` is added to the first policy's means; without ``capture`` a GPU is given every kernel of an update by itself.
         """
 
         class Bandit:
-            num_envs, num_actions, device = 64, A, "cpu"
-
-            def get_observations(self):
-                return observations(self.num_envs)
+            num_envs, num_actions = 64, A
 
         model = ModelConfig(pointnet=(8, 6), lstm=12, mlp=(16,), initial_std=0.5, normalize_returns=ppo.pop("normalize_returns", False))
         config = TrainConfig(model=model, ppo=PpoConfig(horizon=8, minibatch_size=128, **ppo))
         torch.manual_seed(0)
-        alg = SequencePpo.construct_algorithm(observations(64), Bandit(), rsl_rl_config(config, 64) | {"multi_gpu": None}, "cpu")
+        obs = observations(64).to(device)
+        alg = SequencePpo.construct_algorithm(obs, Bandit(), rsl_rl_config(config, 64) | {"multi_gpu": None}, device)
+        alg._graphs.active &= capture
         alg.actor.mlp[-1].bias.data += bias
-        obs = observations(64)
         obs["perception"] = obs["perception"][:, -1:].expand(-1, 5, -1, -1)  # a scene in which nothing moves
         before = alg.actor(obs).detach()
         alg.actor.reset()
@@ -184,7 +185,7 @@ class StorageTest(unittest.TestCase):
             with torch.no_grad():
                 for _ in range(8):
                     actions = alg.act(obs)
-                    alg.process_env_step(obs, -(actions - target).abs().mean(-1), torch.zeros(64), {})
+                    alg.process_env_step(obs, -(actions - target).abs().mean(-1), torch.zeros(64, device=device), {})
                 alg.compute_returns(obs)
             self.losses = alg.update()
         alg.actor.reset()
@@ -193,6 +194,15 @@ class StorageTest(unittest.TestCase):
     def test_ppo_improves_a_bandit(self):
         _, before, after = self.bandit()
         self.assertLess(float((after - 0.5).abs().mean()), 0.5 * float((before - 0.5).abs().mean()))
+
+    @unittest.skipUnless(torch.cuda.is_available(), "there is no CUDA device: updates are captured on GPUs only")
+    def test_a_captured_update_learns_what_a_plain_one_does(self):
+        for options in ({}, {"normalize_returns": True, "critic_learning_rate": 3e-4}):
+            (one, _, plain), (two, _, captured) = (self.bandit(iterations=3, device="cuda", capture=on, **options) for on in (False, True))
+            torch.testing.assert_close(captured, plain)
+            self.assertEqual(one.learning_rate, two.learning_rate)
+            self.assertFalse(one._graphs._graphs)
+            self.assertTrue(two._graphs._graphs)
 
     def test_a_critic_may_have_its_own_rate_and_unit(self):
         alg, before, after = self.bandit(iterations=20, normalize_returns=True, critic_learning_rate=3e-4)

@@ -17,27 +17,33 @@ class GraphRunner:
     WARM_UP = 2
     """Plain calls before a function is captured: libraries allocate and choose kernels at first."""
 
-    def __init__(self, device: torch.device, generator: torch.Generator) -> None:
-        """Prepare for a device; the functions may draw from ``generator``, which moves on at every replay."""
+    def __init__(self, device: torch.device, generator: torch.Generator | None = None) -> None:
+        """Prepare for a device; the functions may draw from ``generator`` and from torch's own, which move on at every replay."""
         self.active = device.type == "cuda"
         self._generator = generator
+        self._stream = torch.cuda.Stream(device) if self.active else None
         self._calls: dict[str, int] = {}
         self._graphs: dict[str, torch.cuda.CUDAGraph] = {}
 
     def run(self, function: Callable[[], object]) -> None:
         """Call ``function`` (a bound method; known by its name), or replay it."""
-        if not self.active:
+        if not self.active or self._stream is None:
             function()
             return
         name = function.__name__  # pyright: ignore[reportFunctionMemberAccess]
         if name not in self._graphs:
             self._calls[name] = self._calls.get(name, 0) + 1
             if self._calls[name] <= self.WARM_UP:
-                function()
+                # on the stream that will be captured: there autograd's nodes that outlive a call expect to be called again
+                self._stream.wait_stream(torch.cuda.current_stream())
+                with torch.cuda.stream(self._stream):
+                    function()
+                torch.cuda.current_stream().wait_stream(self._stream)
                 return
             graph = torch.cuda.CUDAGraph()
-            graph.register_generator_state(self._generator)
-            with torch.cuda.graph(graph):
+            if self._generator is not None:
+                graph.register_generator_state(self._generator)
+            with torch.cuda.graph(graph, stream=self._stream):
                 function()
             self._graphs[name] = graph
         self._graphs[name].replay()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Generator, Iterable
 from typing import Any, cast
 
 import torch
@@ -20,6 +19,7 @@ from rsl_rl.utils import resolve_class, resolve_obs_groups
 from tensordict import TensorDict
 from torch import Tensor
 
+from xreset.capture import GraphRunner
 from xreset.learning.model import ReturnCritic
 
 
@@ -31,35 +31,30 @@ class SequenceStorage(RolloutStorage):
         super().__init__(*args, **options)
         self.sequence_length = sequence_length
 
-    def recurrent_mini_batch_generator(self, num_mini_batches: int, num_epochs: int = 8) -> Generator[RolloutStorage.Batch, None, None]:
-        """Yield minibatches [T, M, ...] of M worlds.
+    def minibatch(self, worlds: Tensor) -> Batch:
+        """The rollout [T, M, ...] of M worlds [M].
 
         ``masks`` [T, M] is True where a step is the first of an episode; ``hidden_states`` [1, pieces * M, lstm] are the states that the
         pieces began with, all worlds of the first piece first.
         """
-        first = torch.zeros_like(self.dones, dtype=torch.bool)
-        first[1:] = self.dones[:-1].bool()  # step 0 begins with the state that was saved there, zeroed where an episode had ended
-        first = first.squeeze(-1)
-        # [T, 1, N, lstm] -> [pieces, N, lstm]
-        states = [
-            tuple(s[:: self.sequence_length].squeeze(1) for s in saved) if saved is not None else None
+        first = torch.zeros_like(self.dones[:, worlds, 0], dtype=torch.bool)
+        # step 0 begins with the state that was saved there, zeroed where an episode had ended
+        first[1:] = self.dones[:-1, worlds, 0].bool()
+        states = tuple(
+            tuple(s[:: self.sequence_length, 0, worlds].flatten(0, 1)[None] for s in saved) if saved is not None else None
             for saved in (self.saved_hidden_state_a, self.saved_hidden_state_c)
-        ]
-        for _ in range(num_epochs):
-            for pick in torch.randperm(self.num_envs, device=self.device).tensor_split(num_mini_batches):
-                yield RolloutStorage.Batch(
-                    observations=self.observations[:, pick],
-                    actions=self.actions[:, pick],
-                    values=self.values[:, pick],
-                    advantages=self.advantages[:, pick],
-                    returns=self.returns[:, pick],
-                    old_actions_log_prob=self.actions_log_prob[:, pick],
-                    old_distribution_params=tuple(p[:, pick] for p in self.distribution_params or ()),
-                    hidden_states=tuple(
-                        tuple(s[:, pick].flatten(0, 1)[None] for s in state) if state is not None else None for state in states
-                    ),  # pyright: ignore[reportArgumentType]
-                    masks=first[:, pick],
-                )
+        )  # [T, 1, N, lstm] -> [1, pieces * M, lstm]
+        return RolloutStorage.Batch(
+            observations=self.observations[:, worlds],
+            actions=self.actions[:, worlds],
+            values=self.values[:, worlds],
+            advantages=self.advantages[:, worlds],
+            returns=self.returns[:, worlds],
+            old_actions_log_prob=self.actions_log_prob[:, worlds],
+            old_distribution_params=tuple(p[:, worlds] for p in self.distribution_params or ()),
+            hidden_states=states,  # pyright: ignore[reportArgumentType]
+            masks=first,
+        )
 
 
 Batch = Any
@@ -88,53 +83,67 @@ class SequencePpo(PPO):
         if critic_learning_rate is not None:
             groups = [{"params": list(self.actor.parameters())}, {"params": list(self.critic.parameters()), "lr": critic_learning_rate}]
             self.optimizer = type(self.optimizer)(groups, lr=self.learning_rate)
+        device, count = torch.device(self.device), self.storage.num_envs
+        self._rate = torch.tensor(self.learning_rate, device=device, dtype=torch.float32 if device.type == "cuda" else torch.float64)
+        self._sums = torch.zeros(4, device=device)
+        self._worlds = torch.zeros(count // self.num_mini_batches, dtype=torch.long, device=device)
+        self._graphs = GraphRunner(device)
+        self._graphs.active &= not self.is_multi_gpu and count % self.num_mini_batches == 0  # all minibatches alike
 
     def update(self) -> dict[str, float]:
         """Learn from the rollout; the mean losses of its minibatches.
 
-        Unlike rsl-rl's, it reads no number back from the device until the end: the adaptive learning rate lives there, too.
+        Unlike rsl-rl's, it reads no number back from the device until the end (the adaptive learning rate lives there, too), and on one
+        GPU a minibatch is a CUDA graph: its many small kernels take longer to launch than to run.
         """
-        storage, on_gpu = self.storage, torch.device(self.device).type == "cuda"
-        value_unit = 1.0
+        storage = self.storage
         if isinstance(self.critic, ReturnCritic):
             self.critic.take_returns(storage.returns)
-            value_unit = self.critic.return_std
-        rate = torch.tensor(self.learning_rate, device=self.device, dtype=torch.float32 if on_gpu else torch.float64)
-        self._use_rate(rate, on_gpu)
-        sums = torch.zeros(4, device=self.device)
-        batches = storage.recurrent_mini_batch_generator(self.num_mini_batches, self.num_learning_epochs)
-        for batch in cast(Iterable[Batch], batches):
-            self.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0], stochastic_output=True)
-            log_prob = self.actor.get_output_log_prob(batch.actions)
-            values = self.critic(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[1])
-            entropy = self.actor.output_entropy.mean()
-            if self.schedule == "adaptive":
-                self._adapt(rate, batch)
-                if not on_gpu:
-                    self._use_rate(rate, on_gpu)
-            advantages = batch.advantages.squeeze(-1)
-            ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze(-1))
-            surrogate = torch.max(-advantages * ratio, -advantages * ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)).mean()
-            value = self._value_loss(values, batch, value_unit)
-            excess = (self.actor.output_mean.abs() - BOUND).clamp_min(0.0).square().sum(dim=-1).mean()
-            loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy + self.bounds_loss * excess
-            self.optimizer.zero_grad()
-            loss.backward()
-            if self.is_multi_gpu:
-                self.reduce_parameters()
-            for model in (self.actor, self.critic):
-                torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
-            self.optimizer.step()
-            sums += torch.stack((value, surrogate, entropy, excess)).detach()
+        self._rate.fill_(self.learning_rate)
+        self._use_rate()
+        self._sums.zero_()
+        for _ in range(self.num_learning_epochs):
+            for worlds in torch.randperm(storage.num_envs, device=self.device).tensor_split(self.num_mini_batches):
+                if self._graphs.active:
+                    self._worlds.copy_(worlds)
+                else:
+                    self._worlds = worlds
+                self._graphs.run(self._learn)
         observations = storage.observations.flatten(0, 1)
         self.actor.update_normalization(observations)
         self.critic.update_normalization(observations)
         storage.clear()
-        means = (sums / (self.num_learning_epochs * self.num_mini_batches)).tolist()
-        self.learning_rate = float(rate)
+        means = (self._sums / (self.num_learning_epochs * self.num_mini_batches)).tolist()
+        self.learning_rate = float(self._rate)
         return dict(zip(("value", "surrogate", "entropy", "bounds"), means, strict=True))
 
-    def _value_loss(self, values: Tensor, batch: Batch, unit: Tensor | float) -> Tensor:
+    def _learn(self) -> None:
+        """One step of the optimiser, on the minibatch of ``_worlds``; adds its losses to ``_sums``."""
+        batch: Batch = cast(SequenceStorage, self.storage).minibatch(self._worlds)
+        self.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0], stochastic_output=True)
+        log_prob = self.actor.get_output_log_prob(batch.actions)
+        values = self.critic(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[1])
+        entropy = self.actor.output_entropy.mean()
+        if self.schedule == "adaptive":
+            self._adapt(batch)
+            self._use_rate()
+        advantages = batch.advantages.squeeze(-1)
+        ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze(-1))
+        surrogate = torch.max(-advantages * ratio, -advantages * ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)).mean()
+        value = self._value_loss(values, batch)
+        excess = (self.actor.output_mean.abs() - BOUND).clamp_min(0.0).square().sum(dim=-1).mean()
+        loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy + self.bounds_loss * excess
+        self.optimizer.zero_grad()
+        loss.backward()
+        if self.is_multi_gpu:
+            self.reduce_parameters()
+        for model in (self.actor, self.critic):
+            torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        self._sums += torch.stack((value, surrogate, entropy, excess)).detach()
+
+    def _value_loss(self, values: Tensor, batch: Batch) -> Tensor:
+        unit = self.critic.return_std if isinstance(self.critic, ReturnCritic) else 1.0
         error = (values - batch.returns) / unit
         if not self.use_clipped_value_loss:
             return error.square().mean()
@@ -142,24 +151,25 @@ class SequencePpo(PPO):
         return torch.max(error.square(), ((near - batch.returns) / unit).square()).mean()
 
     @torch.no_grad()
-    def _adapt(self, rate: Tensor, batch: Batch) -> None:
-        """Divide (multiply) the rate by 1.5 where the policy moved more than twice (less than half) the desired divergence; in place."""
+    def _adapt(self, batch: Batch) -> None:
+        """Divide (multiply) the rate by 1.5 where the policy moved more than twice (less than half) the desired divergence."""
         kl = self.actor.get_kl_divergence(batch.old_distribution_params, self.actor.output_distribution_params).mean()
         if self.is_multi_gpu:
             torch.distributed.all_reduce(kl)
             kl = kl / self.gpu_world_size
+        rate = self._rate
         slower, faster = (rate / 1.5).clamp_min(SLOWEST), (rate * 1.5).clamp_max(FASTEST)
         too_little = (kl < self.desired_kl / 2.0) & (kl > 0.0)
         rate.copy_(torch.where(kl > self.desired_kl * 2.0, slower, torch.where(too_little, faster, rate)))
 
-    def _use_rate(self, rate: Tensor, on_gpu: bool) -> None:
-        """Give the rate to the optimiser: on a GPU as a tensor that it reads there, for which it has to be the fused one."""
-        groups = self.optimizer.param_groups
+    def _use_rate(self) -> None:
+        """Give the rate to the optimiser: on a GPU as the tensor itself, which it reads there; for that it has to be the fused one."""
+        groups, on_gpu = self.optimizer.param_groups, self._rate.is_cuda
         for group in groups[:1] if self.critic_learning_rate is not None else groups:
-            group["lr"] = rate if on_gpu else float(rate)
-        if on_gpu and not groups[0].get("fused"):
+            group["lr"] = self._rate if on_gpu else float(self._rate)
+        if groups[0]["capturable"] != on_gpu:  # new, or from a checkpoint of another kind of device
             for group in groups:
-                group["fused"], group["foreach"] = True, False
+                group["fused"], group["foreach"], group["capturable"] = on_gpu, False, on_gpu
             for state in self.optimizer.state.values():
                 state["step"] = state["step"].to(self.device)
 
@@ -187,10 +197,10 @@ class SequencePpo(PPO):
 
         A faulty step is the last of its episode: with the value as its reward, its error is zero, whatever the simulation said.
         """
-        storage, faulty = self.storage, self._faulty[..., None]
+        storage, faulty, advantages = self.storage, self._faulty[..., None], self.storage.advantages
         storage.rewards = torch.where(faulty, storage.values, storage.rewards)
         super().compute_returns(obs)
-        storage.advantages = torch.where(faulty, 0.0, storage.advantages)
+        storage.advantages = advantages.copy_(torch.where(faulty, 0.0, storage.advantages))  # where the update's graph finds them
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> PPO:

@@ -115,7 +115,7 @@ def rsl_rl_config(config: TrainConfig, num_envs: int, synergies: Any = None) -> 
         "lstm_dim": m.lstm,
         "bfloat16_clouds": p.precision == "bfloat16",
     }
-    gaussian = {"class_name": "GaussianDistribution", "init_std": m.initial_std, "std_type": "log", "learn_std": True}
+    gaussian = {"class_name": "xreset.learning.model:Gaussian", "init_std": m.initial_std, "std_type": "log", "learn_std": True}
     if m.synergy_std is not None and synergies is not None and synergies.shape[1]:
         gaussian |= {
             "class_name": "xreset.learning.synergies:SynergyGaussian", "directions": synergies.tolist(), "synergy_std": m.synergy_std,

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.modules import EmpiricalNormalization, HiddenState
+from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import Tensor, nn
 
@@ -121,6 +122,14 @@ class Trunk(nn.Module):
         """One step for N worlds: [N, D], [N, H, P, 3], LSTM state of [1, N, lstm] each -> [N, lstm], new state."""
         out, state = self.lstm(self.join(flat, self.pointnet(cloud))[None], state)
         return self.norm(out[0]), state
+
+
+class Gaussian(GaussianDistribution):
+    """rsl-rl's, but sampling does not wait for the GPU (torch's ``normal`` looks whether every deviation is positive)."""
+
+    def sample(self) -> Tensor:
+        """[..., J]"""
+        return self.mean + self.std * torch.randn_like(self.mean)
 
 
 class PointNetLstmModel(MLPModel):

@@ -5,7 +5,6 @@ Everything is as in real trainings but small: environment, resets from a bank, P
 
 from __future__ import annotations
 
-import math
 import tempfile
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -88,7 +87,6 @@ def trained(
     backend: Backend,
     config: TrainConfig = CONFIG,
     *,
-    seconds: float = math.inf,
     change: Callable[[TrainingRunner], None] = lambda runner: None,
 ) -> tuple[Shares, int]:
     """What a training does in its last iterations, and its steps in all worlds.
@@ -97,14 +95,13 @@ def trained(
         seed: of all that is random.
         backend: worlds of :func:`scene`.
         config: of the training.
-        seconds: most that its iterations may take.
         change: called with the runner before it begins: to break it.
     """
     torch.manual_seed(seed)
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()):
         runner = TrainingRunner(environment(seed, backend), config, Path(folder))
         change(runner)
-        runner.learn(config.iterations, init_at_random_ep_len=True, seconds=seconds)
+        runner.learn(config.iterations, init_at_random_ep_len=True)
         curves = read_scalars(Path(folder))
     grasped, success = (float(curves[f"task/{name}"].value[-LAST:].mean()) for name in ("grasped", "success"))
     return Shares(grasped=grasped, success=success), runner.env_steps

@@ -230,9 +230,12 @@ class PointNetLstmModel(MLPModel):
             self.state = (self.state[0].detach(), self.state[1].detach())
 
     def update_normalization(self, obs: TensorDict) -> None:
-        """Take observations [M, ...] into the running mean and variance."""
-        if isinstance(self.trunk.normalizer, EmpiricalNormalization):
-            self.trunk.normalizer.update(torch.cat([obs[group] for group in self.obs_groups], dim=-1))
+        """Take observations [M, ...] into the running mean and variance, whose tensors stay where captured updates find them."""
+        normalizer = self.trunk.normalizer
+        if isinstance(normalizer, EmpiricalNormalization):
+            std = normalizer._std
+            normalizer.update(torch.cat([obs[group] for group in self.obs_groups], dim=-1))
+            normalizer._std = std.copy_(normalizer._std)
 
     def as_onnx(self, verbose: bool = False) -> nn.Module:
         """The deterministic policy as a plain module; see :class:`ExportedPolicy`."""

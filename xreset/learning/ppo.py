@@ -102,8 +102,9 @@ class SequencePpo(PPO):
         self._rate.fill_(self.learning_rate)
         self._use_rate()
         self._sums.zero_()
-        for _ in range(self.num_learning_epochs):
-            for worlds in torch.randperm(storage.num_envs, device=self.device).tensor_split(self.num_mini_batches):
+        orders = [torch.randperm(storage.num_envs, device=self.device) for _ in range(self.num_learning_epochs)]
+        for order in orders:
+            for worlds in order.tensor_split(self.num_mini_batches):
                 if self._graphs.active:
                     self._worlds.copy_(worlds)
                 else:

@@ -21,6 +21,7 @@ from xreset.eval.setting import Setting
 from xreset.eval.trial import Engine, Trial
 from xreset.files import claim_folder, file_hash
 from xreset.learning.choice import read_choice
+from xreset.learning.run import read_run
 from xreset.objects import load_objects
 from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
@@ -96,7 +97,6 @@ def resolve(policy: str, robot: str | None, seed: int) -> Subject:
     path, ours = Path(policy), shipped()
     objects_folder = None
     if path.is_dir():
-        from xreset.learning.run import read_run
         from xreset.learning.train import ensure_policy
 
         run = read_run(path)

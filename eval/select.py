@@ -23,7 +23,6 @@ from xreset.eval.trial import Engine
 from xreset.files import atomic_write, file_hash
 from xreset.learning.choice import Candidate, Choice, write_choice
 from xreset.learning.run import checkpoints, read_run
-from xreset.learning.train import export_checkpoint
 
 SEED = 1_000_003
 """Of the starts that decide; evaluations use 0 unless they are told otherwise."""
@@ -85,6 +84,8 @@ def select(
         for path in found:
             file = files[path.name] = Path(scratch) / f"{path.stem}.onnx" if is_run else path
             if is_run:
+                from xreset.learning.train import export_checkpoint  # rsl-rl, which exported policies do not need
+
                 export_checkpoint(folder, path, file)
             subject = resolve(str(file), setting.robot, setting.seed)
             trial, _ = subject.episodes(demos, setting)

@@ -498,7 +498,7 @@ class Command(unittest.TestCase):
         good, bad = engine("mujoco", workers=0), altered(engine("mujoco", workers=0), "pybullet", robot=lambda r: with_drives(r, 0.3))
         for made, code in ((replace(good, name="pybullet"), None), (bad, 1)):
             with (
-                mock.patch("xreset.eval.trial.engine", lambda name, made=made, **_: made),
+                mock.patch("xreset.cli.engines.compare.engine", lambda name, made=made, **_: made),
                 mock.patch("xreset.eval.engines.agreement.engine", lambda name: good),
             ):
                 text, found = self.run_command(path, "--backend", "pybullet", "--grasps", 2, "--json", out)

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,9 +21,8 @@ from xreset.eval.export.recorded import Recorded, Recording
 from xreset.eval.report.clips import encode_mp4
 from xreset.files import write_json
 from xreset.objects import load_object
-
-if TYPE_CHECKING:
-    from xreset.pictures.raster import Renderer
+from xreset.pictures.raster import Renderer, pose_matrix
+from xreset.spec import SceneSpec
 
 VERSION = "v3.0"
 VIDEO = "observation.images.front"
@@ -228,9 +227,6 @@ class _Films:
 
     def write(self, path: Path, episode: Recorded) -> np.ndarray:
         """Write a film; returns some of its pixels [n, 3], as shares of white, for statistics."""
-        from xreset.pictures.raster import Renderer, pose_matrix
-        from xreset.spec import SceneSpec
-
         trace, key = episode.trace, (episode.trace.object, episode.objects)
         if key not in self._renderers:
             thing = load_object(trace.object, episode.objects)

@@ -6,6 +6,7 @@ A step looks at what is there when it begins, so one that was killed, requeued o
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -180,8 +181,6 @@ def log_of(out: Path, name: str) -> Path:
 
 def shown_command(command: Sequence[str]) -> str:
     """A command to read, and to give by hand."""
-    import shlex
-
     text = shlex.join(command)
     python = shlex.quote(sys.executable)
     return text.replace(f"{python} -m torch.distributed.run", "torchrun").replace(f"{python} -m xreset", "xreset")

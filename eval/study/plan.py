@@ -26,6 +26,7 @@ from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import starting_config
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.objects import canonical_name, object_names
+from xreset.plugins import backend_status
 from xreset.typed import from_dict
 
 if TYPE_CHECKING:
@@ -394,7 +395,5 @@ def _folder(out: Path, group: str, spec: Runs, objects: tuple[str, ...], seed: i
 
 
 def _engines(wanted: Iterable[str]) -> tuple[list[str], dict[str, str]]:
-    from xreset.plugins import backend_status
-
     statuses = [backend_status(name) for name in dict.fromkeys(wanted)]
     return [s.name for s in statuses if s.reason is None], {s.name: s.reason for s in statuses if s.reason is not None}

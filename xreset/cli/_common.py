@@ -8,6 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from xreset.cli import INVOCATION
+from xreset.cli._terminal import Progress
+from xreset.plugins import backend_names, backend_status
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -15,8 +19,6 @@ if TYPE_CHECKING:
 @contextmanager
 def engine_bars(console: Console, names: Sequence[str]) -> Iterator[Callable[[str, int, int], None]]:
     """One bar for each engine; gives the function that moves them: (engine, steps done, steps in all)."""
-    from xreset.cli._terminal import Progress
-
     with Progress(console) as bar:
         tasks = {name: bar.add_task(name, total=None) for name in names}
         yield lambda name, done, total: bar.update(tasks[name], completed=done, total=total)
@@ -24,8 +26,6 @@ def engine_bars(console: Console, names: Sequence[str]) -> Iterator[Callable[[st
 
 def usable_engines(console: Console) -> list[str]:
     """Names of the engines that can be used here; says why others cannot."""
-    from xreset.plugins import backend_names, backend_status
-
     statuses = [backend_status(name) for name in backend_names()]
     for status in statuses:
         if status.reason is not None:
@@ -35,8 +35,6 @@ def usable_engines(console: Console) -> list[str]:
 
 def this_command() -> str:
     """What to type to get the same numbers: with the names of files and folders but not where they lie, and without ``--json FILE``."""
-    from xreset.cli import INVOCATION
-
     words = list(INVOCATION)
     if "--json" in words:
         del words[(i := words.index("--json")) : i + 2]

@@ -12,6 +12,7 @@ from typing import Any
 
 from xreset.checks import Options
 from xreset.errors import XResetError
+from xreset.files import claim
 
 _COUNTS = {
     "num_envs", "iterations", "episodes", "states", "grasps", "per_object", "max_per_object", "max_demos", "perturbed", "per_gpu",
@@ -91,8 +92,6 @@ def _check_overwriting(options: dict[str, Any]) -> None:
 
 @contextmanager
 def _claimed(options: dict[str, Any]) -> Iterator[None]:
-    from xreset.files import claim
-
     with ExitStack() as claims:
         for name in _WRITTEN:
             path = options.get(name)

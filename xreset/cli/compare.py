@@ -7,6 +7,10 @@ from typing import Annotated, Literal
 
 import tyro
 
+from xreset.cli._terminal import Console
+from xreset.eval.report.make import compare as make
+from xreset.eval.table import rich_table
+
 
 def compare(
     runs: Annotated[tuple[str, ...], tyro.conf.Positional],
@@ -30,10 +34,6 @@ def compare(
         apart: Show also runs that differ in their seed only one by one.
         out: Folder for compare.png and compare.md.
     """
-    from xreset.cli._terminal import Console
-    from xreset.eval.report.make import compare as make
-    from xreset.eval.table import rich_table
-
     console = Console()
     with console.status("reading"):
         made = make(runs, out, x=x, curves=curve, apart=apart)

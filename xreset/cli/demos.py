@@ -4,15 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+from rich.table import Table
+
+from xreset.cli._terminal import Console, Progress
+from xreset.demos import (
+    Convention,
+    concatenate,
+    demo_objects,
+    mirrored,
+    read_demos,
+    read_dexycb,
+    read_ho3d,
+    read_keypoints,
+    read_transform,
+    symmetry,
+    synthesize,
+    write_demos,
+)
+from xreset.demos.info import summarize
+from xreset.demos.plausible import doubts
+from xreset.errors import DemoError
+from xreset.files import file_hash
 
 if TYPE_CHECKING:
     from xreset.demos import Demos
     from xreset.spec import ObjectSpec
-
 Side = Literal["right", "left", "both"]
 
 
@@ -31,8 +52,6 @@ def dexycb(
         objects: Only sequences that grasp one of these objects; default: all.
         side: Only sequences of this hand.
     """
-    from xreset.demos import read_dexycb, write_demos
-
     with _progress("reading DexYCB") as progress:
         demos = read_dexycb(folder, objects=objects or None, sides=_sides(side), progress=progress)
     write_demos(out, demos, config={"dataset": "dexycb", "objects": list(objects), "side": side})
@@ -49,8 +68,6 @@ def ho3d(folder: Annotated[Path, tyro.conf.Positional], *, out: Path, fps: float
         cameras: File with the camera's pose in the table frame (4x4, metres, as text or npy; x right, y down, z where it looks) for all
             sequences; or a folder with SEQUENCE.txt, where sequences without one are left out.
     """
-    from xreset.demos import read_ho3d, write_demos
-
     with _progress("reading HO-3D") as progress:
         demos = read_ho3d(folder, fps=fps, cameras=cameras, progress=progress)
     write_demos(out, demos, config={"dataset": "ho3d", "fps": fps})
@@ -89,9 +106,6 @@ def keypoints(
         side: The hand, where the files do not say it.
         subject: Who demonstrated, where the files do not say it.
     """
-    from xreset.demos import Convention, read_keypoints, read_transform, write_demos
-    from xreset.files import file_hash
-
     T = None if table_from_camera is None else read_transform(table_from_camera)
     convention = Convention(
         order=order, units=units, frame=coordinates, table_from_camera=T, quat=quat, fps=fps, object_name=object, side=side, subject=subject
@@ -122,8 +136,6 @@ def synth(
         fps: Frames per second.
         side: Hand.
     """
-    from xreset.demos import concatenate, synthesize, write_demos
-
     with _progress("making demonstrations") as progress:
         demos = concatenate([synthesize(objects or None, per_object, seed, fps=fps, side=hand, progress=progress) for hand in _sides(side)])
     config = {"objects": list(objects), "per_object": per_object, "seed": seed, "fps": fps, "side": side}
@@ -148,12 +160,6 @@ def mirror(
         objects: Folder of real meshes; default: the built-in stand-ins.
         tolerance: Largest distance between an object's surface and its reflection, over 95 % of it [m].
     """
-    from rich.table import Table
-
-    from xreset.cli._terminal import Console
-    from xreset.demos import demo_objects, mirrored, read_demos, symmetry, write_demos
-    from xreset.files import file_hash
-
     demos = read_demos(file).select(sides=["left"])
     symmetries = {name: symmetry(spec) for name, spec in demo_objects(demos, objects).items()}
     table = Table("object", "off its reflection [mm]", "mirrored")
@@ -172,9 +178,6 @@ def info(file: Annotated[Path, tyro.conf.Positional], *, objects: Path | None = 
         file: The archive.
         objects: Folder of meshes; default: the built-in stand-ins. Without meshes it is not seen whether objects stand on the table.
     """
-    from xreset.demos import demo_objects, read_demos
-    from xreset.errors import DemoError
-
     demos = read_demos(file)
     try:
         known = demo_objects(demos, objects)
@@ -191,22 +194,12 @@ def _sides(side: Side) -> tuple[Literal["right", "left"], ...]:
 
 @contextmanager
 def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
-    from xreset.cli._terminal import Console, Progress
-
     with Progress(Console(stderr=True)) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total, name: bar.update(task, completed=done, total=total, description=f"{what}: {name}")
 
 
 def _print_summary(demos: Demos, path: Path, objects: dict[str, ObjectSpec] | None = None) -> None:
-    from math import degrees
-
-    from rich.table import Table
-
-    from xreset.cli._terminal import Console
-    from xreset.demos.info import summarize
-    from xreset.demos.plausible import doubts
-
     columns = ("right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg")
     table = Table(caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start pose")
     table.add_column("object", no_wrap=True)

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import tyro
 
+from xreset.cli._common import engine_bars
+from xreset.cli._terminal import Console
 from xreset.eval.setting import Setting
 
 
@@ -31,8 +33,6 @@ def evaluate(
         out: Folder for the results; default: eval/ in the run folder or beside the policy; runs/NAME/eval for a policy that ships with
             xreset, runs/BASELINE-ROBOT/eval for a baseline.
     """
-    from xreset.cli._common import engine_bars
-    from xreset.cli._terminal import Console
     from xreset.eval.evaluate import evaluate, resolve
     from xreset.eval.table import results_table
     from xreset.eval.trial import engine

@@ -7,9 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from xreset.cli._terminal import Console, Progress
+from xreset.errors import RunError
+from xreset.eval.export import read_recorded, write_arrays, write_lerobot
+from xreset.eval.export.recorded import TASK
+
 if TYPE_CHECKING:
     from xreset.eval.export import Recording
-
 Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
 Backends = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
@@ -37,9 +41,6 @@ def lerobot(
         video: Draw a film of each episode.
         size: Width and height of the films, pixels.
     """
-    from xreset.cli._terminal import Console, Progress
-    from xreset.eval.export import write_lerobot
-
     recording = _recording(folders, backend, robot, objects, task)
     with Progress(Console(stderr=True)) as bar:
         item = bar.add_task("writing episodes", total=None)
@@ -57,8 +58,6 @@ def npz(folders: Folders, *, out: Path, backend: Backends = (), robot: str | Non
         robot: Name or folder of the robot; default: as the results name it.
         task: The task in words; {object} stands for the object's name.
     """
-    from xreset.eval.export import write_arrays
-
     recording = _recording(folders, backend, robot, None, task)
     write_arrays(out, recording)
     _say(recording, out)
@@ -67,18 +66,12 @@ def npz(folders: Folders, *, out: Path, backend: Backends = (), robot: str | Non
 def _recording(
     folders: tuple[Path, ...], backends: tuple[str, ...], robot: str | None, objects: Path | None, task: str | None
 ) -> Recording:
-    from xreset.errors import RunError
-    from xreset.eval.export import read_recorded
-    from xreset.eval.export.recorded import TASK
-
     if not folders:
         raise RunError("give a run folder, or a folder that xreset eval wrote into.")
     return read_recorded(folders, backends=backends, robot=robot, objects=objects, task=task or TASK)
 
 
 def _say(recording: Recording, out: Path) -> None:
-    from xreset.cli._terminal import Console
-
     engines = ", ".join(dict.fromkeys(e.engine for e in recording.episodes))
     Console().print(
         f"{out}: {len(recording.episodes)} episodes of {recording.robot.name} in {engines},"

@@ -6,10 +6,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+from rich.table import Table
+
+from xreset.cli._terminal import Console
+from xreset.errors import ObjectError
+from xreset.objects import bounding_box, load_object, object_names
+from xreset.objects.catalogue import ALIASES
+from xreset.objects.meshes import add_mesh, import_with_notes, mesh_files
+from xreset.objects.properties import Properties
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from xreset.spec import ObjectSpec
 
 
@@ -19,9 +25,6 @@ def list_(*, objects: Path | None = None) -> None:
     Args:
         objects: Folder of real meshes; default: the built-in stand-ins.
     """
-    from xreset.cli._terminal import Console
-    from xreset.objects import load_object, object_names
-
     table = _table()
     for name in object_names(objects):
         table.add_row(*_cells(load_object(name, objects)))
@@ -54,10 +57,8 @@ def import_(
         friction: Coefficient of its material: the middle of what training and evaluation draw.
         png: Picture of the meshes beside their pieces, with the deviation in millimetres.
     """
-    from xreset.cli._terminal import Console
-    from xreset.errors import ObjectError
-    from xreset.objects.meshes import add_mesh, import_with_notes, mesh_files
-    from xreset.objects.properties import Properties
+    from xreset.pictures.pieces import draw_pieces
+    from xreset.pictures.raster import write_png
 
     try:
         properties = Properties(mass=mass, density=density, friction=friction)
@@ -96,17 +97,12 @@ def import_(
     for note in notes:
         console.print(note, highlight=False)
     if png is not None:
-        from xreset.pictures.pieces import draw_pieces
-        from xreset.pictures.raster import write_png
-
         captions = [f"{r.obj.name}: {len(r.obj.pieces)} pieces, at most {1e3 * r.deviation:.1f} mm off the surface" for r in found]
         write_png(png, draw_pieces([r.obj for r in found], captions))
         console.print(f"{png}: meshes and their pieces", soft_wrap=True, highlight=False)
 
 
 def _table(*more: str) -> Table:
-    from rich.table import Table
-
     table = Table()
     for column in ("object", "alias"):
         table.add_column(column, no_wrap=True)
@@ -119,9 +115,6 @@ def _table(*more: str) -> Table:
 
 
 def _cells(obj: ObjectSpec) -> tuple[str, ...]:
-    from xreset.objects import bounding_box
-    from xreset.objects.catalogue import ALIASES
-
     low, high = bounding_box(obj)
     kinds = {piece.geometry.kind for piece in obj.pieces}
     return (

@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.table import Table
+
+from xreset.cli._terminal import Console
+from xreset.policies import card, shipped
 
 
 def list_() -> None:
     """Show the cards of the policies that ship with xreset; wherever a policy is asked for, their names will do."""
-    from rich.table import Table
-
-    from xreset.cli._terminal import Console
-    from xreset.policies import card, shipped
     from xreset.policy import OnnxPolicy
 
     console = Console()
@@ -43,7 +43,6 @@ def shrink(policy: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, t
         policy: Exported policy (.onnx).
         out: File to write.
     """
-    from xreset.cli._terminal import Console
     from xreset.learning.shrink import shrink as write_shrunk
 
     before = policy.stat().st_size if policy.is_file() else 0  # now, for the output may replace it; of what is no file, shrinking complains

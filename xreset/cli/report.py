@@ -7,6 +7,11 @@ from typing import Annotated
 
 import tyro
 
+from xreset.cli._terminal import Console, Progress
+from xreset.eval.report import make_report
+from xreset.eval.table import results_table
+from xreset.policies import results_folder, shipped
+
 
 def report(
     run: Annotated[Path, tyro.conf.Positional], *, out: Path | None = None, robot: str | None = None, objects: Path | None = None
@@ -19,11 +24,6 @@ def report(
         robot: Name or folder of the robot, for the clips; default: as the results name it.
         objects: Folder of real meshes, for the clips; default: as the results name it.
     """
-    from xreset.cli._terminal import Console, Progress
-    from xreset.eval.report import make_report
-    from xreset.eval.table import results_table
-    from xreset.policies import results_folder, shipped
-
     if not run.exists() and str(run) in shipped():
         run = results_folder(str(run))
     console = Console()

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.table import Table
 
+from xreset.accounts import accounts_path, described, with_totals, write_accounts
+from xreset.cli._terminal import Console, Progress
+from xreset.description import load_robot
+from xreset.files import file_hash
+from xreset.objects import load_objects
+from xreset.resets.bank import check_retargeted, write_bank
 from xreset.resets.config import ClosingConfig, SqueezeConfig
 
 
@@ -38,16 +46,6 @@ def resets(
         squeeze: Targets of states after contact that press.
         hold: Also count, in every engine, which lifted states hold the object for a second at full gravity.
     """
-    from dataclasses import asdict
-
-    from rich.table import Table
-
-    from xreset.accounts import accounts_path, described, with_totals, write_accounts
-    from xreset.cli._terminal import Console, Progress
-    from xreset.description import load_robot
-    from xreset.files import file_hash
-    from xreset.objects import load_objects
-    from xreset.resets.bank import check_retargeted, write_bank
     from xreset.resets.filter import make_bank
     from xreset.resets.hold import hold_bank
     from xreset.retarget.pipeline import read_retargeted

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
+from rich.table import Table
 
+from xreset.accounts import accounts_path, described, with_totals, write_accounts
+from xreset.cli._terminal import Console, Progress
+from xreset.demos import demo_objects, levelled, read_demos
+from xreset.demos.align import on_something
+from xreset.demos.plausible import doubts
+from xreset.description import load_robot
+from xreset.files import file_hash
 from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.file import Retargeted
 from xreset.retarget.hand.config import HandConfig
 
 
@@ -41,19 +52,7 @@ def retarget(
         arm: Weights and effort of the arm's inverse kinematics.
         picture: PNG to write: first contact, mid-lift and goal for each object, the human keypoints over the robot.
     """
-    from dataclasses import asdict
-
-    import numpy as np
-    from rich.table import Table
-
-    from xreset.accounts import accounts_path, described, with_totals, write_accounts
-    from xreset.cli._terminal import Console, Progress
-    from xreset.demos import demo_objects, levelled, read_demos
-    from xreset.demos.align import on_something
-    from xreset.demos.plausible import doubts
-    from xreset.description import load_robot
-    from xreset.files import file_hash
-    from xreset.retarget import pipeline
+    from xreset.retarget import pipeline  # torch, which --help must not wait for
     from xreset.retarget.collisions import colliding_links
     from xreset.retarget.partial import discard
 
@@ -97,16 +96,33 @@ def retarget(
         shown = load_view(out, demos=demos, robot=robot, objects=objects)
         write_png(picture, draw_sheet(shown, moment_tiles(shown)))
 
-    rows = result.accounts()
     colliding = colliding_links(result, spec, config.thresholds)
     write_accounts(
-        accounts_path(out), of="frames", rows=rows, self_collision=[{"links": list(pair), "frames": n} for pair, n in colliding.items()]
+        accounts_path(out),
+        of="frames",
+        rows=result.accounts(),
+        self_collision=[{"links": list(pair), "frames": n} for pair, n in colliding.items()],
     )
+    console.print(_table(result))
+    if colliding:
+        meeting = Table("links that meet", "frames", title="self collision")
+        for pair, frames in colliding.items():
+            meeting.add_row(" and ".join(pair), str(frames))
+        console.print(meeting)
+        console.print("Links that meet in every position of their joints belong into collision.exclude of the robot.toml.")
+    for index in np.flatnonzero(on_something(levelled(chosen), specs)):
+        console.print(f"{chosen.sequence_name[index]}: the object starts on top of something that the scene does not have; not lowered.")
+    console.print(f"hand {timing.hand:.1f} s, arm {timing.arm:.1f} s", highlight=False)
+    console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}; counts in {accounts_path(out)}")
+
+
+def _table(result: Retargeted) -> Table:
+    """What became of the frames, by object and phase."""
     table = Table(
-        "object", "phase", "frames", "annotated", "valid", "fingertips [mm]", "invalid because of", title=f"retargeted to {spec.name}"
+        "object", "phase", "frames", "annotated", "valid", "fingertips [mm]", "invalid because of", title=f"retargeted to {result.robot}"
     )
     names = result.object_name[result.sequence_of_frame]
-    for row in with_totals(rows):
+    for row in with_totals(result.accounts()):
         mine = result.annotated & ((names == row.object_name) | (row.object_name == "all"))
         if row.phase != "both":
             mine &= result.post_contact == (row.phase == "post-contact")
@@ -120,17 +136,7 @@ def retarget(
             f"{1e3 * result.hand_error[mine].mean():.1f}" if mine.any() else "-",
             described(annotated.lost),
         )
-    console.print(table)
-    if colliding:
-        meeting = Table("links that meet", "frames", title="self collision")
-        for pair, frames in colliding.items():
-            meeting.add_row(" and ".join(pair), str(frames))
-        console.print(meeting)
-        console.print("Links that meet in every position of their joints belong into collision.exclude of the robot.toml.")
-    for index in np.flatnonzero(on_something(levelled(chosen), specs)):
-        console.print(f"{chosen.sequence_name[index]}: the object starts on top of something that the scene does not have; not lowered.")
-    console.print(f"hand {timing.hand:.1f} s, arm {timing.arm:.1f} s", highlight=False)
-    console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}; counts in {accounts_path(out)}")
+    return table
 
 
 COMMAND = retarget

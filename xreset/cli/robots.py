@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import shlex
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
+from rich.table import Table
+from rich.text import Text
 
+from xreset.cli._terminal import Console, Progress
+from xreset.demos import demo_objects, read_demos
+from xreset.description import DESCRIPTION, load_robot, robot_folder
 from xreset.errors import RobotError
-from xreset.robot_tools.placement import PlaceConfig, Reach
+from xreset.geometry.urdf_writer import pose
+from xreset.plugins import robot_names
+from xreset.robot_tools.placement import PlaceConfig, Reach, write_placement
 
 
 def list_robots() -> None:
     """List the robots: built in, and from installed packages."""
-    from rich.table import Table
-
-    from xreset.cli._terminal import Console
-    from xreset.description import load_robot, robot_folder
-    from xreset.plugins import robot_names
-
     table = Table("robot", "joints (arm + hand)", "fingertips", "folder")
     for name in robot_names():
         try:
@@ -45,11 +49,10 @@ def check(
         picture: write a picture (PNG) of the robot at home, with the frames of its palm, fingertips and joints.
         engines: build the robot in every installed engine (the first time, mujoco-warp compiles for a minute or two).
     """
-    from rich.text import Text
-
-    from xreset.cli._terminal import Console
+    from xreset.pictures.raster import write_png
     from xreset.robot_tools.check import Finding
     from xreset.robot_tools.check import check as run_checks
+    from xreset.robot_tools.picture import robot_picture
 
     console = Console()
     styles = {"ok": "green", "skipped": "dim", "warning": "yellow", "error": "bold red"}
@@ -61,10 +64,6 @@ def check(
     findings = run_checks(robot, report=report, engines=engines)
     counts = {level: sum(finding.level == level for finding in findings) for level in ("error", "warning")}
     if picture is not None and findings[0].level == "ok":
-        from xreset.description import load_robot
-        from xreset.pictures.raster import write_png
-        from xreset.robot_tools.picture import robot_picture
-
         write_png(picture, robot_picture(load_robot(robot)))
         console.print(f"wrote {picture}", highlight=False)
     console.print(f"{counts['error']} errors, {counts['warning']} warnings", highlight=False)
@@ -97,9 +96,6 @@ def import_(
         rpy: Its roll, pitch and yaw about the flange's fixed axes [rad].
         thumb: A link or joint of the thumb, where names and geometry do not tell.
     """
-    from xreset.cli._terminal import Console
-    from xreset.description import load_robot
-    from xreset.geometry.urdf_writer import pose
     from xreset.pictures.raster import write_png
     from xreset.robot_tools.importer import import_robot
     from xreset.robot_tools.picture import robot_picture
@@ -136,17 +132,8 @@ def place(
         write: put the placement, its home and its figure into the robot's robot.toml.
         search: ranges and effort.
     """
-    import shlex
-    from dataclasses import fields
-
-    import numpy as np
-
-    from xreset.cli._terminal import Console, Progress
-    from xreset.demos import demo_objects, read_demos
-    from xreset.description import DESCRIPTION, load_robot, robot_folder
     from xreset.retarget.pipeline import rest_on_table, wrist_paths
     from xreset.robot_tools.place import place as search_place
-    from xreset.robot_tools.placement import write_placement
 
     console = Console()
     spec = load_robot(robot)

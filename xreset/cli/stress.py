@@ -6,8 +6,17 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.markup import escape
+from rich.table import Table
 
+from xreset.cli._common import engine_bars
+from xreset.cli._terminal import Console
+from xreset.eval.evaluate import resolve
 from xreset.eval.setting import Setting
+from xreset.eval.stress import chosen
+from xreset.eval.stress import stress as sweep
+from xreset.eval.stress_figure import write_plot
+from xreset.eval.trial import engine
 
 
 def stress(
@@ -32,17 +41,6 @@ def stress(
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: stress/ in the run folder or beside the policy.
     """
-    from rich.markup import escape
-    from rich.table import Table
-
-    from xreset.cli._common import engine_bars
-    from xreset.cli._terminal import Console
-    from xreset.eval.evaluate import resolve
-    from xreset.eval.stress import chosen
-    from xreset.eval.stress import stress as sweep
-    from xreset.eval.stress_figure import write_plot
-    from xreset.eval.trial import engine
-
     properties = chosen(property)
     engines = [engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
     console = Console()

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import math
+from argparse import ArgumentParser
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+from xreset.errors import RunError
 from xreset.learning.config import TrainConfig
+from xreset.learning.recipes import starting_config
 
 
 def train(
@@ -46,9 +51,6 @@ def train(
             deviation and, where it adapts, their learning rate.
         config: Task, model and algorithm. The defaults shown are those of --like.
     """
-    from dataclasses import replace
-
-    from xreset.errors import RunError
     from xreset.learning import train as training
 
     if not minutes > 0:
@@ -80,11 +82,6 @@ def train(
 
 def command_for(arguments: list[str]) -> Callable[..., None]:
     """:func:`train` with the defaults that ``--like`` asks for, which have to be known before the other flags are read."""
-    from argparse import ArgumentParser
-    from functools import partial
-
-    from xreset.learning.recipes import starting_config
-
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--like", nargs="?")  # a missing value is for the real parser to say
     like = parser.parse_known_args(arguments)[0].like

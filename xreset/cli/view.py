@@ -5,11 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import tyro
+from rich.progress import track
+
+from xreset.cli._terminal import Console, Progress
+from xreset.errors import XResetError
+from xreset.files import atomic_write
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from xreset.pictures.view.data import View
 
 
@@ -49,7 +53,6 @@ def view(
         moments: Let --png show first contact, mid-lift and goal of one demonstration of each object.
         reasons: Let --png show one example of every reason for which a frame or state is not used.
     """
-    from xreset.errors import XResetError
     from xreset.pictures.view.load import load_view
 
     if (moments or reasons) and (png is None or (moments and reasons)):
@@ -84,7 +87,6 @@ def _serve(shown: View, host: str, port: int, sequence: int | None, frame: int) 
 
 
 def _write_png(path: Path, shown: View, rows: np.ndarray, frame: int | None) -> None:
-    from xreset.errors import XResetError
     from xreset.pictures.raster import write_png
     from xreset.pictures.view.picture import Drawer
 
@@ -96,7 +98,6 @@ def _write_png(path: Path, shown: View, rows: np.ndarray, frame: int | None) -> 
 
 
 def _write_sheet(path: Path, shown: View, *, moments: bool) -> None:
-    from xreset.cli._terminal import Console, Progress
     from xreset.pictures.raster import write_png
     from xreset.pictures.view.sheet import draw_sheet, moment_tiles, reason_tiles
 
@@ -112,13 +113,7 @@ def _write_sheet(path: Path, shown: View, *, moments: bool) -> None:
 
 
 def _write_mp4(path: Path, shown: View, rows: np.ndarray) -> None:
-    import numpy as np
-    from rich.progress import track
-
-    from xreset.cli._terminal import Console
-    from xreset.errors import XResetError
     from xreset.eval.report.clips import encode_mp4
-    from xreset.files import atomic_write
     from xreset.pictures.view.picture import Drawer
 
     if not len(rows):

@@ -13,6 +13,7 @@ from itertools import pairwise, product
 
 import numpy as np
 import torch
+from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from xreset.geometry.collision import SelfCollision, support_points
@@ -190,8 +191,6 @@ def inscribed_balls(geometry: Geometry) -> tuple[np.ndarray, float]:
     elif geometry.kind == "box":
         center, sides = np.zeros(3), np.array(geometry.size)
     else:
-        from scipy.spatial import ConvexHull
-
         points, _ = support_points(geometry)
         low, high = points.min(axis=0), points.max(axis=0)
         center, sides = (low + high) / 2, (high - low) / 2 * (ConvexHull(points).volume / np.prod(high - low)) ** (1 / 3)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
+from xreset.geometry.kinematics import Kinematics
 from xreset.spec import RobotSpec
 
 
@@ -17,10 +19,6 @@ def mass_matrix(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
         robot: the robot.
         joint_pos: [J] position [rad or m].
     """
-    import torch
-
-    from xreset.geometry.kinematics import Kinematics
-
     kinematics = Kinematics(robot)
     links = [kinematics.tree.link(name) for name in kinematics.link_names]
     com = torch.tensor(np.stack([link.com for link in links]))

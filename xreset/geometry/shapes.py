@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import ConvexHull, QhullError
 
 from xreset.errors import ObjectError
 from xreset.spec import Geometry, Shape
 
 if TYPE_CHECKING:
     import trimesh
-
 _FEW = 300
 """Points that every engine bears in a hull."""
 CYLINDER_SECTIONS = 48
@@ -44,8 +44,6 @@ def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
     Raises:
         ObjectError: the points span no volume.
     """
-    from scipy.spatial import ConvexHull, QhullError
-
     points = np.asarray(points, dtype=float)
     try:
         points = _outermost(points, tolerance) if tolerance > 0 and len(points) > _FEW else points
@@ -64,8 +62,6 @@ def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
 
 def _outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
     """Points [n, 3] whose hull lacks less than the tolerance: those farthest beyond the hull of the points so far, face by face."""
-    from scipy.spatial import ConvexHull
-
     points = points[ConvexHull(points).vertices]
     directions = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
     chosen = np.unique((points @ directions.T).argmax(axis=0))
@@ -168,7 +164,5 @@ def _translation(center: ArrayLike) -> np.ndarray:
 
 def half_spaces(shape: Shape) -> np.ndarray:
     """[P, 4] the planes of a convex shape, (outward unit normal, offset): a point x is inside where normal . x + offset <= 0 for all."""
-    from scipy.spatial import ConvexHull
-
     vertices = np.asarray(shape_mesh(shape).vertices, dtype=float)
     return np.unique(ConvexHull(vertices).equations.round(9), axis=0)  # coplanar triangles share a plane

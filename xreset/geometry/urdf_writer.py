@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from xreset.geometry.urdf import Joint, Link, RobotTree
 from xreset.spec import Geometry, MimicSpec, Shape
@@ -26,8 +27,6 @@ FRAME_INERTIA = 1e-7
 
 def pose(xyz: Sequence[float] = (0, 0, 0), *, rpy: Sequence[float] = (0, 0, 0), quat: Sequence[float] | None = None) -> np.ndarray:
     """[4, 4] pose from a position [m] and roll, pitch, yaw about fixed axes [rad], or a quaternion (w, x, y, z) of any length."""
-    from scipy.spatial.transform import Rotation
-
     rotation = Rotation.from_euler("xyz", rpy) if quat is None else Rotation.from_quat(np.array(quat, dtype=float), scalar_first=True)
     T = np.eye(4)
     T[:3, :3] = rotation.as_matrix()
@@ -133,8 +132,6 @@ def _mesh_name(link: str, number: int) -> str:
 
 
 def _between(kind: Literal["capsule", "cylinder"], start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
-    from scipy.spatial.transform import Rotation
-
     a, b = np.array(start, dtype=float), np.array(end, dtype=float)
     length = float(np.linalg.norm(b - a))
     direction = (b - a) / length

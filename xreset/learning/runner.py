@@ -14,6 +14,7 @@ from typing import Any, cast
 
 import torch
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rsl_rl.runners import OnPolicyRunner
 from torch import Tensor
 
@@ -278,8 +279,6 @@ class _Log:
     """Sums on the device during an iteration; one progress line and one set of TensorBoard scalars after it."""
 
     def __init__(self, folder: Path, num_envs: int, device: str, total: int) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
         self.clock = LiftClock(folder)
         self._curves = CurveFile(folder)
         self._returns, self._lengths = torch.zeros(num_envs, device=device), torch.zeros(num_envs, device=device)

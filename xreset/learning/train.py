@@ -14,11 +14,12 @@ from xreset.env import make_env
 from xreset.errors import RunError
 from xreset.files import claim_folder, file_hash
 from xreset.learning.choice import Choice, read_choice
-from xreset.learning.config import TrainConfig
+from xreset.learning.config import TrainConfig, rsl_rl_config
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx
+from xreset.learning.model import PointNetLstmModel
 from xreset.learning.run import RunInfo, checkpoints, latest_checkpoint, read_run, write_run
-from xreset.learning.runner import TrainingRunner
+from xreset.learning.runner import TrainingRunner, read_checkpoint
 from xreset.objects import load_objects
 from xreset.plugins import backend_class, device_for
 from xreset.policy import check_contract, policy_contract
@@ -221,10 +222,6 @@ def current_choice(out: Path) -> Choice | None:
 def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
     """Write the policy of one of a run's checkpoints as an ONNX file."""
     from tensordict import TensorDict
-
-    from xreset.learning.config import rsl_rl_config
-    from xreset.learning.model import PointNetLstmModel
-    from xreset.learning.runner import read_checkpoint
 
     info = read_run(out)
     weights = read_checkpoint(checkpoint)["actor_state_dict"]

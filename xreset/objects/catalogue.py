@@ -7,6 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from xreset.errors import ObjectError
+from xreset.objects.meshes import import_mesh, mesh_files
 from xreset.objects.standins import STAND_INS, stand_in
 from xreset.spec import ObjectSpec
 
@@ -28,8 +29,6 @@ def object_names(folder: Path | None = None) -> tuple[str, ...]:
     """Official names of the built-in objects, or of the meshes in a folder."""
     if folder is None:
         return STAND_INS
-    from xreset.objects.meshes import mesh_files
-
     return tuple(mesh_files(folder))
 
 
@@ -66,8 +65,6 @@ def load_object(name: str, folder: Path | None = None, *, mass: float | None = N
     """
     if folder is None:
         return _stand_in(canonical_name(name))
-    from xreset.objects.meshes import import_mesh, mesh_files
-
     files = mesh_files(folder)
     try:
         full = canonical_name(name, files)

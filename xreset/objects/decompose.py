@@ -28,7 +28,6 @@ from xreset.spec import Shape
 if TYPE_CHECKING:
     import trimesh
     from manifold3d import Manifold
-
 SCHEMA_NAME = "xreset-pieces/2"
 SCHEMA = {
     "vertices": Field(("V", 3), "f", within=POSITION),
@@ -250,8 +249,6 @@ class _Solid:
     """A solid, and how far a convex piece stands off its surface."""
 
     def __init__(self, solid: Manifold) -> None:
-        from scipy.spatial import cKDTree
-
         self.solid = solid
         vertices, faces = _arrays(solid)
         self._tree = cKDTree(np.concatenate((vertices, _samples(vertices, faces, 60_000)[0])))
@@ -424,8 +421,6 @@ def _farthest_from_span(vertices: np.ndarray, chosen: list[int]) -> int:
 
 def _deviation(vertices: np.ndarray, faces: np.ndarray, shapes: Sequence[Shape]) -> float:
     """[m] How far pieces stand off the surface of a solid, or leave it bare, at the worst of points on both (sampled)."""
-    from scipy.spatial import cKDTree
-
     planes = [half_spaces(shape) for shape in shapes]
 
     def beyond(points: np.ndarray, skip: int | None = None) -> np.ndarray:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from xreset.spec import ObjectSpec
 
@@ -29,9 +31,6 @@ def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
 
     An object rests on a face of its convex hull if its centre of mass projects into that face.
     """
-    from scipy.spatial import ConvexHull
-    from scipy.spatial.transform import Rotation
-
     convex = ConvexHull(obj.vertices)
     corners, normals = obj.vertices[convex.simplices], convex.equations[:, :3]
     distance = normals @ obj.com + convex.equations[:, 3]  # of the centre of mass, negative as it is inside

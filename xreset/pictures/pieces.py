@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from xreset.geometry.shapes import shape_mesh
 from xreset.pictures.raster import OBJECT_COLOR, Camera, draw_bodies
 from xreset.pictures.view.sheet import font, written
 from xreset.spec import ObjectSpec
@@ -29,8 +30,6 @@ def draw_pieces(objects: Sequence[ObjectSpec], captions: Sequence[str], *, size:
     Raises:
         XResetError: Pillow, which writes the captions, is not installed.
     """
-    from xreset.geometry.shapes import shape_mesh
-
     face = font()
     rows = []
     for obj in objects:

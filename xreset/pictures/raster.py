@@ -13,8 +13,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
 
 from xreset.files import atomic_write
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import shape_mesh
+from xreset.geometry.urdf import robot_tree
 from xreset.spec import Geometry, RobotSpec, SceneSpec, Shape, TableSpec
 
 Color = tuple[float, float, float]
@@ -100,8 +105,6 @@ class Renderer:
             camera: default: from the front right, over the table.
             smooth: draw at twice the size and average: better edges, four times the work.
         """
-        from xreset.geometry.kinematics import Kinematics
-
         self.scene = scene
         self.size = size
         self.camera = camera or Camera()
@@ -138,8 +141,6 @@ class Renderer:
         Returns:
             [H, W, 3] uint8 picture.
         """
-        import torch
-
         casters = []
         if joint_pos is not None:
             q = torch.as_tensor(np.asarray(joint_pos), dtype=torch.float64)
@@ -164,8 +165,6 @@ class Renderer:
 
     def link_frames(self, joint_pos: np.ndarray, links: Sequence[str], *, length: float = 0.03) -> Frames:
         """The axes of links, for :meth:`draw`; ``RobotError`` if there is no such link."""
-        import torch
-
         q = torch.as_tensor(np.asarray(joint_pos), dtype=torch.float64)
         return Frames(poses=self._kinematics.link_poses(q, links).numpy(), length=length)
 
@@ -182,8 +181,6 @@ def draw_bodies(
 
 def pose_matrix(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
     """[4, 4] pose from a position [3] and a quaternion [4] (w, x, y, z)."""
-    from scipy.spatial.transform import Rotation
-
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(np.asarray(quat, dtype=float), scalar_first=True).as_matrix()
     T[:3, 3] = pos
@@ -215,16 +212,12 @@ def tinted(color: np.ndarray, tint: Color) -> np.ndarray:
 
 def link_meshes(robot: RobotSpec) -> list[Mesh | None]:
     """The collision shapes of each link of the robot's URDF as one mesh in the link's frame; None for a link without shape."""
-    from xreset.geometry.urdf import robot_tree
-
     tree = robot_tree(robot)
     return [_merge([_shape_mesh(shape) for shape in tree.link(name).collisions]) for name in tree.link_names]
 
 
 def link_colors(robot: RobotSpec) -> list[Color]:
     """The colour of each link of the robot's URDF: arm, palm, fingers and fingertips are told apart."""
-    from xreset.geometry.urdf import robot_tree
-
     tree = robot_tree(robot)
     parent = {joint.child: joint.parent for joint in tree.joints}
     tips = {link for tip in robot.fingertips for link in tip.contact_links}
@@ -315,8 +308,6 @@ def _merge(meshes: Sequence[Mesh]) -> Mesh | None:
 
 
 def _shape_mesh(shape: Shape) -> Mesh:
-    from xreset.geometry.shapes import shape_mesh
-
     mesh = shape_mesh(shape, coarse=True)
     return _mesh(mesh.vertices, mesh.faces)
 

@@ -8,11 +8,16 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 
 from xreset.description import DESCRIPTION, load_robot
 from xreset.errors import BackendUnavailableError, RobotError, XResetError
+from xreset.geometry.collision import SelfCollision, height_above_table, table_points
+from xreset.geometry.dynamics import damping_ratio, drive_inertia
+from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import RobotTree, find_mesh, parse_xml, robot_tree
-from xreset.plugins import robot_folder
+from xreset.plugins import backend_names, make_backend, robot_folder
+from xreset.retarget.hand.model import HandModel, predicted_gigabytes
 from xreset.robot_tools.sources import largest_moment
 from xreset.spec import Geometry, ObjectSpec, RobotSpec, SceneSpec, Shape, TableSpec
 from xreset.text import shown
@@ -83,8 +88,6 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
 
 def check_engine(spec: RobotSpec, backend: str) -> Finding:
     """Build the robot in an engine, compare its link poses with xreset's own kinematics, and let it hold its home configuration."""
-    from xreset.plugins import make_backend
-
     topic = f"engine {backend}"
     try:
         with make_backend(backend, SceneSpec(robot=spec, objects=(_probe(),)), 1) as engine:
@@ -109,8 +112,6 @@ def check(name_or_folder: str | Path, *, report: Callable[[Finding], None] = lam
     Returns:
         All findings.
     """
-    from xreset.plugins import backend_names
-
     spec, found = check_description(name_or_folder)
     for finding in found:
         report(finding)
@@ -259,8 +260,6 @@ def _inertias(tree: RobotTree) -> Iterator[tuple[Level, str]]:
 
 
 def _drives(spec: RobotSpec) -> Iterator[tuple[Level, str]]:
-    from xreset.geometry.dynamics import damping_ratio, drive_inertia
-
     for joint in spec.joints:
         drive = joint.drive
         if drive.kp <= 0 or drive.effort <= 0 or min(drive.kd, drive.armature, drive.friction_loss) < 0:
@@ -281,17 +280,11 @@ def _drives(spec: RobotSpec) -> Iterator[tuple[Level, str]]:
 
 
 def _drive_summary(spec: RobotSpec) -> str:
-    from xreset.geometry.dynamics import damping_ratio
-
     ratio = damping_ratio(spec, spec.home)
     return f"damping ratios at home are {ratio.min():.2f}..{ratio.max():.2f}"
 
 
 def _frames(spec: RobotSpec) -> Iterator[tuple[Level, str]]:
-    import torch
-
-    from xreset.geometry.kinematics import Kinematics
-
     poses = Kinematics(spec).link_poses(torch.tensor(spec.home), spec.tracked_links).numpy()
     palm, tips = poses[0], poses[1:]
     ahead = (tips[:, :3, 3] - palm[:3, 3]).mean(axis=0) @ palm[:3, 0]
@@ -309,11 +302,6 @@ def _frames(spec: RobotSpec) -> Iterator[tuple[Level, str]]:
 
 def _home(spec: RobotSpec) -> list[Finding]:
     """Home, and configurations spread around it as at the start of episodes, against the table and against the robot itself."""
-    import torch
-
-    from xreset.geometry.collision import SelfCollision, height_above_table, table_points
-    from xreset.geometry.kinematics import Kinematics
-
     kinematics = Kinematics(spec)
     home = torch.tensor(spec.home)
     spread = torch.zeros_like(home)
@@ -353,8 +341,6 @@ def _home(spec: RobotSpec) -> list[Finding]:
 
 def _size(spec: RobotSpec) -> list[Finding]:
     """What retargeting makes of the collision shapes, and the memory that it will take."""
-    from xreset.retarget.hand.model import HandModel, predicted_gigabytes
-
     try:
         model = HandModel(spec)
     except XResetError as error:
@@ -387,10 +373,6 @@ def _probe() -> ObjectSpec:
 
 
 def _links_disagree(spec: RobotSpec, engine) -> str | None:
-    import torch
-
-    from xreset.geometry.kinematics import Kinematics
-
     state = engine.state()
     expected = Kinematics(spec).link_poses(state.joint_pos[0].double().cpu(), spec.tracked_links)[:, :3, 3]
     away = (engine.links().pos[0].double().cpu() - expected).norm(dim=-1)
@@ -400,8 +382,6 @@ def _links_disagree(spec: RobotSpec, engine) -> str | None:
 
 
 def _does_not_hold(spec: RobotSpec, engine) -> str | None:
-    import torch
-
     home = torch.tensor(spec.home, dtype=torch.float32)
     engine.set_joint_targets(home.to(engine.device)[None])
     for _ in range(_HOLD_STEPS):

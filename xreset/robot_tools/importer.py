@@ -16,15 +16,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from xreset.description import DESCRIPTION, SCHEMA, load_robot
 from xreset.errors import RobotError
+from xreset.geometry.collision import SelfCollision, height_above_table, table_points
+from xreset.geometry.dynamics import drive_inertia
+from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import surface_of
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import fixed, frame, urdf_text, write_meshes
 from xreset.robot_tools.sources import Source, combined, read_source
-from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
+from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec, TableSpec
 
 _FINGERS = ("index", "middle", "ring", "little")
 _HUMAN = (0.0, 0.45, 0.73)
@@ -228,10 +232,6 @@ def _spec(
 
 def _places(spec: RobotSpec, positions: dict[str, float]) -> dict[str, np.ndarray]:
     """Link -> pose [4, 4] in the frame of the hand's root, at joint positions; others are at home."""
-    import torch
-
-    from xreset.geometry.kinematics import Kinematics
-
     kinematics = Kinematics(spec)
     q = torch.tensor([positions.get(joint.name, joint.home) for joint in spec.joints], dtype=torch.float64)
     poses = kinematics.link_poses(kinematics.clamp(q)).numpy()
@@ -426,12 +426,6 @@ def _hand_home(tree: RobotTree, mimics: Sequence[MimicSpec], bent: dict[str, flo
 
 def _arm_home(spec: RobotSpec, notes: list[str]) -> RobotSpec:
     """Arm joints that hold the palm over the table, looking down: the solution farthest from the limits that is clear of table and self."""
-    import torch
-
-    from xreset.geometry.collision import SelfCollision, height_above_table, table_points
-    from xreset.geometry.kinematics import Kinematics
-    from xreset.spec import TableSpec
-
     kinematics = Kinematics(spec)
     arm = torch.as_tensor(spec.arm_indices)
     lower, upper = kinematics.lower[arm], kinematics.upper[arm]
@@ -466,8 +460,6 @@ def _arm_home(spec: RobotSpec, notes: list[str]) -> RobotSpec:
 
 def _with_drives(spec: RobotSpec, source: Source, notes: list[str]) -> RobotSpec:
     """Drives as the files state them, else by the built-in robots' rule: stiff enough that the effort is reached within 0.35 rad."""
-    from xreset.geometry.dynamics import drive_inertia
-
     joints, without = [], []
     for joint in spec.joints:
         of_arm = joint.group == "arm"
@@ -492,11 +484,6 @@ def _with_drives(spec: RobotSpec, source: Source, notes: list[str]) -> RobotSpec
 
 def _with_exclusions(spec: RobotSpec, notes: list[str]) -> RobotSpec:
     """Pairs of links that meet at home, or nearly wherever the hand's joints are, never collide."""
-    import torch
-
-    from xreset.geometry.collision import SelfCollision
-    from xreset.geometry.kinematics import Kinematics
-
     kinematics = Kinematics(spec)
     collision = SelfCollision(spec, kinematics)
     pairs = dict.fromkeys(collision.overlapping_at_home, "at home")

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
+from xreset.geometry.kinematics import Kinematics
 from xreset.pictures.raster import Camera, Renderer
 from xreset.spec import RobotSpec, SceneSpec
 
@@ -20,10 +22,6 @@ def robot_picture(robot: RobotSpec) -> np.ndarray:
     The wide views show the frames of the moving joints' links, the close ones those of the palm and the fingertips (left) and of the links
     that follow the human's keypoints (right). x is red, y green, z blue.
     """
-    import torch
-
-    from xreset.geometry.kinematics import Kinematics
-
     kinematics = Kinematics(robot)
     poses = kinematics.link_poses(torch.tensor(robot.home), robot.tracked_links).numpy()
     points = poses[:, :3, 3]

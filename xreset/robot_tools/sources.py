@@ -9,6 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from xreset.errors import ObjectError, RobotError
 from xreset.geometry.shapes import hull, mass_properties, surface_of
@@ -354,6 +355,4 @@ def _geoms(model, mujoco, body: int, shift: np.ndarray) -> Iterable[Shape]:
 
 
 def _matrix(quat: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
     return Rotation.from_quat(quat, scalar_first=True).as_matrix()

@@ -6,11 +6,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from xreset.checks import Options
-from xreset.errors import XResetError
+from xreset.cli._terminal import Console, Progress
+from xreset.errors import DemoError, XResetError
+from xreset.eval.evaluate import resolve
 from xreset.eval.setting import Setting
+from xreset.eval.trial import engine
+from xreset.files import file_hash, write_json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,15 +60,8 @@ def attribute(
         setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
         out: Folder for attribution.json and attribution.png; default: attribute/ beside the policy's results.
     """
-    import numpy as np
-
-    from xreset.cli._terminal import Console, Progress
-    from xreset.errors import DemoError
-    from xreset.eval.engines.attribution import attribute as experiment
+    from xreset.eval.engines.attribution import attribute as experiment  # MuJoCo, which --help must not need
     from xreset.eval.engines.attribution_view import not_tried, rich_table, verdict, write_plot
-    from xreset.eval.evaluate import resolve
-    from xreset.eval.trial import engine
-    from xreset.files import file_hash, write_json
 
     if backend == towards:
         raise XResetError(f"--backend and --towards are both {backend!r}; an engine does not differ from itself.")

@@ -6,9 +6,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+from rich.text import Text
+
+from xreset import __version__
+from xreset.backends.conformance import CHECKS, SCHEMA, run
+from xreset.backends.conformance.harness import Bench
+from xreset.backends.conformance.scene import gripper
+from xreset.backends.pool import PoolBackend
+from xreset.cli._common import this_command, usable_engines
+from xreset.cli._terminal import Console
+from xreset.description import load_robot
+from xreset.errors import XResetError
+from xreset.files import write_json
+from xreset.plugins import backend_class, backend_status, make_backend
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from torch import Tensor
 
     from xreset.backends.conformance import CheckResult, MakeBackend, Measure
@@ -35,18 +47,6 @@ def check(
         json: File to write the results to.
         verbose: Show every number that was measured, not only the one nearest to its tolerance.
     """
-    from rich.text import Text
-
-    from xreset import __version__
-    from xreset.backends.conformance import CHECKS, SCHEMA, run
-    from xreset.backends.conformance.scene import gripper
-    from xreset.cli._common import this_command, usable_engines
-    from xreset.cli._terminal import Console
-    from xreset.description import load_robot
-    from xreset.errors import XResetError
-    from xreset.files import write_json
-    from xreset.plugins import backend_class, backend_status
-
     known = [c.name for c in CHECKS]
     if unknown := sorted(set(only) - set(known)):
         raise XResetError(f"there is no check {', '.join(unknown)}; there are {', '.join(known)}.")
@@ -81,10 +81,6 @@ def check(
 
 def _maker(name: str, device: str) -> MakeBackend:
     """Builds worlds on the device; a few of them, for one check only, run in this process sooner than processes start."""
-    from xreset.backends.conformance.harness import Bench
-    from xreset.backends.pool import PoolBackend
-    from xreset.plugins import backend_class, make_backend
-
     pooled = issubclass(backend_class(name), PoolBackend)
 
     def make(scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None) -> Backend:
@@ -99,8 +95,6 @@ _STYLE = {"passed": "green", "known difference": "cyan", "failed": "bold red", "
 
 
 def _print(console: Console, result: CheckResult, verbose: bool) -> None:
-    from rich.text import Text
-
     detail = _text(result.worst) if result.measures else result.problem
     verdict = (f"{result.verdict:<16}", _STYLE[result.verdict])
     console.print(Text.assemble("  ", verdict, f" {result.name:<22} {result.seconds:5.1f} s  {detail}"))

@@ -6,11 +6,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+from rich.table import Table
+from rich.text import Text
+
+from xreset import __version__
+from xreset.cli._common import this_command, usable_engines
+from xreset.cli._terminal import Console, Progress
+from xreset.eval.engines.agreement import REFERENCE
+from xreset.eval.engines.agreement import compare as agreement
+from xreset.eval.engines.sources import load_frames
+from xreset.eval.trial import engine
+from xreset.files import file_hash, write_json
 
 if TYPE_CHECKING:
-    from rich.table import Table
-    from rich.text import Text
-
     from xreset.eval.engines.agreement import EngineParity, Metric, Parity
 
 
@@ -42,15 +50,6 @@ def compare(
         device: Where engines run that can run on GPUs: cpu or cuda.
         json: File to write the results to.
     """
-    from xreset import __version__
-    from xreset.cli._common import this_command, usable_engines
-    from xreset.cli._terminal import Console, Progress
-    from xreset.eval.engines.agreement import REFERENCE
-    from xreset.eval.engines.agreement import compare as agreement
-    from xreset.eval.engines.sources import load_frames
-    from xreset.eval.trial import engine
-    from xreset.files import file_hash, write_json
-
     console = Console(highlight=False, soft_wrap=True)
     names = [name for name in dict.fromkeys(backend) or usable_engines(console) if name != REFERENCE]
     engines = [engine(name, device=device) for name in names]
@@ -79,8 +78,6 @@ def compare(
 
 
 def _table(result: Parity) -> Table:
-    from rich.table import Table
-
     columns: tuple[EngineParity, ...] = (result.floor, *result.engines)
     held = sum(sum(flags) for name, flags in result.reference.carried.items() if name != "closing")
     tried = sum(len(flags) for name, flags in result.reference.carried.items() if name != "closing")
@@ -99,8 +96,6 @@ def _table(result: Parity) -> Table:
 
 
 def _cell(metric: Metric) -> Text:
-    from rich.text import Text
-
     style = "green" if metric.ok else "bold red"
     return Text.assemble((_number(metric.measured, metric.unit), style), f" (n = {metric.n})")
 

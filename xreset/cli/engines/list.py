@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from rich.table import Table
+
+from xreset.cli._terminal import Console
+from xreset.plugins import backend_names, backend_status
+
 
 def engines() -> None:
     """List the physics engines: name, engine version, device, and why not where one cannot be used."""
-    from rich.table import Table
-
-    from xreset.cli._terminal import Console
-    from xreset.plugins import backend_names, backend_status
-
     table = Table("backend", "engine version", "device", "available")
     for name in backend_names():
         status = backend_status(name)

@@ -7,6 +7,9 @@ from typing import Annotated
 
 import tyro
 
+from xreset.eval.engines import page as matrix
+from xreset.files import atomic_write
+
 
 def page(
     *,
@@ -20,9 +23,6 @@ def page(
             the same check of the same engine, device and robot, the later one counts.
         out: File to write; default: print it.
     """
-    from xreset.eval.engines import page as matrix
-    from xreset.files import atomic_write
-
     text = matrix.page(matrix.read(source))
     if out is None:
         print(text, end="")

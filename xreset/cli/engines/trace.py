@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,18 @@ from typing import Annotated
 import tyro
 
 from xreset.checks import Options
+from xreset.cli._common import usable_engines
+from xreset.cli._terminal import Console, Progress
 from xreset.errors import XResetError
+from xreset.eval.engines.actions import write_actions
+from xreset.eval.engines.divergence import Thresholds
+from xreset.eval.engines.film import write_film, write_strip
+from xreset.eval.engines.replay import trace as replay
+from xreset.eval.engines.replay import write_trace
+from xreset.eval.engines.sources import from_file, from_policy
+from xreset.eval.engines.trace_view import rich_table, sentences, write_plot
 from xreset.eval.setting import Place, Sequence
+from xreset.eval.trial import engine
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,19 +85,6 @@ def trace(
         limits: When engines have diverged.
         output: Files.
     """
-    import math
-
-    from xreset.cli._common import usable_engines
-    from xreset.cli._terminal import Console, Progress
-    from xreset.eval.engines.actions import write_actions
-    from xreset.eval.engines.divergence import Thresholds
-    from xreset.eval.engines.film import write_film, write_strip
-    from xreset.eval.engines.replay import trace as replay
-    from xreset.eval.engines.replay import write_trace
-    from xreset.eval.engines.sources import from_file, from_policy
-    from xreset.eval.engines.trace_view import rich_table, sentences, write_plot
-    from xreset.eval.trial import engine
-
     thresholds = Thresholds(
         joint=limits.joint_threshold,
         travel=0.1 * limits.joint_threshold,

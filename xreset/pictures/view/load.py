@@ -8,15 +8,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from xreset.demos.archive import demo_objects, read_demos
+from xreset.description import load_robot
 from xreset.errors import FileFormatError, XResetError
+from xreset.geometry.surface import Surface, keypoint_contacts
+from xreset.objects import load_objects
 from xreset.pictures.view.data import Human, View
 from xreset.records import npz_schema
+from xreset.resets.bank import check_objects, check_retargeted, read_bank
+from xreset.retarget.file import read_retargeted
+from xreset.retarget.pipeline import RetargetConfig, rest_on_table
 from xreset.spec import ObjectSpec
 
 if TYPE_CHECKING:
     from xreset.demos.archive import Demos
     from xreset.resets.bank import ResetBank
-
 _BANK_RATE = 5.0
 """States of a bank that are played per second: they are no motion, and are looked at one by one."""
 
@@ -52,8 +58,6 @@ def load_view(
 
 
 def _demos_view(path: Path, folder: Path | None) -> View:
-    from xreset.demos.archive import demo_objects, read_demos
-
     demos = read_demos(path)
     objects = tuple(demo_objects(demos, folder).values())
     demos, human = _human(demos, objects)
@@ -84,11 +88,6 @@ def _demos_view(path: Path, folder: Path | None) -> View:
 
 
 def _retargeted_view(path: Path, folder: Path | None, robot: str | None, demos: Path | None) -> View:
-    from xreset.description import load_robot
-    from xreset.objects import load_objects
-    from xreset.resets.bank import check_retargeted
-    from xreset.retarget.file import read_retargeted
-
     data = read_retargeted(path)
     spec = load_robot(robot or data.robot)
     check_retargeted(path, data, spec)
@@ -123,10 +122,6 @@ def _retargeted_view(path: Path, folder: Path | None, robot: str | None, demos: 
 
 
 def _bank_view(path: Path, folder: Path | None, robot: str | None, demos: Path | None, retargeted: Path | None) -> View:
-    from xreset.description import load_robot
-    from xreset.objects import load_objects
-    from xreset.resets.bank import check_objects, read_bank
-
     found = read_bank(path)
     spec = load_robot(robot or found.robot)
     bank = read_bank(path, robot=spec)
@@ -162,8 +157,6 @@ def _bank_view(path: Path, folder: Path | None, robot: str | None, demos: Path |
 
 def _with_rejected(path: Path, view: View, bank: ResetBank, retargeted: Path) -> View:
     """A bank's view with the states that physics rejected, each in its place within its sequence."""
-    from xreset.retarget.file import read_retargeted
-
     data = read_retargeted(retargeted)
     parts = (bank.frame_part, bank.rejected_frame_part)
     whole, whole_rejected = (  # states between frames are not in the file
@@ -201,9 +194,6 @@ def _with_rejected(path: Path, view: View, bank: ResetBank, retargeted: Path) ->
 
 def _human(demos: Demos, objects: tuple[ObjectSpec, ...]) -> tuple[Demos, Human]:
     """The demonstrations as retargeting sees them (object on the table), and their hands with the contacts of retargeting."""
-    from xreset.geometry.surface import Surface, keypoint_contacts
-    from xreset.retarget.pipeline import RetargetConfig, rest_on_table
-
     demos = rest_on_table(demos, objects)
     keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan)
     touching, contacts = np.zeros(keypoints.shape[:2], dtype=bool), np.full_like(keypoints, np.nan)
@@ -218,8 +208,6 @@ def _human(demos: Demos, objects: tuple[ObjectSpec, ...]) -> tuple[Demos, Human]
 
 def _human_of(path: Path, demos_path: Path, objects: tuple[ObjectSpec, ...], sequence: np.ndarray, frame: np.ndarray) -> Human:
     """The hands of some frames, found by the name [N] of their sequence and the frame [N] within it."""
-    from xreset.demos.archive import read_demos
-
     demos = read_demos(demos_path)
     wanted = set(sequence.tolist())
     if missing := sorted(wanted - set(demos.sequence_name.tolist())):

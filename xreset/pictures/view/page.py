@@ -12,8 +12,11 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
+import torch
 
 from xreset.errors import XResetError
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import matrix_to_quat
 from xreset.pictures.raster import GOAL_COLOR, OBJECT_COLOR, TABLE_COLORS, Camera, link_colors, link_meshes, tinted
 from xreset.pictures.view.colors import CONTACT_COLOR, HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, GOOD, PHASES, View
@@ -167,8 +170,6 @@ class _Scene:
         self._colors: list[Any] = []
         self._reason = ""
         if view.robot is not None:
-            from xreset.geometry.kinematics import Kinematics
-
             self._kinematics = Kinematics(view.robot)
             self._colors = link_colors(view.robot)
             for i, (name, mesh) in enumerate(zip(self._kinematics.link_names, link_meshes(view.robot), strict=True)):
@@ -211,10 +212,6 @@ class _Scene:
             self._place_robot(view.joint_pos[row], view.reason[row])
 
     def _place_robot(self, joint_pos: np.ndarray, reason: str) -> None:
-        import torch
-
-        from xreset.geometry.rotations import matrix_to_quat
-
         poses = self._kinematics.link_poses(torch.as_tensor(joint_pos, dtype=torch.float64))
         quats = matrix_to_quat(poses[:, :3, :3]).numpy()
         for i, link in self._links.items():

@@ -6,9 +6,11 @@ import math
 
 import numpy as np
 
+from xreset.description import load_robot
 from xreset.pictures.raster import Camera, Points, Renderer, pose_matrix
 from xreset.pictures.view.colors import CONTACT_COLOR, HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, View
+from xreset.plugins import robot_names
 from xreset.spec import SceneSpec
 
 _BONE_DOTS = 6
@@ -30,9 +32,6 @@ class Drawer:
 
     def __init__(self, view: View, *, size: tuple[int, int] = (640, 480), smooth: bool = False) -> None:
         """Prepare the meshes; ``size`` is width and height in pixels, ``smooth`` draws at twice the size and averages."""
-        from xreset.description import load_robot
-        from xreset.plugins import robot_names
-
         robot = view.robot or load_robot(robot_names()[0])  # a scene has one; it is drawn only if the view has one too
         self._view = view
         self._renderer = Renderer(SceneSpec(robot=robot, objects=view.objects), size=size, smooth=smooth)

@@ -1,0 +1,91 @@
+"""A robot as far as an import knows it: its links and joints, and in the end its commented ``robot.toml``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import jinja2
+import numpy as np
+import torch
+
+from xreset.description import SCHEMA
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.urdf import RobotTree
+from xreset.geometry.urdf_writer import urdf_text, write_meshes
+from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
+
+_BASE = ((0.60, 1.00, 0.30), (0.7071068, 0.0, 0.0, -0.7071068))
+"""Where the arm stands until `robots place` finds better: behind the table, on the person's side, its x towards the table."""
+
+
+def moving(tree: RobotTree, mimics: Sequence[MimicSpec]) -> list[str]:
+    """Joints that need a drive, root first."""
+    followers = {mimic.joint for mimic in mimics}
+    return [joint.name for joint in tree.joints if joint.type != "fixed" and joint.name not in followers]
+
+
+def below(tree: RobotTree, root: str) -> list[str]:
+    """The link ``root`` and all that it carries."""
+    found = {root}
+    for joint in tree.joints:
+        if joint.parent in found:
+            found.add(joint.child)
+    return [name for name in tree.link_names if name in found]
+
+
+def draft_spec(
+    tree: RobotTree,
+    mimics: Sequence[MimicSpec],
+    hand_root: str,
+    folder: Path,
+    *,
+    tips: Sequence[FingertipSpec] = (),
+    keypoints: Sequence[KeypointSpec] = (),
+    home: dict[str, float] | None = None,
+) -> RobotSpec:
+    """The robot as far as it is known, its URDF written."""
+    (folder / "robot.urdf").write_text(urdf_text(tree, {}, mimics=mimics, comment="Written by xreset robots import."))
+    write_meshes(tree, folder)
+    inside = {joint.name for joint in tree.joints if joint.child in set(below(tree, hand_root)) - {hand_root}}
+    joints = tuple(
+        JointSpec(
+            name=name,
+            group="hand" if name in inside else "arm",
+            drive=DriveSpec(kp=1.0, kd=0.1, effort=1.0),
+            home=(home or {}).get(name, float(np.clip(0.0, tree.joint(name).lower, tree.joint(name).upper))),
+        )
+        for name in moving(tree, mimics)
+    )
+    return RobotSpec(
+        name=tree.name,
+        urdf=folder / "robot.urdf",
+        joints=joints,
+        mimics=tuple(mimics),
+        base_pos=_BASE[0],
+        base_quat=_BASE[1],
+        palm="palm_frame" if tips else hand_root,
+        hand_root=hand_root,
+        fingertips=tuple(tips),
+        keypoints=tuple(keypoints),
+        self_collision_links=tuple(n for n in below(tree, hand_root) if tree.link(n).collisions),
+        table_exclude=tuple(n for n in tree.link_names if tree.moving_ancestor(n) == tree.root and tree.link(n).collisions),
+    )
+
+
+def link_places(spec: RobotSpec, positions: dict[str, float]) -> dict[str, np.ndarray]:
+    """Link -> pose [4, 4] in the frame of the hand's root, at joint positions; others are at home."""
+    kinematics = Kinematics(spec)
+    q = torch.tensor([positions.get(joint.name, joint.home) for joint in spec.joints], dtype=torch.float64)
+    poses = kinematics.link_poses(kinematics.clamp(q)).numpy()
+    root = np.linalg.inv(poses[kinematics.link_index(spec.hand_root)])
+    return {name: root @ poses[kinematics.link_index(name)] for name in kinematics.link_names}
+
+
+def description_text(spec: RobotSpec, notes: Sequence[str]) -> str:
+    """The robot's ``robot.toml``, every part explained; ``notes`` say what was guessed."""
+    loader = jinja2.FileSystemLoader(Path(__file__).with_name("templates"))
+    pages = jinja2.Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False)
+    pages.filters["toml"] = lambda value: json.dumps(value, ensure_ascii=False)
+    return pages.get_template("robot.toml").render(spec=spec, notes=notes, schema=SCHEMA)

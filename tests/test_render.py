@@ -9,8 +9,10 @@ import trimesh
 
 from xreset.errors import RobotError
 from xreset.geometry.kinematics import Kinematics
+from xreset.pictures import meshes
 from xreset.pictures import raster as render
-from xreset.pictures.raster import Camera, Frames, Points, Renderer, link_colors, pose_matrix, write_png
+from xreset.pictures.meshes import link_colors
+from xreset.pictures.raster import Camera, Frames, Points, Renderer, pose_matrix, write_png
 from xreset.robots import load
 from xreset.spec import Geometry, ObjectSpec, SceneSpec, Shape
 
@@ -173,27 +175,27 @@ class Pictures(unittest.TestCase):
         for name in ("openarm", "ur7e-sharpa"):
             robot = load(name)
             colors = dict(zip(Kinematics(robot).link_names, link_colors(robot), strict=True))
-            self.assertEqual(colors[robot.hand_root], render.PALM_COLOR)
-            self.assertEqual({colors[link] for tip in robot.fingertips for link in tip.contact_links}, {render.TIP_COLOR})
-            self.assertEqual(colors[Kinematics(robot).link_names[0]], render.ARM_COLOR)
-        self.assertEqual(colors["right_index_MP"], render.HAND_COLOR)
+            self.assertEqual(colors[robot.hand_root], meshes.PALM_COLOR)
+            self.assertEqual({colors[link] for tip in robot.fingertips for link in tip.contact_links}, {meshes.TIP_COLOR})
+            self.assertEqual(colors[Kinematics(robot).link_names[0]], meshes.ARM_COLOR)
+        self.assertEqual(colors["right_index_MP"], meshes.HAND_COLOR)
 
 
 class Meshes(unittest.TestCase):
     def test_normals_are_round_on_round_shapes_and_flat_on_boxes(self):
         T = pose_matrix(np.array([0.1, 0.2, 0.3]), np.array([0.5, 0.5, -0.5, 0.5]))
-        box = render._shape_mesh(Shape(geometry=Geometry(kind="box", size=(0.1, 0.2, 0.3)), T_body_shape=T))
+        box = meshes._shape_mesh(Shape(geometry=Geometry(kind="box", size=(0.1, 0.2, 0.3)), T_body_shape=T))
         corners = box.vertices[box.faces]
         flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         flat /= np.linalg.norm(flat, axis=1, keepdims=True)
         np.testing.assert_allclose(box.normals, np.broadcast_to(flat[:, None], box.normals.shape), atol=1e-9)
-        sphere = render._shape_mesh(Shape(geometry=Geometry(kind="sphere", size=(0.2,)), T_body_shape=T))
+        sphere = meshes._shape_mesh(Shape(geometry=Geometry(kind="sphere", size=(0.2,)), T_body_shape=T))
         outward = (sphere.vertices[sphere.faces] - T[:3, 3]) / 0.2
         np.testing.assert_allclose((sphere.normals * outward).sum(-1), 1.0, atol=0.01)
 
     def test_capsules_and_cylinders_are_centred(self):
         for kind, top in (("capsule", 0.15), ("cylinder", 0.1)):
-            mesh = render._shape_mesh(Shape(geometry=Geometry(kind=kind, size=(0.05, 0.1)), T_body_shape=np.eye(4)))
+            mesh = meshes._shape_mesh(Shape(geometry=Geometry(kind=kind, size=(0.05, 0.1)), T_body_shape=np.eye(4)))
             np.testing.assert_allclose((mesh.vertices[:, 2].min(), mesh.vertices[:, 2].max()), (-top, top), atol=1e-6)
 
 

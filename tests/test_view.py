@@ -23,7 +23,8 @@ from xreset.cli import main
 from xreset.demos.archive import Demos, write_demos
 from xreset.errors import FileFormatError, XResetError
 from xreset.geometry.kinematics import Kinematics
-from xreset.pictures.raster import tinted, write_png
+from xreset.pictures.meshes import tinted
+from xreset.pictures.raster import write_png
 from xreset.pictures.view.colors import reason_color
 from xreset.pictures.view.load import load_view
 from xreset.pictures.view.picture import Drawer

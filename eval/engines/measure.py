@@ -23,7 +23,7 @@ from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.geometry.shapes import hull
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import State
-from xreset.pictures.raster import link_meshes
+from xreset.pictures.meshes import link_meshes
 from xreset.spec import GRAVITY, ObjectSpec, SceneSpec
 
 

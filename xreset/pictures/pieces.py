@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from xreset.geometry.shapes import shape_mesh
-from xreset.pictures.raster import OBJECT_COLOR, Camera, draw_bodies
+from xreset.pictures.meshes import OBJECT_COLOR
+from xreset.pictures.raster import Camera, draw_bodies
 from xreset.pictures.view.sheet import font, written
 from xreset.spec import ObjectSpec
 

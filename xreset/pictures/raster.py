@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,34 +18,31 @@ from scipy.spatial.transform import Rotation
 
 from xreset.files import atomic_write
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import shape_mesh
-from xreset.geometry.urdf import robot_tree
-from xreset.spec import Geometry, RobotSpec, SceneSpec, Shape, TableSpec
-
-Color = tuple[float, float, float]
-"""Red, green, blue in 0..1."""
-
-ARM_COLOR: Color = (0.74, 0.77, 0.82)
-HAND_COLOR: Color = (0.45, 0.53, 0.68)
-PALM_COLOR: Color = (0.34, 0.40, 0.54)
-TIP_COLOR: Color = (0.16, 0.68, 0.62)
-OBJECT_COLOR: Color = (0.95, 0.58, 0.22)
-INVALID_COLOR: Color = (0.86, 0.13, 0.13)
-GOAL_COLOR: Color = (0.35, 0.78, 0.35)
-TABLE_COLORS: tuple[Color, Color] = ((0.84, 0.80, 0.74), (0.80, 0.76, 0.70))
-SKY_COLORS: tuple[Color, Color] = ((0.90, 0.93, 0.97), (0.98, 0.98, 0.98))
-AXIS_COLORS: tuple[Color, Color, Color] = ((0.90, 0.15, 0.15), (0.15, 0.70, 0.20), (0.15, 0.35, 0.95))
+from xreset.pictures.meshes import (
+    AXIS_COLORS,
+    GOAL_COLOR,
+    OBJECT_COLOR,
+    SKY_COLORS,
+    Bodies,
+    Color,
+    Placed,
+    joined,
+    link_colors,
+    link_meshes,
+    shaded_mesh,
+    spread,
+    table_top,
+    tinted,
+)
+from xreset.spec import SceneSpec
 
 _LIGHT = np.array([0.15, -0.35, 0.92]) / np.linalg.norm([0.15, -0.35, 0.92])
 """Direction to the light, world frame."""
 _SHADOW_SIZE = 512
 _SHADOW_BIAS = 0.0005
 """[m] by which a surface may lie behind the one that the light sees and still be lit."""
-_CREASE = math.cos(math.radians(40.0))
-"""Faces that meet at a smaller angle than this are shaded as one round surface."""
 _NEAR = 0.02
 """[m] nothing nearer to the camera is drawn."""
-_TABLE_CELL = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,18 +78,6 @@ class Frames:
     """[m]"""
 
 
-@dataclass(frozen=True)
-class Mesh:
-    """Triangles of one body."""
-
-    vertices: np.ndarray
-    """[V, 3]"""
-    faces: np.ndarray
-    """[F, 3] outward"""
-    normals: np.ndarray = field(repr=False)
-    """[F, 3, 3] unit normal at each corner of each face"""
-
-
 class Renderer:
     """Draws one scene again and again. Meshes are prepared once; a picture of 480 x 360 pixels then takes some tens of milliseconds."""
 
@@ -110,9 +95,9 @@ class Renderer:
         self.camera = camera or Camera()
         self._scale = 2 if smooth else 1
         self._kinematics = Kinematics(scene.robot)
-        self._robot = _Bodies(link_meshes(scene.robot), link_colors(scene.robot))
-        self._objects = [_Bodies([_mesh(spec.vertices, spec.faces)], [OBJECT_COLOR]) for spec in scene.objects]
-        self._table = _table(scene.table)
+        self._robot = Bodies(link_meshes(scene.robot), link_colors(scene.robot))
+        self._objects = [Bodies([shaded_mesh(spec.vertices, spec.faces)], [OBJECT_COLOR]) for spec in scene.objects]
+        self._table = table_top(scene.table)
 
     def draw(
         self,
@@ -149,7 +134,7 @@ class Renderer:
         if object_pose is not None:
             casters.append(self._objects[object_index].placed(np.asarray(object_pose, dtype=float)[None]))
         view = _View(camera or self.camera, (self.size[0] * self._scale, self.size[1] * self._scale))
-        picture, nearness = _shade(view, _join([*casters, self._table]), _Shadow(_join(casters)) if casters else None)
+        picture, nearness = _shade(view, joined([*casters, self._table]), _Shadow(joined(casters)) if casters else None)
         if goal_pose is not None:
             ghost = self._objects[object_index].placed(np.asarray(goal_pose, dtype=float)[None], color=GOAL_COLOR)
             over, ghost_nearness = _shade(view, ghost, None)
@@ -173,7 +158,7 @@ def draw_bodies(
     meshes: Sequence[tuple[np.ndarray, np.ndarray]], colors: Sequence[Color], camera: Camera, size: tuple[int, int]
 ) -> np.ndarray:
     """[H, W, 3] uint8 picture of meshes (vertices [V, 3], outward triangles [F, 3]), each in its colour, without table."""
-    bodies = _Bodies([_mesh(vertices, faces) for vertices, faces in meshes], colors).placed(np.tile(np.eye(4), (len(meshes), 1, 1)))
+    bodies = Bodies([shaded_mesh(vertices, faces) for vertices, faces in meshes], colors).placed(np.tile(np.eye(4), (len(meshes), 1, 1)))
     width, height = size
     picture, _ = _shade(_View(camera, (2 * width, 2 * height)), bodies, _Shadow(bodies))
     return (picture.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)).clip(0, 1) * 255 + 0.5).astype(np.uint8)
@@ -203,137 +188,6 @@ def encode_png(picture: np.ndarray) -> bytes:
     rows = np.concatenate((np.zeros((height, 1), np.uint8), picture.reshape(height, width * 3)), axis=1)  # 0: no filter
     header = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes((8, 2, 0, 0, 0))  # 8 bits, RGB
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6)) + chunk(b"IEND", b"")
-
-
-def tinted(color: np.ndarray, tint: Color) -> np.ndarray:
-    """Colours [..., 3] with more than half of another one mixed in: parts can still be told apart."""
-    return 0.4 * np.asarray(color, dtype=float) + 0.6 * np.asarray(tint)
-
-
-def link_meshes(robot: RobotSpec) -> list[Mesh | None]:
-    """The collision shapes of each link of the robot's URDF as one mesh in the link's frame; None for a link without shape."""
-    tree = robot_tree(robot)
-    return [_merge([_shape_mesh(shape) for shape in tree.link(name).collisions]) for name in tree.link_names]
-
-
-def link_colors(robot: RobotSpec) -> list[Color]:
-    """The colour of each link of the robot's URDF: arm, palm, fingers and fingertips are told apart."""
-    tree = robot_tree(robot)
-    parent = {joint.child: joint.parent for joint in tree.joints}
-    tips = {link for tip in robot.fingertips for link in tip.contact_links}
-    body = tree.moving_ancestor(robot.hand_root)
-    colors = []
-    for name in tree.link_names:
-        below, ancestor = False, name
-        while ancestor in parent and not below:
-            ancestor = parent[ancestor]
-            below = ancestor == robot.hand_root
-        palm = name == robot.hand_root or (tree.moving_ancestor(name) == body and below)
-        colors.append(TIP_COLOR if name in tips else PALM_COLOR if palm else HAND_COLOR if below else ARM_COLOR)
-    return colors
-
-
-# Meshes ------------------------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Placed:
-    """Triangles in the world."""
-
-    corners: np.ndarray
-    """[F, 3, 3]"""
-    normals: np.ndarray
-    """[F, 3, 3]"""
-    colors: np.ndarray
-    """[F, 3]"""
-
-
-class _Bodies:
-    """Rigid meshes that are placed together."""
-
-    def __init__(self, meshes: Sequence[Mesh | None], colors: Sequence[Color]) -> None:
-        drawn = [(index, mesh) for index, mesh in enumerate(meshes) if mesh is not None]
-        self._body = np.concatenate([np.full(len(mesh.faces), index) for index, mesh in drawn])
-        self._corners = np.concatenate([mesh.vertices[mesh.faces] for _, mesh in drawn])
-        self._normals = np.concatenate([mesh.normals for _, mesh in drawn])
-        self._colors = np.array(colors, dtype=float)[self._body]
-
-    def placed(self, poses: np.ndarray, color: Color | None = None) -> _Placed:
-        """The triangles with body i at ``poses[i]``."""
-        T = poses[self._body]
-        turned = T[:, None, :3, :3].swapaxes(-1, -2)
-        corners = (self._corners[:, :, None, :] @ turned)[:, :, 0] + T[:, None, :3, 3]
-        normals = (self._normals[:, :, None, :] @ turned)[:, :, 0]
-        colors = self._colors if color is None else np.broadcast_to(np.array(color), self._colors.shape)
-        return _Placed(corners, normals, colors)
-
-
-def _join(parts: Sequence[_Placed]) -> _Placed:
-    return _Placed(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("corners", "normals", "colors")))
-
-
-def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """A mesh with a normal at each corner: the mean over the faces around the vertex that meet this one at less than the crease angle."""
-    vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces, dtype=np.int64)
-    edges = vertices[faces]
-    cross = np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0])  # its length is twice the area: the weight in the mean
-    length = np.linalg.norm(cross, axis=1)
-    keep = length > 0
-    faces, cross, length = faces[keep], cross[keep], length[keep]
-    unit = cross / length[:, None]
-
-    corner_vertex = faces.ravel()
-    order = np.argsort(corner_vertex, kind="stable")
-    start = np.searchsorted(corner_vertex[order], np.arange(len(vertices)))
-    count = np.bincount(corner_vertex, minlength=len(vertices))
-    repeats = count[corner_vertex]
-    corner, step = _spread(repeats)
-    other = order[start[corner_vertex[corner]] + step] // 3
-    together = np.einsum("ij,ij->i", unit[corner // 3], unit[other]) >= _CREASE
-    total = np.zeros((len(corner_vertex), 3))
-    np.add.at(total, corner[together], cross[other[together]])
-    total /= np.linalg.norm(total, axis=1, keepdims=True)
-    return Mesh(vertices, faces, total.reshape(-1, 3, 3))
-
-
-def _merge(meshes: Sequence[Mesh]) -> Mesh | None:
-    if not meshes:
-        return None
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    return Mesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]),
-        np.concatenate([mesh.normals for mesh in meshes]),
-    )
-
-
-def _shape_mesh(shape: Shape) -> Mesh:
-    mesh = shape_mesh(shape, coarse=True)
-    return _mesh(mesh.vertices, mesh.faces)
-
-
-def _table(table: TableSpec) -> _Placed:
-    """The table's top as a chequerboard of 0.1 m, and its sides. Small cells can be dropped one by one where they lie behind the camera."""
-    (cx, cy), (hx, hy, hz) = table.center, table.half_size
-    nx, ny = max(1, round(2 * hx / _TABLE_CELL)), max(1, round(2 * hy / _TABLE_CELL))
-    x, y = np.linspace(cx - hx, cx + hx, nx + 1), np.linspace(cy - hy, cy + hy, ny + 1)
-    i, j = (index.ravel() for index in np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"))
-
-    def at(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.stack((x[a], y[b], np.zeros(len(a))), axis=1)
-
-    a, b, c, d = at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)
-    top = np.concatenate((np.stack((a, b, c), axis=1), np.stack((a, c, d), axis=1)))
-    colors = np.array(TABLE_COLORS)[np.tile((i + j) % 2, 2)]
-    T = np.eye(4)
-    T[:3, 3] = (cx, cy, -hz)
-    body = _shape_mesh(Shape(geometry=Geometry(kind="box", size=table.half_size), T_body_shape=T))
-    sides = ~(body.normals[:, 0, 2] > 0.5)
-    return _Placed(
-        np.concatenate((top, body.vertices[body.faces[sides]])),
-        np.concatenate((np.broadcast_to(np.array([0, 0, 1.0]), top.shape), body.normals[sides])),
-        np.concatenate((colors, np.broadcast_to(np.array(TABLE_COLORS[1]) * 0.8, (int(sides.sum()), 3)))),
-    )
 
 
 # Projection and rasterisation --------------------------------------------------------------------------------------------------------
@@ -371,7 +225,7 @@ class _View:
 class _Shadow:
     """What the light sees: an orthographic depth map around the shapes that cast shadows."""
 
-    def __init__(self, casters: _Placed) -> None:
+    def __init__(self, casters: Placed) -> None:
         x = np.cross([0, 0, 1.0], _LIGHT)
         x /= np.linalg.norm(x)
         self.R = np.stack((x, np.cross(_LIGHT, x), _LIGHT))
@@ -396,13 +250,6 @@ class _Shadow:
             y = (local[..., 1] * self.scale + dy).astype(np.int32).clip(0, _SHADOW_SIZE - 1)
             total += height >= self.map[y, x]
         return total / 4
-
-
-def _spread(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For counts (2, 3): owners (0, 0, 1, 1, 1) and steps (0, 1, 0, 1, 2)."""
-    owner = np.repeat(np.arange(len(counts)), counts)
-    first = np.cumsum(counts) - counts
-    return owner, np.arange(len(owner)) - first[owner]
 
 
 def _least(corners: np.ndarray) -> np.ndarray:
@@ -449,7 +296,7 @@ def _rasterize(pixels: np.ndarray, nearness: np.ndarray, size: tuple[int, int]) 
     n0 = n[:, 0] - nx * x[:, 0] - ny * y[:, 0]
 
     # Rows: where the row's centre line crosses the triangle's edges.
-    owner, step = _spread(bottom[drawn] - top[drawn])
+    owner, step = spread(bottom[drawn] - top[drawn])
     row = top[drawn][owner] + step
     line = row + 0.5
     left, right = np.full(len(owner), np.inf), np.full(len(owner), -np.inf)
@@ -465,7 +312,7 @@ def _rasterize(pixels: np.ndarray, nearness: np.ndarray, size: tuple[int, int]) 
     stop = np.ceil(np.where(some, right, 0) - 0.5).clip(0, width).astype(np.int64)
 
     # Pixels: nearness in the high bits and the triangle in the low ones make "the nearest wins" one maximum.
-    span, step = _spread((stop - start).clip(0))
+    span, step = spread((stop - start).clip(0))
     column = start[span] + step
     tri = owner[span]
     value = (n0[owner] + ny[owner] * line)[span] + nx[tri] * (column + 0.5)
@@ -481,7 +328,7 @@ def _rasterize(pixels: np.ndarray, nearness: np.ndarray, size: tuple[int, int]) 
 # Light and overlays ------------------------------------------------------------------------------------------------------------------
 
 
-def _shade(view: _View, scene: _Placed, shadow: _Shadow | None) -> tuple[np.ndarray, np.ndarray]:
+def _shade(view: _View, scene: Placed, shadow: _Shadow | None) -> tuple[np.ndarray, np.ndarray]:
     """The picture [H, W, 3] in 0..1 over a plain sky, and the nearness [H, W] of what it shows (-1: sky)."""
     width, height = view.size
     picture = np.empty((height, width, 3), dtype=np.float32)

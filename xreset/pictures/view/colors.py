@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from xreset.pictures.raster import INVALID_COLOR, Color
+from xreset.pictures.meshes import INVALID_COLOR, Color
 
 HUMAN_COLOR: Color = (0.85, 0.10, 0.45)
 TOUCH_COLOR: Color = (1.00, 0.80, 0.00)

@@ -17,7 +17,8 @@ import torch
 from xreset.errors import XResetError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat
-from xreset.pictures.raster import GOAL_COLOR, OBJECT_COLOR, TABLE_COLORS, Camera, link_colors, link_meshes, tinted
+from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, TABLE_COLORS, link_colors, link_meshes, tinted
+from xreset.pictures.raster import Camera
 from xreset.pictures.view.colors import CONTACT_COLOR, HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, GOOD, PHASES, View
 from xreset.pictures.view.timeline import bar, legend, mark

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from html import escape
 from itertools import groupby
 
-from xreset.pictures.raster import Color
+from xreset.pictures.meshes import Color
 from xreset.pictures.view.colors import GOOD_COLOR, reason_color
 
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import fields
 from typing import Any, ClassVar, get_args
 
@@ -13,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.errors import BackendUnavailableError, XResetError
+from xreset.errors import XResetError
 from xreset.geometry.rotations import quat_to_matrix
 from xreset.physics import (
     Backend,
@@ -38,10 +35,7 @@ except ImportError as error:
 
 from xreset.backends import mujoco_warp_kernels as kernels
 from xreset.backends.mjcf import KNOWN_DIFFERENCES, MIN_FRICTION, MujocoSettings, compile_scene
-
-_WRONG_DEPTHS = ("4.0.0",)
-"""Versions of MuJoCo-Warp that were seen to take the wrong depth of some contacts. Others are left as they are, and their private modules
-unread; ``tests/test_mujoco_warp_depth.py`` says whether they need it too."""
+from xreset.backends.mujoco_warp_setup import TorchStream, announced, differing_fields, existing_device, fill_batched, prepare_engine
 
 _SET_PER_WORLD = (
     "body_mass", "body_inertia", "body_ipos", "body_subtreemass", "body_invweight0", "body_gravcomp", "geom_friction",
@@ -103,17 +97,16 @@ class MujocoWarpBackend(Backend):
         Raises:
             BackendUnavailableError: there is no such device.
         """
-        super().__init__(scene, num_worlds, object_index=object_index, device=_existing_device(device))
+        super().__init__(scene, num_worlds, object_index=object_index, device=existing_device(device))
         prepare_engine()
         self._warp_device = wp.device_from_torch(self.device)
-        self._streams: dict[int, Any] = {}
+        self._on_stream = TorchStream(self.device)
         held = self.object_index.unique().tolist()
         scenes = {i: compile_scene(scene, i, slots_for=held, settings=settings or MujocoSettings()) for i in held}
-        at = next(iter(scenes.values()))
+        self._at = at = next(iter(scenes.values()))
         at.model.opt.iterations = solver_iterations
-        self._at = at
         with self._on_stream():
-            differing = _differing_fields([s.model for s in scenes.values()])
+            differing = differing_fields([s.model for s in scenes.values()])
             self._model: Any = mjw.put_model(at.model, batch_sizes=dict.fromkeys((*_SET_PER_WORLD, *differing), num_worlds))
             self._model.opt.warn_overflow = 0  # overflows are counted, see health(); printing them from the GPU would flood the terminal
             self._data: Any = mjw.make_data(
@@ -123,9 +116,9 @@ class MujocoWarpBackend(Backend):
                 nccdmax=min(convex_contacts_per_world, contacts_per_world),
                 njmax=constraints_per_world,
             )
-            self._fill_batched({i: s.model for i, s in scenes.items()}, {i: s.parked for i, s in scenes.items()}, differing)
+            fill_batched(self._model, scenes, self.object_index, differing)
             self._allocate()
-            with _announced(self._warp_device):
+            with announced(self._warp_device):
                 self._prepare()
         self.set_state(State.initial(scene, self.object_index).to(self.device))
 
@@ -270,45 +263,15 @@ class MujocoWarpBackend(Backend):
 
     # Building --------------------------------------------------------------------------------------------------------------------
 
-    def _fill_batched(self, models: dict[int, Any], parked: dict[int, np.ndarray], names: list[str]) -> None:
-        """Give each world its object's values of the fields in which the objects differ."""
-        order = list(models)
-        row = torch.tensor([order.index(i) for i in self.object_index.tolist()], device=self.device)
-        for name in names:
-            values = [np.array(getattr(models[i], name)) for i in order]
-            if name == "geom_dataid":
-                values = [np.where(parked[i], -1, value) for i, value in zip(order, values, strict=True)]  # -1: no mesh in this world
-            view = wp.to_torch(getattr(self._model, name))
-            table = torch.as_tensor(np.stack(values), device=self.device).to(view.dtype).reshape(len(order), *view.shape[1:])
-            view.copy_(table[row])
-
     def _allocate(self) -> None:
         """Allocate what the worlds are read into, and name what setters write to."""
         n, joints, tips = self.num_worlds, len(self.scene.robot.joints), len(self.scene.robot.fingertips)
-        at, links = self._at, 1 + tips
-
-        def zeros(shape: int | tuple[int, ...], dtype: Any) -> Any:
-            return wp.zeros(shape, dtype=dtype)
+        at = self._at
 
         def ints(values: np.ndarray) -> Any:
             return wp.array(values.astype(np.int32), dtype=int)
 
-        self._out = {
-            "joint_pos": zeros((n, joints), float),
-            "joint_vel": zeros((n, joints), float),
-            "object_pos": zeros(n, wp.vec3),
-            "object_quat": zeros(n, wp.quat),
-            "object_linvel": zeros(n, wp.vec3),
-            "object_angvel": zeros(n, wp.vec3),
-            "nonfinite": zeros(n, wp.bool),
-            "link_pos": zeros((n, links), wp.vec3),
-            "link_quat": zeros((n, links), wp.quat),
-            "link_linvel": zeros((n, links), wp.vec3),
-            "link_angvel": zeros((n, links), wp.vec3),
-            "tip_force": zeros((n, tips), wp.vec3),
-            "tip_touch": zeros((n, tips), wp.bool),
-            "table_force": zeros(n, wp.vec3),
-        }
+        self._out = kernels.outputs(n, joints, tips)
         self._addresses = [ints(at.joint_qpos), ints(at.joint_dof)]
         self._mimic = [
             ints(at.mimic_qpos), ints(at.mimic_dof), ints(at.mimic_source),
@@ -331,7 +294,12 @@ class MujocoWarpBackend(Backend):
         self._mask = torch.zeros_like(self._everything)
         self._coming = {f.name: torch.zeros_like(getattr(self._state, f.name)) for f in fields(State)}
         self._coming["object_quat"][:, 0] = 1.0
-        field, body = {name: wp.to_torch(getattr(self._model, name)) for name in _SET_PER_WORLD}, at.object_body
+        self._name_parameters()
+
+    def _name_parameters(self) -> None:
+        """Name what the parameters of the worlds start from, and what they are now."""
+        n, body = self.num_worlds, self._at.object_body
+        field = {name: wp.to_torch(getattr(self._model, name)) for name in _SET_PER_WORLD}
         self._drive_fields = [wp.from_torch(field[f"actuator_{name}"]) for name in ("gainprm", "biasprm", "forcerange")]
         gain, bias, force_range = (field[f"actuator_{name}"][0] for name in ("gainprm", "biasprm", "forcerange"))
         nominal = {
@@ -353,14 +321,14 @@ class MujocoWarpBackend(Backend):
             "object_inertia": one.clone(),
             "object_com": torch.zeros_like(self._nominal["com"]),
             "object_gravity": one.clone(),
-            "drives": torch.ones(n, 3, joints, device=self.device),
+            "drives": torch.ones(n, 3, len(self.scene.robot.joints), device=self.device),
         }
         """What each world has now."""
 
     def _prepare(self) -> None:
         """Run each sequence of kernels once, which compiles it, then capture it as a graph: even on the CPU that saves most of the time."""
         sequences: dict[str, Callable[[], None]] = {
-            "step": self._step,
+            "step": lambda: mjw.step(self._model, self._data),
             "contacts": self._read_contacts,
             "refresh": self._refresh,
             "begin": self._begin,
@@ -379,9 +347,6 @@ class MujocoWarpBackend(Backend):
         wp.synchronize_device(self._warp_device)
 
     # What the graphs hold -----------------------------------------------------------------------------------------------------------
-
-    def _step(self) -> None:
-        mjw.step(self._model, self._data)
 
     def _read_contacts(self) -> None:
         """Read the forces of the last step's contacts; their arrays stay until the next step."""
@@ -464,20 +429,6 @@ class MujocoWarpBackend(Backend):
     def _run(self, name: str) -> None:
         wp.capture_launch(self._graphs[name])
 
-    @contextmanager
-    def _on_stream(self) -> Iterator[None]:
-        """Have Warp work on torch's current stream, so that what either queues comes in the order of the program."""
-        with wp.ScopedDevice(self._warp_device):
-            if not self._warp_device.is_cuda:
-                yield
-                return
-            stream = torch.cuda.current_stream(self.device)
-            known = self._streams.get(stream.cuda_stream)
-            if known is None:
-                known = self._streams[stream.cuda_stream] = wp.stream_from_torch(stream)
-            with wp.ScopedStream(known, sync_enter=False):
-                yield
-
     # Checking ----------------------------------------------------------------------------------------------------------------------
 
     def _rows(self, value: Tensor, shape: tuple[int, ...]) -> Tensor:
@@ -495,64 +446,3 @@ class MujocoWarpBackend(Backend):
     def _must_be_open(self) -> None:
         if self._data is None:
             raise XResetError(f"the backend {self.name!r} is closed. Build a new one.")
-
-
-def prepare_engine() -> None:
-    """Set Warp up for this process, before any kernel is made: quiet, and with right depths of contacts."""
-    wp.config.log_level = wp.LOG_WARNING  # else a line for each of some hundred kernels; what a user needs to know is announced
-    wp.init()
-    if mjw.__version__ in _WRONG_DEPTHS:
-        from xreset.backends.mujoco_warp_depth import correct_depths
-
-        correct_depths()
-
-
-def _existing_device(name: str) -> str:
-    """The device with its index; ``BackendUnavailableError`` if it is not there."""
-    device = torch.device(name)
-    if device.type == "cpu":
-        return name
-    if device.type != "cuda":
-        raise BackendUnavailableError(f"the backend 'mujoco-warp' runs on devices 'cuda' and 'cpu', found {str(device)!r}.")
-    if "cuda" not in MujocoWarpBackend.devices():
-        raise BackendUnavailableError(
-            "no CUDA device can be used here. Use device 'cpu', or the backend 'mujoco', which is faster on CPUs."
-        )
-    index = torch.cuda.current_device() if device.index is None else device.index
-    if index >= torch.cuda.device_count():
-        raise BackendUnavailableError(f"there is no device 'cuda:{index}'; there are {torch.cuda.device_count()} CUDA devices.")
-    return f"cuda:{index}"
-
-
-def _differing_fields(models: list[Any]) -> list[str]:
-    """Model fields that can be batched and are not the same in all models."""
-    first, *others = models
-    names = []
-    for field in fields(mjw.Model):
-        shape = getattr(field.type, "shape", ())
-        if not shape or shape[0] != "*" or not hasattr(first, field.name):
-            continue
-        value = np.asarray(getattr(first, field.name))
-        if any(not np.array_equal(value, np.asarray(getattr(other, field.name))) for other in others):
-            names.append(field.name)
-    return names
-
-
-_PATIENCE = 3.0
-"""Seconds after which the wait for kernels is explained. From the cache they take less."""
-
-
-@contextmanager
-def _announced(device: Any) -> Iterator[None]:
-    """Tell the user what takes so long, if it does."""
-    text = (
-        f"mujoco-warp: compiling kernels for {device}, one to three minutes the first time; they are kept in {wp.config.kernel_cache_dir}"
-        " (set WARP_CACHE_PATH to choose another folder)."
-    )
-    timer = threading.Timer(_PATIENCE, lambda: print(text, file=sys.stderr, flush=True))
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()

@@ -9,6 +9,8 @@ Letters as in :mod:`xreset.physics`; Q mimic joints. Quaternions are stored (w, 
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
 from xreset.backends.mjcf import OBJECT, TABLE
@@ -277,3 +279,28 @@ def read_contacts(
         wp.atomic_add(tip_force, world, other, force)
         if local[0] > 0.0:
             tip_touch[world, other] = True
+
+
+def outputs(num_worlds: int, joints: int, tips: int) -> dict[str, Any]:
+    """Arrays that the kernels read the worlds into; links are the palm and the fingertips."""
+
+    def zeros(shape: int | tuple[int, ...], dtype: Any) -> Any:
+        return wp.zeros(shape, dtype=dtype)
+
+    n, links = num_worlds, 1 + tips
+    return {
+        "joint_pos": zeros((n, joints), float),
+        "joint_vel": zeros((n, joints), float),
+        "object_pos": zeros(n, wp.vec3),
+        "object_quat": zeros(n, wp.quat),
+        "object_linvel": zeros(n, wp.vec3),
+        "object_angvel": zeros(n, wp.vec3),
+        "nonfinite": zeros(n, wp.bool),
+        "link_pos": zeros((n, links), wp.vec3),
+        "link_quat": zeros((n, links), wp.quat),
+        "link_linvel": zeros((n, links), wp.vec3),
+        "link_angvel": zeros((n, links), wp.vec3),
+        "tip_force": zeros((n, tips), wp.vec3),
+        "tip_touch": zeros((n, tips), wp.bool),
+        "table_force": zeros(n, wp.vec3),
+    }

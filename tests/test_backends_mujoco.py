@@ -19,7 +19,8 @@ from xreset.backends.conformance.harness import Bench, snapshot
 from xreset.backends.conformance.scene import gripper, objects, scene
 from xreset.backends.mjcf import OBJECT, OTHER_LINK, TABLE, SceneModel, compile_scene
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
-from xreset.backends.mujoco_warp import MujocoWarpBackend, _differing_fields
+from xreset.backends.mujoco_warp import MujocoWarpBackend
+from xreset.backends.mujoco_warp_setup import differing_fields
 from xreset.errors import BackendUnavailableError, ObjectError, RobotError, XResetError
 from xreset.geometry.urdf import robot_tree
 from xreset.physics import Backend
@@ -174,7 +175,7 @@ class Model(unittest.TestCase):
         for field in ("mesh_vert", "mesh_graph", "geom_contype", "geom_bodyid", "geom_condim", "dof_parentid"):
             for other in models[1:]:
                 np.testing.assert_array_equal(getattr(models[0].model, field), getattr(other.model, field), field)
-        differing = _differing_fields([m.model for m in models])
+        differing = differing_fields([m.model for m in models])
         for field in ("geom_size", "geom_pos", "geom_aabb", "geom_rbound", "body_mass", "body_ipos", "body_iquat", "body_inertia",
                       "body_invweight0", "dof_invweight0", "geom_dataid"):  # fmt: skip
             self.assertIn(field, differing)

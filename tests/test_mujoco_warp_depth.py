@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from xreset.backends.mujoco_warp import prepare_engine
+from xreset.backends.mujoco_warp_setup import prepare_engine
 
 WORLDS = 200
 

@@ -17,19 +17,13 @@ from itertools import combinations
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from xreset.backends.rigid import Body, Inertia, Mechanism, mechanism, object_inertia
+from xreset.backends.mjcf_model import MIN_FRICTION, OTHER_LINK, TABLE, SceneModel, add_sensors, body_name, locate, pos_quat
+from xreset.backends.rigid import Inertia, Mechanism, mechanism, object_inertia
 from xreset.errors import ObjectError, XResetError
 from xreset.geometry.urdf import Joint
 from xreset.physics import KnownDifference
 from xreset.spec import GRAVITY, Geometry, ObjectSpec, SceneSpec
-
-TABLE, OTHER_LINK, OBJECT = -1, -2, -3
-"""Values of :attr:`SceneModel.geom_role` beside the fingertip indices 0..E-1."""
-
-MIN_FRICTION = 1e-4
-"""Sliding friction of the object's own geoms, and the smallest of any pair."""
 
 # Collision bits: a pair collides if one's contype meets the other's conaffinity.
 _HIT_OBJECT, _HIT_TABLE, _HIT_SELF = 1, 2, 4
@@ -85,58 +79,6 @@ class MujocoSettings:
 _DEFAULTS = MujocoSettings()
 
 
-@dataclass(frozen=True, kw_only=True)
-class SceneModel:
-    """A compiled model and where the scene's parts are in it.
-
-    Letters: J actuated joints, Q mimic joints, K tracked links, E fingertips, G geoms.
-    """
-
-    model: mujoco.MjModel
-    joint_qpos: np.ndarray
-    """[J] addresses in qpos, in joint order."""
-    joint_dof: np.ndarray
-    """[J] addresses in qvel. Actuator i drives joint i."""
-    mimic_qpos: np.ndarray
-    """[Q]"""
-    mimic_dof: np.ndarray
-    """[Q]"""
-    mimic_source: np.ndarray
-    """[Q] index of the source in joint order."""
-    mimic_multiplier: np.ndarray
-    """[Q]"""
-    mimic_offset: np.ndarray
-    """[Q]"""
-    link_body: np.ndarray
-    """[K] body that each tracked link is part of."""
-    link_pos: np.ndarray
-    """[K, 3] position of the tracked link in that body's frame."""
-    link_quat: np.ndarray
-    """[K, 4]"""
-    moving_bodies: np.ndarray
-    """[B] the robot's bodies that move, in the order of the mechanism."""
-    object_body: int
-    """Its frame is the object's mesh frame."""
-    object_qpos: int
-    """First of 7 addresses in qpos."""
-    object_dof: int
-    """First of 6 addresses in qvel."""
-    geom_role: np.ndarray
-    """[G] what a geom is: index of the fingertip it belongs to, or TABLE, OTHER_LINK, OBJECT."""
-    parked: np.ndarray
-    """[G] bool: an object's shape slot that this object does not use."""
-    sensed_tip: np.ndarray
-    """[S] fingertip of each geom that has a contact sensor; empty without sensors (see :func:`compile_scene`)."""
-
-    @property
-    def friction_column(self) -> np.ndarray:
-        """[G] which of the frictions (object-tip, object-other link, object-table) a geom decides; 3 for the object's own geoms.
-
-        MuJoCo gives a pair the larger friction of its geoms, and the object's own stays at :data:`MIN_FRICTION`.
-        """
-        return np.select([self.geom_role >= 0, self.geom_role == OTHER_LINK, self.geom_role == TABLE], [0, 1, 2], default=3)
-
-
 def compile_scene(
     scene: SceneSpec,
     object_index: int,
@@ -176,7 +118,7 @@ def compile_scene(
     roles["table"] = TABLE
     parked = _add_object(spec, scene, object_index, slots_for, settings)
     _add_drives(spec, scene)
-    sensed = _add_sensors(spec, robot, roles) if sensors else []
+    sensed = add_sensors(spec, robot, roles) if sensors else []
     try:
         model = spec.compile()
     except ValueError as error:
@@ -184,7 +126,7 @@ def compile_scene(
         raise XResetError(f"MuJoCo refuses the robot {scene.robot.name!r} with the object {thing!r}: {error}") from error
     _let_com_move(model, model.body("object").id)
     model.body_gravcomp[model.body("object").id] = 0.0
-    return _locate(robot, model, roles, parked, sensed)
+    return locate(robot, model, roles, parked, sensed)
 
 
 # Options -------------------------------------------------------------------------------------------------------------------------------
@@ -233,9 +175,9 @@ def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, settings
         if body.joint is None:
             parent, pos, quat = spec.worldbody, np.array(description.base_pos), np.array(description.base_quat)
         else:
-            parent, (pos, quat) = added[body.parent], _pose(body.T_parent_body)
+            parent, (pos, quat) = added[body.parent], pos_quat(body.T_parent_body)
         element = parent.add_body(
-            name=_body_name(body), pos=pos, quat=quat, gravcomp=float(description.gravity_compensated), explicitinertial=True
+            name=body_name(body), pos=pos, quat=quat, gravcomp=float(description.gravity_compensated), explicitinertial=True
         )
         if body.inertia is not None:
             _set_inertia(element, body.inertia)
@@ -244,11 +186,11 @@ def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, settings
         added.append(element)
         geoms.append([])
         for i, (link, shape) in enumerate((item.link, item.shape) for item in body.shapes):
-            name = f"{_body_name(body)}/{i}"
+            name = f"{body_name(body)}/{i}"
             roles[name] = role = robot.tip_of.get(link, OTHER_LINK)
             self_bit = _HIT_SELF if link in description.self_collision_links else 0
             table_bit = 0 if link in description.table_exclude else _HIT_TABLE
-            pos, quat = _pose(shape.T_body_shape)
+            pos, quat = pos_quat(shape.T_body_shape)
             mesh = _add_mesh(spec, name, shape.geometry) if shape.geometry.kind == "hull" else ""
             element.add_geom(
                 name=name,
@@ -263,10 +205,6 @@ def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, settings
                 geoms[-1].append((name, link))
     _limit_self_collision(spec, scene, robot, geoms)
     return roles
-
-
-def _body_name(body: Body) -> str:
-    return f"robot/{body.name}"
 
 
 def _set_inertia(element: mujoco.MjsBody, inertia: Inertia) -> None:
@@ -301,7 +239,7 @@ def _limit_self_collision(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanis
         allowed = [(a, b) for a, link_a in mine for b, link_b in others if robot.may_collide(link_a, link_b)]
         if len(allowed) == len(mine) * len(others):
             continue
-        spec.add_exclude(bodyname1=_body_name(robot.bodies[i]), bodyname2=_body_name(robot.bodies[j]))
+        spec.add_exclude(bodyname1=body_name(robot.bodies[i]), bodyname2=body_name(robot.bodies[j]))
         for a, b in allowed:
             spec.add_pair(geomname1=a, geomname2=b, condim=_CONDIM, friction=friction, solref=_solref(scene), solimp=_SOLIMP)
 
@@ -365,7 +303,7 @@ def _add_object(spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Se
             name = f"object/{kind}/{slot}"
             if slot < len(pieces):
                 mesh = meshes[index][slot] if kind == "hull" else ""
-                pos, quat = _pose(pieces[slot].T_body_shape)
+                pos, quat = pos_quat(pieces[slot].T_body_shape)
                 body.add_geom(name=name, pos=pos, quat=quat, **_geometry(pieces[slot].geometry, mesh), **common)
             else:
                 parked.add(name)
@@ -414,72 +352,3 @@ def _add_mesh(spec: mujoco.MjSpec, name: str, hull: Geometry) -> str:
         inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,
     )
     return name
-
-
-def _pose(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
-
-
-# Sensors -------------------------------------------------------------------------------------------------------------------------------
-
-_NET_FORCE = (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1)  # intprm of a contact sensor: what, reduced to the net force, once
-
-
-def _add_sensors(spec: mujoco.MjSpec, robot: Mechanism, roles: dict[str, int]) -> list[int]:
-    """Add what :func:`compile_scene` says; returns the fingertip of each geom sensed."""
-    sites = []
-    for i, link in enumerate(robot.robot.tracked_links):
-        body, T = robot.frames[link]
-        pos, quat = _pose(T)
-        sites.append(spec.body(_body_name(robot.bodies[body])).add_site(name=f"link/{i}", pos=pos, quat=quat).name)
-    kind, site = mujoco.mjtSensor, mujoco.mjtObj.mjOBJ_SITE
-    for quantity in (kind.mjSENS_FRAMEPOS, kind.mjSENS_FRAMEQUAT, kind.mjSENS_FRAMELINVEL, kind.mjSENS_FRAMEANGVEL):
-        for name in sites:
-            spec.add_sensor(type=quantity, objtype=site, objname=name)
-    tips = {geom: role for geom, role in roles.items() if role >= 0}
-    for geom in ("table", *tips):
-        spec.add_sensor(
-            type=kind.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_BODY,
-            objname="object",
-            reftype=mujoco.mjtObj.mjOBJ_GEOM,
-            refname=geom,
-            intprm=_NET_FORCE,
-        )
-    return list(tips.values())
-
-
-# Where everything is -------------------------------------------------------------------------------------------------------------------
-
-
-def _locate(robot: Mechanism, model: mujoco.MjModel, roles: dict[str, int], parked: set[str], sensed: list[int]) -> SceneModel:
-    joints, mimics = robot.robot.joint_names, robot.robot.mimics
-    names = [model.geom(i).name for i in range(model.ngeom)]
-    frames = [robot.frames[link] for link in robot.robot.tracked_links]
-    poses = [_pose(T) for _, T in frames]
-    qpos = {model.joint(i).name: int(model.jnt_qposadr[i]) for i in range(model.njnt)}
-    dof = {model.joint(i).name: int(model.jnt_dofadr[i]) for i in range(model.njnt)}
-
-    def addresses(table: dict[str, int], joints: Sequence[str]) -> np.ndarray:
-        return np.array([table[name] for name in joints], dtype=np.int64)
-
-    return SceneModel(
-        model=model,
-        joint_qpos=addresses(qpos, joints),
-        joint_dof=addresses(dof, joints),
-        mimic_qpos=addresses(qpos, [mimic.joint for mimic in mimics]),
-        mimic_dof=addresses(dof, [mimic.joint for mimic in mimics]),
-        mimic_source=np.array([joints.index(mimic.source) for mimic in mimics], dtype=np.int64),
-        mimic_multiplier=np.array([mimic.multiplier for mimic in mimics], dtype=np.float64),
-        mimic_offset=np.array([mimic.offset for mimic in mimics], dtype=np.float64),
-        link_body=np.array([model.body(_body_name(robot.bodies[i])).id for i, _ in frames], dtype=np.int64),
-        link_pos=np.array([pos for pos, _ in poses]),
-        link_quat=np.array([quat for _, quat in poses]),
-        moving_bodies=np.array([model.body(_body_name(body)).id for body in robot.bodies[1:]], dtype=np.int64),
-        object_body=model.body("object").id,
-        object_qpos=qpos["object"],
-        object_dof=dof["object"],
-        geom_role=np.array([roles.get(name, OBJECT) for name in names], dtype=np.int64),
-        parked=np.array([name in parked for name in names]),
-        sensed_tip=np.array(sensed, dtype=np.int64),
-    )

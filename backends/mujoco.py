@@ -21,7 +21,8 @@ try:
 except ImportError as error:
     raise unavailable("mujoco", "mujoco", error) from error
 
-from xreset.backends.mjcf import KNOWN_DIFFERENCES, MIN_FRICTION, MujocoSettings, SceneModel, compile_scene
+from xreset.backends.mjcf import KNOWN_DIFFERENCES, MujocoSettings, compile_scene
+from xreset.backends.mjcf_model import MIN_FRICTION, SceneModel
 
 _FULL = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
 """The engine's warnings that contacts or constraints have found no room."""

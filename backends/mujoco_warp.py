@@ -34,7 +34,8 @@ except ImportError as error:
     raise unavailable("mujoco_warp", "mujoco-warp", error) from error
 
 from xreset.backends import mujoco_warp_kernels as kernels
-from xreset.backends.mjcf import KNOWN_DIFFERENCES, MIN_FRICTION, MujocoSettings, compile_scene
+from xreset.backends.mjcf import KNOWN_DIFFERENCES, MujocoSettings, compile_scene
+from xreset.backends.mjcf_model import MIN_FRICTION
 from xreset.backends.mujoco_warp_setup import TorchStream, announced, differing_fields, existing_device, fill_batched, prepare_engine
 
 _SET_PER_WORLD = (

@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from xreset.backends.mjcf import OBJECT, TABLE
+from xreset.backends.mjcf_model import OBJECT, TABLE
 
 _OBJECT, _TABLE = wp.constant(OBJECT), wp.constant(TABLE)
 

@@ -15,7 +15,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from xreset.backends.mjcf import SceneModel
+from xreset.backends.mjcf_model import SceneModel
 from xreset.errors import BackendUnavailableError
 
 _WRONG_DEPTHS = ("4.0.0",)

@@ -17,7 +17,8 @@ from tests.toy_robot import toy_hand_arm
 from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench, snapshot
 from xreset.backends.conformance.scene import gripper, objects, scene
-from xreset.backends.mjcf import OBJECT, OTHER_LINK, TABLE, SceneModel, compile_scene
+from xreset.backends.mjcf import compile_scene
+from xreset.backends.mjcf_model import OBJECT, OTHER_LINK, TABLE, SceneModel
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.mujoco_warp import MujocoWarpBackend
 from xreset.backends.mujoco_warp_setup import differing_fields

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from xreset.backends.conformance import CHECKS, CheckResult, Measure, run
-from xreset.backends.mjcf import OBJECT
+from xreset.backends.mjcf_model import OBJECT
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.rigid import Inertia, conjugate, rotate
 from xreset.cli import main

@@ -320,3 +320,31 @@ def matrix_to_quat(R: np.ndarray) -> np.ndarray:
 def nearer(q: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """[4] q or -q, whichever is nearer to the reference: engines flip the sign as they please."""
     return -q if q @ reference < 0 else q
+
+
+_ARM = 1.0
+"""Length [m] that makes torques and forces comparable: long beside an object, so that forces are explained first."""
+
+
+def friction_forces(
+    arms: np.ndarray, normal_forces: np.ndarray, coefficients: np.ndarray, force: np.ndarray, torque: np.ndarray
+) -> np.ndarray:
+    """Friction forces [n, 3] that explain a force and torque [3] on a body, given its contacts.
+
+    Of all tangential forces that add up to the wrench (in the sense of least squares) these have the smallest sum of (f / (mu N))^2: each
+    contact carries what it can. When a single surface touches the object, the sum is what it really is.
+
+    Args:
+        arms: [n, 3] contact points from the centre of mass [m].
+        normal_forces: [n, 3] N.
+        coefficients: [n] friction coefficients mu.
+        force: [3] N.
+        torque: [3] N m, about the centre of mass.
+    """
+    limits = np.sqrt((normal_forces * normal_forces).sum(axis=1))
+    normals = normal_forces / limits[:, None]
+    # Row j of contact i: its force if its share is 1 along j; what is not tangential is taken away.
+    forces = (limits * coefficients)[:, None, None] * (np.eye(3) - normals[:, :, None] * normals[:, None, :])
+    wrenches = np.concatenate([forces, cross(arms[:, None], forces) / _ARM], axis=2).reshape(-1, 6)
+    shares, *_ = np.linalg.lstsq(wrenches.T, np.concatenate([force, torque / _ARM]), rcond=1e-6)
+    return (shares.reshape(-1, 1, 3) @ forces)[:, 0]

@@ -8,7 +8,8 @@ What differs from SAPIEN's defaults, and why:
   Torsional friction is mu times ``min_patch_radius``, so that radius is torsional / mu. PhysX leaves it out where a patch has two points
   and lets half of the sliding friction act at each (``docs/sim-to-sim.md``; ``docs/lab-book.md`` has what that costs a policy).
 - The robot feels no gravity (if it is compensated). The object's weight is applied as a force, which gives gravity fractions.
-- PhysX reports the normal forces of contacts only; friction is worked out from the object's momentum (:func:`_friction`).
+- PhysX reports the normal forces of contacts only; friction is worked out from the object's momentum
+  (:func:`~xreset.backends.rigid.friction_forces`).
 - Linear velocities refer to the centre of mass; they are converted here. PhysX computes in single precision.
 """
 
@@ -28,6 +29,7 @@ from xreset.backends.rigid import (
     Inertia,
     TrackedFrames,
     cross,
+    friction_forces,
     matrix_to_quat,
     mechanism,
     nearer,
@@ -150,7 +152,7 @@ class SapienWorld(World):
             arms = points - (pose.p + self._arm.turned(pose.q)[0])
             limits = np.array([self._pair_friction[surface.role] for surface in surfaces])
             missing = self._missing_wrench(*self._last_step, arms, normal_forces)
-            for surface, force in zip(surfaces, normal_forces + _friction(arms, normal_forces, limits, *missing), strict=True):
+            for surface, force in zip(surfaces, normal_forces + friction_forces(arms, normal_forces, limits, *missing), strict=True):
                 if surface.role == "table":
                     table_force += force
                 elif surface.tip is not None:
@@ -388,32 +390,6 @@ class _Surface(NamedTuple):
     role: Literal["tip", "link", "table"]
     tip: int | None = None
     """Index of its fingertip."""
-
-
-def _friction(arms: np.ndarray, normal_forces: np.ndarray, coefficients: np.ndarray, force: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """Friction forces [n, 3] that explain a force and torque [3] on a body, given its contacts.
-
-    Of all tangential forces that add up to the wrench (in the sense of least squares) these have the smallest sum of (f / (mu N))^2: each
-    contact carries what it can. When a single surface touches the object, the sum is what it really is.
-
-    Args:
-        arms: [n, 3] contact points from the centre of mass [m].
-        normal_forces: [n, 3] N.
-        coefficients: [n] friction coefficients mu.
-        force: [3] N.
-        torque: [3] N m, about the centre of mass.
-    """
-    limits = np.sqrt((normal_forces * normal_forces).sum(axis=1))
-    normals = normal_forces / limits[:, None]
-    # Row j of contact i: its force if its share is 1 along j; what is not tangential is taken away.
-    forces = (limits * coefficients)[:, None, None] * (np.eye(3) - normals[:, :, None] * normals[:, None, :])
-    wrenches = np.concatenate([forces, cross(arms[:, None], forces) / _ARM], axis=2).reshape(-1, 6)
-    shares, *_ = np.linalg.lstsq(wrenches.T, np.concatenate([force, torque / _ARM]), rcond=1e-6)
-    return (shares.reshape(-1, 1, 3) @ forces)[:, 0]
-
-
-_ARM = 1.0
-"""Length [m] that makes torques and forces comparable: long beside an object, so that forces are explained first."""
 
 
 # SAPIEN's habits -----------------------------------------------------------------------------------------------------------------------

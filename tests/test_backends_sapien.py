@@ -12,8 +12,8 @@ import numpy as np
 
 from tests.engine_checks import EngineChecks
 from xreset.backends.conformance.scene import gripper, scene
-from xreset.backends.rigid import mechanism
-from xreset.backends.sapien import SapienBackend, _friction
+from xreset.backends.rigid import friction_forces, mechanism
+from xreset.backends.sapien import SapienBackend
 from xreset.backends.sapien_robot import self_collision_bits
 from xreset.errors import BackendUnavailableError, RobotError
 from xreset.spec import MimicSpec
@@ -62,13 +62,13 @@ class FrictionTest(unittest.TestCase):
         normals = rng.normal(size=(3, 3))
         tangential = np.cross(normals, rng.normal(size=(3, 3)))
         force, torque = tangential.sum(0), np.cross(arms, tangential).sum(0)
-        found = _friction(arms, normals, np.full(3, 0.8), force, torque)
+        found = friction_forces(arms, normals, np.full(3, 0.8), force, torque)
         np.testing.assert_allclose(found, tangential, atol=1e-6)  # three contacts: six unknowns, six equations
 
     def test_a_stronger_contact_carries_more(self):
         arms = np.zeros((2, 3))
         normals = np.array([[-9.0, 0, 0], [3.0, 0, 0]])
-        found = _friction(arms, normals, np.full(2, 0.5), np.array([0, 0, 2.0]), np.zeros(3))
+        found = friction_forces(arms, normals, np.full(2, 0.5), np.array([0, 0, 2.0]), np.zeros(3))
         np.testing.assert_allclose(found.sum(0), [0, 0, 2.0], atol=0.02)
         self.assertGreater(found[0, 2], found[1, 2])
 

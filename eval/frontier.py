@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from xreset.env import Reading
 from xreset.errors import DemoError
 from xreset.eval.evaluate import Subject
 from xreset.eval.metrics import MetricsConfig
@@ -27,6 +26,7 @@ from xreset.policy import Policy
 from xreset.resets.bank import check_objects, read_bank
 from xreset.resets.distribution import bank_starts
 from xreset.schedule import schedule
+from xreset.task.reading import Reading
 
 SCHEMA = "xreset-frontier/1"
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.env import Reading
 from xreset.geometry.rotations import quat_angle
+from xreset.task.reading import Reading
 from xreset.task.rewards import contact_gate, keypoint_distance
 
 STAGE_SCORES = (0.0, 0.33, 0.66, 1.0)

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from xreset.env import ManipulationEnv, Reading
+from xreset.env import ManipulationEnv
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
 from xreset.eval.trial import Engine, Trial
 from xreset.policy import Policy
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.schedule import schedule
+from xreset.task.reading import Reading
 from xreset.task.terminations import out_of_bounds
 
 

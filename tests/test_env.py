@@ -356,7 +356,7 @@ class RobustnessTest(WithEnv):
         for action in self.actions(5, seed=1):
             (one, *_), (two, *_) = env.step(action), other.step(action)
         torch.testing.assert_close(one["policy"], two["policy"], atol=1e-4, rtol=0)
-        torch.testing.assert_close(env._parameters, other._parameters)
+        torch.testing.assert_close(env.variation.parameters, other.variation.parameters)
 
     def test_a_step_with_all_of_it_never_waits_for_the_device(self):
         """As on a GPU, where any of these operations would stop the host until the device is done, and could not be captured."""

@@ -13,7 +13,6 @@ import torch
 
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_results import OBJECTS, toy_rollouts, toy_summary
-from xreset.env import Reading
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.evaluate import evaluate
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
@@ -25,6 +24,7 @@ from xreset.eval.table import result_rows
 from xreset.files import claim_folder
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import Contacts, Health, Links, State
+from xreset.task.reading import Reading
 from xreset.task.rewards import keypoint_distance
 from xreset.typed import from_dict
 

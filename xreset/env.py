@@ -7,7 +7,7 @@ same class, with another configuration, runs evaluations.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -15,11 +15,9 @@ import torch
 from torch import Tensor
 
 from xreset.capture import GraphRunner
-from xreset.errors import CapabilityError
 from xreset.faults import FaultRecorder
-from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.objects import keypoints, surface_points
-from xreset.physics import Backend, Contacts, Health, Links, Parameters, State
+from xreset.physics import Backend, Parameters, State
 from xreset.plugins import make_backend
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import Reset, ResetDistribution
@@ -27,10 +25,10 @@ from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
-from xreset.task.latency import DelayLine
-from xreset.task.randomization import own_friction, sample_drives, sample_friction, sample_mass_scale, sample_offset, sample_range
+from xreset.task.reading import Reading, step_log
 from xreset.task.rewards import Reward, RewardInput, compute_reward, own_term
 from xreset.task.terminations import episode_steps, out_of_bounds
+from xreset.task.variation import Variation
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -81,19 +79,6 @@ def make_env(
         raise
 
 
-@dataclass(frozen=True, kw_only=True)
-class Reading:
-    """What the backend said after a step, and what follows from it."""
-
-    state: State
-    links: Links
-    contacts: Contacts
-    health: Health
-    """Of the engine; a world that was given an action that is not finite counts as not finite, too."""
-    tip_distance: Tensor
-    """[N, E] distance from each fingertip to the object's surface points [m]."""
-
-
 class ManipulationEnv:
     """N worlds in which a robot brings an object to a goal pose.
 
@@ -110,6 +95,7 @@ class ManipulationEnv:
         gravity_fraction: [N]
         nonfinite_count, overflow_count: [] times that a world was ended because a number was not finite; because it dropped contacts.
         faults: the last of those worlds, before and after the step in which they broke.
+        variation: what else differs between one world and the next.
     """
 
     def __init__(self, backend: Backend, task: TaskConfig, resets: ResetDistribution, *, seed: int = 0) -> None:
@@ -142,8 +128,6 @@ class ManipulationEnv:
         self._cloud_points = per_object(lambda o: surface_points(o, task.observation.cloud_points))
         self._surface_points = per_object(lambda o: surface_points(o, task.distance_points))
         self._keypoints = per_object(keypoints)
-        self._nominal_mass = torch.tensor([o.mass for o in scene.objects], device=self.device)[backend.object_index]
-        self._own_friction = own_friction([o.friction for o in scene.objects], task.randomization).to(self.device)[backend.object_index]
         self._limits = tuple(
             torch.where(limit.isfinite(), limit, sign * torch.pi) for limit, sign in ((self.actions.lower, -1.0), (self.actions.upper, 1.0))
         )
@@ -174,24 +158,7 @@ class ManipulationEnv:
         self._reset_mask, self._over = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self._bad_action = zeros(dtype=torch.bool)
         self._new_start = self.resets.sample(self.backend.object_index, torch.Generator(device=self.device)).clone()
-        self._parameters = {"friction": zeros(3), "object_mass": zeros()}
-        """Physical parameters of each world, by name; its gravity fraction is :attr:`gravity_fraction`."""
-        # What differs between one robot and the next is None where it does not: then it costs nothing, and draws no random number.
-        random = task.randomization
-        if random.scales_drives:
-            self._parameters["drives"] = zeros(3, self.num_actions)
-        for name, shape in (("torsional_friction", ()), ("object_inertia", ()), ("object_com", (3,))):
-            if random.draws(name):
-                self._parameters[name] = zeros(*shape)
-        if missing := [name.replace("_", " ") for name in self._parameters if name not in self.backend.capabilities]:
-            raise CapabilityError(
-                f"the backend {self.backend.name!r} cannot set {', '.join(missing)} world by world, which this task draws at random: leave "
-                "those ranges of task.randomization as they are by default, or use another backend."
-            )
-        self._force_gain = torch.ones(n, 1, 1, device=self.device) if random.draws("force_gain") else None
-        late_actions, late_poses = (limits[1] if random.enabled else 0.0 for limits in (random.action_latency, random.observation_latency))
-        self._commands = DelayLine(self._target, late_actions) if late_actions else None
-        self._poses = DelayLine(zeros(7), late_poses) if late_poses else None
+        self.variation = Variation(self.backend, task.randomization, self.actions.is_arm)
         self._sent_target = zeros(self.num_actions)
         # What is kept of a step in case that it breaks a world.
         state = self.backend.state()
@@ -281,15 +248,14 @@ class ManipulationEnv:
         self._reset_mask.zero_()
         self._reset_mask[worlds] = True
         if start is not None:
-            for f in fields(Reset):
-                getattr(self._new_start, f.name)[worlds] = getattr(start, f.name)
+            self._new_start[worlds] = start
         self._sample_resets(start is None)
         self._write_resets()
         self._compute_observations()
 
     def reading(self) -> Reading:
         """The present physical state and what follows from it."""
-        return self._read()
+        return Reading.of(self.backend, self._surface_points, self._bad_action)
 
     @property
     def joint_target(self) -> Tensor:
@@ -330,14 +296,7 @@ class ManipulationEnv:
     @property
     def _lasting(self) -> dict[str, Tensor]:
         """What is kept of each world from step to step, besides the engine's state."""
-        lasting = {name: getattr(self, name) for name in _LASTING}
-        lasting |= {f"_parameters.{name}": value for name, value in self._parameters.items()}
-        if self._force_gain is not None:
-            lasting["_force_gain"] = self._force_gain
-        for name in ("_commands", "_poses"):
-            if (line := getattr(self, name)) is not None:
-                lasting |= {f"{name}.values": line.values, f"{name}.delay": line.delay}
-        return lasting
+        return {name: getattr(self, name) for name in _LASTING} | self.variation.lasting()
 
     # Parts -------------------------------------------------------------------------------------------------------------------------
 
@@ -357,11 +316,11 @@ class ManipulationEnv:
         if not self.task.reward.raw_actions:
             self._action.clamp_(-1.0, 1.0)
         self._target.copy_(self.actions.targets(self._action, self._target, state.joint_pos))
-        self._sent_target.copy_(self._target if self._commands is None else self._commands.push(self._target))
+        self._sent_target.copy_(self.variation.heard(self._target))
 
     def _compute_rewards(self) -> tuple[Reading, Reward]:
         """What the step has brought: reward, ends of episodes, numbers to log."""
-        reading = self._read()
+        reading = self.reading()
         # What failed in the simulation ends, is counted and kept, and is not learned from. Numbers that are not finite say nothing at all.
         broken, live = reading.health.nonfinite, ~self._over
         self._faulty.copy_((broken | reading.health.overflow) & live)
@@ -397,9 +356,13 @@ class ManipulationEnv:
         self._time_out.copy_(time_out & ~lost)
         self._reset_mask.copy_((lost | time_out) & live)
         self._reached |= reward.success
+        totals = {"health/nonfinite_total": self.nonfinite_count, "health/overflow_total": self.overflow_count}
         if self.resets.config.frontier > 0:
             self.resets.learn(self.bank_state, self.sequence, self._reset_mask & ~self._faulty, self._reached)
-        names, values = self._log(reward, self._reset_mask, sound=~broken)
+            totals["task/reached_from_bank"] = self.resets.reached_from_bank.mean()
+            totals["task/reached_from_home"] = self.resets.reached_from_home.mean()
+            totals["task/from_bank"] = self.from_bank.float().mean()
+        names, values = step_log(reward, self._reset_mask, sound=~broken, from_home=~self.from_bank, totals=totals)
         if not self._log_names:
             self._log_names, self._log_values = names, torch.zeros_like(values)
         self._log_values.copy_(values)
@@ -414,7 +377,7 @@ class ManipulationEnv:
             "from_bank": self.from_bank,
             "episode_step": self._episode_length,
             "gravity_fraction": self.gravity_fraction,
-            **self._parameters,
+            **self.variation.parameters,
             "target": self._target,
             **{f"before_{name}": value for name, value in self._state_before.items()},
             **{f"after_{name}": getattr(after, name) for name in self._state_before},
@@ -424,13 +387,10 @@ class ManipulationEnv:
         """Draw how every world would begin anew, so that nothing waits for their number, and let the fresh ones take it over."""
         fresh, start = self._reset_mask, self._new_start
         if from_distribution:
-            drawn = self.resets.sample(self.backend.object_index, self.generator)
-            for f in fields(Reset):
-                getattr(start, f.name).copy_(getattr(drawn, f.name))
-        if self._commands is not None:
-            self._commands.fill(fresh, start.joint_target)
+            start.map(Tensor.copy_, self.resets.sample(self.backend.object_index, self.generator))
+        self.variation.begin(fresh, start.joint_target)
         for new, old in (
-            *self._drawn_parameters(),
+            *self.variation.draw(self.generator),
             (start.goal_pos, self.goal_pos),
             (start.goal_quat, self.goal_quat),
             (start.gravity_fraction, self.gravity_fraction),
@@ -442,25 +402,6 @@ class ManipulationEnv:
         for cleared in (self._episode_length, self._previous_action, self._reward, self._reached, self._over):
             cleared.masked_fill_(fresh.view(-1, *[1] * (cleared.ndim - 1)), 0)
 
-    def _drawn_parameters(self) -> list[tuple[Tensor, Tensor]]:
-        """What is drawn for every world beside its start [N, ...], and where it is kept."""
-        c, n, generator = self.task.randomization, self.num_envs, self.generator
-        samples: dict[str, Callable[[], Tensor]] = {
-            "friction": lambda: (sample_friction(n, c, generator) + self._own_friction).clamp(min=0.05),  # slippery, not negative
-            "object_mass": lambda: self._nominal_mass * sample_mass_scale(n, c, generator),
-            "drives": lambda: sample_drives(self.actions.is_arm, n, c, generator),
-            "torsional_friction": lambda: self.backend.scene.friction.torsional * sample_range(n, c.torsional_friction, generator),
-            "object_inertia": lambda: sample_range(n, c.object_inertia, generator),
-            "object_com": lambda: sample_offset(n, c.object_com, generator),
-        }
-        drawn = [(samples[name](), kept) for name, kept in self._parameters.items()]
-        if self._force_gain is not None:
-            drawn.append((sample_range(n, c.force_gain, generator).view(-1, 1, 1), self._force_gain))
-        for line, limits in ((self._commands, c.action_latency), (self._poses, c.observation_latency)):
-            if line is not None:
-                drawn.append((sample_range(n, limits, generator), line.delay))
-        return drawn
-
     def _write_resets(self) -> None:
         """Put the fresh worlds into their new states."""
         start = self._new_start
@@ -469,25 +410,14 @@ class ManipulationEnv:
 
     def _set_worlds(self, state: State) -> None:
         """Give the worlds of the mask states [N, ...] and their physical parameters."""
-        self.backend.set_where(self._reset_mask, state, Parameters(**self._parameters, object_gravity=self.gravity_fraction))
-
-    def _read(self) -> Reading:
-        state, links, health = self.backend.state(), self.backend.links(), self.backend.health()
-        local = quat_rotate_inverse(state.object_quat[:, None], links.pos[:, 1:] - state.object_pos[:, None])
-        return Reading(
-            state=state,
-            links=links,
-            contacts=self.backend.contacts(),
-            health=replace(health, nonfinite=health.nonfinite | self._bad_action),
-            tip_distance=torch.cdist(local, self._surface_points).amin(dim=-1),
-        )
+        self.backend.set_where(self._reset_mask, state, Parameters(**self.variation.parameters, object_gravity=self.gravity_fraction))
 
     def _compute_observations(self) -> None:
         """Refresh the observations; fresh worlds start with a cloud history of copies, and with this reach as their best."""
-        reading = self._read()
+        reading = self.reading()
         c, state, links = self.task.observation, reading.state, reading.links
         self._best_reach.copy_(torch.where(self._reset_mask, reading.tip_distance.mean(dim=-1), self._best_reach))
-        seen_pos, seen_quat = self._delayed_pose(state)
+        seen_pos, seen_quat = self.variation.seen(state, self._reset_mask)
         x = obs.ObservationInput(
             state=state,
             links=links,
@@ -500,7 +430,7 @@ class ManipulationEnv:
             goal_quat=self.goal_quat,
             gravity_fraction=self.gravity_fraction,
             previous_action=self._previous_action.clamp(-1.0, 1.0),
-            tip_force=reading.contacts.tip_force * (1.0 if self._force_gain is None else self._force_gain),
+            tip_force=self.variation.felt(reading.contacts.tip_force),
             tip_distance=reading.tip_distance,
             reward=self._reward,
         )
@@ -517,41 +447,3 @@ class ManipulationEnv:
             if name not in self._observations:
                 self._observations[name] = torch.zeros_like(value)
             self._observations[name].copy_(value)
-
-    def _delayed_pose(self, state: State) -> tuple[Tensor, Tensor]:
-        """[N, 3], [N, 4] the object's pose as it is seen, which may be late."""
-        if self._poses is None:
-            return state.object_pos, state.object_quat
-        last = self._poses.values[:, 0, 3:]
-        facing = (state.object_quat * last).sum(dim=-1, keepdim=True) < 0  # of a rotation's two quaternions, the one near the last
-        pose = torch.cat((state.object_pos, torch.where(facing, -state.object_quat, state.object_quat)), dim=-1)
-        self._poses.fill(self._reset_mask, pose)
-        pos, quat = self._poses.push(pose).split((3, 4), dim=-1)
-        return pos, torch.nn.functional.normalize(quat, dim=-1)
-
-    def _log(self, reward: Reward, done: Tensor, sound: Tensor) -> tuple[tuple[str, ...], Tensor]:
-        """Names and values [K] of what there is to say about this step: means over worlds, on the device, so that nothing waits for them.
-
-        Reward terms are means over the worlds that are ``sound`` [N]: the others' say nothing, and are counted.
-        """
-        all_worlds, from_home = torch.ones_like(sound), ~self.from_bank
-        rows = {f"reward/{name}": (value, sound) for name, value in reward.terms.items()}
-        rows |= {
-            "task/grasped": (reward.grasped, all_worlds),
-            "task/success": (reward.success, all_worlds),
-            "task/grasped_from_home": (reward.grasped, from_home),
-            "task/success_from_home": (reward.success, from_home),
-            "episode/ended": (done, all_worlds),
-        }
-        values = torch.stack([value.float() for value, _ in rows.values()])
-        masks = torch.stack([mask for _, mask in rows.values()])
-        means = torch.where(masks, values, 0).sum(dim=-1) / masks.sum(dim=-1).clamp_min(1)
-        totals = {"health/nonfinite_total": self.nonfinite_count, "health/overflow_total": self.overflow_count}
-        if self.resets.config.frontier > 0:
-            totals["task/reached_from_bank"] = self.resets.reached_from_bank.mean()
-            totals["task/reached_from_home"] = self.resets.reached_from_home.mean()
-            totals["task/from_bank"] = self.from_bank.float().mean()
-        return (*rows, *totals), torch.cat((means, torch.stack([value.float() for value in totals.values()])))
-
-
-__all__ = ["ManipulationEnv", "Reading", "make_env", "make_scene"]

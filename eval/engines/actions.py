@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from xreset.env import Reading
 from xreset.errors import FileFormatError
 from xreset.eval.engines.episodes import Motion, closing_episode
 from xreset.eval.engines.grasps import Grasps
@@ -26,6 +25,7 @@ from xreset.records import JOINT, POSITION, Field, Schema, read_npz, write_npz
 from xreset.resets.bank import check_robot
 from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
 from xreset.task.config import TaskConfig
+from xreset.task.reading import Reading
 
 SCHEMA = "xreset-actions/1"
 

@@ -195,7 +195,6 @@ def evaluate(
                 robot=subject.robot.name,
                 policy=subject.label,
                 seed=setting.seed,
-                repetitions=episodes,
                 inputs=inputs,
                 objects_folder=str(folder) if folder else None,
                 unseen=subject.unseen(trial.names),

@@ -113,7 +113,7 @@ class EvalResult(Checked):
 
 
 def summarize(
-    rollouts: Rollouts, *, backend: str, backend_version: str, robot: str, policy: str, seed: int, repetitions: int, inputs: dict[str, str],
+    rollouts: Rollouts, *, backend: str, backend_version: str, robot: str, policy: str, seed: int, inputs: dict[str, str],
     objects_folder: str | None, unseen: tuple[str, ...] = (),
 ) -> EvalResult:  # fmt: skip
     """What the episodes come to."""
@@ -128,7 +128,7 @@ def summarize(
         objects_folder=objects_folder,
         policy=policy,
         episodes=len(episodes),
-        episodes_per_demo=repetitions,
+        episodes_per_demo=1 + max(e.repetition for e in episodes),
         seed=seed,
         task_progress=TaskProgress(mean=mean(episodes, "task_progress"), ci95=(low, high)),
         reorient_once_rate=mean(episodes, "reorient_once"),

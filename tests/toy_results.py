@@ -57,7 +57,6 @@ def toy_summary(backend: str = "mujoco", rollouts: Rollouts | None = None, **cha
         "robot": "toy",
         "policy": "zero",
         "seed": 3,
-        "repetitions": 2,
         "inputs": {"demos": "ab"},
         "objects_folder": None,
     }

@@ -124,25 +124,28 @@ def _write(pa: ModuleType, root: Path, recording: Recording, films: _Films | Non
     write("meta/tasks.parquet", _task_table(pa, tasks))
     stats = {key: _stats(key, np.concatenate([sample[key] for sample in samples])) for key in samples[0]}
     write_json(root / "meta/stats.json", {key: {name: v.tolist() for name, v in some.items()} for key, some in stats.items()})
+    write_json(root / "meta/info.json", _info(recording, len(tasks), features, films is not None))
+    progress(len(episodes), len(episodes))
+
+
+def _info(recording: Recording, tasks: int, features: dict[str, dict[str, Any]], video: bool) -> dict[str, Any]:
     fps = int(recording.fps) if recording.fps.is_integer() else recording.fps
     file = _FILE.replace("chunk:", "chunk_index:").replace("file:", "file_index:")
-    info = {
+    return {
         "codebase_version": VERSION,
         "robot_type": recording.robot.name,
-        "total_episodes": len(episodes),
-        "total_frames": int(offsets[-1]),
-        "total_tasks": len(tasks),
+        "total_episodes": len(recording.episodes),
+        "total_frames": int(recording.offsets[-1]),
+        "total_tasks": tasks,
         "chunks_size": _CHUNK,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": fps,
-        "splits": {"train": f"0:{len(episodes)}"},
+        "splits": {"train": f"0:{len(recording.episodes)}"},
         "data_path": f"data/{file}.parquet",
-        "video_path": f"videos/{{video_key}}/{file}.mp4" if films is not None else None,
+        "video_path": f"videos/{{video_key}}/{file}.mp4" if video else None,
         "features": features,
     }
-    write_json(root / "meta/info.json", info)
-    progress(len(episodes), len(episodes))
 
 
 def _features(recording: Recording, films: _Films | None) -> dict[str, dict[str, Any]]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.table import Table
@@ -15,8 +16,12 @@ from xreset.cli._terminal import Console, Progress
 from xreset.description import load_robot
 from xreset.files import file_hash
 from xreset.objects import load_objects
-from xreset.resets.bank import check_retargeted, write_bank
+from xreset.resets.bank import Band, ResetBank, check_retargeted, write_bank
 from xreset.resets.config import ClosingConfig, SqueezeConfig
+from xreset.retarget.file import Retargeted
+
+if TYPE_CHECKING:
+    from xreset.resets.hold import Held
 
 
 def resets(
@@ -81,11 +86,22 @@ def resets(
         **({"hold": [asdict(row) for row in held]} if hold else {}),
     )
 
+    console.print(_accepted(data, bank, f"{spec.name}: states stable in {', '.join(backends)}"))
+    if closing.spacing is not None:
+        console.print(_closing(bands))
+    if squeeze.force > 0:
+        console.print(f"{bank.num_pressing} of {int(bank.post_contact.sum())} states after contact press with {squeeze.force:g} N")
+    if hold:
+        console.print(_holding(held, backends))
+    console.print(
+        f"{bank.num_states} states of {bank.num_states + len(bank.rejected_reason)} kept in {out}; counts in {accounts_path(out)}"
+    )
+
+
+def _accepted(data: Retargeted, bank: ResetBank, title: str) -> Table:
+    """How many states of each object and phase are kept."""
     annotated = {(row.object_name, row.phase): row.without("not annotated").total for row in with_totals(data.accounts())}
-    table = Table(
-        "object", "phase", "annotated frames", "valid: tried", "accepted", "of annotated", "rejected because of",
-        title=f"{spec.name}: states stable in {', '.join(backends)}",
-    )  # fmt: skip
+    table = Table("object", "phase", "annotated frames", "valid: tried", "accepted", "of annotated", "rejected because of", title=title)
     for row in with_totals(bank.accounts()):
         frames = annotated.get((row.object_name, row.phase), 0)
         table.add_row(
@@ -97,26 +113,27 @@ def resets(
             f"{row.kept / frames:.0%}" if frames else "-",
             described(row.lost),
         )
-    console.print(table)
-    if closing.spacing is not None:
-        table = Table("finger to object", "frames: tried", "accepted", "added: tried", "accepted", title="where the hand closes in")
-        for band in bands:
-            counts = (band.tried, band.kept, band.added, band.added_kept)
-            far, near = ("" if edge is None else f"{100 * edge:g}" for edge in (band.nearer, band.farther))
-            table.add_row(f"{far} to {near} cm" if far and near else f"beyond {near} cm" if near else "contact", *map(str, counts))
-        console.print(table)
-    if squeeze.force > 0:
-        console.print(f"{bank.num_pressing} of {int(bank.post_contact.sum())} states after contact press with {squeeze.force:g} N")
-    if hold:
-        table = Table("object", "lifted", *backends, title="lifted states that hold the object for 1 s at full gravity")
-        for name in dict.fromkeys(row.object_name for row in held):
-            mine = [row for row in held if row.object_name == name]
-            shares = [f"{row.held} ({row.held / row.lifted:.0%})" if row.lifted else "-" for row in mine]
-            table.add_row(name, str(mine[0].lifted), *shares)
-        console.print(table)
-    console.print(
-        f"{bank.num_states} states of {bank.num_states + len(bank.rejected_reason)} kept in {out}; counts in {accounts_path(out)}"
-    )
+    return table
+
+
+def _closing(bands: Sequence[Band]) -> Table:
+    """States by the distance between finger and object."""
+    table = Table("finger to object", "frames: tried", "accepted", "added: tried", "accepted", title="where the hand closes in")
+    for band in bands:
+        counts = (band.tried, band.kept, band.added, band.added_kept)
+        far, near = ("" if edge is None else f"{100 * edge:g}" for edge in (band.nearer, band.farther))
+        table.add_row(f"{far} to {near} cm" if far and near else f"beyond {near} cm" if near else "contact", *map(str, counts))
+    return table
+
+
+def _holding(held: Sequence[Held], backends: Sequence[str]) -> Table:
+    """How many lifted states hold the object, engine by engine."""
+    table = Table("object", "lifted", *backends, title="lifted states that hold the object for 1 s at full gravity")
+    for name in dict.fromkeys(row.object_name for row in held):
+        mine = [row for row in held if row.object_name == name]
+        shares = [f"{row.held} ({row.held / row.lifted:.0%})" if row.lifted else "-" for row in mine]
+        table.add_row(name, str(mine[0].lifted), *shares)
+    return table
 
 
 COMMAND = resets

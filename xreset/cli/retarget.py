@@ -105,10 +105,7 @@ def retarget(
     )
     console.print(_table(result))
     if colliding:
-        meeting = Table("links that meet", "frames", title="self collision")
-        for pair, frames in colliding.items():
-            meeting.add_row(" and ".join(pair), str(frames))
-        console.print(meeting)
+        console.print(_meeting(colliding))
         console.print("Links that meet in every position of their joints belong into collision.exclude of the robot.toml.")
     for index in np.flatnonzero(on_something(levelled(chosen), specs)):
         console.print(f"{chosen.sequence_name[index]}: the object starts on top of something that the scene does not have; not lowered.")
@@ -136,6 +133,14 @@ def _table(result: Retargeted) -> Table:
             f"{1e3 * result.hand_error[mine].mean():.1f}" if mine.any() else "-",
             described(annotated.lost),
         )
+    return table
+
+
+def _meeting(colliding: dict[tuple[str, str], int]) -> Table:
+    """Which links are in each other's way, and in how many frames."""
+    table = Table("links that meet", "frames", title="self collision")
+    for pair, frames in colliding.items():
+        table.add_row(" and ".join(pair), str(frames))
     return table
 
 

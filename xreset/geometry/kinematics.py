@@ -6,7 +6,7 @@ Poses are 4x4 matrices ``T_a_b`` (b in a). Lengths in m, angles in rad.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,8 +16,8 @@ from torch import Tensor
 
 from xreset.errors import RobotError
 from xreset.geometry.rotations import quat_to_matrix
-from xreset.geometry.urdf import RobotTree, robot_tree
-from xreset.spec import RobotSpec
+from xreset.geometry.urdf import Joint, RobotTree, robot_tree
+from xreset.spec import MimicSpec, RobotSpec
 
 
 class PointJacobian(NamedTuple):
@@ -104,7 +104,18 @@ class Kinematics:
         """[J] indices of this kinematics' joints in the robot's joint order; all of them when the root is the URDF's."""
         self.joint_names: tuple[str, ...] = tuple(robot.joint_names[i] for i in self.joint_indices)
         """Names of the joints, in the robot's joint order."""
+        self._couple(moving, mimics)
+        self._chain(joints, moving)
 
+        from_root = torch.eye(4, dtype=dtype, device=self.device)
+        if self.root == tree.root:
+            from_root[:3, :3] = quat_to_matrix(self._tensor(robot.base_quat))
+            from_root[:3, 3] = self._tensor(robot.base_pos)
+        self.base = from_root
+        """[4, 4] pose of the root that is used where none is given: the robot's base in the world, or the identity below another root."""
+
+    def _couple(self, moving: Sequence[Joint], mimics: Mapping[str, MimicSpec]) -> None:
+        """How the positions of the moving joints follow from those of the actuated ones, and the limits that this leaves them."""
         column = {name: i for i, name in enumerate(self.joint_names)}
         coupling = torch.zeros(len(moving), len(column), dtype=torch.float64)
         constant = torch.zeros(len(moving), dtype=torch.float64)
@@ -124,6 +135,8 @@ class Kinematics:
         self.upper = self._tensor(upper)
         """[J] upper position limits."""
 
+    def _chain(self, joints: Sequence[Joint], moving: Sequence[Joint]) -> None:
+        """The steps from each link to the next, and which joints move which link."""
         row = {joint.name: i for i, joint in enumerate(moving)}
         self._revolute = torch.tensor([joint.type == "revolute" for joint in moving], dtype=torch.bool, device=self.device)
         self._steps: list[_Step] = []
@@ -149,13 +162,6 @@ class Kinematics:
                 )
             )
         self._ancestry = ancestry.to(self.device)
-
-        from_root = torch.eye(4, dtype=dtype, device=self.device)
-        if self.root == tree.root:
-            from_root[:3, :3] = quat_to_matrix(self._tensor(robot.base_quat))
-            from_root[:3, 3] = self._tensor(robot.base_pos)
-        self.base = from_root
-        """[4, 4] pose of the root that is used where none is given: the robot's base in the world, or the identity below another root."""
 
     def link_index(self, name: str) -> int:
         """Index of a link in :attr:`link_names`; ``RobotError`` if there is none of that name below the root."""

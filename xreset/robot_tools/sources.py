@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -205,7 +206,8 @@ def largest_moment(link: Link) -> float:
 # MJCF ------------------------------------------------------------------------------------------------------------------------------------
 
 
-def _read_mjcf(path: Path) -> Source:
+def _mjcf_model(path: Path) -> tuple[Any, Any]:
+    """The model, and the module that has read it."""
     try:
         import mujoco
     except ImportError as error:
@@ -218,7 +220,11 @@ def _read_mjcf(path: Path) -> Source:
         raise RobotError(f"{path} is not valid MJCF: {error}") from error
     if problems := _unsupported(model, mujoco):
         raise RobotError(f"{path} uses what xreset does not have:" + "".join(f"\n  - {problem}" for problem in problems))
+    return model, mujoco
 
+
+def _read_mjcf(path: Path) -> Source:
+    model, mujoco = _mjcf_model(path)
     notes: list[str] = []
     names = [model.body(i).name or f"body{i}" for i in range(model.nbody)]
     tops = [i for i in range(1, model.nbody) if model.body_parentid[i] == 0]
@@ -262,6 +268,22 @@ def _read_mjcf(path: Path) -> Source:
         elif own:
             raise RobotError(f"{path}: the first body {names[body]!r} has joints; put it into a body that does not move.")
         links.append(link)
+    mimics = []
+    for i in range(model.neq):
+        if model.eq_obj2id[i] >= 0:
+            ends = [joint_name[int(model.eq_obj1id[i])], joint_name[int(model.eq_obj2id[i])]]
+            offset, factor = (float(value) for value in model.eq_data[i, :2])
+            mimics.append(MimicSpec(joint=ends[0], source=ends[1], multiplier=factor, offset=offset))
+    order = {link.name: link for link in links}
+    tree = RobotTree(
+        name=Path(path).stem, root=names[tops[0]], links=(order[names[tops[0]]], *(order[j.child] for j in joints)), joints=tuple(joints)
+    )
+    drives, effort = _mjcf_drives(model, joint_name)
+    return Source(tree=tree, mimics=tuple(mimics), effort=effort, drives=drives, notes=tuple(notes))
+
+
+def _mjcf_drives(model, joint_name: dict[int, str]) -> tuple[dict[str, DriveSpec], dict[str, float]]:
+    """Position drives and efforts of the joints that have actuators."""
     drives, effort = {}, {}
     for i in range(model.nu):
         j = int(model.actuator_trnid[i, 0])
@@ -276,17 +298,7 @@ def _read_mjcf(path: Path) -> Source:
             kd += float(model.dof_damping[dof])
             armature = float(model.dof_armature[dof])
             drives[joint_name[j]] = DriveSpec(kp=kp, kd=kd, effort=max(limit, 0.0), armature=armature)
-    mimics = []
-    for i in range(model.neq):
-        if model.eq_obj2id[i] >= 0:
-            ends = [joint_name[int(model.eq_obj1id[i])], joint_name[int(model.eq_obj2id[i])]]
-            offset, factor = (float(value) for value in model.eq_data[i, :2])
-            mimics.append(MimicSpec(joint=ends[0], source=ends[1], multiplier=factor, offset=offset))
-    order = {link.name: link for link in links}
-    tree = RobotTree(
-        name=Path(path).stem, root=names[tops[0]], links=(order[names[tops[0]]], *(order[j.child] for j in joints)), joints=tuple(joints)
-    )
-    return Source(tree=tree, mimics=tuple(mimics), effort=effort, drives=drives, notes=tuple(notes))
+    return drives, effort
 
 
 def _unsupported(model, mujoco) -> list[str]:

@@ -213,34 +213,6 @@ class MujocoWarpBackend(Backend):
 
     # Physical parameters ---------------------------------------------------------------------------------------------------------
 
-    def set_friction(self, friction: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_friction`."""
-        self._set("friction", friction, worlds)
-
-    def set_torsional_friction(self, torsional: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_torsional_friction`."""
-        self._set("torsional_friction", torsional, worlds)
-
-    def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_mass`."""
-        self._set("object_mass", mass, worlds)
-
-    def set_object_inertia(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_inertia`."""
-        self._set("object_inertia", scale, worlds)
-
-    def set_object_com(self, offset: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_com`."""
-        self._set("object_com", offset, worlds)
-
-    def set_object_gravity(self, fraction: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_gravity`."""
-        self._set("object_gravity", fraction, worlds)
-
-    def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_drives`."""
-        self._set("drives", scale, worlds)
-
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         self._must_be_open()
         index = self._every_world if worlds is None else torch.as_tensor(worlds, dtype=torch.int64, device=self.device)

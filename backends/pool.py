@@ -249,34 +249,6 @@ class PoolBackend(Backend):
         mass, com, inertia = (torch.from_numpy(self._arrays[f"body_{name}"].copy()) for name in ("mass", "com", "inertia"))
         return MassProperties(mass=mass, com=com, inertia=inertia)
 
-    def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_mass`."""
-        self._set_parameter("object_mass", mass, worlds)
-
-    def set_friction(self, friction: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_friction`."""
-        self._set_parameter("friction", friction, worlds)
-
-    def set_torsional_friction(self, torsional: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_torsional_friction`."""
-        self._set_parameter("torsional_friction", torsional, worlds)
-
-    def set_object_inertia(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_inertia`."""
-        self._set_parameter("object_inertia", scale, worlds)
-
-    def set_object_com(self, offset: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_com`."""
-        self._set_parameter("object_com", offset, worlds)
-
-    def set_object_gravity(self, fraction: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_gravity`."""
-        self._set_parameter("object_gravity", fraction, worlds)
-
-    def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_drives`."""
-        self._set_parameter("drives", scale, worlds)
-
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         """See :meth:`Backend.set_object_wrench`; the worlds read it at the next step."""
         self._require("object_wrench")
@@ -288,7 +260,7 @@ class PoolBackend(Backend):
         """End the workers. Calling it twice does no harm."""
         self._close()
 
-    def _set_parameter(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
+    def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         self._require(name)
         index = self._selected(worlds)
         given = self._checked(name, value, len(index))

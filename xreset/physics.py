@@ -251,39 +251,39 @@ class Backend(ABC):
 
     # Physical parameters: each stays through set_state, except the wrench; CapabilityError where the backend lacks it -----------------
 
-    @abstractmethod
     def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
         """Set the object's mass [M] kg; its inertia scales with it, its centre of mass stays."""
+        self._set("object_mass", mass, worlds)
 
-    @abstractmethod
     def set_friction(self, friction: Tensor, worlds: Tensor | None = None) -> None:
         """Set the friction of the pairs object-fingertip, object-other link, object-table: [M, 3]."""
+        self._set("friction", friction, worlds)
 
     def set_torsional_friction(self, torsional: Tensor, worlds: Tensor | None = None) -> None:
         """Set the torsional friction of the object's pairs: [M], a length as in :class:`~xreset.spec.PairFriction`."""
-        self._cannot("torsional_friction")
+        self._set("torsional_friction", torsional, worlds)
 
     def set_object_inertia(self, scale: Tensor, worlds: Tensor | None = None) -> None:
         """Set the factor [M] on the object's inertia about its centre of mass, beside what its mass does; 1 is what the spec says."""
-        self._cannot("object_inertia")
+        self._set("object_inertia", scale, worlds)
 
     def set_object_com(self, offset: Tensor, worlds: Tensor | None = None) -> None:
         """Move the object's centre of mass by [M, 3] m from where its spec has it, in its mesh frame; its inertia about it stays.
 
         Of an object that moves, set the state anew.
         """
-        self._cannot("object_com")
+        self._set("object_com", offset, worlds)
 
-    @abstractmethod
     def set_object_gravity(self, fraction: Tensor, worlds: Tensor | None = None) -> None:
         """Set the object's gravity fraction [M]: an upward force (1 - fraction) m g acts at its centre of mass.
 
         The robot is not affected (the paper, appendix D.e).
         """
+        self._set("object_gravity", fraction, worlds)
 
     def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
         """Set factors on the drives: [M, 3, J] of stiffness, damping and effort limit; 1 is what the robot spec says."""
-        self._cannot("drives")
+        self._set("drives", scale, worlds)
 
     @abstractmethod
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
@@ -331,9 +331,10 @@ class Backend(ABC):
         if capability not in self.capabilities:
             raise CapabilityError(f"the backend {self.name!r} cannot set {capability.replace('_', ' ')}: {_REMEDIES[capability]}")
 
-    def _cannot(self, capability: Capability) -> None:
-        self._require(capability)
-        raise NotImplementedError(f"the backend {self.name!r} says that it can set {capability.replace('_', ' ')}, and does not")
+    def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
+        """Set a physical parameter [M, ...], as the setter of that name says: what all of them do."""
+        self._require(name)
+        raise NotImplementedError(f"the backend {self.name!r} says that it can set {name.replace('_', ' ')}, and does not")
 
 
 _REMEDIES: dict[str, str] = {

@@ -201,8 +201,7 @@ def read_result(path: Path) -> EvalResult:
     Raises:
         FileFormatError: it is damaged, or lacks an entry; the message names it.
     """
-    data = read_json(path, SCHEMA)
-    return from_dict(EvalResult, {name: value for name, value in data.items() if name != "schema"}, str(path))
+    return from_dict(EvalResult, read_json(path, SCHEMA), str(path))
 
 
 def read_episodes(folder: Path, backend: str) -> tuple[Episode, ...]:

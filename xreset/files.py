@@ -128,7 +128,7 @@ def write_json(path: str | Path, data: Any) -> None:
 
 
 def read_json(path: str | Path, schema: str | None = None) -> dict[str, Any]:
-    """Read a JSON object; with ``schema``, its ``schema`` entry must be that."""
+    """Read a JSON object; with ``schema``, its ``schema`` entry must be that, and is left out."""
     path = Path(path)
     must_exist(path, "JSON file")
     if path.stat().st_size > max_bytes() // 16:  # what it becomes is about so many times as large
@@ -138,7 +138,7 @@ def read_json(path: str | Path, schema: str | None = None) -> dict[str, Any]:
     except ValueError as error:
         raise FileFormatError(f"{path} is not valid JSON ({error}). It may be truncated; make it again.") from error
     if schema is not None:
-        check_schema(path, data.get("schema"), schema)
+        check_schema(path, data.pop("schema", None), schema)
     return data
 
 

@@ -62,7 +62,7 @@ class Subset:
         file = self.folder / "subset.json"
         if not file.is_file():
             return
-        made = {k: v for k, v in read_json(file, SUBSET_SCHEMA).items() if k != "schema"}
+        made = read_json(file, SUBSET_SCHEMA)
         names = sorted({*made, *self.definition})
         there, wanted = ({k: of.get(k) for k in names} for of in (made, self.definition))
         refuse_other(f"{self.folder} was made otherwise", "data", there, wanted)

@@ -83,5 +83,6 @@ def read_choice(folder: Path) -> Choice | None:
     path = folder / FILE
     if not path.is_file():
         return None
-    data = {name: value for name, value in read_json(path, SCHEMA).items() if name not in ("schema", "xreset")}
+    data = read_json(path, SCHEMA)
+    data.pop("xreset", None)
     return from_dict(Choice, data, str(path))

@@ -81,5 +81,4 @@ def read_lift(folder: Path) -> Lift:
     path = folder / FILE
     if not path.is_file():
         return Lift()
-    data = read_json(path, SCHEMA)
-    return from_dict(Lift, {name: value for name, value in data.items() if name != "schema"}, str(path))
+    return from_dict(Lift, read_json(path, SCHEMA), str(path))

@@ -73,7 +73,7 @@ def read_run(folder: str | Path) -> RunInfo:
         raise RunError(f"{folder} is not a run folder: it has no run.json. Make one with: xreset train --out {folder} ...")
     data = read_json(folder / "run.json", SCHEMA)
     where = f"{folder / 'run.json'} (of xreset {shown(data.pop('xreset', None))})"
-    info = from_dict(RunInfo, {name: value for name, value in data.items() if name != "schema"}, where)
+    info = from_dict(RunInfo, data, where)
     try:
         check_contract_entries("it", info.contract)
     except PolicyError as error:

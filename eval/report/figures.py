@@ -11,18 +11,17 @@ import numpy as np
 
 from xreset.eval.pages import short_name
 from xreset.eval.plots import COLORS, INK, percent_axis, picture, svg
+from xreset.eval.report.clips import Clip
 from xreset.eval.report.groups import Group, Scores, engines_of
 from xreset.eval.report.lifting import Fate, fates, share_of_runs
 from xreset.eval.report.progress import Line, X, line
+from xreset.eval.report.read import Curve
 from xreset.eval.results import EvalResult
 from xreset.learning.clock import SHARES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from xreset.eval.report.clips import Clip
-    from xreset.eval.report.read import Curve
 
 STAGES = (("approach_rate", "approach"), ("grasp_rate", "grasp"), ("reorient_rate", "reorient"))
 Summaries = Sequence[EvalResult]

@@ -6,14 +6,12 @@ import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from rich.console import Console
 
 from xreset.cli import INVOCATION
 from xreset.cli._terminal import Progress
 from xreset.plugins import backend_names, backend_status
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import degrees
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 from rich.table import Table
@@ -14,6 +14,7 @@ from rich.table import Table
 from xreset.cli._terminal import Console, Progress
 from xreset.demos import (
     Convention,
+    Demos,
     concatenate,
     demo_objects,
     mirrored,
@@ -30,10 +31,8 @@ from xreset.demos.info import summarize
 from xreset.demos.plausible import doubts
 from xreset.errors import DemoError
 from xreset.files import file_hash
+from xreset.spec import ObjectSpec
 
-if TYPE_CHECKING:
-    from xreset.demos import Demos
-    from xreset.spec import ObjectSpec
 Side = Literal["right", "left", "both"]
 
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import RunError
-from xreset.eval.export import read_recorded, write_arrays, write_lerobot
+from xreset.eval.export import Recording, read_recorded, write_arrays, write_lerobot
 from xreset.eval.export.recorded import TASK
 
-if TYPE_CHECKING:
-    from xreset.eval.export import Recording
 Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
 Backends = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 

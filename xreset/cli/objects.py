@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 from rich.table import Table
@@ -14,9 +14,7 @@ from xreset.objects import bounding_box, load_object, object_names
 from xreset.objects.catalogue import ALIASES
 from xreset.objects.meshes import add_mesh, import_with_notes, mesh_files
 from xreset.objects.properties import Properties
-
-if TYPE_CHECKING:
-    from xreset.spec import ObjectSpec
+from xreset.spec import ObjectSpec
 
 
 def list_(*, objects: Path | None = None) -> None:

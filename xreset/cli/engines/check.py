@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 from rich.text import Text
+from torch import Tensor
 
 from xreset import __version__
-from xreset.backends.conformance import CHECKS, SCHEMA, run
+from xreset.backends.conformance import CHECKS, SCHEMA, CheckResult, MakeBackend, Measure, run
 from xreset.backends.conformance.harness import Bench
 from xreset.backends.conformance.scene import gripper
 from xreset.backends.pool import PoolBackend
@@ -18,14 +19,9 @@ from xreset.cli._terminal import Console
 from xreset.description import load_robot
 from xreset.errors import XResetError
 from xreset.files import write_json
+from xreset.physics import Backend
 from xreset.plugins import backend_class, backend_status, make_backend
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from xreset.backends.conformance import CheckResult, MakeBackend, Measure
-    from xreset.physics import Backend
-    from xreset.spec import SceneSpec
+from xreset.spec import SceneSpec
 
 
 def check(

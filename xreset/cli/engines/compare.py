@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 from rich.table import Table
@@ -12,14 +12,11 @@ from rich.text import Text
 from xreset import __version__
 from xreset.cli._common import this_command, usable_engines
 from xreset.cli._terminal import Console, Progress
-from xreset.eval.engines.agreement import REFERENCE
+from xreset.eval.engines.agreement import REFERENCE, EngineParity, Metric, Parity
 from xreset.eval.engines.agreement import compare as agreement
 from xreset.eval.engines.sources import load_frames
 from xreset.eval.trial import engine
 from xreset.files import file_hash, write_json
-
-if TYPE_CHECKING:
-    from xreset.eval.engines.agreement import EngineParity, Metric, Parity
 
 
 def compare(

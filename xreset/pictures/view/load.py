@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xreset.demos.archive import demo_objects, read_demos
+from xreset.demos.archive import Demos, demo_objects, read_demos
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, XResetError
 from xreset.geometry.surface import Surface, keypoint_contacts
 from xreset.objects import load_objects
 from xreset.pictures.view.data import Human, View
 from xreset.records import npz_schema
-from xreset.resets.bank import check_objects, check_retargeted, read_bank
+from xreset.resets.bank import ResetBank, check_objects, check_retargeted, read_bank
 from xreset.retarget.file import read_retargeted
 from xreset.retarget.pipeline import RetargetConfig, rest_on_table
 from xreset.spec import ObjectSpec
 
-if TYPE_CHECKING:
-    from xreset.demos.archive import Demos
-    from xreset.resets.bank import ResetBank
 _BANK_RATE = 5.0
 """States of a bank that are played per second: they are no motion, and are looked at one by one."""
 

@@ -217,6 +217,14 @@ class TrainingTest(unittest.TestCase):
             (("--like", "minutes", "--resume"), "leave out --like"),
             (("--weights", str(self.out), "--resume"), "leave out --weights"),
             (("--minutes", "0"), "--minutes is 0.0, expected more than 0"),
+            (
+                ("--like", "minutes", "--config.task.action.hand-zero", "home"),
+                "task.action.hand_zero is home, which means something where hand is absolute; it is relative. Leave it out",
+            ),
+            (
+                ("--config.task.action.hand-step", "0.1", "--config.task.reward.progress", "3"),
+                "hand_step is 0.1, .* hand is relative; it is absolute; --config.task.reward.progress is 3.0, which",
+            ),
         ):
             with self.subTest(arguments), redirect_stderr(io.StringIO()) as said, self.assertRaises(SystemExit):
                 parsed(*arguments)

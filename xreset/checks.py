@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from functools import cache
 from math import inf, isfinite
 from types import UnionType
@@ -27,6 +27,35 @@ NotNegative = Annotated[T, Rule("a finite number, 0 or more", lambda x: 0 <= x <
 Finite = Annotated[T, Rule("a finite number", isfinite)]
 Share = Annotated[T, Rule("a number from 0 to 1", lambda x: 0 <= x <= 1)]
 Range = Annotated[tuple[float, float], Rule("two finite numbers, 0 or more, the lower one first", lambda x: 0 <= x[0] <= x[1] < inf)]
+
+
+@dataclass(frozen=True)
+class Only:
+    """What another field must be for a field to mean anything: metadata of its annotation."""
+
+    field: str
+    choice: str
+
+
+def without_effect(settings: Any, defaults: Any, path: tuple[str, ...] = ()) -> list[str]:
+    """What was changed from the defaults and means nothing beside the other settings; a sentence for each field, nested ones with it.
+
+    Args:
+        settings: a dataclass.
+        defaults: another of its kind.
+        path: names of the fields that lead to it.
+    """
+    sentences = []
+    hints = get_type_hints(type(settings), include_extras=True)
+    for name, hint in hints.items():
+        value, default = getattr(settings, name), getattr(defaults, name)
+        if is_dataclass(value) and type(value) is type(default):
+            sentences += without_effect(value, default, (*path, name))
+        for rule in (r for r in getattr(hint, "__metadata__", ()) if isinstance(r, Only)):
+            if value != default and (found := getattr(settings, rule.field)) != rule.choice:
+                where = ".".join((*path, name))
+                sentences.append(f"{where} is {value}, which means something where {rule.field} is {rule.choice}; it is {found}")
+    return sentences
 
 
 class Checked:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from xreset.checks import without_effect
 from xreset.errors import RunError
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import starting_config
@@ -64,6 +65,8 @@ def train(
         return
     if robot is None or resets is None:
         raise RunError("a new run needs --robot and --resets; --resume continues the run in --out.")
+    if sentences := without_effect(config, starting_config(like)):
+        raise RunError(f"--config.{'; --config.'.join(sentences)}. Leave it out, or change the other one.")
     if iterations is not None:
         config = replace(config, iterations=iterations)
     inputs = training.load_inputs(robot, resets, objects)

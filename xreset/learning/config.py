@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from xreset.checks import Checked, NotNegative, Positive, Rule, Share
+from xreset.checks import Checked, NotNegative, Only, Positive, Rule, Share
 from xreset.task.config import TaskConfig
 
 Widths = Annotated[tuple[int, ...], Rule("one width or more, each above 0", lambda widths: min(widths, default=0) >= 1)]
@@ -61,7 +61,7 @@ class PpoConfig(Checked):
     """A fixed rate of the critic's own. None: the actor's, which adapts to how far the *policy* moves."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """``adaptive``: the rate is divided (multiplied) by 1.5 where the policy moved more than twice (less than half) ``desired_kl``."""
-    desired_kl: Positive[float] = 0.01
+    desired_kl: Annotated[Positive[float], Only("schedule", "adaptive")] = 0.01
     clip: Positive[float] = 0.2
     entropy: NotNegative[float] = 0.005
     bounds_loss: NotNegative[float] = 0.0

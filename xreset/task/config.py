@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import isfinite
-from typing import Literal
+from typing import Annotated, Literal
 
-from xreset.checks import Checked, Finite, NotNegative, Positive, Range, Share
+from xreset.checks import Checked, Finite, NotNegative, Only, Positive, Range, Share
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,18 +25,18 @@ class ActionConfig(Checked):
     for the arm, so that a policy that does nothing holds what it was given: with absolute targets a new policy opens the hand in every
     demonstrated grasp and has to learn to hold before it can learn to lift. In-hand manipulation is commonly learned so (Qi et al. 2022,
     In-Hand Object Rotation via Rapid Motor Adaptation)."""
-    hand_step: Positive[float] = 0.05
-    """``relative`` only: largest change of a hand joint's target per control step [rad]: 3 rad/s at 60 Hz. Joints that slide move 4 cm
+    hand_step: Annotated[Positive[float], Only("hand", "relative")] = 0.05
+    """Largest change of a hand joint's target per control step [rad]: 3 rad/s at 60 Hz. Joints that slide move 4 cm
     for every radian."""
-    hand_lead: Positive[float] = 0.4
-    """``relative`` only: farthest that a hand joint's target may run ahead of the joint [rad], which is how hard it can press: drives of
+    hand_lead: Annotated[Positive[float], Only("hand", "relative")] = 0.4
+    """Farthest that a hand joint's target may run ahead of the joint [rad], which is how hard it can press: drives of
     the Sharpa hand reach their effort limits at 0.3 to 0.7."""
-    hand_zero: Literal["middle", "home"] = "middle"
-    """``absolute`` only. Where a hand joint is sent by action 0: to the middle of its limits, which is a half-closed fist, or to the
+    hand_zero: Annotated[Literal["middle", "home"], Only("hand", "absolute")] = "middle"
+    """Where a hand joint is sent by action 0: to the middle of its limits, which is a half-closed fist, or to the
     robot's home pose, from which -1 and +1 lead to the limits along two slopes. A new policy's mean is 0: with ``middle`` it closes the
     open hand at once and comes down on the object with its knuckles. Not in the paper."""
-    hand_smoothing: Positive[Share[float]] = 1.0
-    """``absolute`` only. Share of the new hand target that is taken per control step, in (0, 1]; 1 is the paper's plain target."""
+    hand_smoothing: Annotated[Positive[Share[float]], Only("hand", "absolute")] = 1.0
+    """Share of the new hand target that is taken per control step, in (0, 1]; 1 is the paper's plain target."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,17 +98,15 @@ class RewardConfig(Checked):
     """What pays for the object's pose while the contact gate is open. ``presence``: how near it is to the goal, in position and in rotation
     (the paper), also of an object that is only pressed down where it stands. ``progress``: how much nearer than at the demonstration's
     start, which pays nothing for that. Isaac Lab came to reward lifting so (isaac-sim/IsaacLab#6155); this form is our own."""
-    position: Finite[float] = 4.0
-    """``presence`` only."""
-    position_width: Positive[float] = 0.2
+    position: Annotated[Finite[float], Only("tracking", "presence")] = 4.0
+    position_width: Annotated[Positive[float], Only("tracking", "presence")] = 0.2
     """[m]"""
-    rotation: Finite[float] = 4.0
-    """``presence`` only."""
-    rotation_width: Positive[float] = 1.5
+    rotation: Annotated[Finite[float], Only("tracking", "presence")] = 4.0
+    rotation_width: Annotated[Positive[float], Only("tracking", "presence")] = 1.5
     """[rad]"""
-    progress: Finite[float] = 8.0
-    """``progress`` only: paid in full at the goal, nothing at the start, and less than nothing farther away."""
-    progress_width: Positive[float] = 0.15
+    progress: Annotated[Finite[float], Only("tracking", "progress")] = 8.0
+    """Paid in full at the goal, nothing at the start, and less than nothing farther away."""
+    progress_width: Annotated[Positive[float], Only("tracking", "progress")] = 0.15
     """[m]"""
     success: Finite[float] = 10.0
     success_position: Positive[float] = 0.02

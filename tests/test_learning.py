@@ -219,14 +219,19 @@ class StorageTest(unittest.TestCase):
 
     @unittest.skipUnless(torch.cuda.is_available(), "there is no CUDA device: updates are captured on GPUs only")
     def test_a_captured_update_learns_what_a_plain_one_does(self):
-        for options in ({}, {"normalize_returns": True, "critic_learning_rate": 3e-4}):
+        # an adaptive rate multiplies the last bits in which kernels differ: a step more or less of it is a factor of 1.5
+        for tolerance, options in (
+            (1e-3, {"schedule": "fixed", "learning_rate": 3e-4}),
+            (1e-3, {"schedule": "fixed", "learning_rate": 3e-4, "normalize_returns": True, "critic_learning_rate": 3e-4}),
+            (5e-2, {}),
+        ):
             (one, before, plain), (two, _, captured) = (
                 self.bandit(iterations=3, device="cuda", capture=on, **options) for on in (False, True)
             )
             self.assertFalse(one._graphs._graphs)
             self.assertTrue(two._graphs._graphs)
             self.assertGreater(float((plain - before).abs().mean()), 0.05)
-            torch.testing.assert_close(captured, plain, rtol=0.0, atol=0.01)
+            torch.testing.assert_close(captured, plain, rtol=0.0, atol=tolerance)
 
     def test_a_critic_may_have_its_own_rate_and_unit(self):
         alg, before, after = self.bandit(iterations=20, normalize_returns=True, critic_learning_rate=3e-4)

@@ -1,6 +1,7 @@
 """Demonstrations: the archive, DexYCB's layout, synthetic ones, and the commands."""
 
 import contextlib
+import importlib.util
 import io
 import tempfile
 import unittest
@@ -8,6 +9,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+import trimesh
 import yaml
 from scipy.spatial.transform import Rotation
 
@@ -423,6 +425,19 @@ class Synthetic(unittest.TestCase):
                 self.assertEqual(getattr(a, array).tobytes(), getattr(b, array).tobytes())
         other = synthesize(["soup"], per_object=1, seed=1)
         self.assertFalse(np.array_equal(other.object_pos[0], again.select(objects=["soup"]).object_pos[0]))
+
+    @unittest.skipUnless(importlib.util.find_spec("manifold3d"), "manifold3d is not installed")
+    def test_a_wall_of_ones_own_mesh_is_held_from_both_sides(self):
+        with tempfile.TemporaryDirectory() as folder:
+            trimesh.creation.annulus(0.0365, 0.04, 0.09, sections=16).export(Path(folder) / "tube.obj")
+            demos = synthesize(None, per_object=1, seed=0, meshes=folder)
+        tips = self.in_object(demos, demos.hand_keypoints.astype(float))[-1, TIPS]
+        radius = np.linalg.norm(tips[:3, :2], axis=1)  # thumb, index, middle
+        inside = radius < 0.0365
+        self.assertTrue(((radius < 0.040) == inside).all(), radius)  # none is in the wall
+        self.assertNotEqual(inside[0], inside[1])
+        self.assertEqual(inside[1], inside[2])
+        self.assertLess(np.abs(tips[:3, 2]).max(), 0.045)
 
     def test_starts_at_rest_in_the_workspace(self):
         for one, obj, lifted in self.sequences():

@@ -124,19 +124,23 @@ def synth(
     seed: int = 0,
     fps: float = 30.0,
     side: Side = "right",
+    meshes: Path | None = None,
 ) -> None:
-    """Make synthetic demonstrations of the built-in objects: reach, grasp, lift, turn.
+    """Make synthetic demonstrations: reach, grasp, lift, turn.
 
     Args:
         out: Archive to write.
-        objects: Objects to grasp; default: all nine.
+        objects: Objects to grasp; default: all.
         per_object: Sequences of each object (and hand).
         seed: The same seed gives the same file.
         fps: Frames per second.
         side: Hand.
+        meshes: Folder of real meshes, which stand with z up; default: the built-in stand-ins.
     """
     with _progress("making demonstrations") as progress:
-        demos = concatenate([synthesize(objects or None, per_object, seed, fps=fps, side=hand, progress=progress) for hand in _sides(side)])
+        demos = concatenate(
+            [synthesize(objects or None, per_object, seed, fps=fps, side=s, meshes=meshes, progress=progress) for s in _sides(side)]
+        )
     config = {"objects": list(objects), "per_object": per_object, "seed": seed, "fps": fps, "side": side}
     write_demos(out, demos, config=config)
     _print_summary(demos, out)

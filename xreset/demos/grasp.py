@@ -25,6 +25,8 @@ SKIN = 0.002
 """Distance of a fingertip keypoint from the surface it touches [m]."""
 MAX_OPENING = 0.095
 """Widest object part that the hand takes between thumb and fingers [m]."""
+MIN_WIDTH = 0.002
+"""Thinnest part: the wall of a cup, with the thumb or the fingers inside [m]."""
 
 _STACK = np.array([-0.004, -0.026, -0.043, -0.059])  # index to little along the knuckles, the thumb at 0 [m]
 _FINGER_ROOM = 0.022  # free space that a finger needs beside the object [m]
@@ -181,7 +183,7 @@ def _contacts_at(solid: Solid, centers: np.ndarray, approach: np.ndarray, closin
     thumb = np.isfinite(end[:, 0]) & (room_after[:, 0] > _FINGER_ROOM) & (facing_thumb[:, 0] > 0.75) & (height[:, 0] > 0.007)
     width = end[:, 0] - start[:, 0]
     with np.errstate(invalid="ignore"):
-        good = thumb & finger[:, 1] & finger[:, 2] & (width < MAX_OPENING) & (width > 0.004)
+        good = thumb & finger[:, 1] & finger[:, 2] & (width < MAX_OPENING) & (width > MIN_WIDTH)
 
     depth = _depth(solid, centers, approach)
     good &= (depth > 0.004) & (depth < 0.055)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -55,27 +56,29 @@ def synthesize(
     *,
     fps: float = 30.0,
     side: Literal["right", "left"] = "right",
+    meshes: str | Path | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Demos:
-    """Synthetic demonstrations of the built-in stand-ins.
+    """Synthetic demonstrations of the built-in stand-ins, or of the objects of a folder of meshes, which stand with z up.
 
     The same arguments give the same arrays, and a sequence does not depend on which others are made.
 
     Args:
-        objects: names, official or the paper's; None for all nine.
+        objects: names, official or the paper's; None for all.
         per_object: sequences of each object.
         seed: chooses all that varies: place and heading of the object, grasp, paths, timing, goal pose.
         fps: frames per second; a sequence lasts about 2.4 s.
         side: hand.
+        meshes: folder of real meshes; None for the stand-ins.
         progress: called with (sequences done, sequences in all, name) before each sequence is made.
 
     Raises:
         ObjectError: unknown object.
-        DemoError: ``per_object`` is not positive, or ``fps`` is too small for a motion of a second.
+        DemoError: ``per_object`` is not positive, ``fps`` is too small for a motion of a second, or an object cannot be held.
     """
     if per_object < 1 or not 5 <= fps <= 1000:
         raise DemoError(f"per_object is {per_object} and fps is {fps}, expected at least 1, and 5 to 1000.")
-    specs = [load_object(name) for name in (object_names() if objects is None else objects)]
+    specs = [load_object(name, meshes) for name in (object_names(meshes) if objects is None else objects)]
     parts = []
     for spec in specs:
         starts = [_start(spec, np.array(up), side) for up in _REST_UP.get(spec.name, ((0.0, 0.0, 1.0),))]

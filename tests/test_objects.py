@@ -8,6 +8,7 @@ import tempfile
 import unittest
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -449,6 +450,15 @@ class ThinWalls(unittest.TestCase):
         self.assertGreater(self.room(np.array([0, 0, 0.05]), pieces), 0.030)  # the cup's inner radius is 36.5 mm
         self.assertGreater(self.room(np.array([0.051, 0, 0.045]), pieces), 0.008)  # a finger of 16 mm through the handle
         self.assertAlmostEqual(pieces.volume, mug.volume, delta=1e-9)
+
+    def test_the_stated_deviation_is_the_measured_one(self):
+        for name in ("035_power_drill", "037_scissors"):  # hollows beside one another
+            with self.subTest(name):
+                result = import_with_notes(data_dir() / "ycb" / f"{name}.obj", name)
+                mesh = trimesh.Trimesh(result.obj.vertices, result.obj.faces, process=False)
+                measured = max(self.off(mesh, SimpleNamespace(shapes=result.obj.pieces)))
+                self.assertAlmostEqual(result.deviation, measured, delta=4e-4)
+                self.assertLess(result.deviation, 0.0025)
 
     def test_an_open_sheet_becomes_a_thin_wall(self):
         angle = np.linspace(0, 1.0, 6)

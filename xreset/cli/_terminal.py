@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from typing import Any
 
 import rich.console
@@ -9,10 +11,11 @@ import rich.progress
 
 
 class Console(rich.console.Console):
-    """A console without markup; style whole texts instead."""
+    """A console without markup; style whole texts instead. A file or a pipe, which has no width of its own, gets 160 columns."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(markup=False, emoji=False, **options)
+        known = sys.stdout.isatty() or os.environ.get("COLUMNS")
+        super().__init__(markup=False, emoji=False, **{"width": None if known else 160} | options)
 
 
 class Progress(rich.progress.Progress):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -56,7 +55,7 @@ def resets(
     from xreset.retarget.pipeline import read_retargeted
 
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
-    console = Console(width=None if sys.stdout.isatty() else 160)  # a file or a pipe has no width of its own
+    console = Console()
     data = read_retargeted(retargeted)
     spec = load_robot(robot or data.robot)
     check_retargeted(retargeted, data, spec)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -56,7 +55,7 @@ def retarget(
     from xreset.retarget.collisions import colliding_links
     from xreset.retarget.partial import discard
 
-    console = Console(width=None if sys.stdout.isatty() else 160)  # a file or a pipe has no width of its own
+    console = Console()
     spec = load_robot(robot)
     chosen = read_demos(demos)
     if max_per_object is not None:

@@ -1,4 +1,4 @@
-"""A mesh as few convex pieces that keep to its surface, small enough for every engine, kept in a cache because it takes seconds.
+"""A mesh as few convex pieces that keep to its surface, small enough for every engine.
 
 The mesh is made a solid, cut by planes wherever the convex hull of a part stands too far off the surface, and pieces whose common hull
 does not are joined again. PhysX takes hulls of at most 64 vertices in its fast path, and contact cost grows with the number of pieces.
@@ -6,46 +6,30 @@ does not are joined again. PhysX takes hulls of at most 64 vertices in its fast 
 
 from __future__ import annotations
 
-import hashlib
 import heapq
-import json
-import os
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
-from xreset.errors import FileFormatError, ObjectError, XResetError
+from xreset.errors import ObjectError
 from xreset.geometry.shapes import half_spaces, hull, mass_properties, shape_mesh
-from xreset.records import POSITION, Field, read_npz, write_npz
 from xreset.spec import Shape
 
 if TYPE_CHECKING:
     import trimesh
     from manifold3d import Manifold
-SCHEMA_NAME = "xreset-pieces/2"
-SCHEMA = {
-    "vertices": Field(("V", 3), "f", within=POSITION),
-    "offsets": Field(("K+1",), "i"),
-    "deviation": Field((), "f", within=POSITION),
-    "volume": Field((), "f"),
-    "com": Field((3,), "f", within=POSITION),
-    "inertia": Field((3, 3), "f"),
-}
 
 _CUTS = 7
 """Planes that are tried along each direction, evenly spaced."""
 _CROSSES = ((0, 1), (0, 2), (1, 2), (3, 4), (3, 5), (4, 5))
 """Pairs of directions whose middle planes are tried together: halves of a ring are as convex as the ring, quarters are not."""
+_DIAGONALS = np.array([(1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)]) / np.sqrt(3)
 _SPECK = 1e-11
 """[m^3] Parts smaller than a cube of 0.2 mm are dropped."""
-_SAMPLES = 20_000
-"""Points at which pieces are compared with the mesh."""
 _SMALL_HOLE = 0.03
 """Holes of at most so much of the mesh's area are closed; larger ones are openings."""
 _FACES = 3000
@@ -106,60 +90,26 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings(), progress: 
         ObjectError: the mesh is concave and manifold3d, which cuts it, is not installed.
     """
     end = time.process_time() + settings.seconds
-    if _depth(mesh) <= settings.hull_depth:
-        hulls = [np.asarray(mesh.vertices)]
-        solid = mesh if mesh.is_volume else shape_mesh(hull(mesh.vertices))
-        vertices, faces = np.asarray(solid.vertices), np.asarray(solid.faces)
+    surface = _Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    around = mesh.convex_hull
+    if surface.farthest(around.vertices, around.faces) <= settings.hull_depth * np.linalg.norm(mesh.extents):
+        solid, shapes = mesh if mesh.is_volume else around, (limited_hull(mesh.vertices, settings.max_vertices),)
+        vertices, faces, piece = np.asarray(solid.vertices), np.asarray(solid.faces), shape_mesh(shapes[0])
+        off = [surface.farthest(piece.vertices, piece.faces)]
     else:
         whole = as_solid(mesh, settings.thickness)
-        vertices, faces = _arrays(whole)
-        hulls = [_arrays(piece)[0] for piece in _convex(_Solid(whole.simplify(settings.tolerance / 10)), settings, end, progress)]
-    shapes = tuple(limited_hull(points, settings.max_vertices) for points in hulls)
+        pieces = _convex(_Solid(whole.simplify(settings.tolerance / 10)), settings, end, progress)
+        shapes = tuple(limited_hull(_arrays(piece)[0], settings.max_vertices) for piece in pieces)
+        surface = _Solid(whole)
+        vertices, faces = surface.vertices, surface.faces
+        off = [surface.excess(_manifold3d().Manifold.hull_points(shape.geometry.vertices)) for shape in shapes]
     com, inertia = mass_properties(vertices, faces, 1.0)
     corners = vertices[faces]
     volume = float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
-    deviation = _deviation(vertices, faces, shapes)
-    return Pieces(shapes=shapes, deviation=deviation, volume=volume, com=com, inertia=inertia, in_time=bool(time.process_time() < end))
-
-
-def cached_pieces(
-    mesh: trimesh.Trimesh, source: str, settings: Settings = Settings(), progress: Progress = lambda parts, worst: None
-) -> Pieces:
-    """The pieces of a mesh, from the cache if they are there. Those of a decomposition that time cut short are not kept.
-
-    Args:
-        mesh: the mesh.
-        source: SHA-256 of what it was read from.
-        settings: how to decompose it.
-        progress: see :func:`decompose`.
-    """
-    config = asdict(replace(settings, seconds=0.0))
-    key = hashlib.sha256(json.dumps([SCHEMA_NAME, source, config], sort_keys=True).encode()).hexdigest()
-    path = cache_folder() / "objects" / f"{key}.npz"
-    if path.is_file():
-        try:
-            arrays = read_npz(path, SCHEMA_NAME, SCHEMA, what="cached convex pieces")
-            shapes = tuple(hull(part) for part in np.split(arrays["vertices"], arrays["offsets"][1:-1]))
-            deviation, volume = float(arrays["deviation"]), float(arrays["volume"])
-            return Pieces(shapes=shapes, deviation=deviation, volume=volume, com=arrays["com"], inertia=arrays["inertia"], cached=True)
-        except (FileFormatError, ObjectError):
-            path.unlink(missing_ok=True)  # damaged: make it again
-    pieces = decompose(mesh, settings, progress)
-    parts = [piece.geometry.vertices for piece in pieces.shapes if piece.geometry.vertices is not None]
-    offsets = np.cumsum([0, *map(len, parts)])
-    numbers = {name: np.asarray(getattr(pieces, name)) for name in ("deviation", "volume", "com", "inertia")}
-    arrays = {"vertices": np.concatenate(parts), "offsets": offsets, **numbers}
-    with suppress(XResetError):  # a cache that cannot be written costs time, nothing else
-        if pieces.in_time:
-            write_npz(path, SCHEMA_NAME, arrays, config=config, inputs={"mesh": source})
-    return pieces
-
-
-def cache_folder() -> Path:
-    """``XRESET_CACHE``, or ``xreset`` in the user's cache folder."""
-    if os.environ.get("XRESET_CACHE"):
-        return Path(os.environ["XRESET_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "xreset"
+    return Pieces(
+        shapes=shapes, deviation=max(*off, surface.bare(shapes)), volume=volume, com=com, inertia=inertia,
+        in_time=time.process_time() < end,
+    )  # fmt: skip
 
 
 # Solids ----------------------------------------------------------------------------------------------------------------------------------
@@ -168,53 +118,33 @@ def cache_folder() -> Path:
 def as_solid(mesh: trimesh.Trimesh, thickness: float = Settings.thickness) -> Manifold:
     """The mesh as a solid that can be cut.
 
-    If it is not closed, its small holes are capped. If that does not make it a volume, it becomes a wall of that thickness [m] along its
-    triangles. Where more than two of them share an edge, each becomes a plate, and what the plates enclose is filled: a scan with cracks
-    becomes a solid, half the thickness larger.
+    If it is not closed, its small holes are capped. If that does not make it a volume, each triangle becomes a plate of that thickness
+    [m], its sides along the normals of its corners, and what the plates enclose is filled: a sheet becomes a wall, a scan with cracks a
+    solid, half the thickness larger.
 
     Raises:
         ObjectError: it encloses nothing.
     """
+    import trimesh
+
+    m3 = _manifold3d()
     if not mesh.is_volume:
         mesh = _capped(_thinned(mesh))
-    for make in (lambda: mesh, lambda: _wall(mesh, thickness)):
-        solid = _manifold(make())
-        if solid is not None:
+    if mesh.is_volume:
+        arrays = np.ascontiguousarray(mesh.vertices, dtype=np.float64), np.ascontiguousarray(mesh.faces, dtype=np.uint64)
+        solid = m3.Manifold(m3.Mesh64(*arrays))
+        if solid.status() == m3.Error.NoError and solid.volume() > 0:
             return solid
-    m3 = _manifold3d()
-    corners = mesh.vertices[mesh.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    half = (normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12) * (thickness / 2))[:, None]
-    plates = [m3.Manifold.hull_points(points) for points in np.concatenate((corners + half, corners - half), axis=1)]
-    union = m3.Manifold.batch_boolean(plates, m3.OpType.Add)
+    mesh = mesh.copy()
+    trimesh.repair.fix_winding(mesh)
+    corners, half = mesh.vertices[mesh.faces], thickness / 2
+    sides = [half * normals for normals in (mesh.vertex_normals[mesh.faces], mesh.face_normals[:, None])]
+    ends = np.concatenate([corners + sign * side for side in sides for sign in (1, -1)], axis=1)
+    union = m3.Manifold.batch_boolean([m3.Manifold.hull_points(points) for points in ends], m3.OpType.Add)
     outer = [part for part in union.decompose() if part.volume() > 0]  # surfaces of cavities have negative volume
     if not outer:
         raise ObjectError("the mesh encloses no solid, however its holes are closed; repair it, for example in MeshLab or Blender.")
     return m3.Manifold.batch_boolean(outer, m3.OpType.Add)
-
-
-def _manifold(mesh: trimesh.Trimesh) -> Manifold | None:
-    """The closed mesh as a solid; None if it is not closed."""
-    m3 = _manifold3d()
-    if not mesh.is_volume:
-        return None
-    arrays = np.ascontiguousarray(mesh.vertices, dtype=np.float64), np.ascontiguousarray(mesh.faces, dtype=np.uint64)
-    solid = m3.Manifold(m3.Mesh64(*arrays))
-    return solid if solid.status() == m3.Error.NoError and solid.volume() > 0 else None
-
-
-def _wall(mesh: trimesh.Trimesh, thickness: float) -> trimesh.Trimesh:
-    """A wall along the triangles; closed if no more than two of them share an edge."""
-    import trimesh
-
-    mesh = mesh.copy()
-    trimesh.repair.fix_winding(mesh)
-    half, count = mesh.vertex_normals * (thickness / 2), len(mesh.vertices)
-    rim = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
-    a, b = rim.T
-    sides = np.concatenate((np.column_stack((b, a, a + count)), np.column_stack((b, a + count, b + count))))
-    faces = np.concatenate((mesh.faces, mesh.faces[:, ::-1] + count, sides))
-    return trimesh.Trimesh(np.concatenate((mesh.vertices + half, mesh.vertices - half)), faces, process=False)
 
 
 def _thinned(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -245,21 +175,37 @@ def _capped(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
 
 
-class _Solid:
+class _Surface:
+    """Points of a surface, close together."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        self.vertices, self.faces = vertices, faces
+        self._points = np.concatenate((vertices, _samples(vertices, faces, 60_000)))
+        self._tree = cKDTree(self._points)
+
+    def farthest(self, vertices: np.ndarray, faces: np.ndarray) -> float:
+        """[m] From the farthest point of another surface (sampled) to this one."""
+        return float(self._tree.query(np.concatenate((vertices, _samples(vertices, faces, 400))))[0].max())
+
+    def bare(self, shapes: Sequence[Shape]) -> float:
+        """[m] How far its worst point is outside of all pieces: exact next to a face, too little next to an edge."""
+        distance = np.full(len(self._points), np.inf)
+        for planes in map(half_spaces, shapes):
+            np.minimum(distance, (self._points @ planes[:, :3].T + planes[:, 3]).max(axis=1), out=distance)
+        return float(distance.max().clip(0.0))
+
+
+class _Solid(_Surface):
     """A solid, and how far a convex piece stands off its surface."""
 
     def __init__(self, solid: Manifold) -> None:
+        super().__init__(*_arrays(solid))
         self.solid = solid
-        vertices, faces = _arrays(solid)
-        self._tree = cKDTree(np.concatenate((vertices, _samples(vertices, faces, 60_000)[0])))
 
     def excess(self, piece: Manifold) -> float:
         """[m] How far the farthest point of a piece outside the solid is from its surface (sampled)."""
         outside = piece - self.solid
-        if outside.is_empty() or outside.volume() < _SPECK / 100:
-            return 0.0
-        vertices, faces = _arrays(outside)
-        return float(self._tree.query(np.concatenate((vertices, _samples(vertices, faces, 400)[0])))[0].max())
+        return 0.0 if outside.volume() < _SPECK / 100 else self.farthest(*_arrays(outside))
 
 
 def _convex(solid: _Solid, settings: Settings, end: float, progress: Progress) -> list[Manifold]:
@@ -268,7 +214,7 @@ def _convex(solid: _Solid, settings: Settings, end: float, progress: Progress) -
     tolerance = max(settings.tolerance, *(solid.excess(piece) for piece in pieces))
     pieces = _joined(solid, pieces, tolerance, end)
     while len(pieces) > settings.max_pieces and time.process_time() < end:
-        tolerance *= 1.25
+        tolerance *= 1.1
         progress(len(pieces), tolerance)
         pieces = _joined(solid, pieces, tolerance, end)
     return pieces
@@ -364,8 +310,8 @@ def _arrays(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts).astype(np.int64)
 
 
-def _samples(vertices: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points [count, 3] uniform over the triangles' area, and their triangles [count]; the same for the same mesh."""
+def _samples(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
+    """Points [count, 3] uniform over the triangles' area; the same for the same mesh."""
     rng = np.random.default_rng(0)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -373,7 +319,7 @@ def _samples(vertices: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.nd
     u, v = rng.random((2, count, 1))
     fold = u + v > 1
     u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
-    return a[face] + u * (b - a)[face] + v * (c - a)[face], face
+    return a[face] + u * (b - a)[face] + v * (c - a)[face]
 
 
 def _manifold3d() -> Any:
@@ -399,54 +345,11 @@ def limited_hull(points: np.ndarray, max_vertices: int) -> Shape:
     assert vertices is not None
     if len(vertices) <= max_vertices:
         return full
-    chosen = sorted({int(i) for axis in range(3) for i in (vertices[:, axis].argmin(), vertices[:, axis].argmax())})
-    while len(chosen) < 4:
-        chosen.append(_farthest_from_span(vertices, chosen))
+    along = vertices @ np.vstack((np.eye(3), _DIAGONALS)).T
+    chosen = sorted({*along.argmin(axis=0).tolist(), *along.argmax(axis=0).tolist()})
     while len(chosen) < max_vertices:
         inner = ConvexHull(vertices[chosen], qhull_options="QJ")  # joggled: the first few may be coplanar
         outside = (vertices @ inner.equations[:, :3].T + inner.equations[:, 3]).max(axis=1)
         outside[chosen] = -np.inf
         chosen.append(int(outside.argmax()))
     return hull(vertices[chosen])
-
-
-def _farthest_from_span(vertices: np.ndarray, chosen: list[int]) -> int:
-    rest = vertices - vertices[chosen[0]]
-    basis = np.linalg.qr((vertices[chosen[1:]] - vertices[chosen[0]]).T)[0]
-    return int(np.linalg.norm(rest - rest @ basis @ basis.T, axis=1).argmax())
-
-
-# Deviation -------------------------------------------------------------------------------------------------------------------------------
-
-
-def _deviation(vertices: np.ndarray, faces: np.ndarray, shapes: Sequence[Shape]) -> float:
-    """[m] How far pieces stand off the surface of a solid, or leave it bare, at the worst of points on both (sampled)."""
-    planes = [half_spaces(shape) for shape in shapes]
-
-    def beyond(points: np.ndarray, skip: int | None = None) -> np.ndarray:
-        """[n] how far points are outside the nearest piece: exact next to a face, too little next to an edge."""
-        others = [piece for i, piece in enumerate(planes) if i != skip]
-        return np.min([np.full(len(points), np.inf), *((points @ p[:, :3].T + p[:, 3]).max(axis=1) for p in others)], axis=0)
-
-    bare = beyond(_samples(vertices, faces, _SAMPLES)[0]).max()
-    own, face = _samples(vertices, faces, 10 * _SAMPLES)
-    corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[face]
-    tree, worst = cKDTree(own), 0.0
-    for i, shape in enumerate(shapes):
-        mesh = shape_mesh(shape)
-        points = _samples(np.asarray(mesh.vertices), np.asarray(mesh.faces), max(200, _SAMPLES // len(shapes)))[0]
-        points = points[beyond(points, i) > 0]
-        off, nearest = tree.query(points)
-        outside = ((points - own[nearest]) * normals[nearest]).sum(axis=1) > 0  # those inside the solid are where pieces meet
-        worst = max(worst, float(off[outside].max(initial=0.0)))
-    return float(max(worst, bare, 0.0))
-
-
-def _depth(mesh: trimesh.Trimesh) -> float:
-    """Largest distance of the convex hull's surface from the mesh's, as a fraction of the bounding box's diagonal (sampled)."""
-    import trimesh
-
-    hull_points = trimesh.sample.sample_surface(mesh.convex_hull, 2000, seed=0)[0]
-    own_points = trimesh.sample.sample_surface(mesh, 40000, seed=0)[0]
-    return float(cKDTree(own_points).query(hull_points)[0].max() / np.linalg.norm(mesh.extents))

@@ -13,7 +13,8 @@ import numpy as np
 from xreset.errors import ObjectError
 from xreset.files import atomic_write, file_hash, max_bytes
 from xreset.geometry.shapes import shell_properties
-from xreset.objects.decompose import Progress, Settings, cached_pieces
+from xreset.objects.cache import cached_pieces
+from xreset.objects.decompose import Progress, Settings
 from xreset.objects.properties import Properties, properties_of
 from xreset.objects.ycb import MASSES
 from xreset.spec import ObjectSpec

@@ -28,6 +28,10 @@ Finite = Annotated[T, Rule("a finite number", isfinite)]
 Share = Annotated[T, Rule("a number from 0 to 1", lambda x: 0 <= x <= 1)]
 Range = Annotated[tuple[float, float], Rule("two finite numbers, 0 or more, the lower one first", lambda x: 0 <= x[0] <= x[1] < inf)]
 
+Text = Annotated[str, Rule("a text", lambda text: bool(text.strip()) and text.isprintable())]
+Number = Annotated[float, Rule("a finite number, and no huge one", lambda x: abs(x) <= 1e9)]
+"""Of a robot's description: stiffnesses reach 1e5, everything else far less."""
+
 
 @dataclass(frozen=True)
 class Only:

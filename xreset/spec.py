@@ -10,9 +10,11 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+
+from xreset.checks import Number, Rule, Text
 
 GRAVITY = 9.81
 """Magnitude of gravity in m/s^2; it points along -z."""
@@ -79,23 +81,23 @@ class JointSpec:
 class MimicSpec:
     """A joint that follows an actuated one: q = multiplier * q_source + offset."""
 
-    joint: str
-    source: str
-    multiplier: float = 1.0
-    offset: float = 0.0
+    joint: Text
+    source: Text
+    multiplier: Number = 1.0
+    offset: Number = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class FingertipSpec:
     """A fingertip: a frame at the pad, and the links whose contact counts as this finger's."""
 
-    name: str
+    name: Text
     """``thumb`` must exist; the other names are free."""
-    link: str
+    link: Text
     """URDF link (a fixed frame) at the tip."""
-    contact_links: tuple[str, ...]
+    contact_links: tuple[Text, ...]
     """URDF links whose contact with the object counts as this finger's contact; they have the fingertip's friction."""
-    keypoint: str
+    keypoint: Annotated[str, Rule(f"one of {', '.join(KEYPOINTS)}", KEYPOINTS.__contains__)]
     """The human keypoint that it follows, one of :data:`KEYPOINTS`."""
 
 
@@ -113,13 +115,13 @@ class KeypointSpec:
 class PlacementSpec:
     """How good a robot's base placement is, and how it was found (``xreset robots place``)."""
 
-    reached: float
+    reached: Number
     """Share of wrist poses that the arm reaches, each on its own."""
-    followed: float
+    followed: Number
     """Share of annotated frames that are valid when the arm follows the motions."""
     frames: int
     """Annotated frames of those motions."""
-    command: str
+    command: Text
     """What found it."""
 
 

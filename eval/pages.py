@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from functools import cache
 from typing import Any
 
@@ -10,11 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from xreset import __version__
 from xreset.eval.table import escape, markdown
-
-
-def short_name(name: str) -> str:
-    """``005_tomato_soup_can`` -> ``tomato soup can``."""
-    return re.sub(r"^\d+_", "", name).replace("_", " ")
+from xreset.text import short_name
 
 
 def percent(share: float, digits: int = 0) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
 from typing import Any
 
@@ -32,3 +33,8 @@ def is_plain(text: str) -> bool:
 def plain(text: str) -> str:
     """The text with every other character written as an escape."""
     return text if is_plain(text) else "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
+
+
+def short_name(name: str, gap: str = " ") -> str:
+    """``005_tomato_soup_can`` -> ``tomato soup can``, with another ``gap`` between its words for files."""
+    return re.sub(r"^\d+_(?=.)", "", name).replace("_", gap)

@@ -14,12 +14,12 @@ import numpy as np
 
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError
-from xreset.eval.pages import short_name
 from xreset.eval.report.clips import recorded_episode
 from xreset.eval.report.read import results_in
 from xreset.eval.results import mesh_folder, read_episodes, read_results, read_traces
 from xreset.eval.rollout import Episode, Trace
 from xreset.spec import RobotSpec
+from xreset.text import short_name
 
 TASK = "Grasp the {object} and bring it to the goal pose."
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from xreset.eval.pages import short_name
 from xreset.eval.report.groups import Group, Scores
 from xreset.eval.report.read import ASPECTS, Training, differences
 from xreset.eval.results import EvalResult
+from xreset.text import short_name
 
 _OF_EVALUATION = ("task.termination.", "task.reset.spawn_", "task.reset.home_noise", "task.timestep")
 """Fields of a training's task that its evaluation keeps (:func:`xreset.task.config.evaluation_task`) and that make it easier or harder."""

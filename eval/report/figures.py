@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xreset.eval.pages import short_name
 from xreset.eval.plots import COLORS, INK, percent_axis, picture, svg
 from xreset.eval.report.clips import Clip
 from xreset.eval.report.groups import Group, Scores, engines_of
@@ -18,6 +17,7 @@ from xreset.eval.report.progress import Line, X, line
 from xreset.eval.report.read import Curve
 from xreset.eval.results import EvalResult
 from xreset.learning.clock import SHARES
+from xreset.text import short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from xreset.description import load_robot
 from xreset.errors import RunError, XResetError
-from xreset.eval.pages import render, short_name
+from xreset.eval.pages import render
 from xreset.eval.report import fairness, lifting, tables
 from xreset.eval.report.clips import Clip, Strip, camera_for, choose_failures, choose_sequence, draw_clip, draw_strip, recorded_episode
 from xreset.eval.report.figures import write_overview, write_picture
@@ -20,6 +20,7 @@ from xreset.eval.results import EvalResult, mesh_folder, read_traces
 from xreset.eval.table import Rows
 from xreset.files import atomic_write, claim_folder
 from xreset.objects import load_object
+from xreset.text import short_name
 
 
 @dataclass(frozen=True, kw_only=True)

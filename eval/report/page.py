@@ -8,13 +8,14 @@ from collections.abc import Sequence
 from html import escape
 
 from xreset import __version__
-from xreset.eval.pages import percent, render, short_name
+from xreset.eval.pages import percent, render
 from xreset.eval.plots import COLORS
 from xreset.eval.report import figures
 from xreset.eval.report.clips import Clip, Strip, count_failures, encode_mp4
 from xreset.eval.report.read import ReportData
 from xreset.eval.rollout import Episode
 from xreset.pictures.raster import encode_png
+from xreset.text import short_name
 
 
 def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) -> str:

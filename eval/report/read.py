@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from xreset.errors import FileFormatError, RunError, XResetError
-from xreset.eval.pages import short_name
 from xreset.eval.results import EvalResult, read_episodes, read_results
 from xreset.eval.rollout import Episode
 from xreset.eval.stress import Stress, read_stress
@@ -21,6 +20,7 @@ from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
 from xreset.learning.run import RunInfo, read_run
 from xreset.policies import results_folder, shipped
+from xreset.text import short_name
 
 CURVES = {
     "episode/return": "episode return",

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from xreset.demos import read_demos
 from xreset.errors import DemoError, FileFormatError, RunError, XResetError
 from xreset.eval.study.file import Data, Evaluation, Runs, Study, merged
-from xreset.eval.study.subset import Subset, refuse_other, short
+from xreset.eval.study.subset import Subset, refuse_other
 from xreset.files import claim, file_hash
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
@@ -27,6 +27,7 @@ from xreset.learning.recipes import starting_config
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.objects import canonical_name, object_names
 from xreset.plugins import backend_status
+from xreset.text import short_name
 from xreset.typed import from_dict
 
 if TYPE_CHECKING:
@@ -391,7 +392,7 @@ def _runs(study: Study, group: str, spec: Runs, objects: tuple[str, ...], out: P
 
 
 def _folder(out: Path, group: str, spec: Runs, objects: tuple[str, ...], seed: int) -> Path:
-    return out / "-".join([group, *map(short, objects if spec.alone else ()), f"seed{seed}"])
+    return out / "-".join([group, *(short_name(name, "_") for name in (objects if spec.alone else ())), f"seed{seed}"])
 
 
 def _engines(wanted: Iterable[str]) -> tuple[list[str], dict[str, str]]:

@@ -6,15 +6,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from xreset.eval.pages import render, short_name
+from xreset.eval.pages import render
 from xreset.eval.report import fairness
 from xreset.eval.report.make import compare
 from xreset.eval.study.paper import paper_training
-from xreset.eval.study.plan import EvalStep, Plan, Run, TrainStep, short
+from xreset.eval.study.plan import EvalStep, Plan, Run, TrainStep
 from xreset.eval.study.tables import Made, as_rows, broken, draw, fill, versions
 from xreset.eval.table import Rows
 from xreset.files import atomic_write
 from xreset.learning.clock import Lift, read_lift
+from xreset.text import short_name
 
 _ALIKE = 0.05
 """Trainings whose lengths differ by less are of equal length."""
@@ -124,7 +125,7 @@ def _compare(plan: Plan, out: Path) -> list[str]:
             by_objects.setdefault(run.objects, []).append(run)
     names = []
     for objects, runs in by_objects.items():
-        names.append(f"compare-{short(objects[0]) if len(objects) == 1 else f'{len(objects)}-objects'}")
+        names.append(f"compare-{short_name(objects[0], '_') if len(objects) == 1 else f'{len(objects)}-objects'}")
         compare([f"{run.group}-seed{run.seed}={run.folder}" for run in runs], out / names[-1])
     return names
 

@@ -11,7 +11,7 @@ from xreset.demos import Demos, read_demos, synthesize, write_demos
 from xreset.errors import RunError
 from xreset.eval.study.file import Data
 from xreset.files import file_hash, read_json, write_json
-from xreset.text import shown
+from xreset.text import short_name, shown
 
 SUBSET_SCHEMA = "xreset-subset/1"
 
@@ -33,7 +33,7 @@ class Subset:
     @property
     def folder(self) -> Path:
         """Named after what it holds."""
-        parts = [self.name, "+".join(map(short, self.objects)), str(self.per_object or "")]
+        parts = [self.name, "+".join(short_name(name, "_") for name in self.objects), str(self.per_object or "")]
         return self.out / "data" / "-".join(filter(None, parts))
 
     @property
@@ -83,12 +83,6 @@ def source_demos(data: Data, given: Path, objects: tuple[str, ...]) -> Demos:
     if data.demos:
         return read_demos(given / data.demos)
     return synthesize(objects or None, data.synthetic_per_object, data.synthetic_seed)
-
-
-def short(name: str) -> str:
-    """``005_tomato_soup_can`` -> ``tomato_soup_can``."""
-    number, _, rest = name.partition("_")
-    return rest if number.isdecimal() and rest else name
 
 
 def refuse_other(problem: str, what: str, there: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> None:

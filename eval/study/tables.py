@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.eval.pages import short_name
 from xreset.eval.plots import COLORS, INK, percent_axis, picture
 from xreset.eval.report.groups import Group, Scores, estimate, scores
 from xreset.eval.report.read import Training, read_training
@@ -18,6 +17,7 @@ from xreset.eval.study.paper import ALL, METRICS, PaperTable, paper_tables
 from xreset.eval.study.plan import Plan
 from xreset.eval.table import Rows
 from xreset.objects import canonical_name
+from xreset.text import short_name
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -59,7 +59,7 @@ def _demos_view(path: Path, folder: Path | None) -> View:
     demos, human = _human(demos, objects)
     owner = demos.sequence_of_frame
     contact = np.asarray(human.touching.any(axis=1))
-    touched = np.array([contact[demos.frames(s)][: i + 1].any() for s in range(len(demos)) for i in range(_length(demos, s))])
+    touched = np.concatenate([np.logical_or.accumulate(contact[demos.frames(s)]) for s in range(len(demos))])
     names = [spec.name for spec in objects]
     goal_pos, goal_quat = demos.goal_pose
     return View(
@@ -89,9 +89,8 @@ def _retargeted_view(path: Path, folder: Path | None, robot: str | None, demos: 
     check_retargeted(path, data, spec)
     objects = load_objects(sorted(set(data.object_name.tolist())), folder)
     names = [o.name for o in objects]
-    owner = np.repeat(np.arange(len(data.sequence_name)), np.diff(data.frame_offsets))
+    owner = data.sequence_of_frame
     frame = np.arange(len(data.valid)) - data.frame_offsets[owner]
-    first = data.first_contact[owner]
     return View(
         kind="robot trajectories",
         robot=spec,
@@ -106,7 +105,7 @@ def _retargeted_view(path: Path, folder: Path | None, robot: str | None, demos: 
         goal_pos=data.goal_pos,
         goal_quat=data.goal_quat_wxyz,
         contact=data.contact,
-        post_contact=(first >= 0) & (frame >= first),
+        post_contact=data.post_contact,
         reason=tuple("" if reason == 0 else data.reason_names[reason] for reason in data.reason.tolist()),
         reasons=data.reason_names[1:],
         joint_pos=data.joint_pos,
@@ -218,7 +217,3 @@ def _human_of(path: Path, demos_path: Path, objects: tuple[ObjectSpec, ...], seq
     _, human = _human(demos, objects)
     rows = demos.frame_offsets[owner] + frame
     return Human(keypoints=human.keypoints[rows], touching=human.touching[rows], contacts=human.contacts[rows])
-
-
-def _length(demos: Demos, sequence: int) -> int:
-    return int(demos.frame_offsets[sequence + 1] - demos.frame_offsets[sequence])

@@ -15,7 +15,6 @@ from tests.test_cli import run
 from tests.toy_bank import toy_bank
 from xreset.accounts import accounts_path
 from xreset.geometry.kinematics import Kinematics
-from xreset.records import meta_of
 from xreset.resets.bank import read_bank, write_bank
 from xreset.resets.closing import with_closing_frames
 from xreset.resets.config import ClosingConfig, HoldConfig, SqueezeConfig
@@ -289,7 +288,7 @@ class CommandTest(unittest.TestCase):
         for words in ("5 to 2 cm", "2 of 2 states after contact press with 2.5 N", "1 (100%)", "8 states of 8"):
             self.assertIn(words, out)
         with np.load(self.folder / "b.npz") as file:
-            config = meta_of(dict(file))["config"]
+            config = json.loads(str(file["meta"]))["config"]
         self.assertEqual(config["closing"], {"spacing": 0.0056, "within": 0.1})
         self.assertEqual(config["squeeze"]["force"], 2.5)
 

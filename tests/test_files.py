@@ -21,7 +21,7 @@ from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.errors import FileFormatError, XResetError
 from xreset.files import atomic_write, claim, read_json, write_json
-from xreset.records import Field, meta_of, read_npz, write_npz
+from xreset.records import Field, read_npz, write_npz
 from xreset.resets.bank import check_objects, read_bank, write_bank
 from xreset.spec import ObjectSpec
 from xreset.task.config import TaskConfig
@@ -199,8 +199,8 @@ class NpzTest(InFolder):
             np.testing.assert_array_equal(found[name], value)
             self.assertEqual(found[name].dtype, value.dtype)
         self.assertEqual(str(found["note"]), "hello")
-        self.assertEqual(meta_of(found)["config"], {"p": 0.5})
-        self.assertEqual(meta_of(found)["inputs"], {"a": "ff"})
+        self.assertEqual(json.loads(str(found["meta"]))["config"], {"p": 0.5})
+        self.assertEqual(json.loads(str(found["meta"]))["inputs"], {"a": "ff"})
 
     def test_the_same_content_gives_the_same_bytes(self):
         self.write()

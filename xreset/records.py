@@ -21,7 +21,7 @@ import numpy as np
 
 from xreset import __version__
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import RAISE_LIMIT, atomic_write, check_schema, max_bytes, must_exist, parse_json
+from xreset.files import RAISE_LIMIT, atomic_write, check_schema, max_bytes, must_exist
 from xreset.text import is_plain, shown
 
 T = TypeVar("T")
@@ -277,14 +277,6 @@ def unique_problem(names: np.ndarray) -> str | None:
     if (counts > 1).any():
         return f"sequence names must be unique, but {unique[np.argmax(counts)]!s} occurs {counts.max()} times."
     return None
-
-
-def meta_of(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Provenance of a file read with :func:`read_npz`: ``{"xreset", "config", "inputs"}``; empty if it has none."""
-    try:
-        return parse_json(str(arrays["meta"])) if "meta" in arrays else {}
-    except ValueError as error:
-        raise FileFormatError(f"the provenance of a file ('meta') is not valid JSON: {error}.") from error
 
 
 _KINDS = {"f": "floating-point", "i": "integer", "u": "unsigned", "b": "bool", "U": "text"}

@@ -107,8 +107,3 @@ def matrix_to_quat(R: Tensor) -> Tensor:
     )
     best = t.argmax(dim=-1)[..., None, None].expand(*t.shape[:-1], 1, 4)
     return quat_normalize(candidates.gather(-2, best).squeeze(-2))
-
-
-def quat_integrate(q: Tensor, omega: Tensor, dt: float) -> Tensor:
-    """[..., 4] orientation after turning for dt seconds at the world-frame angular velocity omega [..., 3] rad/s."""
-    return quat_normalize(quat_multiply(quat_from_axis_angle(omega * dt), q))

@@ -133,11 +133,6 @@ class ResetDistribution:
         self._home = tensor(robot.home)
         self._home_std = tensor(np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints]))
 
-    @property
-    def states_per_object(self) -> Tensor:
-        """[O] bank states of each object of the scene."""
-        return self._state_count
-
     def start_pose(self, sequence: Tensor) -> tuple[Tensor, Tensor]:
         """Where the object is at the start of given demonstrations [M]: position [M, 3] and quaternion [M, 4]."""
         return self._start_pos[sequence], self._start_quat[sequence]

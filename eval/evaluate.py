@@ -28,7 +28,7 @@ from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_co
 from xreset.records import npz_schema
 from xreset.resets.bank import ResetBank, check_retargeted
 from xreset.retarget.pipeline import SCHEMA as RETARGETED
-from xreset.retarget.pipeline import Retargeted, read_retargeted, rest_on_table, retarget
+from xreset.retarget.pipeline import Retargeted, read_retargeted, rest_on_table, retarget_demos
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
 from xreset.typed import from_dict
@@ -142,7 +142,7 @@ def load_motion(path: Path, robot: RobotSpec, objects_folder: Path | None, *, tr
         demos = read_demos(path)
         objects = tuple(demo_objects(demos, objects_folder).values())
         if trajectories:
-            data = retarget(demos, robot, objects)
+            data = retarget_demos(demos, robot, objects)
         else:
             demos = rest_on_table(demos, objects)
             return _starts_and_goals(robot, demos.sequence_name, demos.object_name, demos.frame_offsets, demos), None

@@ -36,7 +36,7 @@ from xreset.retarget.hand.problem import HandState
 from xreset.retarget.hand.solve import HandConfig, HandTargets, retarget_hand
 from xreset.retarget.least_squares import solve_chain
 from xreset.retarget.partial import discard, run_key
-from xreset.retarget.pipeline import RetargetConfig, rest_on_table, retarget
+from xreset.retarget.pipeline import RetargetConfig, rest_on_table, retarget_demos
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
 from xreset.spec import KEYPOINTS, Geometry, ObjectSpec, Shape, TableSpec
 
@@ -609,7 +609,9 @@ class PipelineTest(unittest.TestCase):
         cls.objects = list(demo_objects(demos).values())
         cls.config = RetargetConfig(arm=ArmConfig(restarts=12, branches=2))
         cls.ticks = []
-        cls.result = retarget(cls.demos, cls.robot, cls.objects, cls.config, progress=lambda done, total: cls.ticks.append((done, total)))
+        cls.result = retarget_demos(
+            cls.demos, cls.robot, cls.objects, cls.config, progress=lambda done, total: cls.ticks.append((done, total))
+        )
 
     def test_most_frames_of_a_synthetic_demonstration_are_valid(self):
         first = self.demos.frames(0)
@@ -658,7 +660,7 @@ class PipelineTest(unittest.TestCase):
         self.assertEqual([done for done, _ in self.ticks], sorted(done for done, _ in self.ticks))
 
     def test_the_same_inputs_give_the_same_file(self):
-        again = retarget(self.demos, self.robot, self.objects, self.config)
+        again = retarget_demos(self.demos, self.robot, self.objects, self.config)
         for name, result in (("a.npz", self.result), ("b.npz", again)):
             write_retargeted(self.folder / name, result, config={}, inputs={})
         self.assertEqual((self.folder / "a.npz").read_bytes(), (self.folder / "b.npz").read_bytes())
@@ -685,7 +687,7 @@ class PipelineTest(unittest.TestCase):
 
     def test_an_object_that_was_not_given_is_named(self):
         with self.assertRaisesRegex(DemoError, "005_tomato_soup_can"):
-            retarget(self.demos, self.robot, [])
+            retarget_demos(self.demos, self.robot, [])
 
     def test_the_command_writes_file_and_picture_for_a_gripper(self):
         from xreset.cli.retarget import retarget as command
@@ -727,7 +729,7 @@ class StopAndContinueTest(unittest.TestCase):
         frames |= {name: getattr(demos, name)[short] for name in ("object_pos", "object_quat_wxyz")}
         cls.demos = dataclasses.replace(demos, frame_offsets=np.arange(0, 24, 6, dtype=np.int32), **frames)
         cls.objects = list(demo_objects(cls.demos).values())
-        cls.whole = retarget(cls.demos, cls.robot, cls.objects, cls.CONFIG)
+        cls.whole = retarget_demos(cls.demos, cls.robot, cls.objects, cls.CONFIG)
 
     def setUp(self):
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory())) / "out.npz.partial"
@@ -742,7 +744,7 @@ class StopAndContinueTest(unittest.TestCase):
                 if stop_in is not None and int(done) == stop_in:
                     raise KeyboardInterrupt
 
-        return retarget(
+        return retarget_demos(
             demos or self.demos, robot or self.robot, self.objects, config or self.CONFIG, progress=progress, partial=self.folder
         )
 
@@ -846,7 +848,7 @@ class StopAndContinueTest(unittest.TestCase):
 class RealDataTest(unittest.TestCase):
     def test_fingertips_follow_a_real_hand(self):
         demos = read_demos(data_dir() / "dexycb_right_9x20.npz").select(objects=["soup"], max_per_object=1)
-        result = retarget(demos, robots.load("ur7e-sharpa"), list(demo_objects(demos).values()))
+        result = retarget_demos(demos, robots.load("ur7e-sharpa"), list(demo_objects(demos).values()))
         self.assertLess(result.hand_error[result.annotated].mean(), 0.010)
         self.assertGreater(result.valid.sum() / result.annotated.sum(), 0.9)
 

@@ -371,14 +371,14 @@ class RealGraspTest(unittest.TestCase):
         from xreset.eval.engines.actions import grasp_and_lift
         from xreset.eval.engines.grasps import Frames, find_grasps
         from xreset.objects import load_objects
-        from xreset.retarget.pipeline import retarget
+        from xreset.retarget.pipeline import retarget_demos
 
         folder = data_dir()
         robot = robots.load("ur7e-sharpa")
         (can,) = load_objects(["005_tomato_soup_can"], folder / "ycb")
         demos = read_demos(folder / "dexycb_right_9x20.npz")
         first = int(np.flatnonzero(np.asarray(demos.object_name) == can.name)[0])
-        data = retarget(demos.select(indices=[first]), robot, [can])
+        data = retarget_demos(demos.select(indices=[first]), robot, [can])
         actions = grasp_and_lift(robot, can, find_grasps(Frames.of_retargeted(data), robot, (can,), 1, where="table"))
         result = trace(actions, engine("mujoco", workers=0), [engine("sapien")], perturbed=1)
         self.assertGreater(result.reference.lifted, 0.07)

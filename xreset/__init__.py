@@ -12,66 +12,23 @@
 Importing this package loads nothing heavy: no torch, no physics engine, no display. A name is imported when it is first used.
 """
 
+import re
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from xreset.demos.archive import read_demos
-    from xreset.demos.synth import synthesize
-    from xreset.description import load_robot
-    from xreset.env import ManipulationEnv, make_env
-    from xreset.eval.evaluate import evaluate
-    from xreset.learning.train import train
-    from xreset.objects.catalogue import load_object
-    from xreset.plugins import make_backend
-    from xreset.policy import OnnxPolicy
-    from xreset.resets.bank import read_bank
-    from xreset.resets.filter import make_bank
-    from xreset.retarget.pipeline import retarget as retarget_demos
-    from xreset.vector_env import VectorEnv
+from pathlib import Path
+from typing import Any
 
 __version__ = "0.1.0"
 
-_HOMES = {
-    "ManipulationEnv": "xreset.env",
-    "OnnxPolicy": "xreset.policy",
-    "evaluate": "xreset.eval.evaluate",
-    "load_object": "xreset.objects.catalogue",
-    "load_robot": "xreset.description",
-    "make_backend": "xreset.plugins",
-    "make_bank": "xreset.resets.filter",
-    "make_env": "xreset.env",
-    "read_bank": "xreset.resets.bank",
-    "read_demos": "xreset.demos.archive",
-    "retarget_demos": "xreset.retarget.pipeline",  # xreset.retarget is the package
-    "synthesize": "xreset.demos.synth",
-    "train": "xreset.learning.train",
-    "VectorEnv": "xreset.vector_env",
-}
-_OWN_NAMES = {"retarget_demos": "retarget"}
-
-__all__ = [
-    "ManipulationEnv",
-    "OnnxPolicy",
-    "VectorEnv",
-    "evaluate",
-    "load_object",
-    "load_robot",
-    "make_backend",
-    "make_bank",
-    "make_env",
-    "read_bank",
-    "read_demos",
-    "retarget_demos",
-    "synthesize",
-    "train",
-]
+_STUB = Path(__file__).with_suffix(".pyi").read_text()
+_HOMES = {name: module for module, name in re.findall(r"^from (\S+) import (\w+) as \w+$", _STUB, re.MULTILINE)}
+"""Public name -> its module. The stub, which editors read, is the one list of them."""
+__all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'xreset' has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_HOMES[name]), _OWN_NAMES.get(name, name))
+    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
     return value
 
 

@@ -24,7 +24,7 @@ from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import ResetBank, check_objects, check_retargeted, check_robot, read_bank
 from xreset.retarget.file import SCHEMA as RETARGETED
 from xreset.retarget.file import read_retargeted
-from xreset.retarget.pipeline import retarget
+from xreset.retarget.pipeline import retarget_demos
 from xreset.spec import ObjectSpec, RobotSpec
 
 
@@ -60,7 +60,7 @@ def load_frames(
         demos, spec = read_demos(path), load_robot(robot)
         objects = wanted(demos.object_name.tolist())
         demos = demos.select(objects=[o.name for o in objects])
-        data = retarget(demos, spec, objects, progress=lambda done, total: progress("retargeting", done, total))
+        data = retarget_demos(demos, spec, objects, progress=lambda done, total: progress("retargeting", done, total))
         return spec, objects, Frames.of_retargeted(data)
     if schema not in (RETARGETED, BANK):
         raise FileFormatError(f"{path} states schema {schema!r}; grasps come from {RETARGETED!r}, {BANK!r} or {DEMOS!r}.")

@@ -70,7 +70,7 @@ def retarget(
     try:
         with Progress(console) as bar:
             task = bar.add_task("sequences", total=chosen.num_sequences)
-            result = pipeline.retarget(
+            result = pipeline.retarget_demos(
                 chosen, spec, list(specs.values()), config,
                 progress=lambda done, total: bar.update(task, completed=done, total=total), partial=partial, timing=timing,
                 device=device,

@@ -27,7 +27,7 @@ from xreset.retarget.partial import Batch, Partial, run_key
 from xreset.retarget.validity import REASONS, Thresholds, classify
 from xreset.spec import ObjectSpec, RobotSpec
 
-__all__ = ["SCHEMA", "RetargetConfig", "Retargeted", "read_retargeted", "rest_on_table", "retarget", "write_retargeted"]
+__all__ = ["SCHEMA", "RetargetConfig", "Retargeted", "read_retargeted", "rest_on_table", "retarget_demos", "write_retargeted"]
 
 _SEQUENCES_PER_BATCH = 24
 """Enough to make batching pay; few enough to keep memory below about 1 GB and progress visible."""
@@ -72,7 +72,7 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def retarget(
+def retarget_demos(
     demos: Demos,
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],

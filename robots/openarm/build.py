@@ -6,14 +6,13 @@ shapes only as meshes: those here are primitives sized from link lengths, and th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from xreset.geometry.urdf import Joint, Link, RobotTree
-from xreset.geometry.urdf_writer import axes, box, capsule, cylinder, fixed, frame, inertia_matrix, pose, urdf_text
-from xreset.spec import MimicSpec, Shape
+from xreset.geometry.urdf_writer import ArmLink, axes, box, capsule, cylinder, fixed, frame, inertia_matrix, pose, urdf_text
+from xreset.spec import MimicSpec
 
 URDF = Path(__file__).parent / "robot.urdf"
 
@@ -24,33 +23,6 @@ Figures: the OpenArm project's robot description (arm v10). Shapes are primitive
 ROTOR_MASS = 0.2
 """Reflected inertia [kg] of the gripper's motor, added to each jaw. A jaw alone (0.036 kg) on a stiff drive would be too fast for the
 physics step; a real rotor slows it, and as a link's mass it means the same thing in every engine, which armature does not."""
-
-Vector = tuple[float, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArmLink:
-    """A link of the arm and the revolute joint before it."""
-
-    name: str
-    joint: str
-    xyz: Vector
-    """Joint origin in the parent link [m]; never turned."""
-    axis: Vector
-    range: tuple[float, float]
-    """[rad]"""
-    velocity: float
-    """[rad/s]"""
-    effort: float
-    """[N m]"""
-    mass: float
-    """[kg]"""
-    com: Vector
-    """[m]"""
-    inertia: Vector
-    """ixx ixy ixz iyy iyz izz about the centre of mass [kg m^2]."""
-    shapes: tuple[Shape, ...]
-
 
 BASE = Link(
     name="link0",
@@ -132,14 +104,9 @@ def tree() -> tuple[RobotTree, dict[str, float]]:
     """The robot's tree, and the effort limit of each actuated joint."""
     links, joints, effort = [BASE], [], {}
     for part in ARM:
-        joints.append(
-            Joint(
-                name=part.joint, type="revolute", parent=links[-1].name, child=part.name, T_parent_joint=pose(part.xyz),
-                axis=np.array(part.axis, dtype=float), lower=part.range[0], upper=part.range[1], velocity=part.velocity,
-            )
-        )  # fmt: skip
-        inertia = inertia_matrix(*part.inertia)
-        links.append(Link(name=part.name, mass=part.mass, com=np.array(part.com), inertia=inertia, collisions=part.shapes))
+        joint, link = part.below(links[-1].name)
+        joints.append(joint)
+        links.append(link)
         effort[part.joint] = part.effort
     wrist = links[-1].name
     links.append(GRIPPER_BODY)

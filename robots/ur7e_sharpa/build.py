@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from xreset.geometry.urdf import Joint, Link, RobotTree
-from xreset.geometry.urdf_writer import axes, box, capsule, cylinder, fixed, frame, inertia_matrix, pose, urdf_text
+from xreset.geometry.urdf_writer import ArmLink, axes, box, capsule, cylinder, fixed, frame, pose, urdf_text
 from xreset.spec import Shape
 
 URDF = Path(__file__).parent / "robot.urdf"
@@ -40,31 +40,6 @@ Vector = tuple[float, ...]
 # The arm -----------------------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
-class ArmLink:
-    """A link of the arm and the joint before it, which turns about +z."""
-
-    name: str
-    joint: str
-    xyz: Vector
-    """Joint origin in the parent link [m]."""
-    rpy: Vector
-    """Orientation of the joint origin [rad]."""
-    limit: float
-    """The joint's range is -limit..limit [rad]."""
-    effort: float
-    """[N m]"""
-    mass: float
-    """[kg]"""
-    com: Vector
-    """[m]"""
-    inertia: Vector
-    """ixx ixy ixz iyy iyz izz about the centre of mass [kg m^2], along axes turned by ``inertia_roll``."""
-    inertia_roll: float
-    """Turn of those axes about x [rad]."""
-    shapes: tuple[Shape, ...]
-
-
 _TURN, _HALF, _QUARTER = 6.283185, 3.141592654, 1.570796327
 _ARM_SPEED = 3.141593
 
@@ -78,14 +53,14 @@ ARM_BASE = Link(
 
 ARM = (
     ArmLink(
-        name="shoulder_link", joint="shoulder_pan_joint", xyz=(0, 0, 0.1625), rpy=(0, 0, 0), limit=_TURN, effort=150.0,
-        mass=3.761, com=(0, -0.00193, -0.02561), inertia_roll=_QUARTER,
+        name="shoulder_link", joint="shoulder_pan_joint", xyz=(0, 0, 0.1625), range=(-_TURN, _TURN),
+        velocity=_ARM_SPEED, effort=150.0, mass=3.761, com=(0, -0.00193, -0.02561), inertia_roll=_QUARTER,
         inertia=(0.00700210, 0.00000073, -0.00001053, 0.00648091, 0.00049994, 0.00657286),
         shapes=(capsule((0, 0, -0.02), (0, 0, 0.002), 0.06), capsule((0, -0.005, 0), (0, -0.03, 0), 0.06)),
     ),
     ArmLink(
-        name="upper_arm_link", joint="shoulder_lift_joint", xyz=(0, 0, 0), rpy=(_QUARTER, 0, 0), limit=_TURN, effort=150.0,
-        mass=8.058, com=(-0.2125, 0, 0.11336), inertia_roll=0.0,
+        name="upper_arm_link", joint="shoulder_lift_joint", xyz=(0, 0, 0), rpy=(_QUARTER, 0, 0), range=(-_TURN, _TURN),
+        velocity=_ARM_SPEED, effort=150.0, mass=8.058, com=(-0.2125, 0, 0.11336),
         inertia=(0.01505885, -0.00005400, 0.00000563, 0.33388086, -0.00000181, 0.33247207),
         shapes=(
             capsule((0, 0, 0.115), (0, 0, 0.140), 0.06),
@@ -94,8 +69,8 @@ ARM = (
         ),
     ),
     ArmLink(
-        name="forearm_link", joint="elbow_joint", xyz=(-0.425, 0, 0), rpy=(0, 0, 0), limit=3.141593, effort=150.0,
-        mass=2.846, com=(-0.2422, 0, 0.0265), inertia_roll=0.0,
+        name="forearm_link", joint="elbow_joint", xyz=(-0.425, 0, 0), range=(-3.141593, 3.141593),
+        velocity=_ARM_SPEED, effort=150.0, mass=2.846, com=(-0.2422, 0, 0.0265),
         inertia=(0.00399632, -0.00001365, 0.00137272, 0.07879254, -0.00000660, 0.07848510),
         shapes=(
             capsule((0, 0, 0.007), (0, 0, 0.035), 0.06),
@@ -104,20 +79,20 @@ ARM = (
         ),
     ),
     ArmLink(
-        name="wrist_1_link", joint="wrist_1_joint", xyz=(-0.3922, 0, 0.1333), rpy=(0, 0, 0), limit=_TURN, effort=28.0,
-        mass=1.37, com=(0, -0.01634, -0.0018), inertia_roll=_QUARTER,
+        name="wrist_1_link", joint="wrist_1_joint", xyz=(-0.3922, 0, 0.1333), range=(-_TURN, _TURN),
+        velocity=_ARM_SPEED, effort=28.0, mass=1.37, com=(0, -0.01634, -0.0018), inertia_roll=_QUARTER,
         inertia=(0.00165491, -0.00000282, -0.00000438, 0.00135962, 0.00010157, 0.00126279),
         shapes=(capsule((0, 0, -0.02), (0, 0, 0.005), 0.045), capsule((0, 0, 0), (0, -0.04, 0), 0.045)),
     ),
     ArmLink(
-        name="wrist_2_link", joint="wrist_2_joint", xyz=(0, -0.0997, 0), rpy=(_QUARTER, 0, 0), limit=_TURN, effort=28.0,
-        mass=1.3, com=(0, 0.01634, -0.0018), inertia_roll=-_QUARTER,
+        name="wrist_2_link", joint="wrist_2_joint", xyz=(0, -0.0997, 0), rpy=(_QUARTER, 0, 0), range=(-_TURN, _TURN),
+        velocity=_ARM_SPEED, effort=28.0, mass=1.3, com=(0, 0.01634, -0.0018), inertia_roll=-_QUARTER,
         inertia=(0.00135617, -0.00000274, 0.00000444, 0.00127827, -0.00005048, 0.00096614),
         shapes=(capsule((0, 0, -0.02), (0, 0, 0.005), 0.045), capsule((0, 0, 0), (0, 0.04, 0), 0.045)),
     ),
     ArmLink(
-        name="wrist_3_link", joint="wrist_3_joint", xyz=(0, 0.0996, 0), rpy=(_QUARTER, _HALF, _HALF), limit=_TURN, effort=28.0,
-        mass=0.365, com=(0, 0, -0.001159), inertia_roll=0.0,
+        name="wrist_3_link", joint="wrist_3_joint", xyz=(0, 0.0996, 0), rpy=(_QUARTER, _HALF, _HALF), range=(-_TURN, _TURN),
+        velocity=_ARM_SPEED, effort=28.0, mass=0.365, com=(0, 0, -0.001159),
         inertia=(0.00018694, 0.00000006, -0.00000017, 0.00018908, -0.00000092, 0.00025756),
         shapes=(cylinder((0, 0, -0.035), (0, 0, 0), 0.0375),),
     ),
@@ -278,16 +253,7 @@ def _moving_parts() -> Iterator[tuple[Joint, Link, float]]:
     z = np.array([0.0, 0, 1])
     parent = ARM_BASE.name
     for part in ARM:
-        R = pose(rpy=(part.inertia_roll, 0, 0))[:3, :3]
-        inertia = R @ inertia_matrix(*part.inertia) @ R.T
-        yield (
-            Joint(
-                name=part.joint, type="revolute", parent=parent, child=part.name, T_parent_joint=pose(part.xyz, rpy=part.rpy), axis=z,
-                lower=-part.limit, upper=part.limit, velocity=_ARM_SPEED,
-            ),
-            Link(name=part.name, mass=part.mass, com=np.array(part.com), inertia=inertia, collisions=part.shapes),
-            part.effort,
-        )  # fmt: skip
+        yield *part.below(parent), part.effort
         parent = part.name
     for part in HAND_BASE + tuple(link for finger in FINGERS for link in finger_tail(finger)):
         R = pose(quat=part.com_quat)[:3, :3]

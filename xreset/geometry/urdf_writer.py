@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree
@@ -79,6 +80,44 @@ def fixed(parent: str, child: str, T_parent_child: np.ndarray) -> Joint:
         upper=math.inf,
         velocity=math.inf,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmLink:
+    """A link of an arm and the revolute joint before it, as makers publish them."""
+
+    name: str
+    joint: str
+    xyz: Sequence[float]
+    """Joint origin in the parent link [m]."""
+    rpy: Sequence[float] = (0, 0, 0)
+    """Its orientation [rad]."""
+    axis: Sequence[float] = (0, 0, 1)
+    range: tuple[float, float]
+    """[rad]"""
+    velocity: float
+    """[rad/s]"""
+    effort: float
+    """[N m]"""
+    mass: float
+    """[kg]"""
+    com: Sequence[float]
+    """[m]"""
+    inertia: Sequence[float]
+    """ixx ixy ixz iyy iyz izz about the centre of mass [kg m^2], along axes turned by ``inertia_roll``."""
+    inertia_roll: float = 0.0
+    """Turn of those axes about x [rad]."""
+    shapes: tuple[Shape, ...]
+
+    def below(self, parent: str) -> tuple[Joint, Link]:
+        """The joint that hangs it below another link, and the link."""
+        R = pose(rpy=(self.inertia_roll, 0, 0))[:3, :3]
+        inertia = R @ inertia_matrix(*self.inertia) @ R.T
+        joint = Joint(
+            name=self.joint, type="revolute", parent=parent, child=self.name, T_parent_joint=pose(self.xyz, rpy=self.rpy),
+            axis=np.array(self.axis, dtype=float), lower=self.range[0], upper=self.range[1], velocity=self.velocity,
+        )  # fmt: skip
+        return joint, Link(name=self.name, mass=self.mass, com=np.array(self.com), inertia=inertia, collisions=self.shapes)
 
 
 def urdf_text(tree: RobotTree, effort: Mapping[str, float], *, mimics: Sequence[MimicSpec] = (), comment: str = "") -> str:

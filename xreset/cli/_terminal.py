@@ -15,7 +15,8 @@ class Console(rich.console.Console):
 
     def __init__(self, **options: Any) -> None:
         known = sys.stdout.isatty() or os.environ.get("COLUMNS")
-        super().__init__(markup=False, emoji=False, **{"width": None if known else 160} | options)
+        options.setdefault("width", None if known else 160)
+        super().__init__(markup=False, emoji=False, **options)
 
 
 class Progress(rich.progress.Progress):

@@ -78,7 +78,8 @@ def synthesize(
     """
     if per_object < 1 or not 5 <= fps <= 1000:
         raise DemoError(f"per_object is {per_object} and fps is {fps}, expected at least 1, and 5 to 1000.")
-    specs = [load_object(name, meshes) for name in (object_names(meshes) if objects is None else objects)]
+    folder = None if meshes is None else Path(meshes)
+    specs = [load_object(name, folder) for name in (object_names(folder) if objects is None else objects)]
     parts = []
     for spec in specs:
         starts = [_start(spec, np.array(up), side) for up in _REST_UP.get(spec.name, ((0.0, 0.0, 1.0),))]

@@ -100,6 +100,11 @@ class Curve:
         above = f"up to {self.upper:.2g}" if self.upper is not None else f"up to {high:g} or more" if high > self.nominal else ""
         return " ".join(filter(None, (below, above, "" if self.unit == "x" else self.unit)))
 
+    def is_certain(self, limit: float) -> bool:
+        """Whether the loss that a limit comes from is more than chance: its interval leaves out zero."""
+        beyond = [p for p in self.points if (p.value <= limit if limit < self.nominal else p.value >= limit)]
+        return min(beyond, key=lambda p: abs(p.value - limit)).difference_ci95[1] < 0
+
 
 @dataclass(frozen=True, kw_only=True)
 class Stress:
@@ -115,28 +120,26 @@ class Stress:
     """Properties that the engine cannot set."""
 
     def sentence(self) -> str:
-        """What it bears, in one line: the smallest changes that cost ten points, and what costs less as far as was tried."""
-        limits = [
-            (abs(math.log(value)) if curve.unit == "x" else math.inf, f"{curve.property} {_amount(curve, value)}")
-            for curve in self.curves
-            for value in (curve.lower, curve.upper)
-            if value is not None
-        ]
-        costs = ", or ".join(text for _, text in sorted(limits, key=lambda limit: limit[0]))
-        bears = [
-            f"{curve.property} {_amount(curve, curve.points[0].value, curve.points[-1].value)}"
-            for curve in self.curves
-            if curve.lower is None and curve.upper is None
-        ]
-        text = f"{self.backend}: {100 * self.task_progress:.0f} %"
-        text += f"; {100 * COSTLY:.0f} points less with {costs}" if costs else ""
-        return text + (f"; less than that with {', '.join(bears)}." if bears else ".")
+        """What it bears, in one line: the smallest changes that cost ten points, those that may, and how many properties cost less."""
+        costs: dict[bool, list[tuple[float, str]]] = {True: [], False: []}
+        for curve in self.curves:
+            for value in (curve.lower, curve.upper):
+                if value is not None:
+                    size = abs(math.log(value)) if curve.unit == "x" else math.inf
+                    costs[curve.is_certain(value)].append((size, f"{curve.property} {_amount(curve.unit, value)}"))
+        sure, perhaps = (", or ".join(text for _, text in sorted(costs[certain], key=lambda c: c[0])) for certain in (True, False))
+        borne = sum(curve.lower is None and curve.upper is None for curve in self.curves)
+        points = f"{100 * COSTLY:.0f} points"
+        parts = [f"{points} less with {sure}"] if sure else []
+        parts += [f"perhaps {points} less, within chance, with {perhaps}"] if perhaps else []
+        parts += [f"fewer than {points} less with {borne} of {len(self.curves)} properties, as far as was tried"] if borne else []
+        return f"{self.backend}, {self.episodes} episodes: {'; '.join((f'{100 * self.task_progress:.0f} %', *parts))}."
 
 
-def _amount(curve: Curve, *values: float) -> str:
+def _amount(unit: str, *values: float) -> str:
     """A value of a property, or the range between two."""
-    text = " to ".join(f"{v:.2g}" for v in values)
-    return f"x {text}" if curve.unit == "x" else f"of {text} {curve.unit}"
+    text = " to ".join(f"{float(f'{v:.2g}'):g}" for v in values)
+    return f"x {text}" if unit == "x" else f"of {text} {unit}"
 
 
 def chosen(wanted: Sequence[str]) -> tuple[Property, ...]:
@@ -177,7 +180,7 @@ def stressed(task: TaskConfig, prop: Property | None = None, value: float = 1.0)
         try:
             return replace(task, randomization=replace(still, **{prop.field: (value, value)}))
         except ValueError as error:
-            raise XResetError(f"{prop.name} cannot be {value:g} {prop.unit}: {error}.") from None
+            raise XResetError(f"{prop.name} {_amount(prop.unit, value)} cannot be tried: {error}.") from None
     return replace(task, randomization=still)
 
 
@@ -192,7 +195,7 @@ def stress(
     repetitions: int = 2,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> list[Stress]:
-    """Sweep properties in each engine and write ``OUT/BACKEND.json``.
+    """Sweep properties in each engine and write ``OUT/BACKEND.json``, after each property anew: one that is stopped keeps what it has.
 
     Args:
         subject: what to try.
@@ -209,6 +212,17 @@ def stress(
     """
     trial, trajectories = subject.episodes(demos, setting)
     tasks = {(p.name, v): stressed(trial.task, p, v) for p in properties for v in p.values}  # all are checked before the first is played
+    about: dict[str, Any] = {
+        "schema": SCHEMA,
+        "policy": subject.label,
+        "robot": subject.robot.name,
+        "seed": setting.seed,
+        "inputs": subject.inputs | {"demos": file_hash(demos)},
+    }
+
+    def keep(card: Stress) -> None:
+        write_json(out / f"{card.backend}.json", about | asdict(card))
+
     found = []
     for engine in engines:
         able = backend_class(engine.name).capabilities
@@ -221,34 +235,27 @@ def stress(
 
         nominal = run(stressed(trial.task))
         progress(engine.name, 1, total)
-        curves, done = [], 1
+        score, groups = _scores(nominal)
+        card = Stress(
+            backend=engine.name,
+            backend_version=engine.version,
+            episodes=len(nominal),
+            task_progress=float(score.mean()),
+            ci95=bootstrap_ci95(score, groups),
+            curves=(),
+            left_out=tuple(p.name for p in properties if p not in usable),
+        )
+        keep(card)
+        done = 1
         for p in usable:
             swept: dict[float, tuple[Episode, ...]] = {p.nominal: nominal}
             for value in p.values:
                 swept[value] = run(tasks[p.name, value])
                 done += 1
                 progress(engine.name, done, total)
-            curves.append(_curve(p, swept))
-        score, groups = _scores(nominal)
-        result = Stress(
-            backend=engine.name,
-            backend_version=engine.version,
-            episodes=len(nominal),
-            task_progress=float(score.mean()),
-            ci95=bootstrap_ci95(score, groups),
-            curves=tuple(curves),
-            left_out=tuple(p.name for p in properties if p not in usable),
-        )
-        inputs = subject.inputs | {"demos": file_hash(demos)}
-        about: dict[str, Any] = {
-            "schema": SCHEMA,
-            "policy": subject.label,
-            "robot": subject.robot.name,
-            "seed": setting.seed,
-            "inputs": inputs,
-        }
-        write_json(out / f"{engine.name}.json", about | asdict(result))
-        found.append(result)
+            card = replace(card, curves=(*card.curves, _curve(p, swept)))
+            keep(card)
+        found.append(card)
     return found
 
 

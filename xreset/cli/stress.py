@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.markup import escape
 from rich.table import Table
 
 from xreset.cli._common import engine_bars
@@ -49,22 +48,26 @@ def stress(
     with engine_bars(console, [e.name for e in engines]) as progress:
         found = sweep(subject, engines, demos, setting, folder, properties=properties, repetitions=episodes, progress=progress)
     write_plot(folder / "stress.png", found, f"{subject.label}: what it bears")
-    table = Table("property", "value", title=f"{escape(subject.label)}: task progress, and its difference to the same episodes (95 %)")
+    table = Table("property", title=f"{subject.label}: task progress, and its difference to the same episodes (95 %)")
+    table.add_column("value", justify="right")
     for result in found:
         table.add_column(result.backend, justify="right", no_wrap=True)
     for prop in properties:
         curves = [next((c for c in result.curves if c.property == prop.name), None) for result in found]
-        for i, value in enumerate(sorted({*prop.values, prop.nominal})):
+        values = sorted({*prop.values, prop.nominal})
+        for i, value in enumerate(values):
             cells = []
             for curve in curves:
                 point = curve.points[i] if curve is not None else None
                 low, high = (100 * x for x in point.difference_ci95) if point else (0, 0)
                 change = f" ({100 * point.difference:+.1f}; {low:+.1f} to {high:+.1f})" if point and value != prop.nominal else ""
                 cells.append(f"{100 * point.task_progress:.1f} %{change}" if point else "cannot be set")
-            table.add_row("" if i else prop.name, f"{value:g} {'' if prop.unit == 'x' else prop.unit}", *cells, end_section=False)
+            named = prop.name if prop.unit == "x" else f"{prop.name} [{prop.unit}]"
+            amount = f"x {value:g}" if prop.unit == "x" else f"{value:g}"
+            table.add_row("" if i else named, amount, *cells, end_section=i == len(values) - 1)
     console.print(table)
     for result in found:
-        console.print(escape(result.sentence()))
+        console.print(result.sentence())
         if result.left_out:
             console.print(f"left out in {result.backend}, which cannot set them: {', '.join(result.left_out)}")
     console.print(f"results and picture in {folder}")

@@ -15,11 +15,13 @@ from tests.test_cli import run
 from tests.toy_bank import toy_bank
 from xreset.accounts import accounts_path
 from xreset.geometry.kinematics import Kinematics
+from xreset.physics import Health, State
 from xreset.resets.bank import read_bank, write_bank
 from xreset.resets.closing import with_closing_frames
 from xreset.resets.config import ClosingConfig, HoldConfig, SqueezeConfig
 from xreset.resets.distribution import ResetDistribution, bank_starts
 from xreset.resets.fingers import Fingers, fingers_of
+from xreset.resets.hold import hold_bank
 from xreset.resets.squeeze import squeeze_targets
 from xreset.retarget.file import Retargeted, write_retargeted
 from xreset.task.config import ResetConfig
@@ -251,6 +253,26 @@ class TargetsTest(unittest.TestCase):
         torch.testing.assert_close(drawn.joint_target, drawn.joint_pos + 0.25 * drawn.from_bank[:, None])
         chosen = bank_starts(bank, np.array([4, 1]))
         torch.testing.assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
+
+
+class Held(unittest.TestCase):
+    def test_engines_are_told_apart_state_by_state(self):
+        """As many held does not mean alike."""
+        bank, drops = toy_bank(ROBOT), {"a": [0, 1], "b": [0, 2], "c": [0, 1]}  # three states are lifted: soup, spam, soup
+
+        def spawn(name, scene, index, states, **_):
+            start = State.at_rest(*(torch.as_tensor(array, dtype=torch.float32) for array in states))
+            end = start.object_pos.clone()
+            end[drops[name], 2] -= 0.1
+            backend = mock.Mock(device="cpu")
+            backend.state.return_value = replace(start, object_pos=end)
+            backend.health.return_value = Health(nonfinite=torch.zeros(3, dtype=torch.bool), overflow=torch.zeros(3, dtype=torch.bool))
+            yield backend, start, np.arange(3), np.ones(3, dtype=bool)
+
+        with mock.patch("xreset.resets.hold.spawn", spawn):
+            rows = hold_bank(bank, ROBOT, [replace(toy_grasp.brick(), name=name) for name in bank.object_names], list(drops))
+        found = {row.backend: (row.held, row.lifted, row.alike) for row in rows if row.object_name == "all"}
+        self.assertEqual(found, {"a": (1, 3, {"b": 1, "c": 3}), "b": (1, 3, {"a": 1, "c": 1}), "c": (1, 3, {"a": 3, "b": 1})})
 
 
 class CommandTest(unittest.TestCase):

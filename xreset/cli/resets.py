@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -92,6 +93,8 @@ def resets(
         console.print(f"{bank.num_pressing} of {int(bank.post_contact.sum())} states after contact press with {squeeze.force:g} N")
     if hold:
         console.print(_holding(held, backends))
+        if len(backends) > 1:
+            console.print(_alike(held, backends))
     console.print(
         f"{bank.num_states} states of {bank.num_states + len(bank.rejected_reason)} kept in {out}; counts in {accounts_path(out)}"
     )
@@ -132,6 +135,17 @@ def _holding(held: Sequence[Held], backends: Sequence[str]) -> Table:
         mine = [row for row in held if row.object_name == name]
         shares = [f"{row.held} ({row.held / row.lifted:.0%})" if row.lifted else "-" for row in mine]
         table.add_row(name, str(mine[0].lifted), *shares)
+    return table
+
+
+def _alike(held: Sequence[Held], backends: Sequence[str]) -> Table:
+    """How many lifted states end alike in two engines."""
+    pairs = list(combinations(backends, 2))
+    table = Table("object", *(f"{a}, {b}" for a, b in pairs), title="of these, held or not held alike")
+    rows = {(row.backend, row.object_name): row for row in held}
+    for name in dict.fromkeys(row.object_name for row in held):
+        shares = [(rows[a, name].alike[b], rows[a, name].lifted) for a, b in pairs]
+        table.add_row(name, *(f"{same} ({same / lifted:.0%})" if lifted else "-" for same, lifted in shares))
     return table
 
 

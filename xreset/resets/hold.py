@@ -24,6 +24,8 @@ class Held:
     """``all`` in a sum over objects."""
     lifted: int
     held: int
+    alike: dict[str, int]
+    """Other engine -> how many end as they do there: held or not."""
 
 
 def hold_bank(
@@ -56,9 +58,8 @@ def hold_bank(
     lifted = np.flatnonzero(bank.post_contact & (bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2] > config.lift))
     names = bank.object_name[lifted]
     used = tuple(o for o in objects if o.name in set(names.tolist()))
-    found = []
+    held = {name: np.zeros(len(lifted), dtype=bool) for name in backends}
     for number, name in enumerate(backends):
-        held = np.zeros(len(lifted), dtype=bool)
         if len(lifted):
             scene, index = SceneSpec(robot=robot, objects=used), np.array([[o.name for o in used].index(n) for n in names])
             states = [array[lifted] for array in (bank.joint_pos, bank.object_pos, bank.object_quat_wxyz, bank.targets)]
@@ -75,9 +76,16 @@ def hold_bank(
                 state, health = backend.state(), backend.health()
                 stays = (state.object_pos - start.object_pos).norm(dim=-1) < config.distance
                 stays &= (quat_angle(state.object_quat, start.object_quat) < config.angle) & ~health.nonfinite & ~health.overflow
-                held[items[fresh]] = stays.cpu().numpy()[fresh]
-        found += [
-            Held(backend=name, object_name=label, lifted=int(mine.sum()), held=int(held[mine].sum()))
-            for label, mine in [*((n, names == n) for n in np.unique(names).tolist()), ("all", np.ones(len(lifted), dtype=bool))]
-        ]
-    return found
+                held[name][items[fresh]] = stays.cpu().numpy()[fresh]
+    groups = [*((name, names == name) for name in np.unique(names).tolist()), ("all", np.ones(len(lifted), dtype=bool))]
+    return [
+        Held(
+            backend=name,
+            object_name=label,
+            lifted=int(mine.sum()),
+            held=int((held[name] & mine).sum()),
+            alike={other: int(((held[name] == held[other]) & mine).sum()) for other in held if other != name},
+        )
+        for name in backends
+        for label, mine in groups
+    ]

@@ -6,7 +6,7 @@ They are written here from the fused bodies, so every mass and inertia is the on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,9 +50,7 @@ class Model:
         return list(enumerate(self.parts, start=self.first))
 
 
-# Bullet inflates a hull by a margin of 1 mm against anything round. The margin can be removed from the base of a body only, and only where
-# the base has a single hull in the frame of its inertia; else Bullet wraps the hull, and sets the wrap's margin instead. So objects are
-# loaded in the frame of their inertia. What remains inflated: an object's further hulls against round links, and a robot's hulls.
+# What remains inflated by Bullet's margin of 1 mm against anything round: a robot's hulls.
 
 
 def link_groups(shapes: Sequence[Shape]) -> list[tuple[Shape, ...]]:
@@ -100,15 +98,6 @@ def robot_urdf(robot: Mechanism, parts: Sequence[Part], folder: Path) -> Path:
             f'<limit lower="{lower!r}" upper="{upper!r}" effort="0" velocity="0"/></joint>'
         )
     return _write(folder / "robot.urdf", text)
-
-
-def rigid_urdf(parts: Sequence[Part], inertia: Inertia, folder: Path) -> Path:
-    """Write the URDF of a single body whose shapes are in the frame of its inertia."""
-    text, inertia = [], replace(inertia, com=WEIGHTLESS.com, quat=WEIGHTLESS.quat)
-    for i, part in enumerate(parts):
-        text.append(_link_text(f"link{i}", WEIGHTLESS if i else inertia, part.shapes, folder))
-        text.append(_fixed_joint_text(i, "link0") if i else "")
-    return _write(folder / "rigid.urdf", text)
 
 
 def _fixed_joint_text(link: int, parent: str) -> str:

@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from xreset.backends.bullet_drives import BulletDrives
-from xreset.backends.bullet_models import WEIGHTLESS, Model, Part, inertial_frame, link_groups, rigid_urdf, robot_parts, robot_urdf
+from xreset.backends.bullet_models import WEIGHTLESS, Model, Part, inertial_frame, link_groups, robot_parts, robot_urdf
 from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.rigid import (
     Arms,
@@ -60,6 +61,8 @@ class PybulletSettings:
 
 
 _DEFAULTS = PybulletSettings()
+_GEOM_INITIALIZE_SAT_FEATURES = 4
+"""Bullet's flag of a collision shape, to which PyBullet gives no name: contacts between polyhedra are found on their faces."""
 _FAR = 100.0
 """A height [m] where nothing touches the object."""
 
@@ -99,9 +102,9 @@ class PybulletWorld(World):
 
         with tempfile.TemporaryDirectory(prefix="xreset-") as folder:
             self._robot = self._load_robot(robot, Path(folder))
-            self._object = self._load_rigid(link_groups(thing.pieces), self._inertia, (0.0, 0.0, _FAR), Path(folder))
-            table = Shape(geometry=Geometry(kind="box", size=scene.table.half_size))
-            self._table = self._load_rigid([(table,)], None, (*scene.table.center, -scene.table.half_size[2]), Path(folder))
+        self._object = self._load_rigid(link_groups(thing.pieces), self._inertia, (0.0, 0.0, _FAR))
+        table = Shape(geometry=Geometry(kind="box", size=scene.table.half_size))
+        self._table = self._load_rigid([(table,)], None, (*scene.table.center, -scene.table.half_size[2]))
         for model in (self._robot, self._object, self._table):
             self._remove_defaults(model)
         self._set_collision_pairs()
@@ -286,14 +289,59 @@ class PybulletWorld(World):
         body = self._load(robot_urdf(robot, parts, folder), pos=spec.base_pos, quat=spec.base_quat, fixed=True)
         return Model(body, 0, parts)
 
-    def _load_rigid(self, groups: list[tuple[Shape, ...]], inertia: Inertia | None, pos: tuple[float, float, float], folder: Path) -> Model:
-        """Load a single body, in the frame of its inertia; fixed if it has none."""
+    def _load_rigid(self, groups: list[tuple[Shape, ...]], inertia: Inertia | None, pos: tuple[float, float, float]) -> Model:
+        """Make a single body, in the frame of its inertia; fixed if it has none. Its further groups are links without mass to speak of."""
+        p = self._p
+        T = np.eye(4) if inertia is None else np.linalg.inv(inertial_frame(inertia))
+        base, *others = [self._shape([replace(shape, T_body_shape=T @ shape.T_body_shape) for shape in group]) for group in groups]
+        n, still, upright = len(others), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+        body = p.createMultiBody(
+            baseMass=0.0 if inertia is None else inertia.mass,
+            baseCollisionShapeIndex=base,
+            basePosition=pos,
+            linkMasses=[WEIGHTLESS.mass] * n,
+            linkCollisionShapeIndices=others,
+            linkVisualShapeIndices=[-1] * n,
+            linkPositions=[still] * n,
+            linkOrientations=[upright] * n,
+            linkInertialFramePositions=[still] * n,
+            linkInertialFrameOrientations=[upright] * n,
+            linkParentIndices=[0] * n,
+            linkJointTypes=[p.JOINT_FIXED] * n,
+            linkJointAxis=[(0.0, 0.0, 1.0)] * n,
+            physicsClientId=self._client,
+        )
         if inertia is not None:
-            T = np.linalg.inv(inertial_frame(inertia))
-            groups = [tuple(replace(shape, T_body_shape=T @ shape.T_body_shape) for shape in group) for group in groups]
-        parts = [Part(body=0, link="", shapes=group) for group in groups]
-        urdf = rigid_urdf(parts, inertia or WEIGHTLESS, folder)
-        return Model(self._load(urdf, pos=pos, quat=(1.0, 0.0, 0.0, 0.0), fixed=inertia is None), -1, parts)
+            p.changeDynamics(body, -1, localInertiaDiagonal=inertia.moments, physicsClientId=self._client)
+        return Model(body, -1, [Part(body=0, link="", shapes=group) for group in groups])
+
+    def _shape(self, shapes: Sequence[Shape]) -> int:
+        """A collision shape: a hull, or primitives.
+
+        Bullet inflates a hull by a margin of 1 mm against anything round, and takes it away from the base of a body only. But bodies share
+        the shape, so one that is made for that alone does for all.
+        """
+        p, client = self._p, self._client
+        if shapes[0].geometry.vertices is not None:
+            (shape,) = shapes
+            vertices = (shape.geometry.vertices @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]).tolist()
+            index = p.createCollisionShape(p.GEOM_MESH, vertices=vertices, flags=_GEOM_INITIALIZE_SAT_FEATURES, physicsClientId=client)
+            alone = p.createMultiBody(0.0, index, physicsClientId=client)
+            p.changeDynamics(alone, -1, collisionMargin=0.0, physicsClientId=client)
+            p.removeBody(alone, physicsClientId=client)
+            return index
+        kinds = {"box": p.GEOM_BOX, "sphere": p.GEOM_SPHERE, "capsule": p.GEOM_CAPSULE, "cylinder": p.GEOM_CYLINDER}
+        sizes = [(*shape.geometry.size, 0.0, 0.0)[:3] for shape in shapes]
+        return p.createCollisionShapeArray(
+            shapeTypes=[kinds[shape.geometry.kind] for shape in shapes],
+            halfExtents=sizes,
+            radii=[size[0] for size in sizes],
+            lengths=[2.0 * size[1] for size in sizes],
+            collisionFramePositions=[shape.T_body_shape[:3, 3].tolist() for shape in shapes],
+            collisionFrameOrientations=[Rotation.from_matrix(shape.T_body_shape[:3, :3]).as_quat().tolist() for shape in shapes],
+            flags=[_GEOM_INITIALIZE_SAT_FEATURES] * len(shapes),
+            physicsClientId=client,
+        )
 
     def _load(self, urdf: Path, *, pos: Sequence[float], quat: Sequence[float], fixed: bool) -> int:
         p = self._p
@@ -332,8 +380,6 @@ class PybulletWorld(World):
         robot = self._mechanism
         for piece, _ in self._object.links:
             allow(self._object, piece, self._table, -1, True)
-            for other in range(-1, piece):
-                allow(self._object, piece, self._object, other, False)
         for link, part in self._robot.links:
             allow(self._robot, link, self._table, -1, part.link not in robot.robot.table_exclude)
             for piece, _ in self._object.links:

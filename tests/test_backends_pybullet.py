@@ -45,7 +45,7 @@ class PybulletTest(EngineChecks, unittest.TestCase):
             np.testing.assert_allclose(Rotation.from_euler("xyz", rpy).as_matrix(), T[:3, :3], atol=1e-7)
 
     def test_a_hull_touches_where_it_is(self):
-        """Round pads hold a box and its hull, whose centres of mass are off their frames, with the same opening."""
+        """Round pads hold a box, its hull, and the hulls of its halves, all off their frames' origins, with the same opening."""
 
         def rounded(pad: Shape) -> Shape:
             return replace(pad, geometry=Geometry(kind="sphere", size=(min(pad.geometry.size),))) if pad.geometry.kind == "box" else pad
@@ -55,8 +55,8 @@ class PybulletTest(EngineChecks, unittest.TestCase):
             bodies = [replace(b, shapes=tuple(replace(s, shape=rounded(s.shape)) for s in b.shapes)) for b in made.bodies]
             return replace(made, bodies=tuple(bodies))
 
-        def opening(geometry: Geometry) -> float:
-            held = replace(brick, pieces=(replace(brick.pieces[0], geometry=geometry),))
+        def opening(*pieces: Shape) -> float:
+            held = replace(brick, pieces=pieces)
             with (
                 mock.patch("xreset.backends.pybullet.mechanism", round_pads),
                 mock.patch("tests.engine_checks.scene", lambda: replace(scene(), objects=(held,))),
@@ -68,8 +68,16 @@ class PybulletTest(EngineChecks, unittest.TestCase):
 
         brick = objects()[0]
         self.assertGreater(float(np.abs(brick.com).max()), 0.0)
-        box = brick.pieces[0].geometry
-        self.assertAlmostEqual(opening(box), opening(hull_box(*box.size)), delta=5e-5)
+        (whole,) = brick.pieces
+        box = opening(whole)
+        self.assertAlmostEqual(opening(replace(whole, geometry=hull_box(*whole.geometry.size))), box, delta=5e-5)
+        for axis in range(3):
+            with self.subTest(axis=axis):
+                half, moved = np.array(whole.geometry.size), np.stack([whole.T_body_shape] * 2)
+                half[axis] /= 2
+                moved[:, :3, 3] += np.outer((half[axis], -half[axis]), whole.T_body_shape[:3, axis])
+                pieces = [Shape(geometry=hull_box(*half.tolist()), T_body_shape=T) for T in moved]
+                self.assertAlmostEqual(opening(*pieces), box, delta=5e-5)
 
     def test_an_impossible_object_is_refused(self):
         bad = replace(scene().objects[0], inertia=np.diag([1e-4, 1e-4, 1e-3]))

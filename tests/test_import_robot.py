@@ -106,6 +106,13 @@ class Toy(WithFolder):
         keypoints = {point.keypoint: point.link for point in spec.keypoints}
         self.assertEqual([keypoints[f"index{i}"] for i in (1, 2, 4)], ["f1_a", "f1_b", "index_tip_frame"])
 
+    def test_centres_of_mass_that_lie_in_the_joints_are_doubted(self):
+        at_joint = HAND.replace('<mass value="0.05"/><origin xyz="0.02 0 0"/>', '<mass value="0.05"/><origin xyz="0 0 0"/>')
+        folder = import_robot(self.arm, self.file("at_joint.urdf", at_joint), self.folder / "mine").folder
+        found = [f.message for f in check_description(folder)[1] if f.topic == "inertias" and f.level == "warning"]
+        self.assertEqual(len(found), 1, found)
+        self.assertIn("the centre of mass of f1_a, f2_a, f3_a, f4_a lies in the joint, more than 10 mm", found[0])
+
     def test_a_coupled_joint_has_the_limits_that_its_source_gives_it(self):
         narrow = HAND.replace(
             '<limit lower="0" upper="1.5" effort="1" velocity="5"/><mimic', '<limit lower="0" upper="1" effort="1"/><mimic'

@@ -18,11 +18,12 @@ from tests.toy_robot import toy_hand_arm, toy_motion
 from xreset import robots
 from xreset.demos import demo_objects, read_demos, synthesize, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError
-from xreset.geometry.balls import BARE, SPACING, filling, inscribed_balls, shape_balls, sharp_points
+from xreset.geometry.balls import BARE, SPACING, inscribed_balls, shape_balls, sharp_points
 from xreset.geometry.collision import SelfCollision, height_above_table, support_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_matrix
 from xreset.geometry.shapes import box, half_spaces, hull, shape_mesh, surface_of
+from xreset.geometry.solids import link_field, signed_distance
 from xreset.geometry.surface import Surface, keypoint_contacts, solid_nodes
 from xreset.retarget import pipeline as pipeline_module
 from xreset.retarget.arm import cost as arm_cost
@@ -165,31 +166,63 @@ class CollisionTest(unittest.TestCase):
         steps = np.diff(np.unique(centers[:, 0].round(9)))
         self.assertLessEqual(steps.max(), SPACING + 1e-9)
 
-    def test_pairs_of_balls_are_bounded_and_no_pair_of_links_is_forgotten(self):
-        robot = robots.load("ur7e-sharpa")
-        whole = HandModel(robot).balls
-        with mock.patch("xreset.geometry.balls.MAX_PAIRS", 400):
-            few = HandModel(robot).balls
-        self.assertEqual(whole.spacing, 0.0)
-        self.assertGreater(few.spacing, 0.0)
-        self.assertLessEqual(len(few.pairs), 400)
-        self.assertTrue(torch.equal(few.link_pairs, whole.link_pairs))
-        own = len(whole.centers)
-        self.assertTrue(torch.equal(few.centers[:own], whole.centers))  # the object and the table still meet all of them, and no other
-        self.assertEqual(int(few.spans.count.sum()), own)
-        self.assertGreaterEqual(int(few.pairs.min()), own)
+    def test_a_link_of_thin_walls_is_solid_for_other_links_and_no_thicker(self):
+        walls = [box((0, 0, z), (0.06, 0.04, 0.001)) for z in (-0.0095, 0.0095)] + [
+            box((0, y, 0), (0.06, 0.001, 0.02)) for y in (-0.0195, 0.0195)
+        ]  # a tube, open at both ends
+        field, half = link_field(walls), np.array((0.03, 0.02, 0.01))
+        points = np.random.default_rng(0).uniform(-1.2 * half, 1.2 * half, (2000, 3))
+        found, which = (
+            field.signed_distance(torch.as_tensor(points), torch.zeros(len(points), dtype=torch.long))[0].numpy(),
+            np.abs(points) - half,
+        )
+        solid = np.linalg.norm(np.maximum(which, 0), axis=1) + np.minimum(which.max(axis=1), 0)
+        middle = np.abs(points[:, 0]) < 0.015  # at its open ends a ball of a gap's size looks in
+        np.testing.assert_allclose(found[middle], solid[middle], atol=1e-3)
+        self.assertGreater((found - solid).min(), -1e-3)
 
-    def test_a_link_of_thin_walls_is_filled_for_other_links(self):
-        walls = [box((0, 0, z), (0.06, 0.04, 0.001)) for z in (-0.015, 0.015)] + [
-            box((0, y, 0), (0.06, 0.001, 0.03)) for y in (-0.02, 0.02)
-        ]
-        centers, radii = filling(walls)
-        inside = np.random.default_rng(0).uniform((-0.03, -0.02, -0.015), (0.03, 0.02, 0.015), (500, 3))
-        outside = np.linalg.norm(inside[:, None] - centers, axis=2).min(axis=1) - radii[0]
-        self.assertLess(np.mean(outside > 0), 0.1)
-        self.assertLess(
-            (np.abs(centers) + radii[:, None] - (0.03, 0.02, 0.015)).max(), 0.010
-        )  # faces are stood out of, so that edges are covered
+    def test_distances_to_every_kind_of_shape(self):
+        import trimesh
+
+        points = np.random.default_rng(0).uniform(-0.07, 0.07, (300, 3))
+        turn = trimesh.transformations.euler_matrix(0.3, -0.4, 0.5)
+        for geometry in (*self.SHAPES[:5], hull(trimesh.creation.icosphere(1, 0.03).vertices).geometry):
+            with self.subTest(kind=geometry.kind):
+                shape = Shape(geometry=geometry, T_body_shape=turn)
+                expected = -trimesh.proximity.signed_distance(shape_mesh(shape), points)
+                np.testing.assert_allclose(signed_distance(shape, points), expected, atol=5e-4)
+
+    def test_one_link_is_kept_out_of_another_however_many_balls_are_looked_at_in_one_go(self):
+        robot = robots.load("ur7e-sharpa")
+        model = HandModel(robot)
+        joints = torch.as_tensor(robot.home[robot.hand_indices])[None].repeat(3, 1)
+        for name, value in {"right_middle_MCP_AA": 0.3, "right_ring_MCP_AA": -0.3}.items():
+            joints[1:, model.kinematics.joint_names.index(name)] = value
+        joints.requires_grad_()
+        clear = torch.zeros(3, 3, dtype=FLOAT)
+        clear[:, 2] = 1.0  # above the table
+        nothing = Objects.at(
+            clear + 10.0,
+            torch.tensor([1.0, 0, 0, 0], dtype=FLOAT).expand(3, 4),
+            torch.zeros(3, dtype=torch.long),
+            link_field([box((0, 0, 0), (0.1, 0.1, 0.1))]),
+        )
+
+        def found(q):
+            bodies = model.bodies(q, clear, torch.tensor([1.0, 0, 0, 0], dtype=FLOAT).expand(3, 4))
+            return too_near(model, bodies, nothing, torch.ones(3, dtype=torch.bool), 0.0, 0.0)
+
+        here = found(joints.detach())
+        self.assertEqual(sorted(set(here.frame.tolist())), [1, 2])
+        self.assertLess(float(here.value.min()), -0.003)
+        with mock.patch.dict("xreset.geometry.balls._ROWS", {"cpu": 7}):
+            pieces = found(joints.detach())
+        self.assertTrue(torch.equal(here.value.sort().values, pieces.value.sort().values))
+        step, column = 1e-5, model.kinematics.joint_names.index("right_middle_MCP_AA")
+        moved = joints.detach().clone()
+        moved[:, column] += step
+        change = (found(moved).value - here.value) / step
+        torch.testing.assert_close(change, here.slope[:, column], atol=2e-3, rtol=0.0)
 
     def test_self_collision_names_the_links(self):
         robot = robots.load("ur7e-sharpa")
@@ -222,15 +255,14 @@ class CollisionTest(unittest.TestCase):
         import trimesh
 
         for shape in (box((0, 0, 0), (0.05, 0.14, 0.04)), hull(trimesh.creation.cone(0.04, 0.08).vertices)):
-            centers, radii, fills = shape_balls(shape)
+            centers, radii = shape_balls(shape)
             surface = trimesh.sample.sample_surface(shape_mesh(shape), 4000, seed=0)[0]
             bare = (np.linalg.norm(surface[:, None] - centers, axis=-1) - radii).min(axis=1)
             self.assertLess(np.quantile(bare, 0.98), BARE + SPACING / 2)
             planes = half_spaces(shape)
             outside = (centers @ planes[:, :3].T + planes[:, 3]).max(axis=1) + radii
-            self.assertLess(outside[~fills].max(), 1e-3)
-        capsule = Shape(geometry=self.SHAPES[2])
-        self.assertTrue(shape_balls(capsule)[2].all())
+            self.assertLess(outside[radii < radii.max()].max(), 1e-3)
+        self.assertTrue((shape_balls(Shape(geometry=self.SHAPES[2]))[1] == 0.01).all())
 
     def test_height_counts_only_above_the_table(self):
         table = TableSpec(center=(0.0, 0.0), half_size=(0.5, 0.5, 0.02))

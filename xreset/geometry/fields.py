@@ -39,6 +39,10 @@ class DistanceFields(Tensors):
         shift = sizes.cumsum(0) - sizes
         return replace(DistanceFields.cat(parts), start=torch.cat([part.start + shift[i] for i, part in enumerate(parts)]))
 
+    def beside(self, points: Tensor, which: Tensor) -> Tensor:
+        """[...] distance of points [..., 3] from the bounding box of their object [...]; 0 inside."""
+        return (points - torch.minimum(torch.maximum(points, self.low[which]), self.high[which])).norm(dim=-1)
+
     def signed_distance(self, points: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance [N] and its gradient [N, 3] by trilinear interpolation.
 

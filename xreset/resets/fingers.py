@@ -75,7 +75,7 @@ def fingers_of(
     gap = q.new_zeros(len(q), len(links))
     point, inward = q.new_zeros(len(q), len(links), 3), q.new_zeros(len(q), len(links), 3)
     for g, link in enumerate(links):
-        balls = [shape_balls(shape)[:2] for shape in kinematics.tree.link(link).collisions] or [(np.zeros((1, 3)), np.zeros(1))]
+        balls = [shape_balls(shape) for shape in kinematics.tree.link(link).collisions] or [(np.zeros((1, 3)), np.zeros(1))]
         centers, radii = (torch.as_tensor(np.concatenate(part)) for part in zip(*balls, strict=True))
         R, p = poses[:, g, :3, :3], poses[:, g, :3, 3]
         for number, surface in surfaces.items():

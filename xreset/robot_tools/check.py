@@ -15,7 +15,8 @@ from xreset.errors import BackendUnavailableError, RobotError, XResetError
 from xreset.geometry.collision import SelfCollision, height_above_table, table_points
 from xreset.geometry.dynamics import damping_ratio, drive_inertia
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.urdf import RobotTree, find_mesh, parse_xml, robot_tree
+from xreset.geometry.shapes import surface_of
+from xreset.geometry.urdf import Link, RobotTree, find_mesh, parse_xml, robot_tree
 from xreset.plugins import backend_names, make_backend, robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
 from xreset.robot_tools.sources import largest_moment
@@ -32,6 +33,8 @@ _SAMPLES = 200
 _POSE_TOLERANCE = 1e-3
 _LIMIT_SLACK = 1e-3
 """[rad or m] By which a mimic joint's limits may fall short of its source's: published figures are rounded."""
+_OFF = 0.01
+"""[m] From the middle of a link's shapes: a centre of mass in the joint that is farther away is doubted."""
 _HOLD_STEPS = 30
 _HOLD_TOLERANCE = 0.02
 
@@ -233,6 +236,13 @@ def _links(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
 
 
 def _inertias(tree: RobotTree) -> Iterator[tuple[Level, str]]:
+    at_joints = [link.name for link in tree.links if link.mass > 0 and link.collisions and not link.com.any() and _off_middle(link) > _OFF]
+    if at_joints:
+        yield (
+            "warning",
+            f"the centre of mass of {_listed(at_joints)} lies in the joint, more than {1e3 * _OFF:.0f} mm from the middle of the link's "
+            "shapes. Is it a placeholder?",
+        )
     fixed = {joint.child for joint in tree.joints if joint.type == "fixed"}
     for link in tree.links:
         if link.mass <= 0:
@@ -254,6 +264,12 @@ def _inertias(tree: RobotTree) -> Iterator[tuple[Level, str]]:
                 f"{link.name!r} has a moment of {moments[2]:.3g} kg m^2; {link.mass:.3g} kg of its size can have {most:.2g} at most. Is it"
                 " a placeholder? `xreset robots import` replaces such.",
             )
+
+
+def _off_middle(link: Link) -> float:
+    """Distance of a link's centre of mass from the middle of its shapes' bounding box [m]."""
+    vertices, _ = surface_of(link.collisions)
+    return float(np.linalg.norm((vertices.min(axis=0) + vertices.max(axis=0)) / 2 - link.com))
 
 
 # Physics ---------------------------------------------------------------------------------------------------------------------------------
@@ -347,11 +363,9 @@ def _size(spec: RobotSpec) -> list[Finding]:
         return [Finding("skipped", "retargeting", str(error))]
     balls = model.balls
     text = (
-        f"{len(balls.radii)} balls on {len(balls.links)} links of the hand, {len(balls.pairs)} pairs of them on {len(balls.link_pairs)}"
-        f" pairs of links; about {predicted_gigabytes(model):.1f} GB"
+        f"{len(balls.radii)} balls on {len(balls.links)} links of the hand, {len(balls.guards)} of them kept out of other links in"
+        f" {len(balls.link_pairs) // 2} pairs of links; about {predicted_gigabytes(model):.1f} GB"
     )
-    if balls.spacing:
-        text += f"; balls within {1e3 * balls.spacing:.0f} mm of a larger one are in no pair"
     return [Finding("ok", "retargeting", text)]
 
 

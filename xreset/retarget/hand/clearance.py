@@ -5,11 +5,13 @@ Shape letters: B frames, G links with balls, A things found, n variables.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from xreset.geometry.balls import STAND_IN
 from xreset.geometry.collision import height_above_table
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import quat_to_matrix
@@ -71,61 +73,70 @@ def too_near(
         self_depth: [m]
     """
     bounds = bodies.pos[:, model.group_body] + (bodies.rot[:, model.group_body] @ model.balls.bound_centers[..., None])[..., 0]  # [B, G, 3]
+    none = bounds.new_zeros(0, len(model.home) + 6)
     found = (
-        _below_table(model, bodies, bounds, considered),
-        _in_object(model, bodies, bounds, objects, considered, object_clearance),
-        _in_each_other(model, bodies, bounds, considered, self_depth),
+        Distances(frame=torch.zeros(0, dtype=torch.long, device=none.device), value=none[:, 0], slope=none),
+        *_below_table(model, bodies, bounds, considered),
+        *_in_object(model, bodies, bounds, objects, considered, object_clearance),
+        *_in_each_other(model, bodies, bounds, considered, self_depth),
     )
     return _sorted(*(torch.cat([getattr(part, name) for part in found]) for name in ("frame", "value", "slope")))
 
 
-def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Distances:
+def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Iterator[Distances]:
     candidate, group = ((bounds[..., 2] < model.balls.bound_radii) & considered[:, None]).nonzero(as_tuple=True)
-    asking, ball = model.balls.spans.members(group)
-    frame = candidate[asking]
-    centers = model.ball_centers(bodies, frame, ball)
-    value = height_above_table(centers, model.balls.radii[ball], model.table)
-    low = value < 0
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=centers.dtype, device=centers.device).expand(int(low.sum()), 3)
-    slope = model.ball_slope(bodies, frame[low], ball[low], centers[low], up)
-    return Distances(frame=frame[low], value=value[low], slope=slope)
+    for asking, ball in model.balls.spans.members(group):
+        frame = candidate[asking]
+        centers = model.ball_centers(bodies, frame, ball)
+        value = height_above_table(centers, model.balls.radii[ball], model.table)
+        low = value < 0
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=centers.dtype, device=centers.device).expand(int(low.sum()), 3)
+        slope = model.point_slope(bodies, frame[low], model.balls.link[ball[low]], centers[low], up)
+        yield Distances(frame=frame[low], value=value[low], slope=slope)
 
 
 def _in_object(
     model: HandModel, bodies: Bodies, bounds: Tensor, objects: Objects, considered: Tensor, object_clearance: float
-) -> Distances:
+) -> Iterator[Distances]:
     every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
-    low, high = (value[objects.index][:, None] for value in (objects.fields.low, objects.fields.high))
-    middle = objects.local(bounds, every)
-    beside = (middle - torch.minimum(torch.maximum(middle, low), high)).norm(dim=-1)
+    beside = objects.fields.beside(objects.local(bounds, every), objects.index[every])
     candidate, group = ((beside < model.balls.bound_radii + object_clearance) & considered[:, None]).nonzero(as_tuple=True)
-    asking, ball = model.balls.spans.members(group)
-    frame = candidate[asking]
-    centers = model.ball_centers(bodies, frame, ball)
-    distance, direction = objects.signed_distance(centers, frame)
-    value = distance - model.balls.radii[ball] - object_clearance
-    near = value < 0
-    slope = model.ball_slope(bodies, frame[near], ball[near], centers[near], direction[near])
-    return Distances(frame=frame[near], value=value[near], slope=slope)
+    for asking, ball in model.balls.spans.members(group):
+        frame = candidate[asking]
+        centers = model.ball_centers(bodies, frame, ball)
+        distance, direction = objects.signed_distance(centers, frame)
+        value = distance - model.balls.radii[ball] - object_clearance
+        near = value < 0
+        slope = model.point_slope(bodies, frame[near], model.balls.link[ball[near]], centers[near], direction[near])
+        yield Distances(frame=frame[near], value=value[near], slope=slope)
 
 
-def _in_each_other(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor, self_depth: float) -> Distances:
-    a, b = model.balls.link_pairs.unbind(1)
-    reach = model.balls.bound_radii[a] + model.balls.bound_radii[b] - self_depth
-    near = (bounds[:, a] - bounds[:, b]).norm(dim=-1) < reach
-    candidate, group = (near & considered[:, None]).nonzero(as_tuple=True)
-    asking, pair = model.balls.pair_spans.members(group)
-    frame = candidate[asking]
-    first, second = model.balls.pairs[pair].unbind(1)
-    at_first, at_second = model.ball_centers(bodies, frame, first), model.ball_centers(bodies, frame, second)
-    gap = at_first - at_second
-    distance = gap.norm(dim=-1)
-    value = distance - model.balls.radii[first] - model.balls.radii[second] + self_depth
-    deep = value < 0
-    frame, first, second, at_first, at_second = (v[deep] for v in (frame, first, second, at_first, at_second))
-    direction = gap[deep] / distance[deep, None].clamp_min(1e-9)
-    slope = model.ball_slope(bodies, frame, first, at_first, direction) - model.ball_slope(bodies, frame, second, at_second, direction)
-    return Distances(frame=frame, value=value[deep], slope=slope)
+def _in_each_other(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor, self_depth: float) -> Iterator[Distances]:
+    balls, fields = model.balls, model.balls.fields
+    a, b = balls.link_pairs.unbind(1)
+    first, second, reach = model.group_body[a], model.group_body[b], balls.bound_radii + STAND_IN - self_depth
+    near = (bounds[:, a] - bounds[:, b]).norm(dim=-1) < reach[a] + balls.bound_radii[b]
+    candidate, pair = (near & considered[:, None]).nonzero(as_tuple=True)
+    inverse = bodies.rot[candidate, second[pair]].mT
+    middle = (inverse @ (bounds[candidate, a[pair]] - bodies.pos[candidate, second[pair]])[..., None])[..., 0]
+    near = fields.beside(middle, b[pair]) < reach[a[pair]]
+    candidate, pair, inverse = candidate[near], pair[near], inverse[near]
+    turn = inverse @ bodies.rot[candidate, first[pair]]
+    shift = (inverse @ (bodies.pos[candidate, first[pair]] - bodies.pos[candidate, second[pair]])[..., None])[..., 0]
+    for asking, guard in balls.guard_spans.members(a[pair]):
+        ball, radius, solid = balls.guards[guard], balls.guard_radii[guard], b[pair[asking]]
+        local = (turn[asking] @ balls.centers[ball][..., None])[..., 0] + shift[asking]
+        close = fields.beside(local, solid) <= (radius - self_depth).clamp_min(0.0)
+        asking, ball, radius, solid, local = asking[close], ball[close], radius[close], solid[close], local[close]
+        distance, away = fields.signed_distance(local, solid)
+        value = distance - radius + self_depth
+        deep = value < 0
+        asking, ball, solid = asking[deep], ball[deep], solid[deep]
+        frame = candidate[asking]
+        direction = (bodies.rot[frame, model.group_body[solid]] @ away[deep][..., None])[..., 0]
+        centers = model.ball_centers(bodies, frame, ball)
+        slope = model.point_slope(bodies, frame, balls.link[ball], centers, direction)
+        yield Distances(frame=frame, value=value[deep], slope=slope - model.point_slope(bodies, frame, solid, centers, direction))
 
 
 def _sorted(frame: Tensor, value: Tensor, slope: Tensor) -> Distances:

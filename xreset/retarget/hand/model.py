@@ -121,25 +121,25 @@ class HandModel:
         body = self.group_body[self.balls.link[ball]]
         return bodies.pos[frame, body] + (bodies.rot[frame, body] @ self.balls.centers[ball][..., None])[..., 0]
 
-    def ball_slope(self, bodies: Bodies, frame: Tensor, ball: Tensor, center: Tensor, direction: Tensor) -> Tensor:
-        """[A, n] how the centre of a ball moves along a direction: n . (v + w x r) = n . v + (r x n) . w.
+    def point_slope(self, bodies: Bodies, frame: Tensor, group: Tensor, point: Tensor, direction: Tensor) -> Tensor:
+        """[A, n] how a point of a link moves along a direction: n . (v + w x r) = n . v + (r x n) . w.
 
         Args:
             bodies: the hand.
             frame: [A]
-            ball: [A]
-            center: [A, 3] of those balls.
+            group: [A] the point's link, among the links with balls.
+            point: [A, 3] in the world.
             direction: [A, 3] unit vectors n.
         """
-        body = self.group_body[self.balls.link[ball]]
-        lever = torch.linalg.cross(center - bodies.pos[frame, body], direction)
+        body = self.group_body[group]
+        lever = torch.linalg.cross(point - bodies.pos[frame, body], direction)
         along = direction[:, None] @ bodies.linear[frame, body] + lever[:, None] @ bodies.angular[frame, body]
         return along[:, 0]
 
 
 def predicted_gigabytes(model: HandModel) -> float:
     """Memory that hand retargeting on the CPU will take [GB], all balls of a chunk of 256 frames being near something: an upper bound."""
-    return 0.5 + 256 * 400e-9 * (len(model.balls.radii) + len(model.balls.pairs))
+    return 0.5 + 256 * 400e-9 * len(model.balls.radii)
 
 
 def keypoint_pairs(names: Sequence[str], links: Sequence[str]) -> list[tuple[int, int]]:

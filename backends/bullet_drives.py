@@ -15,7 +15,8 @@ class BulletDrives:
     Arrays are over the D moving joints in the order of the bodies, which is Bullet's link order. With M the mass matrix and c the Coriolis
     torque, drives that have armature A and are implicit in their damping give the acceleration a = (M + B)^-1 (tau - c), where tau is the
     PD torque and B = diag(A + dt kd). Bullet integrates a = M^-1 (tau' - c), so it does the same when given tau' = tau - B a. Mimic joints
-    are coupled by a stiff spring and damper, which add J^T (dt^2 k + dt b) J to B.
+    are coupled by a stiff spring and damper, which add J^T (dt^2 k + dt b) J to B; a drive's torque is shared with those that follow its
+    joint, and so is its dt kd.
 
     In contact that alone is wrong: a held joint does not move with a, and would lack the torque B a. So the torque r of contacts and limits
     in the last step, seen as r = M dv / dt - (tau' - c), is expected again: a = (M + B)^-1 (tau - c + r). A held joint then gets the whole
@@ -78,8 +79,7 @@ class BulletDrives:
         q, v = self.read()
         dt, driven = self._dt, self.driven
         wanted = self._kp * (self.target - q[driven]) - self._kd * v[driven]
-        tau = np.zeros(len(q))
-        tau[driven] = np.minimum(np.maximum(wanted, -self._effort), self._effort)  # np.clip takes three times as long
+        tau = np.minimum(np.maximum(wanted, -self._effort), self._effort) @ self._joints.shares  # np.clip takes three times as long
         if len(self._mimic):
             lag = self._multiplier * q[driven[self._source]] + self._joints.offset - q[self._mimic]
             rate = self._J @ v
@@ -109,9 +109,10 @@ class BulletDrives:
 
     def _factorise(self, q: np.ndarray, saturated: np.ndarray) -> None:
         """Invert M + B; a drive at its effort limit has no damping left to be implicit in."""
-        added = np.zeros(len(q))
-        added[self.driven] = self._joints.armature + np.where(saturated, 0.0, self._dt * self._kd)
-        self._added = self._coupling + np.diag(added)
+        shares, armature = self._joints.shares, np.zeros(len(q))
+        armature[self.driven] = self._joints.armature
+        damping = np.where(saturated, 0.0, self._dt * self._kd)
+        self._added = self._coupling + np.diag(armature) + shares.T @ (damping[:, None] * shares)
         self._M = self._mass_matrix(q)
         self._inverse = np.linalg.inv(self._M + self._added)
         self._saturated = saturated

@@ -21,6 +21,7 @@ import numpy as np
 from xreset.backends.mjcf_model import MIN_FRICTION, OTHER_LINK, TABLE, SceneModel, add_sensors, body_name, locate, pos_quat
 from xreset.backends.rigid import Inertia, Mechanism, mechanism, object_inertia
 from xreset.errors import ObjectError, XResetError
+from xreset.geometry.dynamics import drive_shares
 from xreset.geometry.urdf import Joint
 from xreset.physics import KnownDifference
 from xreset.spec import GRAVITY, Geometry, ObjectSpec, SceneSpec
@@ -31,6 +32,7 @@ _HIT_OBJECT, _HIT_TABLE, _HIT_SELF = 1, 2, 4
 _IMPRATIO = 10.0
 _SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
 _SOLIMP_MIMIC = (0.99, 0.999, 0.001, 0.5, 2.0)
+_STIFF_MIMIC = 0.8  # share of a mimic joint's lag that the next step takes away; its rate goes wholly
 MIN_TIME_CONSTANT_STEPS = 2.0
 """MuJoCo's smallest time constant of contacts and other constraints, in timesteps."""
 _CONDIM = 4
@@ -245,16 +247,24 @@ def _limit_self_collision(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanis
 
 
 def _add_drives(spec: mujoco.MjSpec, scene: SceneSpec) -> None:
-    for joint in scene.robot.joints:
-        drive = joint.drive
+    """Drives on joints; on those that others follow, through a tendon along all of them: see :func:`drive_shares`."""
+    robot = scene.robot
+    moving = [*robot.joint_names, *(mimic.joint for mimic in robot.mimics)]
+    offset = np.array([*np.zeros(len(robot.joints)), *(mimic.offset for mimic in robot.mimics)])
+    for joint, shares in zip(robot.joints, drive_shares(robot), strict=True):
+        drive, along = joint.drive, np.flatnonzero(shares)
+        if shared := len(along) > 1:
+            tendon = spec.add_tendon(name=joint.name)
+            for i in along:
+                tendon.wrap_joint(moving[i], shares[i])
         spec.add_actuator(
             name=joint.name,
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            trntype=mujoco.mjtTrn.mjTRN_TENDON if shared else mujoco.mjtTrn.mjTRN_JOINT,
             target=joint.name,
             gaintype=mujoco.mjtGain.mjGAIN_FIXED,
             gainprm=_padded((drive.kp,)),
             biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-            biasprm=_padded((0.0, -drive.kp, -drive.kd)),
+            biasprm=_padded((drive.kp * float(shares @ offset), -drive.kp, -drive.kd)),
             ctrllimited=False,
             forcelimited=True,
             forcerange=(-drive.effort, drive.effort),
@@ -267,7 +277,7 @@ def _add_drives(spec: mujoco.MjSpec, scene: SceneSpec) -> None:
             name1=mimic.joint,
             name2=mimic.source,
             data=_padded((mimic.offset, mimic.multiplier), mujoco.mjNEQDATA),
-            solref=_solref(scene),
+            solref=(-_STIFF_MIMIC / scene.timestep**2, -1.0 / scene.timestep),
             solimp=_SOLIMP_MIMIC,
         )
 

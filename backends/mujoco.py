@@ -191,7 +191,7 @@ class MujocoWorld(World):
         model, nominal = self._model, self._at.model
         stiffness, damping, effort = scale
         model.actuator_gainprm[:, 0] = stiffness * nominal.actuator_gainprm[:, 0]
-        model.actuator_biasprm[:, 1] = stiffness * nominal.actuator_biasprm[:, 1]
+        model.actuator_biasprm[:, :2] = stiffness[:, None] * nominal.actuator_biasprm[:, :2]
         model.actuator_biasprm[:, 2] = damping * nominal.actuator_biasprm[:, 2]
         model.actuator_forcerange[:] = effort[:, None] * nominal.actuator_forcerange
         self._ahead = False

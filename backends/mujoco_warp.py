@@ -281,7 +281,8 @@ class MujocoWarpBackend(Backend):
             "com": field["body_ipos"][:, body],
             "total": field["body_subtreemass"][:, 0],
             "invweight": field["body_invweight0"][:, body],
-            "drive": torch.stack((gain[:, 0], -bias[:, 2], force_range[:, 1]), dim=1),  # stiffness, damping, effort limit
+            # stiffness, damping, effort limit, and what the followers' offsets make of the stiffness
+            "drive": torch.stack((gain[:, 0], -bias[:, 2], force_range[:, 1], bias[:, 0]), dim=1),
         }
         self._nominal = {name: value.clone() for name, value in nominal.items()}
         friction = self.scene.friction

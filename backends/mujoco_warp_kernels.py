@@ -167,6 +167,7 @@ def write_parameters(
         stiffness = drives[world, 0, j] * nominal_drive[j, 0]
         effort = drives[world, 2, j] * nominal_drive[j, 2]
         gain[world, j, 0] = stiffness
+        bias[world, j, 0] = drives[world, 0, j] * nominal_drive[j, 3]
         bias[world, j, 1] = -stiffness
         bias[world, j, 2] = -drives[world, 1, j] * nominal_drive[j, 1]
         force_range[world, j, 0] = -effort

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.errors import ObjectError, RobotError, XResetError
+from xreset.geometry.dynamics import drive_shares
 from xreset.geometry.urdf import Joint, Link, RobotTree, robot_tree
 from xreset.spec import ObjectSpec, RobotSpec, Shape
 
@@ -183,6 +184,9 @@ class MovingJoints:
         self.multiplier = np.array([mimic.multiplier for mimic in robot.mimics])
         self.offset = np.array([mimic.offset for mimic in robot.mimics])
         drives = [joint.drive for joint in robot.joints]
+        self.shares = np.zeros((len(robot.joints), self.count))
+        """[J, D] how each drive's torque is shared: see :func:`drive_shares`."""
+        self.shares[:, [*self.driven, *self.mimic]] = drive_shares(robot)
         self.nominal = np.array([(drive.kp, drive.kd, drive.effort) for drive in drives]).T
         """[3, J] stiffness, damping and effort limit."""
         self.armature = np.array([drive.armature for drive in drives])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,13 +23,19 @@ class SapienJoints:
         joints = {joint.name: joint for joint in articulation.active_joints}
         self._moving = MovingJoints(spec, active)
         self._driven = self._moving.driven
-        self._drives = [joints[name] for name in spec.joint_names]
         for joint in articulation.active_joints:
             joint.set_friction(0.0)
-        for joint, described in zip(self._drives, spec.joints, strict=True):
-            joint.set_armature(np.array([[described.drive.armature]]))
+        for described in spec.joints:
+            joints[described.name].set_armature(np.array([[described.drive.armature]]))
+        at = [*self._driven, *self._moving.mimic]
+        self._drives = [articulation.active_joints[i] for i in at]
+        """[J + Q] the actuated joints, then those that follow, whose drives carry a share of their source's."""
+        self._followed = np.concatenate((np.arange(len(spec.joints)), self._moving.source))
+        share, rate = self._moving.shares[self._followed, at], np.concatenate((np.ones(len(spec.joints)), self._moving.multiplier))
+        self._share = np.abs(np.stack((share / rate, share / rate, share)))
+        """[3, J + Q] of stiffness, damping and effort limit."""
         for mimic in spec.mimics:
-            _couple(articulation, joints, _by_a_neighbour(mimic, spec.mimics, joints))
+            _couple(articulation, joints, mimic)
 
         self._set_target = [joint.set_drive_target for joint in self._drives]
         self.target = spec.home
@@ -55,13 +61,15 @@ class SapienJoints:
     def set_drives(self, scale: np.ndarray) -> None:
         """Set factors (3, J) on stiffness, damping and effort limit."""
         self._kp, self._kd, self._effort = scale * self._moving.nominal
-        for joint, kp, kd, effort in zip(self._drives, self._kp.tolist(), self._kd.tolist(), self._effort.tolist(), strict=True):
+        shared = self._share * (scale * self._moving.nominal)[:, self._followed]
+        for joint, (kp, kd, effort) in zip(self._drives, shared.T.tolist(), strict=True):
             joint.set_drive_properties(kp, kd, effort, "force")
 
     def set_targets(self, targets: np.ndarray) -> None:
         """Set the drive targets [J]."""
         self.target = targets
-        for set_target, target in zip(self._set_target, targets.tolist(), strict=True):
+        followers = self._moving.multiplier * targets[self._moving.source] + self._moving.offset
+        for set_target, target in zip(self._set_target, (*targets.tolist(), *followers.tolist()), strict=True):
             set_target(target)
 
     def brake(self) -> None:
@@ -81,38 +89,32 @@ class SapienJoints:
 _TENDON_STIFFNESS, _TENDON_DAMPING = 1e5, 1e2
 
 
-def _by_a_neighbour(mimic: MimicSpec, mimics: Iterable[MimicSpec], joints: Mapping[str, Any]) -> MimicSpec:
-    """The same coupling to another joint that follows the same source, where the source is no neighbour and that one is."""
-    if _adjacent(joints[mimic.joint], joints[mimic.source]):
-        return mimic
-    for other in mimics:
-        if other.source == mimic.source and other.multiplier and other != mimic and _adjacent(joints[mimic.joint], joints[other.joint]):
-            rate = mimic.multiplier / other.multiplier
-            return MimicSpec(joint=mimic.joint, source=other.joint, multiplier=rate, offset=mimic.offset - rate * other.offset)
-    return mimic
-
-
-def _adjacent(a: Any, b: Any) -> bool:
-    return a.parent_link in (b.parent_link, b.child_link) or b.parent_link == a.child_link
-
-
 def _couple(articulation: Any, joints: Mapping[str, Any], mimic: MimicSpec) -> None:
     """Tie a mimic joint to its source: a fixed tendon keeps q_mimic - multiplier q_source = offset and acts on both.
 
+    It runs through the links between the two, whose own joints it leaves alone.
+
     Raises:
-        RobotError: the two joints neither share their parent link nor follow one another, so PhysX has no tendon for them.
+        RobotError: neither of the two joints' parent links carries the other joint, so PhysX has no tendon for them.
     """
-    follower, leader = joints[mimic.joint], joints[mimic.source]
-    if follower.parent_link == leader.parent_link or follower.parent_link == leader.child_link:
-        chain, rates = [leader.parent_link, leader.child_link, follower.child_link], [0.0, -mimic.multiplier, 1.0]
-    elif leader.parent_link == follower.child_link:
-        chain, rates = [follower.parent_link, follower.child_link, leader.child_link], [0.0, 1.0, -mimic.multiplier]
-    else:
-        raise RobotError(
-            f"the joint {mimic.joint!r} mimics {mimic.source!r}, but they neither share a parent link nor follow one another: "
-            "the backend 'sapien' cannot couple them. Use another backend."
-        )
-    articulation.create_fixed_tendon(chain, rates, rates, rest_length=mimic.offset, stiffness=_TENDON_STIFFNESS, damping=_TENDON_DAMPING)
+    ends = [(joints[mimic.source], -mimic.multiplier), (joints[mimic.joint], 1.0)]
+    for (upper, first), (lower, last) in (ends, ends[::-1]):
+        between, link = [], lower.parent_link
+        while link is not None and link not in (upper.parent_link, upper.child_link):
+            between.append(link)
+            link = link.parent
+        if link is not None:
+            chain = [upper.parent_link, upper.child_link, *between[::-1], lower.child_link]
+            rates = [0.0, first, *[0.0] * len(between), last]
+            inverse = [rate and 1.0 / rate for rate in rates]  # what PhysX scales the tendon's force by; the rates themselves jam it
+            articulation.create_fixed_tendon(
+                chain, rates, inverse, rest_length=mimic.offset, stiffness=_TENDON_STIFFNESS, damping=_TENDON_DAMPING
+            )
+            return
+    raise RobotError(
+        f"the joint {mimic.joint!r} mimics {mimic.source!r}, but neither lies below the other's parent link: "
+        "the backend 'sapien' cannot couple them. Use another backend."
+    )
 
 
 # Which shapes collide --------------------------------------------------------------------------------------------------------------------

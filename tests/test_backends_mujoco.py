@@ -104,10 +104,19 @@ class Model(unittest.TestCase):
         for i, joint in enumerate(robot.joints):
             self.assertEqual(model.actuator(i).name, joint.name)
             self.assertEqual(model.actuator(i).gainprm[0], joint.drive.kp)
-            np.testing.assert_array_equal(model.actuator(i).biasprm[:3], (0.0, -joint.drive.kp, -joint.drive.kd))
+            np.testing.assert_array_equal(model.actuator(i).biasprm[1:3], (-joint.drive.kp, -joint.drive.kd))
             np.testing.assert_array_equal(model.actuator(i).forcerange, (-joint.drive.effort, joint.drive.effort))
             self.assertEqual(model.dof_armature[self.at.joint_dof[i]], joint.drive.armature)
             self.assertEqual(model.jnt_qposadr[model.joint(joint.name).id], self.at.joint_qpos[i])
+
+    def test_a_drive_at_its_target_rests_and_off_it_pulls_with_its_stiffness_where_joints_are_coupled_too(self):
+        at, robot, data = self.at, self.scene.robot, mujoco.MjData(self.at.model)
+        q = robot.home + 0.01
+        data.qpos[at.joint_qpos], data.qpos[at.mimic_qpos] = q, at.mimic_multiplier * q[at.mimic_source] + at.mimic_offset
+        off = np.linspace(-1e-4, 1e-4, len(q))
+        data.ctrl[:] = q + off
+        mujoco.mj_forward(at.model, data)
+        np.testing.assert_allclose(data.actuator_force, off * [joint.drive.kp for joint in robot.joints], atol=1e-9)
 
     def test_gravity_compensation_takes_the_weight_of_the_robot_only(self):
         model, data = self.at.model, mujoco.MjData(self.at.model)

@@ -6,15 +6,17 @@ import itertools
 import sys
 import unittest
 from dataclasses import replace
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
 
 from tests.engine_checks import EngineChecks
-from xreset.backends.conformance.scene import gripper, scene
+from xreset.backends.conformance import run
+from xreset.backends.conformance.scene import gripper
 from xreset.backends.rigid import friction_forces, mechanism
 from xreset.backends.sapien import SapienBackend
-from xreset.backends.sapien_robot import self_collision_bits
+from xreset.backends.sapien_robot import _couple, self_collision_bits
 from xreset.errors import BackendUnavailableError, RobotError
 from xreset.spec import MimicSpec
 
@@ -26,15 +28,28 @@ class SapienTest(EngineChecks, unittest.TestCase):
         with mock.patch.dict(sys.modules, {"sapien": None}), self.assertRaisesRegex(BackendUnavailableError, r"xreset\[sapien\]"):
             SapienBackend.engine_version()
 
-    def test_a_mimic_joint_far_from_its_source_is_refused(self):
+    def test_a_mimic_joint_far_below_its_source_follows_it(self):
         robot = gripper()
         far = replace(
             robot,
             joints=tuple(j for j in robot.joints if j.name != "finger_b_bend"),
-            mimics=(*robot.mimics, MimicSpec(joint="finger_b_bend", source="swing")),
+            mimics=(*robot.mimics, MimicSpec(joint="finger_b_bend", source="swing", multiplier=0.5)),
         )
-        with self.assertRaisesRegex(RobotError, "'finger_b_bend' mimics 'swing'"):
-            SapienBackend(scene(far), 1)
+        (result,) = run(SapienBackend, robot=far, only=["mimic_joints"])
+        self.assertLess(max(measure.measured for measure in result.measures), 4e-3)  # 0.002 rad through three links; alone it would stay
+
+    def test_a_mimic_joint_on_another_branch_than_its_source_is_refused(self):
+        def joint(parent, child):
+            return SimpleNamespace(parent_link=parent, child_link=child)
+
+        def link(name, parent):
+            return SimpleNamespace(name=name, parent=parent)
+
+        palm = link("palm", None)
+        first, second = link("first", palm), link("second", palm)
+        joints = {"a": joint(first, link("a", first)), "b": joint(second, link("b", second))}
+        with self.assertRaisesRegex(RobotError, "'b' mimics 'a', but neither lies below"):
+            _couple(None, joints, MimicSpec(joint="b", source="a"))
 
 
 class CollisionBitsTest(unittest.TestCase):

@@ -1,3 +1,4 @@
+import dataclasses
 import tempfile
 import unittest
 from pathlib import Path
@@ -6,8 +7,32 @@ import numpy as np
 import torch
 
 from tests.toy_robot import toy_hand_arm, write_urdf
+from xreset import robots
+from xreset.backends.conformance.scene import gripper
 from xreset.errors import RobotError
+from xreset.geometry.dynamics import drive_shares, mass_matrix
 from xreset.geometry.kinematics import Kinematics
+from xreset.spec import DriveSpec, JointSpec
+
+
+class DriveSharesTest(unittest.TestCase):
+    def test_a_shared_drive_accelerates_coupled_joints_as_they_are_coupled(self):
+        robot = gripper()
+        (mimic,) = robot.mimics
+        source = robot.joint_names.index(mimic.source)
+        shares = drive_shares(robot)
+        rates = np.vstack((np.eye(len(robot.joints)), mimic.multiplier * np.eye(len(robot.joints))[source]))
+        np.testing.assert_allclose(shares @ rates, np.eye(len(robot.joints)), atol=1e-9)
+        follower = JointSpec(name=mimic.joint, group="hand", drive=DriveSpec(kp=0, kd=0, effort=0), home=0.0)
+        free = dataclasses.replace(robot, joints=(*robot.joints, follower), mimics=())
+        home = np.append(robot.home, mimic.multiplier * robot.home[source] + mimic.offset)
+        M = mass_matrix(free, home) + np.diag([joint.drive.armature for joint in free.joints])
+        acceleration = np.linalg.solve(M, shares.T @ np.random.default_rng(0).normal(size=len(robot.joints)))
+        self.assertAlmostEqual(acceleration[-1], mimic.multiplier * acceleration[source], places=9)
+
+    def test_without_mimic_joints_a_drive_is_its_joints_own(self):
+        robot = robots.load("ur7e-sharpa")
+        np.testing.assert_array_equal(drive_shares(robot), np.eye(len(robot.joints)))
 
 
 class KinematicsTest(unittest.TestCase):
@@ -89,7 +114,6 @@ class KinematicsTest(unittest.TestCase):
             self.kinematics.points(self.q, ["nose"])
         with self.assertRaisesRegex(ValueError, "expected"):
             self.kinematics.link_poses(self.q[..., :2])
-        import dataclasses
 
         passive = dataclasses.replace(self.robot, mimics=())
         with self.assertRaisesRegex(RobotError, "jaw_b"):

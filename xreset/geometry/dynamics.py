@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from xreset.geometry.kinematics import Kinematics
-from xreset.spec import RobotSpec
+from xreset.spec import DriveSpec, JointSpec, RobotSpec
 
 
 def mass_matrix(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
@@ -27,6 +29,29 @@ def mass_matrix(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
     mass = np.array([link.mass for link in links])
     inertia = rot @ np.stack([link.inertia for link in links]) @ rot.transpose(0, 2, 1)
     return np.einsum("l,lai,laj->ij", mass, linear, linear) + np.einsum("lai,lab,lbj->ij", angular, inertia, angular)
+
+
+def drive_shares(robot: RobotSpec) -> np.ndarray:
+    """[J, J + Q] how the torque of each drive is shared by its joint and the Q mimic joints, those that follow it.
+
+    A drive on one joint of several that move as one would have to push the others through their coupling, which then gives way; and what
+    an engine integrates implicitly in the drive's damping would slow that joint alone. With U [J + Q, J] the rates of all joints by those
+    of the actuated ones and M their mass matrix at home, armature included, the shares W = (U^T M U)^-1 U^T M accelerate all joints as they
+    are coupled, so that the coupling has nothing to do; and W U = 1: along coupled motion a drive is what its figures say.
+    """
+    joints, mimics = robot.joints, robot.mimics
+    U = np.eye(len(joints) + len(mimics), len(joints))
+    if not mimics:
+        return U
+    idle = DriveSpec(kp=0.0, kd=0.0, effort=0.0)
+    free = []
+    for row, mimic in zip(U[len(joints) :], mimics, strict=True):
+        source = robot.joint_names.index(mimic.source)
+        row[source] = mimic.multiplier
+        free.append(JointSpec(name=mimic.joint, group="hand", drive=idle, home=mimic.multiplier * robot.home[source] + mimic.offset))
+    uncoupled = replace(robot, joints=(*joints, *free), mimics=())
+    M = mass_matrix(uncoupled, uncoupled.home) + np.diag([joint.drive.armature for joint in uncoupled.joints])
+    return np.linalg.solve(U.T @ M @ U, U.T @ M)
 
 
 def drive_inertia(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:

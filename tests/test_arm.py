@@ -97,6 +97,10 @@ class PlaceTest(unittest.TestCase):
         first, second = (placing.place(self.robot, [self.wrists], np.zeros((0, 3)), small) for _ in range(2))
         self.assertEqual((first.best, first.own), (second.best, second.own))
 
+    def test_no_candidate_is_tried_when_its_time_is_over(self):
+        found = placing.place(self.robot, [self.wrists], np.zeros((0, 3)), dataclasses.replace(CONFIG, seconds=0.0))
+        self.assertEqual(found.best.placement, self.own)
+
     def test_without_a_round_the_own_placement_is_measured(self):
         found = placing.place(self.robot, [self.wrists], np.zeros((0, 3)), dataclasses.replace(CONFIG, rounds=0))
         self.assertEqual((found.best, found.best.placement), (found.own, self.own))

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
+from time import perf_counter
 from typing import Any
 
 import rich.console
 import rich.progress
+
+_LOG_SECONDS = 20.0
 
 
 class Console(rich.console.Console):
@@ -20,7 +23,7 @@ class Console(rich.console.Console):
 
 
 class Progress(rich.progress.Progress):
-    """Bars whose descriptions are no markup; they vanish at the end."""
+    """Bars whose descriptions are no markup; they vanish at the end. A log, where no bar can be drawn, gets a line every 20 seconds."""
 
     def __init__(self, console: rich.console.Console) -> None:
         super().__init__(
@@ -31,3 +34,12 @@ class Progress(rich.progress.Progress):
             console=console,
             transient=True,
         )
+        self._said = perf_counter()
+
+    def update(self, task_id: rich.progress.TaskID, **changes: Any) -> None:
+        """See :meth:`rich.progress.Progress.update`."""
+        super().update(task_id, **changes)
+        if not self.console.is_terminal and (now := perf_counter()) - self._said > _LOG_SECONDS:
+            self._said = now
+            task = self._tasks[task_id]
+            self.console.print(f"{task.description}: {task.percentage:.0f} %", highlight=False, soft_wrap=True)

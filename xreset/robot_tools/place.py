@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from time import perf_counter
 
 import numpy as np
 import torch
@@ -60,7 +61,10 @@ def place(
     own = Placement(pos=robot.base_pos, quat=robot.base_quat)
     found = [(own, reach(robot, own, tried, config))]
     effort = config.rounds * config.candidates + 10 * (1 + config.elite)  # a finalist takes as long as ten candidates or so
+    started = perf_counter()
     for step, candidate in enumerate(_draws(robot, avoid, config, random, found)):
+        if perf_counter() - started > config.seconds:
+            break
         found.append((candidate, reach(robot, candidate, tried, config)))
         found.sort(key=lambda pair: pair[1].rank, reverse=True)
         progress((step + 1) / effort, found[0][1])

@@ -33,6 +33,8 @@ class PlaceConfig:
     """Of each round."""
     rounds: int = 5
     """Of candidates; 0 measures the description's own placement only."""
+    seconds: float = 150.0
+    """Time after which no further candidate is tried [s]; the finalists come after. Give more on a slow machine."""
     elite: int = 5
     """Best candidates: the next round is drawn around them, and in the end they and the description's own placement are the finalists."""
     position: float = 0.005

@@ -8,6 +8,7 @@ import unittest
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from xreset.eval.report.clips import (
     encode_mp4,
     recorded_episode,
 )
+from xreset.eval.report.film import make_film
 from xreset.eval.report.page import headline, page
 from xreset.eval.report.read import Curve, collect, differences, read_curves
 from xreset.eval.results import EvalResult, TaskProgress, write_results
@@ -249,6 +251,21 @@ class ClipTest(InFolder):
         self.assertRegex(decoded.stderr.decode(), r"Video: h264.*yuv420p.*64x48.*10 fps")  # what browsers play
         found = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, 48, 64, 3).mean(axis=(1, 2))
         np.testing.assert_allclose(found, colors, atol=12)
+
+    def test_a_film_of_all_objects_in_all_engines(self):
+        self.folder.mkdir()
+        robot = toy_hand_arm(self.folder)
+        rollouts = toy_rollouts(robot.home)
+        self.write(rollouts=rollouts, joints=robot.joint_names)
+        out = self.folder / "film.mp4"
+        with (
+            mock.patch("xreset.eval.report.film.load_robot", lambda _: robot),
+            mock.patch("xreset.eval.report.film.encode_mp4", lambda frames, fps: repr((frames.shape, round(fps))).encode()),
+        ):
+            film = make_film(self.folder, out)
+        names = tuple(sorted({trace.object for trace in rollouts.traces}))
+        self.assertEqual((set(film.engines), film.objects), (set(ENGINES), names))
+        self.assertEqual(out.read_text(), repr(((3, 4 * 150, len(names) * 200, 3), 10)))
 
 
 class FailureTest(InFolder):

@@ -9,12 +9,19 @@ import tyro
 
 from xreset.cli._terminal import Console, Progress
 from xreset.eval.report import make_report
+from xreset.eval.report.film import make_film
 from xreset.eval.table import results_table
 from xreset.policies import results_folder, shipped
+from xreset.text import short_name
 
 
 def report(
-    run: Annotated[Path, tyro.conf.Positional], *, out: Path | None = None, robot: str | None = None, objects: Path | None = None
+    run: Annotated[Path, tyro.conf.Positional],
+    *,
+    out: Path | None = None,
+    robot: str | None = None,
+    objects: Path | None = None,
+    film: Path | None = None,
 ) -> None:
     """Make a self-contained HTML page of a run's evaluations, and one picture.
 
@@ -23,6 +30,7 @@ def report(
         out: Folder for index.html and overview.png; default: report/ in the run folder.
         robot: Name or folder of the robot, for the clips; default: as the results name it.
         objects: Folder of real meshes, for the clips; default: as the results name it.
+        film: Also write an mp4 with every object side by side, in all engines.
     """
     if not run.exists() and str(run) in shipped():
         run = results_folder(str(run))
@@ -36,6 +44,14 @@ def report(
     console.print(made.headline)
     for note in made.notes:
         console.print(f"note: {note}", style="yellow")
+    if film is not None:
+        with Progress(console) as bar:
+            task = bar.add_task("drawing the film", total=None)
+            shown = make_film(
+                run, film, robot=robot, objects=objects, progress=lambda done, total: bar.update(task, completed=done, total=total)
+            )
+        rows, columns = ", ".join(shown.engines), ", ".join(map(short_name, shown.objects))
+        console.print(f"film:    {film}\n         from above: {rows}; from the left: {columns}", soft_wrap=True)
     console.print(f"page:    {made.html}\npicture: {made.overview}", soft_wrap=True)
 
 

@@ -18,8 +18,8 @@ from xreset.plugins import backend_names, backend_status
 def engine_bars(console: Console, names: Sequence[str]) -> Iterator[Callable[[str, int, int], None]]:
     """One bar for each engine; gives the function that moves them: (engine, steps done, steps in all)."""
     with Progress(console) as bar:
-        tasks = {name: bar.add_task(name, total=None) for name in names}
-        yield lambda name, done, total: bar.update(tasks[name], completed=done, total=total)
+        counts = {name: bar.count(name) for name in names}
+        yield lambda name, done, total: counts[name](done, total)
 
 
 def usable_engines(console: Console) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any
 
@@ -43,3 +44,8 @@ class Progress(rich.progress.Progress):
             self._said = now
             task = self._tasks[task_id]
             self.console.print(f"{task.description}: {task.percentage:.0f} %", highlight=False, soft_wrap=True)
+
+    def count(self, what: str) -> Callable[[float, float], None]:
+        """Add a bar; gives the function that moves it: (done, in all)."""
+        task = self.add_task(what, total=None)
+        return lambda done, total: self.update(task, completed=done, total=total)

@@ -41,8 +41,7 @@ def lerobot(
     """
     recording = _recording(folders, backend, robot, objects, task)
     with Progress(Console(stderr=True)) as bar:
-        item = bar.add_task("writing episodes", total=None)
-        write_lerobot(out, recording, video=video, size=size, progress=lambda done, total: bar.update(item, completed=done, total=total))
+        write_lerobot(out, recording, video=video, size=size, progress=bar.count("writing episodes"))
     _say(recording, out)
 
 

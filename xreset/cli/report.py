@@ -36,10 +36,7 @@ def report(
         run = results_folder(str(run))
     console = Console()
     with Progress(console) as bar:
-        task = bar.add_task("drawing clips", total=None)
-        made = make_report(
-            run, out, robot=robot, objects=objects, progress=lambda done, total: bar.update(task, completed=done, total=total)
-        )
+        made = make_report(run, out, robot=robot, objects=objects, progress=bar.count("drawing clips"))
     console.print(results_table(made.summaries))
     console.print(made.headline)
     for note in made.notes:

@@ -62,17 +62,15 @@ def resets(
     check_retargeted(retargeted, data, spec)
     loaded = load_objects(sorted({*map(str, data.object_name)}), objects)
     with Progress(console) as bar:
-        task = bar.add_task(f"states in {', '.join(backends)}")
         bank = make_bank(
             data, spec, loaded, backends, num_envs=num_envs, device=device, closing=closing, squeeze=squeeze,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=bar.count(f"states in {', '.join(backends)}"),
         )  # fmt: skip
         held = []
         if hold:
-            task = bar.add_task("lifted states hold")
             held = hold_bank(
                 bank, spec, loaded, backends, num_envs=num_envs, device=device,
-                progress=lambda done, total: bar.update(task, completed=done, total=total),
+                progress=bar.count("lifted states hold"),
             )  # fmt: skip
     config = {"backends": backends, "num_envs": num_envs, "closing": asdict(closing), "squeeze": asdict(squeeze)}
     write_bank(out, bank, config=config, inputs={"retargeted": file_hash(retargeted)})

@@ -69,10 +69,9 @@ def retarget(
         discard(partial)
     try:
         with Progress(console) as bar:
-            task = bar.add_task("sequences", total=chosen.num_sequences)
             result = pipeline.retarget_demos(
                 chosen, spec, list(specs.values()), config,
-                progress=lambda done, total: bar.update(task, completed=done, total=total), partial=partial, timing=timing,
+                progress=bar.count("sequences"), partial=partial, timing=timing,
                 device=device,
             )  # fmt: skip
     except KeyboardInterrupt:

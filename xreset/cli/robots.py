@@ -140,8 +140,7 @@ def place(
     chosen = read_demos(demos).select(max_per_object=max_per_object)
     specs = list(demo_objects(chosen, objects).values())
     with Progress(console) as bar:
-        task = bar.add_task("hand retargeting", total=chosen.num_sequences)
-        paths = wrist_paths(chosen, spec, specs, progress=lambda done, total: bar.update(task, completed=done, total=total))
+        paths = wrist_paths(chosen, spec, specs, progress=bar.count("hand retargeting"))
         wrists = np.concatenate([path.root_pos[path.annotated].numpy() for path in paths])
         avoid = np.concatenate((wrists, rest_on_table(chosen, specs).object_pos))
         task = bar.add_task("placements", total=1.0)

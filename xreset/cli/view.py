@@ -104,8 +104,7 @@ def _write_sheet(path: Path, shown: View, *, moments: bool) -> None:
     tiles = moment_tiles(shown) if moments else reason_tiles(shown)
     console = Console()
     with Progress(console) as bar:
-        task = bar.add_task("drawing", total=len(tiles))
-        picture = draw_sheet(shown, tiles, progress=lambda done, total: bar.update(task, completed=done, total=total))
+        picture = draw_sheet(shown, tiles, progress=bar.count("drawing"))
     write_png(path, picture)
     for tile in tiles:
         print("; ".join(tile.caption))

@@ -19,7 +19,7 @@ from xreset.spec import SceneSpec
 try:
     import mujoco
 except ImportError as error:
-    raise unavailable("mujoco", "mujoco", error) from error
+    raise unavailable("mujoco", "'xreset[mujoco]'", error) from error
 
 from xreset.backends.mjcf import KNOWN_DIFFERENCES, MujocoSettings, compile_scene
 from xreset.backends.mjcf_model import MIN_FRICTION, SceneModel

@@ -31,7 +31,7 @@ try:
     import mujoco_warp as mjw
     import warp as wp
 except ImportError as error:
-    raise unavailable("mujoco_warp", "mujoco-warp", error) from error
+    raise unavailable("mujoco_warp", "'xreset[mujoco-warp]'", error) from error
 
 from xreset.backends import mujoco_warp_kernels as kernels
 from xreset.backends.mjcf import KNOWN_DIFFERENCES, MujocoSettings, compile_scene

@@ -425,7 +425,7 @@ def _engine() -> Any:
         with _silent():
             import pybullet
     except ImportError as error:
-        raise unavailable("pybullet", "pybullet", error) from error
+        raise unavailable("pybullet", "'xreset[pybullet]'", error) from error
     return pybullet
 
 

@@ -432,5 +432,5 @@ def _engine() -> Any:
             import sapien
             import sapien.physx
     except ImportError as error:
-        raise unavailable("sapien", "sapien", error) from error
+        raise unavailable("sapien", "'xreset[sapien]'", error) from error
     return sapien

@@ -1,33 +1,40 @@
-"""Engine plugins: how they are found and what goes wrong; and the example, where its engine is installed."""
+"""Engine plugins: how they are found and what goes wrong; and the examples, where their engines are installed."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import sys
 import tempfile
 import tomllib
 import unittest
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import ClassVar
 from unittest import mock
 
 import torch
 
 from xreset import plugins
 from xreset.backends import backend_status, make_backend
-from xreset.backends.conformance import run
+from xreset.backends.conformance import CHECKS, run
 from xreset.backends.conformance.scene import scene
 from xreset.cli import main
-from xreset.errors import BackendUnavailableError
+from xreset.errors import BackendUnavailableError, CapabilityError
 
-EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "xreset-drake"
-MISSING = "Drake is not installed: pip install -e examples/xreset-drake"
+EXAMPLES = {"drake": "pydrake", "newton": "newton"}
+"""What each example's engine is imported as."""
 
 
-def declared() -> EntryPoint:
-    """The entry point of the example, as its pyproject.toml states it."""
-    project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
+def folder_of(engine: str) -> Path:
+    return Path(__file__).resolve().parents[1] / "examples" / f"xreset-{engine}"
+
+
+def declared(engine: str) -> EntryPoint:
+    """The entry point of an example, as its pyproject.toml states it."""
+    project = tomllib.loads((folder_of(engine) / "pyproject.toml").read_text())["project"]
     [(name, value)] = project["entry-points"][plugins.ENGINES].items()
     return EntryPoint(name=name, value=value, group=plugins.ENGINES)
 
@@ -95,23 +102,24 @@ class PluginTest(unittest.TestCase):
 
 
 class ExampleTest(unittest.TestCase):
-    def setUp(self):
-        self.enterContext(mock.patch.object(sys, "path", [str(EXAMPLE), *sys.path]))
+    def test_without_its_engine_an_example_says_what_to_install(self):
+        for engine, package in EXAMPLES.items():
+            ours = f"xreset_{engine}"
+            absent = {name: None for name in list(sys.modules) if name.split(".")[0] == package} | {package: None}
+            kept = {name: module for name, module in sys.modules.items() if not name.startswith(ours)}
+            with (
+                self.subTest(engine),
+                mock.patch.object(sys, "path", [str(folder_of(engine)), *sys.path]),
+                mock.patch.dict(sys.modules, kept | absent, clear=True),
+                mock.patch.object(plugins, "entry_points", lambda group, engine=engine: [declared(engine)]),
+            ):
+                with self.assertRaisesRegex(BackendUnavailableError, f"pip install '?{engine}"):
+                    make_backend(engine, scene(), 1)
+                self.assertRegex(backend_status(engine).reason or "", f"pip install '?{engine}")
 
-    def test_without_its_engine_the_example_says_what_to_install(self):
-        absent = {name: None for name in list(sys.modules) if name.split(".")[0] == "pydrake"} | {"pydrake": None}
-        kept = {name: module for name, module in sys.modules.items() if not name.startswith("xreset_drake")}
-        with (
-            mock.patch.dict(sys.modules, kept | absent, clear=True),
-            mock.patch.object(plugins, "entry_points", lambda group: [declared()]),
-        ):
-            with self.assertRaisesRegex(BackendUnavailableError, "pip install drake"):
-                make_backend("drake", scene(), 1)
-            self.assertIn("pip install drake", backend_status("drake").reason or "")
-
-    def test_it_uses_the_public_interface_only(self):
+    def test_they_use_the_public_interface_only(self):
         public = {"xreset.physics", "xreset.backends.pool", "xreset.backends.rigid", "xreset.spec", "xreset.errors"}
-        for file in EXAMPLE.rglob("*.py"):
+        for file in (file for engine in EXAMPLES for file in folder_of(engine).rglob("*.py")):
             for line in file.read_text().splitlines():
                 words = line.split()
                 if words[:1] in (["from"], ["import"]) and words[1].split(".")[0] == "xreset":
@@ -119,36 +127,58 @@ class ExampleTest(unittest.TestCase):
                     self.assertNotRegex(line, r"import .*\b_\w", f"{file.name}: {line}")
 
 
-class DrakeTest(unittest.TestCase):
-    """What the suite takes minutes for is left to `xreset engines check --backend drake`."""
+class EngineTest(unittest.TestCase):
+    """What the suite takes minutes for is left to `xreset engines check --backend NAME`. Skipped where the engine is not installed."""
 
-    def setUp(self):
+    engine: ClassVar[str]
+    checks: ClassVar[tuple[str, ...]]
+
+    @classmethod
+    def setUpClass(cls):
         try:
-            import pydrake  # noqa: F401
+            importlib.import_module(EXAMPLES[cls.engine])
         except ImportError:
-            self.skipTest(MISSING)
-        self.enterContext(mock.patch.object(sys, "path", [str(EXAMPLE), *sys.path]))
-        from xreset_drake import backend  # pyright: ignore[reportMissingImports]
-
-        self.module = backend
+            raise unittest.SkipTest(f"{cls.engine} is not installed: pip install -e examples/xreset-{cls.engine}") from None
+        cls.enterClassContext(mock.patch.object(sys, "path", [str(folder_of(cls.engine)), *sys.path]))
+        cls.backend = declared(cls.engine).load()
 
     def make(self, scene, num_worlds, *, object_index=None):
-        return self.module.DrakeBackend(scene, num_worlds, object_index=object_index, workers=0)
+        return self.backend(scene, num_worlds, object_index=object_index, workers=0)
 
-    def test_checks_of_the_suite(self):
-        wanted = [
-            *("state_round_trip", "links_after_set", "nothing_stays", "masked_set", "mass_properties", "drive_equation", "free_spin"),
-            *("object_gravity", "object_wrench", "resting_weight", "object_mass", "held_object", "tip_friction", "broken_world"),
-        ]
-        for result in run(self.make, only=wanted):
+    def check_suite(self):
+        for result in run(self.make, only=self.checks):
             with self.subTest(result.name):
                 self.assertEqual(result.verdict, "passed", f"{result.worst} {result.problem}")
-
-    def test_every_known_difference_names_a_check(self):
-        from xreset.backends.conformance import CHECKS
-
-        for known in self.module.DrakeBackend.known_differences:
+        for known in self.backend.known_differences:
             self.assertIn(known.check, {check.name for check in CHECKS})
+
+
+class NewtonTest(EngineTest):
+    engine = "newton"
+    checks = (
+        *("state_round_trip", "links_after_set", "nothing_stays", "mass_properties", "free_spin", "object_gravity", "object_wrench"),
+        *("resting_weight", "held_object", "tip_friction", "broken_world"),
+    )
+
+    def test_checks_of_the_suite(self):
+        self.check_suite()
+
+    def test_what_it_lacks_is_refused(self):
+        stiff = scene().robot
+        joints = tuple(replace(joint, drive=replace(joint.drive, friction_loss=0.1)) for joint in stiff.joints)
+        with self.assertRaisesRegex(CapabilityError, "no dry friction of joints on the CPU: give the robot's drives a friction_loss of 0"):
+            self.make(replace(scene(), robot=replace(stiff, joints=joints)), 1)
+
+
+class DrakeTest(EngineTest):
+    engine = "drake"
+    checks = (
+        *("state_round_trip", "links_after_set", "nothing_stays", "masked_set", "mass_properties", "drive_equation", "free_spin"),
+        *("object_gravity", "object_wrench", "resting_weight", "object_mass", "held_object", "tip_friction", "broken_world"),
+    )
+
+    def test_checks_of_the_suite(self):
+        self.check_suite()
 
     def test_a_pair_has_its_friction(self):
         from xreset_drake.model import OBJECT_FRICTION, friction_of_other  # pyright: ignore[reportMissingImports]

@@ -349,6 +349,6 @@ _REMEDIES: dict[str, str] = {
 }
 
 
-def unavailable(package: str, extra: str, error: Exception) -> BackendUnavailableError:
-    """The error for an engine that cannot be imported."""
-    return BackendUnavailableError(f"{package} cannot be imported ({error}). Install it with: pip install 'xreset[{extra}]'")
+def unavailable(package: str, install: str, error: Exception) -> BackendUnavailableError:
+    """The error for an engine that cannot be imported; ``install`` is what follows ``pip install``."""
+    return BackendUnavailableError(f"{package} cannot be imported ({error}). Install it with: pip install {install}")

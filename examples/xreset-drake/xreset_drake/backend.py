@@ -22,8 +22,8 @@ import numpy as np
 
 from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.rigid import Inertia, mechanism, nearer, object_inertia, principal
-from xreset.errors import BackendUnavailableError, XResetError
-from xreset.physics import Capability, KnownDifference
+from xreset.errors import XResetError
+from xreset.physics import Capability, KnownDifference, unavailable
 from xreset.spec import GRAVITY, SceneSpec
 
 try:
@@ -34,7 +34,7 @@ try:
     from pydrake.systems.analysis import Simulator
     from pydrake.systems.framework import Context
 except ImportError as error:
-    raise BackendUnavailableError(f"pydrake cannot be imported ({error}). Install it with: pip install drake") from error
+    raise unavailable("pydrake", "drake", error) from error
 
 from xreset_drake.model import OBJECT_FRICTION, DrakeModel, DrakeSettings, build_model, friction_of_other, spatial_inertia
 

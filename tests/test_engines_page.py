@@ -160,12 +160,11 @@ class PageTest(unittest.TestCase):
 class DocsTest(unittest.TestCase):
     def test_the_page_names_engines_versions_and_commands(self):
         text = (DOCS / "engines.md").read_text()
-        for engine in ("mujoco", "mujoco-warp", "pybullet", "sapien", "drake"):
+        for engine in ("mujoco", "mujoco-warp", "pybullet", "sapien", "drake", "newton"):
             self.assertRegex(text, rf"[|;] {engine} \d+\.\d+[\d.]* with [\w-]+ on \w+", engine)
             self.assertRegex(text, rf"`xreset engines check [^`]*--backend {engine}\b", engine)
-        for robot in ("conformance-gripper", "ur7e-sharpa", "openarm"):
-            for device in ("cpu", "cuda"):
-                self.assertRegex(text, rf"\bmujoco-warp [\d.]+ with {robot} on {device}\b")
+        # To be asked for again once they are measured by today's suite: ur7e-sharpa, openarm, and MuJoCo-Warp on cuda.
+        self.assertRegex(text, r"\bmujoco-warp [\d.]+ with conformance-gripper on cpu\b")
         self.assertIn("## Known differences", text)
 
     def test_no_engine_fails_on_the_page(self):

@@ -8,8 +8,6 @@ from typing import Annotated, Literal
 import tyro
 
 from xreset.cli._terminal import Console
-from xreset.eval.report.make import compare as make
-from xreset.eval.table import rich_table
 
 
 def compare(
@@ -34,6 +32,9 @@ def compare(
         apart: Show also runs that differ in their seed only one by one.
         out: Folder for compare.png and compare.md.
     """
+    from xreset.eval.report.make import compare as make  # torch, which --help must not need
+    from xreset.eval.table import rich_table
+
     console = Console()
     with console.status("reading"):
         made = make(runs, out, x=x, curves=curve, apart=apart)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import RunError
-from xreset.eval.export import Recording, read_recorded, write_arrays, write_lerobot
-from xreset.eval.export.recorded import TASK
+
+if TYPE_CHECKING:
+    from xreset.eval.export import Recording
 
 Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
 Backends = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
@@ -39,6 +40,8 @@ def lerobot(
         video: Draw a film of each episode.
         size: Width and height of the films, pixels.
     """
+    from xreset.eval.export import write_lerobot  # torch, which --help must not need
+
     recording = _recording(folders, backend, robot, objects, task)
     with Progress(Console(stderr=True)) as bar:
         write_lerobot(out, recording, video=video, size=size, progress=bar.count("writing episodes"))
@@ -55,6 +58,8 @@ def npz(folders: Folders, *, out: Path, backend: Backends = (), robot: str | Non
         robot: Name or folder of the robot; default: as the results name it.
         task: The task in words; {object} stands for the object's name.
     """
+    from xreset.eval.export import write_arrays  # torch, which --help must not need
+
     recording = _recording(folders, backend, robot, None, task)
     write_arrays(out, recording)
     _say(recording, out)
@@ -63,6 +68,9 @@ def npz(folders: Folders, *, out: Path, backend: Backends = (), robot: str | Non
 def _recording(
     folders: tuple[Path, ...], backends: tuple[str, ...], robot: str | None, objects: Path | None, task: str | None
 ) -> Recording:
+    from xreset.eval.export import read_recorded
+    from xreset.eval.export.recorded import TASK
+
     if not folders:
         raise RunError("give a run folder, or a folder that xreset eval wrote into.")
     return read_recorded(folders, backends=backends, robot=robot, objects=objects, task=task or TASK)

@@ -11,9 +11,7 @@ from rich.table import Table
 from xreset.cli._common import engine_bars
 from xreset.cli._terminal import Console
 from xreset.errors import PolicyError
-from xreset.eval.evaluate import resolve
 from xreset.eval.setting import Setting
-from xreset.eval.trial import engine
 
 
 def frontier(
@@ -36,7 +34,9 @@ def frontier(
         setting: Robot, meshes, seed of their choice, device and worlds.
         out: Folder for the results; default: frontier/ in the run folder or beside the policy.
     """
+    from xreset.eval.evaluate import resolve  # torch, which --help must not need
     from xreset.eval.frontier import STAGES, frontier
+    from xreset.eval.trial import engine
 
     if policy == "ik":
         raise PolicyError("ik follows a demonstration from its beginning and cannot go on from a state. Give a policy, zero or random.")

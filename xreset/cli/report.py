@@ -8,9 +8,6 @@ from typing import Annotated
 import tyro
 
 from xreset.cli._terminal import Console, Progress
-from xreset.eval.report import make_report
-from xreset.eval.report.film import make_film
-from xreset.eval.table import results_table
 from xreset.policies import results_folder, shipped
 from xreset.text import short_name
 
@@ -32,6 +29,10 @@ def report(
         objects: Folder of real meshes, for the clips; default: as the results name it.
         film: Also write an mp4 with every object side by side, in all engines.
     """
+    from xreset.eval.report import make_report  # torch, which --help must not need
+    from xreset.eval.report.film import make_film
+    from xreset.eval.table import results_table
+
     if not run.exists() and str(run) in shipped():
         run = results_folder(str(run))
     console = Console()

@@ -11,8 +11,6 @@ from rich.table import Table
 
 from xreset.cli._terminal import Console
 from xreset.errors import XResetError
-from xreset.eval.select import SEED
-from xreset.eval.select import select as choose
 from xreset.eval.setting import Setting
 
 
@@ -40,6 +38,8 @@ def select(
         setting: Robot, meshes, device and worlds; --seed is not used, see --starts.
         starts: Seed of the starts that decide; default: one that no evaluation uses unless it is told to.
     """
+    from xreset.eval.select import SEED  # torch, which --help must not need
+    from xreset.eval.select import select as choose
     from xreset.eval.trial import engine
 
     for name, value in (("most", most), ("episodes", episodes)):

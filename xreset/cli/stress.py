@@ -10,12 +10,7 @@ from rich.table import Table
 
 from xreset.cli._common import engine_bars
 from xreset.cli._terminal import Console
-from xreset.eval.evaluate import resolve
 from xreset.eval.setting import Setting
-from xreset.eval.stress import chosen
-from xreset.eval.stress import stress as sweep
-from xreset.eval.stress_figure import write_plot
-from xreset.eval.trial import engine
 
 
 def stress(
@@ -40,13 +35,18 @@ def stress(
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: stress/ in the run folder or beside the policy.
     """
-    properties = chosen(property)
+    from xreset.eval import stress as sweeps  # torch, which --help must not need
+    from xreset.eval.evaluate import resolve
+    from xreset.eval.stress_figure import write_plot
+    from xreset.eval.trial import engine
+
+    properties = sweeps.chosen(property)
     engines = [engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
     console = Console()
     subject = resolve(policy, setting.robot, setting.seed)
     folder = out or subject.folder.parent / "stress"
     with engine_bars(console, [e.name for e in engines]) as progress:
-        found = sweep(subject, engines, demos, setting, folder, properties=properties, repetitions=episodes, progress=progress)
+        found = sweeps.stress(subject, engines, demos, setting, folder, properties=properties, repetitions=episodes, progress=progress)
     write_plot(folder / "stress.png", found, f"{subject.label}: what it bears")
     table = Table("property", title=f"{subject.label}: task progress, and its difference to the same episodes (95 %)")
     table.add_column("value", justify="right")

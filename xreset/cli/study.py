@@ -12,7 +12,6 @@ from xreset.errors import RunError
 from xreset.eval.study.file import read_study, study_path
 from xreset.eval.study.launch import launch, shown_command
 from xreset.eval.study.plan import Plan, make_plan
-from xreset.eval.study.report import plan_rows, write_page
 
 
 def study(
@@ -42,6 +41,8 @@ def study(
         slurm: Options of sbatch as submitit names them, such as partition=gpu time=600 (minutes) cpus_per_task=16.
         dry_run: Print the plan and its commands; do nothing.
     """
+    from xreset.eval.study.report import plan_rows, write_page  # torch, which --help must not need
+
     if slurm and cluster != "slurm":
         raise RunError("--slurm goes with --cluster slurm.")
     if wrong := [text for text in slurm if "=" not in text]:

@@ -49,7 +49,9 @@ class ProbesTest(unittest.TestCase):
         for name, value in (vars(STATED) | expected).items():
             if name == "contact_give" and name not in expected:
                 continue
-            relative = 0.10 if name in ("arm_damping", "hand_damping") else 0.03  # numerical damping is part of what is measured
+            # Numerical damping is part of what is measured. So is what the coupling of the jaws gives way in a step: 1 to 4 % of their
+            # drive's stiffness with the steps used here, 0.3 % with a 16th of them.
+            relative = {"arm_damping": 0.10, "hand_damping": 0.10, "hand_stiffness": 0.05}.get(name, 0.03)
             self.assertAlmostEqual(getattr(found, name), value, delta=max(relative * value, 1e-9), msg=name)
 
     def test_mujoco_has_what_the_scene_says(self):
@@ -199,14 +201,12 @@ class AttributeTest(unittest.TestCase):
 
     def test_half_the_drives_stiffness_is_told_from_friction(self):
         found = self.attribute(replace(altered_engine(mujoco(), Alteration(hand_stiffness=0.5, table_friction=0.7)), name="weak"))
-        # A softer drive also has less of the integrator's numerical damping, kp dt / 2, which counts.
-        self.assertEqual([row.name for row in found.rows if row.kind == "towards"], ["table friction", "hand stiffness", "hand damping"])
+        self.assertEqual([row.name for row in found.rows if row.kind == "towards"], ["table friction", "hand stiffness"])
         worst = found.costs()
         assert worst is not None
         self.assertEqual(worst.name, "hand stiffness")
-        for harmless in (found.rows[1], found.rows[3]):
-            self.assertEqual(found.difference(harmless), (0.0, (0.0, 0.0)))
-        self.assertEqual([row.name for row in found.rows if row.kind == "all"], ["all 3 at once"])
+        self.assertEqual(found.difference(found.rows[1]), (0.0, (0.0, 0.0)))
+        self.assertEqual([row.name for row in found.rows if row.kind == "all"], ["all 2 at once"])
 
     def test_the_same_engine_leaves_nothing_to_attribute(self):
         found = self.attribute(replace(mujoco(), name="same"), only=["tip friction"], what_if=True)

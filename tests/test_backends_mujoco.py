@@ -269,13 +269,19 @@ class BothBackends(unittest.TestCase):
                 self.assertFalse(bool(backend.health().nonfinite.any()))
 
     def test_held_forces_agree(self):
+        """Their means, once the grip has settled: single precision makes each sway by 0.03 N about them."""
         state, _ = grasp(self.bench)
+        means = []
         for backend in self.both():
             backend.set_state(state)
-            backend.step(60)
-        a, b = self.warp.contacts(), self.c.contacts()
-        torch.testing.assert_close(a.tip_force[[0, 3]], b.tip_force[[0, 3]], atol=0.02, rtol=0.0)
-        torch.testing.assert_close(a.tip_touch, b.tip_touch)
+            backend.step(160)
+            forces = []
+            for _ in range(60):
+                backend.step()
+                forces.append(backend.contacts().tip_force.clone())
+            means.append(torch.stack(forces).mean(dim=0)[[0, 3]])
+        torch.testing.assert_close(*means, atol=0.02, rtol=0.0)
+        torch.testing.assert_close(self.warp.contacts().tip_touch, self.c.contacts().tip_touch)
 
     def test_readings_are_those_of_a_plain_computation(self):
         """The engine's sensors against loops over links and contacts: while a grasped box is swung about, and right after a set."""

@@ -703,7 +703,7 @@ class CommandTest(InFolder):
         self.assertEqual(code, 0, printed)
         for expected in (*ENGINES, "[one]", "49.8", "75/50/25", "num_envs", "67", "note: These results are not comparable", "compare.png"):
             self.assertIn(expected, printed)
-        self.assertLessEqual(max(map(len, printed.split("picture:")[0].splitlines())), 80)
+        self.assertLessEqual(max(map(len, printed.split("picture:")[0].splitlines())), 160)
         self.assertEqual(sorted(f.name for f in out.iterdir()), ["compare.md", "compare.png"])
 
     def test_mistakes_are_one_line(self):

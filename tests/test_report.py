@@ -172,7 +172,7 @@ class CollectTest(InFolder):
         text = Outline(page(data, [])).text
         for words in (
             "What it bears",
-            "mujoco: 80 %; 10 points less with arm-stiffness x 0.8.",
+            "mujoco, 4 episodes: 80 %; perhaps 10 points less, within chance, with arm-stiffness x 0.8.",
             "from 0.9 up to 1.6 or more",
             choice.sentence(),
         ):

@@ -50,12 +50,11 @@ def without_effect(settings: Any, defaults: Any, path: tuple[str, ...] = ()) -> 
         path: names of the fields that lead to it.
     """
     sentences = []
-    hints = get_type_hints(type(settings), include_extras=True)
-    for name, hint in hints.items():
+    for name, marks in _marks(type(settings)).items():
         value, default = getattr(settings, name), getattr(defaults, name)
         if is_dataclass(value) and type(value) is type(default):
             sentences += without_effect(value, default, (*path, name))
-        for rule in (r for r in getattr(hint, "__metadata__", ()) if isinstance(r, Only)):
+        for rule in (mark for mark in marks if isinstance(mark, Only)):
             if value != default and (found := getattr(settings, rule.field)) != rule.choice:
                 where = ".".join((*path, name))
                 sentences.append(f"{where} is {value}, which means something where {rule.field} is {rule.choice}; it is {found}")
@@ -71,24 +70,24 @@ class Checked:
     def __post_init__(self) -> None:
         wrong = [
             f"{name} is {value}, expected {rule.expected}"
-            for name, rules in _rules(type(self)).items()
+            for name, marks in _marks(type(self)).items()
             if (value := getattr(self, name)) is not None
-            for rule in rules
-            if not rule.holds(value)
+            for rule in marks
+            if isinstance(rule, Rule) and not rule.holds(value)
         ]
         if wrong:
             raise ValueError("; ".join(wrong))
 
 
 @cache
-def _rules(cls: type) -> dict[str, list[Rule]]:
-    hints = get_type_hints(cls, include_extras=True)
-    return {name: rules for name, hint in hints.items() if (rules := _rules_in(hint))}
+def _marks(cls: type) -> dict[str, list[Rule | Only]]:
+    """What the annotation of each field says besides its type."""
+    return {name: _marks_in(hint) for name, hint in get_type_hints(cls, include_extras=True).items()}
 
 
-def _rules_in(hint: Any) -> list[Rule]:
+def _marks_in(hint: Any) -> list[Rule | Only]:
     inside = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    return [rule for part in inside for rule in getattr(part, "__metadata__", ()) if isinstance(rule, Rule)]
+    return [mark for part in inside for mark in getattr(part, "__metadata__", ()) if isinstance(mark, Rule | Only)]
 
 
 def is_rigid(T: np.ndarray) -> bool:

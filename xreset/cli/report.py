@@ -44,10 +44,7 @@ def report(
         console.print(f"note: {note}", style="yellow")
     if film is not None:
         with Progress(console) as bar:
-            task = bar.add_task("drawing the film", total=None)
-            shown = make_film(
-                run, film, robot=robot, objects=objects, progress=lambda done, total: bar.update(task, completed=done, total=total)
-            )
+            shown = make_film(run, film, robot=robot, objects=objects, progress=bar.count("drawing the film"))
         rows, columns = ", ".join(shown.engines), ", ".join(map(short_name, shown.objects))
         console.print(f"film:    {film}\n         from above: {rows}; from the left: {columns}", soft_wrap=True)
     console.print(f"page:    {made.html}\npicture: {made.overview}", soft_wrap=True)

@@ -40,9 +40,8 @@ def link_field(shapes: Sequence[Shape]) -> DistanceFields:
     if len(shapes) > 1:
         slope = np.stack(np.gradient(values, _SPACING), axis=-1)
         steep = np.linalg.norm(slope, axis=-1)
-        rim = (
-            (values > reach) & (values <= reach + 2 * _SPACING) & (steep > 0.5)
-        )  # where a ridge between two shapes is flat, others are near
+        # where a ridge between two shapes is flat, others are near
+        rim = (values > reach) & (values <= reach + 2 * _SPACING) & (steep > 0.5)
         beyond = (values[rim] - reach) / steep[rim]
         grown = cKDTree(nodes[rim] - beyond[:, None] * slope[rim])  # the surface at that distance from all shapes
         inside = values <= reach

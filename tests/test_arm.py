@@ -97,9 +97,13 @@ class PlaceTest(unittest.TestCase):
         first, second = (placing.place(self.robot, [self.wrists], np.zeros((0, 3)), small) for _ in range(2))
         self.assertEqual((first.best, first.own), (second.best, second.own))
 
-    def test_no_candidate_is_tried_when_its_time_is_over(self):
-        found = placing.place(self.robot, [self.wrists], np.zeros((0, 3)), dataclasses.replace(CONFIG, seconds=0.0))
-        self.assertEqual(found.best.placement, self.own)
+    def test_a_candidate_that_cannot_come_in_is_given_up(self):
+        whole = placing.reach(self.robot, self.own, self.wrists, CONFIG)
+        self.assertEqual(placing.reach(self.robot, self.own, self.wrists, CONFIG, whole.rank[0]).rank[0], whole.rank[0])
+        far = Placement(pos=(0.45, 0.6, 3.0), quat=self.robot.base_quat)
+        given_up = placing.reach(self.robot, far, self.wrists, CONFIG, whole.rank[0])
+        self.assertEqual(given_up.reached, 1 - placing._FIRST / 40)  # what was tried fails, what was not counts as reached
+        self.assertLess(given_up.rank[0], whole.rank[0])
 
     def test_without_a_round_the_own_placement_is_measured(self):
         found = placing.place(self.robot, [self.wrists], np.zeros((0, 3)), dataclasses.replace(CONFIG, rounds=0))

@@ -19,7 +19,7 @@ from xreset import robots
 from xreset.demos import demo_objects, read_demos, synthesize, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError
 from xreset.geometry.balls import BARE, SPACING, inscribed_balls, shape_balls, sharp_points
-from xreset.geometry.collision import SelfCollision, height_above_table, support_points
+from xreset.geometry.collision import SelfCollision, height_above_table, support_points, table_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_matrix
 from xreset.geometry.shapes import box, half_spaces, hull, shape_mesh, surface_of
@@ -27,7 +27,7 @@ from xreset.geometry.solids import link_field, signed_distance
 from xreset.geometry.surface import Surface, keypoint_contacts, solid_nodes
 from xreset.retarget import pipeline as pipeline_module
 from xreset.retarget.arm import cost as arm_cost
-from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, measure, track
+from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, track
 from xreset.retarget.collisions import colliding_links
 from xreset.retarget.file import Retargeted, read_retargeted, write_retargeted
 from xreset.retarget.hand.clearance import Distances, Objects, too_near
@@ -539,8 +539,11 @@ class ArmTest(unittest.TestCase):
         torch.testing.assert_close(runs[0], runs[1], atol=0, rtol=0)
 
     def test_stays_above_the_table(self):
-        low = self.along(self.home_path(4))
-        height = measure(self.model, low, self.home_path(4)[None]).table_clearance.min().item()
+        path = self.along(self.home_path(4))
+        kinematics, support = self.model.kinematics, table_points(self.robot, self.model.kinematics)
+        joints = self.model.full(self.home_path(4)[None], path.hand_joints)
+        points = kinematics.points(joints, support.links, torch.as_tensor(support.points))
+        height = height_above_table(points, torch.as_tensor(support.radii), self.model.table).min().item()
         sunk = self.along(self.home_path(4), lower=height + 0.05)
         _, free = track(self.model, sunk, Thresholds(), dataclasses.replace(self.config, collision_weight=0.0))
         _, kept = track(self.model, sunk, Thresholds(), self.config)
@@ -548,6 +551,26 @@ class ArmTest(unittest.TestCase):
         self.assertGreater(kept.table_clearance.min().item(), -0.006)
         self.assertEqual(REASONS[classify(free, Thresholds()).max()], "table collision")
         self.assertEqual(REASONS[classify(kept, Thresholds()).max()], "wrist position")
+
+    def test_lowest_points_are_those_of_all_points(self):
+        for name in ("ur7e-sharpa", "openarm"):
+            model = ArmModel(robots.load(name))
+            kinematics, support = model.kinematics, table_points(model.robot, model.kinematics)
+            span = (kinematics.upper - kinematics.lower).clamp_max(6.0)
+            generator = torch.Generator().manual_seed(0)
+            joints = kinematics.clamp(span * (torch.rand(300, len(span), generator=generator, dtype=FLOAT) - 0.5))
+            carriers = kinematics.link_poses(joints, model.carriers)
+            hand_poses = model.hand_poses(joints[:, torch.as_tensor(model.hand.joint_indices)])
+            low = model.lowest(carriers[..., :3, 3], carriers[..., :3, :3], hand_poses, 0.02)
+            points = kinematics.points(joints, support.links, torch.as_tensor(support.points))
+            heights = height_above_table(points, torch.as_tensor(support.radii), model.table)
+            of_carrier = model.carrier_of[[kinematics.link_index(link) for link in support.links]]
+            for carrier in range(len(model.carriers)):
+                own = low[low.carrier == carrier]
+                expected = heights[:, of_carrier == carrier].amin(1) if (of_carrier == carrier).any() else torch.full((300,), np.inf)
+                self.assertEqual(own.frame.tolist(), (expected < 0.02).nonzero()[:, 0].tolist())
+                torch.testing.assert_close(own.height, expected[own.frame].to(FLOAT), atol=1e-12, rtol=0)
+            self.assertGreater(len(low.frame), 40)
 
     def test_out_of_reach_is_invalid(self):
         far = self.along(self.home_path(2))
@@ -564,7 +587,7 @@ class ArmTest(unittest.TestCase):
         frame = arm_cost.Frame(
             pos=targets.root_pos[:, 0],
             quat=targets.root_quat[:, 0],
-            support=self.model.hand_support(targets.hand_joints)[:, 0],
+            hand_poses=self.model.hand_poses(targets.hand_joints)[:, 0],
             hand_joints=targets.hand_joints[:, 0],
             previous=None,
         )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self, TypeVar
 
@@ -54,3 +55,14 @@ def where(mask: Tensor, yes: _Batch, no: _Batch) -> _Batch:
     if isinstance(yes, Tensor):
         return torch.where(mask.view(-1, *[1] * (yes.dim() - 1)), yes, no)  # pyright: ignore
     return yes.map(lambda a, b: where(mask, a, b), no)  # pyright: ignore
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Batches here are small: a second thread gains nothing, and spins while it waits, which beside other work costs many times the run."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -7,7 +7,7 @@ for the exact checks that follow (coal, then physics).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence, Sized
 from dataclasses import dataclass
 from itertools import product
 
@@ -37,6 +37,8 @@ STAND_IN = 3.5e-3
 any ball, and the exact test takes how far two shapes must be moved to part: with this the LEAP hand loses 1 % of its frames to that test,
 without it 90 %."""
 
+_CLUSTER = 16
+"""Most balls that are ruled out together, by a ball about them."""
 _INWARD = 8
 """Steps by which a point of a surface moves inwards from one face after the other."""
 _ROWS = {"cpu": 200_000, "cuda": 8_000_000}
@@ -67,13 +69,49 @@ class Spans(Tensors):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Clusters(Tensors):
+    """Rows of a table that lie near each other, with a ball about each such cluster (K in number): what is far from it is far from all."""
+
+    centers: Tensor
+    """[K, 3] in the link's frame."""
+    radii: Tensor
+    """[K]"""
+    of_link: Spans
+    """[G] the clusters of each link."""
+    spans: Spans
+    """[K] the places of each cluster's rows in ``rows``."""
+    rows: Tensor
+    """Rows of the table, cluster after cluster."""
+
+    @staticmethod
+    def of(centers: Sequence[np.ndarray], radii: Sequence[np.ndarray]) -> Clusters:
+        """Clusters of balls, given by link: centres [n, 3] in its frame and radii [n] of rows that follow one another."""
+        parts = [_halved(own) for own in centers]
+        first = np.cumsum([0, *map(len, radii)])
+        rows = [part + start for own, start in zip(parts, first, strict=False) for part in own]
+        balls = [bounding_ball(c[part], r[part]) for c, r, own in zip(centers, radii, parts, strict=True) for part in own]
+        return Clusters(
+            centers=torch.as_tensor(np.array([middle for middle, _ in balls]).reshape(-1, 3)),
+            radii=torch.as_tensor(np.array([radius for _, radius in balls])),
+            of_link=_spans(parts),
+            spans=_spans(rows),
+            rows=torch.as_tensor(np.concatenate([np.zeros(0, dtype=np.int64), *rows])),
+        )
+
+    def members(self, clusters: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """All rows of some clusters [C], as :meth:`Spans.members` has them."""
+        for asking, place in self.spans.members(clusters):
+            yield asking, self.rows[place]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Balls(Tensors):
     """Balls fixed to the links of a hand, and those links as solids that the balls of others stay out of: Q balls on G links."""
 
     links: tuple[str, ...]
     """The links that carry balls (length G)."""
-    spans: Spans
-    """[G] the balls of each link."""
+    clusters: Clusters
+    """Of the balls."""
     link: Tensor
     """[Q] each ball's link, as an index of ``links``: ascending."""
     centers: Tensor
@@ -88,8 +126,8 @@ class Balls(Tensors):
     """[R] the balls that keep out of other links, none nearer than :data:`APART` to another of its link."""
     guard_radii: Tensor
     """[R] their radii there: larger where they stand for others."""
-    guard_spans: Spans
-    """[G] those of each link."""
+    guard_clusters: Clusters
+    """Of the guards."""
     fields: DistanceFields
     """Signed distances to the G links, in their frames."""
     link_pairs: Tensor
@@ -107,29 +145,46 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
     links = [name for name in hand.link_names if hand.tree.link(name).collisions]
     balls = [[np.concatenate(part) for part in zip(*map(shape_balls, hand.tree.link(name).collisions), strict=True)] for name in links]
     centers, radii = [part[0] for part in balls], [part[1] for part in balls]
-    spans = _spans(radii)
     guards = [_apart(c, r, APART) for c, r in zip(centers, radii, strict=True)]
     stand_in = [_near_others(c, g) for c, g in zip(centers, guards, strict=True)]
-    middles = np.array([(part.max(axis=0) + part.min(axis=0)) / 2 for part in centers]).reshape(-1, 3)
-    reach = np.array([(np.linalg.norm(c - m, axis=1) + r).max() for c, m, r in zip(centers, middles, radii, strict=True)])
+    guard_radii = [r[g] + STAND_IN * s for r, g, s in zip(radii, guards, stand_in, strict=True)]
+    first = np.cumsum([0, *map(len, radii)])
+    bounds = [bounding_ball(c, r) for c, r in zip(centers, radii, strict=True)]
     named = [(hand.link_names[a], hand.link_names[b]) for a, b in collision.link_pairs]
     link_pairs = [(links.index(a), links.index(b)) for a, b in named if {a, b} <= set(links)]
     return Balls(
         links=tuple(links),
-        spans=spans,
-        link=torch.repeat_interleave(torch.arange(len(links)), spans.count),
+        clusters=Clusters.of(centers, radii),
+        link=torch.repeat_interleave(torch.arange(len(links)), torch.tensor([len(part) for part in radii], dtype=torch.long)),
         centers=torch.as_tensor(np.concatenate([np.zeros((0, 3)), *centers])),
         radii=torch.as_tensor(np.concatenate([np.zeros(0), *radii])),
-        bound_centers=torch.as_tensor(middles),
-        bound_radii=torch.as_tensor(reach),
-        guards=torch.cat([torch.zeros(0, dtype=torch.long), *(torch.as_tensor(g) + s for g, s in zip(guards, spans.start, strict=True))]),
-        guard_radii=torch.as_tensor(
-            np.concatenate([np.zeros(0), *(r[g] + STAND_IN * s for r, g, s in zip(radii, guards, stand_in, strict=True))])
-        ),
-        guard_spans=_spans(guards),
+        bound_centers=torch.as_tensor(np.array([middle for middle, _ in bounds]).reshape(-1, 3)),
+        bound_radii=torch.as_tensor(np.array([radius for _, radius in bounds])),
+        guards=torch.as_tensor(np.concatenate([np.zeros(0, dtype=np.int64), *(g + f for g, f in zip(guards, first, strict=False))])),
+        guard_radii=torch.as_tensor(np.concatenate([np.zeros(0), *guard_radii])),
+        guard_clusters=Clusters.of([c[g] for c, g in zip(centers, guards, strict=True)], guard_radii),
         fields=DistanceFields.join([link_field(hand.tree.link(name).collisions) for name in links]),
         link_pairs=torch.as_tensor(np.array([*link_pairs, *((b, a) for a, b in link_pairs)], dtype=np.int64).reshape(-1, 2)),
     )
+
+
+def bounding_ball(centers: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, float]:
+    """A ball about balls at centres [n, 3] of radii [n]: its centre, the middle of the box about theirs, and its radius."""
+    middle = (centers.max(axis=0) + centers.min(axis=0)) / 2
+    return middle, float((np.linalg.norm(centers - middle, axis=1) + radii).max())
+
+
+def _halved(centers: np.ndarray) -> list[np.ndarray]:
+    """Some points [n, 3], halved across their longest side until no part has more than :data:`_CLUSTER`: those of each part, ascending."""
+    parts, todo = [], [np.arange(len(centers))] if len(centers) else []
+    while todo:
+        part = todo.pop()
+        if len(part) <= _CLUSTER:
+            parts.append(part)
+            continue
+        along = centers[part][:, np.ptp(centers[part], axis=0).argmax()].argsort(kind="stable")
+        todo += [np.sort(part[along[len(part) // 2 :]]), np.sort(part[along[: len(part) // 2]])]
+    return parts
 
 
 def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray:
@@ -217,7 +272,7 @@ def shape_balls(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     return points, np.concatenate([np.full(len(part), r) for part, r in ((inner, radius), (shell, small), (sharp, 0.0))])
 
 
-def _spans(parts: list[np.ndarray]) -> Spans:
+def _spans(parts: Sequence[Sized]) -> Spans:
     counts = torch.tensor([len(part) for part in parts], dtype=torch.long)
     return Spans(start=counts.cumsum(0) - counts, count=counts)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -138,7 +139,7 @@ class Kinematics:
     def _chain(self, joints: Sequence[Joint], moving: Sequence[Joint]) -> None:
         """The steps from each link to the next, and which joints move which link."""
         row = {joint.name: i for i, joint in enumerate(moving)}
-        self._revolute = torch.tensor([joint.type == "revolute" for joint in moving], dtype=torch.bool, device=self.device)
+        self._turns = [joint.type == "revolute" for joint in moving]
         self._steps: list[_Step] = []
         ancestry = torch.zeros(len(self.link_names), len(moving), dtype=torch.bool)
         for i, joint in enumerate(joints, start=1):
@@ -161,7 +162,13 @@ class Kinematics:
                     axis=self._tensor(R @ joint.axis),
                 )
             )
-        self._ancestry = ancestry.to(self.device)
+        self._ancestry = ancestry
+        self._moved = cache(self._moved_by_joints)
+
+    def _moved_by_joints(self, links: tuple[int, ...]) -> list[tuple[int, Tensor]]:
+        """The moving joints that move any of the links, and which of the links each moves."""
+        moves = self._ancestry[list(links)]
+        return [(m, moves[:, m].nonzero()[:, 0].to(self.device)) for m in moves.any(dim=0).nonzero()[:, 0].tolist()]
 
     def link_index(self, name: str) -> int:
         """Index of a link in :attr:`link_names`; ``RobotError`` if there is none of that name below the root."""
@@ -215,24 +222,24 @@ class Kinematics:
         if offsets is not None:
             wide = offsets.expand(*batch, len(indices), 3).reshape(-1, len(indices), 3)
             pos = pos + (rot @ wide[..., None])[..., 0]
-        moves = self._ancestry[indices]  # [P, M]
-        linear = q.new_zeros(len(pos), len(indices), 3, len(axes))
+        moved = self._moved(tuple(indices))
+        linear = q.new_zeros(len(pos), len(indices), 3, len(moved))
         angular = torch.zeros_like(linear)
-        for m, (axis, origin) in enumerate(zip(axes, origins, strict=True)):
-            rows = moves[:, m].nonzero()[:, 0]
-            if not len(rows) or axis is None or origin is None:
-                continue
-            if self._revolute[m]:
-                linear[..., m][:, rows] = torch.linalg.cross(axis[:, None], pos[:, rows] - origin[:, None])
-                angular[..., m][:, rows] = axis[:, None].expand(-1, len(rows), -1)
+        for column, (m, rows) in enumerate(moved):
+            axis, origin = axes[m], origins[m]
+            assert axis is not None and origin is not None
+            if self._turns[m]:
+                linear[..., column][:, rows] = torch.linalg.cross(axis[:, None], pos[:, rows] - origin[:, None])
+                angular[..., column][:, rows] = axis[:, None].expand(-1, len(rows), -1)
             else:
-                linear[..., m][:, rows] = axis[:, None].expand(-1, len(rows), -1)
+                linear[..., column][:, rows] = axis[:, None].expand(-1, len(rows), -1)
+        coupling = self._coupling[[m for m, _ in moved]]
         shape = (*batch, len(indices))
         return PointJacobian(
             pos=pos.view(*shape, 3),
             rot=rot.view(*shape, 3, 3),
-            linear=(linear @ self._coupling).view(*shape, 3, -1),
-            angular=(angular @ self._coupling).view(*shape, 3, -1),
+            linear=(linear @ coupling).view(*shape, 3, coupling.shape[1]),
+            angular=(angular @ coupling).view(*shape, 3, coupling.shape[1]),
         )
 
     def clamp(self, q: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -26,6 +25,7 @@ from xreset.retarget.hand.solve import HandMotion, HandTargets, retarget_hand
 from xreset.retarget.partial import Batch, Partial, run_key
 from xreset.retarget.validity import REASONS, Thresholds, classify
 from xreset.spec import ObjectSpec, RobotSpec
+from xreset.tensors import one_thread
 
 __all__ = ["SCHEMA", "RetargetConfig", "Retargeted", "read_retargeted", "rest_on_table", "retarget_demos", "write_retargeted"]
 
@@ -59,17 +59,6 @@ def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
         DemoError: an object of the demonstrations is not among ``objects``.
     """
     return grounded(levelled(demos), _by_name(demos, objects))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Batches here are small: a second thread gains nothing, and spins while it waits, which beside other work costs many times the run."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def retarget_demos(
@@ -118,7 +107,7 @@ def retarget_demos(
         solved = kept.read(number) if kept else None
         if solved is None:
             targets = work.hand_targets(hand, sequences)
-            with _one_thread():
+            with one_thread():
                 solved = _solve(demos, sequences, hand, arm, targets, config, report, timing or Timing())
             if kept:
                 kept.write(number, solved)
@@ -172,7 +161,9 @@ def hand_motions(
     work, hand = _Work(demos, objects, config), HandModel(robot, device=device)
     for sequences, report in work.batches(progress):
         targets = work.hand_targets(hand, sequences)
-        yield sequences, targets, retarget_hand(hand, targets, config.hand, report)
+        with one_thread():
+            motion = retarget_hand(hand, targets, config.hand, report)
+        yield sequences, targets, motion
 
 
 def wrist_paths(

@@ -59,9 +59,9 @@ class Measures:
     arm_jump: Tensor
     """[rad or m]; 0 in the first annotated frame."""
     table_clearance: Tensor
-    """Lowest height of the robot's shapes above the table [m]."""
+    """Lowest height of the robot's shapes above the table, 2 cm where it is more [m]."""
     self_clearance: Tensor
-    """Smallest signed distance between the robot's shapes [m]."""
+    """Smallest signed distance between the robot's shapes, 2 cm where it is more [m]."""
 
 
 def classify(measures: Measures, thresholds: Thresholds) -> Tensor:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from time import perf_counter
 
 import numpy as np
 import torch
@@ -23,13 +22,17 @@ from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, track
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search
 from xreset.spec import RobotSpec
+from xreset.tensors import one_thread
 
 _LENGTH = 0.10
 """Length that counts as much as one radian in the measure of dexterity [m]."""
+_FIRST = 12
+"""Frames that a candidate is tried on before all others: most fail on enough of them."""
 _SHRINK = 0.6
 """Factor by which the spread of candidates about the best shrinks from round to round."""
 
 
+@one_thread()
 def place(
     robot: RobotSpec,
     paths: list[ArmTargets],
@@ -61,11 +64,9 @@ def place(
     own = Placement(pos=robot.base_pos, quat=robot.base_quat)
     found = [(own, reach(robot, own, tried, config))]
     effort = config.rounds * config.candidates + 10 * (1 + config.elite)  # a finalist takes as long as ten candidates or so
-    started = perf_counter()
     for step, candidate in enumerate(_draws(robot, avoid, config, random, found)):
-        if perf_counter() - started > config.seconds:
-            break
-        found.append((candidate, reach(robot, candidate, tried, config)))
+        least = found[config.elite - 1][1].rank[0] if len(found) >= config.elite else 0
+        found.append((candidate, reach(robot, candidate, tried, config, least)))
         found.sort(key=lambda pair: pair[1].rank, reverse=True)
         progress((step + 1) / effort, found[0][1])
 
@@ -80,18 +81,26 @@ def place(
     return Search(best=best, own=finalists[0], home=home, frames=sum(int(path.annotated.sum()) for path in paths))
 
 
-def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: PlaceConfig) -> Reach:
-    """What the robot reaches of wrist poses [F, 1, ...] from a placement."""
+def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: PlaceConfig, least: int = 0) -> Reach:
+    """What the robot reaches of wrist poses [F, 1, ...] from a placement.
+
+    It is given up as soon as the first number of its rank must stay below ``least``; then all frames that were not tried count as reached.
+    """
     model = ArmModel(replace(robot, base_pos=placement.pos, base_quat=placement.quat))
     thresholds = Thresholds(hand_error=np.inf, wrist_position=config.position, wrist_orientation=np.radians(config.orientation))
-    joints, measures = track(model, wrists, thresholds, ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0))
-    reached = (classify(measures, thresholds) == 0)[:, 0]
-    if not bool(reached.any()):
-        return Reach(reached=0.0, dexterity=0.0)
-    full = model.full(joints[reached, 0], wrists.hand_joints[reached, 0])
-    jacobian = model.kinematics.jacobian(full, [robot.hand_root])
-    rows = torch.cat((jacobian.linear[:, 0] / _LENGTH, jacobian.angular[:, 0]), dim=1)[..., model.arm]
-    return Reach(reached=float(reached.double().mean()), dexterity=float(torch.linalg.svdvals(rows)[:, -1].mean()))
+    effort = ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0)
+    frames, begin, end = len(wrists.annotated), 0, _FIRST if least else len(wrists.annotated)
+    possible, dexterity = frames, torch.zeros(0, dtype=torch.float64)
+    while begin < frames and Reach(reached=possible / frames, dexterity=0.0).rank[0] >= least:
+        part = wrists[begin:end]
+        joints, measures = track(model, part, thresholds, effort)
+        reached = (classify(measures, thresholds) == 0)[:, 0]
+        possible -= int((~reached).sum())
+        jacobian = model.kinematics.jacobian(model.full(joints[reached, 0], part.hand_joints[reached, 0]), [robot.hand_root])
+        rows = torch.cat((jacobian.linear[:, 0] / _LENGTH, jacobian.angular[:, 0]), dim=1)[..., model.arm]
+        dexterity = torch.cat((dexterity, torch.linalg.svdvals(rows)[:, -1]))
+        begin, end = end, 4 * end
+    return Reach(reached=possible / frames, dexterity=float(dexterity.mean()) if len(dexterity) else 0.0)
 
 
 def single_frames(paths: list[ArmTargets], hand_error: float) -> ArmTargets:

@@ -33,8 +33,6 @@ class PlaceConfig:
     """Of each round."""
     rounds: int = 5
     """Of candidates; 0 measures the description's own placement only."""
-    seconds: float = 150.0
-    """Time after which no further candidate is tried [s]; the finalists come after. Give more on a slow machine."""
     elite: int = 5
     """Best candidates: the next round is drawn around them, and in the end they and the description's own placement are the finalists."""
     position: float = 0.005
@@ -64,7 +62,7 @@ class Reach:
     """Mean over the reached frames of the smallest singular value of the hand root's Jacobian, lengths in units of 0.1 m; 0 is singular."""
 
     @property
-    def rank(self) -> tuple[float, float]:
+    def rank(self) -> tuple[int, float]:
         """For comparison: reach to half a percent, then dexterity."""
         return (round(self.reached * 200), self.dexterity)
 

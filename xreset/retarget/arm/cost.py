@@ -5,7 +5,7 @@
 E_coll = w sum of [margin - distance]_+^2 over the lowest point of the hand and of each of the arm's links (table) and, where asked for,
 over the pairs of shapes that coal finds near each other.
 
-Shape letters: B batch (sequences, branches or restarts), n arm joints, J all joints, A arm links, H support points of the hand.
+Shape letters: B batch (sequences, branches or restarts), n arm joints, J all joints, C carriers, G links with support points.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.geometry.collision import height_above_table
 from xreset.geometry.rotations import matrix_to_quat, quat_conjugate, quat_multiply, quat_to_axis_angle
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel
@@ -34,8 +33,8 @@ class Frame:
     """[B, 3] position of the hand root."""
     quat: Tensor
     """[B, 4] orientation of the hand root."""
-    support: Tensor
-    """[B, H, 3] hand support points in the hand root's frame."""
+    hand_poses: Tensor
+    """[B, G, 4, 4] see :meth:`ArmModel.hand_poses`."""
     hand_joints: Tensor
     """[B, J_hand]"""
     previous: Tensor | None
@@ -79,7 +78,7 @@ def system(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, *, self_
     """Cost of one frame and its Gauss-Newton approximation at ``q`` [B, n]."""
     full = model.full(q, frame.hand_joints)
     carriers = model.kinematics.jacobian(full, model.carriers)
-    linear, angular = carriers.linear[..., model.arm], carriers.angular[..., model.arm]  # [B, 1 + A, 3, n]
+    linear, angular = carriers.linear[..., model.arm], carriers.angular[..., model.arm]  # [B, C, 3, n]
 
     turn = quat_to_axis_angle(quat_multiply(matrix_to_quat(carriers.rot[:, 0]), quat_conjugate(frame.quat)))
     residuals = [config.position_weight**0.5 * (carriers.pos[:, 0] - frame.pos), config.orientation_weight**0.5 * turn]
@@ -88,16 +87,11 @@ def system(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, *, self_
         scale = config.smoothness_weight**0.5
         residuals.append(scale * (q - frame.previous))
         jacobians.append(scale * torch.eye(q.shape[1], dtype=q.dtype).expand(len(q), -1, -1))
-    hand = [(0, frame.support, model.hand_radii)] if len(model.hand_radii) else []
-    for carrier, points, radii in hand + model.arm_support:
-        arms = points @ carriers.rot[:, carrier].mT
-        heights = height_above_table(arms + carriers.pos[:, None, carrier], radii, model.table)
-        lowest = heights.argmin(dim=1)
-        rows = torch.arange(len(q))
-        value, row = _intrusion(heights[rows, lowest], config.table_margin, config.collision_weight)
-        lift = linear[:, carrier, 2] + torch.linalg.cross(angular[:, carrier], arms[rows, lowest][..., None], dim=1)[:, 2]
-        residuals.append(value[:, None])
-        jacobians.append(row[:, None, None] * lift[:, None])
+    low = model.lowest(carriers.pos, carriers.rot, frame.hand_poses, config.table_margin)
+    lift = linear[low.frame, low.carrier, 2] + torch.linalg.cross(angular[low.frame, low.carrier], low.lever[..., None], dim=1)[:, 2]
+    value, slope = _intrusion(low.height, config.table_margin, config.collision_weight)
+    residuals.append(q.new_zeros(linear.shape[:2]).index_put((low.frame, low.carrier), value))
+    jacobians.append(q.new_zeros(linear[:, :, 0].shape).index_put((low.frame, low.carrier), slope[:, None] * lift))
     r, J = torch.cat(residuals, dim=1), torch.cat(jacobians, dim=1)
     system = System(cost=r.square().sum(1), hessian=J.mT @ J, gradient=(J.mT @ r[..., None])[..., 0])
     return _with_self_collision(system, model, full, carriers.pos, linear, angular, config) if self_collision else system
@@ -118,9 +112,9 @@ def _with_self_collision(
         system: to add to.
         model: the robot.
         full: [B, J] all joints.
-        origins: [B, 1 + A, 3] of the carriers.
-        linear: [B, 1 + A, 3, n] their Jacobians.
-        angular: [B, 1 + A, 3, n]
+        origins: [B, C, 3] of the carriers.
+        linear: [B, C, 3, n] their Jacobians.
+        angular: [B, C, 3, n]
         config: weight and margin.
     """
     near = model.arm_collision.near(model.kinematics.link_poses(full).numpy(), config.self_margin)

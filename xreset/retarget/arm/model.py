@@ -1,25 +1,28 @@
 """A robot as its arm's inverse kinematics sees it, what the arm should do, and how well joints do it.
 
-Shape letters: S sequences, T frames, B batch, n arm joints, J_hand hand joints, J all joints, L links, H support points of the hand.
+Shape letters: S sequences, T frames, B batch, n arm joints, J_hand hand joints, J all joints, L links, C carriers, G links with support
+points.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from xreset.errors import RobotError
-from xreset.geometry.collision import SelfCollision, height_above_table, table_points
+from xreset.geometry.balls import Spans
+from xreset.geometry.collision import SelfCollision, SupportPoints, height_above_table, table_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.retarget.validity import Measures
 from xreset.spec import RobotSpec, TableSpec
 from xreset.tensors import Tensors
 
-_SELF_SEARCH = 0.02
-"""Distances between shapes are measured up to here [m]."""
+_SEARCH = 0.02
+"""Distances between shapes, and heights above the table, are measured up to here [m]."""
 _AT_LIMIT = 1e-6
 """A joint this near its limit is at it [rad or m]."""
 
@@ -46,6 +49,20 @@ class ArmTargets(Tensors):
         return self.map(lambda x: x.flip(1))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Lowest(Tensors):
+    """Points of the robot that are low above the table (length A)."""
+
+    frame: Tensor
+    """[A] which of the batch."""
+    carrier: Tensor
+    """[A] index of the link that carries the point."""
+    height: Tensor
+    """[A] of the robot's shape there above the table [m]."""
+    lever: Tensor
+    """[A, 3] from the carrier's origin to the centre of the ball that is lowest, along the world's axes [m]."""
+
+
 class ArmModel:
     """A robot as its arm's inverse kinematics sees it."""
 
@@ -67,31 +84,77 @@ class ArmModel:
         self.hand = hand
         in_hand = set(hand.link_names)
 
-        support = table_points(robot, self.kinematics)
-        points, radii = torch.as_tensor(support.points), torch.as_tensor(support.radii)
-        of_hand = torch.tensor([link in in_hand for link in support.links], dtype=torch.bool)
-        self.hand_links = tuple(link for link in support.links if link in in_hand)
-        """Link of each of the hand's support points (length H)."""
-        self.hand_points, self.hand_radii = points[of_hand], radii[of_hand]
         self.carriers: tuple[str, ...] = (robot.hand_root, *(link for link in self.kinematics.link_names if link not in in_hand))
         """Links whose motion the arm's joints determine: the hand root, which carries the hand, then the arm's links."""
-        rows = {link: [i for i, name in enumerate(support.links) if name == link] for link in support.links if link not in in_hand}
-        self.arm_support = [(self.carriers.index(link), points[of_link], radii[of_link]) for link, of_link in rows.items()]
-        """Per arm link with shapes: its index among the carriers, its support points and radii."""
+        self._hang(table_points(robot, self.kinematics), in_hand)
         self.carrier_of = torch.tensor([0 if name in in_hand else self.carriers.index(name) for name in self.kinematics.link_names])
         """[L] index of the carrier of every link."""
         self.arm_collision = SelfCollision(robot, self.kinematics, moved_by_arm=True)
         """Distances that the arm's joints change."""
         self._hand_collision = SelfCollision(robot, hand, only=robot.self_collision_links)
 
-    def hand_support(self, hand_joints: Tensor) -> Tensor:
-        """[..., H, 3] the hand's support points in the frame of the hand root."""
-        return self.hand.points(hand_joints, self.hand_links, self.hand_points)
+    def _hang(self, support: SupportPoints, in_hand: set[str]) -> None:
+        """Which points stand for the shapes that may not touch the table, and what carries them."""
+        links = list(dict.fromkeys(support.links))
+        self._links = [link for link in links if link in in_hand] + [link for link in links if link not in in_hand]
+        """Links with support points (length G), those of the hand first."""
+        self._in_hand = [link for link in self._links if link in in_hand]
+        self._carrier = torch.tensor([0 if link in in_hand else self.carriers.index(link) for link in self._links], dtype=torch.long)
+        rows = [[i for i, name in enumerate(support.links) if name == link] for link in self._links]
+        count = torch.tensor([len(part) for part in rows], dtype=torch.long)
+        self._spans = Spans(start=count.cumsum(0) - count, count=count)
+        order = [i for part in rows for i in part]
+        self._points, self._radii = torch.as_tensor(support.points[order]), torch.as_tensor(support.radii[order])
+        middles = np.array([(support.points[part].max(axis=0) + support.points[part].min(axis=0)) / 2 for part in rows]).reshape(-1, 3)
+        reach = [
+            (np.linalg.norm(support.points[part] - m, axis=1) + support.radii[part]).max() for part, m in zip(rows, middles, strict=True)
+        ]
+        self._middles, self._reach = torch.as_tensor(middles), torch.tensor(reach, dtype=self._points.dtype)
+        """Of a ball about each link's points, in the link's frame."""
+
+    def hand_poses(self, hand_joints: Tensor) -> Tensor:
+        """[..., G, 4, 4] the links with support points, in the frames of their carriers: only those of the hand move there."""
+        poses = torch.eye(4, dtype=hand_joints.dtype).repeat(*hand_joints.shape[:-1], len(self._links), 1, 1)
+        if self._in_hand:
+            poses[..., : len(self._in_hand), :, :] = self.hand.link_poses(hand_joints, self._in_hand)
+        return poses
+
+    def lowest(self, pos: Tensor, rot: Tensor, hand_poses: Tensor, below: float) -> Lowest:
+        """The lowest point of each carrier's shapes, where it is lower above the table than ``below`` [m].
+
+        Args:
+            pos: [B, C, 3] carriers' origins.
+            rot: [B, C, 3, 3] their orientations.
+            hand_poses: [B, G, 4, 4] see :meth:`hand_poses`.
+            below: [m]
+        """
+        turn, shift = hand_poses[..., :3, :3], hand_poses[..., :3, 3]
+        middle = shift + (turn @ self._middles[..., None])[..., 0]  # [B, G, 3]
+        height = pos[:, self._carrier, 2] + (rot[:, self._carrier, 2] * middle).sum(-1)
+        frame, link = (height - self._reach < below).nonzero(as_tuple=True)
+        found: list[Lowest] = []
+        for asking, point in self._spans.members(link):
+            row, of = frame[asking], link[asking]
+            carrier = self._carrier[of]
+            local = shift[row, of] + (turn[row, of] @ self._points[point][..., None])[..., 0]
+            lever = (rot[row, carrier] @ local[..., None])[..., 0]
+            heights = height_above_table(lever[:, None] + pos[row, carrier][:, None], self._radii[point][:, None], self.table)[:, 0]
+            found.append(Lowest(frame=row, carrier=carrier, height=heights, lever=lever)[heights < below])
+        if not found:
+            none = frame.new_zeros(0)
+            return Lowest(frame=none, carrier=none, height=pos.new_zeros(0), lever=pos.new_zeros(0, 3))
+        low = Lowest.cat(found)
+        low = low[low.height.argsort(stable=True)]
+        key = low.frame * len(self.carriers) + low.carrier
+        order = key.argsort(stable=True)
+        first = torch.ones_like(order, dtype=torch.bool)
+        first[1:] = key[order][1:] != key[order][:-1]
+        return low[order[first]]
 
     def hand_clearance(self, hand_joints: Tensor) -> Tensor:
         """[...] smallest signed distance between those of the hand's shapes that collide in physics [m]."""
         poses = self.hand.link_poses(hand_joints.flatten(0, -2)).numpy()
-        return torch.as_tensor(self._hand_collision.clearance(poses, _SELF_SEARCH)).view(hand_joints.shape[:-1])
+        return torch.as_tensor(self._hand_collision.clearance(poses, _SEARCH)).view(hand_joints.shape[:-1])
 
     def full(self, arm: Tensor, hand_joints: Tensor) -> Tensor:
         """[..., J] all joints in joint order."""
@@ -105,14 +168,12 @@ def measure(model: ArmModel, targets: ArmTargets, joints: Tensor) -> Measures:
     """What is measured of every frame [S, T] of the paths ``joints`` [S, T, n]."""
     sequences, frames, _ = joints.shape
     poses = model.kinematics.link_poses(model.full(joints, targets.hand_joints).flatten(0, 1))
-    root = poses[:, model.kinematics.link_index(model.robot.hand_root)]
+    carriers = poses[:, [model.kinematics.link_index(link) for link in model.carriers]]
+    root = carriers[:, 0]
     quat = matrix_to_quat(root[:, :3, :3])
-    heights = [torch.full((len(poses), 1), torch.inf, dtype=poses.dtype)]  # what a robot without shapes would keep
-    heights += [height_above_table(_place(root, model.hand_support(targets.hand_joints).flatten(0, 1)), model.hand_radii, model.table)]
-    for carrier, points, radii in model.arm_support:
-        link = poses[:, model.kinematics.link_index(model.carriers[carrier])]
-        heights.append(height_above_table(_place(link, points), radii, model.table))
-    apart = torch.as_tensor(model.arm_collision.clearance(poses.numpy(), _SELF_SEARCH)).view(sequences, frames)
+    low = model.lowest(carriers[..., :3, 3], carriers[..., :3, :3], model.hand_poses(targets.hand_joints).flatten(0, 1), _SEARCH)
+    height = torch.full((len(poses),), _SEARCH, dtype=poses.dtype).scatter_reduce(0, low.frame, low.height, "amin")
+    apart = torch.as_tensor(model.arm_collision.clearance(poses.numpy(), _SEARCH)).view(sequences, frames)
     return Measures(
         annotated=targets.annotated,
         hand_error=targets.hand_error,
@@ -120,7 +181,7 @@ def measure(model: ArmModel, targets: ArmTargets, joints: Tensor) -> Measures:
         wrist_orientation=quat_angle(quat.view(sequences, frames, 4), targets.root_quat),
         at_limit=((joints <= model.lower + _AT_LIMIT) | (joints >= model.upper - _AT_LIMIT)).any(-1),
         arm_jump=arm_jump(joints, targets.annotated),
-        table_clearance=torch.cat(heights, dim=1).amin(1).view(sequences, frames),
+        table_clearance=height.view(sequences, frames),
         self_clearance=torch.minimum(apart, targets.hand_clearance),
     )
 
@@ -129,8 +190,3 @@ def arm_jump(joints: Tensor, annotated: Tensor) -> Tensor:
     """[..., T] largest change of a joint since the frame before, along paths [..., T, n]; 0 where that is not annotated [..., T]."""
     change = joints.diff(dim=-2).abs().amax(-1).masked_fill(~annotated[..., :-1], 0.0)
     return torch.cat((torch.zeros_like(joints[..., :1, 0]), change), dim=-1)
-
-
-def _place(T: Tensor, points: Tensor) -> Tensor:
-    """[B, H, 3] points given in the frames T [B, 4, 4], in the world."""
-    return points @ T[:, :3, :3].mT + T[:, None, :3, 3]

@@ -1,6 +1,7 @@
 """Paths of the arm's joints: followed frame after frame from distinct solutions of one frame, compared, and put together from pieces.
 
-Shape letters: S sequences, T frames, K paths of a sequence, B paths of all, C chosen frames, n arm joints, H support points of the hand.
+Shape letters: S sequences, T frames, K paths of a sequence, B paths of all, C chosen frames, n arm joints, G links with
+support points.
 """
 
 from __future__ import annotations
@@ -48,22 +49,22 @@ class ArmProblem:
 
     model: ArmModel
     targets: ArmTargets
-    support: Tensor
-    """[S, T, H, 3] the hand's support points in the frame of the hand root: they follow from the targets, and are worked out once."""
+    hand_poses: Tensor
+    """[S, T, G, 4, 4] see :meth:`ArmModel.hand_poses`: they follow from the targets, and are worked out once."""
     thresholds: Thresholds
     config: ArmConfig
 
     def select(self, *index: Tensor) -> ArmProblem:
         """That of some sequences, or of some frames of them: every tensor is indexed alike."""
-        return replace(self, targets=self.targets[index], support=self.support[index])
+        return replace(self, targets=self.targets[index], hand_poses=self.hand_poses[index])
 
     def repeated(self, count: int) -> ArmProblem:
         """Every sequence so many times, one after the other: [S count, ...]."""
-        return self.select(torch.arange(len(self.support)).repeat_interleave(count))
+        return self.select(torch.arange(len(self.hand_poses)).repeat_interleave(count))
 
     def reversed(self) -> ArmProblem:
         """The same from the last frame to the first."""
-        return replace(self, targets=self.targets.reversed(), support=self.support.flip(1))
+        return replace(self, targets=self.targets.reversed(), hand_poses=self.hand_poses.flip(1))
 
     def reasons(self, joints: Tensor) -> Tensor:
         """[S, T] why frames of the paths [S, T, n] are invalid, 0 where they are valid: see :func:`~xreset.retarget.validity.classify`."""
@@ -78,7 +79,7 @@ class ArmProblem:
 
 def follow(problem: ArmProblem, start: Tensor, progress: Progress, *, self_collision: bool = False) -> Tensor:
     """[S, T, n] joints along the path, every frame warm-started from the one before; the first from ``start`` [S, n]."""
-    config, frames = problem.config, problem.support.shape[1]
+    config, frames = problem.config, problem.hand_poses.shape[1]
     path: list[Tensor] = []
     for t in range(frames):
         q, previous, steps = (path[-1], path[-1], config.iterations) if path else (start, None, config.first_iterations)
@@ -156,7 +157,7 @@ def _reseeded(problem: ArmProblem, missed: Tensor, progress: Progress) -> tuple[
 def _first_frames(problem: ArmProblem) -> Tensor:
     """[S, K, n] distinct solutions of the first frame: the one that home leads to, then the best others; the last one fills up."""
     model, config = problem.model, problem.config
-    sequences, restarts, home = len(problem.support), config.restarts, model.home
+    sequences, restarts, home = len(problem.hand_poses), config.restarts, model.home
     generator = torch.Generator().manual_seed(config.seed)
     spread = torch.rand(restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0  # every sequence gets the same
     spread[0] = 0.0
@@ -186,7 +187,7 @@ def _frame(problem: ArmProblem, t: int, previous: Tensor | None) -> Frame:
     return Frame(
         pos=targets.root_pos[:, t],
         quat=targets.root_quat[:, t],
-        support=problem.support[:, t],
+        hand_poses=problem.hand_poses[:, t],
         hand_joints=targets.hand_joints[:, t],
         previous=previous,
     )

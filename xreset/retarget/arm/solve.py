@@ -49,8 +49,8 @@ def track(
     Returns:
         [S, T, n] arm joints, and what was measured of every frame ([S, T] each).
     """
-    support = model.hand_support(targets.hand_joints)
-    problem = ArmProblem(model=model, targets=targets, support=support, thresholds=thresholds, config=config or ArmConfig())
+    poses = model.hand_poses(targets.hand_joints)
+    problem = ArmProblem(model=model, targets=targets, hand_poses=poses, thresholds=thresholds, config=config or ArmConfig())
     report = progress or (lambda _: None)
 
     forwards = branches(problem, lambda done: report(0.3 * done))
@@ -72,11 +72,13 @@ def _rescued(problem: ArmProblem, forwards: Paths, joints: Tensor, worth: Tensor
         worth: [S] its worth.
         report: called with the fraction that is done.
     """
-    turned = problem.reversed()
-    backwards = branches(turned, lambda done: report(0.3 + 0.3 * done))
-    back, other = best(turned, backwards)
-    joints = torch.where((other > worth)[:, None, None], back.flip(1), joints)
-    paths = Paths.cat((forwards, backwards.reversed()), dim=1)
+    paths = forwards
+    if problem.targets.annotated.shape[1] > 1:
+        turned = problem.reversed()
+        backwards = branches(turned, lambda done: report(0.3 + 0.3 * done))
+        back, other = best(turned, backwards)
+        joints = torch.where((other > worth)[:, None, None], back.flip(1), joints)
+        paths = Paths.cat((forwards, backwards.reversed()), dim=1)
 
     def apart(part: ArmProblem, rows: Tensor, _: Tensor) -> Tensor:
         return follow(part, joints[rows, 0], lambda done: report(0.6 + 0.1 * done), self_collision=True)

@@ -5,7 +5,7 @@ Shape letters: B frames, G links with balls, A things found, n variables.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +16,7 @@ from xreset.geometry.collision import height_above_table
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import quat_to_matrix
 from xreset.retarget.hand.model import Bodies, HandModel
+from xreset.tensors import Tensors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +63,7 @@ def too_near(
 ) -> Distances:
     """Balls nearer to the object than ``object_clearance``, below the table's top, or deeper in each other than ``self_depth`` [m].
 
-    Links are told apart by one ball about each before their own balls are looked at.
+    Links are told apart by one ball about each, then by one about each cluster of their balls, before those are looked at.
 
     Args:
         model: the hand.
@@ -73,46 +74,84 @@ def too_near(
         self_depth: [m]
     """
     bounds = bodies.pos[:, model.group_body] + (bodies.rot[:, model.group_body] @ model.balls.bound_centers[..., None])[..., 0]  # [B, G, 3]
-    none = bounds.new_zeros(0, len(model.home) + 6)
     found = (
-        Distances(frame=torch.zeros(0, dtype=torch.long, device=none.device), value=none[:, 0], slope=none),
         *_below_table(model, bodies, bounds, considered),
         *_in_object(model, bodies, bounds, objects, considered, object_clearance),
         *_in_each_other(model, bodies, bounds, considered, self_depth),
     )
-    return _sorted(*(torch.cat([getattr(part, name) for part in found]) for name in ("frame", "value", "slope")))
+    if not found:
+        none = bounds.new_zeros(0, len(model.home) + 6)
+        return Distances(frame=torch.zeros(0, dtype=torch.long, device=none.device), value=none[:, 0], slope=none)
+    together = _Found.cat(found)
+    order = together.number.argsort(stable=True)
+    order = order[together.frame[order].argsort(stable=True)]
+    return Distances(frame=together.frame[order], value=together.value[order], slope=together.slope[order])
 
 
-def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Iterator[Distances]:
+@dataclass(frozen=True, kw_only=True)
+class _Found(Tensors):
+    """As :class:`Distances`, in any order."""
+
+    frame: Tensor
+    value: Tensor
+    slope: Tensor
+    number: Tensor
+    """[A] place among those of its frame: the order of a sum shows in its last digits."""
+
+
+def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Iterator[_Found]:
     candidate, group = ((bounds[..., 2] < model.balls.bound_radii) & considered[:, None]).nonzero(as_tuple=True)
-    for asking, ball in model.balls.spans.members(group):
-        frame = candidate[asking]
+    for frame, ball in _near_balls(model, bodies, candidate, group, lambda centers, _: centers[:, 2], 0.0):
         centers = model.ball_centers(bodies, frame, ball)
         value = height_above_table(centers, model.balls.radii[ball], model.table)
         low = value < 0
         up = torch.tensor([0.0, 0.0, 1.0], dtype=centers.dtype, device=centers.device).expand(int(low.sum()), 3)
         slope = model.point_slope(bodies, frame[low], model.balls.link[ball[low]], centers[low], up)
-        yield Distances(frame=frame[low], value=value[low], slope=slope)
+        yield _Found(frame=frame[low], value=value[low], slope=slope, number=ball[low])
 
 
 def _in_object(
     model: HandModel, bodies: Bodies, bounds: Tensor, objects: Objects, considered: Tensor, object_clearance: float
-) -> Iterator[Distances]:
+) -> Iterator[_Found]:
     every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
     beside = objects.fields.beside(objects.local(bounds, every), objects.index[every])
     candidate, group = ((beside < model.balls.bound_radii + object_clearance) & considered[:, None]).nonzero(as_tuple=True)
-    for asking, ball in model.balls.spans.members(group):
-        frame = candidate[asking]
+    margin = object_clearance + objects.fields.spacing
+    for frame, ball in _near_balls(
+        model, bodies, candidate, group, lambda centers, frame: objects.signed_distance(centers, frame)[0], margin
+    ):
         centers = model.ball_centers(bodies, frame, ball)
         distance, direction = objects.signed_distance(centers, frame)
         value = distance - model.balls.radii[ball] - object_clearance
         near = value < 0
         slope = model.point_slope(bodies, frame[near], model.balls.link[ball[near]], centers[near], direction[near])
-        yield Distances(frame=frame[near], value=value[near], slope=slope)
+        yield _Found(frame=frame[near], value=value[near], slope=slope, number=len(model.balls.radii) + ball[near])
 
 
-def _in_each_other(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor, self_depth: float) -> Iterator[Distances]:
-    balls, fields = model.balls, model.balls.fields
+def _near_balls(
+    model: HandModel, bodies: Bodies, frame: Tensor, group: Tensor, distance: Callable[[Tensor, Tensor], Tensor], margin: float
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Frames [A] and balls [A] of links [C] in frames [C] whose cluster is nearer to something than ``margin`` [m].
+
+    Args:
+        model: the hand.
+        bodies: its configurations.
+        frame: [C]
+        group: [C] among the links with balls.
+        distance: to it, of points [K, 3] in frames [K].
+        margin: [m]; for distances from a grid one step of it more, which is as far as they may be wrong beside an edge.
+    """
+    clusters = model.balls.clusters
+    for asking, cluster in clusters.of_link.members(group):
+        row, body = frame[asking], model.group_body[group[asking]]
+        centers = bodies.pos[row, body] + (bodies.rot[row, body] @ clusters.centers[cluster][..., None])[..., 0]
+        near = distance(centers, row) < clusters.radii[cluster] + margin
+        for within, ball in clusters.members(cluster[near]):
+            yield row[near][within], ball
+
+
+def _in_each_other(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor, self_depth: float) -> Iterator[_Found]:
+    balls, fields, clusters = model.balls, model.balls.fields, model.balls.guard_clusters
     a, b = balls.link_pairs.unbind(1)
     first, second, reach = model.group_body[a], model.group_body[b], balls.bound_radii + STAND_IN - self_depth
     near = (bounds[:, a] - bounds[:, b]).norm(dim=-1) < reach[a] + balls.bound_radii[b]
@@ -123,22 +162,28 @@ def _in_each_other(model: HandModel, bodies: Bodies, bounds: Tensor, considered:
     candidate, pair, inverse = candidate[near], pair[near], inverse[near]
     turn = inverse @ bodies.rot[candidate, first[pair]]
     shift = (inverse @ (bodies.pos[candidate, first[pair]] - bodies.pos[candidate, second[pair]])[..., None])[..., 0]
-    for asking, guard in balls.guard_spans.members(a[pair]):
-        ball, radius, solid = balls.guards[guard], balls.guard_radii[guard], b[pair[asking]]
-        local = (turn[asking] @ balls.centers[ball][..., None])[..., 0] + shift[asking]
-        close = fields.beside(local, solid) <= (radius - self_depth).clamp_min(0.0)
-        asking, ball, radius, solid, local = asking[close], ball[close], radius[close], solid[close], local[close]
-        distance, away = fields.signed_distance(local, solid)
-        value = distance - radius + self_depth
-        deep = value < 0
-        asking, ball, solid = asking[deep], ball[deep], solid[deep]
-        frame = candidate[asking]
-        direction = (bodies.rot[frame, model.group_body[solid]] @ away[deep][..., None])[..., 0]
-        centers = model.ball_centers(bodies, frame, ball)
-        slope = model.point_slope(bodies, frame, balls.link[ball], centers, direction)
-        yield Distances(frame=frame, value=value[deep], slope=slope - model.point_slope(bodies, frame, solid, centers, direction))
 
+    def local(asking: Tensor, points: Tensor) -> Tensor:
+        return (turn[asking] @ points[..., None])[..., 0] + shift[asking]
 
-def _sorted(frame: Tensor, value: Tensor, slope: Tensor) -> Distances:
-    order = frame.argsort(stable=True)
-    return Distances(frame=frame[order], value=value[order], slope=slope[order])
+    for asking, cluster in clusters.of_link.members(a[pair]):
+        centers, solid = local(asking, clusters.centers[cluster]), b[pair[asking]]
+        margin = clusters.radii[cluster] - self_depth + fields.spacing
+        close = fields.beside(centers, solid) < margin
+        asking, cluster, centers, solid, margin = asking[close], cluster[close], centers[close], solid[close], margin[close]
+        close = fields.signed_distance(centers, solid)[0] < margin
+        asking, cluster = asking[close], cluster[close]
+        for within, guard in clusters.members(cluster):
+            owner = asking[within]
+            ball, radius, solid = balls.guards[guard], balls.guard_radii[guard], b[pair[owner]]
+            distance, away = fields.signed_distance(local(owner, balls.centers[ball]), solid)
+            value = distance - radius + self_depth
+            deep = value < 0
+            owner, ball, solid, guard = owner[deep], ball[deep], solid[deep], guard[deep]
+            frame = candidate[owner]
+            direction = (bodies.rot[frame, model.group_body[solid]] @ away[deep][..., None])[..., 0]
+            centers = model.ball_centers(bodies, frame, ball)
+            slope = model.point_slope(bodies, frame, balls.link[ball], centers, direction)
+            slope = slope - model.point_slope(bodies, frame, solid, centers, direction)
+            number = 2 * len(balls.radii) + pair[owner] * len(balls.guards) + guard
+            yield _Found(frame=frame, value=value[deep], slope=slope, number=number)

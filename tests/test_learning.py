@@ -219,10 +219,11 @@ class StorageTest(unittest.TestCase):
 
     @unittest.skipUnless(torch.cuda.is_available(), "there is no CUDA device: updates are captured on GPUs only")
     def test_a_captured_update_learns_what_a_plain_one_does(self):
-        # an adaptive rate multiplies the last bits in which kernels differ: a step more or less of it is a factor of 1.5
+        # Adam moves a weight by about the rate whatever its gradient's size, so that one whose sign hangs on the last bits of a kernel may
+        # end 60 steps x 3e-4 away: 0.018. An adaptive rate multiplies that: a step more or less of it is a factor of 1.5.
         for tolerance, options in (
-            (1e-3, {"schedule": "fixed", "learning_rate": 3e-4}),
-            (1e-3, {"schedule": "fixed", "learning_rate": 3e-4, "normalize_returns": True, "critic_learning_rate": 3e-4}),
+            (1e-2, {"schedule": "fixed", "learning_rate": 3e-4}),
+            (1e-2, {"schedule": "fixed", "learning_rate": 3e-4, "normalize_returns": True, "critic_learning_rate": 3e-4}),
             (5e-2, {}),
         ):
             (one, before, plain), (two, _, captured) = (

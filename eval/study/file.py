@@ -110,7 +110,7 @@ class Runs(Checked):
     device: Literal["cuda", "cpu"] = "cuda"
     gpus: int = 1
     """Processes, each with a GPU and ``num_envs`` worlds of its own."""
-    num_envs: int = 8192
+    num_envs: int = 4096
     """Worlds of each process."""
     evaluations: tuple[str, ...] = ()
     """Names of those that are done; none: all."""

@@ -477,6 +477,15 @@ class ThinWalls(unittest.TestCase):
         self.assertGreater(few.deviation, 0.002)
         self.assertLess(decompose(ring).deviation, 0.002)
 
+    def test_cutting_stops_after_so_many_triangles_at_the_same_pieces(self):
+        ring = trimesh.creation.annulus(0.03, 0.04, 0.05, sections=24)
+        whole, short, again = decompose(ring), *(decompose(ring, Settings(effort=5_000)) for _ in range(2))
+        self.assertEqual((whole.finished, short.finished), (True, False))
+        self.assertLess(whole.deviation, 0.002)
+        self.assertGreater(short.deviation, 0.002)
+        for one, other in zip(short.shapes, again.shapes, strict=True):
+            np.testing.assert_array_equal(one.geometry.vertices, other.geometry.vertices)
+
 
 class SpecIsFrozen(unittest.TestCase):
     def test_the_cached_stand_in_is_shared_but_cannot_be_reassigned(self):

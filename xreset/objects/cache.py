@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,7 +37,7 @@ def cached_pieces(
     settings: Settings = Settings(),  # noqa: B008 (frozen)
     progress: Progress = lambda parts, worst: None,
 ) -> Pieces:
-    """The pieces of a mesh, from the cache if they are there. Those of a decomposition that time cut short are not kept.
+    """The pieces of a mesh, from the cache if they are there. Those of a decomposition that was cut short are not kept.
 
     Args:
         mesh: the mesh.
@@ -45,7 +45,7 @@ def cached_pieces(
         settings: how to decompose it.
         progress: see :func:`xreset.objects.decompose.decompose`.
     """
-    config = asdict(replace(settings, seconds=0.0))
+    config = asdict(settings)
     key = hashlib.sha256(json.dumps([SCHEMA_NAME, source, config], sort_keys=True).encode()).hexdigest()
     path = cache_folder() / "objects" / f"{key}.npz"
     if path.is_file():
@@ -62,7 +62,7 @@ def cached_pieces(
     numbers = {name: np.asarray(getattr(pieces, name)) for name in ("deviation", "volume", "com", "inertia")}
     arrays = {"vertices": np.concatenate(parts), "offsets": offsets, **numbers}
     with suppress(XResetError):  # a cache that cannot be written costs time, nothing else
-        if pieces.in_time:
+        if pieces.finished:
             write_npz(path, SCHEMA_NAME, arrays, config=config, inputs={"mesh": source})
     return pieces
 

@@ -7,7 +7,6 @@ does not are joined again. PhysX takes hulls of at most 64 vertices in its fast 
 from __future__ import annotations
 
 import heapq
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -38,7 +37,7 @@ _FACES = 3000
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How a mesh is decomposed. Every field but ``seconds`` is part of the cache's key."""
+    """How a mesh is decomposed; the same on every machine."""
 
     max_pieces: int = 80
     """If the tolerance asks for more, it is widened."""
@@ -53,8 +52,9 @@ class Settings:
     """[m] How far pieces may stand off the surface of a mesh that is more than one."""
     thickness: float = 0.001
     """[m] Of the sheet that stands for a mesh that is not closed."""
-    seconds: float = 50.0
-    """Of processor time; after that, the pieces so far are taken. So the pieces of a mesh do not depend on what else the machine does."""
+    effort: int = 12_000_000
+    """Triangles that cutting may handle in all, about 50 s of one core; after that, the pieces so far are taken. A count and no clock: the
+    pieces of a mesh, and with them its physics, are the same on every machine."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +71,19 @@ class Pieces:
     inertia: np.ndarray
     """[3, 3] about that, of 1 kg of uniform density [m^2]."""
     cached: bool = False
-    in_time: bool = True
+    finished: bool = True
+    """Whether the effort sufficed."""
+
+
+@dataclass
+class _Effort:
+    """What is left of :attr:`Settings.effort`."""
+
+    left: int
+
+    def spend(self, *solids: Manifold) -> None:
+        """Handle these solids once."""
+        self.left -= sum(solid.num_tri() for solid in solids)
 
 
 Progress = Callable[[int, float], None]
@@ -89,7 +101,7 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings(), progress: 
     Raises:
         ObjectError: the mesh is concave and manifold3d, which cuts it, is not installed.
     """
-    end = time.process_time() + settings.seconds
+    effort = _Effort(settings.effort)
     surface = _Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     around = mesh.convex_hull
     if surface.farthest(around.vertices, around.faces) <= settings.hull_depth * np.linalg.norm(mesh.extents):
@@ -98,7 +110,7 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings(), progress: 
         off = [surface.farthest(piece.vertices, piece.faces)]
     else:
         whole = as_solid(mesh, settings.thickness)
-        pieces = _convex(_Solid(whole.simplify(settings.tolerance / 10)), settings, end, progress)
+        pieces = _convex(_Solid(whole.simplify(settings.tolerance / 10)), settings, effort, progress)
         shapes = tuple(limited_hull(_arrays(piece)[0], settings.max_vertices) for piece in pieces)
         surface = _Solid(whole)
         vertices, faces = surface.vertices, surface.faces
@@ -108,7 +120,7 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings(), progress: 
     volume = float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
     return Pieces(
         shapes=shapes, deviation=max(*off, surface.bare(shapes)), volume=volume, com=com, inertia=inertia,
-        in_time=time.process_time() < end,
+        finished=effort.left > 0,
     )  # fmt: skip
 
 
@@ -208,19 +220,19 @@ class _Solid(_Surface):
         return 0.0 if outside.volume() < _SPECK / 100 else self.farthest(*_arrays(outside))
 
 
-def _convex(solid: _Solid, settings: Settings, end: float, progress: Progress) -> list[Manifold]:
+def _convex(solid: _Solid, settings: Settings, effort: _Effort, progress: Progress) -> list[Manifold]:
     """Convex pieces of a solid, at most as many as allowed."""
-    pieces = [part.hull() for part in _cut(solid, settings, end, progress)]
+    pieces = [part.hull() for part in _cut(solid, settings, effort, progress)]
     tolerance = max(settings.tolerance, *(solid.excess(piece) for piece in pieces))
-    pieces = _joined(solid, pieces, tolerance, end)
-    while len(pieces) > settings.max_pieces and time.process_time() < end:
+    pieces = _joined(solid, pieces, tolerance, effort)
+    while len(pieces) > settings.max_pieces and effort.left > 0:
         tolerance *= 1.1
         progress(len(pieces), tolerance)
-        pieces = _joined(solid, pieces, tolerance, end)
+        pieces = _joined(solid, pieces, tolerance, effort)
     return pieces
 
 
-def _cut(solid: _Solid, settings: Settings, end: float, progress: Progress) -> list[Manifold]:
+def _cut(solid: _Solid, settings: Settings, effort: _Effort, progress: Progress) -> list[Manifold]:
     """Parts of a solid whose hulls keep to its surface: the worst one is cut first."""
     queue: list[tuple[float, int, Manifold]] = []
     done: list[Manifold] = []
@@ -228,6 +240,7 @@ def _cut(solid: _Solid, settings: Settings, end: float, progress: Progress) -> l
 
     def add(part: Manifold) -> None:
         nonlocal count
+        effort.spend(solid.solid, part)
         excess = solid.excess(part.hull())
         if excess <= settings.tolerance:
             done.append(part)
@@ -237,10 +250,10 @@ def _cut(solid: _Solid, settings: Settings, end: float, progress: Progress) -> l
 
     for part in solid.solid.decompose():
         add(part)
-    while queue and len(queue) + len(done) < 2 * settings.max_pieces and time.process_time() < end:
+    while queue and len(queue) + len(done) < 2 * settings.max_pieces and effort.left > 0:
         excess, _, worst = heapq.heappop(queue)
         progress(len(queue) + len(done) + 1, -excess)
-        parts = _best_cut(worst)
+        parts = _best_cut(worst, effort)
         if len(parts) < 2:
             done.append(worst)
             continue
@@ -249,7 +262,7 @@ def _cut(solid: _Solid, settings: Settings, end: float, progress: Progress) -> l
     return done + [part for _, _, part in queue]
 
 
-def _best_cut(part: Manifold) -> list[Manifold]:
+def _best_cut(part: Manifold, effort: _Effort) -> list[Manifold]:
     """The parts by the planes that take away most of the hulls' volume for each further part; one if none cuts it."""
     vertices, faces = _arrays(part)
     corners = vertices[faces]
@@ -265,6 +278,7 @@ def _best_cut(part: Manifold) -> list[Manifold]:
     whole, best, best_gain = part.hull().volume(), [part], -np.inf
     for planes in singles + crosses:
         parts = [part]
+        effort.spend(part)
         for normal, offset in planes:
             parts = [half for one in parts for half in one.split_by_plane(tuple(normal), offset)]
         parts = [one for half in parts for one in half.decompose() if one.volume() > _SPECK]
@@ -275,7 +289,7 @@ def _best_cut(part: Manifold) -> list[Manifold]:
     return best
 
 
-def _joined(solid: _Solid, hulls: Sequence[Manifold], tolerance: float, end: float) -> list[Manifold]:
+def _joined(solid: _Solid, hulls: Sequence[Manifold], tolerance: float, effort: _Effort) -> list[Manifold]:
     """Pieces joined wherever the hull of two keeps to the surface; those first that lose least volume by it."""
     batch_hull = _manifold3d().Manifold.batch_hull
     alive: dict[int, Manifold] = {}
@@ -286,7 +300,8 @@ def _joined(solid: _Solid, hulls: Sequence[Manifold], tolerance: float, end: flo
         boxes[number] = np.array(piece.bounding_box()).reshape(2, 3)
         for other, neighbour in alive.items():
             (low, high), (low2, high2) = boxes[number], boxes[other]
-            if ((low <= high2 + 2e-4) & (low2 <= high + 2e-4)).all() and time.process_time() < end:
+            if ((low <= high2 + 2e-4) & (low2 <= high + 2e-4)).all() and effort.left > 0:
+                effort.spend(solid.solid)
                 both = batch_hull([piece, neighbour])
                 if solid.excess(both) <= tolerance:
                     heapq.heappush(queue, (both.volume() - piece.volume() - neighbour.volume(), other, number, both))

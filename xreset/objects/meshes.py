@@ -113,10 +113,8 @@ def import_with_notes(path: str | Path, name: str, *, mass: float | None = None,
         com, inertia = shell_properties(np.asarray(mesh.vertices), np.asarray(mesh.faces), mass)
         litres = pieces.volume * 1e3
         notes.append(f"the mesh is solid, but {mass:.3f} kg in {litres:.2f} l is a hollow object: its mass is put on its surface")
-    if not pieces.in_time:
-        notes.append(
-            f"cutting it was stopped after {Settings().seconds:.0f} s of processor time: a mesh with fewer triangles would fit better"
-        )
+    if not pieces.finished:
+        notes.append("cutting it was stopped early, for it takes too long: a mesh with fewer triangles would fit better")
     if len(pieces.shapes) > 1 and pieces.deviation > _FEW_MM:
         notes.append(f"its pieces stand up to {1e3 * pieces.deviation:.1f} mm off its surface")
     obj = ObjectSpec(

@@ -3,7 +3,3 @@
 A backend is named by the entry-point group ``xreset.backends``; this package's own are listed in ``pyproject.toml`` like anyone else's.
 Nothing here imports an engine until one is asked for.
 """
-
-from xreset.plugins import BackendStatus, backend_names, backend_status, make_backend
-
-__all__ = ["BackendStatus", "backend_names", "backend_status", "make_backend"]

@@ -12,7 +12,8 @@ from benchlib import Options, seconds_of
 from rich.console import Console
 
 from xreset import robots
-from xreset.demos import demo_objects, read_demos, synthesize
+from xreset.demos.archive import demo_objects, read_demos
+from xreset.demos.synth import synthesize
 from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, track
 from xreset.retarget.pipeline import wrist_paths
 from xreset.retarget.validity import Measures, Thresholds

@@ -15,7 +15,7 @@ from xreset import robots
 from xreset.geometry.collision import coal_geometry, support_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_to_matrix
-from xreset.objects import load_objects
+from xreset.objects.catalogue import load_objects
 from xreset.retarget.file import Retargeted, read_retargeted
 from xreset.spec import ObjectSpec, RobotSpec, Shape
 

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from xreset import robots
 from xreset.env import ManipulationEnv, make_scene
-from xreset.objects import load_objects
+from xreset.objects.catalogue import load_objects
 from xreset.plugins import make_backend
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import ResetDistribution

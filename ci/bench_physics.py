@@ -36,7 +36,7 @@ from xreset import robots
 from xreset.backends.pool import PoolBackend, World
 from xreset.backends.workers import usable_cores
 from xreset.env import make_scene
-from xreset.objects import load_objects
+from xreset.objects.catalogue import load_objects
 from xreset.physics import Backend, State
 from xreset.plugins import backend_class, make_backend
 from xreset.spec import GRAVITY, SceneSpec

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from xreset import robots
-from xreset.demos import Demos, demo_objects, read_demos
+from xreset.demos.archive import Demos, demo_objects, read_demos
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.model import HandModel
 from xreset.retarget.pipeline import RetargetConfig, hand_motions, rest_on_table

@@ -22,7 +22,7 @@ from xreset.eval.trial import Engine, Trial
 from xreset.files import claim_folder, file_hash
 from xreset.learning.choice import read_choice
 from xreset.learning.run import read_run
-from xreset.objects import load_objects
+from xreset.objects.catalogue import load_objects
 from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
 from xreset.records import npz_schema

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from xreset.env import ManipulationEnv, make_scene
-from xreset.objects import keypoints
+from xreset.objects.sampling import keypoints
 from xreset.physics import Backend
 from xreset.plugins import backend_class, device_for, make_backend
 from xreset.resets.bank import ResetBank

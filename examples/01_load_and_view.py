@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 import xreset
-from xreset.demos import write_demos
+from xreset.demos.archive import write_demos
 from xreset.pictures.raster import write_png
 from xreset.pictures.view.load import load_view
 from xreset.pictures.view.picture import Drawer

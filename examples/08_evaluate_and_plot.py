@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 import xreset
-from xreset.demos import write_demos
+from xreset.demos.archive import write_demos
 from xreset.eval.evaluate import resolve
 from xreset.eval.setting import Setting
 from xreset.eval.trial import engine

@@ -24,7 +24,7 @@ from tests.toy_bank import SOUP, toy_bank
 from tests.toy_policy import write_policy
 from tests.toy_results import toy_rollouts, toy_summary
 from tests.toy_robot import toy_hand_arm
-from xreset.demos import read_demos, write_demos
+from xreset.demos.archive import read_demos, write_demos
 from xreset.errors import XResetError
 from xreset.files import read_json, write_json
 from xreset.geometry import urdf
@@ -75,7 +75,7 @@ def readers() -> Iterator[dict[str, Reader]]:
     from xreset.eval.study.file import SHIPPED, read_study
     from xreset.learning.clock import LiftClock, read_lift
     from xreset.learning.runner import read_checkpoint
-    from xreset.objects import load_object
+    from xreset.objects.catalogue import load_object
     from xreset.objects.meshes import read_mesh
     from xreset.policy import OnnxPolicy, policy_contract
     from xreset.robot_tools.sources import read_source

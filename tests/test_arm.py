@@ -12,6 +12,7 @@ import torch
 
 from xreset import robots
 from xreset.description import DESCRIPTION
+from xreset.description import load_robot as load
 from xreset.errors import RobotError
 from xreset.geometry.rotations import matrix_to_quat, quat_multiply
 from xreset.plugins import robot_folder
@@ -20,7 +21,6 @@ from xreset.retarget.arm.splice import splice, spread_over
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools.check import check_description
 from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search, write_placement
-from xreset.robots import load
 
 try:
     from xreset.robot_tools import place as placing

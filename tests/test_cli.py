@@ -11,6 +11,7 @@ from unittest import mock
 
 from xreset.cli import COMMANDS, MOVED, main
 from xreset.cli._terminal import Console, Progress
+from xreset.cli.engines import COMMANDS as ENGINES
 
 HEAVY = ("torch", "warp", "mujoco", "mujoco_warp", "pybullet", "sapien", "matplotlib", "trimesh", "scipy", "rsl_rl", "tyro", "numpy")
 
@@ -41,10 +42,19 @@ class LightnessTest(unittest.TestCase):
     def test_help_loads_nothing_heavy(self):
         self.assertFalse(modules_after("from xreset.cli import main; main(['--help'])") & set(HEAVY))
 
-    def test_help_of_commands_with_a_configuration_loads_no_torch_and_no_engine(self):
-        for command in ("train", "retarget"):
-            code = f"from xreset.cli import main\ntry: main(['{command}', '--help'])\nexcept SystemExit: pass\npass"
-            self.assertFalse(modules_after(code) & {"torch", "warp", "mujoco", "mujoco_warp", "pybullet", "sapien", "rsl_rl"}, command)
+    def test_help_of_every_command_loads_nothing_heavy(self):
+        commands = [[name] for name in COMMANDS] + [["engines", name] for name in ENGINES]
+        code = (
+            "import sys\nfrom xreset.cli import main\nloaded = {}\n"
+            f"for words in {commands}:\n"
+            "  try: main([*words, '--help'])\n"
+            "  except SystemExit: pass\n"
+            f"  for name in {{*{HEAVY}}} & {{*sys.modules}} - {{'tyro', 'numpy'}}: loaded.setdefault(name, ' '.join(words))\n"
+            "print(loaded)"
+        )
+        self.assertEqual(
+            subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.splitlines()[-1], "{}"
+        )
 
 
 class UsageTest(unittest.TestCase):

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.backends import backend_status, make_backend
 from xreset.backends.conformance import CHECKS, CheckResult, run
 from xreset.geometry.dynamics import drive_inertia
+from xreset.plugins import backend_status, make_backend
 from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
 
 BACKENDS = ("mujoco", "mujoco-warp", "pybullet", "sapien")

@@ -15,12 +15,15 @@ from scipy.spatial.transform import Rotation
 
 from tests.data import data_dir
 from xreset.cli import main
-from xreset.demos import concatenate, demo_objects, grounded, hand, levelled, read_demos, read_dexycb, synthesize, write_demos
-from xreset.demos.align import on_something
+from xreset.demos import hand
+from xreset.demos.align import grounded, levelled, on_something
+from xreset.demos.archive import concatenate, demo_objects, read_demos, write_demos
+from xreset.demos.dexycb import read_dexycb
 from xreset.demos.grasp import TIPS, Solid
 from xreset.demos.info import summarize
+from xreset.demos.synth import synthesize
 from xreset.errors import DemoError, FileFormatError, ObjectError
-from xreset.objects import object_names
+from xreset.objects.catalogue import object_names
 
 PARENTS = [0 if k % 4 == 1 else k - 1 for k in range(1, 21)]
 

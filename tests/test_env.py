@@ -20,7 +20,8 @@ from xreset.eval.rollout import roll_out
 from xreset.eval.trial import Engine, Trial
 from xreset.geometry.rotations import quat_rotate
 from xreset.learning.recipes import RECIPES
-from xreset.objects import keypoints, load_objects
+from xreset.objects.catalogue import load_objects
+from xreset.objects.sampling import keypoints
 from xreset.physics import State
 from xreset.policy import ZeroPolicy
 from xreset.resets.distribution import ResetDistribution

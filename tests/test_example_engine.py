@@ -18,11 +18,11 @@ from unittest import mock
 import torch
 
 from xreset import plugins
-from xreset.backends import backend_status, make_backend
 from xreset.backends.conformance import CHECKS, run
 from xreset.backends.conformance.scene import scene
 from xreset.cli import main
 from xreset.errors import BackendUnavailableError, CapabilityError
+from xreset.plugins import backend_status, make_backend
 
 EXAMPLES = {"drake": "pydrake", "newton": "newton"}
 """What each example's engine is imported as."""

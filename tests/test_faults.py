@@ -21,7 +21,7 @@ from xreset.learning.faults import MAX_SHARE, WINDOW, FaultBudget, FaultCounts
 from xreset.learning.ppo import SequencePpo
 from xreset.learning.run import checkpoints
 from xreset.learning.runner import TrainingRunner
-from xreset.objects import load_objects
+from xreset.objects.catalogue import load_objects
 from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import ObservationConfig, TaskConfig
 

@@ -18,7 +18,7 @@ from xreset.eval.evaluate import Subject
 from xreset.eval.frontier import STAGES, Tried, by_stage, frontier, stage_of
 from xreset.eval.setting import Setting
 from xreset.eval.trial import engine
-from xreset.objects import load_objects
+from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
 from xreset.policy import ZeroPolicy
 from xreset.resets.bank import read_bank, write_bank

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.test_keypoints import CAMERA, seen_from, written
-from xreset.demos import read_ho3d, synthesize
+from xreset.demos.ho3d import read_ho3d
 from xreset.demos.pickles import read_pickle
+from xreset.demos.synth import synthesize
 from xreset.errors import DemoError
 
 OPENGL = np.diag([1.0, -1.0, -1.0])

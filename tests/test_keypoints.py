@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.data import data_dir
 from xreset.cli import main
-from xreset.demos import Convention, read_demos, read_keypoints, synthesize
-from xreset.demos.keypoints import ORDERS
+from xreset.demos.archive import read_demos
+from xreset.demos.keypoints import ORDERS, Convention, read_keypoints
+from xreset.demos.synth import synthesize
 from xreset.errors import DemoError, FileFormatError
 
 CAMERA = np.eye(4)

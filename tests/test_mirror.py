@@ -4,10 +4,11 @@ import unittest
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.demos import mirrored, symmetry, synthesize
+from xreset.demos.mirror import mirrored, symmetry
+from xreset.demos.synth import synthesize
 from xreset.errors import DemoError
 from xreset.geometry.shapes import box, surface_of
-from xreset.objects import load_object
+from xreset.objects.catalogue import load_object
 from xreset.spec import ObjectSpec, TableSpec
 
 

@@ -20,24 +20,13 @@ from scipy.spatial.transform import Rotation
 from tests.data import data_dir
 from xreset.cli import main
 from xreset.errors import ObjectError, XResetError
-from xreset.geometry.shapes import half_spaces, hull, shell_properties
-from xreset.objects import (
-    bounding_box,
-    bounding_radius,
-    canonical_name,
-    keypoints,
-    load_object,
-    load_objects,
-    object_names,
-    rest_height,
-    resting_orientation,
-    shape_mesh,
-    surface_points,
-)
+from xreset.geometry.shapes import half_spaces, hull, shape_mesh, shell_properties
+from xreset.objects.catalogue import canonical_name, load_object, load_objects, object_names
 from xreset.objects.decompose import Settings, as_solid, decompose, limited_hull
 from xreset.objects.meshes import DEFAULT_DENSITY, add_mesh, import_with_notes, mesh_files
 from xreset.objects.properties import Properties
-from xreset.objects.sampling import sample_surface, winding_number
+from xreset.objects.rest import rest_height, resting_orientation
+from xreset.objects.sampling import bounding_box, bounding_radius, keypoints, sample_surface, surface_points, winding_number
 from xreset.task.config import RandomizationConfig
 from xreset.task.randomization import own_friction
 

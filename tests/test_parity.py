@@ -15,7 +15,6 @@ import torch
 
 from tests.toy_bank import toy_bank
 from xreset import cli, robots
-from xreset.backends import backend_status
 from xreset.errors import DemoError
 from xreset.eval.engines.agreement import (
     Metric,
@@ -43,8 +42,10 @@ from xreset.eval.engines.trials import ParityConfig
 from xreset.eval.trial import Engine, engine
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_from_axis_angle
-from xreset.objects import load_object, rest_height
+from xreset.objects.catalogue import load_object
+from xreset.objects.rest import rest_height
 from xreset.physics import State
+from xreset.plugins import backend_status
 from xreset.retarget.file import Retargeted, write_retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
@@ -498,7 +499,7 @@ class Command(unittest.TestCase):
         good, bad = engine("mujoco", workers=0), altered(engine("mujoco", workers=0), "pybullet", robot=lambda r: with_drives(r, 0.3))
         for made, code in ((replace(good, name="pybullet"), None), (bad, 1)):
             with (
-                mock.patch("xreset.cli.engines.compare.engine", lambda name, made=made, **_: made),
+                mock.patch("xreset.eval.trial.engine", lambda name, made=made, **_: made),
                 mock.patch("xreset.eval.engines.agreement.engine", lambda name: good),
             ):
                 text, found = self.run_command(path, "--backend", "pybullet", "--grasps", 2, "--json", out)

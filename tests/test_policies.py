@@ -19,7 +19,8 @@ from tests.test_cli import run
 from tests.toy_bank import SOUP
 from tests.toy_policy import write_policy
 from xreset import policies, robots
-from xreset.demos import synthesize, write_demos
+from xreset.demos.archive import write_demos
+from xreset.demos.synth import synthesize
 from xreset.errors import PolicyError
 from xreset.eval.engines.sources import from_policy
 from xreset.eval.evaluate import resolve

@@ -7,13 +7,13 @@ import numpy as np
 import torch
 import trimesh
 
+from xreset.description import load_robot as load
 from xreset.errors import RobotError
 from xreset.geometry.kinematics import Kinematics
 from xreset.pictures import meshes
 from xreset.pictures import raster as render
 from xreset.pictures.meshes import link_colors
 from xreset.pictures.raster import Camera, Frames, Points, Renderer, pose_matrix, write_png
-from xreset.robots import load
 from xreset.spec import Geometry, ObjectSpec, SceneSpec, Shape
 
 

@@ -18,7 +18,7 @@ from tests.toy_results import toy_rollouts, toy_summary
 from tests.toy_robot import toy_hand_arm
 from xreset import robots
 from xreset.errors import FileFormatError, RunError
-from xreset.eval.report import figures, make_report
+from xreset.eval.report import figures
 from xreset.eval.report.clips import (
     Clip,
     Strip,
@@ -32,6 +32,7 @@ from xreset.eval.report.clips import (
     recorded_episode,
 )
 from xreset.eval.report.film import make_film
+from xreset.eval.report.make import make_report
 from xreset.eval.report.page import headline, page
 from xreset.eval.report.read import Curve, collect, differences, read_curves
 from xreset.eval.results import EvalResult, TaskProgress, write_results
@@ -40,7 +41,7 @@ from xreset.files import claim_folder, write_json
 from xreset.learning.choice import Candidate, Choice, write_choice
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import RunInfo, write_run
-from xreset.objects import load_object
+from xreset.objects.catalogue import load_object
 
 ENGINES = ("mujoco", "mujoco-warp", "pybullet", "sapien")
 VOID = {"meta", "br", "link", "img", "input", "hr"}

@@ -9,7 +9,8 @@ import torch
 
 from xreset import robots
 from xreset.errors import DemoError
-from xreset.objects import load_objects, rest_height
+from xreset.objects.catalogue import load_objects
+from xreset.objects.rest import rest_height
 from xreset.physics import Health, State
 from xreset.resets.filter import REASONS, FilterConfig, make_bank, try_states
 from xreset.retarget.pipeline import Retargeted

@@ -16,7 +16,8 @@ from tests.data import data_dir
 from tests.test_cli import run
 from tests.toy_robot import toy_hand_arm, toy_motion
 from xreset import robots
-from xreset.demos import demo_objects, read_demos, synthesize, write_demos
+from xreset.demos.archive import demo_objects, read_demos, write_demos
+from xreset.demos.synth import synthesize
 from xreset.errors import DemoError, FileFormatError, RobotError
 from xreset.geometry.balls import BARE, SPACING, inscribed_balls, shape_balls, sharp_points
 from xreset.geometry.collision import SelfCollision, height_above_table, support_points, table_points

@@ -13,12 +13,13 @@ import torch
 
 from xreset import plugins
 from xreset.cli import main
+from xreset.description import load_robot as load
 from xreset.errors import RobotError
 from xreset.geometry.dynamics import damping_ratio, mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import find_mesh, load_urdf
+from xreset.plugins import robot_names
 from xreset.robot_tools.check import check_description
-from xreset.robots import load, robot_names
 from xreset.robots.openarm import build as openarm
 from xreset.robots.ur7e_sharpa import build as ur7e_sharpa
 
@@ -144,7 +145,7 @@ class Dynamics(unittest.TestCase):
 
     @unittest.skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
     def test_a_step_settles_without_overshoot(self):
-        from xreset.backends import make_backend
+        from xreset.plugins import make_backend
         from xreset.robot_tools.check import _probe
         from xreset.spec import SceneSpec
 

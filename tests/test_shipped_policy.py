@@ -9,11 +9,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from xreset import robots
-from xreset.demos import synthesize, write_demos
+from xreset.demos.archive import write_demos
+from xreset.demos.synth import synthesize
 from xreset.eval.evaluate import BASELINES, evaluate, resolve
 from xreset.eval.setting import Setting
 from xreset.eval.trial import engine
-from xreset.objects import object_names
+from xreset.objects.catalogue import object_names
 from xreset.policies import card, shipped
 from xreset.policy import OnnxPolicy, check_contract
 from xreset.task.config import TaskConfig

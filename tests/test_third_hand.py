@@ -15,13 +15,15 @@ import torch
 
 from tests import allegro_plugin
 from xreset.cli import main
-from xreset.demos import read_demos, synthesize, write_demos
+from xreset.demos.archive import read_demos, write_demos
+from xreset.demos.synth import synthesize
+from xreset.description import load_robot as load
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import load_urdf
+from xreset.plugins import robot_names
 from xreset.resets.bank import read_bank
 from xreset.retarget.file import read_retargeted
 from xreset.robot_tools.check import check_description
-from xreset.robots import load, robot_names
 
 OBJECTS = ["005_tomato_soup_can", "010_potted_meat_can"]
 

@@ -370,7 +370,7 @@ class RealGraspTest(unittest.TestCase):
         from xreset.demos.archive import read_demos
         from xreset.eval.engines.actions import grasp_and_lift
         from xreset.eval.engines.grasps import Frames, find_grasps
-        from xreset.objects import load_objects
+        from xreset.objects.catalogue import load_objects
         from xreset.retarget.pipeline import retarget_demos
 
         folder = data_dir()

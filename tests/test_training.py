@@ -23,7 +23,6 @@ import torch
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from xreset import robots
-from xreset.backends import make_backend
 from xreset.cli import main
 from xreset.errors import BackendUnavailableError, FileFormatError, PolicyError, RunError, XResetError
 from xreset.files import claim, file_hash
@@ -33,6 +32,7 @@ from xreset.learning.recipes import RECIPES
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt, read_checkpoint
 from xreset.learning.train import current_choice, ensure_policy, export_checkpoint, load_inputs, resumed, start_run, train
+from xreset.plugins import make_backend
 from xreset.policy import OnnxPolicy, check_contract
 from xreset.resets.bank import write_bank
 from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfig

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from xreset.capture import GraphRunner
 from xreset.faults import FaultRecorder
-from xreset.objects import keypoints, surface_points
+from xreset.objects.sampling import keypoints, surface_points
 from xreset.physics import Backend, Parameters, State
 from xreset.plugins import make_backend
 from xreset.resets.bank import ResetBank

@@ -19,7 +19,7 @@ from xreset.eval.engines.episodes import Recording
 from xreset.eval.engines.grasps import Frames, Grasps, find_grasps
 from xreset.eval.engines.trials import Closings, CommonStates, ParityConfig, common_states, try_closings, try_holds, try_paths
 from xreset.eval.trial import Engine, MakeBackend, engine
-from xreset.objects import surface_points
+from xreset.objects.sampling import surface_points
 from xreset.physics import Backend
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 

@@ -18,7 +18,7 @@ from xreset.eval.evaluate import resolve
 from xreset.eval.results import TRACE_SCHEMA, mesh_folder, read_result, read_traces
 from xreset.eval.setting import Place, Sequence, Setting
 from xreset.eval.trial import Engine
-from xreset.objects import canonical_name, load_object, load_objects
+from xreset.objects.catalogue import canonical_name, load_object, load_objects
 from xreset.records import npz_schema
 from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import ResetBank, check_objects, check_retargeted, check_robot, read_bank

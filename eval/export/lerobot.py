@@ -20,7 +20,7 @@ from xreset.errors import XResetError
 from xreset.eval.export.recorded import Recorded, Recording
 from xreset.eval.report.clips import encode_mp4
 from xreset.files import write_json
-from xreset.objects import load_object
+from xreset.objects.catalogue import load_object
 from xreset.pictures.raster import Renderer, pose_matrix
 from xreset.spec import SceneSpec
 

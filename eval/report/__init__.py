@@ -1,9 +1,5 @@
 """The report of an evaluation: one self-contained HTML page and one picture.
 
-from xreset.eval.report import make_report
+from xreset.eval.report.make import make_report
 make_report(Path("runs/soup"))          # runs/soup/report/index.html and overview.png
 """
-
-from xreset.eval.report.make import Report, make_report
-
-__all__ = ["Report", "make_report"]

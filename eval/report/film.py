@@ -14,7 +14,7 @@ from xreset.eval.report.clips import camera_for, choose_sequence, draw_clip, enc
 from xreset.eval.report.read import collect
 from xreset.eval.results import mesh_folder, read_traces
 from xreset.files import atomic_write
-from xreset.objects import load_object
+from xreset.objects.catalogue import load_object
 
 
 @dataclass(frozen=True, kw_only=True)

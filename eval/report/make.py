@@ -19,7 +19,7 @@ from xreset.eval.report.read import ReportData, Training, collect, read_training
 from xreset.eval.results import EvalResult, mesh_folder, read_traces
 from xreset.eval.table import Rows
 from xreset.files import atomic_write, claim_folder
-from xreset.objects import load_object
+from xreset.objects.catalogue import load_object
 from xreset.text import short_name
 
 

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from xreset.objects import canonical_name
+from xreset.objects.catalogue import canonical_name
 from xreset.typed import from_dict
 
 FILE = Path(__file__).parent / "paper.toml"

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from xreset.demos import read_demos
+from xreset.demos.archive import read_demos
 from xreset.errors import DemoError, FileFormatError, RunError, XResetError
 from xreset.eval.study.file import Data, Evaluation, Runs, Study, merged
 from xreset.eval.study.subset import Subset, refuse_other
@@ -25,7 +25,7 @@ from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import starting_config
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
-from xreset.objects import canonical_name, object_names
+from xreset.objects.catalogue import canonical_name, object_names
 from xreset.plugins import backend_status
 from xreset.text import short_name
 from xreset.typed import from_dict

@@ -7,7 +7,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from xreset.demos import Demos, read_demos, synthesize, write_demos
+from xreset.demos.archive import Demos, read_demos, write_demos
+from xreset.demos.synth import synthesize
 from xreset.errors import RunError
 from xreset.eval.study.file import Data
 from xreset.files import file_hash, read_json, write_json

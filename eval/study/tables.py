@@ -16,7 +16,7 @@ from xreset.eval.study.file import Table
 from xreset.eval.study.paper import ALL, METRICS, PaperTable, paper_tables
 from xreset.eval.study.plan import Plan
 from xreset.eval.table import Rows
-from xreset.objects import canonical_name
+from xreset.objects.catalogue import canonical_name
 from xreset.text import short_name
 
 

@@ -2,14 +2,22 @@
 
 The first word picks a module of this package, which is only then imported, so that ``xreset --help`` is instant. A command module holds
 typed functions; tyro turns their signatures and docstrings into flags.
+
+So that a command's own help is instant too, what it imports of xreset runs when something of it is first used. Command modules therefore
+import modules (``from xreset.eval import trial``, then ``trial.engine(...)``), and names of light ones only: of configurations, of errors.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
+from importlib.abc import Loader
+from importlib.machinery import ModuleSpec, PathFinder
 from io import TextIOWrapper
-from typing import NoReturn
+from types import ModuleType
+from typing import Any, NoReturn
 
 COMMANDS: dict[str, str] = {
     "demos": "Import, make and describe human demonstrations.",
@@ -98,7 +106,8 @@ def _run(group: str, commands: dict[str, str], argv: list[str]) -> None:
     if name not in commands:
         print(f"xreset{group}: there is no command {name!r}.\n\n{_usage(group, commands)}", file=sys.stderr)
         raise SystemExit(2)
-    module = import_module(f"xreset.cli{group.replace(' ', '.')}.{name}")
+    with _lazily():
+        module = import_module(f"xreset.cli{group.replace(' ', '.')}.{name}")
     if hasattr(module, "COMMANDS"):
         _run(f"{group} {name}", module.COMMANDS, arguments)
         return
@@ -115,6 +124,57 @@ def _run(group: str, commands: dict[str, str], argv: list[str]) -> None:
         tyro.extras.subcommand_cli_from_dict(verbs, prog=program, description=description, args=arguments)
     else:
         tyro.cli(checked(command), prog=program, description=description, args=arguments)
+
+
+class _LazyModule(ModuleType):
+    """A module that runs when one of its names is first asked for.
+
+    ``importlib.util.LazyLoader`` runs it for the sake of ``__file__`` too, which ``inspect`` asks of all modules in the middle of imports.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(f"module {self.__name__!r} has not run yet and has no {name!r}")
+        self.__class__ = ModuleType
+        try:
+            self.__loader__.loader.exec_module(self)
+        except BaseException:
+            self.__class__ = _LazyModule
+            raise
+        return getattr(self, name)
+
+
+class _LazyLoader(Loader):
+    def __init__(self, loader: Loader) -> None:
+        self.loader = loader
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        return _LazyModule(spec.name)
+
+    def exec_module(self, module: ModuleType) -> None:
+        pass
+
+
+class _LazyFinder:
+    """Finds xreset's modules, but for the commands' own, as lazy ones."""
+
+    @staticmethod
+    def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
+        if not name.startswith("xreset.") or name.startswith("xreset.cli"):
+            return None
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is not None and spec.loader is not None:
+            spec.loader = _LazyLoader(spec.loader)
+        return spec
+
+
+@contextmanager
+def _lazily() -> Iterator[None]:
+    sys.meta_path.insert(0, _LazyFinder)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(_LazyFinder)
 
 
 def _usage(group: str, commands: dict[str, str]) -> str:

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 import tyro
 
 from xreset.cli._terminal import Console
+from xreset.eval import table
+from xreset.eval.report import make
 
 
 def compare(
@@ -32,15 +34,12 @@ def compare(
         apart: Show also runs that differ in their seed only one by one.
         out: Folder for compare.png and compare.md.
     """
-    from xreset.eval.report.make import compare as make  # torch, which --help must not need
-    from xreset.eval.table import rich_table
-
     console = Console()
     with console.status("reading"):
-        made = make(runs, out, x=x, curves=curve, apart=apart)
+        made = make.compare(runs, out, x=x, curves=curve, apart=apart)
     for rows in (made.results, made.lifted, made.different):
         if rows.body:
-            console.print(rich_table(rows))
+            console.print(table.rich_table(rows))
     for caption in made.captions:
         console.print(caption, highlight=False)
     for note in made.notes:

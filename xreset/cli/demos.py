@@ -12,23 +12,7 @@ import tyro
 from rich.table import Table
 
 from xreset.cli._terminal import Console, Progress
-from xreset.demos import (
-    Convention,
-    Demos,
-    concatenate,
-    demo_objects,
-    mirrored,
-    read_demos,
-    read_dexycb,
-    read_ho3d,
-    read_keypoints,
-    read_transform,
-    symmetry,
-    synthesize,
-    write_demos,
-)
-from xreset.demos.info import summarize
-from xreset.demos.plausible import doubts
+from xreset.demos import archive, dexycb, ho3d, info, keypoints, mirror, plausible, synth
 from xreset.errors import DemoError
 from xreset.files import file_hash
 from xreset.spec import ObjectSpec
@@ -36,7 +20,7 @@ from xreset.spec import ObjectSpec
 Side = Literal["right", "left", "both"]
 
 
-def dexycb(
+def import_dexycb(
     folder: Annotated[Path, tyro.conf.Positional],
     *,
     out: Path,
@@ -52,12 +36,12 @@ def dexycb(
         side: Only sequences of this hand.
     """
     with _progress("reading DexYCB") as progress:
-        demos = read_dexycb(folder, objects=objects or None, sides=_sides(side), progress=progress)
-    write_demos(out, demos, config={"dataset": "dexycb", "objects": list(objects), "side": side})
+        demos = dexycb.read_dexycb(folder, objects=objects or None, sides=_sides(side), progress=progress)
+    archive.write_demos(out, demos, config={"dataset": "dexycb", "objects": list(objects), "side": side})
     _print_summary(demos, out)
 
 
-def ho3d(folder: Annotated[Path, tyro.conf.Positional], *, out: Path, fps: float, cameras: Path) -> None:
+def import_ho3d(folder: Annotated[Path, tyro.conf.Positional], *, out: Path, fps: float, cameras: Path) -> None:
     """Read HO-3D (versions 2 and 3) in its own layout and write an archive of demonstrations. Not yet tried on the original files.
 
     Args:
@@ -68,12 +52,12 @@ def ho3d(folder: Annotated[Path, tyro.conf.Positional], *, out: Path, fps: float
             sequences; or a folder with SEQUENCE.txt, where sequences without one are left out.
     """
     with _progress("reading HO-3D") as progress:
-        demos = read_ho3d(folder, fps=fps, cameras=cameras, progress=progress)
-    write_demos(out, demos, config={"dataset": "ho3d", "fps": fps})
+        demos = ho3d.read_ho3d(folder, fps=fps, cameras=cameras, progress=progress)
+    archive.write_demos(out, demos, config={"dataset": "ho3d", "fps": fps})
     _print_summary(demos, out)
 
 
-def keypoints(
+def import_keypoints(
     path: Annotated[Path, tyro.conf.Positional],
     *,
     out: Path,
@@ -105,18 +89,18 @@ def keypoints(
         side: The hand, where the files do not say it.
         subject: Who demonstrated, where the files do not say it.
     """
-    T = None if table_from_camera is None else read_transform(table_from_camera)
-    convention = Convention(
+    T = None if table_from_camera is None else keypoints.read_transform(table_from_camera)
+    convention = keypoints.Convention(
         order=order, units=units, frame=coordinates, table_from_camera=T, quat=quat, fps=fps, object_name=object, side=side, subject=subject
     )
     with _progress("reading keypoints") as progress:
-        demos = read_keypoints(path, convention, progress=progress)
+        demos = keypoints.read_keypoints(path, convention, progress=progress)
     config = {"dataset": "keypoints", **vars(convention), "table_from_camera": None if T is None else T.tolist()}
-    write_demos(out, demos, config=config, inputs={"keypoints": file_hash(path)} if path.is_file() else {})
+    archive.write_demos(out, demos, config=config, inputs={"keypoints": file_hash(path)} if path.is_file() else {})
     _print_summary(demos, out)
 
 
-def synth(
+def synthesize(
     *,
     out: Path,
     objects: tuple[str, ...] = (),
@@ -138,15 +122,15 @@ def synth(
         meshes: Folder of real meshes, which stand with z up; default: the built-in stand-ins.
     """
     with _progress("making demonstrations") as progress:
-        demos = concatenate(
-            [synthesize(objects or None, per_object, seed, fps=fps, side=s, meshes=meshes, progress=progress) for s in _sides(side)]
+        demos = archive.concatenate(
+            [synth.synthesize(objects or None, per_object, seed, fps=fps, side=s, meshes=meshes, progress=progress) for s in _sides(side)]
         )
     config = {"objects": list(objects), "per_object": per_object, "seed": seed, "fps": fps, "side": side}
-    write_demos(out, demos, config=config)
+    archive.write_demos(out, demos, config=config)
     _print_summary(demos, out)
 
 
-def mirror(
+def reflect(
     file: Annotated[Path, tyro.conf.Positional],
     *,
     out: Path,
@@ -163,27 +147,27 @@ def mirror(
         objects: Folder of real meshes; default: the built-in stand-ins.
         tolerance: Largest distance between an object's surface and its reflection, over 95 % of it [m].
     """
-    demos = read_demos(file).select(sides=["left"])
-    symmetries = {name: symmetry(spec) for name, spec in demo_objects(demos, objects).items()}
+    demos = archive.read_demos(file).select(sides=["left"])
+    symmetries = {name: mirror.symmetry(spec) for name, spec in archive.demo_objects(demos, objects).items()}
     table = Table("object", "off its reflection [mm]", "mirrored")
     for name, found in sorted(symmetries.items()):
         table.add_row(name, f"{1e3 * found.deviation:.1f}", "yes" if found.deviation <= tolerance else "no: not symmetric enough")
     Console().print(table)
-    result = mirrored(demos, symmetries, tolerance=tolerance)
-    write_demos(out, result, config={"mirrored": True, "tolerance": tolerance}, inputs={"demos": file_hash(file)})
+    result = mirror.mirrored(demos, symmetries, tolerance=tolerance)
+    archive.write_demos(out, result, config={"mirrored": True, "tolerance": tolerance}, inputs={"demos": file_hash(file)})
     _print_summary(result, out)
 
 
-def info(file: Annotated[Path, tyro.conf.Positional], *, objects: Path | None = None) -> None:
+def describe(file: Annotated[Path, tyro.conf.Positional], *, objects: Path | None = None) -> None:
     """Say what an archive of demonstrations contains, object by object, and what is odd about it.
 
     Args:
         file: The archive.
         objects: Folder of meshes; default: the built-in stand-ins. Without meshes it is not seen whether objects stand on the table.
     """
-    demos = read_demos(file)
+    demos = archive.read_demos(file)
     try:
-        known = demo_objects(demos, objects)
+        known = archive.demo_objects(demos, objects)
     except DemoError:
         if objects is not None:
             raise
@@ -202,13 +186,13 @@ def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
         yield lambda done, total, name: bar.update(task, completed=done, total=total, description=f"{what}: {name}")
 
 
-def _print_summary(demos: Demos, path: Path, objects: dict[str, ObjectSpec] | None = None) -> None:
+def _print_summary(demos: archive.Demos, path: Path, objects: dict[str, ObjectSpec] | None = None) -> None:
     columns = ("right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg")
     table = Table(caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start pose")
     table.add_column("object", no_wrap=True)
     for column in columns:
         table.add_column(column, justify="right")
-    for row in summarize(demos):
+    for row in info.summarize(demos):
         table.add_row(
             row.object_name,
             str(row.right),
@@ -224,8 +208,15 @@ def _print_summary(demos: Demos, path: Path, objects: dict[str, ObjectSpec] | No
     console.print(
         f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second", soft_wrap=True, highlight=False
     )
-    for doubt in doubts(demos, objects):
+    for doubt in plausible.doubts(demos, objects):
         console.print(f"note: {doubt}", style="yellow", soft_wrap=True, highlight=False)
 
 
-COMMAND = {"import dexycb": dexycb, "import ho3d": ho3d, "import keypoints": keypoints, "synth": synth, "mirror": mirror, "info": info}
+COMMAND = {
+    "import dexycb": import_dexycb,
+    "import ho3d": import_ho3d,
+    "import keypoints": import_keypoints,
+    "synth": synthesize,
+    "mirror": reflect,
+    "info": describe,
+}

@@ -9,6 +9,8 @@ import tyro
 
 from xreset.cli._common import engine_bars
 from xreset.cli._terminal import Console
+from xreset.eval import evaluate as evaluation
+from xreset.eval import table, trial
 from xreset.eval.setting import Setting
 
 
@@ -33,17 +35,13 @@ def evaluate(
         out: Folder for the results; default: eval/ in the run folder or beside the policy; runs/NAME/eval for a policy that ships with
             xreset, runs/BASELINE-ROBOT/eval for a baseline.
     """
-    from xreset.eval.evaluate import evaluate, resolve
-    from xreset.eval.table import results_table
-    from xreset.eval.trial import engine
-
-    engines = [engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
+    engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
     console = Console()
-    subject = resolve(policy, setting.robot, setting.seed)
+    subject = evaluation.resolve(policy, setting.robot, setting.seed)
     folder = out or subject.folder
     with engine_bars(console, [e.name for e in engines]) as progress:
-        summaries = evaluate(subject, engines, demos, setting, folder, episodes=episodes, progress=progress)
-    console.print(results_table(summaries))
+        summaries = evaluation.evaluate(subject, engines, demos, setting, folder, episodes=episodes, progress=progress)
+    console.print(table.results_table(summaries))
     if unseen := summaries[0].unseen:
         console.print(f"not in the policy's training: {', '.join(unseen)}", highlight=False, soft_wrap=True)
     console.print(f"results in {folder}")

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import RunError
-
-if TYPE_CHECKING:
-    from xreset.eval.export import Recording
+from xreset.eval.export import arrays, recorded
+from xreset.eval.export import lerobot as dataset
 
 Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
 Backends = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
@@ -40,11 +39,9 @@ def lerobot(
         video: Draw a film of each episode.
         size: Width and height of the films, pixels.
     """
-    from xreset.eval.export import write_lerobot  # torch, which --help must not need
-
     recording = _recording(folders, backend, robot, objects, task)
     with Progress(Console(stderr=True)) as bar:
-        write_lerobot(out, recording, video=video, size=size, progress=bar.count("writing episodes"))
+        dataset.write_lerobot(out, recording, video=video, size=size, progress=bar.count("writing episodes"))
     _say(recording, out)
 
 
@@ -58,25 +55,20 @@ def npz(folders: Folders, *, out: Path, backend: Backends = (), robot: str | Non
         robot: Name or folder of the robot; default: as the results name it.
         task: The task in words; {object} stands for the object's name.
     """
-    from xreset.eval.export import write_arrays  # torch, which --help must not need
-
     recording = _recording(folders, backend, robot, None, task)
-    write_arrays(out, recording)
+    arrays.write_arrays(out, recording)
     _say(recording, out)
 
 
 def _recording(
     folders: tuple[Path, ...], backends: tuple[str, ...], robot: str | None, objects: Path | None, task: str | None
-) -> Recording:
-    from xreset.eval.export import read_recorded
-    from xreset.eval.export.recorded import TASK
-
+) -> recorded.Recording:
     if not folders:
         raise RunError("give a run folder, or a folder that xreset eval wrote into.")
-    return read_recorded(folders, backends=backends, robot=robot, objects=objects, task=task or TASK)
+    return recorded.read_recorded(folders, backends=backends, robot=robot, objects=objects, task=task or recorded.TASK)
 
 
-def _say(recording: Recording, out: Path) -> None:
+def _say(recording: recorded.Recording, out: Path) -> None:
     engines = ", ".join(dict.fromkeys(e.engine for e in recording.episodes))
     Console().print(
         f"{out}: {len(recording.episodes)} episodes of {recording.robot.name} in {engines},"

@@ -11,6 +11,8 @@ from rich.table import Table
 from xreset.cli._common import engine_bars
 from xreset.cli._terminal import Console
 from xreset.errors import PolicyError
+from xreset.eval import evaluate, trial
+from xreset.eval import frontier as frontiers
 from xreset.eval.setting import Setting
 
 
@@ -34,23 +36,19 @@ def frontier(
         setting: Robot, meshes, seed of their choice, device and worlds.
         out: Folder for the results; default: frontier/ in the run folder or beside the policy.
     """
-    from xreset.eval.evaluate import resolve  # torch, which --help must not need
-    from xreset.eval.frontier import STAGES, frontier
-    from xreset.eval.trial import engine
-
     if policy == "ik":
         raise PolicyError("ik follows a demonstration from its beginning and cannot go on from a state. Give a policy, zero or random.")
-    engines = [engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
+    engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
     console = Console()
-    subject = resolve(policy, setting.robot, setting.seed)
+    subject = evaluate.resolve(policy, setting.robot, setting.seed)
     folder = out or subject.folder.parent / "frontier"
     with engine_bars(console, [e.name for e in engines]) as progress:
-        results = frontier(subject, engines, resets, setting, folder, states=states, progress=progress)
+        results = frontiers.frontier(subject, engines, resets, setting, folder, states=states, progress=progress)
     title = f"{subject.label} on {subject.robot.name} goes on from {len(results[0]['tried'])} demonstrated states:"
     table = Table("the episode begins with", title=f"{title}\nof them, at the goal at any time / at the end", title_justify="left")
     for result in results:
         table.add_column(result["backend"], justify="right", no_wrap=True)
-    for stage in STAGES:  # (a state at the edge between two stages may count to another one in another engine)
+    for stage in frontiers.STAGES:  # (a state at the edge between two stages may count to another one in another engine)
         rows = [next((row for row in result["stages"] if row["stage"] == stage), None) for result in results]
         if any(rows):
             table.add_row(stage, *(f"{row['states']}: {row['reached']:.0%} / {row['stayed']:.0%}" if row else "-" for row in rows))

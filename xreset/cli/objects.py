@@ -10,10 +10,9 @@ from rich.table import Table
 
 from xreset.cli._terminal import Console
 from xreset.errors import ObjectError
-from xreset.objects import bounding_box, load_object, object_names
-from xreset.objects.catalogue import ALIASES
-from xreset.objects.meshes import add_mesh, import_with_notes, mesh_files
+from xreset.objects import catalogue, meshes, sampling
 from xreset.objects.properties import Properties
+from xreset.pictures import pieces, raster
 from xreset.spec import ObjectSpec
 
 
@@ -24,8 +23,8 @@ def list_(*, objects: Path | None = None) -> None:
         objects: Folder of real meshes; default: the built-in stand-ins.
     """
     table = _table()
-    for name in object_names(objects):
-        table.add_row(*_cells(load_object(name, objects)))
+    for name in catalogue.object_names(objects):
+        table.add_row(*_cells(catalogue.load_object(name, objects)))
     Console().print(table)
 
 
@@ -55,9 +54,6 @@ def import_(
         friction: Coefficient of its material: the middle of what training and evaluation draw.
         png: Picture of the meshes beside their pieces, with the deviation in millimetres.
     """
-    from xreset.pictures.pieces import draw_pieces
-    from xreset.pictures.raster import write_png
-
     try:
         properties = Properties(mass=mass, density=density, friction=friction)
     except ValueError as error:
@@ -68,7 +64,7 @@ def import_(
                 f"{path} is a folder, whose meshes stay as they are: --out, --name, --scale, --mass, --density and --friction"
                 " are for one mesh file. NAME.toml beside a mesh may say mass, density and friction."
             )
-        files = mesh_files(path)
+        files = meshes.mesh_files(path)
     elif out is None:
         raise ObjectError("a mesh file goes into a folder of objects: say which with --out.")
     else:
@@ -84,9 +80,9 @@ def import_(
 
             status.update(f"{object_name} ({file})")
             if out is None:
-                result = import_with_notes(file, object_name, progress=progress)
+                result = meshes.import_with_notes(file, object_name, progress=progress)
             else:
-                result = add_mesh(file, out, object_name, scale=scale, properties=properties, progress=progress)
+                result = meshes.add_mesh(file, out, object_name, scale=scale, properties=properties, progress=progress)
             seconds = "cached" if result.cached else f"{result.seconds:.1f} s"
             table.add_row(*_cells(result.obj), f"{1e3 * result.deviation:.1f}", seconds)
             notes += [f"{object_name}: {note}" for note in result.notes]
@@ -96,7 +92,7 @@ def import_(
         console.print(note, highlight=False)
     if png is not None:
         captions = [f"{r.obj.name}: {len(r.obj.pieces)} pieces, at most {1e3 * r.deviation:.1f} mm off the surface" for r in found]
-        write_png(png, draw_pieces([r.obj for r in found], captions))
+        raster.write_png(png, pieces.draw_pieces([r.obj for r in found], captions))
         console.print(f"{png}: meshes and their pieces", soft_wrap=True, highlight=False)
 
 
@@ -113,11 +109,11 @@ def _table(*more: str) -> Table:
 
 
 def _cells(obj: ObjectSpec) -> tuple[str, ...]:
-    low, high = bounding_box(obj)
+    low, high = sampling.bounding_box(obj)
     kinds = {piece.geometry.kind for piece in obj.pieces}
     return (
         obj.name,
-        next((alias for alias, name in ALIASES.items() if name == obj.name), ""),
+        next((alias for alias, name in catalogue.ALIASES.items() if name == obj.name), ""),
         f"{obj.mass:.3f}",
         "x".join(f"{1000 * length:.0f}" for length in high - low),
         f"{len(obj.pieces)} {' + '.join(sorted(kinds))}",

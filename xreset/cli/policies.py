@@ -8,17 +8,17 @@ from typing import Annotated
 import tyro
 from rich.table import Table
 
+from xreset import policy as policy_files
 from xreset.cli._terminal import Console
+from xreset.learning import shrink as shrinking
 from xreset.policies import card, shipped
 
 
 def list_() -> None:
     """Show the cards of the policies that ship with xreset; wherever a policy is asked for, their names will do."""
-    from xreset.policy import OnnxPolicy
-
     console = Console()
     for name, file in shipped().items():
-        contract, about = OnnxPolicy(file).contract, card(file)
+        contract, about = policy_files.OnnxPolicy(file).contract, card(file)
         console.print(f"{name}: {about.about}", highlight=False)
         facts = {
             "robot": contract["robot"],
@@ -43,10 +43,8 @@ def shrink(policy: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, t
         policy: Exported policy (.onnx).
         out: File to write.
     """
-    from xreset.learning.shrink import shrink as write_shrunk
-
     before = policy.stat().st_size if policy.is_file() else 0  # now, for the output may replace it; of what is no file, shrinking complains
-    write_shrunk(policy, out)
+    shrinking.shrink(policy, out)
     Console().print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, was {before / 1e6:.2f} MB", highlight=False, soft_wrap=True)
 
 

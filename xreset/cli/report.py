@@ -8,6 +8,9 @@ from typing import Annotated
 import tyro
 
 from xreset.cli._terminal import Console, Progress
+from xreset.eval import table
+from xreset.eval.report import film as films
+from xreset.eval.report import make
 from xreset.policies import results_folder, shipped
 from xreset.text import short_name
 
@@ -29,22 +32,18 @@ def report(
         objects: Folder of real meshes, for the clips; default: as the results name it.
         film: Also write an mp4 with every object side by side, in all engines.
     """
-    from xreset.eval.report import make_report  # torch, which --help must not need
-    from xreset.eval.report.film import make_film
-    from xreset.eval.table import results_table
-
     if not run.exists() and str(run) in shipped():
         run = results_folder(str(run))
     console = Console()
     with Progress(console) as bar:
-        made = make_report(run, out, robot=robot, objects=objects, progress=bar.count("drawing clips"))
-    console.print(results_table(made.summaries))
+        made = make.make_report(run, out, robot=robot, objects=objects, progress=bar.count("drawing clips"))
+    console.print(table.results_table(made.summaries))
     console.print(made.headline)
     for note in made.notes:
         console.print(f"note: {note}", style="yellow")
     if film is not None:
         with Progress(console) as bar:
-            shown = make_film(run, film, robot=robot, objects=objects, progress=bar.count("drawing the film"))
+            shown = films.make_film(run, film, robot=robot, objects=objects, progress=bar.count("drawing the film"))
         rows, columns = ", ".join(shown.engines), ", ".join(map(short_name, shown.objects))
         console.print(f"film:    {film}\n         from above: {rows}; from the left: {columns}", soft_wrap=True)
     console.print(f"page:    {made.html}\npicture: {made.overview}", soft_wrap=True)

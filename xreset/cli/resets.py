@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 from rich.table import Table
@@ -15,13 +15,12 @@ from xreset.accounts import accounts_path, described, with_totals, write_account
 from xreset.cli._terminal import Console, Progress
 from xreset.description import load_robot
 from xreset.files import file_hash
-from xreset.objects import load_objects
-from xreset.resets.bank import Band, ResetBank, check_retargeted, write_bank
+from xreset.objects import catalogue
+from xreset.resets import bank as banks
+from xreset.resets import filter as trying
+from xreset.resets import hold as holding
 from xreset.resets.config import ClosingConfig, SqueezeConfig
-from xreset.retarget.file import Retargeted
-
-if TYPE_CHECKING:
-    from xreset.resets.hold import Held
+from xreset.retarget import file
 
 
 def resets(
@@ -51,29 +50,25 @@ def resets(
         squeeze: Targets of states after contact that press.
         hold: Also count, in every engine, which lifted states hold the object for a second at full gravity.
     """
-    from xreset.resets.filter import make_bank
-    from xreset.resets.hold import hold_bank
-    from xreset.retarget.pipeline import read_retargeted
-
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
     console = Console()
-    data = read_retargeted(retargeted)
+    data = file.read_retargeted(retargeted)
     spec = load_robot(robot or data.robot)
-    check_retargeted(retargeted, data, spec)
-    loaded = load_objects(sorted({*map(str, data.object_name)}), objects)
+    banks.check_retargeted(retargeted, data, spec)
+    loaded = catalogue.load_objects(sorted({*map(str, data.object_name)}), objects)
     with Progress(console) as bar:
-        bank = make_bank(
+        bank = trying.make_bank(
             data, spec, loaded, backends, num_envs=num_envs, device=device, closing=closing, squeeze=squeeze,
             progress=bar.count(f"states in {', '.join(backends)}"),
         )  # fmt: skip
         held = []
         if hold:
-            held = hold_bank(
+            held = holding.hold_bank(
                 bank, spec, loaded, backends, num_envs=num_envs, device=device,
                 progress=bar.count("lifted states hold"),
             )  # fmt: skip
     config = {"backends": backends, "num_envs": num_envs, "closing": asdict(closing), "squeeze": asdict(squeeze)}
-    write_bank(out, bank, config=config, inputs={"retargeted": file_hash(retargeted)})
+    banks.write_bank(out, bank, config=config, inputs={"retargeted": file_hash(retargeted)})
     bands = bank.bands()
     write_accounts(
         accounts_path(out),
@@ -98,7 +93,7 @@ def resets(
     )
 
 
-def _accepted(data: Retargeted, bank: ResetBank, title: str) -> Table:
+def _accepted(data: file.Retargeted, bank: banks.ResetBank, title: str) -> Table:
     """How many states of each object and phase are kept."""
     annotated = {(row.object_name, row.phase): row.without("not annotated").total for row in with_totals(data.accounts())}
     table = Table("object", "phase", "annotated frames", "valid: tried", "accepted", "of annotated", "rejected because of", title=title)
@@ -116,7 +111,7 @@ def _accepted(data: Retargeted, bank: ResetBank, title: str) -> Table:
     return table
 
 
-def _closing(bands: Sequence[Band]) -> Table:
+def _closing(bands: Sequence[banks.Band]) -> Table:
     """States by the distance between finger and object."""
     table = Table("finger to object", "frames: tried", "accepted", "added: tried", "accepted", title="where the hand closes in")
     for band in bands:
@@ -126,7 +121,7 @@ def _closing(bands: Sequence[Band]) -> Table:
     return table
 
 
-def _holding(held: Sequence[Held], backends: Sequence[str]) -> Table:
+def _holding(held: Sequence[holding.Held], backends: Sequence[str]) -> Table:
     """How many lifted states hold the object, engine by engine."""
     table = Table("object", "lifted", *backends, title="lifted states that hold the object for 1 s at full gravity")
     for name in dict.fromkeys(row.object_name for row in held):
@@ -136,7 +131,7 @@ def _holding(held: Sequence[Held], backends: Sequence[str]) -> Table:
     return table
 
 
-def _alike(held: Sequence[Held], backends: Sequence[str]) -> Table:
+def _alike(held: Sequence[holding.Held], backends: Sequence[str]) -> Table:
     """How many lifted states end alike in two engines."""
     pairs = list(combinations(backends, 2))
     table = Table("object", *(f"{a}, {b}" for a, b in pairs), title="of these, held or not held alike")

@@ -12,13 +12,13 @@ from rich.table import Table
 
 from xreset.accounts import accounts_path, described, with_totals, write_accounts
 from xreset.cli._terminal import Console, Progress
-from xreset.demos import demo_objects, levelled, read_demos
-from xreset.demos.align import on_something
-from xreset.demos.plausible import doubts
+from xreset.demos import align, archive, plausible
 from xreset.description import load_robot
 from xreset.files import file_hash
+from xreset.pictures import raster
+from xreset.pictures.view import load, sheet
+from xreset.retarget import collisions, file, partial, pipeline
 from xreset.retarget.arm.config import ArmConfig
-from xreset.retarget.file import Retargeted
 from xreset.retarget.hand.config import HandConfig
 
 
@@ -51,32 +51,28 @@ def retarget(
         arm: Weights and effort of the arm's inverse kinematics.
         picture: PNG to write: first contact, mid-lift and goal for each object, the human keypoints over the robot.
     """
-    from xreset.retarget import pipeline  # torch, which --help must not wait for
-    from xreset.retarget.collisions import colliding_links
-    from xreset.retarget.partial import discard
-
     console = Console()
     spec = load_robot(robot)
-    chosen = read_demos(demos)
+    chosen = archive.read_demos(demos)
     if max_per_object is not None:
         chosen = chosen.select(max_per_object=max_per_object)
-    for doubt in doubts(chosen):
+    for doubt in plausible.doubts(chosen):
         console.print(f"note: {doubt}", style="yellow", soft_wrap=True, highlight=False)
-    specs = demo_objects(chosen, objects)
+    specs = archive.demo_objects(chosen, objects)
     config, timing = pipeline.RetargetConfig(hand=hand, arm=arm), pipeline.Timing()
-    partial = out.with_name(f"{out.name}.partial")
+    kept = out.with_name(f"{out.name}.partial")
     if restart:
-        discard(partial)
+        partial.discard(kept)
     try:
         with Progress(console) as bar:
             result = pipeline.retarget_demos(
                 chosen, spec, list(specs.values()), config,
-                progress=bar.count("sequences"), partial=partial, timing=timing,
+                progress=bar.count("sequences"), partial=kept, timing=timing,
                 device=device,
             )  # fmt: skip
     except KeyboardInterrupt:
-        if partial.is_dir():
-            console.print(f"What is finished is kept in {partial}; give the same command again to continue, with --restart to begin anew.")
+        if kept.is_dir():
+            console.print(f"What is finished is kept in {kept}; give the same command again to continue, with --restart to begin anew.")
         raise
     pipeline.write_retargeted(
         out,
@@ -84,17 +80,13 @@ def retarget(
         config={"retarget": asdict(config), "robot": robot, "max_per_object": max_per_object},
         inputs={"demos": file_hash(demos), "robot": spec.fingerprint} | {f"object {s.name}": s.source for s in specs.values()},
     )
-    discard(partial)
+    partial.discard(kept)
 
     if picture is not None:
-        from xreset.pictures.raster import write_png
-        from xreset.pictures.view.load import load_view
-        from xreset.pictures.view.sheet import draw_sheet, moment_tiles
+        shown = load.load_view(out, demos=demos, robot=robot, objects=objects)
+        raster.write_png(picture, sheet.draw_sheet(shown, sheet.moment_tiles(shown)))
 
-        shown = load_view(out, demos=demos, robot=robot, objects=objects)
-        write_png(picture, draw_sheet(shown, moment_tiles(shown)))
-
-    colliding = colliding_links(result, spec, config.thresholds)
+    colliding = collisions.colliding_links(result, spec, config.thresholds)
     write_accounts(
         accounts_path(out),
         of="frames",
@@ -105,13 +97,13 @@ def retarget(
     if colliding:
         console.print(_meeting(colliding))
         console.print("Links that meet in every position of their joints belong into collision.exclude of the robot.toml.")
-    for index in np.flatnonzero(on_something(levelled(chosen), specs)):
+    for index in np.flatnonzero(align.on_something(align.levelled(chosen), specs)):
         console.print(f"{chosen.sequence_name[index]}: the object starts on top of something that the scene does not have; not lowered.")
     console.print(f"hand {timing.hand:.1f} s, arm {timing.arm:.1f} s", highlight=False)
     console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}; counts in {accounts_path(out)}")
 
 
-def _table(result: Retargeted) -> Table:
+def _table(result: file.Retargeted) -> Table:
     """What became of the frames, by object and phase."""
     table = Table(
         "object", "phase", "frames", "annotated", "valid", "fingertips [mm]", "invalid because of", title=f"retargeted to {result.robot}"

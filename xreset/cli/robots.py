@@ -13,12 +13,18 @@ from rich.table import Table
 from rich.text import Text
 
 from xreset.cli._terminal import Console, Progress
-from xreset.demos import demo_objects, read_demos
+from xreset.demos import archive
 from xreset.description import DESCRIPTION, load_robot, robot_folder
 from xreset.errors import RobotError
-from xreset.geometry.urdf_writer import pose
+from xreset.geometry import urdf_writer
+from xreset.pictures import raster
 from xreset.plugins import robot_names
-from xreset.robot_tools.placement import PlaceConfig, Reach, write_placement
+from xreset.retarget import pipeline
+from xreset.robot_tools import check as checks
+from xreset.robot_tools import importer, placement
+from xreset.robot_tools import picture as pictures
+from xreset.robot_tools import place as places
+from xreset.robot_tools.placement import PlaceConfig
 
 
 def list_robots() -> None:
@@ -49,22 +55,17 @@ def check(
         picture: write a picture (PNG) of the robot at home, with the frames of its palm, fingertips and joints.
         engines: build the robot in every installed engine (the first time, mujoco-warp compiles for a minute or two).
     """
-    from xreset.pictures.raster import write_png
-    from xreset.robot_tools.check import Finding
-    from xreset.robot_tools.check import check as run_checks
-    from xreset.robot_tools.picture import robot_picture
-
     console = Console()
     styles = {"ok": "green", "skipped": "dim", "warning": "yellow", "error": "bold red"}
 
-    def report(finding: Finding) -> None:
+    def report(finding: checks.Finding) -> None:
         level = (f"{finding.level:8}", styles[finding.level])
         console.print(Text.assemble(level, f" {finding.topic}: {finding.message}"), soft_wrap=True)
 
-    findings = run_checks(robot, report=report, engines=engines)
+    findings = checks.check(robot, report=report, engines=engines)
     counts = {level: sum(finding.level == level for finding in findings) for level in ("error", "warning")}
     if picture is not None and findings[0].level == "ok":
-        write_png(picture, robot_picture(load_robot(robot)))
+        raster.write_png(picture, pictures.robot_picture(load_robot(robot)))
         console.print(f"wrote {picture}", highlight=False)
     console.print(f"{counts['error']} errors, {counts['warning']} warnings", highlight=False)
     if counts["error"]:
@@ -96,13 +97,9 @@ def import_(
         rpy: Its roll, pitch and yaw about the flange's fixed axes [rad].
         thumb: A link or joint of the thumb, where names and geometry do not tell.
     """
-    from xreset.pictures.raster import write_png
-    from xreset.robot_tools.importer import import_robot
-    from xreset.robot_tools.picture import robot_picture
-
-    T = None if offset is None and rpy is None else pose(offset or (0, 0, 0), rpy=rpy or (0, 0, 0))
-    made = import_robot(arm, hand, out, name=name, flange=flange, T_flange_hand=T, thumb=thumb)
-    write_png(out / "robot.png", robot_picture(load_robot(out)))
+    T = None if offset is None and rpy is None else urdf_writer.pose(offset or (0, 0, 0), rpy=rpy or (0, 0, 0))
+    made = importer.import_robot(arm, hand, out, name=name, flange=flange, T_flange_hand=T, thumb=thumb)
+    raster.write_png(out / "robot.png", pictures.robot_picture(load_robot(out)))
     console = Console()
     for title, lines in (("guessed", made.guessed), ("for you to say", made.to_say)):
         console.print(f"{title}:", highlight=False)
@@ -132,23 +129,20 @@ def place(
         write: put the placement, its home and its figure into the robot's robot.toml.
         search: ranges and effort.
     """
-    from xreset.retarget.pipeline import rest_on_table, wrist_paths
-    from xreset.robot_tools.place import place as search_place
-
     console = Console()
     spec = load_robot(robot)
-    chosen = read_demos(demos).select(max_per_object=max_per_object)
-    specs = list(demo_objects(chosen, objects).values())
+    chosen = archive.read_demos(demos).select(max_per_object=max_per_object)
+    specs = list(archive.demo_objects(chosen, objects).values())
     with Progress(console) as bar:
-        paths = wrist_paths(chosen, spec, specs, progress=bar.count("hand retargeting"))
+        paths = pipeline.wrist_paths(chosen, spec, specs, progress=bar.count("hand retargeting"))
         wrists = np.concatenate([path.root_pos[path.annotated].numpy() for path in paths])
-        avoid = np.concatenate((wrists, rest_on_table(chosen, specs).object_pos))
+        avoid = np.concatenate((wrists, pipeline.rest_on_table(chosen, specs).object_pos))
         task = bar.add_task("placements", total=1.0)
 
-        def report(done: float, best: Reach) -> None:
+        def report(done: float, best: placement.Reach) -> None:
             bar.update(task, completed=done, description=f"placements (best yet reaches {best.reached:.0%})")
 
-        found = search_place(spec, paths, avoid, search, report)
+        found = places.place(spec, paths, avoid, search, report)
     for title, finalist in (("as described", found.own), ("best found", found.best)):
         pos, quat = (", ".join(f"{v:.4f}" for v in values) for values in (finalist.placement.pos, finalist.placement.quat))
         console.print(
@@ -166,7 +160,7 @@ def place(
         for field in fields(search):
             if (value := getattr(search, field.name)) != field.default:
                 command += [f"--search.{field.name}", *map(str, value if isinstance(value, tuple) else (value,))]
-        write_placement(robot_folder(robot) / DESCRIPTION, spec, found, shlex.join(command))
+        placement.write_placement(robot_folder(robot) / DESCRIPTION, spec, found, shlex.join(command))
         console.print(f"wrote {robot_folder(robot) / DESCRIPTION}", highlight=False)
 
 

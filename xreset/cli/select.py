@@ -11,6 +11,8 @@ from rich.table import Table
 
 from xreset.cli._terminal import Console
 from xreset.errors import XResetError
+from xreset.eval import select as selection
+from xreset.eval import trial
 from xreset.eval.setting import Setting
 
 
@@ -38,22 +40,18 @@ def select(
         setting: Robot, meshes, device and worlds; --seed is not used, see --starts.
         starts: Seed of the starts that decide; default: one that no evaluation uses unless it is told to.
     """
-    from xreset.eval.select import SEED  # torch, which --help must not need
-    from xreset.eval.select import select as choose
-    from xreset.eval.trial import engine
-
     for name, value in (("most", most), ("episodes", episodes)):
         if value < 1:
             raise XResetError(f"--{name} is {value}, expected 1 or more.")
-    engines = [engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco", "pybullet", "sapien"))]
+    engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco", "pybullet", "sapien"))]
     console = Console()
 
     def say(name: str, engine: str, score: float | None) -> None:
         if score is not None:
             console.print(f"{name} in {engine}: {100 * score:.1f} %")
 
-    setting = replace(setting, seed=SEED if starts is None else starts)
-    choice = choose(folder, engines, demos, setting, most=most, episodes=episodes, progress=say)
+    setting = replace(setting, seed=selection.SEED if starts is None else starts)
+    choice = selection.select(folder, engines, demos, setting, most=most, episodes=episodes, progress=say)
     table = Table("checkpoint", title="task progress", title_justify="left")
     for e in engines:
         table.add_column(e.name, justify="right")

@@ -10,6 +10,8 @@ from rich.table import Table
 
 from xreset.cli._common import engine_bars
 from xreset.cli._terminal import Console
+from xreset.eval import evaluate, stress_figure, trial
+from xreset.eval import stress as sweeps
 from xreset.eval.setting import Setting
 
 
@@ -35,19 +37,14 @@ def stress(
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: stress/ in the run folder or beside the policy.
     """
-    from xreset.eval import stress as sweeps  # torch, which --help must not need
-    from xreset.eval.evaluate import resolve
-    from xreset.eval.stress_figure import write_plot
-    from xreset.eval.trial import engine
-
     properties = sweeps.chosen(property)
-    engines = [engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
+    engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
     console = Console()
-    subject = resolve(policy, setting.robot, setting.seed)
+    subject = evaluate.resolve(policy, setting.robot, setting.seed)
     folder = out or subject.folder.parent / "stress"
     with engine_bars(console, [e.name for e in engines]) as progress:
         found = sweeps.stress(subject, engines, demos, setting, folder, properties=properties, repetitions=episodes, progress=progress)
-    write_plot(folder / "stress.png", found, f"{subject.label}: what it bears")
+    stress_figure.write_plot(folder / "stress.png", found, f"{subject.label}: what it bears")
     table = Table("property", title=f"{subject.label}: task progress, and its difference to the same episodes (95 %)")
     table.add_column("value", justify="right")
     for result in found:

@@ -9,9 +9,8 @@ import tyro
 
 from xreset.cli._terminal import Console
 from xreset.errors import RunError
-from xreset.eval.study.file import read_study, study_path
-from xreset.eval.study.launch import launch, shown_command
-from xreset.eval.study.plan import Plan, make_plan
+from xreset.eval.study import file as files
+from xreset.eval.study import launch, plan, report
 
 
 def study(
@@ -41,36 +40,34 @@ def study(
         slurm: Options of sbatch as submitit names them, such as partition=gpu time=600 (minutes) cpus_per_task=16.
         dry_run: Print the plan and its commands; do nothing.
     """
-    from xreset.eval.study.report import plan_rows, write_page  # torch, which --help must not need
-
     if slurm and cluster != "slurm":
         raise RunError("--slurm goes with --cluster slurm.")
     if wrong := [text for text in slurm if "=" not in text]:
         raise RunError(f"--slurm {wrong[0]} is not KEY=VALUE.")
     options = {key: int(value) if value.isdecimal() else value for key, _, value in (text.partition("=") for text in slurm)}
-    path, console = study_path(file), Console()
+    path, console = files.study_path(file), Console()
 
-    def planned() -> Plan:
-        return make_plan(read_study(path), path.stem, given=data, out=out, only=run)
+    def planned() -> plan.Plan:
+        return plan.make_plan(files.read_study(path), path.stem, given=data, out=out, only=run)
 
-    plan = planned()
-    wanted = [step for step in plan.steps.values() if only in ("all", step.kind)]
+    todo = planned()
+    wanted = [step for step in todo.steps.values() if only in ("all", step.kind)]
     if dry_run:
-        for name, state, on, after in plan_rows(plan, [step.name for step in wanted]).body:
+        for name, state, on, after in report.plan_rows(todo, [step.name for step in wanted]).body:
             console.print(f"{name}: {state} ({on}{', after ' + after if after else ''})", highlight=False, soft_wrap=True)
-            for command in [] if plan.steps[name].done() else plan.steps[name].commands():
-                console.print(f"    {shown_command(command)}", highlight=False, soft_wrap=True)
+            for command in [] if todo.steps[name].done() else todo.steps[name].commands():
+                console.print(f"    {launch.shown_command(command)}", highlight=False, soft_wrap=True)
         return
     problems = []
     if only != "tables":
-        for subset in plan.subsets:
+        for subset in todo.subsets:
             subset.make()
-        problems = launch(
-            plan, [step for step in wanted if not step.done()], cluster=cluster, per_gpu=per_gpu, options=options,
+        problems = launch.launch(
+            todo, [step for step in wanted if not step.done()], cluster=cluster, per_gpu=per_gpu, options=options,
             say=lambda line: console.print(line, highlight=False, soft_wrap=True),
         )  # fmt: skip
     if only in ("all", "tables"):
-        page = write_page(planned(), out / "reports" / plan.name)
+        page = report.write_page(planned(), out / "reports" / todo.name)
         for note in page.notes:
             console.print(f"note: {note}", style="yellow")
         console.print(f"page: {page.path}", soft_wrap=True)

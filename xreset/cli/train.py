@@ -11,6 +11,7 @@ from pathlib import Path
 
 from xreset.checks import without_effect
 from xreset.errors import RunError
+from xreset.learning import train as training
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import starting_config
 
@@ -52,8 +53,6 @@ def train(
             deviation and, where it adapts, their learning rate.
         config: Task, model and algorithm. The defaults shown are those of --like.
     """
-    from xreset.learning import train as training
-
     if not minutes > 0:
         raise RunError(f"--minutes is {minutes}, expected more than 0.")
     if resume and like != "paper":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -11,10 +11,10 @@ from rich.progress import track
 
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import XResetError
+from xreset.eval.report import clips
 from xreset.files import atomic_write
-
-if TYPE_CHECKING:
-    from xreset.pictures.view.data import View
+from xreset.pictures import raster
+from xreset.pictures.view import data, load, page, picture, sheet
 
 
 def view(
@@ -53,11 +53,9 @@ def view(
         moments: Let --png show first contact, mid-lift and goal of one demonstration of each object.
         reasons: Let --png show one example of every reason for which a frame or state is not used.
     """
-    from xreset.pictures.view.load import load_view
-
     if (moments or reasons) and (png is None or (moments and reasons)):
         raise XResetError("--moments and --reasons say what picture to write: give one of them, and a file with --png.")
-    shown = load_view(file, demos=demos, retargeted=retargeted, robot=robot, objects=objects)
+    shown = load.load_view(file, demos=demos, retargeted=retargeted, robot=robot, objects=objects)
     if png is not None and (moments or reasons):
         _write_sheet(png, shown, moments=moments)
         return
@@ -71,55 +69,44 @@ def view(
         _write_mp4(mp4, shown, rows)
 
 
-def _serve(shown: View, host: str, port: int, sequence: int | None, frame: int) -> None:
-    from xreset.pictures.view.page import Page
-
-    page = Page(shown, host=host, port=port, sequence=sequence, frame=frame)
-    number = page.url.rpartition(":")[2]
-    print(f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {shown.kind} at {page.url}", flush=True)
+def _serve(shown: data.View, host: str, port: int, sequence: int | None, frame: int) -> None:
+    opened = page.Page(shown, host=host, port=port, sequence=sequence, frame=frame)
+    number = opened.url.rpartition(":")[2]
+    print(f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {shown.kind} at {opened.url}", flush=True)
     print(f"From another machine: ssh -L {number}:localhost:{number} THIS_MACHINE, then open the same address. Ctrl-C ends.", flush=True)
     try:
-        page.serve()
+        opened.serve()
     except KeyboardInterrupt:  # the way to end it, not a failure
         print("\nclosed.")
     finally:
-        page.close()
+        opened.close()
 
 
-def _write_png(path: Path, shown: View, rows: np.ndarray, frame: int | None) -> None:
-    from xreset.pictures.raster import write_png
-    from xreset.pictures.view.picture import Drawer
-
+def _write_png(path: Path, shown: data.View, rows: np.ndarray, frame: int | None) -> None:
     chosen = len(rows) // 2 if frame is None else frame
     if not 0 <= chosen < len(rows):
         raise XResetError(f"there is no frame {chosen}; the choice has {len(rows)}, counted from 0.")
-    write_png(path, Drawer(shown, size=(960, 720), smooth=True).draw(int(rows[chosen])))
+    raster.write_png(path, picture.Drawer(shown, size=(960, 720), smooth=True).draw(int(rows[chosen])))
     print("\n".join((*shown.text(int(rows[chosen])), f"picture in {path}")))
 
 
-def _write_sheet(path: Path, shown: View, *, moments: bool) -> None:
-    from xreset.pictures.raster import write_png
-    from xreset.pictures.view.sheet import draw_sheet, moment_tiles, reason_tiles
-
-    tiles = moment_tiles(shown) if moments else reason_tiles(shown)
+def _write_sheet(path: Path, shown: data.View, *, moments: bool) -> None:
+    tiles = sheet.moment_tiles(shown) if moments else sheet.reason_tiles(shown)
     console = Console()
     with Progress(console) as bar:
-        picture = draw_sheet(shown, tiles, progress=bar.count("drawing"))
-    write_png(path, picture)
+        drawn = sheet.draw_sheet(shown, tiles, progress=bar.count("drawing"))
+    raster.write_png(path, drawn)
     for tile in tiles:
         print("; ".join(tile.caption))
     print(f"{sum(tile.row is not None for tile in tiles)} pictures in {path}")
 
 
-def _write_mp4(path: Path, shown: View, rows: np.ndarray) -> None:
-    from xreset.eval.report.clips import encode_mp4
-    from xreset.pictures.view.picture import Drawer
-
+def _write_mp4(path: Path, shown: data.View, rows: np.ndarray) -> None:
     if not len(rows):
         raise XResetError("this sequence has no state to film; choose another one with --sequence.")
-    draw = Drawer(shown).draw
+    draw = picture.Drawer(shown).draw
     frames = [draw(int(row)) for row in track(rows, "drawing", console=Console(), transient=True)]
-    film = encode_mp4(np.stack(frames), shown.rate)
+    film = clips.encode_mp4(np.stack(frames), shown.rate)
     with atomic_write(path) as file:
         file.write(film)
     print(f"{len(rows)} frames in {path}")

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from xreset.demos.archive import Demos
 from xreset.errors import DemoError
-from xreset.objects import rest_height
+from xreset.objects.rest import rest_height
 from xreset.spec import ObjectSpec
 
 CALIBRATION_ERROR = 0.020

@@ -15,7 +15,7 @@ import numpy as np
 
 from xreset.checks import is_rigid
 from xreset.errors import DemoError, ObjectError
-from xreset.objects import canonical_name, load_object, object_names
+from xreset.objects.catalogue import canonical_name, load_object, object_names
 from xreset.records import POSITION, RATE, UNIT_TOLERANCE, Field, arrays_of, offsets_problem, read_record, write_record
 from xreset.spec import ObjectSpec
 

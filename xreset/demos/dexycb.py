@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from xreset.checks import is_rigid
 from xreset.demos.archive import SIDES, Demos, concatenate
 from xreset.errors import DemoError, FileFormatError
-from xreset.objects import canonical_name
+from xreset.objects.catalogue import canonical_name
 from xreset.objects.ycb import NAME_OF_ID
 from xreset.records import read_arrays
 from xreset.text import is_plain, shown

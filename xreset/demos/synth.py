@@ -19,7 +19,8 @@ from xreset.demos.archive import Demos, concatenate
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, plan_contacts
 from xreset.demos.motion import HandPath, clear_approach, object_path, place_hand, random_timing
 from xreset.errors import DemoError
-from xreset.objects import load_object, object_names, rest_height, resting_orientation
+from xreset.objects.catalogue import load_object, object_names
+from xreset.objects.rest import rest_height, resting_orientation
 from xreset.spec import ObjectSpec
 
 SUBJECT = "synthetic"

@@ -20,7 +20,7 @@ from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel
 from xreset.learning.run import RunInfo, checkpoints, latest_checkpoint, read_run, write_run
 from xreset.learning.runner import TrainingRunner, read_checkpoint
-from xreset.objects import load_objects
+from xreset.objects.catalogue import load_objects
 from xreset.plugins import backend_class, device_for
 from xreset.policy import check_contract, policy_contract
 from xreset.resets.bank import ResetBank, check_objects, read_bank

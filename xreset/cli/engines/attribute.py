@@ -12,9 +12,9 @@ import tyro
 from xreset.checks import Options
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import DemoError, XResetError
-from xreset.eval.evaluate import resolve
+from xreset.eval import evaluate, trial
+from xreset.eval.engines import attribution, attribution_view
 from xreset.eval.setting import Setting
-from xreset.eval.trial import engine
 from xreset.files import file_hash, write_json
 
 
@@ -60,27 +60,24 @@ def attribute(
         setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
         out: Folder for attribution.json and attribution.png; default: attribute/ beside the policy's results.
     """
-    from xreset.eval.engines.attribution import attribute as experiment  # MuJoCo, which --help must not need
-    from xreset.eval.engines.attribution_view import not_tried, rich_table, verdict, write_plot
-
     if backend == towards:
         raise XResetError(f"--backend and --towards are both {backend!r}; an engine does not differ from itself.")
     console, demos = Console(), played.demos
-    subject = resolve(policy, setting.robot, setting.seed)
-    a, b = engine(backend, device=setting.device), engine(towards, device=setting.device)
-    trial, trajectories = subject.episodes(demos, setting)
-    if unknown := sorted(set(played.object) - set(trial.names)):
-        raise DemoError(f"{demos} has no {', '.join(unknown)}; it has {', '.join(trial.names)}.")
-    objects = tuple(o for o in trial.objects if o.name in (played.object or trial.names))
-    chosen = np.flatnonzero(np.isin(trial.bank.sequence_object, [o.name for o in objects]))
+    subject = evaluate.resolve(policy, setting.robot, setting.seed)
+    a, b = (trial.engine(name, device=setting.device) for name in (backend, towards))
+    played_trial, trajectories = subject.episodes(demos, setting)
+    if unknown := sorted(set(played.object) - set(played_trial.names)):
+        raise DemoError(f"{demos} has no {', '.join(unknown)}; it has {', '.join(played_trial.names)}.")
+    objects = tuple(o for o in played_trial.objects if o.name in (played.object or played_trial.names))
+    chosen = np.flatnonzero(np.isin(played_trial.bank.sequence_object, [o.name for o in objects]))
     if played.max_demos is not None and played.max_demos < len(chosen):
         chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, played.max_demos).round().astype(int))]
-    objects = tuple(o for o in objects if o.name in trial.bank.sequence_object[chosen])
+    objects = tuple(o for o in objects if o.name in played_trial.bank.sequence_object[chosen])
     out, folder = out or subject.folder.parent / "attribute", subject.meshes(setting.objects)
     with Progress(console) as bar:
         task = bar.add_task("", total=None)
-        found = experiment(
-            lambda: subject.policy(subject.robot, trajectories), a, b, replace(trial, objects=objects),
+        found = attribution.attribute(
+            lambda: subject.policy(subject.robot, trajectories), a, b, replace(played_trial, objects=objects),
             episodes=played.episodes, sequences=chosen, only=only, what_if=what_if,
             progress=lambda run, done, total: bar.update(task, description=run, completed=done, total=total or None),
         )  # fmt: skip
@@ -96,11 +93,11 @@ def attribute(
         "inputs": subject.inputs | {"demos": file_hash(demos)},
     }
     write_json(out / "attribution.json", content)
-    write_plot(out / "attribution.png", found, title)
-    console.print(rich_table(found, title))
-    for line in not_tried(found):
+    attribution_view.write_plot(out / "attribution.png", found, title)
+    console.print(attribution_view.rich_table(found, title))
+    for line in attribution_view.not_tried(found):
         console.print(line, style="dim", highlight=False)
-    console.print(verdict(found), highlight=False)
+    console.print(attribution_view.verdict(found), highlight=False)
     console.print(f"results in {out}")
 
 

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.text import Text
-from torch import Tensor
 
 from xreset import __version__
-from xreset.backends.conformance import CHECKS, SCHEMA, CheckResult, MakeBackend, Measure, run
-from xreset.backends.conformance.harness import Bench
-from xreset.backends.conformance.scene import gripper
-from xreset.backends.pool import PoolBackend
+from xreset.backends import conformance, pool
 from xreset.cli._common import this_command, usable_engines
 from xreset.cli._terminal import Console
 from xreset.description import load_robot
 from xreset.errors import XResetError
 from xreset.files import write_json
-from xreset.physics import Backend
 from xreset.plugins import backend_class, backend_status, make_backend
 from xreset.spec import SceneSpec
 
@@ -43,18 +38,18 @@ def check(
         json: File to write the results to.
         verbose: Show every number that was measured, not only the one nearest to its tolerance.
     """
-    known = [c.name for c in CHECKS]
+    known = [c.name for c in conformance.CHECKS]
     if unknown := sorted(set(only) - set(known)):
         raise XResetError(f"there is no check {', '.join(unknown)}; there are {', '.join(known)}.")
     console = Console(highlight=False, soft_wrap=True)
-    spec = gripper() if robot is None else load_robot(robot)
+    spec = load_robot(robot) if robot else conformance.scene().robot
     runs = []
     for name in dict.fromkeys(backend) or usable_engines(console):
         status = backend_status(name)
         used = device if device.split(":")[0] in status.device else "cpu"
         what = f" {status.version}, {spec.name}, {used}: verdict, check, and what came nearest to its tolerance"
         console.print(Text.assemble((name, "bold"), what))
-        results = run(_maker(name, used), robot=spec, only=only or None, report=lambda r: _print(console, r, verbose))
+        results = conformance.run(_maker(name, used), robot=spec, only=only or None, report=lambda r: _print(console, r, verbose))
         runs.append(
             {
                 "engine": name,
@@ -67,7 +62,7 @@ def check(
             }
         )
     if json is not None:
-        write_json(json, {"schema": SCHEMA, "xreset_version": __version__, "command": this_command(), "runs": runs})
+        write_json(json, {"schema": conformance.SCHEMA, "xreset_version": __version__, "command": this_command(), "runs": runs})
         console.print(f"wrote {json}")
     failed = sum(result["verdict"] == "failed" for record in runs for result in record["checks"])
     console.print(f"{failed} checks failed" if failed else "no check failed", style="bold red" if failed else "bold green")
@@ -75,14 +70,14 @@ def check(
         raise SystemExit(1)
 
 
-def _maker(name: str, device: str) -> MakeBackend:
+def _maker(name: str, device: str) -> conformance.MakeBackend:
     """Builds worlds on the device; a few of them, for one check only, run in this process sooner than processes start."""
-    pooled = issubclass(backend_class(name), PoolBackend)
+    pooled = issubclass(backend_class(name), pool.PoolBackend)
 
-    def make(scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None) -> Backend:
-        here = pooled and num_worlds != Bench.NUM_WORLDS and num_worlds <= 24
+    def make(scene: SceneSpec, num_worlds: int, **chosen: Any) -> Any:
+        here = pooled and num_worlds != conformance.Bench.NUM_WORLDS and num_worlds <= 24
         options = {"workers": 0} if here else {}
-        return make_backend(name, scene, num_worlds, object_index=object_index, device=device, **options)
+        return make_backend(name, scene, num_worlds, device=device, **chosen, **options)
 
     return make
 
@@ -90,7 +85,7 @@ def _maker(name: str, device: str) -> MakeBackend:
 _STYLE = {"passed": "green", "known difference": "cyan", "failed": "bold red", "unsupported": "yellow", "skipped": "dim"}
 
 
-def _print(console: Console, result: CheckResult, verbose: bool) -> None:
+def _print(console: Console, result: conformance.CheckResult, verbose: bool) -> None:
     detail = _text(result.worst) if result.measures else result.problem
     verdict = (f"{result.verdict:<16}", _STYLE[result.verdict])
     console.print(Text.assemble("  ", verdict, f" {result.name:<22} {result.seconds:5.1f} s  {detail}"))
@@ -106,7 +101,7 @@ def _print(console: Console, result: CheckResult, verbose: bool) -> None:
         console.print(f"{'':19}likely: {result.check.cause}")
 
 
-def _text(measure: Measure | None) -> str:
+def _text(measure: conformance.Measure | None) -> str:
     if measure is None:
         return ""
     return f"{measure.what}: {measure.measured:.2g}, tolerance {measure.tolerance:.2g} {measure.unit}".rstrip()

@@ -12,10 +12,8 @@ from rich.text import Text
 from xreset import __version__
 from xreset.cli._common import this_command, usable_engines
 from xreset.cli._terminal import Console, Progress
-from xreset.eval.engines.agreement import REFERENCE, EngineParity, Metric, Parity
-from xreset.eval.engines.agreement import compare as agreement
-from xreset.eval.engines.sources import load_frames
-from xreset.eval.trial import engine
+from xreset.eval import trial
+from xreset.eval.engines import agreement, sources
 from xreset.files import file_hash, write_json
 
 
@@ -48,16 +46,16 @@ def compare(
         json: File to write the results to.
     """
     console = Console(highlight=False, soft_wrap=True)
-    names = [name for name in dict.fromkeys(backend) or usable_engines(console) if name != REFERENCE]
-    engines = [engine(name, device=device) for name in names]
+    names = [name for name in dict.fromkeys(backend) or usable_engines(console) if name != agreement.REFERENCE]
+    engines = [trial.engine(name, device=device) for name in names]
     with Progress(console) as bar:
         task = bar.add_task("reading")
-        spec, loaded, frames = load_frames(
+        spec, loaded, frames = sources.load_frames(
             motion, robot=robot, objects_folder=objects, only=only,
             progress=lambda doing, done, total: bar.update(task, description=doing, completed=done, total=total),
         )  # fmt: skip
         inputs = {"motion": file_hash(motion)}  # now: after minutes of work the file may be another, or gone
-        result = agreement(
+        result = agreement.compare(
             spec, loaded, frames, engines, grasps=grasps,
             progress=lambda doing, done, total: bar.update(task, description=doing, completed=done, total=total),
         )  # fmt: skip
@@ -74,8 +72,8 @@ def compare(
         raise SystemExit(1)
 
 
-def _table(result: Parity) -> Table:
-    columns: tuple[EngineParity, ...] = (result.floor, *result.engines)
+def _table(result: agreement.Parity) -> Table:
+    columns: tuple[agreement.EngineParity, ...] = (result.floor, *result.engines)
     held = sum(sum(flags) for name, flags in result.reference.carried.items() if name != "closing")
     tried = sum(len(flags) for name, flags in result.reference.carried.items() if name != "closing")
     table = Table(
@@ -92,7 +90,7 @@ def _table(result: Parity) -> Table:
     return table
 
 
-def _cell(metric: Metric) -> Text:
+def _cell(metric: agreement.Metric) -> Text:
     style = "green" if metric.ok else "bold red"
     return Text.assemble((_number(metric.measured, metric.unit), style), f" (n = {metric.n})")
 

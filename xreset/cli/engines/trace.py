@@ -14,15 +14,9 @@ from xreset.checks import Options
 from xreset.cli._common import usable_engines
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import XResetError
-from xreset.eval.engines.actions import write_actions
-from xreset.eval.engines.divergence import Thresholds
-from xreset.eval.engines.film import write_film, write_strip
-from xreset.eval.engines.replay import trace as replay
-from xreset.eval.engines.replay import write_trace
-from xreset.eval.engines.sources import from_file, from_policy
-from xreset.eval.engines.trace_view import rich_table, sentences, write_plot
+from xreset.eval import trial
+from xreset.eval.engines import actions, divergence, film, replay, sources, trace_view
 from xreset.eval.setting import Place, Sequence
-from xreset.eval.trial import engine
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +79,7 @@ def trace(
         limits: When engines have diverged.
         output: Files.
     """
-    thresholds = Thresholds(
+    thresholds = divergence.Thresholds(
         joint=limits.joint_threshold,
         travel=0.1 * limits.joint_threshold,
         position=limits.position_threshold,
@@ -94,9 +88,9 @@ def trace(
         contact_time=limits.contact_time,
     )
     console, out = Console(), output.out
-    base = engine(reference, device=place.device)
+    base = trial.engine(reference, device=place.device)
     names = [name for name in dict.fromkeys(backend) or usable_engines(console) if name != reference]
-    engines = [engine(name, device=place.device) for name in names]
+    engines = [trial.engine(name, device=place.device) for name in names]
     with Progress(console) as bar:
         task = bar.add_task("actions", total=None)
 
@@ -104,22 +98,22 @@ def trace(
             return lambda done, total: bar.update(task, description=what, completed=done, total=total)
 
         if sequence.policy is None:
-            actions = from_file(source, sequence, place)
+            played = sources.from_file(source, sequence, place)
         else:
-            actions = from_policy(source, base, sequence, place, show("policy"))
-        result = replay(
-            actions, base, engines, thresholds=thresholds, perturbed=limits.perturbed, perturbation=limits.perturbation, seed=place.seed,
+            played = sources.from_policy(source, base, sequence, place, show("policy"))
+        result = replay.trace(
+            played, base, engines, thresholds=thresholds, perturbed=limits.perturbed, perturbation=limits.perturbation, seed=place.seed,
             progress=lambda name: bar.update(task, description=name, completed=0, total=None),
         )  # fmt: skip
-        write_actions(out / "actions.npz", actions)
-        write_trace(out, result)
-        write_plot(out / "trace.png", result)
+        actions.write_actions(out / "actions.npz", played)
+        replay.write_trace(out, result)
+        trace_view.write_plot(out / "trace.png", result)
         if output.strip:
-            write_strip(out / "strip.png", result, progress=show("strip"))
+            film.write_strip(out / "strip.png", result, progress=show("strip"))
         if output.mp4:
-            write_film(out / "film.mp4", result, progress=show("film"))
-    console.print(rich_table(result))
-    for sentence in sentences(result):
+            film.write_film(out / "film.mp4", result, progress=show("film"))
+    console.print(trace_view.rich_table(result))
+    for sentence in trace_view.sentences(result):
         console.print(sentence, highlight=False)
     console.print(f"results in {out}")
 

@@ -11,7 +11,7 @@ from xreset.demos.archive import Demos, demo_objects, read_demos
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, XResetError
 from xreset.geometry.surface import Surface, keypoint_contacts
-from xreset.objects import load_objects
+from xreset.objects.catalogue import load_objects
 from xreset.pictures.view.data import Human, View
 from xreset.records import npz_schema
 from xreset.resets.bank import ResetBank, check_objects, check_retargeted, read_bank

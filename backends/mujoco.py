@@ -12,7 +12,7 @@ from typing import ClassVar, get_args
 import numpy as np
 
 from xreset.backends.pool import PoolBackend, World
-from xreset.backends.rigid import Inertia
+from xreset.backends.rigid import Inertia, object_inertia
 from xreset.physics import Capability, KnownDifference, unavailable
 from xreset.spec import SceneSpec
 
@@ -68,8 +68,8 @@ class MujocoWorld(World):
         self._geom_forces = tip_forces.reshape(-1, 3)
         self._sum_by_tip = -(self._at.sensed_tip == np.arange(links - 1)[:, None]).astype(np.float64)  # minus: of the tip on the object
         self._full = [data.warning[int(kind)] for kind in _FULL]
+        self._com = object_inertia(scene.objects[object_index]).com
         self._ones = np.ones(len(data.qpos)), np.ones(len(data.qvel))
-        self._mass_ratio = self._inertia_scale = 1.0
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         """See :meth:`World.set_state`."""
@@ -144,30 +144,16 @@ class MujocoWorld(World):
         bodies = (*self._at.moving_bodies, self._at.object_body)
         return [Inertia(mass=m.body_mass[i], com=m.body_ipos[i], quat=m.body_iquat[i], moments=m.body_inertia[i]) for i in bodies]
 
-    def set_object_mass(self, mass: float) -> None:
-        """See :meth:`World.set_object_mass`."""
+    def set_object_inertia(self, inertia: Inertia) -> None:
+        """See :meth:`World.set_object_inertia`. Of a free body, the solver's weights are the inverse of mass and inertia."""
         body, model, nominal = self._at.object_body, self._model, self._at.model
-        model.body_mass[body] = model.body_subtreemass[body] = mass
-        model.body_subtreemass[0] = nominal.body_subtreemass[0] + mass - nominal.body_mass[body]
-        self._mass_ratio = mass / nominal.body_mass[body]
-        self._weigh_object()
-
-    def set_object_inertia(self, scale: float) -> None:
-        """See :meth:`World.set_object_inertia`."""
-        self._inertia_scale = scale
-        self._weigh_object()
-
-    def _weigh_object(self) -> None:
-        """What follows from the object's mass and inertia; of a free body, the solver's weights are the inverse of either."""
-        body, model, nominal = self._at.object_body, self._model, self._at.model
-        turning = self._mass_ratio * self._inertia_scale
-        model.body_inertia[body] = turning * nominal.body_inertia[body]
-        model.body_invweight0[body] = nominal.body_invweight0[body] / (self._mass_ratio, turning)
-        self._ahead = False
-
-    def set_object_com(self, offset: np.ndarray) -> None:
-        """See :meth:`World.set_object_com`."""
-        self._model.body_ipos[self._at.object_body] = self._at.model.body_ipos[self._at.object_body] + offset
+        model.body_mass[body] = model.body_subtreemass[body] = inertia.mass
+        model.body_subtreemass[0] = nominal.body_subtreemass[0] + inertia.mass - nominal.body_mass[body]
+        model.body_inertia[body] = inertia.moments
+        model.body_ipos[body] = nominal.body_ipos[body] + (inertia.com - self._com)
+        growth = inertia.mass / nominal.body_mass[body]
+        turning = inertia.moments[0] / (growth * nominal.body_inertia[body, 0])  # exactly 1 where the mass alone is another
+        model.body_invweight0[body] = nominal.body_invweight0[body] / (growth, growth * turning)
         self._ahead = False
 
     def set_friction(self, friction: np.ndarray) -> None:

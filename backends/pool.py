@@ -32,6 +32,11 @@ class World(ABC):
     often: they must move nothing, and speak of the last step. No parameter changes between that step and the call.
     """
 
+    gravity_fraction = 1.0
+    """Of the object."""
+    force = torque = np.zeros(3)
+    """What acts on the object besides, until the next step: see :meth:`set_object_wrench`."""
+
     @abstractmethod
     def __init__(self, scene: SceneSpec, object_index: int) -> None:
         """Build the world with ``scene.objects[object_index]`` in it."""
@@ -66,12 +71,12 @@ class World(ABC):
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """On the object in the last physics step: tip force (E, 3), tip touch (E,) bool, table force (3,). Zero right after set_state."""
 
-    @abstractmethod
     def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
-        """Whether the state is not finite, and whether contacts overflowed in the last :meth:`step`.
+        """Whether the state is not finite, and whether contacts overflowed in the last :meth:`step`: never, unless an engine knows better.
 
         ``state`` is what :meth:`get_state` has just returned: nothing has to be read again. See :func:`is_finite`.
         """
+        return not is_finite(state), False
 
     def mass_properties(self) -> list[Inertia]:
         """What the engine itself holds: of each moving body of the robot, in the order of the mechanism, then of the object.
@@ -81,38 +86,30 @@ class World(ABC):
         raise NotImplementedError
 
     @abstractmethod
-    def set_object_mass(self, mass: float) -> None:
-        """Set the object's mass [kg]; the inertia scales with it."""
+    def set_object_inertia(self, inertia: Inertia) -> None:
+        """Set the object's mass properties. Another centre of mass only where the backend has the capability ``object_com``."""
 
     @abstractmethod
     def set_friction(self, friction: np.ndarray) -> None:
         """Set the friction of the pairs object-tip, object-other link, object-table (3,)."""
 
-    @abstractmethod
     def set_object_gravity(self, fraction: float) -> None:
         """Set the object's gravity fraction."""
+        self.gravity_fraction = fraction
 
-    # The next four are called only where the backend has the capability.
+    def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
+        """Set the force (3,) at the object's centre of mass and the torque (3,); called before every :meth:`step`."""
+        self.force, self.torque = force, torque
+
+    # The next two are called only where the backend has the capability.
 
     def set_torsional_friction(self, torsional: float) -> None:
         """Set the torsional friction of the object's pairs [m]."""
         raise NotImplementedError
 
-    def set_object_inertia(self, scale: float) -> None:
-        """Set the factor on the object's inertia beside what its mass does."""
-        raise NotImplementedError
-
-    def set_object_com(self, offset: np.ndarray) -> None:
-        """Move the object's centre of mass by (3,) m from where its spec has it."""
-        raise NotImplementedError
-
     def set_drives(self, scale: np.ndarray) -> None:
         """Set factors (3, J) on the drives' stiffness, damping and effort limit."""
         raise NotImplementedError
-
-    @abstractmethod
-    def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
-        """Set the force (3,) at the object's centre of mass and the torque (3,); called before every :meth:`step`."""
 
     def close(self) -> None:  # noqa: B027 (most engines need nothing)
         """Free what the engine holds."""

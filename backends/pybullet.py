@@ -71,16 +71,13 @@ class PybulletWorld(World):
     """One world of Bullet, in a client of its own."""
 
     def __init__(self, scene: SceneSpec, object_index: int, *, settings: PybulletSettings = _DEFAULTS) -> None:
-        self._arguments = scene, object_index, settings
-        self._com_offset = np.zeros(3)
+        self._arguments = scene, scene.objects[object_index], settings
+        self._inertia = object_inertia(scene.objects[object_index])
         self._build()
 
     def _build(self) -> None:
-        scene, object_index, settings = self._arguments
+        scene, thing, settings = self._arguments
         self._mechanism = robot = mechanism(scene.robot)
-        thing = scene.objects[object_index]
-        self._inertia = object_inertia(thing)
-        self._inertia = replace(self._inertia, com=self._inertia.com + self._com_offset)
         self._p = p = _engine()
         self._client = p.connect(p.DIRECT)
         if self._client < 0:
@@ -113,8 +110,6 @@ class PybulletWorld(World):
         self._frames = TrackedFrames(robot)
         self._arm = Arms(self._inertia.com[None])
         self._from_principal = conjugate(self._inertia.quat)
-        self._mass, self._inertia_scale, self._fraction = self._inertia.mass, 1.0, 1.0
-        self._force, self._torque = np.zeros(3), np.zeros(3)
         self._torsional, self._drive_scale = scene.friction.torsional, None
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
         self._fresh = True
@@ -135,7 +130,6 @@ class PybulletWorld(World):
         p.resetBasePositionAndOrientation(self._object.body, state["object_pos"] + arm, _xyzw(turn), physicsClientId=client)
         omega = state["object_angvel"]
         p.resetBaseVelocity(self._object.body, state["object_linvel"] + cross(omega, arm), omega, physicsClientId=client)
-        self._force, self._torque = np.zeros(3), np.zeros(3)
         self._fresh = True
 
     def get_state(self) -> dict[str, np.ndarray]:
@@ -163,15 +157,15 @@ class PybulletWorld(World):
     def step(self, n: int) -> None:
         """See :meth:`World.step`."""
         p, client = self._p, self._client
-        weight = np.array([0.0, 0.0, self._mass * (-GRAVITY * self._fraction - self._world_gravity)])
-        force = (weight + self._force).tolist()
-        turned = bool(self._torque.any())
+        weight = np.array([0.0, 0.0, self._inertia.mass * (-GRAVITY * self.gravity_fraction - self._world_gravity)])
+        force = (weight + self.force).tolist()
+        turned = bool(self.torque.any())
         for _ in range(n * self._internal_steps):
             self._drives.apply()
             com, _ = p.getBasePositionAndOrientation(self._object.body, physicsClientId=client)
             p.applyExternalForce(self._object.body, -1, force, com, p.WORLD_FRAME, physicsClientId=client)
             if turned:
-                p.applyExternalTorque(self._object.body, -1, self._torque, p.WORLD_FRAME, physicsClientId=client)
+                p.applyExternalTorque(self._object.body, -1, self.torque, p.WORLD_FRAME, physicsClientId=client)
             p.stepSimulation(physicsClientId=client)
         self._fresh = False
 
@@ -203,10 +197,6 @@ class PybulletWorld(World):
                 tip_touch[tip] = True
         return tip_force, tip_touch, table_force
 
-    def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
-        """See :meth:`World.health`. Bullet allocates contacts as it needs them: none is ever dropped."""
-        return not is_finite(state), False
-
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`. The object is loaded in the frame of its inertia."""
         moving = [(self._robot.body, link) for link in range(1, len(self._mechanism.bodies))]
@@ -216,25 +206,16 @@ class PybulletWorld(World):
         in_mesh = replace(thing, com=own.com + rotate(own.quat, thing.com), quat=multiply(own.quat, thing.quat))
         return [*found[:-1], in_mesh]
 
-    def set_object_mass(self, mass: float) -> None:
-        """See :meth:`World.set_object_mass`."""
-        self._mass = mass
-        self._p.changeDynamics(self._object.body, -1, mass=mass, physicsClientId=self._client)  # also invents an inertia
-        self.set_object_inertia(self._inertia_scale)
-
-    def set_object_inertia(self, scale: float) -> None:
-        """See :meth:`World.set_object_inertia`."""
-        self._inertia_scale = scale
-        moments = self._inertia.moments * (scale * self._mass / self._inertia.mass)
-        self._p.changeDynamics(self._object.body, -1, localInertiaDiagonal=moments, physicsClientId=self._client)
-
-    def set_object_com(self, offset: np.ndarray) -> None:
-        """See :meth:`World.set_object_com`. Bullet's bodies have their origin there, so the object is made anew."""
-        if not np.array_equal(offset, self._com_offset):
+    def set_object_inertia(self, inertia: Inertia) -> None:
+        """See :meth:`World.set_object_inertia`. Bullet's bodies have their origin at the centre of mass: with another, all is made anew."""
+        moved, self._inertia = not np.array_equal(inertia.com, self._inertia.com), inertia
+        if moved:
             state = self.get_state()
-            self._com_offset = offset
             self._rebuild()
             self.set_state(state)
+        else:
+            self._p.changeDynamics(self._object.body, -1, mass=inertia.mass, physicsClientId=self._client)  # also invents an inertia
+            self._p.changeDynamics(self._object.body, -1, localInertiaDiagonal=inertia.moments, physicsClientId=self._client)
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
@@ -249,18 +230,10 @@ class PybulletWorld(World):
         self._torsional = torsional
         self.set_friction(self._friction)
 
-    def set_object_gravity(self, fraction: float) -> None:
-        """See :meth:`World.set_object_gravity`."""
-        self._fraction = fraction
-
     def set_drives(self, scale: np.ndarray) -> None:
         """See :meth:`World.set_drives`."""
         self._drive_scale = scale
         self._drives.scale(scale.astype(np.float64))
-
-    def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
-        """See :meth:`World.set_object_wrench`."""
-        self._force, self._torque = force, torque
 
     def close(self) -> None:
         """See :meth:`World.close`."""
@@ -270,14 +243,11 @@ class PybulletWorld(World):
 
     def _rebuild(self) -> None:
         """Begin with a new client: in Bullet's broad phase, numbers that are not finite stay, and the body touches nothing any more."""
-        mass, inertia, fraction, drives = self._mass, self._inertia_scale, self._fraction, self._drive_scale
-        friction, torsional = self._friction, self._torsional
+        drives, friction, torsional = self._drive_scale, self._friction, self._torsional
         self.close()
         self._build()
-        self._inertia_scale, self._torsional = inertia, torsional
-        self.set_object_mass(mass)
+        self._torsional = torsional
         self.set_friction(friction)
-        self.set_object_gravity(fraction)
         if drives is not None:
             self.set_drives(drives)
 

@@ -7,7 +7,7 @@ where every link has gone. Also numpy operations on a few quaternions (w, x, y, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -37,6 +37,11 @@ class Inertia:
         """[3, 3] inertia about the centre of mass, along the axes of the body's frame [kg m^2]."""
         axes = np.stack([rotate(self.quat, axis) for axis in np.eye(3)])
         return axes.T @ (self.moments[:, None] * axes)
+
+    def changed(self, *, mass: float | None = None, scale: float = 1.0, offset: np.ndarray | float = 0.0) -> Inertia:
+        """With another mass [kg], with which the inertia scales; a further factor on the inertia; the centre of mass moved by [3] m."""
+        mass = self.mass if mass is None else mass
+        return replace(self, mass=mass, com=self.com + offset, moments=self.moments * (scale * mass / self.mass))
 
 
 @dataclass(frozen=True, kw_only=True)

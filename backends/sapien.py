@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from xreset.backends.pool import PoolBackend, World, is_finite
+from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import (
     Arms,
     Inertia,
@@ -65,6 +65,7 @@ class SapienWorld(World):
         _configure(sapien.physx, settings)
         self._mechanism = robot = mechanism(scene.robot)
         self._inertia = object_inertia(scene.objects[object_index])
+        self._arm = Arms(self._inertia.com[None])
         self._torsional = scene.friction.torsional
         self._materials = {role: sapien.physx.PhysxMaterial(0.0, 0.0, 0.0) for role in ("tip", "link", "table", "object")}
         self._surfaces: dict[Any, _Surface] = {}
@@ -78,11 +79,7 @@ class SapienWorld(World):
         self._joints = SapienJoints(self._bodies, robot, scene.timestep)
         self._frames = TrackedFrames(robot)
         self._tracked = [self._bodies[i] for i in self._frames.bodies]
-        self._arm = Arms(self._inertia.com[None])
         self._axes = Arms(np.array([rotate(self._inertia.quat, axis) for axis in np.eye(3)]))
-        self._mass, self._moments, self._fraction = self._inertia.mass, self._inertia.moments, 1.0
-        self._inertia_scale, self._com = 1.0, self._inertia.com
-        self._force, self._torque = np.zeros(3), np.zeros(3)
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
         self._last_step: tuple[_Motion, np.ndarray, np.ndarray] | None = None
@@ -94,9 +91,8 @@ class SapienWorld(World):
         self._quat = np.array(state["object_quat"])
         self._object.entity.pose = self._sapien.Pose(state["object_pos"], self._quat)
         omega = state["object_angvel"]
-        self._object.linear_velocity = state["object_linvel"] + cross(omega, rotate(self._quat, self._com))
+        self._object.linear_velocity = state["object_linvel"] + cross(omega, rotate(self._quat, self._inertia.com))
         self._object.angular_velocity = omega
-        self._force, self._torque = np.zeros(3), np.zeros(3)
         self._last_step = None
 
     def get_state(self) -> dict[str, np.ndarray]:
@@ -122,13 +118,13 @@ class SapienWorld(World):
     def step(self, n: int) -> None:
         """See :meth:`World.step`."""
         body = self._object
-        force = self._force - np.array([0.0, 0.0, self._mass * GRAVITY * self._fraction])
+        force = self.force - np.array([0.0, 0.0, self._inertia.mass * GRAVITY * self.gravity_fraction])
         for remaining in reversed(range(n)):
             self._joints.brake()
-            body.add_force_torque(force, self._torque)
+            body.add_force_torque(force, self.torque)
             if not remaining:
                 start = _Motion(body.linear_velocity, body.angular_velocity, body.entity_pose.q)
-                self._last_step = start, force, self._torque
+                self._last_step = start, force, self.torque
             self._system.step()
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -160,10 +156,6 @@ class SapienWorld(World):
                     tip_touch[surface.tip] = True
         return tip_force, tip_touch, table_force
 
-    def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
-        """See :meth:`World.health`. PhysX allocates contacts as it needs them: none is ever dropped."""
-        return not is_finite(state), False
-
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`."""
         bodies = (*self._bodies[1:], self._object)
@@ -173,21 +165,10 @@ class SapienWorld(World):
             for body, frame in zip(bodies, frames, strict=True)
         ]
 
-    def set_object_mass(self, mass: float) -> None:
-        """See :meth:`World.set_object_mass`."""
-        self._object.mass = self._mass = mass
-        self.set_object_inertia(self._inertia_scale)
-
-    def set_object_inertia(self, scale: float) -> None:
+    def set_object_inertia(self, inertia: Inertia) -> None:
         """See :meth:`World.set_object_inertia`."""
-        self._inertia_scale = scale
-        self._object.inertia = self._moments = self._inertia.moments * (scale * self._mass / self._inertia.mass)
-
-    def set_object_com(self, offset: np.ndarray) -> None:
-        """See :meth:`World.set_object_com`."""
-        self._com = self._inertia.com + offset
-        self._arm = Arms(self._com[None])
-        self._object.cmass_local_pose = self._sapien.Pose(self._com, self._inertia.quat)
+        self._inertia, self._arm = inertia, Arms(inertia.com[None])
+        self._set_inertia(self._object, inertia)
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
@@ -203,17 +184,9 @@ class SapienWorld(World):
             mu = self._pair_friction[surface.role]
             shape.min_patch_radius = torsional / mu if mu > 0 else 0.0
 
-    def set_object_gravity(self, fraction: float) -> None:
-        """See :meth:`World.set_object_gravity`."""
-        self._fraction = fraction
-
     def set_drives(self, scale: np.ndarray) -> None:
         """See :meth:`World.set_drives`."""
         self._joints.set_drives(scale.astype(np.float64))
-
-    def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
-        """See :meth:`World.set_object_wrench`."""
-        self._force, self._torque = force, torque
 
     # Building ----------------------------------------------------------------------------------------------------------------------------
 
@@ -338,8 +311,8 @@ class SapienWorld(World):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Force and torque [3] about the centre of mass that the object's change of momentum shows beyond the forces given."""
         axes, omega = self._axes.turned(start.quat), start.angvel.astype(np.float64)
-        inertia = (axes.T * self._moments) @ axes
-        gained = self._mass * (self._object.linear_velocity - start.linvel) / self._dt
+        inertia = (axes.T * self._inertia.moments) @ axes
+        gained = self._inertia.mass * (self._object.linear_velocity - start.linvel) / self._dt
         turned = inertia @ (self._object.angular_velocity - omega) / self._dt + cross(omega, inertia @ omega)
         return gained - force - contact_forces.sum(axis=0), turned - torque - cross(arms, contact_forces).sum(axis=0)
 

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from xreset.backends.rigid import object_inertia
 from xreset.errors import XResetError
 from xreset.physics import Parameter, State
 from xreset.spec import RobotSpec, SceneSpec
@@ -136,6 +137,10 @@ _GIVEN = {
 """Arrays that a command's worlds are given, in double precision."""
 
 
+_OF_INERTIA = {"object_mass": "mass", "object_inertia": "scale", "object_com": "offset"}
+"""Parameters of the object's mass properties -> arguments of :meth:`Inertia.changed`."""
+
+
 class LocalWorlds:
     """The worlds of one job in this process."""
 
@@ -146,6 +151,8 @@ class LocalWorlds:
         """Of the worlds of this job."""
         self._given: dict[str, np.ndarray] = {}
         self._worlds: list[World] = []
+        self._changes: list[dict[str, Any]] = [{} for _ in job.object_index]
+        """What has been set of the objects' mass properties."""
 
     def command(self, method: str, worlds: np.ndarray | None, argument: Any, readings: frozenset[str]) -> None:
         """Run one of the methods below for the given worlds (all if None), and publish what they then report, and the readings.
@@ -203,7 +210,13 @@ class LocalWorlds:
 
     def _set_parameter(self, i: int, name: Parameter) -> None:
         value = self._arrays[name][i].astype(np.float64)
-        getattr(self._worlds[i], f"set_{name}")(value if value.ndim else float(value))
+        value = value if value.ndim else float(value)
+        if name in _OF_INERTIA:
+            self._changes[i][_OF_INERTIA[name]] = value
+            nominal = object_inertia(self._job.scene.objects[self._job.object_index[i]])
+            self._worlds[i].set_object_inertia(nominal.changed(**self._changes[i]))
+        else:
+            getattr(self._worlds[i], f"set_{name}")(value)
 
     def _publish(self, i: int) -> None:
         world, arrays = self._worlds[i], self._arrays

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from xreset.backends import conformance
-from xreset.backends.pool import PoolBackend, World, is_finite
+from xreset.backends.pool import PoolBackend, World
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat
 
@@ -36,10 +36,7 @@ class KinematicWorld(World):
         fingers = len(self._robot.fingertips)
         return np.zeros((fingers, 3)), np.zeros(fingers, dtype=bool), np.zeros(3)
 
-    def health(self, state):
-        return not is_finite(state), False
-
-    set_object_mass = set_friction = set_object_gravity = set_object_wrench = lambda self, *_: None  # they move nothing here
+    set_object_inertia = set_friction = lambda self, *_: None  # they move nothing here
 
 
 class KinematicBackend(PoolBackend):

@@ -374,31 +374,33 @@ class ParametersLostWithTheState(MujocoWorld):
 
 @breaks("set_as_built", "object_wrench")
 class MassWithoutInertia(MujocoWorld):
-    def set_object_mass(self, mass):
+    def set_object_inertia(self, inertia):
         kept = self._model.body_inertia[self._at.object_body].copy()
-        super().set_object_mass(mass)
+        super().set_object_inertia(inertia)
         self._model.body_inertia[self._at.object_body] = kept
 
 
 @breaks("set_as_built")
 class MassWithoutTheSolversWeights(MujocoWorld):
-    def set_object_mass(self, mass):
+    def set_object_inertia(self, inertia):
         body = self._at.object_body
         kept = self._model.body_invweight0[body].copy()
-        super().set_object_mass(mass)
+        super().set_object_inertia(inertia)
         self._model.body_invweight0[body] = kept
 
 
 @breaks("object_inertia_set")
 class InertiaScaledTwice(MujocoWorld):
-    def set_object_inertia(self, scale):
-        super().set_object_inertia(scale * scale)
+    def set_object_inertia(self, inertia):
+        scale = inertia.moments[0] / self._at.model.body_inertia[self._at.object_body, 0]
+        super().set_object_inertia(inertia.changed(scale=scale))
 
 
 @breaks("object_com_set")
 class ShapesMoveWithTheCentreOfMass(MujocoWorld):
-    def set_object_com(self, offset):
-        super().set_object_com(offset)
+    def set_object_inertia(self, inertia):
+        super().set_object_inertia(inertia)
+        offset = inertia.com - self._at.model.body_ipos[self._at.object_body]
         mine = self._model.geom_bodyid == self._at.object_body
         self._model.geom_pos[mine] = self._at.model.geom_pos[mine] + offset
 
@@ -549,7 +551,7 @@ class TheSuiteCanFail(unittest.TestCase):
 
     def test_an_exception_is_a_failure_of_that_check_only(self):
         class World(MujocoWorld):
-            def set_object_mass(self, mass):
+            def set_object_inertia(self, inertia):
                 raise ArithmeticError("boom")
 
         results = outcome(World, "object_mass", "resting_weight")

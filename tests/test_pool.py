@@ -79,8 +79,8 @@ class ToyWorld(World):
     def health(self, state):
         return not is_finite(state), bool(state["joint_target"][0] == 5.0)
 
-    def set_object_mass(self, mass):
-        self.mass = mass
+    def set_object_inertia(self, inertia):
+        self.mass = inertia.mass
 
     def set_friction(self, friction):
         self.friction = friction

@@ -20,7 +20,7 @@ from typing import get_args
 
 import numpy as np
 
-from xreset.backends.pool import PoolBackend, World, is_finite
+from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import Inertia, mechanism, nearer, object_inertia, principal
 from xreset.errors import XResetError
 from xreset.physics import Capability, KnownDifference, unavailable
@@ -69,9 +69,6 @@ class DrakeWorld(World):
         """Positions and velocities that are not finite, and that Drake therefore has not been given."""
         self._target = scene.robot.home
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
-        self._mass, self._fraction = self._inertia.mass, 1.0
-        self._com, self._inertia_scale = self._inertia.com, 1.0
-        self._force, self._torque = np.zeros(3), np.zeros(3)
         self._steps = 0
         self._friction: dict[str, float] = {}
         self._set_friction({"object": OBJECT_FRICTION})
@@ -92,7 +89,6 @@ class DrakeWorld(World):
         if self._lost is None:
             at.plant.SetPositionsAndVelocities(self._context, values)
         self.set_joint_targets(state["joint_target"])
-        self._force, self._torque = np.zeros(3), np.zeros(3)
         self._steps = 0
         self._root.SetTime(0.0)
         self._simulator.Initialize()
@@ -126,8 +122,8 @@ class DrakeWorld(World):
             return
         at = self._at
         load = ExternallyAppliedSpatialForce()
-        load.body_index, load.p_BoBq_B = at.object.index(), self._com
-        load.F_Bq_W = SpatialForce(self._torque, self._force - np.array([0.0, 0.0, self._mass * GRAVITY * self._fraction]))
+        load.body_index, load.p_BoBq_B = at.object.index(), self._inertia.com
+        load.F_Bq_W = SpatialForce(self.torque, self.force - np.array([0.0, 0.0, self._inertia.mass * GRAVITY * self.gravity_fraction]))
         at.plant.get_applied_spatial_force_input_port().FixValue(self._context, Value[list[ExternallyAppliedSpatialForce]]([load]))
         for count in [1] * (n * self._internal_steps) if self._brake.needed else [n * self._internal_steps]:
             if self._brake.needed:
@@ -174,10 +170,6 @@ class DrakeWorld(World):
                 tip_touch[second.tip] |= bool(force.any())
         return tip_force, tip_touch, table_force
 
-    def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
-        """See :meth:`World.health`. Drake allocates contacts as it needs them: none is ever dropped."""
-        return not is_finite(state), False
-
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`."""
         found = []
@@ -188,38 +180,14 @@ class DrakeWorld(World):
             found.append(principal(about_origin.get_mass(), com, central, XResetError, f"Drake's body {body.name()!r}"))
         return found
 
-    def set_object_mass(self, mass: float) -> None:
-        """See :meth:`World.set_object_mass`."""
-        self._mass = mass
-        self._weigh_object()
-
-    def set_object_inertia(self, scale: float) -> None:
+    def set_object_inertia(self, inertia: Inertia) -> None:
         """See :meth:`World.set_object_inertia`."""
-        self._inertia_scale = scale
-        self._weigh_object()
-
-    def set_object_com(self, offset: np.ndarray) -> None:
-        """See :meth:`World.set_object_com`."""
-        self._com = self._inertia.com + offset
-        self._weigh_object()
-
-    def _weigh_object(self) -> None:
-        nominal = self._inertia
-        moments = nominal.moments * (self._inertia_scale * self._mass / nominal.mass)
-        inertia = Inertia(mass=self._mass, com=self._com, quat=nominal.quat, moments=moments)
+        self._inertia = inertia
         self._at.object.SetSpatialInertiaInBodyFrame(self._context, spatial_inertia(inertia))
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
         self._set_friction({role: friction_of_other(float(mu)) for role, mu in zip(("tip", "link", "table"), friction, strict=True)})
-
-    def set_object_gravity(self, fraction: float) -> None:
-        """See :meth:`World.set_object_gravity`."""
-        self._fraction = fraction
-
-    def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
-        """See :meth:`World.set_object_wrench`."""
-        self._force, self._torque = force, torque
 
     def _set_friction(self, coefficients: Mapping[str, float]) -> None:
         """Give the geometries of some roles a coefficient of their own. Drake rebuilds what has changed, so only that is touched."""

@@ -63,7 +63,7 @@ class NewtonWorld(World):
             warn_constraint_overflow=False,
             deterministic=wp.DeterministicMode.RUN_TO_RUN,
         )
-        self._forces = self._solver.observables({_FORCE}, contacts=self._contacts)
+        self.forces = self._solver.observables({_FORCE}, contacts=self._contacts)
         self._states, self._control = [model.state(), model.state()], model.control()
         self._roles = {role: np.array([s.role == role for s in at.surfaces]) for role in ("tip", "link", "table", "object")}
         self._tip_of_shape = np.array([surface.tip for surface in at.surfaces])
@@ -72,8 +72,6 @@ class NewtonWorld(World):
         self._robot_weight = masses * (0.0 if scene.robot.gravity_compensated else GRAVITY)
         self._graph = self._captured(scene.timestep / settings.internal_steps, settings.internal_steps)
         self._target, self._quat = scene.robot.home, np.array([1.0, 0.0, 0.0, 0.0])
-        self._mass, self._fraction, self._com, self._inertia_scale = self._inertia.mass, 1.0, self._inertia.com, 1.0
-        self._force, self._torque = np.zeros(3), np.zeros(3)
         self._stepped = False
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
 
@@ -84,13 +82,12 @@ class NewtonWorld(World):
         q[:-7], v[:-6] = self._joints.spread(state["joint_pos"], state["joint_vel"])
         self._quat = state["object_quat"] / np.linalg.norm(state["object_quat"])
         q[-7:-4], q[-4:] = state["object_pos"], np.roll(self._quat, -1)
-        v[-6:-3] = state["object_linvel"] + cross(state["object_angvel"], rotate(self._quat, self._com))
+        v[-6:-3] = state["object_linvel"] + cross(state["object_angvel"], rotate(self._quat, self._inertia.com))
         v[-3:] = state["object_angvel"]
         newton.eval_fk(self._model, now.joint_q, now.joint_qd, now)
         self._states[1].assign(now)
         self._solver.reset(now)
         self.set_joint_targets(state["joint_target"])
-        self._force, self._torque = np.zeros(3), np.zeros(3)
         self._stepped = False
 
     def get_state(self) -> dict[str, np.ndarray]:
@@ -104,7 +101,7 @@ class NewtonWorld(World):
             "joint_target": self._target,
             "object_pos": q[-7:-4],
             "object_quat": self._quat,
-            "object_linvel": v[-6:-3] - cross(v[-3:], rotate(self._quat, self._com)),
+            "object_linvel": v[-6:-3] - cross(v[-3:], rotate(self._quat, self._inertia.com)),
             "object_angvel": v[-3:],
         }
 
@@ -118,8 +115,8 @@ class NewtonWorld(World):
         for state in self._states:
             load = state.body_f.numpy()
             load[:-1, 2] = -self._robot_weight
-            load[-1, :3], load[-1, 3:] = self._force, self._torque
-            load[-1, 2] -= self._mass * GRAVITY * self._fraction
+            load[-1, :3], load[-1, 3:] = self.force, self.torque
+            load[-1, 2] -= self._inertia.mass * GRAVITY * self.gravity_fraction
         for _ in range(n):
             wp.capture_launch(self._graph)
         self._stepped = True
@@ -131,7 +128,7 @@ class NewtonWorld(World):
             for index in range(internal_steps):
                 now, after = self._states[index % 2], self._states[1 - index % 2]
                 self._pipeline.collide(now, self._contacts)
-                self._solver.step(now, after, self._control, self._contacts, dt, observables=self._forces)
+                self._solver.step(now, after, self._control, self._contacts, dt, observables=self.forces)
 
         step()  # what is allocated or decided once
         with wp.ScopedCapture(device="cpu") as capture:
@@ -150,7 +147,7 @@ class NewtonWorld(World):
         tip_force, tip_touch, table_force = np.zeros((self._tips, 3)), np.zeros(self._tips, dtype=bool), np.zeros(3)
         count = int(self._contacts.rigid_contact_count.numpy()[0]) if self._stepped else 0
         first, second = (shape.numpy()[:count] for shape in (self._contacts.rigid_contact_shape0, self._contacts.rigid_contact_shape1))
-        force = self._forces.contact_f.numpy()[:count, :3].astype(float)  # on the first shape's body
+        force = self.forces.contact_f.numpy()[:count, :3].astype(float)  # on the first shape's body
         mine = self._roles["object"]
         for other, forces in ((second, force), (first, -force)):
             at = mine[first] if other is second else mine[second]
@@ -171,26 +168,12 @@ class NewtonWorld(World):
         values = zip(model.body_mass.numpy(), model.body_com.numpy(), model.body_inertia.numpy(), model.body_label, strict=True)
         return [principal(float(m), c.astype(float), i.astype(float), XResetError, f"Newton's {name!r}") for m, c, i, name in values]
 
-    def set_object_mass(self, mass: float) -> None:
-        """See :meth:`World.set_object_mass`."""
-        self._mass = mass
-        self._weigh_object()
-
-    def set_object_inertia(self, scale: float) -> None:
+    def set_object_inertia(self, inertia: Inertia) -> None:
         """See :meth:`World.set_object_inertia`."""
-        self._inertia_scale = scale
-        self._weigh_object()
-
-    def set_object_com(self, offset: np.ndarray) -> None:
-        """See :meth:`World.set_object_com`."""
-        self._com = self._inertia.com + offset
-        self._weigh_object()
-
-    def _weigh_object(self) -> None:
-        model, matrix = self._model, self._inertia.matrix * (self._inertia_scale * self._mass / self._inertia.mass)
-        model.body_mass.numpy()[-1], model.body_inv_mass.numpy()[-1] = self._mass, 1.0 / self._mass
+        self._inertia, model, matrix = inertia, self._model, inertia.matrix
+        model.body_mass.numpy()[-1], model.body_inv_mass.numpy()[-1] = inertia.mass, 1.0 / inertia.mass
         model.body_inertia.numpy()[-1], model.body_inv_inertia.numpy()[-1] = matrix, np.linalg.inv(matrix)
-        model.body_com.numpy()[-1] = self._com
+        model.body_com.numpy()[-1] = inertia.com
         self._solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
     def set_friction(self, friction: np.ndarray) -> None:
@@ -199,10 +182,6 @@ class NewtonWorld(World):
             self._model.shape_material_mu.numpy()[self._roles[role]] = 2.0 * mu
         self._solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
 
-    def set_object_gravity(self, fraction: float) -> None:
-        """See :meth:`World.set_object_gravity`."""
-        self._fraction = fraction
-
     def set_drives(self, scale: np.ndarray) -> None:
         """See :meth:`World.set_drives`."""
         model, joints = self._model, self._joints
@@ -210,10 +189,6 @@ class NewtonWorld(World):
         for array, value in zip(arrays, joints.nominal * scale, strict=True):
             array.numpy()[joints.driven] = value
         self._solver.notify_model_changed(newton.ModelFlags.JOINT_DOF_PROPERTIES)
-
-    def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
-        """See :meth:`World.set_object_wrench`."""
-        self._force, self._torque = force, torque
 
 
 _DAMPED = "drives are integrated by implicit Euler steps, which damp: the difference shrinks with the step"

@@ -6,9 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from xreset.demos.archive import SCHEMA_NAME as DEMOS
 from xreset.demos.archive import demo_objects, read_demos
@@ -26,7 +23,7 @@ from xreset.objects.catalogue import load_objects
 from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
 from xreset.records import npz_schema
-from xreset.resets.bank import ResetBank, check_retargeted
+from xreset.resets.bank import ResetBank, check_retargeted, starts_and_goals
 from xreset.retarget.pipeline import SCHEMA as RETARGETED
 from xreset.retarget.pipeline import Retargeted, read_retargeted, rest_on_table, retarget_demos
 from xreset.spec import RobotSpec
@@ -144,11 +141,10 @@ def load_motion(path: Path, robot: RobotSpec, objects_folder: Path | None, *, tr
         if trajectories:
             data = retarget_demos(demos, robot, objects)
         else:
-            demos = rest_on_table(demos, objects)
-            return _starts_and_goals(robot, demos.sequence_name, demos.object_name, demos.frame_offsets, demos), None
+            return starts_and_goals(rest_on_table(demos, objects), robot), None
     else:
         raise FileFormatError(f"{path} states schema {schema!r}, expected {DEMOS!r} (xreset demos) or {RETARGETED!r} (xreset retarget).")
-    return _starts_and_goals(robot, data.sequence_name, data.object_name, data.frame_offsets, data), data
+    return starts_and_goals(data, robot), data
 
 
 def evaluate(
@@ -207,37 +203,3 @@ def evaluate(
 def _given(trajectories: Retargeted | None) -> Retargeted:
     assert trajectories is not None, "the ik baseline needs trajectories"
     return trajectories
-
-
-def _starts_and_goals(robot: RobotSpec, names: Any, object_names: Any, offsets: np.ndarray, motion: Any) -> ResetBank:
-    """A bank without states from anything that has ``object_pos`` and ``object_quat_wxyz`` per frame."""
-    names, object_names = np.asarray(names), np.asarray(object_names)
-    first, last = offsets[:-1], offsets[1:] - 1
-    unique = tuple(sorted(set(object_names.tolist())))
-    none_i, none_f = np.zeros(0, np.int32), np.zeros((0, 3), np.float32)
-    return ResetBank(
-        robot=robot.name,
-        robot_fingerprint=robot.fingerprint,
-        backends=(),
-        joint_names=robot.joint_names,
-        joint_pos=np.zeros((0, len(robot.joints)), np.float32),
-        object_pos=none_f,
-        object_quat_wxyz=np.zeros((0, 4), np.float32),
-        object_name=np.zeros(0, np.str_),
-        sequence_index=none_i,
-        frame_index=none_i,
-        post_contact=np.zeros(0, bool),
-        sequence_name=names,
-        sequence_object=object_names,
-        start_pos=motion.object_pos[first].astype(np.float32),
-        start_quat_wxyz=motion.object_quat_wxyz[first].astype(np.float32),
-        goal_pos=motion.object_pos[last].astype(np.float32),
-        goal_quat_wxyz=motion.object_quat_wxyz[last].astype(np.float32),
-        object_names=unique,
-        object_sources=("",) * len(unique),
-        rejected_sequence_index=none_i,
-        rejected_frame_index=none_i,
-        rejected_post_contact=np.zeros(0, bool),
-        rejected_reason=none_i,
-        reason_names=(),
-    )

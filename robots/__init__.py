@@ -1,1 +1,8 @@
 """Robots: one folder each, a URDF and a ``robot.toml``; further ones come as plugins."""
+
+from xreset.description import load_robot
+from xreset.plugins import robot_names
+
+load = load_robot
+
+__all__ = ["load", "robot_names"]

@@ -16,7 +16,6 @@ from xreset.backends.conformance.harness import (
     replace_fields,
     rotation_angle,
     snapshot,
-    start_state,
     worst_of,
 )
 from xreset.backends.conformance.results import Measure, checks_of
@@ -88,7 +87,7 @@ def rest_and_bounce(bench: Bench) -> list[Measure]:
     objects = flat_objects()
     scene = replace(bench.scene, objects=objects)
     which = torch.arange(len(objects))
-    start = bench.placed(start_state(scene, which))
+    start = bench.placed(State.initial(scene, which))
     height = start.object_pos[:, 2]
     with bench.other(scene, len(objects), which) as backend:
 

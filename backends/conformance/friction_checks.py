@@ -8,9 +8,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, advanced, largest, replace_fields, snapshot, start_state, worst_of
+from xreset.backends.conformance.harness import Bench, advanced, largest, replace_fields, snapshot, worst_of
 from xreset.backends.conformance.results import Measure, checks_of
 from xreset.backends.conformance.scene import ball, flat_objects
+from xreset.physics import State
 from xreset.spec import GRAVITY
 
 check = checks_of("contact")
@@ -36,7 +37,7 @@ def sliding_distance(bench: Bench) -> list[Measure]:
     scene = replace(bench.scene, objects=shapes)
     which = torch.arange(len(shapes)).repeat(len(_CASES))
     mu, direction = _cases(bench, len(shapes))
-    start = bench.placed(start_state(scene, which))
+    start = bench.placed(State.initial(scene, which))
     speed = (2.0 * mu * GRAVITY * _DISTANCE).sqrt()
     with bench.other(scene, len(which), which) as backend:
         backend.set_friction(_pairs(bench, mu).to(backend.device))
@@ -64,7 +65,7 @@ def slope(bench: Bench) -> list[Measure]:
     ratio = torch.tensor([0.95, 1.05]).repeat(len(_CASES))
     n = len(mu)
     which = torch.zeros(n, dtype=torch.long)
-    start = bench.placed(start_state(scene, which))
+    start = bench.placed(State.initial(scene, which))
     with bench.other(scene, n, which) as backend:
         backend.set_friction(_pairs(bench, mu).to(backend.device))
         advanced(backend, start, round(0.25 / scene.timestep))
@@ -100,7 +101,7 @@ def torsional_friction(bench: Bench) -> list[Measure]:
     thing = ball()
     scene = replace(bench.scene, objects=(thing,))
     which = torch.zeros(2, dtype=torch.long)
-    start = replace_fields(bench.placed(start_state(scene, which)), object_angvel=torch.tensor([0.0, 0.0, 10.0]))
+    start = replace_fields(bench.placed(State.initial(scene, which)), object_angvel=torch.tensor([0.0, 0.0, 10.0]))
     steps = round(0.8 / scene.timestep)  # long enough for what a contact that patters takes and gives to even out
     with bench.other(scene, 2, which) as backend:
         backend.set_friction(_pairs(bench, torch.tensor([0.3, 1.0])).to(backend.device))
@@ -124,7 +125,7 @@ def torsional_friction_set(bench: Bench) -> list[Measure]:
     scene = replace(bench.scene, objects=(thing,))
     factors = torch.tensor([0.0, 0.5, 1.0, 2.0])
     which = torch.zeros(len(factors), dtype=torch.long)
-    start = replace_fields(bench.placed(start_state(scene, which)), object_angvel=torch.tensor([0.0, 0.0, 10.0]))
+    start = replace_fields(bench.placed(State.initial(scene, which)), object_angvel=torch.tensor([0.0, 0.0, 10.0]))
     steps = round(0.4 / scene.timestep)
     with bench.other(scene, len(factors), which) as backend:
         torsional = (factors * scene.friction.torsional).to(backend.device)

@@ -99,7 +99,7 @@ class Bench:
 
     def start(self, device: torch.device | str = "cpu") -> State:
         """[N] initial states, the object resting where the robot is not."""
-        return self.placed(start_state(self.scene, self.object_index)).to(device)
+        return self.placed(State.initial(self.scene, self.object_index)).to(device)
 
     def placed(self, state: State) -> State:
         """The same states with the object moved to where the robot is not, at the same height."""
@@ -124,11 +124,6 @@ def free_place(scene: SceneSpec) -> tuple[float, float]:
     palm = Kinematics(robot).link_poses(torch.as_tensor(robot.home), [robot.palm])[0, :2, 3].numpy()
     avoid = np.stack((palm, np.array(robot.base_pos[:2])))
     return max(corners, key=lambda c: float(np.linalg.norm(avoid - np.array(c), axis=1).min()))
-
-
-def start_state(scene: SceneSpec, object_index: Tensor) -> State:
-    """[N] the states that a new backend begins with."""
-    return State.initial(scene, object_index)
 
 
 def replace_fields(state: State, **changes: Tensor) -> State:

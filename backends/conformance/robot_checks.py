@@ -12,7 +12,7 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, advanced, largest, replace_fields, rotation_angle, snapshot, start_state, worst_of
+from xreset.backends.conformance.harness import Bench, advanced, largest, replace_fields, rotation_angle, snapshot, worst_of
 from xreset.backends.conformance.results import Measure, Skipped, checks_of
 from xreset.backends.conformance.scene import without_collisions
 from xreset.geometry.kinematics import Kinematics
@@ -153,7 +153,7 @@ def _alone(bench: Bench, scene: SceneSpec) -> tuple[State, Tensor]:
     way = torch.where(slides, _SLIDE_WAY, _WAY).double().minimum(0.3 * (upper - lower))
     home = torch.as_tensor(scene.robot.home)
     middle = torch.minimum(torch.maximum(home, lower + 1.5 * way), upper - 1.5 * way)
-    start = bench.placed(start_state(scene, torch.zeros(count, dtype=torch.long)))
+    start = bench.placed(State.initial(scene, torch.zeros(count, dtype=torch.long)))
     pos = start.joint_pos.clone()
     pos[range(count), range(count)] = middle.float()
     return replace_fields(start, joint_pos=pos, joint_target=pos), way.float()
@@ -254,7 +254,7 @@ def drive_scale(bench: Bench) -> list[Measure]:
     count, joints = len(scales), len(scene.robot.joints)
     which = torch.zeros(count, dtype=torch.long)
     _, way = _alone(bench, scene)
-    start = bench.placed(start_state(scene, which))
+    start = bench.placed(State.initial(scene, which))
     limits = bench.kinematics
     target = (start.joint_pos + way).minimum(limits.upper.float()).maximum(limits.lower.float())
     factors = scales[:, :, None].expand(count, 3, joints)

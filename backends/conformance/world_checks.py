@@ -18,7 +18,6 @@ from xreset.backends.conformance.harness import (
     replace_fields,
     small_motion,
     snapshot,
-    start_state,
 )
 from xreset.backends.conformance.results import Measure, Skipped, checks_of
 from xreset.physics import Backend, Parameters, State
@@ -129,7 +128,7 @@ def objects_in_a_batch(bench: Bench) -> list[Measure]:
     for i, thing in enumerate(bench.scene.objects):
         which = torch.tensor([i])
         with bench.other(bench.scene, 1, object_index=which) as alone:
-            state = advanced(alone, drop(bench.placed(start_state(bench.scene, which))), 48)
+            state = advanced(alone, drop(bench.placed(State.initial(bench.scene, which))), 48)
             force = alone.contacts().table_force[0, 2].cpu()
         measures.append(Measure(f"pos of {thing.name}", largest(together.object_pos[i] - state.object_pos[0]), 1e-4, "m"))
         quat, other = together.object_quat[i], state.object_quat[0]

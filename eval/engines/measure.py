@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from xreset.backends.conformance.harness import free_place, start_state
+from xreset.backends.conformance.harness import free_place
 from xreset.backends.conformance.scene import shape, solid
 from xreset.errors import XResetError
 from xreset.eval.trial import Engine
@@ -224,7 +224,7 @@ class _Bench:
     # What is done to the worlds ----------------------------------------------------------------------------------------------------------
 
     def _start(self) -> State:
-        start = start_state(self.scene, self.object_index)
+        start = State.initial(self.scene, self.object_index)
         pos, quat, linvel = start.object_pos, start.object_quat, start.object_linvel
         for i, name in enumerate(self._names):
             if name in _SLABS:

@@ -26,8 +26,37 @@ _HAND = 0.5
 """[m] No keypoint is so far from its wrist: the longest hand on record has 33 cm."""
 
 
+class ObjectMotions:
+    """Motions of objects behind one another: S sequences, F frames of all of them. Base of what files of frames hold."""
+
+    sequence_name: np.ndarray
+    object_name: np.ndarray
+    frame_offsets: np.ndarray
+    object_pos: np.ndarray
+    object_quat_wxyz: np.ndarray
+
+    def frames(self, sequence: int) -> slice:
+        """The frames of a sequence."""
+        return slice(int(self.frame_offsets[sequence]), int(self.frame_offsets[sequence + 1]))
+
+    @property
+    def sequence_of_frame(self) -> np.ndarray:
+        """[F] index of the sequence that owns each frame."""
+        return np.repeat(np.arange(len(self.sequence_name)), np.diff(self.frame_offsets))
+
+    @property
+    def start_pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """Object pose in each sequence's first frame: [S, 3] and [S, 4]."""
+        return self.object_pos[self.frame_offsets[:-1]], self.object_quat_wxyz[self.frame_offsets[:-1]]
+
+    @property
+    def goal_pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """Object pose in each sequence's last frame, the goal of the task: [S, 3] and [S, 4]."""
+        return self.object_pos[self.frame_offsets[1:] - 1], self.object_quat_wxyz[self.frame_offsets[1:] - 1]
+
+
 @dataclass(frozen=True, kw_only=True)
-class Demos:
+class Demos(ObjectMotions):
     """Demonstrations of one or several objects; the attributes are the arrays of the file."""
 
     sequence_name: Annotated[np.ndarray, Field(("S",), "U")]
@@ -69,25 +98,6 @@ class Demos:
 
     def __len__(self) -> int:
         return self.num_sequences
-
-    def frames(self, sequence: int) -> slice:
-        """The frames of a sequence."""
-        return slice(int(self.frame_offsets[sequence]), int(self.frame_offsets[sequence + 1]))
-
-    @property
-    def sequence_of_frame(self) -> np.ndarray:
-        """[F] index of the sequence that owns each frame."""
-        return np.repeat(np.arange(self.num_sequences), np.diff(self.frame_offsets))
-
-    @property
-    def start_pose(self) -> tuple[np.ndarray, np.ndarray]:
-        """Object pose in each sequence's first frame: [S, 3] and [S, 4]."""
-        return self.object_pos[self.frame_offsets[:-1]], self.object_quat_wxyz[self.frame_offsets[:-1]]
-
-    @property
-    def goal_pose(self) -> tuple[np.ndarray, np.ndarray]:
-        """Object pose in each sequence's last frame, the goal of the task: [S, 3] and [S, 4]."""
-        return self.object_pos[self.frame_offsets[1:] - 1], self.object_quat_wxyz[self.frame_offsets[1:] - 1]
 
     def select(
         self,

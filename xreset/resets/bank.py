@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from xreset.accounts import Account, accounts
+from xreset.demos.archive import ObjectMotions
 from xreset.errors import FileFormatError
 from xreset.geometry.urdf import robot_tree
 from xreset.records import JOINT, POSITION, Field, read_record, schema_of, unique_problem, write_record
@@ -149,6 +150,35 @@ class ResetBank:
             keep &= ~self.post_contact
         of_states = [name for name, field in schema_of(ResetBank).items() if field.shape[:1] == ("L",)]
         return replace(self, **{name: value[keep] for name in of_states if (value := getattr(self, name)) is not None})
+
+
+_DTYPES = {"f": np.float32, "i": np.int32, "b": np.bool_, "U": np.str_}
+
+
+def starts_and_goals(motions: ObjectMotions, robot: RobotSpec, sources: Mapping[str, str] | None = None) -> ResetBank:
+    """A bank of demonstrations or trajectories without any state; ``sources``: of the objects, where banks are kept."""
+    schema, named = schema_of(ResetBank), tuple(sorted({*map(str, motions.object_name)}))
+    of_states = {name: field for name, field in schema.items() if field.required and field.shape[0:1] in (("L",), ("C",))}
+    (start_pos, start_quat), (goal_pos, goal_quat) = motions.start_pose, motions.goal_pose
+    return ResetBank(
+        robot=robot.name,
+        robot_fingerprint=robot.fingerprint,
+        backends=(),
+        joint_names=robot.joint_names,
+        sequence_name=np.asarray(motions.sequence_name),
+        sequence_object=np.asarray(motions.object_name),
+        start_pos=start_pos.astype(np.float32),
+        start_quat_wxyz=start_quat.astype(np.float32),
+        goal_pos=goal_pos.astype(np.float32),
+        goal_quat_wxyz=goal_quat.astype(np.float32),
+        object_names=named,
+        object_sources=tuple((sources or {}).get(name, "") for name in named),
+        reason_names=(),
+        **{
+            name: np.zeros([{"J": len(robot.joints)}.get(n, 0) if isinstance(n, str) else n for n in field.shape], _DTYPES[field.kind])
+            for name, field in of_states.items()
+        },
+    )
 
 
 def write_bank(path: str | Path, bank: ResetBank, *, config: Mapping[str, Any], inputs: Mapping[str, str]) -> None:

@@ -7,7 +7,7 @@ rejected if it leaves the scene or still moves: object faster than 0.10 m/s or 1
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ import torch
 from xreset.errors import DemoError
 from xreset.physics import Backend, State
 from xreset.plugins import device_for, make_backend
-from xreset.resets.bank import ResetBank
+from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import Closing, with_closing_frames
 from xreset.resets.config import ClosingConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of
@@ -206,16 +206,10 @@ def _bank(
     part = dense.part[frames].astype(np.float32) if dense.part.any() else None
     post = retargeted.post_contact[frames]
     keep, reject = reason < 0, reason >= 0
-    rows = frames[keep]
-    starts, ends = retargeted.frame_offsets[:-1], retargeted.frame_offsets[1:] - 1
-    named = sorted({*map(str, retargeted.object_name)})
-    sources = {o.name: o.source for o in objects}
-    f32 = np.float32
-    return ResetBank(
-        robot=robot.name,
-        robot_fingerprint=robot.fingerprint,
+    rows, f32 = frames[keep], np.float32
+    return replace(
+        starts_and_goals(retargeted, robot, {o.name: o.source for o in objects}),
         backends=backends,
-        joint_names=robot.joint_names,
         joint_pos=retargeted.joint_pos[rows].astype(f32),
         object_pos=retargeted.object_pos[rows].astype(f32),
         object_quat_wxyz=retargeted.object_quat_wxyz[rows].astype(f32),
@@ -223,14 +217,6 @@ def _bank(
         sequence_index=sequence[keep].astype(np.int32),
         frame_index=local[keep].astype(np.int32),
         post_contact=post[keep],
-        sequence_name=np.asarray(retargeted.sequence_name),
-        sequence_object=np.asarray(retargeted.object_name),
-        start_pos=retargeted.object_pos[starts].astype(f32),
-        start_quat_wxyz=retargeted.object_quat_wxyz[starts].astype(f32),
-        goal_pos=retargeted.object_pos[ends].astype(f32),
-        goal_quat_wxyz=retargeted.object_quat_wxyz[ends].astype(f32),
-        object_names=tuple(named),
-        object_sources=tuple(sources[name] for name in named),
         rejected_sequence_index=sequence[reject].astype(np.int32),
         rejected_frame_index=local[reject].astype(np.int32),
         rejected_post_contact=post[reject],

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from xreset.accounts import Account, accounts
-from xreset.demos.archive import SIDES
+from xreset.demos.archive import SIDES, ObjectMotions
 from xreset.records import JOINT, POSITION, RATE, Field, offsets_problem, read_record, write_record
 from xreset.text import shown
 
@@ -21,7 +21,7 @@ SCHEMA = "xreset-retargeted/1"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Retargeted:
+class Retargeted(ObjectMotions):
     """Robot trajectories of demonstrations, in the table frame."""
 
     robot: Annotated[str, Field((), "U")]
@@ -63,11 +63,6 @@ class Retargeted:
     """[F] mean distance of the robot's fingertips from the human's [m]; infinite where not annotated."""
     wrist_error: Annotated[np.ndarray, Field(("F",), "f", within=None)]
     """[F] distance of the hand root from where hand retargeting wants it [m]; infinite where not annotated."""
-
-    @property
-    def sequence_of_frame(self) -> np.ndarray:
-        """[F] index of every frame's sequence."""
-        return np.repeat(np.arange(len(self.sequence_name)), np.diff(self.frame_offsets))
 
     @property
     def post_contact(self) -> np.ndarray:

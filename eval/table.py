@@ -53,25 +53,42 @@ def _cell(text: str) -> Text:
     return Text(text.replace(" / ", "/").replace(" %", "\N{NO-BREAK SPACE}%"))
 
 
-_RESULTS: dict[str, Callable[[EvalResult], str]] = {
-    "version": lambda s: s.backend_version,
-    "task progress": lambda s: f"{s.task_progress.mean:.1%}",
-    "  95 % interval": lambda s: "{:.0f}-{:.0f}%".format(*(100 * x for x in s.task_progress.ci95)),
-    "approach": lambda s: f"{s.approach_rate:.0%}",
-    "grasp": lambda s: f"{s.grasp_rate:.0%}",
-    "reorient": lambda s: f"{s.reorient_rate:.0%}",
-    "reorientation progress": lambda s: f"{s.reorientation_progress:.1%}",
-    "not finite": lambda s: str(s.health.nonfinite),
-    "overflow": lambda s: str(s.health.overflow),
-    "left the scene": lambda s: str(s.health.out_of_bounds),
-    "control steps/s": lambda s: f"{s.control_steps_per_second:,.0f}",
+@dataclass(frozen=True)
+class Figure:
+    """A figure of an evaluation: a row of the terminal's table, a column of the report's."""
+
+    text: Callable[[EvalResult], str]
+    share: Callable[[EvalResult], float] | None = None
+    """Drawn behind it, in [0, 1]."""
+    interval: Callable[[EvalResult], tuple[float, float]] | None = None
+    """95 %, in [0, 1]."""
+    fault: bool = False
+    """Whether all but 0 is bad."""
+
+
+FIGURES = {
+    "task progress": Figure(
+        lambda s: f"{s.task_progress.mean:.1%}", share=lambda s: s.task_progress.mean, interval=lambda s: s.task_progress.ci95
+    ),
+    "approach": Figure(lambda s: f"{s.approach_rate:.0%}"),
+    "grasp": Figure(lambda s: f"{s.grasp_rate:.0%}"),
+    "reorient": Figure(lambda s: f"{s.reorient_rate:.0%}"),
+    "reorientation progress": Figure(lambda s: f"{s.reorientation_progress:.1%}", share=lambda s: s.reorientation_progress),
+    "not finite": Figure(lambda s: str(s.health.nonfinite), fault=True),
+    "overflow": Figure(lambda s: str(s.health.overflow), fault=True),
+    "left the scene": Figure(lambda s: str(s.health.out_of_bounds)),
+    "control steps/s": Figure(lambda s: f"{s.control_steps_per_second:,.0f}"),
 }
-"""Rows of an evaluation's table."""
+"""What is shown of every engine, by name."""
 
 
 def result_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
-    """One row of text per quantity: its name, then its value in each engine."""
-    found, first = [(name, *map(text, summaries)) for name, text in _RESULTS.items()], summaries[0]
+    """One row of text per figure: its name, then its value in each engine."""
+    found, first = [("version", *(s.backend_version for s in summaries))], summaries[0]
+    for name, figure in FIGURES.items():
+        found.append((name, *map(figure.text, summaries)))
+        if (interval := figure.interval) is not None:
+            found.append(("  95 % interval", *("{:.0f}-{:.0f}%".format(*(100 * x for x in interval(s))) for s in summaries)))
     known = [name for name in first.objects if name not in first.unseen]
     parts = {"  trained objects": known, "  unseen objects": first.unseen} if known and first.unseen else {}
     for place, (part, objects) in enumerate(parts.items(), 3):

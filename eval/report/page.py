@@ -14,6 +14,7 @@ from xreset.eval.report import figures
 from xreset.eval.report.clips import Clip, Strip, count_failures, encode_mp4
 from xreset.eval.report.read import ReportData
 from xreset.eval.rollout import Episode
+from xreset.eval.table import FIGURES
 from xreset.pictures.raster import encode_png
 from xreset.text import short_name
 
@@ -24,7 +25,7 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) 
     found = [{row.sequence: row for row in s.per_demo} for s in data.summaries]
     return render(
         "report.html.j2",
-        data=data, title=f"{s.policy} on {s.robot}", headline=headline(data), facts=_facts(data), colors=COLORS,
+        data=data, figures=FIGURES, title=f"{s.policy} on {s.robot}", headline=headline(data), facts=_facts(data), colors=COLORS,
         script=script, script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         clips=clips, strips=strips, outcome_of=outcome_of,
         mp4=lambda clip: base64.b64encode(encode_mp4(clip.frames, clip.fps)).decode(),

@@ -49,7 +49,7 @@ def turned(degrees: float, axis=(0.0, 0.0, 1.0)) -> torch.Tensor:
 
 
 def height(x: RewardInput) -> torch.Tensor:
-    return x.object_pos[:, 2]
+    return x.object_pos[:, 2] - x.state.object_linvel[:, 2]
 
 
 def one_number(x: RewardInput) -> torch.Tensor:
@@ -80,7 +80,9 @@ class RewardTest(unittest.TestCase):
             "previous_action": torch.zeros(4),
             "out_of_bounds": torch.tensor(False),
         } | changes
-        return compute_reward(RewardInput(**{k: v[None] for k, v in x.items()}), config or RewardConfig())
+        x = {k: v[None] for k, v in x.items()}
+        state = State.at_rest(torch.zeros(1, 4), x.pop("object_pos"), x.pop("object_quat"))
+        return compute_reward(RewardInput(state=state, **x), config or RewardConfig())
 
     PRESS = torch.tensor([[0.6, 0.0, 0.8], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 

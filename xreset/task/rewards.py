@@ -19,6 +19,7 @@ from torch import Tensor
 
 from xreset.errors import RunError
 from xreset.geometry.rotations import quat_angle, quat_rotate
+from xreset.physics import State
 from xreset.task.config import RewardConfig
 
 
@@ -32,8 +33,8 @@ class RewardInput:
     """[N] smallest mean fingertip distance of the episode, this step included [m]."""
     tip_force: Tensor
     """[N, E, 3] each finger's contact force on the object [N], world frame."""
-    object_pos: Tensor
-    object_quat: Tensor
+    state: State
+    """[N, ...] of joints and object, velocities included."""
     goal_pos: Tensor
     goal_quat: Tensor
     start_pos: Tensor
@@ -46,6 +47,16 @@ class RewardInput:
     previous_action: Tensor
     out_of_bounds: Tensor
     """[N] bool"""
+
+    @property
+    def object_pos(self) -> Tensor:
+        """[N, 3] of the state."""
+        return self.state.object_pos
+
+    @property
+    def object_quat(self) -> Tensor:
+        """[N, 4] of the state."""
+        return self.state.object_quat
 
 
 @dataclass(frozen=True, kw_only=True)

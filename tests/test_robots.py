@@ -21,9 +21,11 @@ from xreset.geometry.urdf import find_mesh, load_urdf
 from xreset.plugins import robot_names
 from xreset.robot_tools.check import check_description
 from xreset.robots.openarm import build as openarm
+from xreset.robots.panda_allegro import build as panda_allegro
 from xreset.robots.ur7e_sharpa import build as ur7e_sharpa
+from xreset.robots.xarm7_leap import build as xarm7_leap
 
-BUILT_IN = {"ur7e-sharpa": ur7e_sharpa, "openarm": openarm}
+BUILT_IN = {"ur7e-sharpa": ur7e_sharpa, "openarm": openarm, "panda-allegro": panda_allegro, "xarm7-leap": xarm7_leap}
 
 
 class BuiltIn(unittest.TestCase):
@@ -54,7 +56,7 @@ class BuiltIn(unittest.TestCase):
 
     def test_degrees_of_freedom(self):
         counts = {name: (len(load(name).arm_indices), len(load(name).hand_indices)) for name in BUILT_IN}
-        self.assertEqual(counts, {"ur7e-sharpa": (6, 22), "openarm": (7, 1)})
+        self.assertEqual(counts, {"ur7e-sharpa": (6, 22), "openarm": (7, 1), "panda-allegro": (7, 16), "xarm7-leap": (7, 16)})
 
     def test_efforts_in_the_description_are_those_of_the_urdf(self):
         for name, build in BUILT_IN.items():

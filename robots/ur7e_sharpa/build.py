@@ -15,6 +15,7 @@ import numpy as np
 
 from xreset.geometry.urdf import Joint, Link, RobotTree
 from xreset.geometry.urdf_writer import ArmLink, axes, box, capsule, cylinder, fixed, frame, pose, urdf_text
+from xreset.robots.parts import ROTOR_INERTIA, Vector
 from xreset.spec import Shape
 
 URDF = Path(__file__).parent / "robot.urdf"
@@ -24,18 +25,12 @@ Figures: Universal Robots' ROS 2 description; Sharpa's description of the Wave (
 Shapes are primitives sized from link lengths and radii (capsule: length of the cylindrical part).
 Every moving hand link carries 0.002 kg m^2 of rotor inertia on its diagonal, which stands in for joint armature."""
 
-ROTOR_INERTIA = 0.002
-"""Reflected rotor inertia [kg m^2] added to the diagonal of every moving hand link. The maker's description has it as joint armature
-instead, but not every engine has armature, and emulating it loses grasps; a link's inertia means the same thing in all of them."""
 AXLE_MASS = 1e-3
 """Mass [kg] of the links between the two axes of a joint; the maker has 1e-6, too small beside the others for single precision."""
 HAND_MOUNT = 0.02
 """Thickness [m] of the adapter between the arm's flange and the hand's root. Not a published figure."""
 HAND_SPEED = 10.0
 """Speed limit [rad/s] that a URDF must state; none is published for the hand."""
-
-Vector = tuple[float, ...]
-
 
 # The arm -----------------------------------------------------------------------------------------------------------------------------
 

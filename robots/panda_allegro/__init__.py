@@ -1,0 +1,1 @@
+"""Franka Panda arm with the Allegro right hand."""

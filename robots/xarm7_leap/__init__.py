@@ -1,0 +1,1 @@
+"""UFACTORY xArm7 arm with the LEAP right hand."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xreset.errors import XResetError
-from xreset.files import atomic_write
+from xreset.files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,8 +30,7 @@ def picture(path: Path, size: tuple[float, float], *, dpi: int = 120, **style: A
         yield figure
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=dpi)
-    with atomic_write(path) as file:
-        file.write(buffer.getbuffer())
+    write_whole(path, buffer.getbuffer())
 
 
 def svg(draw: Callable[[Figure], None], size: tuple[float, float], salt: str) -> str:

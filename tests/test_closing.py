@@ -20,9 +20,8 @@ from xreset.resets.bank import read_bank, write_bank
 from xreset.resets.closing import with_closing_frames
 from xreset.resets.config import ClosingConfig, HoldConfig, SqueezeConfig
 from xreset.resets.distribution import ResetDistribution, bank_starts
-from xreset.resets.fingers import Fingers, fingers_of
+from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
 from xreset.resets.hold import hold_bank
-from xreset.resets.squeeze import squeeze_targets
 from xreset.retarget.file import Retargeted, write_retargeted
 from xreset.task.config import ResetConfig
 

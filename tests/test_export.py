@@ -12,9 +12,8 @@ import numpy as np
 from tests.toy_results import toy_rollouts, toy_summary
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError, XResetError
-from xreset.eval.export.arrays import write_arrays
 from xreset.eval.export.lerobot import write_lerobot
-from xreset.eval.export.recorded import read_recorded
+from xreset.eval.export.recorded import read_recorded, write_arrays
 from xreset.eval.results import write_results
 
 PARQUET = importlib.util.find_spec("pyarrow") is not None

@@ -60,6 +60,12 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
             temporary.unlink(missing_ok=True)
 
 
+def write_whole(path: str | Path, content: bytes | memoryview | str) -> None:
+    """Write a file at once, text as UTF-8; see :func:`atomic_write`."""
+    with atomic_write(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
 @contextmanager
 def claim(path: str | Path) -> Iterator[None]:
     """Keep a file, or a folder that is there, to this process while the block runs, and remove what killed writers have left of it.
@@ -123,8 +129,7 @@ def _locked(path: Path, lock: Path) -> int:
 
 def write_json(path: str | Path, data: Any) -> None:
     """Write ``data`` as indented JSON; non-finite numbers are refused (``ValueError``)."""
-    with atomic_write(path, "w") as file:
-        file.write(json.dumps(data, indent=2, allow_nan=False) + "\n")
+    write_whole(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: str | Path, schema: str | None = None) -> dict[str, Any]:

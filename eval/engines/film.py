@@ -10,7 +10,7 @@ import numpy as np
 from xreset.eval.engines.replay import EngineTrace, TraceResult
 from xreset.eval.plots import COLORS, figure_style, picture
 from xreset.eval.report.clips import camera_at, encode_mp4
-from xreset.files import atomic_write
+from xreset.files import write_whole
 from xreset.pictures.raster import Renderer, pose_matrix
 
 SIZE = (320, 300)
@@ -56,8 +56,7 @@ def write_film(path: Path, result: TraceResult, *, progress: Callable[[int, int]
         frames.append(np.concatenate((banner, pictures)))
         progress(i + 1, len(steps))
     film = encode_mp4(np.stack(frames), 1.0 / (every * dt))
-    with atomic_write(path) as file:
-        file.write(film)
+    write_whole(path, film)
 
 
 def _picture(renderer: Renderer, engine: EngineTrace, step: int) -> np.ndarray:

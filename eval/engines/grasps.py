@@ -56,20 +56,17 @@ class Frames:
     @classmethod
     def of_retargeted(cls, data: Retargeted) -> Frames:
         """Every valid frame after the first contact: no engine has had a say."""
-        sequence = np.repeat(np.arange(len(data.frame_offsets) - 1), np.diff(data.frame_offsets))
-        number = np.arange(len(sequence)) - data.frame_offsets[sequence]
-        first = data.first_contact[sequence]
-        rows = np.flatnonzero(data.valid & (first >= 0) & (number >= first))
-        start = data.frame_offsets[sequence[rows]]
+        rows = np.flatnonzero(data.valid & data.post_contact)
+        sequence, (start_pos, start_quat) = data.sequence_of_frame[rows], data.start_pose
         return cls(
             joint_pos=data.joint_pos[rows],
             object_pos=data.object_pos[rows],
             object_quat=data.object_quat_wxyz[rows],
-            object_name=np.asarray(data.object_name)[sequence[rows]],
-            sequence_name=np.asarray(data.sequence_name)[sequence[rows]],
-            frame=number[rows],
-            start_pos=data.object_pos[start],
-            start_quat=data.object_quat_wxyz[start],
+            object_name=np.asarray(data.object_name)[sequence],
+            sequence_name=np.asarray(data.sequence_name)[sequence],
+            frame=rows - data.frame_offsets[sequence],
+            start_pos=start_pos[sequence],
+            start_quat=start_quat[sequence],
         )
 
     @classmethod

@@ -18,9 +18,11 @@ from xreset.eval.report.clips import recorded_episode
 from xreset.eval.report.read import results_in
 from xreset.eval.results import mesh_folder, read_episodes, read_results, read_traces
 from xreset.eval.rollout import Episode, Trace
+from xreset.records import write_npz
 from xreset.spec import RobotSpec
 from xreset.text import short_name
 
+SCHEMA = "xreset-rollouts/1"
 TASK = "Grasp the {object} and bring it to the goal pose."
 
 
@@ -149,3 +151,37 @@ def _finite(whole: Recorded, results: Path) -> list[Recorded]:
 def _rate(interval: float) -> float:
     rate = 1 / interval
     return float(round(rate)) if abs(rate - round(rate)) < 1e-3 else rate
+
+
+def write_arrays(path: str | Path, recording: Recording) -> None:
+    """Write them as plain arrays in one npz file, behind one another; ``docs/rollouts.md`` has the schema.
+
+    Raises:
+        XResetError: the file cannot be written.
+    """
+    episodes = recording.episodes
+    traces = [e.trace for e in episodes]
+    per_frame = {
+        "time": [t.time for t in traces],
+        "joint_pos": [t.joint_pos for t in traces],
+        "joint_target": [e.action for e in episodes],
+        "object_pos": [t.object_pos for t in traces],
+        "object_quat_wxyz": [t.object_quat for t in traces],
+    }
+    arrays = {name: np.concatenate(parts).astype(np.float32) for name, parts in per_frame.items()} | {
+        "frame_offsets": recording.offsets,
+        "fps": np.array(recording.fps),
+        "robot": np.array(recording.robot.name),
+        "joint_names": np.array(recording.robot.joint_names),
+        "goal_pos": np.stack([t.goal_pos for t in traces]).astype(np.float32),
+        "goal_quat_wxyz": np.stack([t.goal_quat for t in traces]).astype(np.float32),
+        "engine": np.array([e.engine for e in episodes]),
+        "policy": np.array([e.policy for e in episodes]),
+        "task": np.array([e.task for e in episodes]),
+        "seed": np.array([e.seed for e in episodes]),
+        "object_name": np.array([t.object for t in traces]),
+        "sequence_name": np.array([e.episode.sequence_name for e in episodes]),
+        "success": np.array([e.episode.reorient for e in episodes]),
+        "task_progress": np.array([e.episode.task_progress for e in episodes]),
+    }
+    write_npz(path, SCHEMA, arrays)

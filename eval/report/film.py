@@ -13,7 +13,7 @@ from xreset.errors import RunError
 from xreset.eval.report.clips import camera_for, choose_sequence, draw_clip, encode_mp4, recorded_episode
 from xreset.eval.report.read import collect
 from xreset.eval.results import mesh_folder, read_traces
-from xreset.files import atomic_write
+from xreset.files import write_whole
 from xreset.objects.catalogue import load_object
 
 
@@ -75,6 +75,5 @@ def make_film(
         np.concatenate([frames[np.minimum(np.arange(length), len(frames) - 1)] for frames in column], axis=1) for column in columns.values()
     ]
     film = encode_mp4(np.concatenate(whole, axis=2), rate)
-    with atomic_write(out) as file:
-        file.write(film)
+    write_whole(out, film)
     return Film(engines=data.engines, objects=tuple(columns))

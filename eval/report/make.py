@@ -18,7 +18,7 @@ from xreset.eval.report.progress import X
 from xreset.eval.report.read import ReportData, Training, collect, read_trainings
 from xreset.eval.results import EvalResult, mesh_folder, read_traces
 from xreset.eval.table import Rows
-from xreset.files import atomic_write, claim_folder
+from xreset.files import claim_folder, write_whole
 from xreset.objects.catalogue import load_object
 from xreset.text import short_name
 
@@ -77,8 +77,7 @@ def _make(data: ReportData, out: Path, robot: str | None, objects: Path | None, 
     shown = clips[0].episode if clips else None
     caption = f"{short_name(shown.object)}: middle and end of the same episode in each engine" if shown else ""
     write_overview(overview, f"{first.policy} on {first.robot}", data.summaries, clips, caption)
-    with atomic_write(html) as file:
-        file.write(content.encode())
+    write_whole(html, content)
     return Report(html=html, overview=overview, summaries=data.summaries, headline=headline(data), notes=data.notes)
 
 
@@ -178,8 +177,7 @@ def compare(runs: Sequence[str], out: Path, *, x: X = "minutes", curves: Sequenc
     )
     content = render("compare.md.j2", **vars(made))
     write_picture(made.picture, groups, tags, found, x)
-    with atomic_write(made.page) as file:
-        file.write(content.encode())
+    write_whole(made.page, content)
     return made
 
 

@@ -83,19 +83,19 @@ class Run:
         if self.config is None or not self.begun:
             return
         info = read_run(self.folder)
-        wanted: dict[str, Any] = {
-            "robot": self.runs.robot, "backend": self.runs.backend, "num_envs": self.runs.num_envs, "seed": self.seed,
-            "stand-ins": self.subset.data.meshes is None, "other networks to begin with": self.weights is not None,
-            "config": _lasting(self.config),
-        }  # fmt: skip
-        found = wanted | {
-            "robot": info.robot, "backend": info.backend, "num_envs": info.num_envs, "seed": info.seed,
-            "stand-ins": info.objects is None, "other networks to begin with": info.weights is not None,
-            "config": _lasting(info.config),
-        }  # fmt: skip
+        both = {  # there, and wanted
+            "robot": (info.robot, self.runs.robot),
+            "backend": (info.backend, self.runs.backend),
+            "num_envs": (info.num_envs, self.runs.num_envs),
+            "seed": (info.seed, self.seed),
+            "stand-ins": (info.objects is None, self.subset.data.meshes is None),
+            "other networks to begin with": (info.weights is not None, self.weights is not None),
+            "config": (_lasting(info.config), _lasting(self.config)),
+        }
         if self.bank.is_file():
-            wanted["reset bank"], found["reset bank"] = file_hash(self.bank)[:12], info.resets_hash[:12]
-        refuse_other(f"{self.folder} holds a run of another configuration", "runs", found, wanted)
+            both["reset bank"] = info.resets_hash[:12], file_hash(self.bank)[:12]
+        there, wanted = ({name: values[i] for name, values in both.items()} for i in (0, 1))
+        refuse_other(f"{self.folder} holds a run of another configuration", "runs", there, wanted)
 
 
 def _lasting(config: TrainConfig) -> dict[str, Any]:

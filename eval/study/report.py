@@ -13,7 +13,7 @@ from xreset.eval.study.paper import paper_training
 from xreset.eval.study.plan import EvalStep, Plan, Run, TrainStep
 from xreset.eval.study.tables import Made, as_rows, broken, draw, fill, versions
 from xreset.eval.table import Rows
-from xreset.files import atomic_write
+from xreset.files import write_whole
 from xreset.learning.clock import Lift, read_lift
 from xreset.text import short_name
 
@@ -47,8 +47,7 @@ def write_page(plan: Plan, out: Path) -> Page:
         if table.cells:
             draw(out / f"table-{i}.png", table)
     text = render("study.md.j2", plan=plan, compared=_compare(plan, out), as_rows=as_rows, versions=versions, **vars(made))
-    with atomic_write(made.path) as file:
-        file.write(text.encode())
+    write_whole(made.path, text)
     return made
 
 

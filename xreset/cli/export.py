@@ -9,8 +9,8 @@ import tyro
 
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import RunError
-from xreset.eval.export import arrays, recorded
 from xreset.eval.export import lerobot as dataset
+from xreset.eval.export import recorded
 
 Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
 Backends = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
@@ -56,7 +56,7 @@ def npz(folders: Folders, *, out: Path, backend: Backends = (), robot: str | Non
         task: The task in words; {object} stands for the object's name.
     """
     recording = _recording(folders, backend, robot, None, task)
-    arrays.write_arrays(out, recording)
+    recorded.write_arrays(out, recording)
     _say(recording, out)
 
 

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from xreset.cli._common import engine_bars
 from xreset.cli._terminal import Console
-from xreset.eval import evaluate, stress_figure, trial
+from xreset.eval import evaluate, trial
 from xreset.eval import stress as sweeps
 from xreset.eval.setting import Setting
 
@@ -44,7 +44,7 @@ def stress(
     folder = out or subject.folder.parent / "stress"
     with engine_bars(console, [e.name for e in engines]) as progress:
         found = sweeps.stress(subject, engines, demos, setting, folder, properties=properties, repetitions=episodes, progress=progress)
-    stress_figure.write_plot(folder / "stress.png", found, f"{subject.label}: what it bears")
+    sweeps.write_plot(folder / "stress.png", found, f"{subject.label}: what it bears")
     table = Table("property", title=f"{subject.label}: task progress, and its difference to the same episodes (95 %)")
     table.add_column("value", justify="right")
     for result in found:

@@ -12,7 +12,7 @@ from rich.progress import track
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import XResetError
 from xreset.eval.report import clips
-from xreset.files import atomic_write
+from xreset.files import write_whole
 from xreset.pictures import raster
 from xreset.pictures.view import data, load, page, picture, sheet
 
@@ -107,8 +107,7 @@ def _write_mp4(path: Path, shown: data.View, rows: np.ndarray) -> None:
     draw = picture.Drawer(shown).draw
     frames = [draw(int(row)) for row in track(rows, "drawing", console=Console(), transient=True)]
     film = clips.encode_mp4(np.stack(frames), shown.rate)
-    with atomic_write(path) as file:
-        file.write(film)
+    write_whole(path, film)
     print(f"{len(rows)} frames in {path}")
 
 

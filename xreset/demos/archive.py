@@ -29,6 +29,7 @@ _HAND = 0.5
 class ObjectMotions:
     """Motions of objects behind one another: S sequences, F frames of all of them. Base of what files of frames hold."""
 
+    fps: float
     sequence_name: np.ndarray
     object_name: np.ndarray
     frame_offsets: np.ndarray

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from xreset.files import atomic_write
+from xreset.files import write_whole
 from xreset.geometry.kinematics import Kinematics
 from xreset.pictures.meshes import (
     AXIS_COLORS,
@@ -174,8 +174,7 @@ def pose_matrix(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 def write_png(path: str | Path, picture: np.ndarray) -> None:
     """Write an [H, W, 3] uint8 picture as PNG; ``XResetError`` if it cannot be written."""
-    with atomic_write(path) as file:
-        file.write(encode_png(picture))
+    write_whole(path, encode_png(picture))
 
 
 def encode_png(picture: np.ndarray) -> bytes:

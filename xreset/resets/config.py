@@ -19,7 +19,7 @@ class ClosingConfig(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class SqueezeConfig(Checked):
-    """Drive targets that press (:mod:`xreset.resets.squeeze`)."""
+    """Drive targets that press (:func:`xreset.resets.fingers.squeeze_targets`)."""
 
     force: NotNegative[float] = 0.0
     """Normal force of each finger that is at the object [N]. 0: targets are the joints' positions."""

@@ -18,8 +18,7 @@ from xreset.plugins import device_for, make_backend
 from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import Closing, with_closing_frames
 from xreset.resets.config import ClosingConfig, SqueezeConfig
-from xreset.resets.fingers import fingers_of
-from xreset.resets.squeeze import squeeze_targets
+from xreset.resets.fingers import fingers_of, squeeze_targets
 from xreset.retarget.pipeline import Retargeted
 from xreset.schedule import schedule
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec

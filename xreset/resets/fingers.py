@@ -1,4 +1,5 @@
-"""How near the fingers of a state are to its object: between their collision shapes and the object's, not between frames.
+"""How near the fingers of a state are to its object: between their collision shapes and the object's, not between frames;
+and drive targets with which they press, and do not only stand where they are.
 
 Shape letters: M states, J joints, E fingers, G contact links of all fingers.
 """
@@ -16,6 +17,7 @@ from xreset.geometry.balls import shape_balls
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.geometry.surface import Surface
+from xreset.resets.config import SqueezeConfig
 from xreset.spec import ObjectSpec, RobotSpec
 
 
@@ -89,3 +91,28 @@ def fingers_of(
             gap[mine, g], inward[mine, g] = distance, into
             point[mine, g] = centers[best] + radii[best, None] * (R[mine].transpose(-1, -2) @ into[..., None])[..., 0]
     return Fingers(links=links, finger=torch.tensor([number for number, _ in owned]), gap=gap, point=point, inward=inward)
+
+
+def squeeze_targets(robot: RobotSpec, fingers: Fingers, joint_pos: np.ndarray, config: SqueezeConfig) -> np.ndarray:
+    """[M, J] targets: the joints' positions, and for hand joints what presses, within joint limits and the drives' largest torques.
+
+    A finger that presses on the object with a normal force f needs joint torques J^T f, and a drive gives them where its target lies
+    J^T f / kp beyond the joint. What the other parts of the hand would have to do for balance is left to them: drives are soft, and the
+    object moves by millimetres until what it rests against presses back.
+
+    Args:
+        robot: its hand's drives.
+        fingers: where they are, in M states.
+        joint_pos: [M, J]
+        config: force, and which fingers are at the object.
+    """
+    q = torch.as_tensor(joint_pos, dtype=torch.float64)
+    kinematics = Kinematics(robot)
+    jacobian = kinematics.jacobian(q, fingers.links, fingers.point).linear
+    pressing = fingers.leading & (fingers.gap < config.reach)
+    torque = torch.einsum("mgi,mgij->mj", config.force * pressing[..., None] * fingers.inward, jacobian)
+    drives = [joint.drive for joint in robot.joints]
+    effort, kp = (torch.tensor([getattr(drive, name) for drive in drives], dtype=torch.float64) for name in ("effort", "kp"))
+    is_hand = torch.tensor([joint.group == "hand" and joint.drive.kp > 0 for joint in robot.joints])
+    beyond = torch.where(is_hand, torque.clamp(-effort, effort) / kp.clamp_min(1e-9), 0.0)
+    return torch.where(beyond != 0, kinematics.clamp(q + beyond), q).numpy()

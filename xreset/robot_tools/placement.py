@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from xreset.errors import RobotError
-from xreset.files import atomic_write
+from xreset.files import write_whole
 from xreset.spec import RobotSpec
 
 
@@ -116,8 +116,7 @@ def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) 
         text, count = re.subn(pattern, new, text, count=1, flags=re.MULTILINE)
         if not count:
             raise RobotError(f"{path} has no line like {pattern!r} to put the placement into; edit it by hand: {new}")
-    with atomic_write(path, "w") as file:
-        file.write(text)
+    write_whole(path, text)
 
 
 def _literal(text: str) -> str:

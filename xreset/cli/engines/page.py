@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from xreset.eval.engines import page as matrix
-from xreset.files import atomic_write
+from xreset.files import write_whole
 
 
 def page(
@@ -27,8 +27,7 @@ def page(
     if out is None:
         print(text, end="")
         return
-    with atomic_write(out, "w") as file:
-        file.write(text)
+    write_whole(out, text)
     print(f"wrote {out}")
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from xreset.demos.archive import Demos, demo_objects, read_demos
+from xreset.demos.archive import Demos, ObjectMotions, demo_objects, read_demos
 from xreset.description import load_robot
 from xreset.errors import FileFormatError, XResetError
 from xreset.geometry.surface import Surface, keypoint_contacts
@@ -57,24 +59,12 @@ def _demos_view(path: Path, folder: Path | None) -> View:
     demos = read_demos(path)
     objects = tuple(demo_objects(demos, folder).values())
     demos, human = _human(demos, objects)
-    owner = demos.sequence_of_frame
     contact = np.asarray(human.touching.any(axis=1))
     touched = np.concatenate([np.logical_or.accumulate(contact[demos.frames(s)]) for s in range(len(demos))])
-    names = [spec.name for spec in objects]
-    goal_pos, goal_quat = demos.goal_pose
     return View(
         kind="demonstrations",
         robot=None,
-        objects=objects,
-        rate=demos.fps,
-        sequence_name=tuple(demos.sequence_name.tolist()),
-        sequence=owner,
-        frame=np.arange(demos.num_frames) - demos.frame_offsets[owner],
-        object_index=np.array([names.index(name) for name in demos.object_name.tolist()])[owner],
-        object_pos=demos.object_pos,
-        object_quat=demos.object_quat_wxyz,
-        goal_pos=goal_pos,
-        goal_quat=goal_quat,
+        **_motions(demos, objects),
         contact=contact,
         post_contact=touched,
         reason=tuple("" if valid else "not annotated" for valid in demos.hand_valid),
@@ -83,27 +73,33 @@ def _demos_view(path: Path, folder: Path | None) -> View:
     )
 
 
+def _motions(data: ObjectMotions, objects: Sequence[ObjectSpec]) -> dict[str, Any]:
+    """What a view shows of files of frames."""
+    names, owner, (goal_pos, goal_quat) = [spec.name for spec in objects], data.sequence_of_frame, data.goal_pose
+    return {
+        "objects": tuple(objects),
+        "rate": data.fps,
+        "sequence_name": tuple(data.sequence_name.tolist()),
+        "sequence": owner,
+        "frame": np.arange(len(owner)) - data.frame_offsets[owner],
+        "object_index": np.array([names.index(name) for name in data.object_name.tolist()])[owner],
+        "object_pos": data.object_pos,
+        "object_quat": data.object_quat_wxyz,
+        "goal_pos": goal_pos,
+        "goal_quat": goal_quat,
+    }
+
+
 def _retargeted_view(path: Path, folder: Path | None, robot: str | None, demos: Path | None) -> View:
     data = read_retargeted(path)
     spec = load_robot(robot or data.robot)
     check_retargeted(path, data, spec)
     objects = load_objects(sorted(set(data.object_name.tolist())), folder)
-    names = [o.name for o in objects]
-    owner = data.sequence_of_frame
-    frame = np.arange(len(data.valid)) - data.frame_offsets[owner]
+    shown = _motions(data, objects)
     return View(
         kind="robot trajectories",
         robot=spec,
-        objects=objects,
-        rate=data.fps,
-        sequence_name=tuple(data.sequence_name.tolist()),
-        sequence=owner,
-        frame=frame,
-        object_index=np.array([names.index(name) for name in data.object_name.tolist()])[owner],
-        object_pos=data.object_pos,
-        object_quat=data.object_quat_wxyz,
-        goal_pos=data.goal_pos,
-        goal_quat=data.goal_quat_wxyz,
+        **shown,
         contact=data.contact,
         post_contact=data.post_contact,
         reason=tuple("" if reason == 0 else data.reason_names[reason] for reason in data.reason.tolist()),
@@ -112,7 +108,7 @@ def _retargeted_view(path: Path, folder: Path | None, robot: str | None, demos: 
         fingertips=data.fingertip_pos,
         hand_error=data.hand_error,
         wrist_error=data.wrist_error,
-        human=None if demos is None else _human_of(path, demos, objects, data.sequence_name[owner], frame),
+        human=None if demos is None else _human_of(path, demos, objects, data.sequence_name[shown["sequence"]], shown["frame"]),
     )
 
 

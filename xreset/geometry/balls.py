@@ -54,6 +54,12 @@ class Spans(Tensors):
     count: Tensor
     """[G] number of its rows."""
 
+    @staticmethod
+    def of(parts: Sequence[Sized]) -> Spans:
+        """Of groups whose members follow one another."""
+        counts = torch.tensor([len(part) for part in parts], dtype=torch.long)
+        return Spans(start=counts.cumsum(0) - counts, count=counts)
+
     def members(self, groups: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """All rows of some groups [C], in pieces that bound the memory: for each row, the place [A] in ``groups`` that asks for it,
         ascending, and the row [A] itself."""
@@ -93,8 +99,8 @@ class Clusters(Tensors):
         return Clusters(
             centers=torch.as_tensor(np.array([middle for middle, _ in balls]).reshape(-1, 3)),
             radii=torch.as_tensor(np.array([radius for _, radius in balls])),
-            of_link=_spans(parts),
-            spans=_spans(rows),
+            of_link=Spans.of(parts),
+            spans=Spans.of(rows),
             rows=torch.as_tensor(np.concatenate([np.zeros(0, dtype=np.int64), *rows])),
         )
 
@@ -270,11 +276,6 @@ def shape_balls(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     sharp = sharp_points(shape.geometry, max(min(radius, small), SPACING))
     points = np.concatenate((inner, shell, sharp)) @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
     return points, np.concatenate([np.full(len(part), r) for part, r in ((inner, radius), (shell, small), (sharp, 0.0))])
-
-
-def _spans(parts: Sequence[Sized]) -> Spans:
-    counts = torch.tensor([len(part) for part in parts], dtype=torch.long)
-    return Spans(start=counts.cumsum(0) - counts, count=counts)
 
 
 def _grid(half: tuple[float, ...], radius: float) -> np.ndarray:

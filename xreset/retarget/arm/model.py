@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import RobotError
-from xreset.geometry.balls import Spans
+from xreset.geometry.balls import Spans, bounding_ball
 from xreset.geometry.collision import SelfCollision, SupportPoints, height_above_table, table_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
@@ -101,15 +101,12 @@ class ArmModel:
         self._in_hand = [link for link in self._links if link in in_hand]
         self._carrier = torch.tensor([0 if link in in_hand else self.carriers.index(link) for link in self._links], dtype=torch.long)
         rows = [[i for i, name in enumerate(support.links) if name == link] for link in self._links]
-        count = torch.tensor([len(part) for part in rows], dtype=torch.long)
-        self._spans = Spans(start=count.cumsum(0) - count, count=count)
+        self._spans = Spans.of(rows)
         order = [i for part in rows for i in part]
         self._points, self._radii = torch.as_tensor(support.points[order]), torch.as_tensor(support.radii[order])
-        middles = np.array([(support.points[part].max(axis=0) + support.points[part].min(axis=0)) / 2 for part in rows]).reshape(-1, 3)
-        reach = [
-            (np.linalg.norm(support.points[part] - m, axis=1) + support.radii[part]).max() for part, m in zip(rows, middles, strict=True)
-        ]
-        self._middles, self._reach = torch.as_tensor(middles), torch.tensor(reach, dtype=self._points.dtype)
+        balls = [bounding_ball(support.points[part], support.radii[part]) for part in rows]
+        self._middles = torch.as_tensor(np.array([middle for middle, _ in balls]).reshape(-1, 3))
+        self._reach = torch.tensor([radius for _, radius in balls], dtype=self._points.dtype)
         """Of a ball about each link's points, in the link's frame."""
 
     def hand_poses(self, hand_joints: Tensor) -> Tensor:

@@ -203,8 +203,25 @@ class Toy(WithFolder):
         self.assertNotIn("claw", whole.tree.link_names)
         self.assertTrue(any("claw" in note for note in whole.notes))
         np.testing.assert_array_equal(whole.tree.joint("hand_base_fixed").T_parent_joint, T)
+        second = gripper.replace("claw", "thumb").replace("mount", "second")
+        two = self.file("two.urdf", ARM.replace("</robot>", gripper.removesuffix("</robot>") + second))
+        with self.assertRaisesRegex(RobotError, "ends in claw, thumb, after base, l0, l1, l2, l3, l4, l5; say with --flange"):
+            combined(read_source(two), read_source(self.hand), flange=None, T_flange_hand=T, name="x")
         with self.assertRaisesRegex(RobotError, "no link 'wrist'"):
             combined(arm, read_source(self.hand), flange="wrist", T_flange_hand=T, name="x")
+
+    def test_a_hand_whose_root_is_inside_it_stands_before_the_flange(self):
+        made = import_robot(self.arm, self.hand, self.folder / "mine", rpy=(0, -np.pi / 2, 0))  # its palm lies along x, from 0 to 80 mm
+        T = load_urdf(made.folder / "robot.urdf").joint("hand_base_fixed").T_parent_joint
+        np.testing.assert_allclose(T[:3, 3], 0, atol=1e-9)
+        self.assertRegex(made.to_say[0], r"its fingers point along \(0.05, 0.00, 1.00\) of 'l5'")
+        back = import_robot(self.arm, self.hand, self.folder / "back", rpy=(0, np.pi / 2, 0))
+        T = load_urdf(back.folder / "robot.urdf").joint("hand_base_fixed").T_parent_joint
+        np.testing.assert_allclose(T[:3, 3], (0, 0, 0.08), atol=1e-9)
+        self.assertTrue(any("80 mm along z of 'l5'" in note for note in back.guessed), back.guessed)
+        stated = import_robot(self.arm, self.hand, self.folder / "stated", offset=(0, 0, 0.01), rpy=(0, np.pi / 2, 0))
+        T = load_urdf(stated.folder / "robot.urdf").joint("hand_base_fixed").T_parent_joint
+        np.testing.assert_allclose(T[:3, 3], (0, 0, 0.01), atol=1e-9)
 
     def test_impossible_figures_are_replaced_and_told(self):
         heavy = HAND.replace('ixx="1e-5" iyy="1e-5" izz="1e-5"', 'ixx="0.1" iyy="0.1" izz="0.1"', 1).replace(

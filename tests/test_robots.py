@@ -245,6 +245,18 @@ class Registry(unittest.TestCase):
         for part in ("'joint9' is not in the URDF", "'joint7' moves", "'joint4' is at home at 2.6", "'link77'", "finger_joint2", "'link6'"):
             self.assertIn(part, found)
 
+    def test_a_check_that_asks_for_what_is_missing_hides_no_other(self):
+        def asks(spec, tree):
+            yield "warning", "first"
+            tree.joint("nowhere")
+
+        with mock.patch("xreset.robot_tools.check._mimics", asks):
+            _, found = check_description("openarm")
+        mimics = [(f.level, f.message) for f in found if f.topic == "mimic joints"]
+        self.assertEqual(mimics[0], ("warning", "first"))
+        self.assertRegex(mimics[1][1], "has no joint 'nowhere'; it has joint1")
+        self.assertEqual([f.level for f in found if f.topic in ("links", "inertias")], ["ok", "ok"])
+
     def test_check_finds_an_indefinite_inertia_and_a_missing_mass(self):
         self.edit("robot.urdf", 'ixx="0.000143"', 'ixx="-0.000143"')
         self.edit("robot.urdf", '<mass value="0.550659" />', '<mass value="0" />')

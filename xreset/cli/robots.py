@@ -16,7 +16,6 @@ from xreset.cli._terminal import Console, Progress
 from xreset.demos import archive
 from xreset.description import DESCRIPTION, load_robot, robot_folder
 from xreset.errors import RobotError
-from xreset.geometry import urdf_writer
 from xreset.pictures import raster
 from xreset.plugins import robot_names
 from xreset.retarget import pipeline
@@ -80,7 +79,7 @@ def import_(
     name: str | None = None,
     flange: str | None = None,
     offset: tuple[float, float, float] | None = None,
-    rpy: tuple[float, float, float] | None = None,
+    rpy: tuple[float, float, float] = (0, 0, 0),
     thumb: str | None = None,
 ) -> None:
     """Make a robot's folder from an arm and a hand as their makers publish them.
@@ -93,12 +92,12 @@ def import_(
         out: Folder to make.
         name: Name of the robot; default: the folder's.
         flange: Link of the arm that carries the hand; default: the arm's last link.
-        offset: Position of the hand's root link in the flange's frame [m].
+        offset: Position of the hand's root link in the flange's frame [m]; default: its origin, or as far along its z axis as keeps the
+            hand's body out of the arm.
         rpy: Its roll, pitch and yaw about the flange's fixed axes [rad].
         thumb: A link or joint of the thumb, where names and geometry do not tell.
     """
-    T = None if offset is None and rpy is None else urdf_writer.pose(offset or (0, 0, 0), rpy=rpy or (0, 0, 0))
-    made = importer.import_robot(arm, hand, out, name=name, flange=flange, T_flange_hand=T, thumb=thumb)
+    made = importer.import_robot(arm, hand, out, name=name, flange=flange, offset=offset, rpy=rpy, thumb=thumb)
     raster.write_png(out / "robot.png", pictures.robot_picture(load_robot(out)))
     console = Console()
     for title, lines in (("guessed", made.guessed), ("for you to say", made.to_say)):
@@ -115,7 +114,7 @@ def place(
     *,
     demos: Path,
     objects: Path | None = None,
-    max_per_object: int = 4,
+    max_per_object: int = 2,
     write: bool = False,
     search: PlaceConfig = PlaceConfig(),  # noqa: B008  tyro reads flags from the default
 ) -> None:

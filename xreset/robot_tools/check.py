@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,8 @@ _LIMIT_SLACK = 1e-3
 """[rad or m] By which a mimic joint's limits may fall short of its source's: published figures are rounded."""
 _OFF = 0.01
 """[m] From the middle of a link's shapes: a centre of mass in the joint that is farther away is doubted."""
+_LISTED = 4
+"""Pairs of links that are named, most frequent first."""
 _HOLD_STEPS = 30
 _HOLD_TOLERANCE = 0.02
 
@@ -131,7 +134,12 @@ def check(name_or_folder: str | Path, *, report: Callable[[Finding], None] = lam
 
 
 def _topic(topic: str, problems: Iterator[tuple[Level, str]], otherwise: str) -> list[Finding]:
-    return [Finding(level, topic, message) for level, message in problems] or [Finding("ok", topic, otherwise)]
+    found = []
+    try:
+        found += (Finding(level, topic, message) for level, message in problems)
+    except XResetError as error:  # a check that asks for what the URDF lacks: the others are still told
+        found.append(Finding("error", topic, str(error)))
+    return found or [Finding("ok", topic, otherwise)]
 
 
 def _summary(spec: RobotSpec) -> str:
@@ -347,9 +355,13 @@ def _home(spec: RobotSpec) -> list[Finding]:
         )
     near = collision.near(poses, 0.0)
     share = 100 * len(np.unique(near.configuration)) / len(q)
-    pairs = sorted({" and ".join(names[pair]) for pair in near.links})
+    meetings = {(int(at), " and ".join(names[pair])) for at, pair in zip(near.configuration, near.links, strict=True)}
+    pairs = Counter(pair for _, pair in meetings).most_common()
     if share > 20:
-        found.append(Finding("warning", "home and self", f"{share:.0f} % of the spread around home touches itself: {_listed(pairs)}"))
+        often = _listed(f"{pair} ({100 * count / len(q):.0f} %)" for pair, count in pairs[:_LISTED])
+        more = f" and {len(pairs) - _LISTED} more pairs" if len(pairs) > _LISTED else ""
+        text = f"{share:.0f} % of the spread around home touches itself: {often}{more}; episodes that start so are pushed apart."
+        found.append(Finding("warning", "home and self", f"{text} Move home away, spread less (home_std), or exclude what always meets."))
     elif not collision.overlapping_at_home:
         found.append(Finding("ok", "home and self", f"free at home; {share:.0f} % of the spread around it touches itself"))
     return found

@@ -23,8 +23,10 @@ from xreset.errors import RobotError
 from xreset.geometry.collision import SelfCollision, height_above_table, table_points
 from xreset.geometry.dynamics import drive_inertia
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import surface_of
 from xreset.geometry.urdf import RobotTree
-from xreset.robot_tools.draft import below, description_text, draft_spec, moving
+from xreset.geometry.urdf_writer import pose
+from xreset.robot_tools.draft import below, description_text, draft_spec, link_places, moving
 from xreset.robot_tools.fingers import find_fingers, find_palm, with_frames
 from xreset.robot_tools.sources import Source, combined, read_source
 from xreset.spec import DriveSpec, MimicSpec, RobotSpec, TableSpec
@@ -62,7 +64,8 @@ def import_robot(
     *,
     name: str | None = None,
     flange: str | None = None,
-    T_flange_hand: np.ndarray | None = None,
+    offset: tuple[float, float, float] | None = None,
+    rpy: tuple[float, float, float] = (0, 0, 0),
     thumb: str | None = None,
 ) -> Imported:
     """Make a robot's folder.
@@ -73,7 +76,9 @@ def import_robot(
         out: folder to make; it appears whole or not at all.
         name: of the robot; default: the folder's.
         flange: link of the arm that carries the hand; default: its last one.
-        T_flange_hand: [4, 4] pose of the hand's root link in the flange's frame; default: the same frame.
+        offset: position of the hand's root link in the flange's frame [m]; default: the flange's origin, or as far along its z axis as
+            keeps the hand's body before the flange.
+        rpy: its roll, pitch and yaw about the flange's fixed axes [rad].
         thumb: a link or joint of the thumb, where names and geometry do not tell.
 
     Raises:
@@ -83,14 +88,17 @@ def import_robot(
         raise RobotError(f"{out} is there already; give another folder, or remove it.")
     name = name or out.name
     parts = read_source(arm), read_source(hand)
-    T = np.eye(4) if T_flange_hand is None else T_flange_hand
-    whole = combined(*parts, flange=flange, T_flange_hand=T, name=name)
+    stand_off = _stand_off(parts[1].tree, rpy) if offset is None else 0.0
+    whole = combined(*parts, flange=flange, T_flange_hand=pose(offset or (0, 0, stand_off), rpy=rpy), name=name)
     mount = next(joint for joint in whole.tree.joints if joint.child not in parts[0].tree.link_names)
+    if stand_off > 0:
+        moved = f"the hand's root lies {1e3 * stand_off:.0f} mm along z of {mount.parent!r}, so that its body begins there (--offset)"
+        whole = replace(whole, notes=(*whole.notes, moved))
     hand_root = _carrier(whole.tree, mount.child)
     out.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}."))
     try:
-        guessed, to_say = _write(whole, hand_root, work, thumb=thumb, stated_offset=T_flange_hand is not None)
+        guessed, to_say = _write(whole, mount.parent, hand_root, work, thumb=thumb)
         load_robot(work)
         work.chmod(0o755)
         if out.is_dir():
@@ -111,9 +119,17 @@ def _carrier(tree: RobotTree, link: str) -> str:
     return link
 
 
-def _write(
-    source: Source, hand_root: str, folder: Path, *, thumb: str | None, stated_offset: bool
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _stand_off(hand: RobotTree, rpy: tuple[float, float, float]) -> float:
+    """Distance [m] by which a hand's body would reach behind the flange's origin, were its root there."""
+    poses = {hand.root: pose((0, 0, 0), rpy=rpy)}
+    for joint in hand.joints:  # parents come before children
+        if joint.type == "fixed" and joint.parent in poses:
+            poses[joint.child] = poses[joint.parent] @ joint.T_parent_joint
+    height = [surface_of(hand.link(name).collisions)[0] @ T[2, :3] + T[2, 3] for name, T in poses.items() if hand.link(name).collisions]
+    return max(0.0, round(-float(np.concatenate(height).min()), 3)) if height else 0.0
+
+
+def _write(source: Source, flange: str, hand_root: str, folder: Path, *, thumb: str | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
     notes = list(source.notes)
     tree = _with_rotors(source, hand_root, notes)
     fingers = find_fingers(tree, source.mimics, hand_root, folder, thumb, notes)
@@ -124,14 +140,16 @@ def _write(
     spec = _with_drives(spec, source, notes)
     spec = _with_exclusions(spec, notes)
     (folder / DESCRIPTION).write_text(description_text(spec, notes))
-    to_say = [
+    at = link_places(spec, {})
+    palm = np.linalg.inv(at[flange]) @ at[spec.palm]
+    ahead, inner = (", ".join(f"{v + 0.0:.2f}" for v in axis.round(2)) for axis in (palm[:3, 0], palm[:3, 2]))
+    to_say = (
+        f"how the hand is mounted (--offset, --rpy): now its fingers point along ({ahead}) of {flange!r}, its inner side along ({inner})",
         "whether each finger and the thumb are what they are called, and the palm looks where its z axis points (see the picture)",
         "efforts and gains of the drives, where the maker's figures are better than the rule",
         "where the base stands: xreset robots place FOLDER --demos DEMOS --write",
-    ]
-    if not stated_offset:
-        to_say.insert(0, "the pose of the hand on the flange (--offset, --rpy): it was taken to be the flange's own frame")
-    return tuple(notes), tuple(to_say)
+    )
+    return tuple(notes), to_say
 
 
 def _with_rotors(source: Source, hand_root: str, notes: list[str]) -> RobotTree:

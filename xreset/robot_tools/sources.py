@@ -16,6 +16,7 @@ from xreset.errors import ObjectError, RobotError
 from xreset.geometry.shapes import hull, mass_properties, surface_of
 from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree, check_tree, load_urdf, parse_xml
 from xreset.geometry.urdf_writer import FRAME_INERTIA, FRAME_MASS, fixed
+from xreset.robot_tools.draft import below
 from xreset.spec import DriveSpec, Geometry, MimicSpec, Shape
 from xreset.text import shown
 
@@ -94,19 +95,16 @@ def combined(arm: Source, hand: Source, *, flange: str | None, T_flange_hand: np
     ends = [link for link in arm.tree.link_names if link not in parents]
     if flange is None:
         if len(ends) != 1:
-            raise RobotError(f"the arm ends in {', '.join(ends)}; say with --flange which of its links carries the hand.")
+            before = ", ".join(link for link in arm.tree.link_names if {*ends} < {*below(arm.tree, link)})
+            raise RobotError(
+                f"the arm ends in {', '.join(ends)}, after {before}; say with --flange which of its links carries the hand;"
+                " what hangs there is left out."
+            )
         flange = ends[0]
         notes.append(f"the hand is carried by the arm's last link, {flange!r} (--flange says another)")
     arm.tree.link(flange)
-    below = {flange}
-    path = {flange}
-    for joint in arm.tree.joints:
-        if joint.parent in below:
-            below.add(joint.child)
-    for joint in reversed(arm.tree.joints):
-        if joint.child in path:
-            path.add(joint.parent)
-    gone = below - {flange}
+    path = {link for link in arm.tree.link_names if flange in below(arm.tree, link)}
+    gone = {*below(arm.tree, flange)} - {flange}
     if gone:
         notes.append(f"left out, because it hangs on the flange where the hand goes: {', '.join(sorted(gone))}")
     kept = [joint for joint in arm.tree.joints if joint.child not in gone]
@@ -170,7 +168,8 @@ def _with_limits(source: Source) -> Source:
 
 def _with_masses(source: Source) -> Source:
     """Masses and inertias that a solid body can have: from the shapes where none or an impossible one is stated."""
-    notes, links = list(source.notes), []
+    links: list[Link] = []
+    replaced: dict[str, list[str]] = {}
     for link in source.tree.links:
         if not link.collisions:
             if link.mass <= FRAME_MASS or not plausible(link):
@@ -182,11 +181,12 @@ def _with_masses(source: Source) -> Source:
             volume = float(np.einsum("ij,ij->", vertices[faces[:, 0]], np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]])) / 6)
             mass = link.mass if link.mass > 0 else _DENSITY * volume
             com, inertia = mass_properties(vertices, faces, mass)
-            was = "has no mass" if link.mass <= 0 else f"has an inertia that {link.mass:.3g} kg of its size cannot have"
-            notes.append(f"the link {link.name!r} {was}; it is that of its shapes, {mass:.3g} kg")
+            why = "have no mass" if link.mass <= 0 else "have an inertia that their mass and size do not allow"
+            replaced.setdefault(why, []).append(f"{link.name} ({mass:.3g} kg)")
             link = replace(link, mass=mass, com=com, inertia=inertia)
         links.append(link)
-    return replace(source, tree=replace(source.tree, links=tuple(links)), notes=tuple(notes))
+    notes = (f"these links {why}, and get that of their shapes: {', '.join(names)}" for why, names in replaced.items())
+    return replace(source, tree=replace(source.tree, links=tuple(links)), notes=(*source.notes, *notes))
 
 
 def plausible(link: Link) -> bool:

@@ -92,14 +92,11 @@ def compile_scene(
     """The model of a scene that holds ``scene.objects[object_index]``.
 
     Args:
-        scene: the scene.
-        object_index: the object in it.
         slots_for: also make room for the shapes of these objects: the models of one scene with the same ``slots_for`` agree in the
             type and number of all geoms and in all meshes, so one engine model can hold any of the objects. Slots without use are parked.
         sensors: let the engine itself compute what a backend reports. ``sensordata`` then holds, one behind the other, of the tracked
             links the positions [K, 3], orientations [K, 4], velocities [K, 3] and angular velocities [K, 3]; then the force of the
             object on the table [3] and on each fingertip geom [S, 3].
-        settings: dials.
 
     Raises:
         RobotError: the robot cannot be simulated.

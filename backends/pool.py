@@ -145,9 +145,6 @@ class PoolBackend(Backend):
         """Build the worlds.
 
         Args:
-            scene: what to simulate.
-            num_worlds: N.
-            object_index: [N] which object each world holds.
             device: ``cpu``.
             workers: number of processes; 0 runs the worlds in this process. Default: one per usable core, but no more than worlds, and
                 this process if there is one world only.

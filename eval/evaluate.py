@@ -127,7 +127,6 @@ def load_motion(path: Path, robot: RobotSpec, objects_folder: Path | None, *, tr
 
     Args:
         path: demonstrations (``xreset demos``) or retargeted trajectories (``xreset retarget``).
-        robot: the robot.
         objects_folder: folder of meshes; None: stand-ins.
         trajectories: whether robot trajectories are needed; demonstrations are then retargeted here.
     """
@@ -160,12 +159,8 @@ def evaluate(
     """Evaluate in each engine and write the results.
 
     Args:
-        subject: what to evaluate.
-        engines: where.
         demos: demonstrations or retargeted trajectories.
         setting: meshes, seed of the perturbations, worlds at a time.
-        out: folder for the results.
-        episodes: episodes per demonstration.
         progress: called with (engine, control steps done, control steps in all).
 
     Returns:

@@ -82,9 +82,6 @@ def try_policy(
     """Let a policy go on from states of a bank, at rest and at full gravity, for one episode each.
 
     Args:
-        policy: what acts.
-        engine: where.
-        trial: robot, objects and bank.
         rows: [M] states to try.
         progress: called with (control steps done, control steps in all).
     """
@@ -141,11 +138,7 @@ def frontier(
     """Try states of a bank in each engine and write ``OUT/BACKEND.json``.
 
     Args:
-        subject: what to try.
-        engines: where.
-        resets: reset bank.
         setting: meshes, seed of the draw, worlds at a time.
-        out: folder for the results.
         states: how many to draw from the bank, without repetition; all if it has fewer.
         progress: called with (engine, control steps done, control steps in all).
 

@@ -48,7 +48,6 @@ class EpisodeMetrics:
             goal_pos: [N, 3]
             goal_quat: [N, 4]
             keypoints: [N, 4, 3] in the object frame.
-            config: thresholds.
         """
         self._config, self._keypoints = config, keypoints
         self._goal_pos, self._goal_quat = goal_pos.clone(), goal_quat.clone()

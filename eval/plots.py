@@ -37,7 +37,6 @@ def svg(draw: Callable[[Figure], None], size: tuple[float, float], salt: str) ->
     """An ``<svg>`` element that scales with the page and takes its text colour.
 
     Args:
-        draw: fills the figure.
         size: width and height [inches].
         salt: keeps its identifiers apart from those of other figures on the page; the same salt and drawing give the same text.
     """

@@ -87,13 +87,9 @@ def roll_out(
     """Run demonstrations ``repetitions`` times each.
 
     Args:
-        policy: what acts.
-        engine: where.
-        trial: robot, objects, starts and goals, task.
         repetitions: episodes per demonstration, each with its own perturbation of robot and object.
         only: indices of the demonstrations to run; None: all.
         trace_interval: time between the states of a trace [s].
-        metrics: thresholds.
         progress: called with (control steps done, control steps in all).
     """
     demos, names = trial.bank, trial.names
@@ -138,7 +134,6 @@ def play(
         policy: what acts; it begins anew.
         env: the worlds, just reset.
         points: [N, 4, 3] of the objects, in their frames.
-        metrics: thresholds.
         look: called with (steps done, reading), first at the start and then after every control step.
 
     Returns:

@@ -32,7 +32,6 @@ def candidates_in(folder: Path, most: int) -> list[Path]:
     """Checkpoints of a run folder, or exported policies of another folder, the newest first.
 
     Args:
-        folder: where.
         most: how many at most, spread evenly over all; the newest is among them.
 
     Raises:
@@ -64,11 +63,9 @@ def select(
 
     Args:
         folder: run folder, or a folder of exported policies.
-        engines: where.
         demos: demonstrations whose starts and goals are played.
         setting: robot, meshes, seed of the starts, worlds.
         most: checkpoints at most.
-        episodes: of each demonstration.
         progress: called with (candidate, engine, task progress) before (None) and after each.
 
     Raises:

@@ -199,11 +199,8 @@ def stress(
     """Sweep properties in each engine and write ``OUT/BACKEND.json``, after each property anew: one that is stopped keeps what it has.
 
     Args:
-        subject: what to try.
-        engines: where.
         demos: demonstrations or retargeted trajectories.
         setting: meshes, seed and worlds at a time.
-        out: folder for the results.
         properties: what to sweep.
         repetitions: episodes per demonstration, the same for every value.
         progress: called with (engine, runs done, runs in all).

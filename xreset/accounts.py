@@ -99,7 +99,6 @@ def write_accounts(path: Path, *, of: str, rows: Sequence[Account], **more: Any)
     """Write accounts as JSON.
 
     Args:
-        path: file.
         of: what was counted, such as ``frames``.
         rows: per object and phase.
         more: what else there is to say, by name.

@@ -45,7 +45,6 @@ def without_effect(settings: Any, defaults: Any, path: tuple[str, ...] = ()) -> 
     """What was changed from the defaults and means nothing beside the other settings; a sentence for each field, nested ones with it.
 
     Args:
-        settings: a dataclass.
         defaults: another of its kind.
         path: names of the fields that lead to it.
     """

@@ -60,7 +60,6 @@ def make_env(
     """N worlds of the task in an engine. Close it, or use it as a context manager.
 
     Args:
-        robot: the robot.
         objects: those of the bank; world i holds object i modulo their number.
         bank: where episodes begin, and their goals.
         task: what to observe, reward and end on; None: the paper's.

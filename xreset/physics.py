@@ -179,7 +179,6 @@ class Backend(ABC):
 
         Args:
             scene: what to simulate.
-            num_worlds: N.
             object_index: [N] which of ``scene.objects`` each world holds; default: world i holds object i modulo their number.
             device: ``cpu`` or ``cuda[:i]``.
         """

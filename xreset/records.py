@@ -95,7 +95,6 @@ def read_npz(
     """Read an npz file and check all of it before anything is used; names, kinds, shapes and sizes before anything is unpacked.
 
     Args:
-        path: file.
         schema_name: schema that the file must state; None: a file that others made, which states none.
         schema: fields that it must have. Others are left aside, with a warning.
         what: what the file is, for messages ("a reset bank").

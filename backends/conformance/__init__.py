@@ -48,7 +48,6 @@ def run(
     """Run the checks.
 
     Args:
-        make: builds the backend under test.
         robot: robot to test with; default the suite's own. Checks that need the suite's own are skipped with another.
         only: names of the checks to run; default all.
         report: called with each result as it comes.

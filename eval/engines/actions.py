@@ -91,12 +91,9 @@ def grasp_and_lift(
     """The open-loop try of a grasp: the hand, open around the object at rest, closes, lifts and shakes (:mod:`xreset.eval.engines`).
 
     Args:
-        robot: the robot.
-        thing: the object of the grasp.
         grasps: as :func:`xreset.eval.engines.grasps.find_grasps` finds them.
         number: which of them.
         scene: timestep, substeps and friction; default: those of :class:`SceneSpec`.
-        motion: distances and durations.
     """
     motion, scene = motion or Motion(), scene or SceneSpec(robot=robot, objects=(thing,))
     chosen = slice(number, number + 1)
@@ -127,9 +124,6 @@ def play_policy(
     """Let a policy act through one episode in one engine, and record what the drives were told.
 
     Args:
-        policy: what acts.
-        engine: where.
-        trial: robot, objects, starts and goals, task.
         sequence: index of the demonstration.
         repetition: which perturbation of its start, as ``xreset eval`` counts them.
         progress: called with (control steps done, control steps in all).
@@ -156,12 +150,6 @@ def play_policy(
 
 def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label: str) -> Actions:
     """The actions of an episode that an evaluation has recorded; it has begun at rest, with the physics of an evaluation.
-
-    Args:
-        robot: the robot.
-        thing: the object.
-        trace: the episode, with its joint targets.
-        label: what it is, for people.
 
     Raises:
         FileFormatError: the episode was not played at the control rate of the default task.
@@ -205,11 +193,6 @@ def write_actions(path: str | Path, actions: Actions) -> None:
 
 def read_actions(path: str | Path, robot: RobotSpec, objects: Callable[[str], ObjectSpec]) -> Actions:
     """Read an action sequence.
-
-    Args:
-        path: file.
-        robot: the robot, which must be the one of the file.
-        objects: gives the object of a name.
 
     Raises:
         FileFormatError: the file is damaged, or for another robot or object geometry.

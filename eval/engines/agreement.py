@@ -111,12 +111,8 @@ def compare(
     """Measure engines against the reference.
 
     Args:
-        robot: the robot.
         objects: geometry; frames of other objects are left out.
-        frames: where to look for grasps.
-        engines: the contenders.
         grasps: how many closings, and how many holds from common states.
-        config: what is tried.
         reference: default: the backend ``mujoco``.
         progress: called with (what is being done, tries done, tries in all).
 

@@ -88,7 +88,6 @@ def differences(
     """Compare a world of a recording with one of the reference's.
 
     Args:
-        found: the engine's.
         reference: the reference's, of the same length.
         dt: control step [s].
         thresholds: of touch, and the window of the forces.

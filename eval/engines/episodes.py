@@ -133,12 +133,10 @@ def closing_episode(
     """A whole try: the open hand around an object at rest closes, lifts and shakes.
 
     Args:
-        robot: the robot.
         joint_pos: [G, J] the hand as it holds the object (rad, m).
         object_pos: [G, 3] where the object is [m].
         object_quat: [G, 4]
         dt: control step [s].
-        motion: distances and durations.
     """
     motion = motion or Motion()
     kinematics = Kinematics(robot)
@@ -152,14 +150,7 @@ def closing_episode(
 
 
 def lifting_episode(robot: RobotSpec, start: State, dt: float, motion: Motion | None = None) -> Episode:
-    """Lift and shake what the hand already holds; the targets begin with those of the state.
-
-    Args:
-        robot: the robot.
-        start: [G, ...] the common state.
-        dt: control step [s].
-        motion: distances and durations.
-    """
+    """Lift and shake what the hand holds in states [G, ...], with the targets of each; dt: control step [s]."""
     motion = motion or Motion()
     targets = start.joint_target.double().cpu()
     still = targets.expand(round(motion.hold / dt), *targets.shape)
@@ -184,7 +175,6 @@ def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float)
     stretched or at a limit move less.
 
     Args:
-        kinematics: of the robot.
         joint_pos: [G, J] (rad, m).
         distance: how far [m]; negative: apart.
     """
@@ -203,9 +193,7 @@ def squeezed(kinematics: Kinematics, joint_pos: Tensor, motion: Motion) -> Tenso
     The thumb presses as much as the other fingers together, and these alike.
 
     Args:
-        kinematics: of the robot.
         joint_pos: [G, J] the hand as it holds the object (rad, m).
-        motion: reach and force.
     """
     robot = kinematics.robot
     hand = torch.as_tensor(robot.hand_indices)
@@ -235,7 +223,6 @@ def carried_palm(kinematics: Kinematics, joint_pos: Tensor, offset: Tensor) -> T
     """[T, G, J] joint positions that move the palm without turning it: each step's arm follows from the one before.
 
     Args:
-        kinematics: of the robot.
         joint_pos: [G, J] where to begin (rad, m); the hand's joints stay.
         offset: [T, 3] of the palm from where it begins, world frame [m].
     """

@@ -114,11 +114,8 @@ def find_grasps(frames: Frames, robot: RobotSpec, objects: Sequence[ObjectSpec],
     comes first.
 
     Args:
-        frames: where to look.
-        robot: the robot that they are for.
         objects: geometry; frames of other objects are left out.
         count: G at most; there are fewer where the frames show fewer.
-        where: which grasps.
 
     Raises:
         DemoError: on the table, there is none.

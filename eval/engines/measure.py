@@ -97,7 +97,6 @@ def measure(engine: Engine, scene: SceneSpec) -> Measured:
       what moves, so an integrator's numerical damping counts as damping); when it begins tells the delay.
 
     Args:
-        engine: the engine.
         scene: robot and object (the first) of the skill, and its friction and timestep.
 
     Raises:

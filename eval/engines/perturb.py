@@ -143,8 +143,6 @@ class AlteredBackend(Backend):
 
         Args:
             inner: the worlds, of ``alteration.scene(scene)``.
-            scene: what callers see.
-            alteration: how they differ.
         """
         super().__init__(scene, inner.num_worlds, object_index=inner.object_index, device=str(inner.device))
         self.name, self.capabilities = inner.name, inner.capabilities  # pyright: ignore[reportAttributeAccessIssue]

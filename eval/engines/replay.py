@@ -121,9 +121,6 @@ def trace(
     """Replay a sequence in each engine and compare with the reference.
 
     Args:
-        actions: the sequence.
-        reference: engine to compare with.
-        engines: the others.
         thresholds: from which differences on engines count as parted.
         perturbed: number of perturbed starts in the reference: long contact is chaotic, and what such a start does to the reference
             itself, no engine can be blamed for.

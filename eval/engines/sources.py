@@ -39,7 +39,6 @@ def load_frames(
     """Robot, objects and frames of retargeted trajectories, a reset bank, or demonstrations, which are retargeted here.
 
     Args:
-        path: file.
         robot: name or folder; default: the file's. Demonstrations need it.
         objects_folder: folder of real meshes; None for the stand-ins.
         only: names of the objects to use; default: all of the file.
@@ -78,11 +77,6 @@ def load_frames(
 def from_file(source: Path, sequence: Sequence, place: Place) -> Actions:
     """An open-loop grasp and lift of demonstrations, retargeted trajectories or a reset bank; or recorded actions, also of an evaluation.
 
-    Args:
-        source: the file.
-        sequence: object and grasp.
-        place: robot and meshes.
-
     Raises:
         FileFormatError: the file is of another kind, or for another robot.
         DemoError: there is no such grasp.
@@ -114,9 +108,6 @@ def from_policy(
 
     Args:
         source: demonstrations or retargeted trajectories.
-        engine: where it plays.
-        sequence: policy, object, demonstration, and perturbation of its start.
-        place: robot, meshes and seed.
         progress: called with (control steps done, control steps in all).
     """
     assert sequence.policy is not None, "no policy"

@@ -104,13 +104,9 @@ def common_states(
     A closing counts if a fingertip touches the object when the hand has closed.
 
     Args:
-        robot: the robot.
-        table: the grasps of the closings.
-        air: grasps in the air.
         closings: by engine, the whole closings.
         count: how many at most; fewer where hands have closed on nothing.
         dt: control step [s].
-        config: what is tried.
     """
     shown = min(round(count * config.in_air), len(air))
     labels = [f"{label} as demonstrated" for label in air.label[:shown]]

@@ -51,7 +51,6 @@ def write_lerobot(
 
     Args:
         folder: where to; must not exist, or be empty. It appears whole or not at all.
-        recording: the episodes.
         video: whether films are drawn: from one camera for all episodes, the goal as a translucent object.
         size: width and height of the films [pixels], even.
         progress: called with (episodes done, all of them).

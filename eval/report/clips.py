@@ -81,12 +81,7 @@ def draw_clip(engine: str, episode: Episode, trace: Trace, robot: RobotSpec, obj
     """Draw a trace with the goal as a translucent object.
 
     Args:
-        engine: name of the engine.
-        episode: its result.
         trace: states of the episode; what comes after a state that is not finite is drawn as the last finite one.
-        robot: the robot that the trace is of.
-        obj: the object that the trace is of.
-        camera: where from.
     """
     interval = float(trace.time[1] - trace.time[0]) if len(trace.time) > 1 else 1.0 / FRAMES_PER_SECOND
     every = max(1, round(1.0 / (FRAMES_PER_SECOND * interval)))
@@ -162,7 +157,6 @@ def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) 
 
     Args:
         frames: [T, H, W, 3] uint8 with even H and W.
-        fps: frames per second.
         keyframes: how many frames lie between two that can be shown without others; None: the encoder's choice.
 
     Raises:

@@ -118,9 +118,7 @@ def draw_lines(
     """One line for each group, with a band from ``low`` to ``high`` where they differ.
 
     Args:
-        ax: axes.
         lines: label -> curve, in units of ``x``.
-        title: of the axes.
         x: what the horizontal axis is.
         order: labels of all groups: the position decides the colour.
         percent: whether the values are shares.
@@ -225,11 +223,9 @@ def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], foun
     """The picture of a comparison.
 
     Args:
-        path: PNG file.
         groups: all that are compared.
         tags: curves that at least one of them has, one panel each; may be empty if ``found`` is not.
         found: scores; may be empty if ``tags`` is not.
-        x: horizontal axis of the curves.
     """
     order = [group.label for group in groups]
     across = 3 if len(tags) % 3 == 0 else min(len(tags), 2)

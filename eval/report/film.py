@@ -39,7 +39,6 @@ def make_film(
 
     Args:
         folder: a run folder, or a folder of results.
-        out: file.
         robot: name or folder of the robot; default: as the run and the results name it.
         objects: folder of meshes; default: as the results name it.
         progress: called with (clips drawn, all of them).

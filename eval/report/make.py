@@ -143,7 +143,6 @@ def compare(runs: Sequence[str], out: Path, *, x: X = "minutes", curves: Sequenc
 
     Args:
         runs: folders, as ``FOLDER`` or ``LABEL=FOLDER``.
-        out: folder for the files.
         x: horizontal axis of the learning curves.
         curves: names of curves as in TensorBoard; default: :data:`CURVES`.
         apart: show trainings that differ in their seed only one by one, not as one.

@@ -311,10 +311,6 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, Fact]:
     It is taken as it is, so that trainings of different versions of xreset can be compared. A reset bank is known by its hash, wherever
     the file lies; it was made with certain meshes, so their folder is known by whether there is one. A device is known by its kind: which
     of several GPUs it was says nothing.
-
-    Args:
-        run: content.
-        file: named in messages.
     """
     kinds = {"robot": str, "resets": str, "resets_hash": str, "device": str, "seed": int, "config": dict}
     wrong = [name for name, kind in kinds.items() if not isinstance(run.get(name), kind)]

@@ -77,9 +77,7 @@ def launch(
     """Do steps that are not done, each as soon as those that it needs are done.
 
     Args:
-        plan: all steps, and where their logs go.
         steps: those to do.
-        cluster: this machine, or Slurm.
         per_gpu: trainings at a time on each GPU of this machine.
         options: of ``submitit.SlurmExecutor``, such as ``partition`` and ``time`` [min].
         say: prints a line.

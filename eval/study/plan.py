@@ -279,8 +279,6 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
     """Find out what a study consists of, and refuse what does not fit what is there.
 
     Args:
-        study: the study.
-        name: of the study.
         given: folder that the study's data are relative to.
         out: folder for all that is made.
         only: names of runs; none: all.

@@ -33,12 +33,7 @@ class Page:
 
 
 def write_page(plan: Plan, out: Path) -> Page:
-    """Write ``study.md``, its pictures, and comparisons of the trainings of each object.
-
-    Args:
-        plan: the study.
-        out: folder for them.
-    """
+    """Write ``study.md``, its pictures, and comparisons of the trainings of each object."""
     amounts = {run.name: run.trained() for run in plan.runs if run.config is not None}
     tables = tuple(fill(plan, table) for table in plan.study.tables)
     notes = tuple(dict.fromkeys([*_incomplete(plan), *(note for made in tables for note in _unfair(plan, made, amounts))]))

@@ -120,9 +120,7 @@ def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str = "right") -> li
     """All contacts that a hand could use, best first.
 
     Args:
-        solid: the object.
         azimuths: [A] directions to try from the fingers' side to the thumb's, as angles about z [rad].
-        side: right or left hand.
     """
     low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
     from_above = high[2] <= _LOW_OBJECT

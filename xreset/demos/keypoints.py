@@ -114,8 +114,6 @@ def read_keypoints(
     """Read a tracker's sequences: an npz (one sequence), a CSV (one, or several with a column ``sequence``), or a folder of them.
 
     Args:
-        path: file or folder.
-        convention: what the numbers mean.
         progress: called with (files done, files in all, name) before each file is read.
 
     Returns:

@@ -63,7 +63,6 @@ def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: flo
 
     Args:
         demos: demonstrations; they are levelled first.
-        symmetries: of the objects that they name.
         tolerance: largest deviation from symmetry with which an object is mirrored [m]; sequences of others are left out.
 
     Raises:

@@ -61,8 +61,6 @@ def object_path(pos: np.ndarray, rest: Rotation, timing: Timing, rng: np.random.
 
     Args:
         pos: [3] where it rests.
-        rest: how it rests.
-        timing: when it moves.
         rng: chooses the goal.
     """
     goal = pos + np.array([rng.uniform(-0.06, 0.06), rng.uniform(-0.14, 0.0), rng.uniform(*LIFT)])
@@ -80,11 +78,8 @@ def clear_approach(solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, 
     """The first of some random approaches in which no keypoint comes too near to object or table, or the best of them.
 
     Args:
-        solid: the object where it rests.
         pos: [3] its position.
         grasp: where the hand ends.
-        timing: when it moves.
-        side: right or left hand.
         rng: chooses start and path.
     """
     best: HandPath | None = None

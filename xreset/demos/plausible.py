@@ -30,7 +30,6 @@ def doubts(demos: Demos, objects: Mapping[str, ObjectSpec] | None = None) -> lis
     """Sentences; none if nothing is odd.
 
     Args:
-        demos: the demonstrations.
         objects: their objects by name; without them it is not seen whether they stand on the table.
     """
     found = []

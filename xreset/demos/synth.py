@@ -69,7 +69,6 @@ def synthesize(
         per_object: sequences of each object.
         seed: chooses all that varies: place and heading of the object, grasp, paths, timing, goal pose.
         fps: frames per second; a sequence lasts about 2.4 s.
-        side: hand.
         meshes: folder of real meshes; None for the stand-ins.
         progress: called with (sequences done, sequences in all, name) before each sequence is made.
 

@@ -40,7 +40,6 @@ def cached_pieces(
     """The pieces of a mesh, from the cache if they are there. Those of a decomposition that was cut short are not kept.
 
     Args:
-        mesh: the mesh.
         source: SHA-256 of what it was read from.
         settings: how to decompose it.
         progress: see :func:`xreset.objects.decompose.decompose`.

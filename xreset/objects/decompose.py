@@ -95,7 +95,6 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings(), progress: 
 
     Args:
         mesh: closed or not (:func:`as_solid`).
-        settings: how.
         progress: is told how it goes.
 
     Raises:

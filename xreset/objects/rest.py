@@ -13,7 +13,6 @@ def rest_height(obj: ObjectSpec, quat: np.ndarray) -> np.ndarray | float:
     """Height of the mesh frame's origin at which the lowest vertex touches z = 0 [m].
 
     Args:
-        obj: the object.
         quat: [..., 4] orientations (w, x, y, z).
 
     Returns:

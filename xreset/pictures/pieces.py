@@ -21,7 +21,6 @@ def draw_pieces(objects: Sequence[ObjectSpec], captions: Sequence[str], *, size:
     """A row for each object: its mesh, and its convex pieces in colours of their own, both from above the front.
 
     Args:
-        objects: the objects.
         captions: a line under each.
         size: width and height of each picture [pixels].
 

@@ -86,7 +86,6 @@ class Renderer:
 
         Args:
             scene: robot, objects and table; an empty tuple of objects is allowed.
-            size: width and height in pixels.
             camera: default: from the front right, over the table.
             smooth: draw at twice the size and average: better edges, four times the work.
         """

@@ -190,7 +190,6 @@ def read_bank(path: str | Path, *, robot: RobotSpec | None = None) -> ResetBank:
     """Read a bank.
 
     Args:
-        path: file.
         robot: if given, the bank must be made for this robot.
 
     Raises:

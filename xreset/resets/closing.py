@@ -43,8 +43,6 @@ def with_closing_frames(retargeted: Retargeted, robot: RobotSpec, objects: Seque
     first contact: then the robot's fingers are usually 5 to 10 mm away.
 
     Args:
-        retargeted: robot trajectories.
-        robot: the robot they are for.
         objects: geometry of the objects that they name.
         config: where and how densely.
     """

@@ -86,7 +86,6 @@ class ResetDistribution:
         """Prepare the tables.
 
         Args:
-            bank: states, starts and goals.
             robot: its home configuration and joint limits.
             object_names: objects of the scene, in the scene's order.
             config: mixture, gravity and perturbations.

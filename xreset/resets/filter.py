@@ -56,8 +56,6 @@ def spawn(
     """Let an engine have states, as many at a time as there are worlds.
 
     Args:
-        name: the engine.
-        scene: what to build.
         object_index: [M] which of the scene's objects each state has.
         states: joint positions [M, J], object positions [M, 3] and orientations [M, 4], drive targets [M, J].
         num_envs: worlds at a time.
@@ -124,8 +122,6 @@ def make_bank(
     """Try every valid frame in every engine and keep those that all accept.
 
     Args:
-        retargeted: robot trajectories.
-        robot: the robot they are for.
         objects: geometry of the objects that they name.
         backends: engines, tried in this order; a rejection carries the first one's reason.
         num_envs: worlds at a time.

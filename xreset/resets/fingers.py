@@ -63,7 +63,6 @@ def fingers_of(
 
     Args:
         robot: its fingertips' contact links.
-        objects: geometry.
         object_index: [M] which of them each state has.
         joint_pos: [M, J]
         object_pos: [M, 3]

@@ -42,10 +42,7 @@ def hold_bank(
     """Let the lifted states of a bank hold on in every engine.
 
     Args:
-        bank: the states.
-        robot: the robot they are for.
         objects: geometry of the objects that they name.
-        backends: engines.
         num_envs: worlds at a time.
         device: where engines run that can use it; the others run on the CPU.
         config: how long, and how far an object may move.

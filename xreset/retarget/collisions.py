@@ -20,7 +20,6 @@ def colliding_links(result: Retargeted, robot: RobotSpec, thresholds: Thresholds
 
     Args:
         result: trajectories of this robot.
-        robot: the robot.
         thresholds: that the frames were judged by.
     """
     lost = result.reason == REASONS.index("self collision")

@@ -84,9 +84,7 @@ def run_key(demos: Demos, robot: RobotSpec, objects: Sequence[ObjectSpec], confi
 
     Args:
         demos: the demonstrations, as they are retargeted.
-        robot: the robot.
         objects: the objects that the demonstrations name; of these, only the collision pieces are looked at.
-        config: dataclass of JSON-able values.
         sequences_per_batch: decides which sequences a batch holds.
         device: rounds in its own way.
     """

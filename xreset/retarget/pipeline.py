@@ -79,9 +79,7 @@ def retarget_demos(
 
     Args:
         demos: human demonstrations; they need not rest on the table yet.
-        robot: the robot.
         objects: geometry of every object that the demonstrations name.
-        config: weights and thresholds.
         progress: called with (sequences done, sequences in all).
         partial: folder for what is finished, made when needed; batches in it that other arguments made are not used.
         timing: to add the time spent to.

@@ -62,8 +62,6 @@ def sample_drives(is_arm: Tensor, count: int, c: RandomizationConfig, generator:
     Args:
         is_arm: [J] bool.
         count: M.
-        c: ranges.
-        generator: random numbers.
     """
     ranges = ((c.arm_stiffness, c.hand_stiffness), (c.arm_damping, c.hand_damping), (c.effort, c.effort))
     rows = [

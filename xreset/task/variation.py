@@ -26,8 +26,6 @@ class Variation:
         """Allocate.
 
         Args:
-            backend: the worlds.
-            config: ranges.
             is_arm: [J] bool.
 
         Raises:

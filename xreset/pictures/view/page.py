@@ -36,7 +36,6 @@ class Page:
         """Start the server.
 
         Args:
-            view: what to show.
             host: address to listen at; 0.0.0.0 for every one that the machine has.
             port: port to listen at; the next free one if it is taken.
             sequence: the sequence to begin with; None: all of a bank, the first of another file.

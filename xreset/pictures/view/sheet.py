@@ -80,7 +80,6 @@ def draw_sheet(
 
     Args:
         view: what the tiles' rows refer to.
-        tiles: what to draw.
         columns: tiles beside one another.
         size: width and height of a tile's picture [pixels].
         progress: called with (tiles drawn, tiles in all).

@@ -109,13 +109,10 @@ def _with_self_collision(
     """Add w [margin - d]_+^2 of every pair of near shapes; d changes by n . (v_b - v_a) at the nearest points.
 
     Args:
-        system: to add to.
-        model: the robot.
         full: [B, J] all joints.
         origins: [B, C, 3] of the carriers.
         linear: [B, C, 3, n] their Jacobians.
         angular: [B, C, 3, n]
-        config: weight and margin.
     """
     near = model.arm_collision.near(model.kinematics.link_poses(full).numpy(), config.self_margin)
     batch = torch.as_tensor(near.configuration)

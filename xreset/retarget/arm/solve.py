@@ -40,10 +40,8 @@ def track(
     """Arm joints along the hand's path.
 
     Args:
-        model: the robot.
         targets: hand root poses and hand joints.
         thresholds: of a valid frame; they decide between branches.
-        config: weights and effort.
         progress: called with the fraction that is done.
 
     Returns:
@@ -66,7 +64,6 @@ def _rescued(problem: ArmProblem, forwards: Paths, joints: Tensor, worth: Tensor
     """[S, T, n] better paths than ``joints`` [S, T, n], where there are any, of sequences with frames that fail.
 
     Args:
-        problem: of these sequences.
         forwards: their paths from the first frame.
         joints: the best of those.
         worth: [S] its worth.

@@ -66,7 +66,6 @@ def too_near(
     Links are told apart by one ball about each, then by one about each cluster of their balls, before those are looked at.
 
     Args:
-        model: the hand.
         bodies: its B configurations.
         objects: of the same frames.
         considered: [B] bool: other frames are left out.
@@ -134,8 +133,6 @@ def _near_balls(
     """Frames [A] and balls [A] of links [C] in frames [C] whose cluster is nearer to something than ``margin`` [m].
 
     Args:
-        model: the hand.
-        bodies: its configurations.
         frame: [C]
         group: [C] among the links with balls.
         distance: to it, of points [K, 3] in frames [K].

@@ -42,9 +42,7 @@ class HandModel:
         """Prepare the hand.
 
         Args:
-            robot: the robot.
             table: that the hand stays above; default: the project's.
-            device: of all tensors.
 
         Raises:
             RobotError: the description does not allow retargeting; the message says which entry is wrong.
@@ -125,7 +123,6 @@ class HandModel:
         """[A, n] how a point of a link moves along a direction: n . (v + w x r) = n . v + (r x n) . w.
 
         Args:
-            bodies: the hand.
             frame: [A]
             group: [A] the point's link, among the links with balls.
             point: [A, 3] in the world.

@@ -50,7 +50,6 @@ def retarget_hand(
     Args:
         model: the hand; its device does the work.
         targets: what to follow; a sequence must have at least one annotated frame.
-        config: weights.
         progress: called with the fraction of iterations that is done.
 
     Returns:

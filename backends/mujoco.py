@@ -40,7 +40,6 @@ class MujocoWorld(World):
     """
 
     def __init__(self, scene: SceneSpec, object_index: int, *, settings: MujocoSettings = _DEFAULTS) -> None:
-        """See :class:`World`."""
         if mujoco.get_mju_user_warning() is None:  # the default writes a log file into the current folder
             mujoco.set_mju_user_warning(lambda _: None)
         self._at: SceneModel = _compiled(_Same(scene), object_index, settings)
@@ -72,7 +71,6 @@ class MujocoWorld(World):
         self._ones = np.ones(len(data.qpos)), np.ones(len(data.qvel))
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """See :meth:`World.set_state`."""
         at, data = self._at, self._data
         mujoco.mj_resetData(self._model, data)
         self._overflowed, self._overflows = False, 0
@@ -91,7 +89,6 @@ class MujocoWorld(World):
         self._contacts_sensed = True  # resetting has made them zero
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """See :meth:`World.get_state`."""
         return {
             "joint_pos": self._qpos.take(self._at.joint_qpos),
             "joint_vel": self._qvel.take(self._at.joint_dof),
@@ -103,11 +100,9 @@ class MujocoWorld(World):
         }
 
     def set_joint_targets(self, targets: np.ndarray) -> None:
-        """See :meth:`World.set_joint_targets`."""
         self._ctrl[:] = targets
 
     def step(self, n: int) -> None:
-        """See :meth:`World.step`."""
         if self._ahead:
             mujoco.mj_step2(self._model, self._data)
             n -= 1
@@ -118,7 +113,6 @@ class MujocoWorld(World):
         self._overflowed = self._overflows > before
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """See :meth:`World.links`."""
         if not self._links_sensed:
             self._sense_contacts()  # while the engine's contacts are those of the last step
             self._begin_next_step()
@@ -126,7 +120,6 @@ class MujocoWorld(World):
         return self._links
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See :meth:`World.contacts`."""
         self._sense_contacts()
         tip_force = self._sum_by_tip @ self._geom_forces
         # A contact in which no force acts is no touch.
@@ -139,7 +132,6 @@ class MujocoWorld(World):
         return not finite, self._overflowed
 
     def mass_properties(self) -> list[Inertia]:
-        """See :meth:`World.mass_properties`."""
         m = self._model
         bodies = (*self._at.moving_bodies, self._at.object_body)
         return [Inertia(mass=m.body_mass[i], com=m.body_ipos[i], quat=m.body_iquat[i], moments=m.body_inertia[i]) for i in bodies]
@@ -157,23 +149,19 @@ class MujocoWorld(World):
         self._ahead = False
 
     def set_friction(self, friction: np.ndarray) -> None:
-        """See :meth:`World.set_friction`."""
         pairs = np.maximum((*friction, 0.0), MIN_FRICTION)
         self._model.geom_friction[:, 0] = pairs[self._at.friction_column]
         self._ahead = False
 
     def set_torsional_friction(self, torsional: float) -> None:
-        """See :meth:`World.set_torsional_friction`."""
         self._model.geom_friction[:, 1] = torsional
         self._ahead = False
 
     def set_object_gravity(self, fraction: float) -> None:
-        """See :meth:`World.set_object_gravity`."""
         self._model.body_gravcomp[self._at.object_body] = 1.0 - fraction
         self._ahead = False
 
     def set_drives(self, scale: np.ndarray) -> None:
-        """See :meth:`World.set_drives`."""
         model, nominal = self._model, self._at.model
         stiffness, damping, effort = scale
         model.actuator_gainprm[:, 0] = stiffness * nominal.actuator_gainprm[:, 0]
@@ -183,7 +171,6 @@ class MujocoWorld(World):
         self._ahead = False
 
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
-        """See :meth:`World.set_object_wrench`."""
         self._wrench[:3], self._wrench[3:] = force, torque
 
     def _begin_next_step(self) -> None:
@@ -212,7 +199,6 @@ class MujocoBackend(PoolBackend):
 
     @classmethod
     def engine_version(cls) -> str:
-        """See :meth:`Backend.engine_version`."""
         return mujoco.__version__
 
 

@@ -213,7 +213,6 @@ class PoolBackend(Backend):
         self._arrays["joint_target"][:] = self._checked("joint_target", targets, self.num_worlds)
 
     def step(self, substeps: int | None = None) -> None:
-        """See :meth:`Backend.step`."""
         substeps = self.scene.substeps if substeps is None else substeps
         if substeps < 1:
             raise ValueError(f"substeps is {substeps}, expected at least 1")
@@ -236,7 +235,6 @@ class PoolBackend(Backend):
         return self._health
 
     def mass_properties(self) -> MassProperties:
-        """See :meth:`Backend.mass_properties`."""
         if "mass_properties" not in self.capabilities:
             return super().mass_properties()
         self._command("mass_properties")

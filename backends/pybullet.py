@@ -117,7 +117,6 @@ class PybulletWorld(World):
         self._clean = p.saveState(physicsClientId=self._client)
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """See :meth:`World.set_state`."""
         if not is_finite(self.get_state()):
             self._rebuild()
         p, client = self._p, self._client
@@ -133,7 +132,6 @@ class PybulletWorld(World):
         self._fresh = True
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """See :meth:`World.get_state`."""
         p, client = self._p, self._client
         com, turn = p.getBasePositionAndOrientation(self._object.body, physicsClientId=client)
         linear, angular = (np.array(v) for v in p.getBaseVelocity(self._object.body, physicsClientId=client))
@@ -151,11 +149,9 @@ class PybulletWorld(World):
         }
 
     def set_joint_targets(self, targets: np.ndarray) -> None:
-        """See :meth:`World.set_joint_targets`."""
         self._drives.target = targets
 
     def step(self, n: int) -> None:
-        """See :meth:`World.step`."""
         p, client = self._p, self._client
         weight = np.array([0.0, 0.0, self._inertia.mass * (-GRAVITY * self.gravity_fraction - self._world_gravity)])
         force = (weight + self.force).tolist()
@@ -170,7 +166,6 @@ class PybulletWorld(World):
         self._fresh = False
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """See :meth:`World.links`."""
         states = self._p.getLinkStates(
             self._robot.body, self._frames.bodies, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=self._client
         )
@@ -218,7 +213,6 @@ class PybulletWorld(World):
             self._p.changeDynamics(self._object.body, -1, localInertiaDiagonal=inertia.moments, physicsClientId=self._client)
 
     def set_friction(self, friction: np.ndarray) -> None:
-        """See :meth:`World.set_friction`."""
         self._friction = friction
         tip, link, table = (float(mu) for mu in friction)
         self._set_surface(self._object, {None: 1.0}, torsional=0.0)
@@ -226,17 +220,14 @@ class PybulletWorld(World):
         self._set_surface(self._robot, {None: link} | dict.fromkeys(range(len(self._mechanism.robot.fingertips)), tip), self._torsional)
 
     def set_torsional_friction(self, torsional: float) -> None:
-        """See :meth:`World.set_torsional_friction`."""
         self._torsional = torsional
         self.set_friction(self._friction)
 
     def set_drives(self, scale: np.ndarray) -> None:
-        """See :meth:`World.set_drives`."""
         self._drive_scale = scale
         self._drives.scale(scale.astype(np.float64))
 
     def close(self) -> None:
-        """See :meth:`World.close`."""
         if self._client >= 0:
             self._p.disconnect(physicsClientId=self._client)
             self._client = -1
@@ -367,7 +358,6 @@ class PybulletBackend(PoolBackend):
 
     @classmethod
     def engine_version(cls) -> str:
-        """See :meth:`Backend.engine_version`."""
         _engine()
         return version("pybullet")
 

@@ -85,7 +85,6 @@ class SapienWorld(World):
         self._last_step: tuple[_Motion, np.ndarray, np.ndarray] | None = None
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """See :meth:`World.set_state`."""
         self._renew_scene()
         self._joints.reset(state["joint_pos"], state["joint_vel"], state["joint_target"])
         self._quat = np.array(state["object_quat"])
@@ -96,7 +95,6 @@ class SapienWorld(World):
         self._last_step = None
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """See :meth:`World.get_state`."""
         pose = self._object.entity_pose
         self._quat = nearer(pose.q.astype(np.float64), self._quat)
         omega = self._object.angular_velocity.astype(np.float64)
@@ -112,11 +110,9 @@ class SapienWorld(World):
         }
 
     def set_joint_targets(self, targets: np.ndarray) -> None:
-        """See :meth:`World.set_joint_targets`."""
         self._joints.set_targets(targets)
 
     def step(self, n: int) -> None:
-        """See :meth:`World.step`."""
         body = self._object
         force = self.force - np.array([0.0, 0.0, self._inertia.mass * GRAVITY * self.gravity_fraction])
         for remaining in reversed(range(n)):
@@ -128,7 +124,6 @@ class SapienWorld(World):
             self._system.step()
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """See :meth:`World.links`."""
         parts = []
         for body in self._tracked:
             pose = body.entity_pose
@@ -137,7 +132,6 @@ class SapienWorld(World):
         return self._frames.locate(rows[:, :3], rows[:, 3:7], rows[:, 7:10], rows[:, 10:])
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See :meth:`World.contacts`."""
         tips = len(self._mechanism.robot.fingertips)
         tip_force, tip_touch, table_force = np.zeros((tips, 3)), np.zeros(tips, dtype=bool), np.zeros(3)
         if self._last_step is None:
@@ -157,7 +151,6 @@ class SapienWorld(World):
         return tip_force, tip_touch, table_force
 
     def mass_properties(self) -> list[Inertia]:
-        """See :meth:`World.mass_properties`."""
         bodies = (*self._bodies[1:], self._object)
         frames = [body.cmass_local_pose for body in bodies]
         return [
@@ -166,26 +159,22 @@ class SapienWorld(World):
         ]
 
     def set_object_inertia(self, inertia: Inertia) -> None:
-        """See :meth:`World.set_object_inertia`."""
         self._inertia, self._arm = inertia, Arms(inertia.com[None])
         self._set_inertia(self._object, inertia)
 
     def set_friction(self, friction: np.ndarray) -> None:
-        """See :meth:`World.set_friction`."""
         self._pair_friction = dict(zip(("tip", "link", "table"), (float(mu) for mu in friction), strict=True))
         for role, mu in self._pair_friction.items():
             self._materials[role].static_friction = self._materials[role].dynamic_friction = 2.0 * mu
         self.set_torsional_friction(self._torsional)
 
     def set_torsional_friction(self, torsional: float) -> None:
-        """See :meth:`World.set_torsional_friction`."""
         self._torsional = torsional
         for shape, surface in self._surfaces.items():
             mu = self._pair_friction[surface.role]
             shape.min_patch_radius = torsional / mu if mu > 0 else 0.0
 
     def set_drives(self, scale: np.ndarray) -> None:
-        """See :meth:`World.set_drives`."""
         self._joints.set_drives(scale.astype(np.float64))
 
     # Building ----------------------------------------------------------------------------------------------------------------------------
@@ -341,7 +330,6 @@ class SapienBackend(PoolBackend):
 
     @classmethod
     def engine_version(cls) -> str:
-        """See :meth:`Backend.engine_version`."""
         _engine()
         return version("sapien")
 

@@ -175,22 +175,18 @@ class AlteredBackend(Backend):
         self._inner.set_joint_targets(self._late[0] if self._late else self._targets)
 
     def step(self, substeps: int | None = None) -> None:
-        """See :meth:`Backend.step`."""
         inner, outer = self._inner.scene.substeps, self.scene.substeps
         self._inner.step(None if substeps is None else max(1, round(substeps * inner / outer)))
 
     def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_object_mass`."""
         self._inner.set_object_mass(mass * self._alteration.mass, worlds)
 
     def set_friction(self, friction: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_friction`."""
         a = self._alteration
         factors = torch.tensor([a.tip_friction, a.link_friction, a.table_friction]).to(friction)
         self._inner.set_friction(friction * factors, worlds)
 
     def set_torsional_friction(self, torsional: Tensor, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_torsional_friction`."""
         self._inner.set_torsional_friction(torsional * self._alteration.torsional_friction, worlds)
 
     links, contacts, health, mass_properties, set_object_wrench, close = map(

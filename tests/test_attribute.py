@@ -261,7 +261,7 @@ def row(kind: str, name: str, *scores: float) -> Row:
 
 class OutcomeTest(unittest.TestCase):
     def found(self, *rows: Row) -> Attribution:
-        return Attribution(a="mujoco", b="sapien", measured_a=STATED, measured_b=replace(STATED, mass=0.8), rows=rows, skipped=())
+        return Attribution(a="mujoco", b="sapien", measured_a=STATED, measured_b=replace(STATED, mass=0.8), rows=rows, skipped={})
 
     def test_shares_of_the_gap(self):
         found = self.found(

@@ -26,7 +26,7 @@ from xreset.objects.decompose import Settings, as_solid, decompose, limited_hull
 from xreset.objects.meshes import DEFAULT_DENSITY, add_mesh, import_with_notes, mesh_files
 from xreset.objects.properties import Properties
 from xreset.objects.rest import rest_height, resting_orientation
-from xreset.objects.sampling import bounding_box, bounding_radius, keypoints, sample_surface, surface_points, winding_number
+from xreset.objects.sampling import bounding_box, keypoints, sample_surface, surface_points, winding_number
 from xreset.task.config import RandomizationConfig
 from xreset.task.randomization import own_friction
 
@@ -162,10 +162,6 @@ class Sampling(unittest.TestCase):
         for axis in np.eye(3):
             moved = Rotation.from_rotvec(np.pi * axis).apply(box - box.mean(axis=0)) + box.mean(axis=0)
             self.assertGreater(np.linalg.norm(moved - box, axis=1).max(), 0.05)
-
-    def test_bounding_radius(self):
-        obj = load_object("tuna")
-        self.assertAlmostEqual(bounding_radius(obj), np.linalg.norm(obj.vertices, axis=1).max())
 
 
 class Rest(unittest.TestCase):

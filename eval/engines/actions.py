@@ -85,17 +85,14 @@ class Actions:
         return begun[-1] if begun else ""
 
 
-def grasp_and_lift(
-    robot: RobotSpec, thing: ObjectSpec, grasps: Grasps, number: int = 0, *, scene: SceneSpec | None = None, motion: Motion | None = None
-) -> Actions:
+def grasp_and_lift(robot: RobotSpec, thing: ObjectSpec, grasps: Grasps, number: int = 0) -> Actions:
     """The open-loop try of a grasp: the hand, open around the object at rest, closes, lifts and shakes (:mod:`xreset.eval.engines`).
 
     Args:
         grasps: as :func:`xreset.eval.engines.grasps.find_grasps` finds them.
         number: which of them.
-        scene: timestep, substeps and friction; default: those of :class:`SceneSpec`.
     """
-    motion, scene = motion or Motion(), scene or SceneSpec(robot=robot, objects=(thing,))
+    motion, scene = Motion(), SceneSpec(robot=robot, objects=(thing,))
     chosen = slice(number, number + 1)
     dt = scene.control_dt
     episode = closing_episode(robot, grasps.joint_pos[chosen], grasps.object_pos[chosen], grasps.object_quat[chosen], dt, motion)

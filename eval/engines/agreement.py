@@ -40,11 +40,6 @@ class EngineParity:
     broken: int
     """Worlds that were not finite or dropped contacts, over all tries."""
 
-    @property
-    def ok(self) -> bool:
-        """Whether all targets are met."""
-        return all(metric.ok for metric in self.metrics)
-
     def as_dict(self) -> dict[str, Any]:
         """JSON-able content."""
         return {
@@ -69,11 +64,6 @@ class Parity:
     engines: tuple[EngineParity, ...]
     closing: Grasps
     hold: CommonStates
-
-    @property
-    def ok(self) -> bool:
-        """Whether every engine meets all targets."""
-        return all(tested.ok for tested in self.engines)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-able content."""

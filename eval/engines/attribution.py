@@ -15,7 +15,7 @@ import numpy as np
 
 from xreset.errors import XResetError
 from xreset.eval.engines.measure import Measured, measure
-from xreset.eval.engines.perturb import NO_CONTACT_DIAL, Alteration, altered_engine, contact_dial
+from xreset.eval.engines.perturb import Alteration, altered_engine, contact_dial, no_contact_dial
 from xreset.eval.engines.properties import PROPERTIES
 from xreset.eval.rollout import Episode, roll_out
 from xreset.eval.stats import bootstrap_ci95
@@ -50,14 +50,6 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Skipped:
-    """A property that was not tried."""
-
-    name: str
-    reason: str
-
-
-@dataclass(frozen=True, kw_only=True)
 class Attribution:
     """The outcome of :func:`attribute`."""
 
@@ -67,7 +59,8 @@ class Attribution:
     measured_b: Measured
     rows: tuple[Row, ...]
     """The first is A as it is, the last B."""
-    skipped: tuple[Skipped, ...]
+    skipped: dict[str, str]
+    """Property that was not tried -> why."""
 
     def difference(self, row: Row, score: str = "task_progress") -> tuple[float, tuple[float, float]]:
         """How much a run differs from A as it is: mean over the episodes, and its 95 % interval (whole demonstrations are drawn)."""
@@ -131,7 +124,7 @@ class Attribution:
                 for p in PROPERTIES
             ],
             "rows": [row(r) for r in self.rows],
-            "skipped": [asdict(s) for s in self.skipped],
+            "skipped": [{"name": name, "reason": reason} for name, reason in self.skipped.items()],
             "costs_most": None if found is None else found.name,
         }
 
@@ -179,11 +172,11 @@ def attribute(
         rollouts = roll_out(policy(), altered, trial, repetitions=episodes, only=sequences, progress=partial(progress, label))
         return Row(kind=kind, name=name, alteration=alteration, episodes=rollouts.episodes)
 
-    rows, skipped, everything = [run("as it is", a.name, a, Alteration())], [], Alteration()
-    changed = 0
+    rows, everything, changed = [run("as it is", a.name, a, Alteration())], Alteration(), 0
+    skipped: dict[str, str] = {}
     for p in PROPERTIES:
         if only and p.name not in only:
-            skipped.append(Skipped(name=p.name, reason="not asked for"))
+            skipped[p.name] = "not asked for"
             continue
         change = p.change(measured_a, measured_b, a.name, scene)
         if isinstance(change, Alteration):
@@ -191,29 +184,22 @@ def attribute(
             if not p.at_most:
                 everything, changed = everything.and_(change), changed + 1
             continue
-        skipped.append(Skipped(name=p.name, reason=change))
+        skipped[p.name] = change
         for usual in p.what_if if what_if else ():
-            if (reason := _no_dial(usual, a)) is None:
-                rows.append(run("what if", p.name, a, usual))
+            if usual.contact_time != 1.0 and contact_dial(a.name) is None:
+                skipped[f"{p.name}, what if"] = no_contact_dial(a.name)
             else:
-                skipped.append(Skipped(name=f"{p.name}, what if", reason=reason))
+                rows.append(run("what if", p.name, a, usual))
     if changed > 1:
         rows.append(run("all", f"all {changed} at once", a, _allowed(everything, a)))
     rows.append(run("other", b.name, b, Alteration()))
-    return Attribution(a=a.name, b=b.name, measured_a=measured_a, measured_b=measured_b, rows=tuple(rows), skipped=tuple(skipped))
+    return Attribution(a=a.name, b=b.name, measured_a=measured_a, measured_b=measured_b, rows=tuple(rows), skipped=skipped)
 
 
 def _allowed(alteration: Alteration, engine: Engine) -> Alteration:
     """Changes that each fit may together ask for stiffer contacts than the engine allows: then as stiff as it does."""
     dial = contact_dial(engine.name)
     return alteration if dial is None else replace(alteration, contact_time=max(alteration.contact_time, dial.smallest))
-
-
-def _no_dial(alteration: Alteration, engine: Engine) -> str | None:
-    """Why an engine cannot be changed like this; None if it can."""
-    if alteration.contact_time == 1.0 or contact_dial(engine.name) is not None:
-        return None
-    return f"not changeable in {engine.name}: {NO_CONTACT_DIAL.get(engine.name, 'no dial of its contacts is known')}"
 
 
 def _round(value: float) -> float:

@@ -42,10 +42,10 @@ def rich_table(found: Attribution, title: str) -> Table:
 
 def not_tried(found: Attribution) -> Iterator[str]:
     """A line for each property that was not changed towards B: its value in both, and why not."""
-    for s in found.skipped:
-        p = _BY_NAME.get(s.name)
+    for name, reason in found.skipped.items():
+        p = _BY_NAME.get(name)
         values = "" if p is None else f" ({_value(p, found.measured_a)} in {found.a}, {_value(p, found.measured_b)} in {found.b})"
-        yield f"not tried: {s.name}{values}: {s.reason}"
+        yield f"not tried: {name}{values}: {reason}"
 
 
 def verdict(found: Attribution) -> str:

@@ -82,25 +82,22 @@ class Differences:
     """[T, E] bool"""
 
 
-def differences(
-    found: Recording, reference: Recording, dt: float, thresholds: Thresholds, *, world: int = 0, reference_world: int = 0
-) -> Differences:
-    """Compare a world of a recording with one of the reference's.
+def differences(found: Recording, reference: Recording, dt: float, thresholds: Thresholds, *, world: int = 0) -> Differences:
+    """Compare a world of a recording with the first one of the reference's.
 
     Args:
         reference: the reference's, of the same length.
         dt: control step [s].
         thresholds: of touch, and the window of the forces.
         world: of ``found``.
-        reference_world: of ``reference``.
     """
     force, other_force = (
         _averaged(recording.tip_force[:, i].norm(dim=-1).double().numpy(), max(1, round(thresholds.window / dt)))
-        for recording, i in ((found, world), (reference, reference_world))
+        for recording, i in ((found, world), (reference, 0))
     )
-    joint = (found.joint_pos[:, world] - reference.joint_pos[:, reference_world]).abs().double().numpy()
-    position = (found.object_pos[:, world] - reference.object_pos[:, reference_world]).double().norm(dim=-1).numpy()
-    angle = quat_angle(found.object_quat[:, world].double(), reference.object_quat[:, reference_world].double()).numpy()
+    joint = (found.joint_pos[:, world] - reference.joint_pos[:, 0]).abs().double().numpy()
+    position = (found.object_pos[:, world] - reference.object_pos[:, 0]).double().norm(dim=-1).numpy()
+    angle = quat_angle(found.object_quat[:, world].double(), reference.object_quat[:, 0].double()).numpy()
     broken = np.flatnonzero(~np.isfinite(np.column_stack((joint, position, angle, force, other_force))).all(axis=1))
     steps = int(broken[0]) if len(broken) else len(joint)
     return Differences(

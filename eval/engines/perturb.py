@@ -29,11 +29,15 @@ class ContactDial:
     """Why it does not allow less."""
 
 
-NO_CONTACT_DIAL = {
+_NO_CONTACT_DIAL = {
     "pybullet": "Bullet's sequential impulses have no stiffness: how much a contact gives follows from its iterations and steps",
     "sapien": "PhysX's contacts are rigid: how much one gives follows from its solver's iterations",
 }
-"""Why an engine has no dial for contacts."""
+
+
+def no_contact_dial(backend: str) -> str:
+    """Why a backend has no dial for contacts."""
+    return f"not changeable in {backend}: {_NO_CONTACT_DIAL.get(backend, 'no dial of its contacts is known')}"
 
 
 def contact_dial(backend: str) -> ContactDial | None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 
 from xreset.eval.engines.measure import Measured
-from xreset.eval.engines.perturb import NO_CONTACT_DIAL, Alteration, contact_dial
+from xreset.eval.engines.perturb import Alteration, contact_dial, no_contact_dial
 from xreset.spec import SceneSpec
 
 Change = Alteration | str
@@ -75,8 +75,7 @@ def _contact_give(a: float, b: float, engine: str, scene: SceneSpec) -> Change:
     """
     dial = contact_dial(engine)
     if dial is None:
-        reason = NO_CONTACT_DIAL.get(engine, "no dial of its contacts is known")
-        return f"not changeable in {engine}: {reason}"
+        return no_contact_dial(engine)
     factor = math.sqrt(max(b, 0.0) / a) if a > 0 else math.inf
     if factor < dial.smallest:
         return f"not changeable in {engine} towards stiffer: {dial.limit}"

@@ -31,19 +31,14 @@ SCHEMA = {
 }
 
 
-def cached_pieces(
-    mesh: trimesh.Trimesh,
-    source: str,
-    settings: Settings = Settings(),  # noqa: B008 (frozen)
-    progress: Progress = lambda parts, worst: None,
-) -> Pieces:
+def cached_pieces(mesh: trimesh.Trimesh, source: str, progress: Progress) -> Pieces:
     """The pieces of a mesh, from the cache if they are there. Those of a decomposition that was cut short are not kept.
 
     Args:
         source: SHA-256 of what it was read from.
-        settings: how to decompose it.
         progress: see :func:`xreset.objects.decompose.decompose`.
     """
+    settings = Settings()
     config = asdict(settings)
     key = hashlib.sha256(json.dumps([SCHEMA_NAME, source, config], sort_keys=True).encode()).hexdigest()
     path = cache_folder() / "objects" / f"{key}.npz"

@@ -52,13 +52,12 @@ def canonical_name(name: str, known: Iterable[str] = STAND_INS) -> str:
     raise ObjectError(f"there is no object {name!r}; there are {listing}.")
 
 
-def load_object(name: str, folder: Path | None = None, *, mass: float | None = None) -> ObjectSpec:
+def load_object(name: str, folder: Path | None = None) -> ObjectSpec:
     """An object by any of its names.
 
     Args:
         name: official name, name without number, or the paper's name.
         folder: folder of real meshes (``NAME.obj``, ``NAME/textured_simple.obj`` or ``NAME/textured.obj``); None for the stand-in.
-        mass: mass [kg] of a mesh that is none of the built-in objects; None: by density.
 
     Raises:
         ObjectError: unknown object, or no usable mesh of it in the folder.
@@ -70,7 +69,7 @@ def load_object(name: str, folder: Path | None = None, *, mass: float | None = N
         full = canonical_name(name, files)
     except ObjectError as error:
         raise ObjectError(f"{error} (looked for meshes in {folder}; without that folder the built-in stand-ins are used)") from None
-    return import_mesh(files[full], full, mass=mass)
+    return import_mesh(files[full], full)
 
 
 def load_objects(names: Iterable[str], folder: Path | None = None) -> tuple[ObjectSpec, ...]:

@@ -66,9 +66,9 @@ def mesh_files(folder: str | Path) -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
-def import_mesh(path: str | Path, name: str, *, mass: float | None = None) -> ObjectSpec:
+def import_mesh(path: str | Path, name: str) -> ObjectSpec:
     """The object of a mesh file; see :func:`import_with_notes`. What was assumed is logged as a warning."""
-    result = import_with_notes(path, name, mass=mass)
+    result = import_with_notes(path, name)
     for note in result.notes:
         _log.warning("%s: %s", name, note)
     return result.obj
@@ -93,7 +93,7 @@ def import_with_notes(path: str | Path, name: str, *, mass: float | None = None,
     path = Path(path)
     mesh, own = read_mesh(path), properties_of(path)
     source = file_hash(path)
-    pieces = cached_pieces(mesh, source, progress=progress)
+    pieces = cached_pieces(mesh, source, progress)
     notes = []
     if not mesh.is_volume:
         if len(pieces.shapes) == 1:

@@ -80,8 +80,3 @@ def keypoints(obj: ObjectSpec) -> np.ndarray:
     corners = np.array(bounding_box(obj))
     pick = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]])
     return corners[pick, np.arange(3)]
-
-
-def bounding_radius(obj: ObjectSpec) -> float:
-    """Radius of the sphere about the mesh frame's origin that encloses the object [m]."""
-    return float(np.linalg.norm(obj.vertices, axis=1).max())

@@ -10,19 +10,18 @@ import numpy as np
 from xreset.geometry.shapes import shape_mesh
 from xreset.pictures.meshes import OBJECT_COLOR
 from xreset.pictures.raster import Camera, draw_bodies
-from xreset.pictures.view.sheet import font, written
+from xreset.pictures.view.sheet import TILE_SIZE, font, written
 from xreset.spec import ObjectSpec
 
 _CAPTION = 26
 """Height of a line under a picture [pixels]."""
 
 
-def draw_pieces(objects: Sequence[ObjectSpec], captions: Sequence[str], *, size: tuple[int, int] = (420, 360)) -> np.ndarray:
+def draw_pieces(objects: Sequence[ObjectSpec], captions: Sequence[str]) -> np.ndarray:
     """A row for each object: its mesh, and its convex pieces in colours of their own, both from above the front.
 
     Args:
         captions: a line under each.
-        size: width and height of each picture [pixels].
 
     Returns:
         [H, W, 3] uint8.
@@ -40,7 +39,7 @@ def draw_pieces(objects: Sequence[ObjectSpec], captions: Sequence[str], *, size:
         pieces = [shape_mesh(piece) for piece in obj.pieces]
         hues = [colorsys.hsv_to_rgb(0.618 * i % 1, 0.55, 0.95) for i in range(len(pieces))]
         sides = [([(obj.vertices, obj.faces)], [OBJECT_COLOR]), ([(mesh.vertices, mesh.faces) for mesh in pieces], hues)]
-        picture = np.concatenate([draw_bodies(meshes, colors, camera, size) for meshes, colors in sides], axis=1)
+        picture = np.concatenate([draw_bodies(meshes, colors, camera, TILE_SIZE) for meshes, colors in sides], axis=1)
         rows.append(np.concatenate((picture, np.full((_CAPTION, picture.shape[1], 3), 255, np.uint8))))
-    lines = [(6, i * (size[1] + _CAPTION) + size[1], (caption,)) for i, caption in enumerate(captions)]
+    lines = [(6, i * (TILE_SIZE[1] + _CAPTION) + TILE_SIZE[1], (caption,)) for i, caption in enumerate(captions)]
     return written(np.concatenate(rows), face, lines)

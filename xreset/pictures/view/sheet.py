@@ -13,6 +13,8 @@ from xreset.pictures.view.data import View
 from xreset.pictures.view.picture import Drawer
 
 MOMENTS = ("first contact", "mid-lift", "goal")
+TILE_SIZE = (420, 360)
+"""Width and height of a tile's picture [pixels]."""
 _LINE = 16
 """[pixels] height of a line of a caption."""
 
@@ -68,20 +70,11 @@ def reason_tiles(view: View) -> list[Tile]:
     return tiles
 
 
-def draw_sheet(
-    view: View,
-    tiles: Sequence[Tile],
-    *,
-    columns: int = 3,
-    size: tuple[int, int] = (420, 360),
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> np.ndarray:
+def draw_sheet(view: View, tiles: Sequence[Tile], *, progress: Callable[[int, int], None] = lambda done, total: None) -> np.ndarray:
     """Draw tiles beside and below one another, each near to hand and object, captions under them.
 
     Args:
         view: what the tiles' rows refer to.
-        columns: tiles beside one another.
-        size: width and height of a tile's picture [pixels].
         progress: called with (tiles drawn, tiles in all).
 
     Returns:
@@ -91,8 +84,8 @@ def draw_sheet(
         XResetError: Pillow, which writes the captions, is not installed.
     """
     face = font()
-    drawer = Drawer(view, size=size, smooth=True)
-    width, height = size
+    drawer = Drawer(view, size=TILE_SIZE, smooth=True)
+    columns, (width, height) = 3, TILE_SIZE
     full = height + _LINE * max((len(tile.caption) for tile in tiles), default=0) + _LINE // 2
     sheet = np.full((-(-len(tiles) // columns) * full, columns * width, 3), 255, dtype=np.uint8)
     for i, tile in enumerate(tiles):

@@ -141,11 +141,9 @@ class BankStep(Step):
     robot: str
 
     def done(self) -> bool:
-        """See base class."""
         return (self.writes / "resets.npz").is_file()
 
     def commands(self) -> list[list[str]]:
-        """See base class."""
         retargeted, data = self.writes / "retargeted.npz", self.subset.data
         retarget = [*_XRESET, "retarget", str(self.subset.demos), "--robot", self.robot, "--out", str(retargeted)]
         resets = [*_XRESET, "resets", str(retargeted), "--out", str(self.writes / "resets.npz")]
@@ -162,14 +160,12 @@ class TrainStep(Step):
     run: Run
 
     def done(self) -> bool:
-        """See base class."""
         run = self.run
         assert run.config is not None
         now = run.trained()
         return now.iteration >= run.config.iterations or (run.runs.minutes is not None and now.minutes >= _ENOUGH * run.runs.minutes)
 
     def commands(self) -> list[list[str]]:
-        """See base class."""
         run, spec = self.run, self.run.runs
         assert run.config is not None
         command = [*_XRESET, "train", "--out", str(run.folder), "--iterations", str(run.config.iterations)]
@@ -246,11 +242,9 @@ class EvalStep(Step):
         return [e for e, result in found.items() if result is None or result.inputs.get("policy") != digest]
 
     def done(self) -> bool:
-        """See base class."""
         return not self.missing()
 
     def commands(self) -> list[list[str]]:
-        """See base class."""
         run, e = self.run, self.evaluation
         policy = run.folder / "policy.onnx" if run.begun and not checkpoints(run.folder) else run.folder
         command = [*_XRESET, "eval", *([run.runs.policy, "--robot", run.runs.robot] if run.runs.policy else [str(policy)])]

@@ -10,8 +10,7 @@ import modules (``from xreset.eval import trial``, then ``trial.engine(...)``), 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.abc import Loader
 from importlib.machinery import ModuleSpec, PathFinder
@@ -106,8 +105,11 @@ def _run(group: str, commands: dict[str, str], argv: list[str]) -> None:
     if name not in commands:
         print(f"xreset{group}: there is no command {name!r}.\n\n{_usage(group, commands)}", file=sys.stderr)
         raise SystemExit(2)
-    with _lazily():
+    sys.meta_path.insert(0, _Lazily)
+    try:
         module = import_module(f"xreset.cli{group.replace(' ', '.')}.{name}")
+    finally:
+        sys.meta_path.remove(_Lazily)
     if hasattr(module, "COMMANDS"):
         _run(f"{group} {name}", module.COMMANDS, arguments)
         return
@@ -144,37 +146,26 @@ class _LazyModule(ModuleType):
         return getattr(self, name)
 
 
-class _LazyLoader(Loader):
+class _Lazily(Loader):
+    """Finds xreset's modules, but for the commands' own, as lazy ones."""
+
     def __init__(self, loader: Loader) -> None:
         self.loader = loader
+
+    @classmethod
+    def find_spec(cls, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
+        if not name.startswith("xreset.") or name.startswith("xreset.cli"):
+            return None
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is not None and spec.loader is not None:
+            spec.loader = cls(spec.loader)
+        return spec
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         return _LazyModule(spec.name)
 
     def exec_module(self, module: ModuleType) -> None:
         pass
-
-
-class _LazyFinder:
-    """Finds xreset's modules, but for the commands' own, as lazy ones."""
-
-    @staticmethod
-    def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        if not name.startswith("xreset.") or name.startswith("xreset.cli"):
-            return None
-        spec = PathFinder.find_spec(name, path, target)
-        if spec is not None and spec.loader is not None:
-            spec.loader = _LazyLoader(spec.loader)
-        return spec
-
-
-@contextmanager
-def _lazily() -> Iterator[None]:
-    sys.meta_path.insert(0, _LazyFinder)
-    try:
-        yield
-    finally:
-        sys.meta_path.remove(_LazyFinder)
 
 
 def _usage(group: str, commands: dict[str, str]) -> str:

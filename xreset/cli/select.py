@@ -10,7 +10,6 @@ import tyro
 from rich.table import Table
 
 from xreset.cli._terminal import Console
-from xreset.errors import XResetError
 from xreset.eval import select as selection
 from xreset.eval import trial
 from xreset.eval.setting import Setting
@@ -40,9 +39,6 @@ def select(
         setting: Robot, meshes, device and worlds; --seed is not used, see --starts.
         starts: Seed of the starts that decide; default: one that no evaluation uses unless it is told to.
     """
-    for name, value in (("most", most), ("episodes", episodes)):
-        if value < 1:
-            raise XResetError(f"--{name} is {value}, expected 1 or more.")
     engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco", "pybullet", "sapien"))]
     console = Console()
 

@@ -197,11 +197,16 @@ def _bank(
 ) -> ResetBank:
     retargeted = dense.retargeted
     sequence = retargeted.sequence_of_frame[frames]
-    local = dense.frame[frames] - original.frame_offsets[sequence]
-    part = dense.part[frames].astype(np.float32) if dense.part.any() else None
-    post = retargeted.post_contact[frames]
     keep, reject = reason < 0, reason >= 0
     rows, f32 = frames[keep], np.float32
+    of_both = {
+        "sequence_index": sequence.astype(np.int32),
+        "frame_index": (dense.frame[frames] - original.frame_offsets[sequence]).astype(np.int32),
+        "post_contact": retargeted.post_contact[frames],
+        "finger_gap": gap.astype(f32),
+    }
+    if dense.part.any():
+        of_both["frame_part"] = dense.part[frames].astype(f32)
     return replace(
         starts_and_goals(retargeted, robot, {o.name: o.source for o in objects}),
         backends=backends,
@@ -209,17 +214,9 @@ def _bank(
         object_pos=retargeted.object_pos[rows].astype(f32),
         object_quat_wxyz=retargeted.object_quat_wxyz[rows].astype(f32),
         object_name=np.asarray(retargeted.object_name)[sequence[keep]],
-        sequence_index=sequence[keep].astype(np.int32),
-        frame_index=local[keep].astype(np.int32),
-        post_contact=post[keep],
-        rejected_sequence_index=sequence[reject].astype(np.int32),
-        rejected_frame_index=local[reject].astype(np.int32),
-        rejected_post_contact=post[reject],
         rejected_reason=reason[reject].astype(np.int32),
         reason_names=REASONS,
         joint_target=None if target is None else target[keep],
-        frame_part=None if part is None else part[keep],
-        rejected_frame_part=None if part is None else part[reject],
-        finger_gap=gap[keep].astype(f32),
-        rejected_finger_gap=gap[reject].astype(f32),
+        **{name: values[keep] for name, values in of_both.items()},
+        **{f"rejected_{name}": values[reject] for name, values in of_both.items()},
     )

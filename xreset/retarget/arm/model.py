@@ -66,10 +66,10 @@ class Lowest(Tensors):
 class ArmModel:
     """A robot as its arm's inverse kinematics sees it."""
 
-    def __init__(self, robot: RobotSpec, table: TableSpec | None = None) -> None:
+    def __init__(self, robot: RobotSpec) -> None:
         """Raises ``RobotError`` if a joint of the arm lies behind the hand root, and ``XResetError`` if coal is missing."""
         self.robot = robot
-        self.table = table or TableSpec()
+        self.table = TableSpec()
         self.kinematics = Kinematics(robot)
         self.arm = torch.as_tensor(robot.arm_indices)
         """[n] indices of the arm's joints."""

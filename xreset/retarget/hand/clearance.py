@@ -20,7 +20,7 @@ from xreset.tensors import Tensors
 
 
 @dataclass(frozen=True, kw_only=True)
-class Distances:
+class Distances(Tensors):
     """Signed distances and how they change with the variables."""
 
     frame: Tensor
@@ -29,6 +29,8 @@ class Distances:
     """[A] less what is allowed [m]."""
     slope: Tensor
     """[A, n] derivative."""
+    number: Tensor
+    """[A] place among those of its frame: the order of a sum shows in its last digits."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,25 +82,13 @@ def too_near(
     )
     if not found:
         none = bounds.new_zeros(0, len(model.home) + 6)
-        return Distances(frame=torch.zeros(0, dtype=torch.long, device=none.device), value=none[:, 0], slope=none)
-    together = _Found.cat(found)
+        return Distances(frame=none[:, 0].long(), value=none[:, 0], slope=none, number=none[:, 0].long())
+    together = Distances.cat(found)
     order = together.number.argsort(stable=True)
-    order = order[together.frame[order].argsort(stable=True)]
-    return Distances(frame=together.frame[order], value=together.value[order], slope=together.slope[order])
+    return together[order[together.frame[order].argsort(stable=True)]]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Found(Tensors):
-    """As :class:`Distances`, in any order."""
-
-    frame: Tensor
-    value: Tensor
-    slope: Tensor
-    number: Tensor
-    """[A] place among those of its frame: the order of a sum shows in its last digits."""
-
-
-def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Iterator[_Found]:
+def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Iterator[Distances]:
     candidate, group = ((bounds[..., 2] < model.balls.bound_radii) & considered[:, None]).nonzero(as_tuple=True)
     for frame, ball in _near_balls(model, bodies, candidate, group, lambda centers, _: centers[:, 2], 0.0):
         centers = model.ball_centers(bodies, frame, ball)
@@ -106,12 +96,12 @@ def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: T
         low = value < 0
         up = torch.tensor([0.0, 0.0, 1.0], dtype=centers.dtype, device=centers.device).expand(int(low.sum()), 3)
         slope = model.point_slope(bodies, frame[low], model.balls.link[ball[low]], centers[low], up)
-        yield _Found(frame=frame[low], value=value[low], slope=slope, number=ball[low])
+        yield Distances(frame=frame[low], value=value[low], slope=slope, number=ball[low])
 
 
 def _in_object(
     model: HandModel, bodies: Bodies, bounds: Tensor, objects: Objects, considered: Tensor, object_clearance: float
-) -> Iterator[_Found]:
+) -> Iterator[Distances]:
     every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
     beside = objects.fields.beside(objects.local(bounds, every), objects.index[every])
     candidate, group = ((beside < model.balls.bound_radii + object_clearance) & considered[:, None]).nonzero(as_tuple=True)
@@ -124,7 +114,7 @@ def _in_object(
         value = distance - model.balls.radii[ball] - object_clearance
         near = value < 0
         slope = model.point_slope(bodies, frame[near], model.balls.link[ball[near]], centers[near], direction[near])
-        yield _Found(frame=frame[near], value=value[near], slope=slope, number=len(model.balls.radii) + ball[near])
+        yield Distances(frame=frame[near], value=value[near], slope=slope, number=len(model.balls.radii) + ball[near])
 
 
 def _near_balls(
@@ -147,7 +137,7 @@ def _near_balls(
             yield row[near][within], ball
 
 
-def _in_each_other(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor, self_depth: float) -> Iterator[_Found]:
+def _in_each_other(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor, self_depth: float) -> Iterator[Distances]:
     balls, fields, clusters = model.balls, model.balls.fields, model.balls.guard_clusters
     a, b = balls.link_pairs.unbind(1)
     first, second, reach = model.group_body[a], model.group_body[b], balls.bound_radii + STAND_IN - self_depth
@@ -183,4 +173,4 @@ def _in_each_other(model: HandModel, bodies: Bodies, bounds: Tensor, considered:
             slope = model.point_slope(bodies, frame, balls.link[ball], centers, direction)
             slope = slope - model.point_slope(bodies, frame, solid, centers, direction)
             number = 2 * len(balls.radii) + pair[owner] * len(balls.guards) + guard
-            yield _Found(frame=frame, value=value[deep], slope=slope, number=number)
+            yield Distances(frame=frame, value=value[deep], slope=slope, number=number)

@@ -38,11 +38,8 @@ class Bodies:
 class HandModel:
     """A robot's hand as a floating tree, and which of its links follow which human keypoints."""
 
-    def __init__(self, robot: RobotSpec, table: TableSpec | None = None, *, device: torch.device | str = "cpu") -> None:
+    def __init__(self, robot: RobotSpec, *, device: torch.device | str = "cpu") -> None:
         """Prepare the hand.
-
-        Args:
-            table: that the hand stays above; default: the project's.
 
         Raises:
             RobotError: the description does not allow retargeting; the message says which entry is wrong.
@@ -80,7 +77,7 @@ class HandModel:
         upright = self.home.new_tensor([1.0, 0.0, 0.0, 0.0])
         self.at_home = self.keypoints(self.kinematics.clamp(self.home), self.home.new_zeros(3), upright)
         """[P, 3] keypoints at home, in the root's frame."""
-        self.table = table or TableSpec()
+        self.table = TableSpec()
 
         on_cpu = self.kinematics if self.device.type == "cpu" else Kinematics(robot, root=robot.hand_root)  # as coal wants it
         collision = SelfCollision(robot, on_cpu, only=robot.self_collision_links)

@@ -83,7 +83,7 @@ class Parity:
             "floor": self.floor.as_dict(),
             "engines": [tested.as_dict() for tested in self.engines],
             "grasps": {"closing": described(self.closing), "hold": described(self.hold)},
-            "ok": self.ok,
+            "ok": all(metric.ok for tested in self.engines for metric in tested.metrics),
         }
 
 

@@ -558,13 +558,14 @@ class Plausible(unittest.TestCase):
     """What another convention would explain is said; what is right, is not doubted."""
 
     def test_other_conventions(self):
-        from xreset.demos.plausible import _MANO, doubts
+        from xreset.demos.keypoints import ORDERS
+        from xreset.demos.plausible import doubts
 
         for side in ("right", "left"):
             demos = synthesize(["soup"], 1, side=side)
             self.assertEqual(doubts(demos), [])
             mano = np.empty_like(demos.hand_keypoints)
-            mano[:, [0, *(i for chain in _MANO for i in chain[1:])]] = demos.hand_keypoints
+            mano[:, ORDERS["mano"]] = demos.hand_keypoints
             high, end = demos.object_pos + np.float32([0, 0, 0.9]), demos.object_pos.copy()
             end[-1], turn = end[0], demos.object_quat_wxyz.copy()
             turn[-1] = turn[0]

@@ -58,7 +58,7 @@ def read_dexycb(
     *,
     objects: Iterable[str] | None = None,
     sides: Iterable[str] = SIDES,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> Demos:
     """Read all sequences below a DexYCB folder, through to the table frame.
 
@@ -87,8 +87,7 @@ def read_dexycb(
     calibrations: dict[str, Mapping[str, np.ndarray]] = {}
     parts = []
     for done, sequence in enumerate(chosen):
-        if progress is not None:
-            progress(done, len(chosen), sequence.name)
+        progress(done, len(chosen), sequence.name)
         if sequence.extrinsics not in calibrations:
             calibrations[sequence.extrinsics] = _extrinsics(root, sequence.extrinsics)
         parts.append(_read(sequence, calibrations[sequence.extrinsics]))

@@ -279,12 +279,9 @@ def _hand_over(contacts: Contacts, lean: float, side: str) -> np.ndarray:
     return hand.hand_axes(np.cos(lean) * a - np.sin(lean) * c, np.sin(lean) * a + np.cos(lean) * c, side)
 
 
-_PARENTS = np.array([0 if k % 4 == 1 else k - 1 for k in range(1, 21)])
-
-
 def _flesh(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points that stand for the hand's flesh [n, 40, 3], joints and middles of bones, and their radii [40]."""
-    middles = (points[:, 1:] + points[:, _PARENTS]) / 2
+    middles = (points[:, 1:] + points[:, hand.PARENTS]) / 2
     radius = np.full(40, 0.007)
     radius[np.array(TIPS) - 1] = 0.001
     return np.concatenate((points[:, 1:], middles), axis=1), radius

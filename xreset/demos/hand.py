@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+PARENTS = np.array([0 if k % 4 == 1 else k - 1 for k in range(1, 21)])
+"""[20] the keypoint before each of those beyond the wrist: with it, it makes a bone."""
 FINGER_BASES = np.array([[-90, -4, 22], [-95, -2, 0], [-87, -4, -21], [-77, -9, -40]]) * 1e-3
 """[4, 3] the knuckles of index, middle, ring and little finger [m]."""
 FINGER_LENGTHS = np.array([[38, 23, 23], [42, 26, 24], [38, 25, 24], [29, 19, 21]]) * 1e-3
@@ -61,3 +63,8 @@ def hand_axes(direction: np.ndarray, palm: np.ndarray, side: str = "right") -> n
     """[3, 3] orientation of a hand whose fingers point along ``direction`` and whose palm faces ``palm`` (orthogonal unit vectors)."""
     x = -direction if side == "right" else direction
     return np.stack((x, -palm, np.cross(x, -palm)), axis=-1)
+
+
+def bone_lengths(points: np.ndarray) -> np.ndarray:
+    """[F, 20] lengths of the bones between keypoints [F, 21, 3]."""
+    return np.linalg.norm(points[:, 1:] - points[:, PARENTS], axis=-1)

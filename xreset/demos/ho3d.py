@@ -26,7 +26,9 @@ _FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 """To the axes of :class:`xreset.demos.Convention`'s cameras: x right, y down, z where it looks."""
 
 
-def read_ho3d(root: str | Path, *, fps: float, cameras: str | Path, progress: Callable[[int, int, str], None] | None = None) -> Demos:
+def read_ho3d(
+    root: str | Path, *, fps: float, cameras: str | Path, progress: Callable[[int, int, str], None] = lambda done, total, name: None
+) -> Demos:
     """Read the training sequences below an HO-3D folder whose camera's place is known.
 
     Args:
@@ -49,8 +51,7 @@ def read_ho3d(root: str | Path, *, fps: float, cameras: str | Path, progress: Ca
         raise DemoError(f"{cameras} says of no sequence where its camera stands; expected {next(iter(folders))}.txt, or a file for all.")
     parts = []
     for done, (name, place) in enumerate(poses.items()):
-        if progress is not None:
-            progress(done, len(poses), name)
+        progress(done, len(poses), name)
         convention = Convention(order="mano", units="m", frame="camera", table_from_camera=read_transform(place), fps=fps, side="right")
         parts.append(_sequence(folders[name], name, convention))
     return concatenate(parts)

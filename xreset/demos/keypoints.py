@@ -38,7 +38,6 @@ ORDERS: Mapping[Order, tuple[int, ...]] = {
 """Where each of :data:`xreset.spec.KEYPOINTS` stands in the order of others. MANO: the 16 joints of the model (wrist, index, middle,
 little, ring, thumb, base to end), then the tips of thumb, index, middle, ring and little finger (Romero et al. 2017; HO3D's order too)."""
 
-_PARENTS = np.array([0 if k % 4 == 1 else k - 1 for k in range(1, 21)])
 _KNUCKLES = np.array([0, 5, 9, 13, 17])
 _PALM = (0.06, 0.14)
 """[m] Range of distances from the wrist to the middle finger's knuckle: 0.09 to 0.10 in DexYCB, with room for children and for trackers."""
@@ -109,7 +108,10 @@ _MATRIX_BYTES = 1 << 16
 
 
 def read_keypoints(
-    path: str | Path, convention: Convention | None = None, *, progress: Callable[[int, int, str], None] | None = None
+    path: str | Path,
+    convention: Convention | None = None,
+    *,
+    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> Demos:
     """Read a tracker's sequences: an npz (one sequence), a CSV (one, or several with a column ``sequence``), or a folder of them.
 
@@ -135,8 +137,7 @@ def read_keypoints(
         files, names = [path], [path.stem]
     parts = []
     for done, (file, name) in enumerate(zip(files, names, strict=True)):
-        if progress is not None:
-            progress(done, len(files), name)
+        progress(done, len(files), name)
         sequences = _read_csv(file, name) if file.suffix == ".csv" else [_read_npz(file, name)]
         parts += [sequence_of(arrays, f"{file}, sequence {arrays['sequence']}", convention) for arrays in sequences]
     return concatenate(parts)
@@ -328,7 +329,7 @@ def _check_hand(points: np.ndarray, what: str, convention: Convention, side: str
             f"{what}: from the wrist to the middle finger's knuckle it is {1e3 * palm:.3g} mm; no hand measures other than"
             f" {1e3 * _PALM[0]:.0f} to {1e3 * _PALM[1]:.0f} mm.{fits} Keypoints must be metric and in space, not those of an image."
         )
-    sums = {order: float(np.median(_bones(points[:, ORDERS[order]]).sum(axis=1))) for order in ORDERS}
+    sums = {order: float(np.median(hand.bone_lengths(points[:, ORDERS[order]]).sum(axis=1))) for order in ORDERS}
     best = min(sums, key=lambda order: sums[order])
     if sums[convention.order] > _ORDER_RATIO * sums[best]:
         raise DemoError(
@@ -336,7 +337,7 @@ def _check_hand(points: np.ndarray, what: str, convention: Convention, side: str
             f" {best} {sums[best]:.2f} m. Say --order {best}."
         )
     ordered = points[:, ORDERS[convention.order]]
-    lengths = _bones(ordered)
+    lengths = hand.bone_lengths(ordered)
     spread = float(np.median(lengths.std(axis=0) / lengths.mean(axis=0)))
     if spread > _BONE_SPREAD:
         raise DemoError(
@@ -357,11 +358,6 @@ def _check_hand(points: np.ndarray, what: str, convention: Convention, side: str
             f"{what}: as a {side} hand its fingers bend {-1e3 * curl:.0f} mm towards the back of the hand. It is the other hand (--side)"
             " or the coordinates are left-handed, as Unity's are: negate one axis of keypoints and poses."
         )
-
-
-def _bones(points: np.ndarray) -> np.ndarray:
-    """[F, 20] lengths of the bones of keypoints [F, 21, 3] in this project's order."""
-    return np.linalg.norm(points[:, 1:] - points[:, _PARENTS], axis=-1)
 
 
 def _object(arrays: Mapping[str, np.ndarray], what: str, convention: Convention, scale: float) -> tuple[np.ndarray, Rotation]:

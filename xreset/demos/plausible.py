@@ -8,12 +8,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.demos.archive import Demos
+from xreset.demos.hand import bone_lengths
+from xreset.demos.keypoints import ORDERS
 from xreset.spec import ObjectSpec
 
-_OURS = [[0, *range(1 + 4 * finger, 5 + 4 * finger)] for finger in range(5)]
-"""Wrist and joints of thumb, index, middle, ring and little finger, in the order of :data:`xreset.spec.KEYPOINTS`."""
-_MANO = [[0, 13, 14, 15, 16], [0, 1, 2, 3, 17], [0, 4, 5, 6, 18], [0, 10, 11, 12, 19], [0, 7, 8, 9, 20]]
-"""The same in MANO's order (Romero et al. 2017): index, middle, little, ring, thumb, and then the five tips."""
 _SHORTER = 0.8
 """A skeleton that is so much shorter in another order is in that order: bones of a wrong order cross the palm."""
 _HEIGHTS = (-0.1, 0.6)
@@ -36,7 +34,7 @@ def doubts(demos: Demos, objects: Mapping[str, ObjectSpec] | None = None) -> lis
     valid = np.asarray(demos.hand_valid)
     hand = demos.hand_keypoints[valid].astype(float)
     if len(hand):
-        ours, mano = (np.median(_length(hand, chains)) for chains in (_OURS, _MANO))
+        ours, mano = (np.median(bone_lengths(points).sum(axis=1)) for points in (hand, hand[:, ORDERS["mano"]]))
         if mano < _SHORTER * ours:
             found.append(
                 f"the hand's bones are {ours:.2f} m long together, but {mano:.2f} m if the keypoints are in MANO's order. "
@@ -73,11 +71,6 @@ def doubts(demos: Demos, objects: Mapping[str, ObjectSpec] | None = None) -> lis
         i = int(np.argmax(same))
         found.append(f"{_some(same, 'ends')} where it starts ({demos.sequence_name[i]}): whatever lets the object stand solves it.")
     return found
-
-
-def _length(hand: np.ndarray, chains: list[list[int]]) -> np.ndarray:
-    """[F] length of all bones of keypoints [F, 21, 3]."""
-    return sum((np.linalg.norm(np.diff(hand[:, chain], axis=1), axis=2).sum(axis=1) for chain in chains), np.zeros(len(hand)))
 
 
 def _along_fingers(hand: np.ndarray, quat_wxyz: np.ndarray, right: np.ndarray) -> float:

@@ -58,7 +58,7 @@ def synthesize(
     fps: float = 30.0,
     side: Literal["right", "left"] = "right",
     meshes: str | Path | None = None,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> Demos:
     """Synthetic demonstrations of the built-in stand-ins, or of the objects of a folder of meshes, which stand with z up.
 
@@ -85,8 +85,7 @@ def synthesize(
         starts = [_start(spec, np.array(up), side) for up in _REST_UP.get(spec.name, ((0.0, 0.0, 1.0),))]
         for index in range(per_object):
             name = f"{SUBJECT}/{spec.name}_{side}_{seed}_{index:03d}"
-            if progress is not None:
-                progress(len(parts), len(specs) * per_object, name)
+            progress(len(parts), len(specs) * per_object, name)
             rng = np.random.default_rng([seed, index, zlib.crc32(spec.name.encode()), side == "left"])
             parts.append(_sequence(spec, starts, name, side, fps, rng))
     return concatenate(parts)

@@ -32,18 +32,6 @@ def stand_in(name: str) -> ObjectSpec:
     return ObjectSpec(name=name, pieces=pieces, mass=MASSES[name], com=com, inertia=inertia, vertices=vertices, faces=faces)
 
 
-def _cracker_box() -> tuple[Shape, ...]:
-    return (box((-1.2 * MM, -1.6 * MM, -4.7 * MM), (69.5 * MM, 161.0 * MM, 213.5 * MM)),)
-
-
-def _soup_can() -> tuple[Shape, ...]:
-    return (cylinder((-0.3 * MM, 2.0 * MM, -8.6 * MM), 33.2 * MM, 101.6 * MM),)
-
-
-def _tuna_can() -> tuple[Shape, ...]:
-    return (cylinder((0.1 * MM, -0.2 * MM, -4.4 * MM), 42.2 * MM, 33.7 * MM),)
-
-
 def _meat_can() -> tuple[Shape, ...]:
     u, v = _turned(3.5)
     body = [section((-2.4 * MM, -0.5 * MM, z * MM), 49.5 * MM * u, 26.0 * MM * v, power=4.0, count=32) for z in (-49.5, 33.5)]
@@ -160,10 +148,10 @@ def _turned(degrees: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 _MAKERS: dict[str, Callable[[], tuple[Shape, ...]]] = {
-    "003_cracker_box": _cracker_box,
-    "005_tomato_soup_can": _soup_can,
+    "003_cracker_box": lambda: (box((-1.2 * MM, -1.6 * MM, -4.7 * MM), (69.5 * MM, 161.0 * MM, 213.5 * MM)),),
+    "005_tomato_soup_can": lambda: (cylinder((-0.3 * MM, 2.0 * MM, -8.6 * MM), 33.2 * MM, 101.6 * MM),),
     "006_mustard_bottle": _mustard_bottle,
-    "007_tuna_fish_can": _tuna_can,
+    "007_tuna_fish_can": lambda: (cylinder((0.1 * MM, -0.2 * MM, -4.4 * MM), 42.2 * MM, 33.7 * MM),),
     "010_potted_meat_can": _meat_can,
     "011_banana": _banana,
     "019_pitcher_base": _pitcher,

@@ -43,7 +43,7 @@ class HandMotion(Tensors):
 
 
 def retarget_hand(
-    model: HandModel, targets: HandTargets, config: HandConfig | None = None, progress: Callable[[float], None] | None = None
+    model: HandModel, targets: HandTargets, config: HandConfig | None = None, progress: Callable[[float], None] = lambda share: None
 ) -> HandMotion:
     """Hand motions that minimise the cost; sequences are independent of one another.
 
@@ -66,7 +66,7 @@ def retarget_hand(
     steps, cost = sum(stage.iterations for stage in stages), targets.keypoints.new_zeros(sequences)
     for number, stage in enumerate(stages):
         before = sum(earlier.iterations for earlier in stages[:number])
-        state, cost = _minimise(model, targets, stage, state, lambda n, before=before: progress((before + n) / steps) if progress else None)
+        state, cost = _minimise(model, targets, stage, state, lambda n, before=before: progress((before + n) / steps))
     keypoints = model.keypoints(state.joints, state.root_pos, state.root_quat)
     return HandMotion(joints=state.joints, root_pos=state.root_pos, root_quat=state.root_quat, keypoints=keypoints, cost=cost).to(home)
 

@@ -100,7 +100,10 @@ class SelectTest(unittest.TestCase):
                 read_choice(self.folder)
 
     def test_bad_options(self):
-        for options, problem in ((["--most", "0"], "--most is 0, expected a whole number from 1 to"), (["--episodes", "0"], "--episodes is 0")):
+        for options, problem in (
+            (["--most", "0"], "--most is 0, expected a whole number from 1 to"),
+            (["--episodes", "0"], "--episodes is 0"),
+        ):
             with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as said, self.assertRaises(SystemExit):
                 main(["select", str(self.folder), "--demos", str(self.demos), *options])
             self.assertIn(problem, said.getvalue())

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xreset.errors import XResetError
+from xreset.errors import needs
 from xreset.files import write_whole
 
 if TYPE_CHECKING:
@@ -65,11 +65,9 @@ def percent_axis(ax: Axes, which: str) -> None:
 @contextmanager
 def figure_style(style: dict[str, Any]) -> Iterator[type[Figure]]:
     """matplotlib's ``Figure`` class within the style of the project's plots; no window, no global state."""
-    try:
+    with needs("matplotlib", "eval"):
         import matplotlib
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise XResetError(f"matplotlib cannot be imported ({error}). Install it with: pip install 'xreset[eval]'") from error
     base = {
         "font.family": "sans-serif",
         "font.sans-serif": ["DejaVu Sans"],

@@ -4,6 +4,9 @@ The command line prints these without a traceback; anything else that is raised 
 A message says what was found, what was expected, and what to do.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class XResetError(Exception):
     """Base of every error that a user can mend."""
@@ -39,3 +42,12 @@ class PolicyError(XResetError):
 
 class RunError(XResetError):
     """A training run or its folder is not in a state that allows what was asked."""
+
+
+@contextmanager
+def needs(package: str, extra: str, error: type[XResetError] = XResetError) -> Iterator[None]:
+    """Around the import of a package that not every installation has: where it fails, says which extra of xreset brings it."""
+    try:
+        yield
+    except ImportError as problem:
+        raise error(f"{package} cannot be imported ({problem}). Install it with: pip install 'xreset[{extra}]'") from problem

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.errors import PolicyError
+from xreset.errors import PolicyError, needs
 from xreset.files import max_bytes, parse_json
 from xreset.spec import RobotSpec
 from xreset.task.config import NoiseConfig, TaskConfig
@@ -161,10 +161,8 @@ class OnnxPolicy:
         path = Path(path)
         if not path.is_file():
             raise PolicyError(f"there is no policy file {path}.")
-        try:
+        with needs("onnxruntime", "eval", PolicyError):
             import onnxruntime
-        except ImportError as error:
-            raise PolicyError(f"onnxruntime cannot be imported ({error}). Install it with: pip install 'xreset[eval]'") from error
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3
         if path.stat().st_size > max_bytes():

@@ -8,14 +8,12 @@ import numpy as np
 import torch
 
 from xreset.env import ManipulationEnv
-from xreset.errors import XResetError
+from xreset.errors import XResetError, needs
 
-try:
+with needs("gymnasium", "gymnasium"):
     import gymnasium
     from gymnasium.vector import AutoresetMode
     from gymnasium.vector.utils import batch_space
-except ImportError as error:
-    raise XResetError(f"gymnasium cannot be imported ({error}). Install it with: pip install 'xreset[gymnasium]'") from error
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from xreset.errors import XResetError
+from xreset.errors import XResetError, needs
 from xreset.eval.export.recorded import Recorded, Recording
 from xreset.eval.report.clips import encode_mp4
 from xreset.files import write_json
@@ -242,8 +242,6 @@ class _Films:
 
 
 def _pyarrow() -> ModuleType:
-    try:
+    with needs("pyarrow, which writes LeRobot data sets,", "lerobot"):
         import pyarrow
-    except ImportError as error:
-        raise XResetError(f"a LeRobot data set needs pyarrow ({error}). Install it: pip install 'xreset[lerobot]'") from error
     return pyarrow

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.errors import XResetError
+from xreset.errors import XResetError, needs
 from xreset.eval.rollout import Episode, Trace
 from xreset.pictures.raster import Camera, Renderer, pose_matrix
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
@@ -162,10 +162,8 @@ def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) 
     Raises:
         XResetError: the encoder is not installed or fails.
     """
-    try:
+    with needs("imageio-ffmpeg", "eval"):
         import imageio_ffmpeg
-    except ImportError as error:
-        raise XResetError(f"imageio-ffmpeg cannot be imported ({error}). Install it with: pip install 'xreset[eval]'") from error
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "clip.mp4"
         settings = ["-crf", "24", "-preset", "veryfast", "-movflags", "+faststart", "-threads", "1", "-bitexact"]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from xreset.errors import FileFormatError, RunError, XResetError
+from xreset.errors import FileFormatError, RunError, XResetError, needs
 from xreset.eval.results import EvalResult, read_episodes, read_results
 from xreset.eval.rollout import Episode
 from xreset.eval.stress import Stress, read_stress
@@ -182,14 +182,10 @@ def read_scalars(folder: Path) -> dict[str, Curve]:
 
 def _scalars(file: Path) -> Iterator[tuple[str, int, float]]:
     """Tag, step and value of all of an event file. A last record that is not complete is none yet, and no damage."""
-    try:
+    with needs("TensorBoard, which reads learning curves,", "train"):
         from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportMissingImports]
         from tensorboard.compat.tensorflow_stub import errors
         from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import PyRecordReader_New
-    except ImportError as error:
-        raise XResetError(
-            f"Learning curves need TensorBoard, which cannot be imported ({error}). Install it with: pip install 'xreset[train]'"
-        ) from error
     records, last, whole = PyRecordReader_New(str(file)), 0, False
     while True:
         try:

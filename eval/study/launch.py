@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from xreset.errors import RunError, XResetError
+from xreset.errors import RunError, XResetError, needs
 from xreset.eval.study.plan import Plan, Step
 
 Cluster = Literal["local", "slurm"]
@@ -185,10 +185,8 @@ def shown_command(command: Sequence[str]) -> str:
 
 
 def _submitit() -> Any:
-    try:
+    with needs("submitit, which runs studies,", "study"):
         import submitit
-    except ImportError as error:
-        raise XResetError(f"submitit, which runs studies, cannot be imported ({error}). Install it: pip install 'xreset[study]'") from error
     return submitit
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
-from xreset.errors import ObjectError
+from xreset.errors import ObjectError, needs
 from xreset.geometry.shapes import half_spaces, hull, mass_properties, shape_mesh
 from xreset.spec import Shape
 
@@ -337,12 +337,8 @@ def _samples(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
 
 
 def _manifold3d() -> Any:
-    try:
+    with needs("manifold3d, which cuts concave meshes,", "objects", ObjectError):
         import manifold3d
-    except ImportError as error:
-        raise ObjectError(
-            f"a concave mesh needs manifold3d to be cut into convex pieces ({error}). Install it: pip install 'xreset[objects]'"
-        ) from error
     return manifold3d
 
 

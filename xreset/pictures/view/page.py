@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import torch
 
-from xreset.errors import XResetError
+from xreset.errors import XResetError, needs
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, TABLE_COLORS, link_colors, link_meshes, tinted
@@ -44,12 +44,8 @@ class Page:
         Raises:
             XResetError: viser is not installed, the server does not start, or there is no such sequence or frame.
         """
-        try:
+        with needs("viser, without which --png and --mp4 work,", "viewer"):
             import viser
-        except ImportError as error:
-            raise XResetError(
-                f"viser cannot be imported ({error}). Install it with: pip install 'xreset[viewer]'; --png and --mp4 work without it."
-            ) from error
         self.view = view
         sequence = 0 if sequence is None and view.kind != "reset states" else sequence
         self._rows = view.choose(sequence=sequence)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from xreset.errors import XResetError
+from xreset.errors import XResetError, needs
 from xreset.pictures.view.data import View
 from xreset.pictures.view.picture import Drawer
 
@@ -105,10 +105,8 @@ def _caption(first: str, view: View, row: int | None) -> tuple[str, ...]:
 
 def font() -> Any:
     """For :func:`written`; ``XResetError`` if Pillow is not installed."""
-    try:
+    with needs("Pillow", "viewer"):
         from PIL import ImageFont
-    except ImportError as error:
-        raise XResetError(f"Pillow cannot be imported ({error}). Install it with: pip install 'xreset[viewer]'.") from error
     return ImageFont.load_default(13)
 
 

@@ -59,8 +59,6 @@ def crossed_bootstrap_ci95(
         values: [E] one value per episode.
         runs: [E] training of each episode.
         groups: [E] demonstration of each episode; every training has episodes of every one.
-        draws: resamples.
-        seed: of the resampling: the same values give the same interval.
 
     Raises:
         ValueError: a training has no episode of some demonstration.

@@ -201,7 +201,6 @@ def stress(
     Args:
         demos: demonstrations or retargeted trajectories.
         setting: meshes, seed and worlds at a time.
-        properties: what to sweep.
         repetitions: episodes per demonstration, the same for every value.
         progress: called with (engine, runs done, runs in all).
 

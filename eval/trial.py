@@ -50,9 +50,7 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
     If it solves the reference's equations, its paths are compared; and on the CPU nothing else is, for a GPU engine is slow there.
 
     Args:
-        name: of the backend.
         device: where it runs if it can run there; else the CPU.
-        options: further keywords of the backend.
 
     Raises:
         BackendUnavailableError: it cannot be used here.

@@ -96,11 +96,5 @@ def accounts_path(path: Path) -> Path:
 
 
 def write_accounts(path: Path, *, of: str, rows: Sequence[Account], **more: Any) -> None:
-    """Write accounts as JSON.
-
-    Args:
-        of: what was counted, such as ``frames``.
-        rows: per object and phase.
-        more: what else there is to say, by name.
-    """
+    """Write accounts as JSON: ``of`` what (such as ``frames``), and ``more`` by name."""
     write_json(path, {"schema": SCHEMA, "of": of, "rows": [asdict(row) for row in with_totals(rows)]} | more)

@@ -101,8 +101,6 @@ class ManipulationEnv:
         """Wrap a backend; every world is reset at once.
 
         Args:
-            backend: N worlds.
-            task: what to observe, reward and end on.
             resets: where episodes start, on the backend's device.
             seed: of every random number that the environment draws.
         """

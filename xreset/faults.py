@@ -20,7 +20,6 @@ class FaultRecorder:
 
         Args:
             shapes: name -> shape of what is kept of one world.
-            device: where the worlds are.
         """
         self._shapes = dict(shapes)
         width = sum(prod(shape) for shape in self._shapes.values())

@@ -178,7 +178,6 @@ class Backend(ABC):
         """Build the worlds; every world starts with the robot at home and its object at rest height at the table's centre.
 
         Args:
-            scene: what to simulate.
             object_index: [N] which of ``scene.objects`` each world holds; default: world i holds object i modulo their number.
             device: ``cpu`` or ``cuda[:i]``.
         """

@@ -86,12 +86,7 @@ class Actions:
 
 
 def grasp_and_lift(robot: RobotSpec, thing: ObjectSpec, grasps: Grasps, number: int = 0) -> Actions:
-    """The open-loop try of a grasp: the hand, open around the object at rest, closes, lifts and shakes (:mod:`xreset.eval.engines`).
-
-    Args:
-        grasps: as :func:`xreset.eval.engines.grasps.find_grasps` finds them.
-        number: which of them.
-    """
+    """The open-loop try of a grasp: the hand, open around the object at rest, closes, lifts and shakes (:mod:`xreset.eval.engines`)."""
     motion, scene = Motion(), SceneSpec(robot=robot, objects=(thing,))
     chosen = slice(number, number + 1)
     dt = scene.control_dt

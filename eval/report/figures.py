@@ -223,7 +223,6 @@ def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], foun
     """The picture of a comparison.
 
     Args:
-        groups: all that are compared.
         tags: curves that at least one of them has, one panel each; may be empty if ``found`` is not.
         found: scores; may be empty if ``tags`` is not.
     """

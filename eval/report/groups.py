@@ -142,7 +142,6 @@ def estimate(episodes: Sequence[Sequence[Episode]], metric: str) -> tuple[float,
 
     Args:
         episodes: of each training, on the same demonstrations.
-        metric: field of an episode.
     """
     every = [e for own in episodes for e in own]
     values = np.array([float(getattr(e, metric)) for e in every])

@@ -77,10 +77,8 @@ def launch(
     """Do steps that are not done, each as soon as those that it needs are done.
 
     Args:
-        steps: those to do.
         per_gpu: trainings at a time on each GPU of this machine.
         options: of ``submitit.SlurmExecutor``, such as ``partition`` and ``time`` [min].
-        say: prints a line.
 
     Returns:
         What failed, or could not begin: sentences.

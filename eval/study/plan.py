@@ -274,7 +274,6 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
 
     Args:
         given: folder that the study's data are relative to.
-        out: folder for all that is made.
         only: names of runs; none: all.
 
     Raises:

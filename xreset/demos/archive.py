@@ -113,9 +113,7 @@ class Demos(ObjectMotions):
 
         Args:
             indices: sequence indices; the result has their order.
-            names: sequence names.
             objects: object names, official or the paper's.
-            sides: ``right``, ``left``.
             max_per_object: keep the first so many of each object.
 
         Raises:

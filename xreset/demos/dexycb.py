@@ -65,7 +65,6 @@ def read_dexycb(
     Args:
         root: the folder that holds the subjects' folders and ``calibration``.
         objects: only sequences that grasp one of these (official names or the paper's).
-        sides: only these hands.
         progress: called with (sequences done, sequences in all, name) before each sequence is read.
 
     Raises:

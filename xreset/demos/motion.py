@@ -61,7 +61,6 @@ def object_path(pos: np.ndarray, rest: Rotation, timing: Timing, rng: np.random.
 
     Args:
         pos: [3] where it rests.
-        rng: chooses the goal.
     """
     goal = pos + np.array([rng.uniform(-0.06, 0.06), rng.uniform(-0.14, 0.0), rng.uniform(*LIFT)])
     heading = rng.uniform(0, 2 * np.pi)
@@ -79,8 +78,6 @@ def clear_approach(solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, 
 
     Args:
         pos: [3] its position.
-        grasp: where the hand ends.
-        rng: chooses start and path.
     """
     best: HandPath | None = None
     for _ in range(_TRIES):

@@ -36,7 +36,6 @@ def cached_pieces(mesh: trimesh.Trimesh, source: str, progress: Progress) -> Pie
 
     Args:
         source: SHA-256 of what it was read from.
-        progress: see :func:`xreset.objects.decompose.decompose`.
     """
     settings = Settings()
     config = asdict(settings)

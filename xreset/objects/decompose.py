@@ -95,7 +95,6 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings(), progress: 
 
     Args:
         mesh: closed or not (:func:`as_solid`).
-        progress: is told how it goes.
 
     Raises:
         ObjectError: the mesh is concave and manifold3d, which cuts it, is not installed.

@@ -41,10 +41,6 @@ def with_closing_frames(retargeted: Retargeted, robot: RobotSpec, objects: Seque
 
     That is where a finger is near the object, until the thumb and another one touch it or it has been moved. It is not until the human's
     first contact: then the robot's fingers are usually 5 to 10 mm away.
-
-    Args:
-        objects: geometry of the objects that they name.
-        config: where and how densely.
     """
     owner = retargeted.sequence_of_frame
     if config.spacing is None:

@@ -88,8 +88,6 @@ class ResetDistribution:
         Args:
             robot: its home configuration and joint limits.
             object_names: objects of the scene, in the scene's order.
-            config: mixture, gravity and perturbations.
-            device: where to draw.
 
         Raises:
             DemoError: an object of the scene has no demonstration in the bank.

@@ -79,9 +79,7 @@ def try_states(backend: Backend, start: State, config: FilterConfig) -> torch.Te
     """Spawn one state per world, let the steps pass, and look at what moves.
 
     Args:
-        backend: N worlds.
         start: [N, ...] at rest.
-        config: steps and thresholds.
 
     Returns:
         [N] long: index into :data:`REASONS`, -1 where the state is accepted.
@@ -122,11 +120,9 @@ def make_bank(
     """Try every valid frame in every engine and keep those that all accept.
 
     Args:
-        objects: geometry of the objects that they name.
         backends: engines, tried in this order; a rejection carries the first one's reason.
         num_envs: worlds at a time.
         device: where engines run that can use it; the others run on the CPU.
-        config: steps and thresholds.
         closing: states between frames, which are tried like the others; None: none.
         squeeze: with which force the targets of states after contact press. Accepted states are tried with them once more, and where an
             engine does not accept that, the targets stay the joints' positions. None: all do.

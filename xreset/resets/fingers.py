@@ -62,7 +62,6 @@ def fingers_of(
     """Measure states.
 
     Args:
-        robot: its fingertips' contact links.
         object_index: [M] which of them each state has.
         joint_pos: [M, J]
         object_pos: [M, 3]
@@ -100,10 +99,7 @@ def squeeze_targets(robot: RobotSpec, fingers: Fingers, joint_pos: np.ndarray, c
     object moves by millimetres until what it rests against presses back.
 
     Args:
-        robot: its hand's drives.
-        fingers: where they are, in M states.
         joint_pos: [M, J]
-        config: force, and which fingers are at the object.
     """
     q = torch.as_tensor(joint_pos, dtype=torch.float64)
     kinematics = Kinematics(robot)

@@ -42,7 +42,6 @@ def hold_bank(
     """Let the lifted states of a bank hold on in every engine.
 
     Args:
-        objects: geometry of the objects that they name.
         num_envs: worlds at a time.
         device: where engines run that can use it; the others run on the CPU.
         config: how long, and how far an object may move.

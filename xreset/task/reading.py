@@ -30,7 +30,6 @@ class Reading:
         """The present one.
 
         Args:
-            backend: N worlds.
             surface_points: [N, P, 3] on each world's object, in its frame [m].
             bad_action: [N] bool, worlds that were given an action that is not finite.
         """

@@ -86,9 +86,6 @@ class View:
         """Indices of the rows that meet every condition given, in order; may be empty.
 
         Args:
-            sequence: index of the sequence.
-            object_name: name of the object.
-            phase: before or after the sequence's first contact.
             reason: one of :attr:`reasons`; empty text for the rows without any.
 
         Raises:

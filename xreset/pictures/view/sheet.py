@@ -74,7 +74,6 @@ def draw_sheet(view: View, tiles: Sequence[Tile], *, progress: Callable[[int, in
     """Draw tiles beside and below one another, each near to hand and object, captions under them.
 
     Args:
-        view: what the tiles' rows refer to.
         progress: called with (tiles drawn, tiles in all).
 
     Returns:

@@ -40,7 +40,6 @@ def track(
     """Arm joints along the hand's path.
 
     Args:
-        targets: hand root poses and hand joints.
         thresholds: of a valid frame; they decide between branches.
         progress: called with the fraction that is done.
 
@@ -94,7 +93,6 @@ def _improve(problem: ArmProblem, joints: Tensor, reasons: Sequence[str], again:
     """Find new paths for sequences with a frame that is invalid for one of the reasons; where more frames are valid then, replace the old.
 
     Args:
-        problem: of all sequences.
         joints: [S, T, n] paths, changed in place.
         reasons: some of :data:`~xreset.retarget.validity.REASONS`.
         again: finds new paths [C, T, n], given the problem of the C sequences concerned, their indices [C] and their frames that are

@@ -1,13 +1,13 @@
-"""What builders of robots share: an arm and the fingers of a hand, each a chain of links, become a tree."""
+"""What builders of robots share: the links of an arm and of a hand become a tree."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 
-from xreset.geometry.urdf import Link, RobotTree
+from xreset.geometry.urdf import Joint, Link, RobotTree
 from xreset.geometry.urdf_writer import ArmLink, axes, fixed, frame, pose
 
 ROTOR_INERTIA = 0.002
@@ -27,16 +27,30 @@ def with_rotor(inertia: Vector) -> Vector:
     return ixx + ROTOR_INERTIA, ixy, ixz, iyy + ROTOR_INERTIA, iyz, izz + ROTOR_INERTIA
 
 
+class Part(Protocol):
+    """A link and the joint before it."""
+
+    @property
+    def effort(self) -> float:
+        """[N m] or [N]; 0 where the joint follows another."""
+        ...
+
+    def below(self, parent: str) -> tuple[Joint, Link]:
+        """The joint that hangs it below another link, and the link."""
+        ...
+
+
+def chained(root: Link, fingers: Iterable[Sequence[ArmLink]]) -> list[tuple[str, ArmLink]]:
+    """Fingers, each of whose links carries the next, as links with their parents' names."""
+    return [
+        (parent, link) for finger in fingers for parent, link in zip((root.name, *(link.name for link in finger)), finger, strict=False)
+    ]
+
+
 def robot(
-    name: str,
-    base: Link,
-    arm: Sequence[ArmLink],
-    mount: np.ndarray,
-    palm: Link,
-    fingers: Iterable[Sequence[ArmLink]],
-    frames: Iterable[Frame],
+    name: str, base: Link, arm: Sequence[ArmLink], mount: np.ndarray, palm: Link, hand: Iterable[tuple[str, Part]], frames: Iterable[Frame]
 ) -> tuple[RobotTree, dict[str, float]]:
-    """An arm that carries a hand, and the effort limit of each moving joint.
+    """An arm that carries a hand, and the effort limit of each joint that has a drive.
 
     Args:
         name: of the robot.
@@ -44,16 +58,16 @@ def robot(
         arm: its links, each of which carries the next, the last one the hand.
         mount: [4, 4] pose of the palm in the frame of that link.
         palm: the link that carries the fingers.
-        fingers: their links, each of which carries the next.
+        hand: the name of the link that carries each moving one, and that.
         frames: see :data:`Frame`.
     """
-    hand = [(parent, link) for finger in fingers for parent, link in pairwise((palm, *finger)) if isinstance(link, ArmLink)]
-    moved = [link.below(parent.name) for parent, link in [*zip((base, *arm), arm, strict=False), *hand]]
+    parts = [*chained(base, [arm]), *hand]
+    moved = [part.below(parent) for parent, part in parts]
     links = [base, *(link for _, link in moved[: len(arm)]), palm, *(link for _, link in moved[len(arm) :])]
     joints = [joint for joint, _ in moved]
+    effort = {joint.name: part.effort for joint, (_, part) in zip(joints, parts, strict=True) if part.effort}
     joints.insert(len(arm), fixed(arm[-1].name, palm.name, mount))
     for own, parent, xyz, x, z in frames:
         links.append(frame(own))
         joints.append(fixed(parent, own, pose(xyz) @ axes(x=x, z=z)))
-    effort = {link.joint: link.effort for link in (*arm, *(link for _, link in hand))}
     return RobotTree(name=name, root=base.name, links=tuple(links), joints=tuple(joints)), effort

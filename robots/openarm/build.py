@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.geometry.urdf import Joint, Link, RobotTree
-from xreset.geometry.urdf_writer import ArmLink, axes, box, capsule, cylinder, fixed, frame, inertia_matrix, pose, urdf_text
+from xreset.geometry.urdf import Link, RobotTree
+from xreset.geometry.urdf_writer import ArmLink, box, capsule, cylinder, inertia_matrix, pose, urdf_text
+from xreset.robots.parts import Frame, robot
 from xreset.spec import MimicSpec
 
 URDF = Path(__file__).parent / "robot.urdf"
@@ -100,48 +101,37 @@ TIP_INSET = 0.008
 MIMIC = MimicSpec(joint="finger_joint2", source="finger_joint1")
 
 
+def _jaw(name: str, joint: str, y: float, side: float, effort: float) -> ArmLink:
+    """A jaw: a carriage outside and a finger along z; ``side`` is 1 for the left one, -1 for the right one."""
+    finger = box((0.020, 0.013, JAW_END - 0.006), (0, side * (PAD + 0.0065), (JAW_END + 0.006) / 2))
+    carriage = box((0.024, 0.022, 0.022), (0, side * (PAD + 0.022), 0.017))
+    return ArmLink(
+        name=name, joint=joint, type="prismatic", xyz=(0, y, 0.1151), axis=(0, side, 0), range=(0.0, JAW_TRAVEL), velocity=JAW_SPEED,
+        effort=effort, mass=JAW_MASS + ROTOR_MASS, com=(JAW_COM[0], side * JAW_COM[1], JAW_COM[2]), inertia=JAW_INERTIA,
+        shapes=(finger, carriage),
+    )  # fmt: skip
+
+
+WRIST = ARM[-1].name
+JAWS = (
+    _jaw("right_finger", "finger_joint1", -0.0045, -1.0, JAW_EFFORT),
+    _jaw("left_finger", MIMIC.joint, 0.0075, 1.0, 0.0),
+)
+FRAMES: tuple[Frame, ...] = (  # the palm's z points where a human's palm would, with the right jaw as the thumb
+    ("palm", WRIST, (0, 0.0015, 0.125), (0, 0, 1), (-1, 0, 0)),
+    ("thumb_tip", "right_finger", (0, -PAD, JAW_END - TIP_INSET), (0, 0, 1), (0, 1, 0)),
+    ("index_tip", "left_finger", (0, PAD, JAW_END - TIP_INSET), (0, 0, 1), (0, -1, 0)),
+)
+
+
 def tree() -> tuple[RobotTree, dict[str, float]]:
     """The robot's tree, and the effort limit of each actuated joint."""
-    links, joints, effort = [BASE], [], {}
-    for part in ARM:
-        joint, link = part.below(links[-1].name)
-        joints.append(joint)
-        links.append(link)
-        effort[part.joint] = part.effort
-    wrist = links[-1].name
-    links.append(GRIPPER_BODY)
-    joints.append(fixed(wrist, GRIPPER_BODY.name, T_LINK7_BODY))
-    for name, joint, y, side in (("right_finger", "finger_joint1", -0.0045, -1.0), ("left_finger", "finger_joint2", 0.0075, 1.0)):
-        links.append(_jaw(name, side))
-        joints.append(
-            Joint(
-                name=joint, type="prismatic", parent=wrist, child=name, T_parent_joint=pose((0, y, 0.1151)),
-                axis=np.array([0, side, 0]), lower=0.0, upper=JAW_TRAVEL, velocity=JAW_SPEED,
-            )
-        )  # fmt: skip
-    effort["finger_joint1"] = JAW_EFFORT
-    # x along the jaws, z out of the pad; the palm's z points where a human's palm would, with the right jaw as the thumb
-    for name, parent, T in (
-        ("palm", wrist, pose((0, 0.0015, 0.125)) @ axes(x=(0, 0, 1), z=(-1, 0, 0))),
-        ("thumb_tip", "right_finger", pose((0, -PAD, JAW_END - TIP_INSET)) @ axes(x=(0, 0, 1), z=(0, 1, 0))),
-        ("index_tip", "left_finger", pose((0, PAD, JAW_END - TIP_INSET)) @ axes(x=(0, 0, 1), z=(0, -1, 0))),
-    ):
-        links.append(frame(name))
-        joints.append(fixed(parent, name, T))
-    return RobotTree(name="openarm", root=BASE.name, links=tuple(links), joints=tuple(joints)), effort
+    return robot("openarm", BASE, ARM, T_LINK7_BODY, GRIPPER_BODY, [(WRIST, jaw) for jaw in JAWS], FRAMES)
 
 
 def text() -> str:
     """What ``robot.urdf`` must hold."""
     return urdf_text(*tree(), mimics=(MIMIC,), comment=COMMENT)
-
-
-def _jaw(name: str, side: float) -> Link:
-    """A jaw: a carriage outside and a finger along z; ``side`` is 1 for the left one, -1 for the right one."""
-    com = np.array([JAW_COM[0], side * JAW_COM[1], JAW_COM[2]])
-    finger = box((0.020, 0.013, JAW_END - 0.006), (0, side * (PAD + 0.0065), (JAW_END + 0.006) / 2))
-    carriage = box((0.024, 0.022, 0.022), (0, side * (PAD + 0.022), 0.017))
-    return Link(name=name, mass=JAW_MASS + ROTOR_MASS, com=com, inertia=inertia_matrix(*JAW_INERTIA), collisions=(finger, carriage))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import numpy as np
 
 from xreset.geometry.urdf import Link, RobotTree
 from xreset.geometry.urdf_writer import ArmLink, box, capsule, inertia_matrix, pose, urdf_text
-from xreset.robots.parts import Frame, Vector, robot, with_rotor
+from xreset.robots.parts import Frame, Vector, chained, robot, with_rotor
 from xreset.spec import Shape
 
 URDF = Path(__file__).parent / "robot.urdf"
@@ -151,7 +151,7 @@ FRAMES: tuple[Frame, ...] = (
 
 def tree() -> tuple[RobotTree, dict[str, float]]:
     """The robot's tree, and the effort limit of each moving joint."""
-    return robot("panda_allegro", BASE, ARM, pose((0, 0, FLANGE + ADAPTER + HAND_LENGTH)), HAND_ROOT, FINGERS, FRAMES)
+    return robot("panda_allegro", BASE, ARM, pose((0, 0, FLANGE + ADAPTER + HAND_LENGTH)), HAND_ROOT, chained(HAND_ROOT, FINGERS), FRAMES)
 
 
 def text() -> str:

@@ -7,15 +7,14 @@ hand's description gives no effort limits; they are figures published elsewhere 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from xreset.geometry.urdf import Joint, Link, RobotTree
-from xreset.geometry.urdf_writer import ArmLink, axes, box, capsule, cylinder, fixed, frame, pose, urdf_text
-from xreset.robots.parts import ROTOR_INERTIA, Vector
+from xreset.geometry.urdf_writer import ArmLink, box, capsule, cylinder, pose, urdf_text
+from xreset.robots.parts import ROTOR_INERTIA, Frame, Vector, robot
 from xreset.spec import Shape
 
 URDF = Path(__file__).parent / "robot.urdf"
@@ -124,6 +123,17 @@ class HandLink:
     """Principal moments of inertia, without the rotor [kg m^2]."""
     shapes: tuple[Shape, ...] = ()
 
+    def below(self, parent: str) -> tuple[Joint, Link]:
+        """The joint that hangs it below another link, and the link."""
+        R = pose(quat=self.com_quat)[:3, :3]
+        inertia = R @ np.diag(self.diag) @ R.T + ROTOR_INERTIA * np.eye(3)
+        joint = Joint(
+            name=f"right_{self.joint}", type="revolute", parent=parent, child=f"right_{self.name}",
+            T_parent_joint=pose(self.pos, quat=self.quat), axis=np.array([0.0, 0, 1]), lower=self.range[0], upper=self.range[1],
+            velocity=HAND_SPEED,
+        )  # fmt: skip
+        return joint, Link(name=joint.child, mass=self.mass, com=np.array(self.com), inertia=inertia, collisions=self.shapes)
+
 
 CMC_EFFORT, MCP_EFFORT, PIP_EFFORT, DIP_EFFORT = 3.3, 1.864, 0.638, 0.638
 
@@ -223,51 +233,25 @@ def finger_tail(finger: str) -> tuple[HandLink, ...]:
 # Putting it together -----------------------------------------------------------------------------------------------------------------
 
 
+FRAMES: tuple[Frame, ...] = (
+    ("palm", HAND_ROOT.name, PALM_CENTER, (0, 0, 1), (1, 0, 0)),
+    *(
+        (f"{finger}_tip", f"right_{finger}_DP", (length, 0, 0), (1, 0, 0), (0, 1, 0))
+        for finger, length in (("thumb", THUMB_LENGTH), *((finger, FINGER_LENGTH) for finger in FINGERS))
+    ),
+)
+
+
 def tree() -> tuple[RobotTree, dict[str, float]]:
     """The robot's tree, and the effort limit of each moving joint."""
-    links, joints, effort = [ARM_BASE], [], {}
-    for joint, link, limit in _moving_parts():
-        if joint.child == "right_thumb_CMC_VL":  # the hand starts
-            links.append(HAND_ROOT)
-            joints.append(fixed(ARM[-1].name, HAND_ROOT.name, pose((0, 0, HAND_MOUNT))))
-        links.append(link)
-        joints.append(joint)
-        effort[joint.name] = limit
-    for name, parent, T in _frames():
-        links.append(frame(name))
-        joints.append(fixed(parent, name, T))
-    return RobotTree(name="ur7e_sharpa", root=ARM_BASE.name, links=tuple(links), joints=tuple(joints)), effort
+    links = (*HAND_BASE, *(link for finger in FINGERS for link in finger_tail(finger)))
+    hand = [(f"right_{link.parent}", link) for link in links]
+    return robot("ur7e_sharpa", ARM_BASE, ARM, pose((0, 0, HAND_MOUNT)), HAND_ROOT, hand, FRAMES)
 
 
 def text() -> str:
     """What ``robot.urdf`` must hold."""
     return urdf_text(*tree(), comment=COMMENT)
-
-
-def _moving_parts() -> Iterator[tuple[Joint, Link, float]]:
-    z = np.array([0.0, 0, 1])
-    parent = ARM_BASE.name
-    for part in ARM:
-        yield *part.below(parent), part.effort
-        parent = part.name
-    for part in HAND_BASE + tuple(link for finger in FINGERS for link in finger_tail(finger)):
-        R = pose(quat=part.com_quat)[:3, :3]
-        inertia = R @ np.diag(part.diag) @ R.T + ROTOR_INERTIA * np.eye(3)
-        yield (
-            Joint(
-                name=f"right_{part.joint}", type="revolute", parent=f"right_{part.parent}", child=f"right_{part.name}",
-                T_parent_joint=pose(part.pos, quat=part.quat), axis=z, lower=part.range[0], upper=part.range[1], velocity=HAND_SPEED,
-            ),
-            Link(name=f"right_{part.name}", mass=part.mass, com=np.array(part.com), inertia=inertia, collisions=part.shapes),
-            part.effort,
-        )  # fmt: skip
-
-
-def _frames() -> Iterator[tuple[str, str, np.ndarray]]:
-    """Palm and fingertip frames: x along the fingers, z out of the palm's inner side or the fingertip's pad."""
-    yield "palm", HAND_ROOT.name, pose(PALM_CENTER) @ axes(x=(0, 0, 1), z=(1, 0, 0))
-    for finger, length in (("thumb", THUMB_LENGTH), *((finger, FINGER_LENGTH) for finger in FINGERS)):
-        yield f"{finger}_tip", f"right_{finger}_DP", pose((length, 0, 0)) @ axes(x=(1, 0, 0), z=(0, 1, 0))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import numpy as np
 
 from xreset.geometry.urdf import Link, RobotTree
 from xreset.geometry.urdf_writer import ArmLink, box, capsule, cylinder, inertia_matrix, pose, urdf_text
-from xreset.robots.parts import Frame, Vector, robot, with_rotor
+from xreset.robots.parts import Frame, Vector, chained, robot, with_rotor
 from xreset.spec import Shape
 
 URDF = Path(__file__).parent / "robot.urdf"
@@ -141,7 +141,7 @@ FRAMES: tuple[Frame, ...] = (
 def tree() -> tuple[RobotTree, dict[str, float]]:
     """The robot's tree, and the effort limit of each moving joint."""
     mount = pose((0, 0, ADAPTER)) @ pose((0, 0.038, 0.098), rpy=(0, -pi / 2, 0))  # the description's base, on the plate
-    return robot("xarm7_leap", BASE, ARM, mount, HAND_ROOT, FINGERS, FRAMES)
+    return robot("xarm7_leap", BASE, ARM, mount, HAND_ROOT, chained(HAND_ROOT, FINGERS), FRAMES)
 
 
 def text() -> str:

@@ -84,21 +84,22 @@ def fixed(parent: str, child: str, T_parent_child: np.ndarray) -> Joint:
 
 @dataclass(frozen=True, kw_only=True)
 class ArmLink:
-    """A link of an arm and the revolute joint before it, as makers publish them."""
+    """A link and the joint before it, as makers publish them."""
 
     name: str
     joint: str
+    type: Literal["revolute", "prismatic"] = "revolute"
     xyz: Sequence[float]
     """Joint origin in the parent link [m]."""
     rpy: Sequence[float] = (0, 0, 0)
     """Its orientation [rad]."""
     axis: Sequence[float] = (0, 0, 1)
     range: tuple[float, float]
-    """[rad]"""
+    """[rad] or [m]"""
     velocity: float
-    """[rad/s]"""
+    """[rad/s] or [m/s]"""
     effort: float
-    """[N m]"""
+    """[N m] or [N]"""
     mass: float
     """[kg]"""
     com: Sequence[float]
@@ -114,7 +115,7 @@ class ArmLink:
         R = pose(rpy=(self.inertia_roll, 0, 0))[:3, :3]
         inertia = R @ inertia_matrix(*self.inertia) @ R.T
         joint = Joint(
-            name=self.joint, type="revolute", parent=parent, child=self.name, T_parent_joint=pose(self.xyz, rpy=self.rpy),
+            name=self.joint, type=self.type, parent=parent, child=self.name, T_parent_joint=pose(self.xyz, rpy=self.rpy),
             axis=np.array(self.axis, dtype=float), lower=self.range[0], upper=self.range[1], velocity=self.velocity,
         )  # fmt: skip
         return joint, Link(name=self.name, mass=self.mass, com=np.array(self.com), inertia=inertia, collisions=self.shapes)

@@ -20,7 +20,7 @@ import numpy as np
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import atomic_write, claim, read_json, write_json
+from xreset.files import atomic_write, claim, read_json, read_toml, write_json
 from xreset.records import Field, read_npz, write_npz
 from xreset.resets.bank import check_objects, read_bank, write_bank
 from xreset.spec import ObjectSpec
@@ -241,6 +241,22 @@ class NpzTest(InFolder):
         self.file.write_bytes(content)
         with self.refused("cannot be read"):
             self.read()
+
+    def test_toml(self):
+        file = self.folder / "file.toml"
+        with self.refused("cannot be read", "Make one"):
+            read_toml(file, hint=" Make one.")
+        for content, words in (
+            (b"schema = ", "not valid TOML"),
+            (b"\xff", "not valid TOML"),
+            (b"mass = " + b"9" * 5000, "not valid TOML"),
+            (b"a = " + b"[" * 5000, "not valid TOML"),
+            (b"schema = 'other/1'", "states schema 'other/1', expected 'test/1'"),
+        ):
+            with self.subTest(content[:12]):
+                file.write_bytes(content)
+                with self.refused(words):
+                    read_toml(file, "test/1")
 
     def test_wrong_schema_and_version(self):
         self.write("test/2")

@@ -232,7 +232,7 @@ class Registry(unittest.TestCase):
             with self.assertRaisesRegex(RobotError, message):
                 load(self.folder)
         (self.folder / "robot.toml").unlink()
-        with self.assertRaisesRegex(RobotError, "no readable robot.toml"):
+        with self.assertRaisesRegex(RobotError, r"robot\.toml cannot be read"):
             load(self.folder)
 
     def test_check_tells_all_that_only_the_urdf_knows(self):

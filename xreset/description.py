@@ -8,13 +8,13 @@ A robot is a folder with a ``robot.toml`` and the URDF that it names. A package 
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from xreset.checks import Number, Text
 from xreset.errors import RobotError
+from xreset.files import read_toml
 from xreset.plugins import robot_folder
 from xreset.spec import KEYPOINTS, DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, PlacementSpec, RobotSpec
 from xreset.typed import parsed
@@ -40,16 +40,7 @@ def load_robot(name_or_folder: str | Path) -> RobotSpec:
 
 def read_description(path: Path) -> RobotSpec:
     """Read a ``robot.toml``; see :func:`load_robot`."""
-    try:
-        data = tomllib.loads(path.read_text())
-    except OSError as error:
-        raise RobotError(
-            f"{path.parent} has no readable {path.name} ({error.strerror}). A robot's folder holds one beside its URDF."
-        ) from error
-    except (ValueError, RecursionError) as error:  # also texts that are not UTF-8, numbers of thousands of digits
-        raise RobotError(f"{path} is not valid TOML: {error}.") from error
-    if data.get("schema") != SCHEMA:
-        raise RobotError(f"{path} states schema {data.get('schema')!r}, expected {SCHEMA!r}.")
+    data = read_toml(path, SCHEMA, error=RobotError, hint=" A robot's folder holds one beside its URDF.")
     given, problems = parsed(Description, data, "the file")
     spec = None if given is None else _robot(given, path.parent)
     if spec is not None:

@@ -10,6 +10,7 @@ import json
 import os
 import stat
 import tempfile
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -144,6 +145,23 @@ def read_json(path: str | Path, schema: str | None = None) -> dict[str, Any]:
         raise FileFormatError(f"{path} is not valid JSON ({error}). It may be truncated; make it again.") from error
     if schema is not None:
         check_schema(path, data.pop("schema", None), schema)
+    return data
+
+
+def read_toml(path: Path, schema: str | None = None, *, error: type[XResetError] = FileFormatError, hint: str = "") -> dict[str, Any]:
+    """Read a TOML file; with ``schema``, its ``schema`` entry must be that. ``hint``: what to say where it cannot be read.
+
+    Raises:
+        XResetError: it cannot be read, is no TOML, or states another schema; of the kind ``error``.
+    """
+    try:
+        data = tomllib.loads(path.read_bytes().decode())
+    except OSError as problem:
+        raise error(f"{path} cannot be read ({problem.strerror}).{hint}") from problem
+    except (ValueError, RecursionError) as problem:  # of TOML, of decoding, of numbers of thousands of digits
+        raise error(f"{path} is not valid TOML: {problem}.") from problem
+    if schema is not None and data.get("schema") != schema:
+        raise error(f"{path} states schema {shown(data.get('schema'))}, expected {schema!r}.")
     return data
 
 

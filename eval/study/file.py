@@ -30,7 +30,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -38,6 +37,7 @@ from typing import Any, Literal
 from xreset.checks import Checked, NotNegative, Positive
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.paper import METRICS, paper_tables
+from xreset.files import read_toml
 from xreset.typed import from_dict
 
 SCHEMA = "xreset-study/1"
@@ -166,12 +166,7 @@ def read_study(path: Path) -> Study:
     Raises:
         FileFormatError: it is no TOML, holds an unknown key or a value of the wrong type, or names something that it does not define.
     """
-    try:
-        raw = tomllib.loads(path.read_bytes().decode())
-    except (ValueError, RecursionError) as error:  # of tomllib, of decoding, of integers of thousands of digits
-        raise FileFormatError(f"{path} is not valid TOML: {error}.") from error
-    if raw.get("schema") != SCHEMA:
-        raise FileFormatError(f"{path} states schema {raw.get('schema')!r}, expected {SCHEMA!r}. Is it a study?")
+    raw = read_toml(path, SCHEMA)
     defaults, runs = raw.pop("defaults", {}), raw.get("runs", {})
     if not isinstance(defaults, dict) or not isinstance(runs, dict) or not all(isinstance(run, dict) for run in runs.values()):
         raise FileFormatError(f"{path}: defaults, runs and each of the runs must be tables.")

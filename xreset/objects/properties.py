@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from xreset.errors import ObjectError
-from xreset.files import atomic_write
+from xreset.files import atomic_write, read_toml
 from xreset.text import shown
 from xreset.typed import from_dict
 
@@ -51,8 +50,4 @@ def properties_of(mesh: Path) -> Properties:
     path = mesh.with_suffix(".toml")
     if not path.is_file():
         return Properties()
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ObjectError(f"{path} cannot be read as TOML: {shown(str(error))}. It may say mass, density and friction.") from error
-    return from_dict(Properties, data, str(path))
+    return from_dict(Properties, read_toml(path, error=ObjectError), str(path))

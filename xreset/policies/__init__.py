@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from xreset.errors import FileFormatError
+from xreset.files import read_toml
 from xreset.typed import from_dict
 
 FOLDER = Path(__file__).parent
@@ -37,13 +36,7 @@ def shipped() -> dict[str, Path]:
 def card(file: Path) -> Card:
     """The card of a policy's file; ``FileFormatError`` if it is missing or damaged."""
     path = file.with_suffix(".toml")
-    try:
-        found = from_dict(Card, tomllib.loads(path.read_text(encoding="utf-8")), str(path))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{path} cannot be read as the card of {file.name}: {error}.") from error
-    if found.schema != SCHEMA:
-        raise FileFormatError(f"{path} states schema {found.schema!r}, expected {SCHEMA!r}.")
-    return found
+    return from_dict(Card, read_toml(path, SCHEMA, hint=f" It is the card of {file.name}."), str(path))
 
 
 def results_folder(name: str) -> Path:

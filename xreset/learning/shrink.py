@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xreset.errors import PolicyError
+from xreset.errors import PolicyError, needs
 from xreset.files import atomic_write
 from xreset.policy import OnnxPolicy
 
@@ -34,10 +34,8 @@ def shrink(source: str | Path, path: str | Path) -> None:
         XResetError: the file cannot be written.
     """
     OnnxPolicy(source)  # says what is wrong with a file that is none
-    try:
+    with needs("onnx", "train", PolicyError):
         import onnx
-    except ImportError as error:
-        raise PolicyError(f"onnx cannot be imported ({error}). Install it with: pip install 'xreset[train]'") from error
     model = onnx.load(str(source))
     if not halve_matrices(model, str(source)):
         raise PolicyError(f"{source} holds no weight matrix in float32: it was shrunk before. Use it as it is.")

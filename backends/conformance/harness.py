@@ -189,6 +189,8 @@ def random_state(bench: Bench, scene: SceneSpec, num_worlds: int, seed: int, dev
     points, radii = torch.tensor(support.points), torch.tensor(support.radii)
     for _ in range(_NEARER):
         inside = (height_above_table(joints.points(pos, support.links, points), radii, scene.table) < 0).any(dim=1)
+        if not inside.any():
+            break
         pos = torch.where(inside[:, None], (home + pos) / 2, pos)
     return State(
         joint_pos=pos.float(),

@@ -124,13 +124,13 @@ def place(
         robot: name of a registered robot, or a folder with a robot.toml.
         demos: archive of demonstrations (see `xreset demos`).
         objects: folder of real meshes; default: the built-in stand-ins.
-        max_per_object: only the first so many sequences of each object.
+        max_per_object: only so many sequences of each object, taken from all over the archive.
         write: put the placement, its home and its figure into the robot's robot.toml.
         search: ranges and effort.
     """
     console = Console()
     spec = load_robot(robot)
-    chosen = archive.read_demos(demos).select(max_per_object=max_per_object)
+    chosen = archive.read_demos(demos).select(max_per_object=max_per_object, spread=True)
     specs = list(archive.demo_objects(chosen, objects).values())
     with Progress(console) as bar:
         paths = pipeline.wrist_paths(chosen, spec, specs, progress=bar.count("hand retargeting"))

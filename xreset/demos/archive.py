@@ -108,6 +108,7 @@ class Demos(ObjectMotions):
         objects: Iterable[str] | None = None,
         sides: Iterable[str] | None = None,
         max_per_object: int | None = None,
+        spread: bool = False,
     ) -> Demos:
         """The sequences that meet every condition given.
 
@@ -115,6 +116,7 @@ class Demos(ObjectMotions):
             indices: sequence indices; the result has their order.
             objects: object names, official or the paper's.
             max_per_object: keep the first so many of each object.
+            spread: keep so many of each object from all over the archive in place of the first, which in most archives are one person's.
 
         Raises:
             DemoError: an index, name, object or side that is not there, or nothing is left.
@@ -134,12 +136,16 @@ class Demos(ObjectMotions):
         if sides is not None:
             chosen = chosen[np.isin(self.hand_side[chosen], _all_there("hand sides", sides, self.hand_side))]
         if max_per_object is not None:
-            kept: dict[str, int] = {}
-            mask = []
-            for name in self.object_name[chosen].tolist():
-                kept[name] = kept.get(name, 0) + 1
-                mask.append(kept[name] <= max_per_object)
-            chosen = chosen[np.asarray(mask, dtype=bool)]
+            objects_of = self.object_name[chosen]
+            different = np.unique(objects_of)
+            kept = []
+            for number, name in enumerate(different):
+                rows = np.flatnonzero(objects_of == name)
+                picks = np.arange(min(max_per_object, len(rows)))
+                if spread:  # from as many even parts, and from another place in them for every object
+                    picks = ((picks + (number + 0.5) / len(different)) * len(rows) / max(len(picks), 1)).astype(int)
+                kept.append(rows[picks])
+            chosen = chosen[np.sort(np.concatenate(kept))] if kept else chosen
         if not len(chosen):
             raise DemoError("no sequence meets all the conditions of the selection; relax one of them.")
         return self._take(chosen)

@@ -8,6 +8,7 @@ import re
 import tarfile
 import tempfile
 import unittest
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,15 @@ import torch
 from tests.data import DEFAULT
 from xreset.cli import main
 from xreset.description import load_robot
-from xreset.errors import RobotError
+from xreset.errors import PolicyError, RobotError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import load_urdf
+from xreset.policy import check_contract, policy_contract
 from xreset.robot_tools.check import check_description, check_engine
 from xreset.robot_tools.importer import import_robot
+from xreset.robot_tools.reshape import reshape
 from xreset.robot_tools.sources import combined, read_source
+from xreset.task.config import TaskConfig
 
 ARCHIVES = DEFAULT.parent / "robots"
 """Where a development checkout has descriptions as their makers publish them."""
@@ -258,6 +262,56 @@ class Toy(WithFolder):
         self.assertTrue((self.folder / "mine" / "robot.png").read_bytes().startswith(b"\x89PNG"))
 
 
+class Reshaped(WithFolder):
+    HAND = HAND.replace('"base"', '"palm"')
+    PAD = """<link name="pad"><collision><origin xyz="0 0 0.01"/><geometry><sphere radius="0.006"/></geometry></collision></link>
+      <joint name="pad_joint" type="fixed"><parent link="f1_b"/><child link="pad"/><origin xyz="0.03 0 0"/></joint></robot>"""
+
+    def setUp(self):
+        super().setUp()
+        made = import_robot(self.file("arm.urdf", ARM), self.file("hand.urdf", self.HAND), self.folder / "mine")
+        self.robot = load_robot(made.folder)
+
+    def reshaped(self, hand, name="other"):
+        reshape(str(self.folder / "mine"), self.file("shapes.urdf", hand), self.folder / name)
+        return load_robot(self.folder / name)
+
+    def test_only_shapes_change_and_policies_play(self):
+        spec = self.reshaped(self.HAND.replace("0.036 0.014 0.014", "0.030 0.012 0.012").replace("</robot>", self.PAD))
+        old, new = load_urdf(self.robot.urdf), load_urdf(spec.urdf)
+        self.assertEqual([shape.geometry.kind for shape in new.link("f1_b").collisions], ["box", "sphere"])
+        np.testing.assert_allclose(new.link("f1_b").collisions[1].T_body_shape[:3, 3], (0.03, 0, 0.01))
+        np.testing.assert_allclose(new.link("f2_a").collisions[0].geometry.size, (0.015, 0.006, 0.006))
+        self.assertEqual(new.joints[-1].name, old.joints[-1].name)
+        for a, b in zip(old.links, new.links, strict=True):
+            self.assertEqual((a.name, a.mass, a.inertia.tolist()), (b.name, b.mass, b.inertia.tolist()))
+        same = {"name": "mine", "urdf": self.robot.urdf, "like": "", "collision_exclude": self.robot.collision_exclude}
+        self.assertEqual(replace(spec, **same), self.robot)
+        self.assertNotEqual(spec.fingerprint, self.robot.fingerprint)
+        task = TaskConfig()
+        check_contract("p.onnx", policy_contract(self.robot, task, ()), spec, task)
+        with self.assertRaisesRegex(PolicyError, "another robot: other, here it is mine"):
+            check_contract("p.onnx", policy_contract(spec, task, ()), self.robot, task)
+
+    def test_an_arm_from_a_robot_gives_its_hand_up_with_its_names(self):
+        arm, hand = read_source(self.robot.urdf), read_source(self.folder / "hand.urdf")
+        whole = combined(arm, hand, flange="l5", T_flange_hand=np.eye(4), name="again").tree
+        self.assertEqual(set(hand.tree.link_names) - set(whole.link_names), set())
+
+    def test_another_hand_is_refused_and_leaves_nothing(self):
+        for hand, expected in (
+            (self.HAND.replace('xyz="0.085 0.03 0"', 'xyz="0.085 0.04 0"'), "f1_a is 10.0 mm and 0.0 degrees away"),
+            (self.HAND.replace("f1_a", "g1_a"), "'g1_a' has shapes, and neither it nor what it is fixed to is a link of 'mine'"),
+            (HAND, "f1_a hangs on base, in the robot on palm"),
+            (self.HAND.replace("<collision>", "<visual>").replace("</collision>", "</visual>"), "has no collision shapes"),
+        ):
+            with self.assertRaisesRegex(RobotError, expected):
+                self.reshaped(hand)
+        self.assertEqual({path.name for path in self.folder.iterdir()}, {"arm.urdf", "hand.urdf", "shapes.urdf", "mine"})
+        with self.assertRaisesRegex(RobotError, "is there already"):
+            self.reshaped(self.HAND, "mine")
+
+
 class Published(WithFolder):
     """Hands and an arm as their makers publish them."""
 
@@ -278,6 +332,17 @@ class Published(WithFolder):
                 if found.level == "skipped":
                     self.skipTest(found.message)
                 self.assertEqual(found.level, "ok", found.message)
+
+    def test_the_makers_shapes_on_the_built_in_hand(self):
+        hand = self.unpacked("right_sharpa_wave")
+        for file in ("right_sharpa_wave.urdf", "right_sharpa_wave.xml"):
+            with self.subTest(file):
+                folder = self.folder / Path(file).suffix[1:]
+                reshape("ur7e-sharpa", hand / file, folder)
+                spec, found = check_description(folder)
+                self.assertEqual([f"{f.topic}: {f.message}" for f in found if f.level == "error"], [])
+                tree = load_urdf(spec.urdf)
+                self.assertEqual({len(tree.link(tip.contact_links[0]).collisions) for tip in spec.fingertips}, {2})  # its bone and its pad
 
     def test_hands_on_xarm7(self):
         arm = self.unpacked("xarm7") / "xarm7.urdf"

@@ -123,6 +123,7 @@ class Description:
     collision: Collision = Collision()
     home_std: HomeSpread = HomeSpread()
     gravity_compensated: bool = True
+    like: str = ""
 
 
 def _robot(given: Description, folder: Path) -> RobotSpec:
@@ -142,6 +143,7 @@ def _robot(given: Description, folder: Path) -> RobotSpec:
         collision_exclude=given.collision.exclude,
         table_exclude=given.collision.table_exclude,
         gravity_compensated=given.gravity_compensated,
+        like=given.like,
         home_std=(given.home_std.arm, given.home_std.hand),
     )
 

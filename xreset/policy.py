@@ -74,6 +74,8 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
     """
     here = policy_contract(robot, task, ())
     check_contract_entries(source, contract)
+    if contract["robot_fingerprint"] == robot.like:
+        here |= {key: contract[key] for key in ("robot", "robot_fingerprint")}
     for key, what in (("robot", "robot"), ("joint_names", "joint order"), ("fingertip_names", "fingertips")):
         if contract[key] != here[key]:
             raise PolicyError(

@@ -161,6 +161,8 @@ class RobotSpec:
     """Spread of the home configuration: standard deviation of arm and hand joints [rad], the paper's Table IX."""
     placement: PlacementSpec | None = field(default=None, repr=False)
     """Where ``base_pos`` and ``base_quat`` come from, if a search found them; no part of the :attr:`fingerprint`."""
+    like: str = field(default="", repr=False)
+    """Fingerprint of the robot that this one differs from in nothing but shapes, so that its policies play here; no part of its own."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from xreset.robot_tools import check as checks
 from xreset.robot_tools import importer, placement
 from xreset.robot_tools import picture as pictures
 from xreset.robot_tools import place as places
+from xreset.robot_tools import reshape as reshaping
 from xreset.robot_tools.placement import PlaceConfig
 
 
@@ -108,6 +109,21 @@ def import_(
     check(str(out), engines=False)
 
 
+def reshape(robot: Annotated[str, tyro.conf.Positional], /, *, shapes: Path, out: Path) -> None:
+    """Make a robot's folder from a robot and another URDF or MJCF of some of its links, of which it takes the collision shapes.
+
+    Joints, masses, drives and frames stay as they are, and policies of the robot play with the new one. Links are matched by name.
+
+    Args:
+        robot: name of a registered robot, or a folder with a robot.toml.
+        shapes: URDF or MJCF, of the hand for instance.
+        out: Folder to make; its name is the new robot's.
+    """
+    for note in reshaping.reshape(robot, shapes, out):
+        print(note)
+    check(str(out), engines=False)
+
+
 def place(
     robot: Annotated[str, tyro.conf.Positional],
     /,
@@ -163,4 +179,4 @@ def place(
         console.print(f"wrote {robot_folder(robot) / DESCRIPTION}", highlight=False)
 
 
-COMMAND = {"list": list_robots, "check": check, "import": import_, "place": place}
+COMMAND = {"list": list_robots, "check": check, "import": import_, "reshape": reshape, "place": place}

@@ -233,7 +233,14 @@ def _with_drives(spec: RobotSpec, source: Source, notes: list[str]) -> RobotSpec
 
 
 def _with_exclusions(spec: RobotSpec, notes: list[str]) -> RobotSpec:
-    """Pairs of links that meet at home, or nearly wherever the hand's joints are, never collide."""
+    pairs = always_meeting(spec)
+    if pairs:
+        notes.append("never collide, because they meet: " + "; ".join(f"{a} and {b} ({why})" for (a, b), why in pairs.items()))
+    return replace(spec, collision_exclude=tuple(pairs))
+
+
+def always_meeting(spec: RobotSpec) -> dict[tuple[str, str], str]:
+    """Pairs of links that meet at home, or nearly wherever the hand's joints are, and which of the two."""
     kinematics = Kinematics(spec)
     collision = SelfCollision(spec, kinematics)
     pairs = dict.fromkeys(collision.overlapping_at_home, "at home")
@@ -250,6 +257,4 @@ def _with_exclusions(spec: RobotSpec, notes: list[str]) -> RobotSpec:
     for (a, b), count in counts.items():
         if count >= _ALWAYS * _SAMPLES:
             pairs[(names[a], names[b])] = "in nearly every position"
-    if pairs:
-        notes.append("never collide, because they meet: " + "; ".join(f"{a} and {b} ({why})" for (a, b), why in pairs.items()))
-    return replace(spec, collision_exclude=tuple(pairs))
+    return pairs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -112,11 +113,16 @@ def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) 
         edits = [(r"^pos *=.*$", f"pos = [{pos}]"), (r"^quat *=.*$", f"quat = [{quat}]"), *edits]
         for name, value in zip((robot.joint_names[i] for i in robot.arm_indices), search.home, strict=True):
             edits.append((rf'(name *= *"{re.escape(name)}".*?\bhome *= *)[-+.\deE]+', rf"\g<1>{value:.3f}"))
+    write_whole(path, edited(text, path, edits))
+
+
+def edited(text: str, path: Path, edits: Sequence[tuple[str, str]]) -> str:
+    """The text of a ``robot.toml`` with the first match of every pattern replaced; ``RobotError`` names one that nothing matches."""
     for pattern, new in edits:
         text, count = re.subn(pattern, new, text, count=1, flags=re.MULTILINE)
         if not count:
-            raise RobotError(f"{path} has no line like {pattern!r} to put the placement into; edit it by hand: {new}")
-    write_whole(path, text)
+            raise RobotError(f"{path} has no line like {pattern!r} to change; edit it by hand: {new}")
+    return text
 
 
 def _literal(text: str) -> str:

@@ -112,7 +112,7 @@ def combined(arm: Source, hand: Source, *, flange: str | None, T_flange_hand: np
     if stiff:
         notes.append(f"joints of the arm that do not move the hand are fixed at 0: {', '.join(stiff)}")
     joints = [replace(joint, type="fixed") if joint.name in stiff else joint for joint in kept]
-    hand = _renamed(hand, {*arm.tree.link_names}, {joint.name for joint in arm.tree.joints})
+    hand = _renamed(hand, {*arm.tree.link_names} - gone, {joint.name for joint in kept})
     tree = RobotTree(
         name=name,
         root=arm.tree.root,

@@ -180,7 +180,7 @@ def object_inertia_set(bench: Bench) -> list[Measure]:
     def built(thing: ObjectSpec, i: int) -> ObjectSpec:
         return replace(thing, inertia=float(factors[i]) * np.asarray(thing.inertia))
 
-    return _compared(bench, lambda backend, worlds: backend.set_object_inertia(factors[worlds].to(backend.device), worlds), built)
+    return _compared(bench, lambda backend, worlds: backend.set_object_inertia(factors.to(backend.device)[worlds], worlds), built)
 
 
 @check(
@@ -195,7 +195,7 @@ def object_com_set(bench: Bench) -> list[Measure]:
     def built(thing: ObjectSpec, i: int) -> ObjectSpec:
         return replace(thing, com=np.asarray(thing.com) + offsets[i].numpy())
 
-    return _compared(bench, lambda backend, worlds: backend.set_object_com(offsets[worlds].to(backend.device), worlds), built)
+    return _compared(bench, lambda backend, worlds: backend.set_object_com(offsets.to(backend.device)[worlds], worlds), built)
 
 
 def _compared(

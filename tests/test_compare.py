@@ -372,7 +372,10 @@ class GroupTest(InFolder):
         return name
 
     def test_what_differs_in_the_seed_only_is_one(self):
-        names = [self.run_and_results(f"soup-seed{i}", seed=i, device=f"cuda:{i}", resets=f"/{i}/b.npz") for i in (1, 2, 10)]
+        names = [
+            self.run_and_results(f"soup-seed{i}", seed=i, device=f"cuda:{i}", resets=f"/{i}/b.npz", config=TrainConfig(iterations=1000 * i))
+            for i in (1, 2, 10)
+        ]
         other = self.run_and_results("fixed", config=TrainConfig(task=TaskConfig(reset=ResetConfig(random_gravity=False))))
         bank = self.run_and_results("bank", seed=3, resets_hash="aa" * 32)
         baseline = "ik"

@@ -59,7 +59,8 @@ def singles(trainings: Sequence[Training]) -> tuple[Group, ...]:
 
 
 def _configuration(training: Training) -> dict[str, object]:
-    return {name: fact.value for name, fact in training.facts.items() if name != "seed"}
+    """All facts but the seed, and how long it was to go on: a run stops when it is stopped, and how far it came is said of each."""
+    return {name: fact.value for name, fact in training.facts.items() if name not in ("seed", "iterations")}
 
 
 def _apart(members: Sequence[Training]) -> str | None:

@@ -142,7 +142,7 @@ def joint_order(bench: Bench) -> list[Measure]:
         motion = small_motion(kinematics).to(backend.device)
         backend.set_state(start)
         backend.set_joint_targets(start.joint_pos + torch.diag(motion))  # world i moves joint i
-        backend.step(144)  # until they rest: on the way, an arm's motion shakes its fingers
+        backend.step(240)  # until they rest, a second for soft drives: on the way, an arm's motion shakes its fingers
         moved = ((backend.state().joint_pos - start.joint_pos) / motion).cpu()
         wrong = moved - torch.eye(count)
         measures.append(Measure("way missing of the joint named", largest(wrong.diagonal()), 0.1, "of it"))

@@ -443,7 +443,15 @@ class ThinWalls(unittest.TestCase):
                 mesh = trimesh.Trimesh(result.obj.vertices, result.obj.faces, process=False)
                 measured = max(self.off(mesh, SimpleNamespace(shapes=result.obj.pieces)))
                 self.assertAlmostEqual(result.deviation, measured, delta=4e-4)
-                self.assertLess(result.deviation, 0.0025)
+                self.assertLess(result.deviation, 0.002)
+
+    def test_a_small_bridge_on_a_large_piece_is_seen(self):
+        """The middle of what covers a hollow is 4 mm from its walls; a few hundred points of the plate would miss it."""
+        hollow = trimesh.creation.box((0.008, 0.008, 0.012), transform=trimesh.transformations.translation_matrix((0.05, 0.03, 0.01)))
+        plate = trimesh.boolean.difference([trimesh.creation.box((0.3, 0.3, 0.02)), hollow])
+        pieces = decompose(plate)
+        self.assertEqual(len(pieces.shapes), 1)
+        self.assertAlmostEqual(pieces.deviation, 0.004, delta=1e-4)
 
     def test_an_open_sheet_becomes_a_thin_wall(self):
         angle = np.linspace(0, 1.0, 6)

@@ -1,12 +1,14 @@
 """A mesh as few convex pieces that keep to its surface, small enough for every engine.
 
 The mesh is made a solid, cut by planes wherever the convex hull of a part stands too far off the surface, and pieces whose common hull
-does not are joined again. PhysX takes hulls of at most 64 vertices in its fast path, and contact cost grows with the number of pieces.
+does not are joined again. Both go by a quick look at few points; of what is joined then, the deviation is known to 0.1 mm, and pieces that
+stand off too far are cut again. PhysX takes hulls of at most 64 vertices in its fast path, and contact cost grows with their number.
 """
 
 from __future__ import annotations
 
 import heapq
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -33,14 +35,24 @@ _SMALL_HOLE = 0.03
 """Holes of at most so much of the mesh's area are closed; larger ones are openings."""
 _FACES = 3000
 """Meshes that are not closed are thinned out to about so many triangles before they are made solids."""
+_QUICK = 0.85
+"""Share of the tolerance that a quick look at few points may find."""
+_FEW = 0.625
+"""Share of the allowed number that pieces are joined to; the others are for those that stand off farthest then."""
+_EXACT = 1e-4
+"""[m] To which the deviation is known."""
+_NEAREST = 8
+"""Triangles of a surface that a point's distance to it is taken from."""
+_BATCH = 2000
+"""Triangles whose distance is taken together."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """How a mesh is decomposed; the same on every machine."""
 
-    max_pieces: int = 80
-    """If the tolerance asks for more, it is widened."""
+    max_pieces: int = 128
+    """If the tolerance asks for more, pieces stand farther off."""
     max_vertices: int = 64
     """Of each piece."""
     hull_depth: float = 0.05
@@ -48,7 +60,7 @@ class Settings:
 
     The volume ratio would be no good measure: the recessed lids of a tuna can cost as much volume as a pitcher's handle.
     """
-    tolerance: float = 0.0017
+    tolerance: float = 0.002
     """[m] How far pieces may stand off the surface of a mesh that is more than one."""
     thickness: float = 0.001
     """[m] Of the sheet that stands for a mesh that is not closed."""
@@ -63,7 +75,7 @@ class Pieces:
 
     shapes: tuple[Shape, ...]
     deviation: float
-    """[m] Largest distance between their common surface and the mesh's (sampled)."""
+    """[m] Largest distance between their surface and the mesh's, to 0.1 mm."""
     volume: float
     """[m^3] Of the solid."""
     com: np.ndarray
@@ -102,22 +114,20 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings(), progress: 
     effort = _Effort(settings.effort)
     surface = _Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     around = mesh.convex_hull
-    if surface.farthest(around.vertices, around.faces) <= settings.hull_depth * np.linalg.norm(mesh.extents):
+    if surface.deviation(around.vertices, around.faces) <= settings.hull_depth * np.linalg.norm(mesh.extents):
         solid, shapes = mesh if mesh.is_volume else around, (limited_hull(mesh.vertices, settings.max_vertices),)
         vertices, faces, piece = np.asarray(solid.vertices), np.asarray(solid.faces), shape_mesh(shapes[0])
-        off = [surface.farthest(piece.vertices, piece.faces)]
+        off = surface.deviation(piece.vertices, piece.faces)
     else:
         whole = as_solid(mesh, settings.thickness)
-        pieces = _convex(_Solid(whole.simplify(settings.tolerance / 10)), settings, effort, progress)
-        shapes = tuple(limited_hull(_arrays(piece)[0], settings.max_vertices) for piece in pieces)
-        surface = _Solid(whole)
+        solid, surface = _Solid(whole.simplify(_QUICK * settings.tolerance / 10)), _Solid(whole)
+        shapes, off = _cut_again(solid, surface, _convex(solid, settings, effort, progress), settings, effort, progress)
         vertices, faces = surface.vertices, surface.faces
-        off = [surface.excess(_manifold3d().Manifold.hull_points(shape.geometry.vertices)) for shape in shapes]
     com, inertia = mass_properties(vertices, faces, 1.0)
     corners = vertices[faces]
     volume = float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
     return Pieces(
-        shapes=shapes, deviation=max(*off, surface.bare(shapes)), volume=volume, com=com, inertia=inertia,
+        shapes=shapes, deviation=max(off, surface.bare(shapes)), volume=volume, com=com, inertia=inertia,
         finished=effort.left > 0,
     )  # fmt: skip
 
@@ -190,12 +200,47 @@ class _Surface:
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self.vertices, self.faces = vertices, faces
-        self._points = np.concatenate((vertices, _samples(vertices, faces, 60_000)))
+        points, of = _samples(vertices, faces, 60_000)
+        some = np.zeros(len(vertices), dtype=np.int64)
+        some[faces] = np.arange(len(faces))[:, None]  # a triangle of each vertex
+        self._points, self._of = np.concatenate((vertices, points)), np.concatenate((some, of))
         self._tree = cKDTree(self._points)
 
     def farthest(self, vertices: np.ndarray, faces: np.ndarray) -> float:
-        """[m] From the farthest point of another surface (sampled) to this one."""
-        return float(self._tree.query(np.concatenate((vertices, _samples(vertices, faces, 400))))[0].max())
+        """[m] From the farthest of a few points of another surface to the nearest of many of this one."""
+        return float(self._tree.query(np.concatenate((vertices, _samples(vertices, faces, 400)[0])))[0].max())
+
+    def deviation(self, vertices: np.ndarray, faces: np.ndarray) -> float:
+        """[m] From the farthest point of another surface to this one, to ``_EXACT``.
+
+        The distance to a triangle is convex: over another triangle, it is greatest at a corner. So no point of that one is farther from
+        this surface than its corners are from the nearest triangle; it is quartered while that exceeds what its middles have shown.
+        """
+        farthest, pool, middle = 0.0, vertices[faces], vertices[faces].mean(axis=1)
+        bound = self._tree.query(middle)[0] + np.linalg.norm(pool - middle[:, None], axis=2).max(axis=1)
+        while bound.size and bound.max() > farthest + _EXACT:
+            first, rest = np.split(np.argsort(-bound, kind="stable"), [_BATCH])
+            corners = pool[first]
+            middle, *ends = self._away(corners)
+            farthest = max(farthest, float(middle.min(axis=1).max()))
+            least = np.max(ends, axis=0).min(axis=1)
+            split = corners[least > farthest + _EXACT]
+            between = (split + split[:, [1, 2, 0]]) / 2
+            quarters = [between, *(np.stack((split[:, i], between[:, i], between[:, i - 1]), axis=1) for i in range(3))]
+            pool = np.concatenate((pool[rest], *quarters))
+            bound = np.concatenate((bound[rest], np.tile(least[least > farthest + _EXACT], 4)))
+        return farthest
+
+    def _away(self, corners: np.ndarray) -> np.ndarray:
+        """[4, n, k] Distances of triangles' [n, 3, 3] middles and corners to the k triangles here that are next to the middles [m]."""
+        from trimesh.triangles import closest_point
+
+        middle = corners.mean(axis=1)
+        near = self.vertices[self.faces[self._of[self._tree.query(middle, _NEAREST)[1]]]]
+        points = np.stack((middle, *corners.transpose(1, 0, 2)))[:, :, None].repeat(_NEAREST, axis=2)
+        near = np.broadcast_to(near, (4, *near.shape)).reshape(-1, 3, 3)
+        closest = closest_point(1e3 * near, 1e3 * points.reshape(-1, 3)) / 1e3  # its own tolerance is for triangles of millimetres
+        return np.linalg.norm(points - closest.reshape(points.shape), axis=3)
 
     def bare(self, shapes: Sequence[Shape]) -> float:
         """[m] How far its worst point is outside of all pieces: exact next to a face, too little next to an edge."""
@@ -212,18 +257,18 @@ class _Solid(_Surface):
         super().__init__(*_arrays(solid))
         self.solid = solid
 
-    def excess(self, piece: Manifold) -> float:
-        """[m] How far the farthest point of a piece outside the solid is from its surface (sampled)."""
+    def excess(self, piece: Manifold, measure: Callable[[np.ndarray, np.ndarray], float]) -> float:
+        """[m] How far the farthest point of a piece outside the solid is from its surface, by :meth:`farthest` or :meth:`deviation`."""
         outside = piece - self.solid
-        return 0.0 if outside.volume() < _SPECK / 100 else self.farthest(*_arrays(outside))
+        return 0.0 if outside.volume() < _SPECK / 100 else measure(*_arrays(outside))
 
 
 def _convex(solid: _Solid, settings: Settings, effort: _Effort, progress: Progress) -> list[Manifold]:
-    """Convex pieces of a solid, at most as many as allowed."""
+    """Convex pieces of a solid, few of them."""
     pieces = [part.hull() for part in _cut(solid, settings, effort, progress)]
-    tolerance = max(settings.tolerance, *(solid.excess(piece) for piece in pieces))
+    tolerance = max(_QUICK * settings.tolerance, *(solid.excess(piece, solid.farthest) for piece in pieces))
     pieces = _joined(solid, pieces, tolerance, effort)
-    while len(pieces) > settings.max_pieces and effort.left > 0:
+    while len(pieces) > _FEW * settings.max_pieces and effort.left > 0:
         tolerance *= 1.1
         progress(len(pieces), tolerance)
         pieces = _joined(solid, pieces, tolerance, effort)
@@ -239,8 +284,8 @@ def _cut(solid: _Solid, settings: Settings, effort: _Effort, progress: Progress)
     def add(part: Manifold) -> None:
         nonlocal count
         effort.spend(solid.solid, part)
-        excess = solid.excess(part.hull())
-        if excess <= settings.tolerance:
+        excess = solid.excess(part.hull(), solid.farthest)
+        if excess <= _QUICK * settings.tolerance:
             done.append(part)
         else:
             heapq.heappush(queue, (-excess, count, part))
@@ -248,7 +293,7 @@ def _cut(solid: _Solid, settings: Settings, effort: _Effort, progress: Progress)
 
     for part in solid.solid.decompose():
         add(part)
-    while queue and len(queue) + len(done) < 2 * settings.max_pieces and effort.left > 0:
+    while queue and len(queue) + len(done) < 2 * _FEW * settings.max_pieces and effort.left > 0:
         excess, _, worst = heapq.heappop(queue)
         progress(len(queue) + len(done) + 1, -excess)
         parts = _best_cut(worst, effort)
@@ -258,6 +303,40 @@ def _cut(solid: _Solid, settings: Settings, effort: _Effort, progress: Progress)
         for part in parts:
             add(part)
     return done + [part for _, _, part in queue]
+
+
+def _cut_again(
+    solid: _Solid, surface: _Solid, pieces: Sequence[Manifold], settings: Settings, effort: _Effort, progress: Progress
+) -> tuple[tuple[Shape, ...], float]:
+    """The pieces as shapes, those cut again that stand too far off a surface, the worst first; and how far the worst does then [m].
+
+    Args:
+        solid: what they are pieces of: the surface's solid with fewer triangles.
+    """
+    hull_points = _manifold3d().Manifold.hull_points
+    queue: list[tuple[float, int, Manifold, Shape]] = []
+    done: list[tuple[float, int, Manifold, Shape]] = []
+    count = itertools.count()
+
+    def add(piece: Manifold) -> None:
+        effort.spend(surface.solid)
+        shape = limited_hull(_arrays(piece)[0], settings.max_vertices)
+        heapq.heappush(queue, (-surface.excess(hull_points(shape.geometry.vertices), surface.deviation), next(count), piece, shape))
+
+    for piece in pieces:
+        add(piece)
+    while queue and -queue[0][0] > settings.tolerance and effort.left > 0:
+        worst = heapq.heappop(queue)
+        there = len(queue) + len(done)
+        progress(there + 1, -worst[0])
+        parts = _best_cut(worst[2] ^ solid.solid, effort)
+        if 1 < len(parts) <= settings.max_pieces - there:
+            for part in parts:
+                add(part.hull())
+        else:
+            done.append(worst)
+    done = sorted(done + queue, key=lambda one: one[1])
+    return tuple(shape for *_, shape in done), max(-excess for excess, *_ in done)
 
 
 def _best_cut(part: Manifold, effort: _Effort) -> list[Manifold]:
@@ -288,7 +367,11 @@ def _best_cut(part: Manifold, effort: _Effort) -> list[Manifold]:
 
 
 def _joined(solid: _Solid, hulls: Sequence[Manifold], tolerance: float, effort: _Effort) -> list[Manifold]:
-    """Pieces joined wherever the hull of two keeps to the surface; those first that lose least volume by it."""
+    """Pieces joined wherever the hull of two keeps to the surface; those first that lose least volume by it.
+
+    Args:
+        tolerance: what a quick look may find [m].
+    """
     batch_hull = _manifold3d().Manifold.batch_hull
     alive: dict[int, Manifold] = {}
     boxes: dict[int, np.ndarray] = {}
@@ -301,7 +384,7 @@ def _joined(solid: _Solid, hulls: Sequence[Manifold], tolerance: float, effort: 
             if ((low <= high2 + 2e-4) & (low2 <= high + 2e-4)).all() and effort.left > 0:
                 effort.spend(solid.solid)
                 both = batch_hull([piece, neighbour])
-                if solid.excess(both) <= tolerance:
+                if solid.excess(both, solid.farthest) <= tolerance:
                     heapq.heappush(queue, (both.volume() - piece.volume() - neighbour.volume(), other, number, both))
         alive[number] = piece
 
@@ -310,7 +393,7 @@ def _joined(solid: _Solid, hulls: Sequence[Manifold], tolerance: float, effort: 
     number = len(hulls)
     while queue:
         _, one, other, both = heapq.heappop(queue)
-        if one in alive and other in alive:
+        if one in alive and other in alive and solid.excess(both, solid.deviation) <= tolerance / _QUICK:
             del alive[one], alive[other]
             add(number, both)
             number += 1
@@ -323,8 +406,8 @@ def _arrays(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts).astype(np.int64)
 
 
-def _samples(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
-    """Points [count, 3] uniform over the triangles' area; the same for the same mesh."""
+def _samples(vertices: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points [count, 3] uniform over the triangles' area, the same for the same mesh, and the triangle of each [count]."""
     rng = np.random.default_rng(0)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -332,7 +415,7 @@ def _samples(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
     u, v = rng.random((2, count, 1))
     fold = u + v > 1
     u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
-    return a[face] + u * (b - a)[face] + v * (c - a)[face]
+    return a[face] + u * (b - a)[face] + v * (c - a)[face], face
 
 
 def _manifold3d() -> Any:

@@ -21,6 +21,7 @@ from xreset.demos.synth import synthesize
 from xreset.errors import DemoError, FileFormatError, RobotError
 from xreset.geometry.balls import BARE, SPACING, inscribed_balls, shape_balls, sharp_points
 from xreset.geometry.collision import SelfCollision, height_above_table, support_points, table_points
+from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_matrix
 from xreset.geometry.shapes import box, half_spaces, hull, shape_mesh, surface_of
@@ -166,6 +167,19 @@ class CollisionTest(unittest.TestCase):
         self.assertLessEqual(len(centers), 21 * 16)
         steps = np.diff(np.unique(centers[:, 0].round(9)))
         self.assertLessEqual(steps.max(), SPACING + 1e-9)
+
+    def test_near_points_of_several_solids_are_those_that_looking_at_all_of_them_finds(self):
+        fields = DistanceFields.join([link_field([box((0, 0, 0), size)]) for size in ((0.06, 0.04, 0.02), (0.02, 0.02, 0.1))])
+        rng = np.random.default_rng(0)
+        points, than = torch.as_tensor(rng.uniform(-0.06, 0.06, (5000, 3))), torch.as_tensor(rng.uniform(-0.01, 0.03, 5000))
+        which = torch.as_tensor(rng.integers(2, size=5000))
+        value, slope = fields.signed_distance(points, which)
+        near, distance, gradient = fields.nearer(points, which, than)
+        expected = (value < than).nonzero()[:, 0]
+        self.assertGreater(len(expected), 500)
+        self.assertTrue(torch.equal(near, expected))
+        self.assertTrue(torch.equal(distance, value[expected]))
+        self.assertTrue(torch.equal(gradient, slope[expected]))
 
     def test_a_link_of_thin_walls_is_solid_for_other_links_and_no_thicker(self):
         walls = [box((0, 0, z), (0.06, 0.04, 0.001)) for z in (-0.0095, 0.0095)] + [

@@ -43,6 +43,16 @@ class DistanceFields(Tensors):
         """[...] distance of points [..., 3] from the bounding box of their object [...]; 0 inside."""
         return (points - torch.minimum(torch.maximum(points, self.low[which]), self.high[which])).norm(dim=-1)
 
+    def nearer(self, points: Tensor, which: Tensor, than: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Which of some points [N, 3] are nearer than [N] to their object [N]: indices [A], signed distances [A], gradients [A, 3].
+
+        Most are ruled out by the bounding box; one step of the grid more is as far as distances from it may be wrong beside an edge.
+        """
+        some = (self.beside(points, which) <= (than + self.spacing).clamp_min(0.0)).nonzero()[:, 0]
+        distance, gradient = self.signed_distance(points[some], which[some])
+        near = distance < than[some]
+        return some[near], distance[near], gradient[near]
+
     def signed_distance(self, points: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance [N] and its gradient [N, 3] by trilinear interpolation.
 

@@ -54,10 +54,10 @@ class Objects:
         """[..., 3] points in the mesh frame of the object of their frame [...]."""
         return (self.rot[frame].mT @ (points - self.pos[frame])[..., None])[..., 0]
 
-    def signed_distance(self, points: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance [A] of world points [A, 3] and its gradient [A, 3] in the world."""
-        distance, slope = self.fields.signed_distance(self.local(points, frame), self.index[frame])
-        return distance, (self.rot[frame] @ slope[..., None])[..., 0]
+    def nearer(self, points: Tensor, frame: Tensor, than: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As :meth:`DistanceFields.nearer`, of points [N, 3] and with gradients [A, 3] in the world."""
+        near, distance, slope = self.fields.nearer(self.local(points, frame), self.index[frame], than)
+        return near, distance, (self.rot[frame[near]] @ slope[..., None])[..., 0]
 
 
 def too_near(
@@ -90,7 +90,7 @@ def too_near(
 
 def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Iterator[Distances]:
     candidate, group = ((bounds[..., 2] < model.balls.bound_radii) & considered[:, None]).nonzero(as_tuple=True)
-    for frame, ball in _near_balls(model, bodies, candidate, group, lambda centers, _: centers[:, 2], 0.0):
+    for frame, ball in _near_balls(model, bodies, candidate, group, lambda centers, _, than: (centers[:, 2] < than).nonzero()[:, 0], 0.0):
         centers = model.ball_centers(bodies, frame, ball)
         value = height_above_table(centers, model.balls.radii[ball], model.table)
         low = value < 0
@@ -106,33 +106,31 @@ def _in_object(
     beside = objects.fields.beside(objects.local(bounds, every), objects.index[every])
     candidate, group = ((beside < model.balls.bound_radii + object_clearance) & considered[:, None]).nonzero(as_tuple=True)
     margin = object_clearance + objects.fields.spacing
-    for frame, ball in _near_balls(
-        model, bodies, candidate, group, lambda centers, frame: objects.signed_distance(centers, frame)[0], margin
-    ):
+    for frame, ball in _near_balls(model, bodies, candidate, group, lambda *cluster: objects.nearer(*cluster)[0], margin):
         centers = model.ball_centers(bodies, frame, ball)
-        distance, direction = objects.signed_distance(centers, frame)
+        near, distance, direction = objects.nearer(centers, frame, model.balls.radii[ball] + object_clearance)
+        frame, ball, centers = frame[near], ball[near], centers[near]
+        slope = model.point_slope(bodies, frame, model.balls.link[ball], centers, direction)
         value = distance - model.balls.radii[ball] - object_clearance
-        near = value < 0
-        slope = model.point_slope(bodies, frame[near], model.balls.link[ball[near]], centers[near], direction[near])
-        yield Distances(frame=frame[near], value=value[near], slope=slope, number=len(model.balls.radii) + ball[near])
+        yield Distances(frame=frame, value=value, slope=slope, number=len(model.balls.radii) + ball)
 
 
 def _near_balls(
-    model: HandModel, bodies: Bodies, frame: Tensor, group: Tensor, distance: Callable[[Tensor, Tensor], Tensor], margin: float
+    model: HandModel, bodies: Bodies, frame: Tensor, group: Tensor, nearer: Callable[[Tensor, Tensor, Tensor], Tensor], margin: float
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Frames [A] and balls [A] of links [C] in frames [C] whose cluster is nearer to something than ``margin`` [m].
 
     Args:
         frame: [C]
         group: [C] among the links with balls.
-        distance: to it, of points [K, 3] in frames [K].
+        nearer: which of points [K, 3] in frames [K] are nearer to it than [K]: their indices.
         margin: [m]; for distances from a grid one step of it more, which is as far as they may be wrong beside an edge.
     """
     clusters = model.balls.clusters
     for asking, cluster in clusters.of_link.members(group):
         row, body = frame[asking], model.group_body[group[asking]]
         centers = bodies.pos[row, body] + (bodies.rot[row, body] @ clusters.centers[cluster][..., None])[..., 0]
-        near = distance(centers, row) < clusters.radii[cluster] + margin
+        near = nearer(centers, row, clusters.radii[cluster] + margin)
         for within, ball in clusters.members(cluster[near]):
             yield row[near][within], ball
 
@@ -156,21 +154,18 @@ def _in_each_other(model: HandModel, bodies: Bodies, bounds: Tensor, considered:
     for asking, cluster in clusters.of_link.members(a[pair]):
         centers, solid = local(asking, clusters.centers[cluster]), b[pair[asking]]
         margin = clusters.radii[cluster] - self_depth + fields.spacing
-        close = fields.beside(centers, solid) < margin
-        asking, cluster, centers, solid, margin = asking[close], cluster[close], centers[close], solid[close], margin[close]
-        close = fields.signed_distance(centers, solid)[0] < margin
+        close, *_ = fields.nearer(centers, solid, margin)
         asking, cluster = asking[close], cluster[close]
         for within, guard in clusters.members(cluster):
             owner = asking[within]
             ball, radius, solid = balls.guards[guard], balls.guard_radii[guard], b[pair[owner]]
-            distance, away = fields.signed_distance(local(owner, balls.centers[ball]), solid)
-            value = distance - radius + self_depth
-            deep = value < 0
+            deep, distance, away = fields.nearer(local(owner, balls.centers[ball]), solid, radius - self_depth)
             owner, ball, solid, guard = owner[deep], ball[deep], solid[deep], guard[deep]
+            value = distance - radius[deep] + self_depth
             frame = candidate[owner]
-            direction = (bodies.rot[frame, model.group_body[solid]] @ away[deep][..., None])[..., 0]
+            direction = (bodies.rot[frame, model.group_body[solid]] @ away[..., None])[..., 0]
             centers = model.ball_centers(bodies, frame, ball)
             slope = model.point_slope(bodies, frame, balls.link[ball], centers, direction)
             slope = slope - model.point_slope(bodies, frame, solid, centers, direction)
             number = 2 * len(balls.radii) + pair[owner] * len(balls.guards) + guard
-            yield Distances(frame=frame, value=value[deep], slope=slope, number=number)
+            yield Distances(frame=frame, value=value, slope=slope, number=number)

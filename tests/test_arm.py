@@ -1,6 +1,7 @@
 """Base placement: wrist poses that are within reach by construction are found so, and a robot that stands wrong is moved."""
 
 import dataclasses
+import os
 import shutil
 import tempfile
 import unittest
@@ -48,6 +49,10 @@ def wrists_around_home(robot, count: int) -> ArmTargets:
     )
 
 
+def _die(_trial, status: int) -> None:
+    os._exit(status)
+
+
 class PlaceTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
@@ -92,10 +97,15 @@ class PlaceTest(unittest.TestCase):
         self.assertEqual(seen, sorted(seen))  # the best yet never gets worse
         self.assertIsNone(found.home)  # home held the hand three metres up
 
-    def test_the_same_seed_finds_the_same(self):
-        small = dataclasses.replace(CONFIG, candidates=2, rounds=1)
-        first, second = (placing.place(self.robot, [self.wrists], np.zeros((0, 3)), small) for _ in range(2))
+    def test_the_same_seed_finds_the_same_in_any_number_of_processes(self):
+        small = dataclasses.replace(CONFIG, candidates=2, rounds=2)
+        first, second = (placing.place(self.robot, [self.wrists], np.zeros((0, 3)), small, processes=n) for n in (1, 2))
         self.assertEqual((first.best, first.own), (second.best, second.own))
+
+    def test_a_process_that_is_killed_is_an_error(self):
+        trial = placing._Trial(robot=self.robot, config=CONFIG, tried=self.wrists, kept=self.wrists, paths=[self.wrists])
+        with self.assertRaisesRegex(RobotError, "was killed; is there memory"), placing._tried_by(trial, 2) as each:
+            list(each(_die, [9]))
 
     def test_a_candidate_that_cannot_come_in_is_given_up(self):
         whole = placing.reach(self.robot, self.own, self.wrists, CONFIG)

@@ -12,6 +12,7 @@ import tyro
 from rich.table import Table
 from rich.text import Text
 
+from xreset.backends.workers import usable_cores
 from xreset.cli._terminal import Console, Progress
 from xreset.demos import archive
 from xreset.description import DESCRIPTION, load_robot, robot_folder
@@ -131,6 +132,7 @@ def place(
     demos: Path,
     objects: Path | None = None,
     max_per_object: int = 2,
+    processes: int | None = None,
     write: bool = False,
     search: PlaceConfig = PlaceConfig(),  # noqa: B008  tyro reads flags from the default
 ) -> None:
@@ -141,6 +143,7 @@ def place(
         demos: archive of demonstrations (see `xreset demos`).
         objects: folder of real meshes; default: the built-in stand-ins.
         max_per_object: only so many sequences of each object, taken from all over the archive.
+        processes: that try placements at a time, with about 0.5 GB each; default: one for each core, at most 8.
         write: put the placement, its home and its figure into the robot's robot.toml.
         search: ranges and effort.
     """
@@ -157,7 +160,7 @@ def place(
         def report(done: float, best: placement.Reach) -> None:
             bar.update(task, completed=done, description=f"placements (best yet reaches {best.reached:.0%})")
 
-        found = places.place(spec, paths, avoid, search, report)
+        found = places.place(spec, paths, avoid, search, report, processes or min(usable_cores(), 8))
     for title, finalist in (("as described", found.own), ("best found", found.best)):
         pos, quat = (", ".join(f"{v:.4f}" for v in values) for values in (finalist.placement.pos, finalist.placement.quat))
         console.print(

@@ -2,15 +2,23 @@
 
 Hand retargeting says where the hand root must be in every frame of some demonstrations. Candidates are drawn at random, then around the
 best of them (the cross-entropy method), and tried on frames each on its own, from several starts: what the arm *can* reach. The few best,
-and the robot's own placement, then follow whole motions as in ``xreset retarget``, and the one that follows most wins.
+and the robot's own placement, then follow whole motions as in ``xreset retarget``, and the one that follows most wins. In how many
+processes they are tried makes no difference to the result.
 
 Shape letters: F frames, n arm joints.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,6 +36,8 @@ _LENGTH = 0.10
 """Length that counts as much as one radian in the measure of dexterity [m]."""
 _FIRST = 12
 """Frames that a candidate is tried on before all others: most fail on enough of them."""
+_WAVE = 8
+"""Candidates that are given up by the same standard: what had been found before all of them."""
 _SHRINK = 0.6
 """Factor by which the spread of candidates about the best shrinks from round to round."""
 
@@ -39,6 +49,7 @@ def place(
     avoid: np.ndarray,
     config: PlaceConfig | None = None,
     progress: Callable[[float, Reach], None] = lambda done, best: None,
+    processes: int = 1,
 ) -> Search:
     """The placement from which the robot follows most of the motions.
 
@@ -48,9 +59,10 @@ def place(
         avoid: [., 3] points that the base keeps clear of.
         config: ranges and effort.
         progress: called with the share that is done and the best reach yet.
+        processes: that try placements at a time; each needs about 0.5 GB.
 
     Raises:
-        RobotError: there is no wrist pose to reach.
+        RobotError: there is no wrist pose to reach, or a process was killed.
     """
     config = config or PlaceConfig()
     wrists = single_frames(paths, Thresholds().hand_error)
@@ -62,23 +74,74 @@ def place(
     if not len(kept.annotated):
         kept = tried
     own = Placement(pos=robot.base_pos, quat=robot.base_quat)
-    found = [(own, reach(robot, own, tried, config))]
+    trial = _Trial(robot=robot, config=config, tried=tried, kept=kept, paths=paths)
+    found = [(own, trial.reach(own, 0))]
     effort = config.rounds * config.candidates + 10 * (1 + config.elite)  # a finalist takes as long as ten candidates or so
-    for step, candidate in enumerate(_draws(robot, avoid, config, random, found)):
-        least = found[config.elite - 1][1].rank[0] if len(found) >= config.elite else 0
-        found.append((candidate, reach(robot, candidate, tried, config, least)))
-        found.sort(key=lambda pair: pair[1].rank, reverse=True)
-        progress((step + 1) / effort, found[0][1])
-
-    finalists = []
-    for placement in dict.fromkeys([own, *(placement for placement, _ in found[: config.elite if config.rounds else 0])]):
-        finalists.append(
-            Finalist(placement=placement, reach=reach(robot, placement, kept, config), followed=_followed(robot, placement, paths))
-        )
-        progress(1.0 - 10 * (1 + config.elite - len(finalists)) / effort, found[0][1])
+    with _tried_by(trial, processes) as each:
+        for number, drawn in enumerate(_rounds(robot, avoid, config, random, found)):
+            for begin in range(0, len(drawn), _WAVE):
+                wave = drawn[begin : begin + _WAVE]
+                least = found[config.elite - 1][1].rank[0] if len(found) >= config.elite else 0
+                found += zip(wave, each(_Trial.reach, wave, [least] * len(wave)), strict=True)
+                found.sort(key=lambda pair: pair[1].rank, reverse=True)
+                progress((number * config.candidates + begin + len(wave)) / effort, found[0][1])
+        finalists: list[Finalist] = []
+        chosen = list(dict.fromkeys([own, *(placement for placement, _ in found[: config.elite if config.rounds else 0])]))
+        for finalist in each(_Trial.finalist, chosen):
+            finalists.append(finalist)
+            progress(1.0 - 10 * (1 + config.elite - len(finalists)) / effort, found[0][1])
     best = max(finalists, key=lambda finalist: finalist.followed)
     home = robot.home[robot.arm_indices] if best.placement == own else _home(robot, best.placement)
     return Search(best=best, own=finalists[0], home=home, frames=sum(int(path.annotated.sum()) for path in paths))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Trial:
+    """What placements are tried on."""
+
+    robot: RobotSpec
+    config: PlaceConfig
+    tried: ArmTargets
+    """Single frames for candidates."""
+    kept: ArmTargets
+    """Single frames for finalists."""
+    paths: list[ArmTargets]
+
+    def reach(self, placement: Placement, least: int) -> Reach:
+        return reach(self.robot, placement, self.tried, self.config, least)
+
+    def finalist(self, placement: Placement) -> Finalist:
+        reached = reach(self.robot, placement, self.kept, self.config)
+        return Finalist(placement=placement, reach=reached, followed=_followed(self.robot, placement, self.paths))
+
+
+_own_trial: list[_Trial] = []
+"""In a process of the search: what it tries placements on."""
+
+
+def _begin(trial: _Trial) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends them
+    torch.set_num_threads(1)
+    _own_trial.append(trial)
+
+
+def _call(method: Callable[..., Any], *args: Any) -> Any:
+    return method(_own_trial[0], *args)
+
+
+@contextmanager
+def _tried_by(trial: _Trial, processes: int) -> Iterator[Callable[..., Iterable[Any]]]:
+    """``map`` of a method of the trial, here or in several processes."""
+    if processes < 2:
+        yield lambda method, *args: map(partial(method, trial), *args)
+        return
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin, (trial,))
+    try:
+        yield lambda method, *args: pool.map(partial(_call, method), *args)
+    except BrokenProcessPool as error:
+        raise RobotError("a process that tried placements was killed; is there memory for all of them? Try fewer (--processes).") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: PlaceConfig, least: int = 0) -> Reach:
@@ -119,16 +182,17 @@ def _followed(robot: RobotSpec, placement: Placement, paths: list[ArmTargets]) -
     return valid / sum(int(path.annotated.sum()) for path in paths)
 
 
-def _draws(
+def _rounds(
     robot: RobotSpec, avoid: np.ndarray, config: PlaceConfig, random: np.random.Generator, found: list[tuple[Placement, Reach]]
-) -> Iterator[Placement]:
-    """Candidates: first evenly over the ranges, then around the best that ``found`` holds by then."""
+) -> Iterator[list[Placement]]:
+    """The candidates of each round: first evenly over the ranges, then around the best that ``found`` holds by then."""
     own_tilt = float(np.degrees(np.arccos(np.clip(Rotation.from_quat(robot.base_quat, scalar_first=True).as_matrix()[2, 2], -1, 1))))
     tilt = config.tilt or (own_tilt, own_tilt)
     low = np.array([config.x[0], config.y[0], config.z[0], -180.0, tilt[0], -180.0])
     high = np.array([config.x[1], config.y[1], config.z[1], 180.0, tilt[1], 180.0])
     for number in range(config.rounds):
         centres = [_parameters(placement) for placement, _ in found[: config.elite]]
+        candidates = []
         for _ in range(config.candidates):
             while True:
                 if number == 0:
@@ -139,7 +203,8 @@ def _draws(
                 drawn[:3], drawn[4] = np.clip(drawn[:3], low[:3], high[:3]), np.clip(drawn[4], tilt[0], tilt[1])
                 if not len(avoid) or np.linalg.norm(avoid - drawn[:3], axis=1).min() >= config.clear:
                     break
-            yield _placement(drawn)
+            candidates.append(_placement(drawn))
+        yield candidates
 
 
 def _placement(parameters: np.ndarray) -> Placement:

@@ -16,6 +16,7 @@ from xreset.files import claim
 
 _COUNTS = {
     "num_envs", "iterations", "episodes", "states", "grasps", "per_object", "max_per_object", "max_demos", "perturbed", "per_gpu", "most",
+    "processes",
 }  # fmt: skip
 """At least 1."""
 _INDICES = {"seed", "episode", "repetition", "sequence", "frame", "port"}

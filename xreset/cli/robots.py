@@ -12,7 +12,7 @@ import tyro
 from rich.table import Table
 from rich.text import Text
 
-from xreset.backends.workers import usable_cores
+from xreset.backends import workers
 from xreset.cli._terminal import Console, Progress
 from xreset.demos import archive
 from xreset.description import DESCRIPTION, load_robot, robot_folder
@@ -160,7 +160,7 @@ def place(
         def report(done: float, best: placement.Reach) -> None:
             bar.update(task, completed=done, description=f"placements (best yet reaches {best.reached:.0%})")
 
-        found = places.place(spec, paths, avoid, search, report, processes or min(usable_cores(), 8))
+        found = places.place(spec, paths, avoid, search, report, processes or min(workers.usable_cores(), 8))
     for title, finalist in (("as described", found.own), ("best found", found.best)):
         pos, quat = (", ".join(f"{v:.4f}" for v in values) for values in (finalist.placement.pos, finalist.placement.quat))
         console.print(

@@ -20,7 +20,7 @@ import numpy as np
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import atomic_write, claim, read_json, read_toml, write_json
+from xreset.files import atomic_folder, atomic_write, claim, read_json, read_toml, write_json
 from xreset.records import Field, read_npz, write_npz
 from xreset.resets.bank import check_objects, read_bank, write_bank
 from xreset.spec import ObjectSpec
@@ -126,6 +126,20 @@ class AtomicWriteTest(InFolder):
             write_json(self.folder / "a" / "b.json", {})
 
 
+class AtomicFolderTest(InFolder):
+    def test_it_appears_whole_or_not_at_all(self):
+        made = self.folder / "new" / "made"
+        with self.assertRaisesRegex(ValueError, "half"), atomic_folder(made) as part:
+            (part / "a").write_text("1")
+            raise ValueError("half")
+        self.assertEqual(list(made.parent.iterdir()), [])
+        made.mkdir()  # an empty one makes room
+        with atomic_folder(made) as part:
+            (part / "a").write_text("1")
+            self.assertEqual(list(made.iterdir()), [])
+        self.assertEqual([path.name for path in made.parent.rglob("*")], ["made", "a"])
+
+
 class ClaimTest(InFolder):
     def test_one_writer_at_a_time(self):
         program = (
@@ -147,6 +161,7 @@ class ClaimTest(InFolder):
     def test_what_a_killed_writer_left_is_removed(self):
         for name in (".file.npz.abc.part", ".other.npz.abc.part"):
             (self.folder / name).write_bytes(b"half")
+        (self.folder / ".file.npz.abd.part" / "meshes").mkdir(parents=True)
         with claim(self.file):
             self.assert_only(".file.npz.lock", ".other.npz.abc.part")
         with claim(self.folder):

@@ -8,6 +8,7 @@ import glob
 import hashlib
 import json
 import os
+import shutil
 import stat
 import tempfile
 import tomllib
@@ -68,6 +69,19 @@ def write_whole(path: str | Path, content: bytes | memoryview | str) -> None:
 
 
 @contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """A new folder that becomes ``path``, which is not there or is empty, when the block ends, and vanishes if the block raises."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part"))
+    try:
+        yield temporary
+        temporary.chmod(0o755)
+        temporary.replace(path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
 def claim(path: str | Path) -> Iterator[None]:
     """Keep a file, or a folder that is there, to this process while the block runs, and remove what killed writers have left of it.
 
@@ -80,7 +94,10 @@ def claim(path: str | Path) -> Iterator[None]:
     try:
         folder, pattern = (path, ".*.part") if lock == path else (path.parent, f".{glob.escape(path.name)}.*.part")
         for leftover in folder.glob(pattern):
-            leftover.unlink(missing_ok=True)
+            if leftover.is_dir():
+                shutil.rmtree(leftover, ignore_errors=True)
+            else:
+                leftover.unlink(missing_ok=True)
         yield
     finally:
         if lock != path:

@@ -7,8 +7,6 @@ Shape letters: T frames of an episode, J actuated joints.
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -19,7 +17,7 @@ import numpy as np
 from xreset.errors import XResetError, needs
 from xreset.eval.export.recorded import Recorded, Recording
 from xreset.eval.report.clips import encode_mp4
-from xreset.files import write_json
+from xreset.files import atomic_folder, write_json
 from xreset.objects.catalogue import load_object
 from xreset.pictures.raster import Renderer, pose_matrix
 from xreset.spec import SceneSpec
@@ -64,14 +62,8 @@ def write_lerobot(
     if video and (min(size) < 16 or size[0] % 2 or size[1] % 2):
         raise XResetError(f"films of {size[0]} x {size[1]} pixels cannot be encoded; width and height must be even, from 16 on.")
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}.", suffix=".part"))
-        try:
+        with atomic_folder(folder) as part:
             _write(pa, part, recording, _Films(recording, size) if video else None, progress)
-            part.chmod(0o755)
-            part.replace(folder)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
     except OSError as error:
         raise XResetError(f"cannot write {folder}: {error.strerror or error}. Nothing was changed; choose another place.") from error
 

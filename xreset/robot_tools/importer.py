@@ -7,9 +7,6 @@ whether the guesses are right.
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from xreset.description import DESCRIPTION, load_robot
 from xreset.errors import RobotError
+from xreset.files import atomic_folder
 from xreset.geometry.collision import SelfCollision, height_above_table, table_points
 from xreset.geometry.dynamics import drive_inertia
 from xreset.geometry.kinematics import Kinematics
@@ -95,17 +93,9 @@ def import_robot(
         moved = f"the hand's root lies {1e3 * stand_off:.0f} mm along z of {mount.parent!r}, so that its body begins there (--offset)"
         whole = replace(whole, notes=(*whole.notes, moved))
     hand_root = _carrier(whole.tree, mount.child)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}."))
-    try:
+    with atomic_folder(out) as work:
         guessed, to_say = _write(whole, mount.parent, hand_root, work, thumb=thumb)
         load_robot(work)
-        work.chmod(0o755)
-        if out.is_dir():
-            out.rmdir()
-        os.replace(work, out)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
     return Imported(folder=out, guessed=guessed, to_say=to_say)
 
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from xreset.description import DESCRIPTION, load_robot
 from xreset.errors import RobotError
+from xreset.files import atomic_folder
 from xreset.geometry.urdf import RobotTree, robot_tree
 from xreset.geometry.urdf_writer import urdf_text, write_meshes
 from xreset.plugins import robot_folder
@@ -52,9 +50,7 @@ def reshape(robot: str, shapes: Path, out: Path) -> tuple[str, ...]:
             f"{shapes} is of another robot than {spec.name!r}: {'; '.join(apart)}. To make a robot of it: xreset robots import."
         )
     tree = replace(tree, links=tuple(replace(link, collisions=found.get(link.name, link.collisions)) for link in tree.links))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}."))
-    try:
+    with atomic_folder(out) as work:
         comment = f"{spec.name} with the collision shapes of {shapes.name}. Written by xreset robots reshape."
         (work / "robot.urdf").write_text(urdf_text(tree, read_source(spec.urdf).effort, mimics=spec.mimics, comment=comment))
         write_meshes(tree, work)
@@ -68,10 +64,6 @@ def reshape(robot: str, shapes: Path, out: Path) -> tuple[str, ...]:
             edits.append((r"^(exclude *= *\[)", rf"\g<1>{pairs}"))
         (work / DESCRIPTION).write_text(edited(text, robot_folder(robot) / DESCRIPTION, edits))
         load_robot(work)
-        work.chmod(0o755)
-        os.replace(work, out)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
     kept = [link.name for link in tree.links if link.collisions and link.name not in found]
     notes = [f"new shapes: {', '.join(found)}", f"as they were: {', '.join(kept)}"]
     return (*notes, *(f"{a} and {b} never collide: they meet {why}" for (a, b), why in met.items()))

@@ -224,11 +224,12 @@ class _Surface:
             middle, *ends = self._away(corners)
             farthest = max(farthest, float(middle.min(axis=1).max()))
             least = np.max(ends, axis=0).min(axis=1)
-            split = corners[least > farthest + _EXACT]
+            unsure = least > farthest + _EXACT
+            split = corners[unsure]
             between = (split + split[:, [1, 2, 0]]) / 2
             quarters = [between, *(np.stack((split[:, i], between[:, i], between[:, i - 1]), axis=1) for i in range(3))]
             pool = np.concatenate((pool[rest], *quarters))
-            bound = np.concatenate((bound[rest], np.tile(least[least > farthest + _EXACT], 4)))
+            bound = np.concatenate((bound[rest], np.tile(least[unsure], 4)))
         return farthest
 
     def _away(self, corners: np.ndarray) -> np.ndarray:
@@ -279,17 +280,15 @@ def _cut(solid: _Solid, settings: Settings, effort: _Effort, progress: Progress)
     """Parts of a solid whose hulls keep to its surface: the worst one is cut first."""
     queue: list[tuple[float, int, Manifold]] = []
     done: list[Manifold] = []
-    count = 0
+    count = itertools.count()
 
     def add(part: Manifold) -> None:
-        nonlocal count
         effort.spend(solid.solid, part)
         excess = solid.excess(part.hull(), solid.farthest)
         if excess <= _QUICK * settings.tolerance:
             done.append(part)
         else:
-            heapq.heappush(queue, (-excess, count, part))
-        count += 1
+            heapq.heappush(queue, (-excess, next(count), part))
 
     for part in solid.solid.decompose():
         add(part)

@@ -10,18 +10,11 @@ from torch import Tensor
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """[..., 4] Hamilton product: rotation b first, then a."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        (
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ),
-        dim=-1,
-    )
+    """[..., 4] Hamilton product: rotation b first, then a; both broadcast."""
+    aw, u, bw, v = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    product = a * b
+    w = product[..., :1] - product[..., 1:].sum(dim=-1, keepdim=True)
+    return torch.cat((w, torch.addcmul(torch.addcmul(torch.linalg.cross(u, v), aw, v), bw, u)), dim=-1)
 
 
 def quat_conjugate(q: Tensor) -> Tensor:
@@ -34,7 +27,7 @@ def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
     w, u = q[..., :1], q[..., 1:]
     u, v = torch.broadcast_tensors(u, v)
     t = 2.0 * torch.linalg.cross(u, v)
-    return v + w * t + torch.linalg.cross(u, t)
+    return torch.addcmul(v, w, t) + torch.linalg.cross(u, t)
 
 
 def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
@@ -70,13 +63,8 @@ def quat_to_axis_angle(q: Tensor) -> Tensor:
 
 def quat_to_matrix(q: Tensor) -> Tensor:
     """[..., 3, 3] rotation matrix of a unit quaternion [..., 4]."""
-    w, x, y, z = q.unbind(-1)
-    rows = (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    turned = quat_rotate(q[..., None, :], torch.eye(3, dtype=q.dtype, device=q.device))  # the unit vectors: the matrix's columns
+    return turned.mT
 
 
 def matrix_to_quat(R: Tensor) -> Tensor:

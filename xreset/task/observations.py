@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.geometry.rotations import quat_conjugate, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_axis_angle, quat_to_matrix
+from xreset.geometry.rotations import quat_conjugate, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_axis_angle
 from xreset.physics import Links, State
 from xreset.task.config import ObservationConfig
 
@@ -81,8 +81,8 @@ def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Gen
     noise = c.noise
     pos = x.seen_pos + noise.object_pos * _normal(x.seen_pos, generator)
     turn = quat_from_axis_angle(noise.object_rot * _normal(x.seen_pos, generator))
-    rotation = _shown(quat_multiply(turn, x.seen_quat), c)
-    return torch.cat((pos, rotation, x.goal_pos, _shown(x.goal_quat, c), x.gravity_fraction[:, None], x.previous_action), dim=-1)
+    rotation, goal_rotation = _shown(torch.stack((quat_multiply(turn, x.seen_quat), x.goal_quat)), c)
+    return torch.cat((pos, rotation, x.goal_pos, goal_rotation, x.gravity_fraction[:, None], x.previous_action), dim=-1)
 
 
 def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
@@ -140,4 +140,5 @@ def _shown(quat: Tensor, c: ObservationConfig) -> Tensor:
     """[..., 4] or [..., 6] the same rotation for whichever of its two quaternions: a policy must not see two numbers for one pose."""
     if c.rotation == "quaternion":
         return torch.where(quat[..., :1] < 0, -quat, quat)
-    return quat_to_matrix(quat)[..., :2].transpose(-1, -2).flatten(-2)
+    first_two = torch.eye(2, 3, dtype=quat.dtype, device=quat.device)
+    return quat_rotate(quat[..., None, :], first_two).flatten(-2)  # columns of the matrix

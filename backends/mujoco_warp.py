@@ -36,7 +36,15 @@ except ImportError as error:
 from xreset.backends import mujoco_warp_kernels as kernels
 from xreset.backends.mjcf import KNOWN_DIFFERENCES, MujocoSettings, compile_scene
 from xreset.backends.mjcf_model import MIN_FRICTION
-from xreset.backends.mujoco_warp_setup import TorchStream, announced, differing_fields, existing_device, fill_batched, prepare_engine
+from xreset.backends.mujoco_warp_setup import (
+    TorchStream,
+    announced,
+    contact_room,
+    differing_fields,
+    existing_device,
+    fill_batched,
+    prepare_engine,
+)
 
 _SET_PER_WORLD = (
     "body_mass", "body_inertia", "body_ipos", "body_subtreemass", "body_invweight0", "body_gravcomp", "geom_friction",
@@ -75,9 +83,9 @@ class MujocoWarpBackend(Backend):
         *,
         object_index: Tensor | None = None,
         device: str = "cpu",
-        contacts_per_world: int = 64,
-        convex_contacts_per_world: int = 32,
-        constraints_per_world: int = 220,
+        contacts_per_world: int | None = None,
+        convex_contacts_per_world: int | None = None,
+        constraints_per_world: int | None = None,
         solver_iterations: int = 8,
         settings: MujocoSettings | None = None,
     ) -> None:
@@ -92,6 +100,7 @@ class MujocoWarpBackend(Backend):
                 count while contacts are being found, so more are needed than touch.
             convex_contacts_per_world: likewise, pairs of a type that overlap and need the general convex algorithm.
             constraints_per_world: rows of constraints (4 a contact, 1 a dry friction, joint limit or mimic joint) in any one world.
+                None, of any of the three: by the object with the most pieces (:func:`~xreset.backends.mujoco_warp_setup.contact_room`).
             solver_iterations: most Newton iterations; worlds that have converged stop earlier, but a step waits for the slowest. With 8 the
                 conformance checks come out as with 30, at 240 and at 120 Hz.
             settings: further dials.
@@ -106,6 +115,9 @@ class MujocoWarpBackend(Backend):
         held = self.object_index.unique().tolist()
         scenes = {i: compile_scene(scene, i, slots_for=held, settings=settings or MujocoSettings()) for i in held}
         self._at = at = next(iter(scenes.values()))
+        asked = (contacts_per_world, convex_contacts_per_world, constraints_per_world)
+        usual = contact_room(max(len(scene.objects[i].pieces) for i in held))
+        contacts, convex, rows = (u if a is None else a for a, u in zip(asked, usual, strict=True))
         at.model.opt.iterations = solver_iterations
         with self._on_stream():
             differing = differing_fields([s.model for s in scenes.values()])
@@ -114,9 +126,9 @@ class MujocoWarpBackend(Backend):
             self._data: Any = mjw.make_data(
                 at.model,
                 nworld=num_worlds,
-                nconmax=contacts_per_world,
-                nccdmax=min(convex_contacts_per_world, contacts_per_world),
-                njmax=constraints_per_world,
+                nconmax=contacts,
+                nccdmax=min(convex, contacts),
+                njmax=rows,
             )
             fill_batched(self._model, scenes, self.object_index, differing)
             self._allocate()

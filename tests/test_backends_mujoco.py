@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from tests.toy_robot import toy_hand_arm
 from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench, snapshot
-from xreset.backends.conformance.scene import gripper, objects, scene
+from xreset.backends.conformance.scene import gripper, objects, scene, shape, solid
 from xreset.backends.mjcf import compile_scene
 from xreset.backends.mjcf_model import OBJECT, OTHER_LINK, TABLE, SceneModel
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
@@ -390,6 +390,15 @@ class Limits(unittest.TestCase):
         backend.set_state(state)
         backend.step(1)
         self.assertFalse(bool(backend.health().overflow.any()))
+
+    def test_an_object_of_many_pieces_has_room_for_its_contacts(self):
+        """Sixteen feet on the table: 256 rows of constraints."""
+        feet = [shape("box", (0.002, 0.002, 0.005), (x, y, 0.0)) for x in (-0.03, -0.01, 0.01, 0.03) for y in (-0.03, -0.01, 0.01, 0.03)]
+        standing = replace(scene(), objects=(solid("feet", 0.4, tuple(feet)),))
+        for options, overflows in (({}, False), ({"constraints_per_world": 220}, True)):
+            with MujocoWarpBackend(standing, 2, **options) as backend:
+                backend.step(8)
+                self.assertEqual(backend.health().overflow.tolist(), [overflows] * 2, options)
 
     def test_c_reports_the_engine_s_warnings_of_a_full_buffer(self):
         backend = MujocoBackend(scene(), 1, workers=0)

@@ -326,6 +326,7 @@ class HandTest(unittest.TestCase):
             "annotated": torch.ones(shape, dtype=torch.bool),
             "contact_points": torch.zeros_like(self.keypoints),
             "in_contact": torch.zeros(self.keypoints.shape[:3], dtype=torch.bool),
+            "held": torch.ones(shape, dtype=torch.bool),
             "object_pos": torch.full((*shape, 3), 9.0, dtype=FLOAT),
             "object_quat": torch.tensor([1.0, 0, 0, 0], dtype=FLOAT).expand(*shape, 4),
             "object_index": torch.zeros(len(self.keypoints), dtype=torch.long),

@@ -47,6 +47,20 @@ class TermTest(unittest.TestCase):
         cornered = terms.contact(self.target + gap, self.target, self.weight, 0.1, 1e-9).cost  # the paper's: 0, 1 cm and 40 cm beyond
         torch.testing.assert_close(cornered, self.weight @ torch.tensor([0.0, 0.01, 0.4], dtype=FLOAT), atol=1e-8, rtol=0)
 
+    def test_attraction(self):
+        d = torch.tensor([[0.1, -0.3, 0.99, 1.2]], dtype=FLOAT)
+        weight = torch.tensor([2.0, 3.0, 4.0, 5.0], dtype=FLOAT)
+        found = terms.attraction(d, weight, 1.0)
+        for k in range(4):
+            shift = torch.zeros_like(d)
+            shift[0, k] = STEP
+            slope = (terms.attraction(d + shift, weight, 1.0).cost - terms.attraction(d - shift, weight, 1.0).cost) / (4 * STEP)
+            torch.testing.assert_close(found.gradient[:, k], slope, atol=1e-8, rtol=1e-6)
+        self.assertEqual(found.gradient[0, 3].item(), 0.0)  # beyond its reach
+        self.assertTrue((found.curvature >= 0).all())
+        near = torch.full((1, 4), 1e-3, dtype=FLOAT)
+        torch.testing.assert_close(terms.attraction(near, weight, 1.0).cost, near.square() @ weight, atol=0, rtol=1e-5)
+
     def test_change(self):
         d = torch.tensor([[0.1, -0.3, 0.5]], dtype=FLOAT)
         weight = torch.tensor([2.0, 3.0, 4.0], dtype=FLOAT)

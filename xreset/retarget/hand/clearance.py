@@ -54,6 +54,11 @@ class Objects:
         """[..., 3] points in the mesh frame of the object of their frame [...]."""
         return (self.rot[frame].mT @ (points - self.pos[frame])[..., None])[..., 0]
 
+    def signed_distance(self, points: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`DistanceFields.signed_distance`, of points [N, 3] in frames [N] and with gradients [N, 3] in the world."""
+        distance, slope = self.fields.signed_distance(self.local(points, frame), self.index[frame])
+        return distance, (self.rot[frame] @ slope[..., None])[..., 0]
+
     def nearer(self, points: Tensor, frame: Tensor, than: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As :meth:`DistanceFields.nearer`, of points [N, 3] and with gradients [A, 3] in the world."""
         near, distance, slope = self.fields.nearer(self.local(points, frame), self.index[frame], than)

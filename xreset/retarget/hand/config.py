@@ -33,6 +33,10 @@ class HandConfig(Checked):
     """Distance that the hand keeps from the object [m]. Deeper grasps are pushed apart in physics: at -0.001 a third fewer are accepted."""
     self_depth: Finite[float] = 0.002
     """Depth of the hand's links in one another that is allowed [m]."""
+    pad_weight: NotNegative[float] = 1000.0
+    """Distance of a jaw's pads from the object that the human holds, averaged over each pad (not the paper's). Other hands have no pads."""
+    pad_reach: Positive[float] = 0.015
+    """Distance from the object beyond which a point of a pad is not drawn to it [m]."""
     smoothness_weight: Positive[float] = 2.0
     """Change of joints and root between neighbouring frames. Positive: it alone holds what no keypoint determines."""
     jump_limit: Positive[float] = 0.17

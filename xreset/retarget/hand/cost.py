@@ -1,6 +1,6 @@
 """The cost of hand retargeting over whole trajectories, and its Gauss-Newton approximation.
 
-    sum over frames of  bone vectors and directions + keypoints + contact + clearance
+    sum over frames of  bone vectors and directions + keypoints + contact + clearance + a jaw's pads
     + sum over neighbouring frames of  joint and root smoothness, and a wall against joint jumps
 
 Shape letters: S sequences padded to T frames, B frames of a chunk, P mapped keypoints, C pairs of keypoints, n = J + 6 variables.
@@ -18,6 +18,7 @@ from xreset.retarget.hand import terms
 from xreset.retarget.hand.clearance import Distances, Objects, too_near
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.model import HandModel
+from xreset.retarget.hand.pads import off_object
 from xreset.retarget.hand.problem import HandState, HandTargets
 from xreset.tensors import Tensors
 
@@ -116,6 +117,15 @@ def _frames(model: HandModel, targets: HandTargets, config: HandConfig, state: H
     cost = cost + weight * value.square().sum(1)
     gradient = gradient + weight * (row.mT @ value[..., None])[..., 0]
     hessian = hessian + weight * (row.mT @ row)
+
+    held = (targets.held & targets.annotated).flatten().nonzero()[:, 0]
+    if config.pad_weight and len(held) and len(model.pads.ball):
+        value, row = off_object(model, bodies, objects, held)
+        value, row = (value - config.object_clearance) / scale, row / scale
+        pads = terms.attraction(value, config.pad_weight * model.pads.share, config.pad_reach / scale)
+        cost[held] += pads.cost
+        gradient[held] += (row.mT @ pads.gradient[..., None])[..., 0]
+        hessian[held] += (row.mT * pads.curvature[:, None]) @ row
     return cost, gradient, hessian
 
 

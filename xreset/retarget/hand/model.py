@@ -18,6 +18,7 @@ from xreset.geometry.balls import hand_balls
 from xreset.geometry.collision import SelfCollision
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_to_matrix
+from xreset.retarget.hand.pads import pads_of
 from xreset.spec import FINGERS, KEYPOINTS, RobotSpec, TableSpec
 
 
@@ -83,6 +84,8 @@ class HandModel:
         collision = SelfCollision(robot, on_cpu, only=robot.self_collision_links)
         self.balls = hand_balls(robot, on_cpu, collision).to(self.device)
         """What keeps the hand out of the object, the table and itself."""
+        self.pads = pads_of(robot.fingertips, self.kinematics, self.balls, self.home)
+        """Those of a jaw; empty for any other hand."""
         self._bodies = tuple(dict.fromkeys((*self.links, *self.balls.links)))
         self._keypoint_bodies = torch.tensor([self._bodies.index(link) for link in self.links], device=self.device)
         self.group_body = torch.tensor([self._bodies.index(link) for link in self.balls.links], dtype=torch.long, device=self.device)

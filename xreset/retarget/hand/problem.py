@@ -25,6 +25,8 @@ class HandTargets(Tensors):
     """[S, T, P, 3] object surface points that the keypoints touch."""
     in_contact: Tensor
     """[S, T, P] bool"""
+    held: Tensor
+    """[S, T] bool: the thumb and another finger of the human touch the object."""
     object_pos: Tensor
     """[S, T, 3]"""
     object_quat: Tensor

@@ -80,6 +80,32 @@ def contact(x: Tensor, contact_point: Tensor, weight: Tensor, margin: float, kne
     return Term(cost.sum(-1), (pull * excess)[..., None] * n, pull[..., None, None] * n[..., :, None] * n[..., None, :])
 
 
+class Attraction(NamedTuple):
+    """A cost of distances and how it changes with them."""
+
+    cost: Tensor
+    """[B]"""
+    gradient: Tensor
+    """[B, N] half the gradient."""
+    curvature: Tensor
+    """[B, N] half the Hessian's diagonal, as of a weighted least square."""
+
+
+def attraction(distance: Tensor, weight: Tensor, reach: float) -> Attraction:
+    """E = w c^2/3 [1 - (1 - (d/c)^2)^3], w c^2/3 beyond c: w d^2 near 0, and no pull from afar.
+
+    Tukey's biweight (Beaton and Tukey, Technometrics 16, 1974), as iteratively reweighted least squares: its weight is w (1 - (d/c)^2)^2.
+
+    Args:
+        distance: [B, N] d.
+        weight: [N] w.
+        reach: c, in the units of the distances.
+    """
+    left = (1.0 - (distance / reach).square()).clamp_min(0.0)
+    pull = weight * left.square()
+    return Attraction((weight * reach**2 / 3.0 * (1.0 - left**3)).sum(-1), pull * distance, pull)
+
+
 def change(d: Tensor, weight: Tensor, limit: Tensor, excess_weight: float) -> tuple[Tensor, Tensor, Tensor]:
     """Change of variables between neighbouring frames: E = w d^2 + W [|d| - limit]_+^2.
 

@@ -1,7 +1,7 @@
 """A jaw's pads, which lie against the object that the human holds.
 
-Thumb and fingers of a human press on an object wherever their joints let them; a jaw presses along one axis. Drawn to the human's fingertips
-alone it touches the object aslant, with an edge of either pad, and squeezes it out.
+Thumb and fingers of a human press on an object wherever their joints let them; a jaw presses along one axis. Drawn to the human's
+fingertips alone it touches the object aslant, with an edge of either pad, and squeezes it out.
 
 Shape letters: H frames, N balls of pads, n variables.
 """

@@ -229,7 +229,7 @@ class _Work:
             annotated=padded(demos.hand_valid),
             contact_points=padded(self._touched[:, hand.keypoint_indices]),
             in_contact=padded(self.touches[:, hand.keypoint_indices]),
-            held=padded(self.touches[:, 1:5].any(axis=1) & self.touches[:, 5:].any(axis=1)),
+            held=padded(np.asarray(self.touches[:, 1:5].any(axis=1) & self.touches[:, 5:].any(axis=1))),  # keypoints of the thumb: 1 to 4
             object_pos=padded(demos.object_pos.astype(np.float64)),
             object_quat=padded(demos.object_quat_wxyz.astype(np.float64)),
             object_index=torch.tensor([list(self._surfaces).index(name) for name in demos.object_name[list(sequences)].tolist()]),

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.geometry.rotations import quat_conjugate, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_axis_angle
+from xreset.geometry.rotations import quat_conjugate, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_axis_angle, quat_to_matrix
 from xreset.physics import Links, State
 from xreset.task.config import ObservationConfig
 
@@ -140,5 +140,4 @@ def _shown(quat: Tensor, c: ObservationConfig) -> Tensor:
     """[..., 4] or [..., 6] the same rotation for whichever of its two quaternions: a policy must not see two numbers for one pose."""
     if c.rotation == "quaternion":
         return torch.where(quat[..., :1] < 0, -quat, quat)
-    first_two = torch.eye(2, 3, dtype=quat.dtype, device=quat.device)
-    return quat_rotate(quat[..., None, :], first_two).flatten(-2)  # columns of the matrix
+    return quat_to_matrix(quat)[..., :2].mT.flatten(-2)

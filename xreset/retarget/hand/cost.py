@@ -118,8 +118,8 @@ def _frames(model: HandModel, targets: HandTargets, config: HandConfig, state: H
     gradient = gradient + weight * (row.mT @ value[..., None])[..., 0]
     hessian = hessian + weight * (row.mT @ row)
 
-    held = (targets.held & targets.annotated).flatten().nonzero()[:, 0]
-    if config.pad_weight and len(held) and len(model.pads.ball):
+    if config.pad_weight and len(model.pads.ball):
+        held = (targets.held & targets.annotated).flatten().nonzero()[:, 0]
         value, row = off_object(model, bodies, objects, held)
         value, row = (value - config.object_clearance) / scale, row / scale
         pads = terms.attraction(value, config.pad_weight * model.pads.share, config.pad_reach / scale)

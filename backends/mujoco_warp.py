@@ -41,6 +41,7 @@ from xreset.backends.mujoco_warp_setup import (
     announced,
     contact_room,
     differing_fields,
+    engine_step,
     existing_device,
     fill_batched,
     prepare_engine,
@@ -112,6 +113,7 @@ class MujocoWarpBackend(Backend):
         prepare_engine()
         self._warp_device = wp.device_from_torch(self.device)
         self._on_stream = TorchStream(self.device)
+        self._advance = engine_step(self._warp_device)
         held = self.object_index.unique().tolist()
         scenes = {i: compile_scene(scene, i, slots_for=held, settings=settings or MujocoSettings()) for i in held}
         self._at = at = next(iter(scenes.values()))
@@ -180,8 +182,7 @@ class MujocoWarpBackend(Backend):
         with self._on_stream():
             for _ in range(substeps):
                 self._run("step")
-            self._run("contacts")
-            self._run("refresh")
+            self._run("read")
 
     # Readings --------------------------------------------------------------------------------------------------------------------
 
@@ -315,11 +316,11 @@ class MujocoWarpBackend(Backend):
     def _prepare(self) -> None:
         """Run each sequence of kernels once, which compiles it, then capture it as a graph: even on the CPU that saves most of the time."""
         sequences: dict[str, Callable[[], None]] = {
-            "step": lambda: mjw.step(self._model, self._data),
-            "contacts": self._read_contacts,
-            "refresh": self._refresh,
+            "refresh": self._refresh,  # first: a step needs its kinematics
+            "step": self._step,
+            "read": self._read,
             "begin": self._begin,
-            "parameters": self._write_parameters,
+            "parameters": self._change_parameters,
         }
         for sequence in sequences.values():
             sequence()
@@ -334,6 +335,26 @@ class MujocoWarpBackend(Backend):
         wp.synchronize_device(self._warp_device)
 
     # What the graphs hold -----------------------------------------------------------------------------------------------------------
+
+    # The kinematics of the present positions are always there: a step begins after them, and ends with them.
+
+    def _step(self) -> None:
+        self._advance(self._model, self._data)
+        mjw.fwd_kinematics(self._model, self._data)
+
+    def _read(self) -> None:
+        """Read what a step has led to."""
+        self._read_contacts()
+        self._read_motion()
+
+    def _refresh(self) -> None:
+        """Read the state that the worlds have been given."""
+        mjw.fwd_kinematics(self._model, self._data)
+        self._read_motion()
+
+    def _change_parameters(self) -> None:
+        self._write_parameters()
+        mjw.fwd_kinematics(self._model, self._data)  # of the new centres of mass
 
     def _read_contacts(self) -> None:
         """Read the forces of the last step's contacts; their arrays stay until the next step."""
@@ -350,11 +371,9 @@ class MujocoWarpBackend(Backend):
             outputs=[out["tip_force"], out["tip_touch"], out["table_force"]],
         )  # fmt: skip
 
-    def _refresh(self) -> None:
-        """Bring link poses and velocities up to date with qpos and qvel, and translate all of it."""
+    def _read_motion(self) -> None:
+        """Translate positions and velocities of joints, object and links."""
         m, d, out, at = self._model, self._data, self._out, self._at
-        mjw.kinematics(m, d)
-        mjw.com_pos(m, d)
         mjw.com_vel(m, d)
         wp.launch(
             kernels.read_state,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from typing import Any
@@ -21,6 +21,8 @@ from xreset.errors import BackendUnavailableError
 _WRONG_DEPTHS = ("4.0.0",)
 """Versions of MuJoCo-Warp that were seen to take the wrong depth of some contacts. Others are left as they are, and their private modules
 unread; ``tests/test_mujoco_warp_depth.py`` says whether they need it too."""
+_FORKS = ("4.0.0",)
+"""Versions whose step was seen to be the one of :mod:`xreset.backends.mujoco_warp_step`. Others make it themselves."""
 _PATIENCE = 3.0
 """Seconds after which the wait for kernels is explained. From the cache they take less."""
 
@@ -33,6 +35,15 @@ def prepare_engine() -> None:
         from xreset.backends.mujoco_warp_depth import correct_depths
 
         correct_depths()
+
+
+def engine_step(device: Any) -> Callable[[Any, Any], None]:
+    """What takes a model and data, whose kinematics are there, one step further."""
+    if mjw.__version__ not in _FORKS:
+        return mjw.step
+    from xreset.backends.mujoco_warp_step import ForkedStep
+
+    return ForkedStep(device)
 
 
 def existing_device(name: str) -> str:

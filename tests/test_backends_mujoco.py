@@ -9,11 +9,14 @@ from pathlib import Path
 from unittest import mock
 
 import mujoco
+import mujoco_warp
 import numpy as np
 import torch
+import warp
 from scipy.spatial.transform import Rotation
 
 from tests.toy_robot import toy_hand_arm
+from xreset.backends import mujoco_warp as mujoco_warp_backend
 from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench, snapshot
 from xreset.backends.conformance.scene import gripper, objects, scene, shape, solid
@@ -376,6 +379,36 @@ class BothBackends(unittest.TestCase):
             before = snapshot(backend.state())
             backend.set_state(self.bench.start()[[]], torch.tensor([], dtype=torch.long))
             torch.testing.assert_close(backend.state().object_pos, before.object_pos)
+
+
+class Steps(unittest.TestCase):
+    def test_the_forked_step_is_the_engine_s_in_either_order(self):
+        """What runs beside each other may end in either order."""
+        from xreset.backends.mujoco_warp_step import ForkedStep, constraints, finish, smooth_dynamics
+
+        def reversed_step(m, d):
+            constraints(m, d)
+            smooth_dynamics(m, d)
+            finish(m, d)
+
+        results = []
+        for step in (mujoco_warp.step, ForkedStep(warp.get_device("cpu")), reversed_step):
+            with (
+                mock.patch.object(mujoco_warp_backend, "engine_step", return_value=step),
+                MujocoWarpBackend(scene(), 8) as backend,
+            ):
+                state = snapshot(backend.state())
+                backend.set_state(replace(state, object_linvel=state.object_linvel + torch.tensor([0.3, 0.0, -0.5])))
+                backend.set_object_com(torch.tensor([0.01, 0.0, 0.0]).expand(8, 3))  # a parameter that moves what positions lead to
+                for target in torch.linspace(0.0, 0.3, 40):
+                    backend.set_joint_targets(state.joint_target + target)
+                    backend.step(2)
+                now, contacts = snapshot(backend.state()), backend.contacts()
+                results.append([getattr(now, f.name) for f in fields(now)] + [contacts.tip_force.clone(), contacts.table_force.clone()])
+        self.assertGreater(float(results[0][-1].abs().max()), 0.1, "something touches")
+        for other in results[1:]:
+            for a, b in zip(results[0], other, strict=True):
+                torch.testing.assert_close(a, b, rtol=0, atol=0)
 
 
 class Limits(unittest.TestCase):

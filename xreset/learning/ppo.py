@@ -87,6 +87,7 @@ class SequencePpo(PPO):
         self._rate = torch.tensor(self.learning_rate, device=device, dtype=torch.float32 if device.type == "cuda" else torch.float64)
         self._sums = torch.zeros(4, device=device)
         self._worlds = torch.zeros(count // self.num_mini_batches, dtype=torch.long, device=device)
+        self._beside = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._graphs = GraphRunner(device)
         self._graphs.active &= not self.is_multi_gpu and count % self.num_mini_batches == 0  # all minibatches alike
 
@@ -175,17 +176,33 @@ class SequencePpo(PPO):
                 state["step"] = state["step"].to(self.device)
 
     def act(self, obs: TensorDict) -> Tensor:
-        """Sample actions; the very first step of a run starts from a zero LSTM state, which is stored like any other."""
+        """Sample actions; the very first step of a run starts from a zero LSTM state, which is stored like any other.
+
+        As rsl-rl does; but on a GPU the values, which no action needs, are computed beside what follows, until :meth:`process_env_step`.
+        """
         for model in (self.actor, self.critic):
             if model.is_recurrent and model.get_hidden_state() is None:
                 with torch.no_grad():
                     model(obs)
                 h, c = model.get_hidden_state()  # pyright: ignore[reportGeneralTypeIssues]
                 model.reset(hidden_state=(torch.zeros_like(h), torch.zeros_like(c)))
-        return super().act(obs)
+        step, critic = self.transition, self.critic
+        step.observations, step.hidden_states = obs, (self.actor.get_hidden_state(), critic.get_hidden_state())
+        if self._beside is not None:
+            self._beside.wait_stream(torch.cuda.current_stream())
+            self._needed = vars(critic).copy()  # what was allocated on one stream must not be freed while another reads it
+        actions = step.actions = self.actor(obs, stochastic_output=True).detach()
+        step.actions_log_prob = self.actor.get_output_log_prob(actions).detach()
+        step.distribution_params = tuple(p.detach() for p in self.actor.output_distribution_params)
+        with torch.cuda.stream(self._beside):
+            step.values = critic(obs).detach()
+        return actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
         """Record one environment step, and which worlds' part of it is not to be learned from (``extras["faulty"]`` [N] bool)."""
+        if self._beside is not None:
+            torch.cuda.current_stream().wait_stream(self._beside)
+            self._needed = {}
         step = self.storage.step
         if not step:
             self._faulty = torch.zeros(self.storage.num_transitions_per_env, *dones.shape, dtype=torch.bool, device=self.device)

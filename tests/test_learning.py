@@ -95,6 +95,36 @@ class ModelTest(unittest.TestCase):
         self.assertEqual(float(obs["policy"].grad[:L].abs().max()), 0.0)
         self.assertGreater(float(obs["policy"].grad[L:].abs().max()), 0.0)
 
+    def test_the_gpu_s_lstm_is_the_library_s(self):
+        """Here with a stand-in for its kernel."""
+
+        def cell(inputs, recurrent, c, bias, recurrent_bias):
+            i, f, g, o = (inputs + recurrent + bias + recurrent_bias).chunk(4, dim=-1)
+            c = f.sigmoid() * c + i.sigmoid() * g.tanh()
+            return o.sigmoid() * c.tanh(), c, None
+
+        first = torch.zeros(T, N, dtype=torch.bool)
+        first[2, 1] = first[6, 0] = True
+        states = tuple(torch.randn(1, 2 * N, SMALL["lstm_dim"], generator=torch.Generator().manual_seed(i)) for i in range(2))
+        obs, outputs, gradients = with_real_history(observations(T, N), first), [], []
+        for on_gpu, low in ((False, False), (True, False), (True, True)):
+            model = make_model()
+            with (
+                mock.patch.object(torch.Tensor, "is_cuda", on_gpu),
+                mock.patch.object(torch.ops.aten, "_thnn_fused_lstm_cell", cell),
+                mock.patch.object(model.trunk.pointnet, "forward", lambda cloud, mlp=model.trunk.pointnet.mlp: mlp(cloud).amax(dim=-2)),
+            ):
+                model.trunk.pointnet.use_bfloat16 = low
+                outputs.append(model(obs, masks=first, hidden_state=states))
+                outputs[-1].square().sum().backward()
+                outputs[-1] = outputs[-1].detach()
+            gradients.append(model.trunk.lstm.weight_ih_l0.grad)
+        for found, expected in ((outputs[1], outputs[0]), (gradients[1], gradients[0])):
+            torch.testing.assert_close(found, expected)
+        for found, expected in ((outputs[2], outputs[0]), (gradients[2], gradients[0])):
+            self.assertLess(float((found - expected).norm()), 0.01 * float(expected.norm()))
+            self.assertGreater(float((found - expected).norm()), 0.0)
+
     def test_reused_embeddings_are_those_of_the_whole_history(self):
         dones = torch.zeros(T, N, dtype=torch.bool)
         dones[2, 0] = dones[5, 2] = True

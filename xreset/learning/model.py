@@ -65,7 +65,7 @@ def embed_sequences(pointnet: PointNet, cloud: Tensor, first: Tensor) -> Tensor:
     return embedded.transpose(0, 1)[torch.arange(cloud.shape[1], device=cloud.device)[:, None], source]
 
 
-def run_lstm(lstm: nn.LSTM, x: Tensor, keep: Tensor, state: LstmState, *, bfloat16: bool = False) -> tuple[Tensor, LstmState]:
+def run_lstm(lstm: nn.LSTM, x: Tensor, keep: Tensor, state: LstmState) -> tuple[Tensor, LstmState]:
     """One LSTM layer over L steps whose state may be zeroed before any of them.
 
     On a GPU the inputs of all steps are multiplied at once, with widths that suit the matrix units, and each step is one product and one
@@ -73,10 +73,9 @@ def run_lstm(lstm: nn.LSTM, x: Tensor, keep: Tensor, state: LstmState, *, bfloat
 
     Args:
         lstm: the layer.
-        x: [L, N, D]
+        x: [L, N, D]; in bfloat16 (on a GPU) all products take such factors, and sums and the state are float32 all the same.
         keep: [L, N] False where an episode begins.
         state: [1, N, H] each.
-        bfloat16: whether matrix products on a GPU take bfloat16 factors; sums and the state stay float32.
 
     Returns:
         outputs [L, N, H], new state.
@@ -88,15 +87,15 @@ def run_lstm(lstm: nn.LSTM, x: Tensor, keep: Tensor, state: LstmState, *, bfloat
             y, (h, c) = lstm(step[None], (h * kept, c * kept))
             out.append(y)
         return torch.cat(out), (h, c)
-    low = torch.bfloat16 if bfloat16 else x.dtype
+    low = x.dtype
     padding = (0, -x.shape[-1] % 8)
     weight, recurrent, bias, recurrent_bias = lstm.all_weights[0]
-    inputs = nn.functional.linear(nn.functional.pad(x, padding).to(low), nn.functional.pad(weight, padding).to(low)).to(x.dtype)
+    inputs = nn.functional.linear(nn.functional.pad(x, padding), nn.functional.pad(weight, padding).to(low))
     recurrent = recurrent.to(low)
     h, c = h[0], c[0]
     for step, kept in zip(inputs, keep.to(h.dtype)[..., None], strict=True):
-        gates = nn.functional.linear((h * kept).to(low), recurrent).to(x.dtype)
-        h, c, _ = torch.ops.aten._thnn_fused_lstm_cell(step, gates, c * kept, bias, recurrent_bias)
+        gates = (step.to(h.dtype), nn.functional.linear((h * kept).to(low), recurrent).to(h.dtype))  # one step's, while it is in the cache
+        h, c, _ = torch.ops.aten._thnn_fused_lstm_cell(*gates, c * kept, bias, recurrent_bias)
         out.append(h)
     return torch.stack(out), (h[None], c[None])
 
@@ -115,8 +114,12 @@ class Trunk(nn.Module):
         self.norm = nn.LayerNorm(lstm_dim)
 
     def join(self, flat: Tensor, embeddings: Tensor) -> Tensor:
-        """Flat [..., D] and embeddings [..., H, embedding] -> [..., D + H * embedding], the LSTM's input."""
-        return torch.cat((self.normalizer(flat), embeddings.flatten(-2)), dim=-1)
+        """Flat [..., D] and embeddings [..., H, embedding] -> [..., D + H * embedding], the LSTM's input.
+
+        It is in the precision of the LSTM's factors from the start: what copies it later moves half as much.
+        """
+        dtype = torch.bfloat16 if self.pointnet.use_bfloat16 and flat.is_cuda else flat.dtype
+        return torch.cat((self.normalizer(flat).to(dtype), embeddings.flatten(-2).to(dtype)), dim=-1)
 
     def forward(self, flat: Tensor, cloud: Tensor, state: LstmState) -> tuple[Tensor, LstmState]:
         """One step for N worlds: [N, D], [N, H, P, 3], LSTM state of [1, N, lstm] each -> [N, lstm], new state."""
@@ -181,7 +184,7 @@ class PointNetLstmModel(MLPModel):
                 zero = flat.new_zeros(1, flat.shape[0], self._latent_dim)
                 self.state = (zero, zero.clone())
             joined = trunk.join(flat, self._embed(cloud))
-            out, self.state = self._lstm(joined[None], torch.ones_like(joined[None, :, 0], dtype=torch.bool), self.state)
+            out, self.state = run_lstm(trunk.lstm, joined[None], torch.ones_like(joined[None, :, 0], dtype=torch.bool), self.state)
             return trunk.norm(out[0])
         assert isinstance(hidden_state, tuple), "an update needs the LSTM state that each sequence began with"
         self._embeddings = None  # the weights are about to change
@@ -192,11 +195,8 @@ class PointNetLstmModel(MLPModel):
             """[T, N, ...] -> [T / pieces, pieces * N, ...]"""
             return value.unflatten(0, (pieces, -1)).transpose(0, 1).flatten(1, 2)
 
-        out, _ = self._lstm(cut(joined), ~cut(masks), hidden_state)
+        out, _ = run_lstm(trunk.lstm, cut(joined), ~cut(masks), hidden_state)
         return trunk.norm(out).unflatten(1, (pieces, -1)).transpose(0, 1).flatten(0, 1)
-
-    def _lstm(self, x: Tensor, keep: Tensor, state: LstmState) -> tuple[Tensor, LstmState]:
-        return run_lstm(self.trunk.lstm, x, keep, state, bfloat16=self.trunk.pointnet.use_bfloat16)
 
     def _embed(self, cloud: Tensor) -> Tensor:
         """[N, H, embedding] embeddings of the histories [N, H, P, 3] that an environment shows in a rollout."""

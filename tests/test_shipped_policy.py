@@ -8,7 +8,6 @@ import unittest
 from importlib.util import find_spec
 from pathlib import Path
 
-from xreset import robots
 from xreset.demos.archive import write_demos
 from xreset.demos.synth import synthesize
 from xreset.eval.evaluate import BASELINES, evaluate, resolve
@@ -16,8 +15,7 @@ from xreset.eval.setting import Setting
 from xreset.eval.trial import engine
 from xreset.objects.catalogue import object_names
 from xreset.policies import card, shipped
-from xreset.policy import OnnxPolicy, check_contract
-from xreset.task.config import TaskConfig
+from xreset.policy import OnnxPolicy
 
 LARGEST = 5e6
 """What a policy may add to every download [bytes]."""
@@ -50,12 +48,10 @@ class ShippedPolicyTest(unittest.TestCase):
                 out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
                 self.assertEqual(json.loads(out), [[3, len(OnnxPolicy(file).contract["joint_names"])], True])
 
-    def test_it_fits_its_robot_and_the_observations_of_today(self):
-        for name, file in shipped().items():
+    def test_it_fits_its_robot_and_what_its_task_observes_today(self):
+        for name in shipped():
             with self.subTest(name):
-                contract = OnnxPolicy(file).contract
-                check_contract(name, contract, robots.load(contract["robot"]), TaskConfig())
-                resolve(name, None, 0)  # reads its task, too
+                resolve(name, None, 0)
 
     def test_the_file_is_small_and_tells_nothing_of_where_it_was_made(self):
         for name, file in shipped().items():

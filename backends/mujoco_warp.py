@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
+from itertools import chain
 from typing import Any, ClassVar, get_args
 
 import numpy as np
@@ -113,7 +115,6 @@ class MujocoWarpBackend(Backend):
         prepare_engine()
         self._warp_device = wp.device_from_torch(self.device)
         self._on_stream = TorchStream(self.device)
-        self._advance = engine_step(self._warp_device)
         held = self.object_index.unique().tolist()
         scenes = {i: compile_scene(scene, i, slots_for=held, settings=settings or MujocoSettings()) for i in held}
         self._at = at = next(iter(scenes.values()))
@@ -315,46 +316,31 @@ class MujocoWarpBackend(Backend):
 
     def _prepare(self) -> None:
         """Run each sequence of kernels once, which compiles it, then capture it as a graph: even on the CPU that saves most of the time."""
-        sequences: dict[str, Callable[[], None]] = {
-            "refresh": self._refresh,  # first: a step needs its kinematics
-            "step": self._step,
-            "read": self._read,
-            "begin": self._begin,
-            "parameters": self._change_parameters,
+        step = partial(engine_step(self._warp_device), self._model, self._data)
+        begin = partial(self._write_state, self._every_world, self._mask, self._coming)
+        # The kinematics of the present positions are always there: a step begins after them, and whatever changes them ends with them.
+        kinematics = partial(mjw.fwd_kinematics, self._model, self._data)
+        sequences: dict[str, tuple[Callable[[], None], ...]] = {
+            "refresh": (kinematics, self._read_motion),
+            "step": (step, kinematics),
+            "read": (self._read_contacts, self._read_motion),
+            "begin": (begin, self._write_parameters, kinematics, self._read_motion),
+            "parameters": (self._write_parameters, kinematics),
         }
-        for sequence in sequences.values():
-            sequence()
+        for part in chain.from_iterable(sequences.values()):
+            part()
         wp.synchronize_device(self._warp_device)
         self._graphs: dict[str, Any] = {}
         side_stream = wp.Stream(self._warp_device) if self._warp_device.is_cuda else None  # torch's default stream cannot be captured
         with wp.ScopedStream(side_stream):
             for name, sequence in sequences.items():
                 with wp.ScopedCapture(device=self._warp_device) as capture:
-                    sequence()
+                    for part in sequence:
+                        part()
                 self._graphs[name] = capture.graph
         wp.synchronize_device(self._warp_device)
 
     # What the graphs hold -----------------------------------------------------------------------------------------------------------
-
-    # The kinematics of the present positions are always there: a step begins after them, and ends with them.
-
-    def _step(self) -> None:
-        self._advance(self._model, self._data)
-        mjw.fwd_kinematics(self._model, self._data)
-
-    def _read(self) -> None:
-        """Read what a step has led to."""
-        self._read_contacts()
-        self._read_motion()
-
-    def _refresh(self) -> None:
-        """Read the state that the worlds have been given."""
-        mjw.fwd_kinematics(self._model, self._data)
-        self._read_motion()
-
-    def _change_parameters(self) -> None:
-        self._write_parameters()
-        mjw.fwd_kinematics(self._model, self._data)  # of the new centres of mass
 
     def _read_contacts(self) -> None:
         """Read the forces of the last step's contacts; their arrays stay until the next step."""
@@ -390,12 +376,6 @@ class MujocoWarpBackend(Backend):
             inputs=[*self._link_arrays, m.body_rootid, d.xpos, d.xquat, d.cvel, d.subtree_com],
             outputs=[out["link_pos"], out["link_quat"], out["link_linvel"], out["link_angvel"]],
         )
-
-    def _begin(self) -> None:
-        """Give the worlds of the mask what is coming to them."""
-        self._write_state(self._every_world, self._mask, self._coming)
-        self._write_parameters()
-        self._refresh()
 
     def _write_parameters(self) -> None:
         """Have the engine take over the parameters of the worlds of the mask."""

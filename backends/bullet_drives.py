@@ -24,7 +24,9 @@ class BulletDrives:
     far too many where B dwarfs M, as with armature on the light links of a hand.
     """
 
-    def __init__(self, engine: Any, client: int, body: int, robot: Mechanism, dt: float, mass_matrix_steps: int) -> None:
+    def __init__(
+        self, engine: Any, client: int, body: int, robot: Mechanism, dt: float, mass_matrix_steps: int
+    ) -> None:
         self._p, self._client, self._body, self._dt = engine, client, body, dt
         self._mass_matrix_age, self._mass_matrix_steps = 0, mass_matrix_steps
         spec, names = robot.robot, robot.joint_names
@@ -46,13 +48,18 @@ class BulletDrives:
         self._J[rows, self._mimic] = -1.0
         self._J[rows, self.driven[self._source]] = self._multiplier
         inertia = 1.0 / np.diag(np.linalg.inv(M))[self._mimic]
-        self._stiffness, self._damping = inertia / dt**2, 2.0 * inertia / dt  # critically damped, as stiff as one step can feel
+        self._stiffness, self._damping = (
+            inertia / dt**2,
+            2.0 * inertia / dt,
+        )  # critically damped, as stiff as one step can feel
         self._coupling = self._J.T @ ((dt**2 * self._stiffness + dt * self._damping)[:, None] * self._J)
         self._M, self._added, self._inverse = M, np.zeros_like(M), np.zeros_like(M)
         self._saturated = np.zeros(0, dtype=bool)
 
         # Bullet's joints start with a motor that brakes them.
-        engine.setJointMotorControlArray(body, self._links, engine.VELOCITY_CONTROL, forces=np.zeros(len(names)), physicsClientId=client)
+        engine.setJointMotorControlArray(
+            body, self._links, engine.VELOCITY_CONTROL, forces=np.zeros(len(names)), physicsClientId=client
+        )
 
     def reset(self, position: np.ndarray, velocity: np.ndarray, target: np.ndarray) -> None:
         """Set positions, velocities and targets [J] of the actuated joints; mimic joints follow."""
@@ -79,12 +86,18 @@ class BulletDrives:
         q, v = self.read()
         dt, driven = self._dt, self.driven
         wanted = self._kp * (self.target - q[driven]) - self._kd * v[driven]
-        tau = np.minimum(np.maximum(wanted, -self._effort), self._effort) @ self._joints.shares  # np.clip takes three times as long
+        tau = (
+            np.minimum(np.maximum(wanted, -self._effort), self._effort) @ self._joints.shares
+        )  # np.clip takes three times as long
         if len(self._mimic):
             lag = self._multiplier * q[driven[self._source]] + self._joints.offset - q[self._mimic]
             rate = self._J @ v
             tau -= self._J.T @ (self._stiffness * (lag + dt * rate) + self._damping * rate)
-        bias = np.array(self._p.calculateInverseDynamics(self._body, q.tolist(), v.tolist(), [0.0] * len(q), physicsClientId=self._client))
+        bias = np.array(
+            self._p.calculateInverseDynamics(
+                self._body, q.tolist(), v.tolist(), [0.0] * len(q), physicsClientId=self._client
+            )
+        )
         net = tau - bias
         if self._last_step is not None:
             last_velocity, last_net = self._last_step

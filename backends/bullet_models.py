@@ -81,10 +81,14 @@ WEIGHTLESS = Inertia(mass=1e-9, com=np.zeros(3), quat=np.array([1.0, 0, 0, 0]), 
 
 def robot_urdf(robot: Mechanism, parts: Sequence[Part], folder: Path) -> Path:
     """Write the URDF of a robot."""
-    text = [_link_text("root", WEIGHTLESS, (), folder)]  # Bullet does not count the root as a link, and tells less about it
+    text = [
+        _link_text("root", WEIGHTLESS, (), folder)
+    ]  # Bullet does not count the root as a link, and tells less about it
     for i, part in enumerate(parts):
         body = robot.bodies[part.body]
-        text.append(_link_text(f"link{i}", (body.inertia if i == part.body else None) or WEIGHTLESS, part.shapes, folder))
+        text.append(
+            _link_text(f"link{i}", (body.inertia if i == part.body else None) or WEIGHTLESS, part.shapes, folder)
+        )
         if i == 0 or i != part.body:
             text.append(_fixed_joint_text(i, f"link{part.body}" if i else "root"))
             continue
@@ -117,7 +121,9 @@ def _link_text(name: str, inertia: Inertia, shapes: Sequence[Shape], folder: Pat
     ]
     for i, shape in enumerate(shapes):
         geometry = _geometry_text(shape, folder / f"{name}_{i}.obj")
-        origin = _origin(np.eye(4) if shape.geometry.kind == "hull" else shape.T_body_shape)  # a hull's vertices are moved instead
+        origin = _origin(
+            np.eye(4) if shape.geometry.kind == "hull" else shape.T_body_shape
+        )  # a hull's vertices are moved instead
         text.append(f"<collision>{origin}<geometry>{geometry}</geometry></collision>")
     return "".join([*text, "</link>"])
 
@@ -140,7 +146,11 @@ def _geometry_text(shape: Shape, mesh: Path) -> str:
 def _origin(T: np.ndarray) -> str:
     R = T[:3, :3]
     run = float(np.hypot(R[0, 0], R[1, 0]))  # cosine of the pitch: 0 where roll and yaw are one
-    roll, yaw = (np.arctan2(R[2, 1], R[2, 2]), np.arctan2(R[1, 0], R[0, 0])) if run > 1e-9 else (np.arctan2(-R[1, 2], R[1, 1]), 0.0)
+    roll, yaw = (
+        (np.arctan2(R[2, 1], R[2, 2]), np.arctan2(R[1, 0], R[0, 0]))
+        if run > 1e-9
+        else (np.arctan2(-R[1, 2], R[1, 1]), 0.0)
+    )
     return f'<origin xyz="{_numbers(T[:3, 3])}" rpy="{_numbers((roll, np.arctan2(-R[2, 0], run), yaw))}"/>'
 
 

@@ -18,7 +18,16 @@ from itertools import combinations
 import mujoco
 import numpy as np
 
-from xreset.backends.mjcf_model import MIN_FRICTION, OTHER_LINK, TABLE, SceneModel, add_sensors, body_name, locate, pos_quat
+from xreset.backends.mjcf_model import (
+    MIN_FRICTION,
+    OTHER_LINK,
+    TABLE,
+    SceneModel,
+    add_sensors,
+    body_name,
+    locate,
+    pos_quat,
+)
 from xreset.backends.rigid import Inertia, Mechanism, mechanism, object_inertia
 from xreset.errors import ObjectError, XResetError
 from xreset.geometry.dynamics import drive_shares
@@ -75,7 +84,9 @@ class MujocoSettings:
     def __post_init__(self) -> None:
         """Refuse what MuJoCo would silently raise to its minimum."""
         if not self.time_constant_steps >= MIN_TIME_CONSTANT_STEPS:
-            raise ValueError(f"time_constant_steps is {self.time_constant_steps}, expected at least {MIN_TIME_CONSTANT_STEPS}")
+            raise ValueError(
+                f"time_constant_steps is {self.time_constant_steps}, expected at least {MIN_TIME_CONSTANT_STEPS}"
+            )
 
 
 _DEFAULTS = MujocoSettings()
@@ -122,7 +133,9 @@ def compile_scene(
         model = spec.compile()
     except ValueError as error:
         thing = scene.objects[object_index].name
-        raise XResetError(f"MuJoCo refuses the robot {scene.robot.name!r} with the object {thing!r}: {error}") from error
+        raise XResetError(
+            f"MuJoCo refuses the robot {scene.robot.name!r} with the object {thing!r}: {error}"
+        ) from error
     _let_com_move(model, model.body("object").id)
     model.body_gravcomp[model.body("object").id] = 0.0
     return locate(robot, model, roles, parked, sensed)
@@ -176,7 +189,11 @@ def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, settings
         else:
             parent, (pos, quat) = added[body.parent], pos_quat(body.T_parent_body)
         element = parent.add_body(
-            name=body_name(body), pos=pos, quat=quat, gravcomp=float(description.gravity_compensated), explicitinertial=True
+            name=body_name(body),
+            pos=pos,
+            quat=quat,
+            gravcomp=float(description.gravity_compensated),
+            explicitinertial=True,
         )
         if body.inertia is not None:
             _set_inertia(element, body.inertia)
@@ -207,7 +224,12 @@ def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, settings
 
 
 def _set_inertia(element: mujoco.MjsBody, inertia: Inertia) -> None:
-    element.mass, element.ipos, element.inertia, element.iquat = inertia.mass, inertia.com, inertia.moments, inertia.quat
+    element.mass, element.ipos, element.inertia, element.iquat = (
+        inertia.mass,
+        inertia.com,
+        inertia.moments,
+        inertia.quat,
+    )
 
 
 def _add_joint(element: mujoco.MjsBody, joint: Joint, scene: SceneSpec) -> None:
@@ -226,7 +248,9 @@ def _add_joint(element: mujoco.MjsBody, joint: Joint, scene: SceneSpec) -> None:
     )
 
 
-def _limit_self_collision(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, geoms: list[list[tuple[str, str]]]) -> None:
+def _limit_self_collision(
+    spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, geoms: list[list[tuple[str, str]]]
+) -> None:
     """Keep the collisions between bodies that :meth:`Mechanism.may_collide` allows.
 
     MuJoCo excludes whole bodies. Where only some links of two bodies may collide, the bodies are excluded and those links' geoms paired.
@@ -240,7 +264,9 @@ def _limit_self_collision(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanis
             continue
         spec.add_exclude(bodyname1=body_name(robot.bodies[i]), bodyname2=body_name(robot.bodies[j]))
         for a, b in allowed:
-            spec.add_pair(geomname1=a, geomname2=b, condim=_CONDIM, friction=friction, solref=_solref(scene), solimp=_SOLIMP)
+            spec.add_pair(
+                geomname1=a, geomname2=b, condim=_CONDIM, friction=friction, solref=_solref(scene), solimp=_SOLIMP
+            )
 
 
 def _add_drives(spec: mujoco.MjSpec, scene: SceneSpec) -> None:
@@ -288,7 +314,9 @@ def _padded(values: Sequence[float], length: int = mujoco.mjNGAIN) -> np.ndarray
 # Object --------------------------------------------------------------------------------------------------------------------------------
 
 
-def _add_object(spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Sequence[int], settings: MujocoSettings) -> set[str]:
+def _add_object(
+    spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Sequence[int], settings: MujocoSettings
+) -> set[str]:
     """Add the object and empty slots; returns the names of the geoms that are parked."""
     thing = scene.objects[index]
     held = sorted({*slots_for, index})
@@ -297,7 +325,9 @@ def _add_object(spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Se
     for i in held:
         slots |= Counter(piece.geometry.kind for piece in scene.objects[i].pieces)  # the larger of the two counts
 
-    body = spec.worldbody.add_body(name="object", gravcomp=1.0, explicitinertial=True)  # MuJoCo ignores it unless it is set while compiling
+    body = spec.worldbody.add_body(
+        name="object", gravcomp=1.0, explicitinertial=True
+    )  # MuJoCo ignores it unless it is set while compiling
     inertia = object_inertia(thing)
     _set_inertia(body, replace(inertia, com=inertia.com + _ASIDE))
     body.add_joint(name="object", type=mujoco.mjtJoint.mjJNT_FREE, align=mujoco.mjtAlignFree.mjALIGNFREE_FALSE)
@@ -316,7 +346,12 @@ def _add_object(spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Se
                 parked.add(name)
                 size = (_PARKED_SIZE,) * 3
                 body.add_geom(
-                    name=name, type=_GEOM_TYPES[kind], pos=_PARKED_POS, size=size, meshname=spare if kind == "hull" else "", **common
+                    name=name,
+                    type=_GEOM_TYPES[kind],
+                    pos=_PARKED_POS,
+                    size=size,
+                    meshname=spare if kind == "hull" else "",
+                    **common,
                 )
     return parked
 

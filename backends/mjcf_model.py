@@ -67,7 +67,9 @@ class SceneModel:
 
         MuJoCo gives a pair the larger friction of its geoms, and the object's own stays at :data:`MIN_FRICTION`.
         """
-        return np.select([self.geom_role >= 0, self.geom_role == OTHER_LINK, self.geom_role == TABLE], [0, 1, 2], default=3)
+        return np.select(
+            [self.geom_role >= 0, self.geom_role == OTHER_LINK, self.geom_role == TABLE], [0, 1, 2], default=3
+        )
 
 
 def body_name(body: Body) -> str:
@@ -80,7 +82,11 @@ def pos_quat(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
 
 
-_NET_FORCE = (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1)  # intprm of a contact sensor: what, reduced to the net force, once
+_NET_FORCE = (
+    1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE),
+    3,
+    1,
+)  # intprm of a contact sensor: what, reduced to the net force, once
 
 
 def add_sensors(spec: mujoco.MjSpec, robot: Mechanism, roles: dict[str, int]) -> list[int]:
@@ -107,7 +113,9 @@ def add_sensors(spec: mujoco.MjSpec, robot: Mechanism, roles: dict[str, int]) ->
     return list(tips.values())
 
 
-def locate(robot: Mechanism, model: mujoco.MjModel, roles: dict[str, int], parked: set[str], sensed: list[int]) -> SceneModel:
+def locate(
+    robot: Mechanism, model: mujoco.MjModel, roles: dict[str, int], parked: set[str], sensed: list[int]
+) -> SceneModel:
     """Find the parts; ``roles``: geom -> its role, ``sensed``: fingertip of each geom that has a sensor."""
     joints, mimics = robot.robot.joint_names, robot.robot.mimics
     names = [model.geom(i).name for i in range(model.ngeom)]

@@ -44,12 +44,16 @@ class MujocoWorld(World):
             mujoco.set_mju_user_warning(lambda _: None)
         self._at: SceneModel = _compiled(_Same(scene), object_index, settings)
         self._model = copy(self._at.model)  # each world has parameters of its own
-        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world must be seen, not silently put back
+        self._model.opt.disableflags |= (
+            mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        )  # a broken world must be seen, not silently put back
         self._data = mujoco.MjData(self._model)
         self._option = self._model.opt
         self._silent = self._option.disableflags | mujoco.mjtDisableBit.mjDSBL_SENSOR
         self._sensing = self._option.disableflags
-        self._option.disableflags = self._silent  # sensors are read when they are asked for, not computed in each physics step
+        self._option.disableflags = (
+            self._silent
+        )  # sensors are read when they are asked for, not computed in each physics step
         self._ahead = False  # whether the first half of the next step is done, with the present parameters
         self._links_sensed = self._contacts_sensed = False
         self._overflowed, self._overflows = False, 0
@@ -59,13 +63,21 @@ class MujocoWorld(World):
         self._ctrl, self._qpos, self._qvel = data.ctrl, data.qpos, data.qvel
         at, q, v = self._at, self._qpos, self._qvel
         self._wrench = data.xfrc_applied[at.object_body]
-        self._object_pos, self._object_quat = q[at.object_qpos : at.object_qpos + 3], q[at.object_qpos + 3 : at.object_qpos + 7]
-        self._object_linvel, self._object_spin = v[at.object_dof : at.object_dof + 3], v[at.object_dof + 3 : at.object_dof + 6]
+        self._object_pos, self._object_quat = (
+            q[at.object_qpos : at.object_qpos + 3],
+            q[at.object_qpos + 3 : at.object_qpos + 7],
+        )
+        self._object_linvel, self._object_spin = (
+            v[at.object_dof : at.object_dof + 3],
+            v[at.object_dof + 3 : at.object_dof + 6],
+        )
         sizes = np.cumsum((3 * links, 4 * links, 3 * links, 3 * links, 3))
         pos, quat, linvel, angvel, self._table_force, tip_forces = np.split(data.sensordata, sizes)
         self._links = pos.reshape(-1, 3), quat.reshape(-1, 4), linvel.reshape(-1, 3), angvel.reshape(-1, 3)
         self._geom_forces = tip_forces.reshape(-1, 3)
-        self._sum_by_tip = -(self._at.sensed_tip == np.arange(links - 1)[:, None]).astype(np.float64)  # minus: of the tip on the object
+        self._sum_by_tip = -(self._at.sensed_tip == np.arange(links - 1)[:, None]).astype(
+            np.float64
+        )  # minus: of the tip on the object
         self._full = [data.warning[int(kind)] for kind in _FULL]
         self._com = object_inertia(scene.objects[object_index]).com
         self._ones = np.ones(len(data.qpos)), np.ones(len(data.qvel))
@@ -128,13 +140,18 @@ class MujocoWorld(World):
     def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
         """See :meth:`World.health`. The engine's own memory is looked at: in two pieces instead of seven, and with the mimic joints."""
         q_ones, v_ones = self._ones
-        finite = math.isfinite(self._qpos.dot(q_ones) + self._qvel.dot(v_ones))  # one bad number spoils a sum; cheaper than looking at each
+        finite = math.isfinite(
+            self._qpos.dot(q_ones) + self._qvel.dot(v_ones)
+        )  # one bad number spoils a sum; cheaper than looking at each
         return not finite, self._overflowed
 
     def mass_properties(self) -> list[Inertia]:
         m = self._model
         bodies = (*self._at.moving_bodies, self._at.object_body)
-        return [Inertia(mass=m.body_mass[i], com=m.body_ipos[i], quat=m.body_iquat[i], moments=m.body_inertia[i]) for i in bodies]
+        return [
+            Inertia(mass=m.body_mass[i], com=m.body_ipos[i], quat=m.body_iquat[i], moments=m.body_inertia[i])
+            for i in bodies
+        ]
 
     def set_object_inertia(self, inertia: Inertia) -> None:
         """See :meth:`World.set_object_inertia`. Of a free body, the solver's weights are the inverse of mass and inertia."""
@@ -144,7 +161,9 @@ class MujocoWorld(World):
         model.body_inertia[body] = inertia.moments
         model.body_ipos[body] = nominal.body_ipos[body] + (inertia.com - self._com)
         growth = inertia.mass / nominal.body_mass[body]
-        turning = inertia.moments[0] / (growth * nominal.body_inertia[body, 0])  # exactly 1 where the mass alone is another
+        turning = inertia.moments[0] / (
+            growth * nominal.body_inertia[body, 0]
+        )  # exactly 1 where the mass alone is another
         model.body_invweight0[body] = nominal.body_invweight0[body] / (growth, growth * turning)
         self._ahead = False
 

@@ -124,8 +124,12 @@ class MujocoWarpBackend(Backend):
         at.model.opt.iterations = solver_iterations
         with self._on_stream():
             differing = differing_fields([s.model for s in scenes.values()])
-            self._model: Any = mjw.put_model(at.model, batch_sizes=dict.fromkeys((*_SET_PER_WORLD, *differing), num_worlds))
-            self._model.opt.warn_overflow = 0  # overflows are counted, see health(); printing them from the GPU would flood the terminal
+            self._model: Any = mjw.put_model(
+                at.model, batch_sizes=dict.fromkeys((*_SET_PER_WORLD, *differing), num_worlds)
+            )
+            self._model.opt.warn_overflow = (
+                0  # overflows are counted, see health(); printing them from the GPU would flood the terminal
+            )
             self._data: Any = mjw.make_data(
                 at.model,
                 nworld=num_worlds,
@@ -265,7 +269,11 @@ class MujocoWarpBackend(Backend):
             ints(at.mimic_qpos), ints(at.mimic_dof), ints(at.mimic_source),
             wp.array(at.mimic_multiplier, dtype=float), wp.array(at.mimic_offset, dtype=float),
         ]  # fmt: skip
-        self._link_arrays = [ints(at.link_body), wp.array(at.link_pos, dtype=wp.vec3), wp.array(at.link_quat, dtype=wp.quat)]
+        self._link_arrays = [
+            ints(at.link_body),
+            wp.array(at.link_pos, dtype=wp.vec3),
+            wp.array(at.link_quat, dtype=wp.quat),
+        ]
         self._geom_role, self._friction_columns = ints(at.geom_role), ints(at.friction_column)
 
         view = {name: wp.to_torch(array) for name, array in self._out.items()}
@@ -273,10 +281,17 @@ class MujocoWarpBackend(Backend):
         self._overflow, self._nonfinite = wp.to_torch(self._data.overflow), view["nonfinite"]
         self._state = State(
             joint_target=self._ctrl,
-            **{name: view[name] for name in ("joint_pos", "joint_vel", "object_pos", "object_quat", "object_linvel", "object_angvel")},
+            **{
+                name: view[name]
+                for name in ("joint_pos", "joint_vel", "object_pos", "object_quat", "object_linvel", "object_angvel")
+            },
         )
-        self._links = Links(pos=view["link_pos"], quat=view["link_quat"], linvel=view["link_linvel"], angvel=view["link_angvel"])
-        self._contacts = Contacts(tip_force=view["tip_force"], tip_touch=view["tip_touch"], table_force=view["table_force"])
+        self._links = Links(
+            pos=view["link_pos"], quat=view["link_quat"], linvel=view["link_linvel"], angvel=view["link_angvel"]
+        )
+        self._contacts = Contacts(
+            tip_force=view["tip_force"], tip_touch=view["tip_touch"], table_force=view["table_force"]
+        )
         self._every_world = torch.arange(n, device=self.device)
         self._everything = torch.ones(n, dtype=torch.bool, device=self.device)
         self._mask = torch.zeros_like(self._everything)
@@ -331,7 +346,9 @@ class MujocoWarpBackend(Backend):
             part()
         wp.synchronize_device(self._warp_device)
         self._graphs: dict[str, Any] = {}
-        side_stream = wp.Stream(self._warp_device) if self._warp_device.is_cuda else None  # torch's default stream cannot be captured
+        side_stream = (
+            wp.Stream(self._warp_device) if self._warp_device.is_cuda else None
+        )  # torch's default stream cannot be captured
         with wp.ScopedStream(side_stream):
             for name, sequence in sequences.items():
                 with wp.ScopedCapture(device=self._warp_device) as capture:

@@ -29,7 +29,9 @@ _PATIENCE = 3.0
 
 def prepare_engine() -> None:
     """Set Warp up for this process, before any kernel is made: quiet, and with right depths of contacts."""
-    wp.config.log_level = wp.LOG_WARNING  # else a line for each of some hundred kernels; what a user needs to know is announced
+    wp.config.log_level = (
+        wp.LOG_WARNING
+    )  # else a line for each of some hundred kernels; what a user needs to know is announced
     wp.init()
     if mjw.__version__ in _WRONG_DEPTHS:
         from xreset.backends.mujoco_warp_depth import correct_depths
@@ -52,14 +54,18 @@ def existing_device(name: str) -> str:
     if device.type == "cpu":
         return name
     if device.type != "cuda":
-        raise BackendUnavailableError(f"the backend 'mujoco-warp' runs on devices 'cuda' and 'cpu', found {str(device)!r}.")
+        raise BackendUnavailableError(
+            f"the backend 'mujoco-warp' runs on devices 'cuda' and 'cpu', found {str(device)!r}."
+        )
     if not torch.cuda.is_available():
         raise BackendUnavailableError(
             "no CUDA device can be used here. Use device 'cpu', or the backend 'mujoco', which is faster on CPUs."
         )
     index = torch.cuda.current_device() if device.index is None else device.index
     if index >= torch.cuda.device_count():
-        raise BackendUnavailableError(f"there is no device 'cuda:{index}'; there are {torch.cuda.device_count()} CUDA devices.")
+        raise BackendUnavailableError(
+            f"there is no device 'cuda:{index}'; there are {torch.cuda.device_count()} CUDA devices."
+        )
     return f"cuda:{index}"
 
 
@@ -102,7 +108,9 @@ def fill_batched(model: Any, scenes: dict[int, SceneModel], object_index: Tensor
     for name in names:
         values = [np.array(getattr(scene.model, name)) for scene in scenes.values()]
         if name == "geom_dataid":
-            values = [np.where(s.parked, -1, value) for s, value in zip(scenes.values(), values, strict=True)]  # -1: no mesh in this world
+            values = [
+                np.where(s.parked, -1, value) for s, value in zip(scenes.values(), values, strict=True)
+            ]  # -1: no mesh in this world
         view = wp.to_torch(getattr(model, name))
         table = torch.as_tensor(np.stack(values), device=row.device).to(view.dtype).reshape(len(order), *view.shape[1:])
         view.copy_(table[row])

@@ -18,7 +18,16 @@ import torch
 from torch import Tensor
 
 from xreset.backends.rigid import Inertia
-from xreset.backends.workers import READINGS, STATE_FIELDS, Job, LocalWorlds, WorkerTeam, WorldFailure, layout_of, usable_cores
+from xreset.backends.workers import (
+    READINGS,
+    STATE_FIELDS,
+    Job,
+    LocalWorlds,
+    WorkerTeam,
+    WorldFailure,
+    layout_of,
+    usable_cores,
+)
 from xreset.errors import CapabilityError, XResetError
 from xreset.physics import Backend, Contacts, Health, Links, MassProperties, Parameter, State
 from xreset.spec import SceneSpec
@@ -166,7 +175,10 @@ class PoolBackend(Backend):
         layout = layout_of(num_worlds, scene.robot)
         owned = np.array_split(np.arange(num_worlds), max(workers, 1))
         jobs = [
-            Job(self.name, self.world_class, dict(world_options), scene, int(w[0]), tuple(self.object_index[w].tolist())) for w in owned
+            Job(
+                self.name, self.world_class, dict(world_options), scene, int(w[0]), tuple(self.object_index[w].tolist())
+            )
+            for w in owned
         ]
         if workers == 0:
             self._arrays = {name: np.zeros(shape, dtype) for name, (shape, dtype) in layout.items()}
@@ -182,8 +194,12 @@ class PoolBackend(Backend):
 
         views = {name: torch.from_numpy(array) for name, array in self._arrays.items()}
         self._state = State(**{name: views[name] for name in STATE_FIELDS})
-        self._links = Links(pos=views["link_pos"], quat=views["link_quat"], linvel=views["link_linvel"], angvel=views["link_angvel"])
-        self._contacts = Contacts(tip_force=views["tip_force"], tip_touch=views["tip_touch"], table_force=views["table_force"])
+        self._links = Links(
+            pos=views["link_pos"], quat=views["link_quat"], linvel=views["link_linvel"], angvel=views["link_angvel"]
+        )
+        self._contacts = Contacts(
+            tip_force=views["tip_force"], tip_touch=views["tip_touch"], table_force=views["table_force"]
+        )
         self._health = Health(nonfinite=views["nonfinite"], overflow=views["overflow"])
         for name, value in vars(State.initial(scene, self.object_index)).items():
             self._arrays[name][:] = value
@@ -238,7 +254,9 @@ class PoolBackend(Backend):
         if "mass_properties" not in self.capabilities:
             return super().mass_properties()
         self._command("mass_properties")
-        mass, com, inertia = (torch.from_numpy(self._arrays[f"body_{name}"].copy()) for name in ("mass", "com", "inertia"))
+        mass, com, inertia = (
+            torch.from_numpy(self._arrays[f"body_{name}"].copy()) for name in ("mass", "com", "inertia")
+        )
         return MassProperties(mass=mass, com=com, inertia=inertia)
 
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
@@ -260,7 +278,9 @@ class PoolBackend(Backend):
         self._arrays[name][index] = given
         self._command("set_parameter", index, name)
 
-    def _move(self, method: str, worlds: np.ndarray | None = None, argument: Any = None, *, readings: frozenset[str]) -> None:
+    def _move(
+        self, method: str, worlds: np.ndarray | None = None, argument: Any = None, *, readings: frozenset[str]
+    ) -> None:
         """Run a command that changes what worlds report; these readings are present afterwards."""
         self._present = frozenset[str]()
         self._command(method, worlds, argument, readings)
@@ -292,18 +312,30 @@ class PoolBackend(Backend):
             raise ValueError(f"{name} has shape {array.shape}, expected {expected}")
         return array
 
-    def _command(self, method: str, worlds: np.ndarray | None = None, argument: Any = None, readings: frozenset[str] = frozenset()) -> None:
+    def _command(
+        self,
+        method: str,
+        worlds: np.ndarray | None = None,
+        argument: Any = None,
+        readings: frozenset[str] = frozenset(),
+    ) -> None:
         self._must_be_open()
         try:
             self._team.command(method, worlds, argument, readings)
         except WorldFailure as failure:
             if failure.kind is not None:
                 raise failure.kind(f"world {failure.world}: {failure.message}") from failure
-            raise RuntimeError(f"backend {self.name!r}, world {failure.world}, {method}: {failure.message}\n{failure.trace}") from failure
-        except BaseException:  # the workers and this process no longer agree on what has been done (Ctrl-C, a dead worker)
+            raise RuntimeError(
+                f"backend {self.name!r}, world {failure.world}, {method}: {failure.message}\n{failure.trace}"
+            ) from failure
+        except (
+            BaseException
+        ):  # the workers and this process no longer agree on what has been done (Ctrl-C, a dead worker)
             self.close()
             raise
 
     def _must_be_open(self) -> None:
         if not self._close.alive:
-            raise XResetError(f"the backend {self.name!r} is closed (by close(), Ctrl-C or the death of a worker). Build a new one.")
+            raise XResetError(
+                f"the backend {self.name!r} is closed (by close(), Ctrl-C or the death of a worker). Build a new one."
+            )

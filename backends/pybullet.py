@@ -81,7 +81,9 @@ class PybulletWorld(World):
         self._p = p = _engine()
         self._client = p.connect(p.DIRECT)
         if self._client < 0:
-            raise XResetError("PyBullet gives this process no further client. Use more workers, or close backends that are done.")
+            raise XResetError(
+                "PyBullet gives this process no further client. Use more workers, or close backends that are done."
+            )
         self._internal_steps = settings.internal_steps
         dt = scene.timestep / settings.internal_steps
         p.setPhysicsEngineParameter(
@@ -121,14 +123,20 @@ class PybulletWorld(World):
             self._rebuild()
         p, client = self._p, self._client
         p.restoreState(self._clean, physicsClientId=client)
-        p.performCollisionDetection(physicsClientId=client)  # with the object far away: what touched it before is forgotten
+        p.performCollisionDetection(
+            physicsClientId=client
+        )  # with the object far away: what touched it before is forgotten
         self._drives.reset(state["joint_pos"], state["joint_vel"], state["joint_target"])
         self._quat = np.array(state["object_quat"])
         arm = rotate(self._quat, self._inertia.com)
         turn = multiply(self._quat, self._inertia.quat)
-        p.resetBasePositionAndOrientation(self._object.body, state["object_pos"] + arm, _xyzw(turn), physicsClientId=client)
+        p.resetBasePositionAndOrientation(
+            self._object.body, state["object_pos"] + arm, _xyzw(turn), physicsClientId=client
+        )
         omega = state["object_angvel"]
-        p.resetBaseVelocity(self._object.body, state["object_linvel"] + cross(omega, arm), omega, physicsClientId=client)
+        p.resetBaseVelocity(
+            self._object.body, state["object_linvel"] + cross(omega, arm), omega, physicsClientId=client
+        )
         self._fresh = True
 
     def get_state(self) -> dict[str, np.ndarray]:
@@ -167,7 +175,11 @@ class PybulletWorld(World):
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         states = self._p.getLinkStates(
-            self._robot.body, self._frames.bodies, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=self._client
+            self._robot.body,
+            self._frames.bodies,
+            computeLinkVelocity=1,
+            computeForwardKinematics=1,
+            physicsClientId=self._client,
         )
         rows = np.array([state[4] + state[5] + state[6] + state[7] for state in states])
         return self._frames.locate(rows[:, :3], rows[:, [6, 3, 4, 5]], rows[:, 7:10], rows[:, 10:])
@@ -195,7 +207,10 @@ class PybulletWorld(World):
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`. The object is loaded in the frame of its inertia."""
         moving = [(self._robot.body, link) for link in range(1, len(self._mechanism.bodies))]
-        infos = [self._p.getDynamicsInfo(*place, physicsClientId=self._client) for place in (*moving, (self._object.body, -1))]
+        infos = [
+            self._p.getDynamicsInfo(*place, physicsClientId=self._client)
+            for place in (*moving, (self._object.body, -1))
+        ]
         found = [Inertia(mass=i[0], com=np.array(i[3]), quat=_wxyz(i[4]), moments=np.array(i[2])) for i in infos]
         thing, own = found[-1], self._inertia
         in_mesh = replace(thing, com=own.com + rotate(own.quat, thing.com), quat=multiply(own.quat, thing.quat))
@@ -209,15 +224,23 @@ class PybulletWorld(World):
             self._rebuild()
             self.set_state(state)
         else:
-            self._p.changeDynamics(self._object.body, -1, mass=inertia.mass, physicsClientId=self._client)  # also invents an inertia
-            self._p.changeDynamics(self._object.body, -1, localInertiaDiagonal=inertia.moments, physicsClientId=self._client)
+            self._p.changeDynamics(
+                self._object.body, -1, mass=inertia.mass, physicsClientId=self._client
+            )  # also invents an inertia
+            self._p.changeDynamics(
+                self._object.body, -1, localInertiaDiagonal=inertia.moments, physicsClientId=self._client
+            )
 
     def set_friction(self, friction: np.ndarray) -> None:
         self._friction = friction
         tip, link, table = (float(mu) for mu in friction)
         self._set_surface(self._object, {None: 1.0}, torsional=0.0)
         self._set_surface(self._table, {None: table}, torsional=self._torsional)
-        self._set_surface(self._robot, {None: link} | dict.fromkeys(range(len(self._mechanism.robot.fingertips)), tip), self._torsional)
+        self._set_surface(
+            self._robot,
+            {None: link} | dict.fromkeys(range(len(self._mechanism.robot.fingertips)), tip),
+            self._torsional,
+        )
 
     def set_torsional_friction(self, torsional: float) -> None:
         self._torsional = torsional
@@ -250,11 +273,15 @@ class PybulletWorld(World):
         body = self._load(robot_urdf(robot, parts, folder), pos=spec.base_pos, quat=spec.base_quat, fixed=True)
         return Model(body, 0, parts)
 
-    def _load_rigid(self, groups: list[tuple[Shape, ...]], inertia: Inertia | None, pos: tuple[float, float, float]) -> Model:
+    def _load_rigid(
+        self, groups: list[tuple[Shape, ...]], inertia: Inertia | None, pos: tuple[float, float, float]
+    ) -> Model:
         """Make a single body, in the frame of its inertia; fixed if it has none. Its further groups are links without mass to speak of."""
         p = self._p
         T = np.eye(4) if inertia is None else np.linalg.inv(inertial_frame(inertia))
-        base, *others = [self._shape([replace(shape, T_body_shape=T @ shape.T_body_shape) for shape in group]) for group in groups]
+        base, *others = [
+            self._shape([replace(shape, T_body_shape=T @ shape.T_body_shape) for shape in group]) for group in groups
+        ]
         n, still, upright = len(others), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
         body = p.createMultiBody(
             baseMass=0.0 if inertia is None else inertia.mass,
@@ -286,7 +313,9 @@ class PybulletWorld(World):
         if shapes[0].geometry.vertices is not None:
             (shape,) = shapes
             vertices = (shape.geometry.vertices @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]).tolist()
-            index = p.createCollisionShape(p.GEOM_MESH, vertices=vertices, flags=_GEOM_INITIALIZE_SAT_FEATURES, physicsClientId=client)
+            index = p.createCollisionShape(
+                p.GEOM_MESH, vertices=vertices, flags=_GEOM_INITIALIZE_SAT_FEATURES, physicsClientId=client
+            )
             alone = p.createMultiBody(0.0, index, physicsClientId=client)
             p.changeDynamics(alone, -1, collisionMargin=0.0, physicsClientId=client)
             p.removeBody(alone, physicsClientId=client)
@@ -299,7 +328,9 @@ class PybulletWorld(World):
             radii=[size[0] for size in sizes],
             lengths=[2.0 * size[1] for size in sizes],
             collisionFramePositions=[shape.T_body_shape[:3, 3].tolist() for shape in shapes],
-            collisionFrameOrientations=[Rotation.from_matrix(shape.T_body_shape[:3, :3]).as_quat().tolist() for shape in shapes],
+            collisionFrameOrientations=[
+                Rotation.from_matrix(shape.T_body_shape[:3, :3]).as_quat().tolist() for shape in shapes
+            ],
             flags=[_GEOM_INITIALIZE_SAT_FEATURES] * len(shapes),
             physicsClientId=client,
         )
@@ -323,8 +354,12 @@ class PybulletWorld(World):
         """Take away the damping, sleep and margins that Bullet gives every link."""
         p, client = self._p, self._client
         for link, part in model.links:
-            p.changeDynamics(model.body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, physicsClientId=client)
-            p.changeDynamics(model.body, link, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client)
+            p.changeDynamics(
+                model.body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, physicsClientId=client
+            )
+            p.changeDynamics(
+                model.body, link, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING, physicsClientId=client
+            )
             if part.is_hull:
                 p.changeDynamics(model.body, link, collisionMargin=0.0, physicsClientId=client)
 
@@ -332,7 +367,9 @@ class PybulletWorld(World):
         """Set friction by the fingertip that a part belongs to."""
         for link, part in model.links:
             mu = lateral[part.tip]
-            self._p.changeDynamics(model.body, link, lateralFriction=mu, spinningFriction=torsional, physicsClientId=self._client)
+            self._p.changeDynamics(
+                model.body, link, lateralFriction=mu, spinningFriction=torsional, physicsClientId=self._client
+            )
 
     def _set_collision_pairs(self) -> None:
         def allow(a: Model, link_a: int, b: Model, link_b: int, yes: bool) -> None:
@@ -375,7 +412,14 @@ def _wxyz(q: Sequence[float]) -> np.ndarray:
 
 def _force_on_first(contact: Sequence[Any]) -> np.ndarray:
     """[3] force of a contact point on the first of its two bodies."""
-    normal, force, side, along, other_side, other = contact[7], contact[9], contact[10], contact[11], contact[12], contact[13]
+    normal, force, side, along, other_side, other = (
+        contact[7],
+        contact[9],
+        contact[10],
+        contact[11],
+        contact[12],
+        contact[13],
+    )
     return force * np.array(normal) + side * np.array(along) + other_side * np.array(other)
 
 

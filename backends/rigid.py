@@ -133,7 +133,9 @@ def mechanism(robot: RobotSpec) -> Mechanism:
             T_parent_body=T,
             inertia=None if joint is None else _fused_inertia(robot, links, frames),
             shapes=tuple(
-                LinkShape(link=link.name, shape=Shape(geometry=s.geometry, T_body_shape=frames[link.name][1] @ s.T_body_shape))
+                LinkShape(
+                    link=link.name, shape=Shape(geometry=s.geometry, T_body_shape=frames[link.name][1] @ s.T_body_shape)
+                )
                 for link in links
                 for s in link.collisions
             ),
@@ -155,7 +157,9 @@ class TrackedFrames:
         pos = np.array([T[:3, 3] for _, T in places])
         self._arms = Arms(np.stack((pos, pos - com), axis=1))
         quat = np.array([matrix_to_quat(T[:3, :3]) for _, T in places])
-        self._turns = np.stack([multiply(unit, quat) for unit in np.eye(4)], axis=1)  # [K, 4, 4] the product with quat, as a matrix
+        self._turns = np.stack(
+            [multiply(unit, quat) for unit in np.eye(4)], axis=1
+        )  # [K, 4, 4] the product with quat, as a matrix
 
     def locate(
         self, pos: np.ndarray, quat: np.ndarray, com_velocity: np.ndarray, angvel: np.ndarray
@@ -219,7 +223,9 @@ class Arms:
         forms[..., 0, 1:, :] = once
         forms[..., 1:, 1:, :] = cross(np.eye(3)[:, None], once[..., None, :, :])
         self._vectors = vectors
-        self._forms = np.moveaxis(forms.reshape(*vectors.shape[:-1], 16, 3), -3, -2).reshape(*vectors.shape[:-2], 16, -1)
+        self._forms = np.moveaxis(forms.reshape(*vectors.shape[:-1], 16, 3), -3, -2).reshape(
+            *vectors.shape[:-2], 16, -1
+        )
 
     def turned(self, quat: np.ndarray) -> np.ndarray:
         """The vectors [..., A, 3] in the world, given the unit quaternions [..., 4] of their bodies."""
@@ -235,11 +241,15 @@ def object_inertia(spec: ObjectSpec) -> Inertia:
 def principal(mass: float, com: np.ndarray, inertia: np.ndarray, error: type[XResetError], what: str) -> Inertia:
     """Turn an inertia matrix [3, 3] about the centre of mass into principal moments and axes; ``error`` if no body can have it."""
     if not mass > 0:
-        raise error(f"{what} has the mass {mass} kg, expected a positive one. Give it an <inertial> in the URDF, or a mass.")
+        raise error(
+            f"{what} has the mass {mass} kg, expected a positive one. Give it an <inertial> in the URDF, or a mass."
+        )
     moments, axes = np.linalg.eigh(inertia)
     if not (moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - 1e-6)):
         shown = ", ".join(f"{m:.3g}" for m in moments)
-        raise error(f"{what} has principal moments of inertia ({shown}) kg m^2, expected positive ones, none above the sum of the others.")
+        raise error(
+            f"{what} has principal moments of inertia ({shown}) kg m^2, expected positive ones, none above the sum of the others."
+        )
     axes[:, 0] *= np.sign(np.linalg.det(axes))
     return Inertia(mass=float(mass), com=np.asarray(com, dtype=float), quat=matrix_to_quat(axes), moments=moments)
 
@@ -252,10 +262,14 @@ def _check_names(robot: RobotSpec, tree: RobotTree) -> None:
         tree.link(link)
     for name in (*robot.joint_names, *(name for mimic in robot.mimics for name in (mimic.joint, mimic.source))):
         if tree.joint(name).type == "fixed":
-            raise RobotError(f"robot {robot.name!r}: the joint {name!r} is driven or mimics another, but it is fixed in the URDF.")
+            raise RobotError(
+                f"robot {robot.name!r}: the joint {name!r} is driven or mimics another, but it is fixed in the URDF."
+            )
     for mimic in robot.mimics:
         if mimic.source not in robot.joint_names:
-            raise RobotError(f"robot {robot.name!r}: the joint {mimic.joint!r} mimics {mimic.source!r}, expected a driven joint.")
+            raise RobotError(
+                f"robot {robot.name!r}: the joint {mimic.joint!r} mimics {mimic.source!r}, expected a driven joint."
+            )
     known = {*robot.joint_names, *(mimic.joint for mimic in robot.mimics)}
     for joint in tree.joints:
         if joint.type != "fixed" and joint.name not in known:

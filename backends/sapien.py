@@ -67,7 +67,9 @@ class SapienWorld(World):
         self._inertia = object_inertia(scene.objects[object_index])
         self._arm = Arms(self._inertia.com[None])
         self._torsional = scene.friction.torsional
-        self._materials = {role: sapien.physx.PhysxMaterial(0.0, 0.0, 0.0) for role in ("tip", "link", "table", "object")}
+        self._materials = {
+            role: sapien.physx.PhysxMaterial(0.0, 0.0, 0.0) for role in ("tip", "link", "table", "object")
+        }
         self._surfaces: dict[Any, _Surface] = {}
         self._entities: list[Any] = []
         self._add_table(scene)
@@ -142,7 +144,9 @@ class SapienWorld(World):
             arms = points - (pose.p + self._arm.turned(pose.q)[0])
             limits = np.array([self._pair_friction[surface.role] for surface in surfaces])
             missing = self._missing_wrench(*self._last_step, arms, normal_forces)
-            for surface, force in zip(surfaces, normal_forces + friction_forces(arms, normal_forces, limits, *missing), strict=True):
+            for surface, force in zip(
+                surfaces, normal_forces + friction_forces(arms, normal_forces, limits, *missing), strict=True
+            ):
                 if surface.role == "table":
                     table_force += force
                 elif surface.tip is not None:
@@ -154,7 +158,12 @@ class SapienWorld(World):
         bodies = (*self._bodies[1:], self._object)
         frames = [body.cmass_local_pose for body in bodies]
         return [
-            Inertia(mass=body.mass, com=frame.p.astype(float), quat=frame.q.astype(float), moments=body.inertia.astype(float))
+            Inertia(
+                mass=body.mass,
+                com=frame.p.astype(float),
+                quat=frame.q.astype(float),
+                moments=body.inertia.astype(float),
+            )
             for body, frame in zip(bodies, frames, strict=True)
         ]
 
@@ -182,7 +191,10 @@ class SapienWorld(World):
     def _add_table(self, scene: SceneSpec) -> None:
         table = self._sapien.physx.PhysxRigidStaticComponent()
         self._attach(
-            table, Shape(geometry=Geometry(kind="box", size=scene.table.half_size)), _Surface("table"), [TABLE_BIT, OBJECT_BIT, 0, 0]
+            table,
+            Shape(geometry=Geometry(kind="box", size=scene.table.half_size)),
+            _Surface("table"),
+            [TABLE_BIT, OBJECT_BIT, 0, 0],
         )
         self._add(table, "table", self._sapien.Pose([*scene.table.center, -scene.table.half_size[2]]))
 

@@ -31,7 +31,10 @@ class SapienJoints:
         self._drives = [articulation.active_joints[i] for i in at]
         """[J + Q] the actuated joints, then those that follow, whose drives carry a share of their source's."""
         self._followed = np.concatenate((np.arange(len(spec.joints)), self._moving.source))
-        share, rate = self._moving.shares[self._followed, at], np.concatenate((np.ones(len(spec.joints)), self._moving.multiplier))
+        share, rate = (
+            self._moving.shares[self._followed, at],
+            np.concatenate((np.ones(len(spec.joints)), self._moving.multiplier)),
+        )
         self._share = np.abs(np.stack((share / rate, share / rate, share)))
         """[3, J + Q] of stiffness, damping and effort limit."""
         for mimic in spec.mimics:
@@ -82,7 +85,9 @@ class SapienJoints:
         position, velocity = self.read()
         drive = np.clip(self._kp * (self.target - position) - self._kd * velocity, -self._effort, self._effort)
         torque = np.zeros(self._moving.count)
-        torque[self._driven] = np.clip(-self._felt * velocity / self._dt - drive, -self._moving.friction_loss, self._moving.friction_loss)
+        torque[self._driven] = np.clip(
+            -self._felt * velocity / self._dt - drive, -self._moving.friction_loss, self._moving.friction_loss
+        )
         self._articulation.qf = torque
 
 
@@ -106,7 +111,9 @@ def _couple(articulation: Any, joints: Mapping[str, Any], mimic: MimicSpec) -> N
         if link is not None:
             chain = [upper.parent_link, upper.child_link, *between[::-1], lower.child_link]
             rates = [0.0, first, *[0.0] * len(between), last]
-            inverse = [rate and 1.0 / rate for rate in rates]  # what PhysX scales the tendon's force by; the rates themselves jam it
+            inverse = [
+                rate and 1.0 / rate for rate in rates
+            ]  # what PhysX scales the tendon's force by; the rates themselves jam it
             articulation.create_fixed_tendon(
                 chain, rates, inverse, rest_length=mimic.offset, stiffness=_TENDON_STIFFNESS, damping=_TENDON_DAMPING
             )

@@ -80,7 +80,10 @@ _ALIGNMENT = 64
 
 
 def _size(layout: Layout) -> int:
-    return sum(-(-int(np.prod(shape)) * np.dtype(dtype).itemsize // _ALIGNMENT) * _ALIGNMENT for shape, dtype in layout.values())
+    return sum(
+        -(-int(np.prod(shape)) * np.dtype(dtype).itemsize // _ALIGNMENT) * _ALIGNMENT
+        for shape, dtype in layout.values()
+    )
 
 
 def _map(path: str, layout: Layout) -> dict[str, np.ndarray]:
@@ -233,7 +236,9 @@ class LocalWorlds:
 
     def _publish_links(self, i: int) -> None:
         arrays = self._arrays
-        arrays["link_pos"][i], arrays["link_quat"][i], arrays["link_linvel"][i], arrays["link_angvel"][i] = self._worlds[i].links()
+        arrays["link_pos"][i], arrays["link_quat"][i], arrays["link_linvel"][i], arrays["link_angvel"][i] = (
+            self._worlds[i].links()
+        )
 
     def _publish_contacts(self, i: int) -> None:
         arrays = self._arrays
@@ -310,7 +315,9 @@ def _sweep(folder: Path) -> None:
     for path in folder.glob("xreset-*"):
         with contextlib.suppress(OSError), open(path, "rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if time.time() - os.fstat(file.fileno()).st_mtime > 60.0:  # a young one's owner may not have come to hold it yet
+            if (
+                time.time() - os.fstat(file.fileno()).st_mtime > 60.0
+            ):  # a young one's owner may not have come to hold it yet
                 path.unlink()
 
 

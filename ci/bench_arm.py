@@ -37,7 +37,9 @@ def run(options: Options, console: Console) -> None:
     model = ArmModel(robot)
     measures: list[Measures] = []
     arm = seconds_of(lambda: measures.extend(track(model, path, SOLVED)[1] for path in paths))
-    console.print(f"{options.robot}: {demos.num_sequences} sequences, {demos.num_frames} frames: hand {hand:.1f} s, arm {arm:.1f} s")
+    console.print(
+        f"{options.robot}: {demos.num_sequences} sequences, {demos.num_frames} frames: hand {hand:.1f} s, arm {arm:.1f} s"
+    )
 
     above = [path.annotated & (path.root_pos[..., 2] > 0) for path in paths]
     solved = torch.cat([_follows(found, 1e9)[mask] for found, mask in zip(measures, above, strict=True)])

@@ -35,27 +35,46 @@ def run(options: Options, console: Console) -> None:
     robot, states = robots.load(options.robot), read_retargeted(path)
     specs = load_objects(sorted(set(states.object_name.tolist())), folder if isinstance(folder, Path) else None)
     links, name, depth = depths(states, robot, {spec.name: spec for spec in specs})
-    table = Table("", "valid frames", "deepest [mm]", *(f"> {1e3 * limit:g} mm" for limit in _DEPTHS), f"> {1e3 * _DEPTHS[1]:g} mm by link")
+    table = Table(
+        "",
+        "valid frames",
+        "deepest [mm]",
+        *(f"> {1e3 * limit:g} mm" for limit in _DEPTHS),
+        f"> {1e3 * _DEPTHS[1]:g} mm by link",
+    )
     for one in [*dict.fromkeys(name.tolist()), "all"]:
         mine = depth[name == one] if one != "all" else depth
         worst = mine.max(axis=1)
         by_link = ((link, (mine[:, k] > _DEPTHS[1]).mean()) for k, link in enumerate(links))
         shares = [f"{(worst > limit).mean():.1%}" for limit in _DEPTHS]
-        table.add_row(one, str(len(mine)), f"{1e3 * worst.max():.1f}", *shares, ", ".join(f"{link} {s:.1%}" for link, s in by_link if s))
+        table.add_row(
+            one,
+            str(len(mine)),
+            f"{1e3 * worst.max():.1f}",
+            *shares,
+            ", ".join(f"{link} {s:.1%}" for link, s in by_link if s),
+        )
     console.print(table)
 
 
-def depths(states: Retargeted, robot: RobotSpec, objects: dict[str, ObjectSpec]) -> tuple[list[str], np.ndarray, np.ndarray]:
+def depths(
+    states: Retargeted, robot: RobotSpec, objects: dict[str, ObjectSpec]
+) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Links with shapes; object [M] and depth [M, links] in it [m] of every valid frame, 0 where they are apart."""
     import coal
 
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     request.enable_signed_distance = True
     kinematics = Kinematics(robot)
-    links = [link for link in Kinematics(robot, root=robot.hand_root).link_names if kinematics.tree.link(link).collisions]
+    links = [
+        link for link in Kinematics(robot, root=robot.hand_root).link_names if kinematics.tree.link(link).collisions
+    ]
     T_links = kinematics.link_poses(torch.as_tensor(states.joint_pos), links).numpy()
     T_objects = np.tile(np.eye(4), (len(states.valid), 1, 1))
-    T_objects[:, :3, :3], T_objects[:, :3, 3] = quat_to_matrix(torch.as_tensor(states.object_quat_wxyz)).numpy(), states.object_pos
+    T_objects[:, :3, :3], T_objects[:, :3, 3] = (
+        quat_to_matrix(torch.as_tensor(states.object_quat_wxyz)).numpy(),
+        states.object_pos,
+    )
     hand = [[_prepared(coal, shape) for shape in kinematics.tree.link(link).collisions] for link in links]
     pieces = {name: [_prepared(coal, shape) for shape in spec.pieces] for name, spec in objects.items()}
     names = states.object_name[states.sequence_of_frame]
@@ -67,7 +86,9 @@ def depths(states: Retargeted, robot: RobotSpec, objects: dict[str, ObjectSpec])
                 for T_piece, piece, middle, reach in pieces[names[frame]]:
                     a, b = T_links[frame, k], T_objects[frame]
                     if np.linalg.norm(a @ center - b @ middle) < radius + reach:
-                        poses = [coal.Transform3s(T[:3, :3].copy(), T[:3, 3].copy()) for T in (a @ T_shape, b @ T_piece)]
+                        poses = [
+                            coal.Transform3s(T[:3, :3].copy(), T[:3, 3].copy()) for T in (a @ T_shape, b @ T_piece)
+                        ]
                         result.clear()
                         distance = coal.distance(shape, poses[0], piece, poses[1], request, result)
                         depth[row, k] = max(depth[row, k], -distance)

@@ -34,9 +34,13 @@ def run(options: Options, console: Console) -> None:
         for name, device in engines(options, console):
             with make_backend(name, scene, options.num_envs, device=device) as backend:
                 wrapped = rate(backend.step, options.seconds, device) * options.num_envs
-                env = ManipulationEnv(backend, task, ResetDistribution(bank, robot, bank.object_names, task.reset, backend.device))
+                env = ManipulationEnv(
+                    backend, task, ResetDistribution(bank, robot, bank.object_names, task.reset, backend.device)
+                )
                 action = torch.zeros(options.num_envs, env.num_actions, device=backend.device)
-                stepped = rate(lambda env=env, action=action: env.step(action), options.seconds, device) * options.num_envs
+                stepped = (
+                    rate(lambda env=env, action=action: env.step(action), options.seconds, device) * options.num_envs
+                )
                 table.add_row(name, device, f"{wrapped:,.0f}", f"{stepped:,.0f} ({stepped / wrapped:.2f})")
     console.print(table)
 

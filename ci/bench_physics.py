@@ -70,7 +70,14 @@ def run(options: Options, console: Console) -> None:
                 table.add_row(name, device, *cells)
         else:
             bare, wrapped, held = _batched(name, scene, grasp, device, options.seconds)
-            cells = ["all", f"{bare:,.0f}", "", f"{wrapped:,.0f}", f"{wrapped / bare:.2f} of bare", *["", ""] * (len(pools) - 1)]
+            cells = [
+                "all",
+                f"{bare:,.0f}",
+                "",
+                f"{wrapped:,.0f}",
+                f"{wrapped / bare:.2f} of bare",
+                *["", ""] * (len(pools) - 1),
+            ]
             table.add_row(name, device, *cells, held)
     console.print(table)
 
@@ -131,7 +138,9 @@ def _pooled(name: str, scene: SceneSpec, grasp: State, pools: Sequence[int], sec
         for kind in kinds:
             contenders["raw", kind] = partial(_spent, partial(_each, raw[kind]), steps, ())
             for workers, backend in zip(pools, backends, strict=True):
-                contenders[workers, kind] = partial(_spent, partial(_control_step, backend, grasp, kind), steps, _process_ids(backend))
+                contenders[workers, kind] = partial(
+                    _spent, partial(_control_step, backend, grasp, kind), steps, _process_ids(backend)
+                )
         turns: list[dict[Any, _Spent]] = []
         end = time.perf_counter() + seconds * len(contenders)
         while len(turns) < 3 or time.perf_counter() < end:
@@ -142,7 +151,10 @@ def _pooled(name: str, scene: SceneSpec, grasp: State, pools: Sequence[int], sec
         held = _held(backends[-1], grasp)
 
         def cells(kind: Readings) -> list[str]:
-            row = [kind, f"{n / _median(t['bare', kind].cpu for t in turns):,.0f}" if ("bare", kind) in contenders else ""]
+            row = [
+                kind,
+                f"{n / _median(t['bare', kind].cpu for t in turns):,.0f}" if ("bare", kind) in contenders else "",
+            ]
             row.append(f"{n / _median(t['raw', kind].cpu for t in turns):,.0f}")
             for workers in pools:
                 cpu = _median(t["raw", kind].cpu / t[workers, kind].cpu for t in turns)
@@ -252,7 +264,9 @@ def _pybullet_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Read
         state = joint_pos, joint_vel, pose, p.getBaseVelocity(thing, physicsClientId=client)
         if kind == "state":
             return state
-        links = p.getLinkStates(robot, tracked, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=client)
+        links = p.getLinkStates(
+            robot, tracked, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=client
+        )
         world._fresh = False
         return state, np.array([s[4] + s[5] + s[6] + s[7] for s in links]), world.contacts()
 

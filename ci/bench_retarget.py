@@ -53,7 +53,11 @@ class Errors:
 
 
 def add_arguments(group: _ArgumentGroup) -> None:
-    group.add_argument("--retarget-demos", type=Path, help="archive of real right-hand demonstrations (default: the section is left out)")
+    group.add_argument(
+        "--retarget-demos",
+        type=Path,
+        help="archive of real right-hand demonstrations (default: the section is left out)",
+    )
     group.add_argument("--retarget-objects", type=Path, help="folder of their meshes")
 
 
@@ -65,7 +69,9 @@ def run(options: Options, console: Console) -> None:
     demos = read_demos(path)
     objects = demo_objects(demos, folder)
     nine = one_per_object(demos)
-    table = Table("", "fingertips: mean / p95 [mm]", "keypoints", "contacts", "beyond 20 mm", "largest jump [rad]", "time [s]")
+    table = Table(
+        "", "fingertips: mean / p95 [mm]", "keypoints", "contacts", "beyond 20 mm", "largest jump [rad]", "time [s]"
+    )
     for name, config in _CONFIGS.items():
         found: list[Errors] = []
         seconds = seconds_of(lambda found=found, config=config: found.append(errors(nine, objects, options, config)))
@@ -77,8 +83,12 @@ def run(options: Options, console: Console) -> None:
     )
     if found[0].beyond_limits > 0:
         raise AssertionError(f"a hand joint is {found[0].beyond_limits} rad beyond its limits")
-    whole = seconds_of(lambda: list(hand_motions(demos, robots.load(options.robot), list(objects.values()), device=options.device)))
-    console.print(f"hand retargeting of {len(demos)} sequences, {demos.num_frames} frames, all preparation included: {whole:.0f} s")
+    whole = seconds_of(
+        lambda: list(hand_motions(demos, robots.load(options.robot), list(objects.values()), device=options.device))
+    )
+    console.print(
+        f"hand retargeting of {len(demos)} sequences, {demos.num_frames} frames, all preparation included: {whole:.0f} s"
+    )
 
 
 def one_per_object(demos: Demos) -> Demos:
@@ -102,7 +112,10 @@ def errors(demos: Demos, objects: Mapping[str, ObjectSpec], options: Options, co
     parts: list[tuple[np.ndarray, ...]] = []
     beyond = 0.0
     for sequences, _, motion in hand_motions(demos, robot, specs, RetargetConfig(hand=config), device=options.device):
-        beyond = max(beyond, float(torch.maximum(hand.kinematics.lower - motion.joints, motion.joints - hand.kinematics.upper).max()))
+        beyond = max(
+            beyond,
+            float(torch.maximum(hand.kinematics.lower - motion.joints, motion.joints - hand.kinematics.upper).max()),
+        )
         for slot, i in enumerate(sequences):
             rows = on_table.frames(i)
             seen = on_table.hand_valid[rows]
@@ -114,7 +127,9 @@ def errors(demos: Demos, objects: Mapping[str, ObjectSpec], options: Options, co
             to_contact = (np.linalg.norm(x - contact_points, axis=-1)[contact] for x in (robot_points, human))
             parts.append((off[:, tip].ravel(), off.ravel(), *to_contact, jumps.ravel()))
     tips, keypoints, contacts, human_contacts, jumps = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return Errors(tips=tips, keypoints=keypoints, contacts=contacts, human=human_contacts, jumps=jumps, beyond_limits=beyond)
+    return Errors(
+        tips=tips, keypoints=keypoints, contacts=contacts, human=human_contacts, jumps=jumps, beyond_limits=beyond
+    )
 
 
 def vertex_contacts(demos: Demos, objects: Mapping[str, ObjectSpec]) -> tuple[np.ndarray, np.ndarray]:
@@ -122,7 +137,9 @@ def vertex_contacts(demos: Demos, objects: Mapping[str, ObjectSpec]) -> tuple[np
     import trimesh
 
     points, touching = np.zeros((demos.num_frames, 21, 3)), np.zeros((demos.num_frames, 21), dtype=bool)
-    vertices = {name: trimesh.remesh.subdivide_to_size(spec.vertices, spec.faces, _EDGE)[0] for name, spec in objects.items()}
+    vertices = {
+        name: trimesh.remesh.subdivide_to_size(spec.vertices, spec.faces, _EDGE)[0] for name, spec in objects.items()
+    }
     trees = {name: cKDTree(v) for name, v in vertices.items()}
     for i, name in enumerate(demos.object_name.tolist()):
         rows = demos.frames(i)

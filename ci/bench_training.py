@@ -53,7 +53,9 @@ def run(options: Options, console: Console) -> None:
         names = tuple(o.name for o in inputs.objects)
         with make_backend("mujoco-warp", scene, options.num_envs, device=options.device) as backend:
             env = ManipulationEnv(
-                backend, config.task, ResetDistribution(inputs.bank, inputs.robot, names, config.task.reset, backend.device)
+                backend,
+                config.task,
+                ResetDistribution(inputs.bank, inputs.robot, names, config.task.reset, backend.device),
             )
             console.print(_measure(env, config, options, Path(folder)))
 
@@ -95,7 +97,13 @@ def _measure(env: ManipulationEnv, config: TrainConfig, options: Options, folder
     trained = (runner.env_steps - before) / runner.elapsed
     rolled, updated = (horizon / sorted(times)[len(times) // 2] for times in (collect, learn))
 
-    table = Table("", "env steps/s", "ms per control step", "", title=f"training: {n} worlds, {options.robot}, {config.ppo.precision}")
+    table = Table(
+        "",
+        "env steps/s",
+        "ms per control step",
+        "",
+        title=f"training: {n} worlds, {options.robot}, {config.ppo.precision}",
+    )
     note = {
         "raw": f"{still * n:,.0f} with constant targets",
         "env": f"{stepped / raw:.2f} of raw",

@@ -90,7 +90,9 @@ def held_grasp(robot: RobotSpec, objects: Sequence[ObjectSpec]) -> State:
     center = torch.as_tensor(moved.object_pos[frame], dtype=torch.float64)
     position = torch.as_tensor(moved.joint_pos[frame], dtype=torch.float64).requires_grad_()
     poses = Kinematics(robot).link_poses(position, [tip.link for tip in robot.fingertips])
-    (poses[:, :3, 3] - center).norm(dim=-1).sum().backward()  # its gradient is - J^T of a unit force on each tip towards the centre
+    (poses[:, :3, 3] - center).norm(
+        dim=-1
+    ).sum().backward()  # its gradient is - J^T of a unit force on each tip towards the centre
     assert position.grad is not None
     hand = torch.tensor([joint.group == "hand" for joint in robot.joints])
     stiffness = torch.tensor([joint.drive.kp for joint in robot.joints], dtype=torch.float64)

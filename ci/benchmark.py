@@ -37,7 +37,9 @@ def main() -> None:
         description="\n".join([__doc__ or "", *(module.__doc__ or "" for module in known.values())]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("sections", nargs="*", metavar="section", help=f"what to measure: {', '.join(known)} (default: all)")
+    parser.add_argument(
+        "sections", nargs="*", metavar="section", help=f"what to measure: {', '.join(known)} (default: all)"
+    )
     parser.add_argument("--robot", default="ur7e-sharpa")
     parser.add_argument("--backend", action="append", default=[], help="engine; again for more (default: all)")
     own = ", ".join(f"{name} {module.NUM_ENVS}" for name, module in known.items() if hasattr(module, "NUM_ENVS"))

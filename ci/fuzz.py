@@ -22,11 +22,21 @@ GIGABYTES = 6
 """Of address space that the whole process may take beyond what it has at the start."""
 
 
-def _round(name: str, reader: Reader, count: Counter, broken: dict[str, bytes], slowest: dict[str, float], number: int, end: float) -> None:
+def _round(
+    name: str,
+    reader: Reader,
+    count: Counter,
+    broken: dict[str, bytes],
+    slowest: dict[str, float],
+    number: int,
+    end: float,
+) -> None:
     whole = reader.file.read_bytes()
 
     @seed(number)
-    @settings(max_examples=100, deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+    @settings(
+        max_examples=100, deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
+    )
     @given(damages(reader.kind))
     def run(damage):
         if time.monotonic() > end:
@@ -64,7 +74,9 @@ def main() -> int:
                 _round(name, reader, counts[name], broken[name], slowest, options.seed * 1_000_003 + rounds, end)
     print("| reader | files | refused | read, and sound | broken | slowest |\n|---|---|---|---|---|---|")
     for name, count in counts.items():
-        print(f"| {name} | {count.total()} | {count['refused']} | {count['read']} | {count['broken']} | {slowest[name]:.1f} s |")
+        print(
+            f"| {name} | {count.total()} | {count['refused']} | {count['read']} | {count['broken']} | {slowest[name]:.1f} s |"
+        )
     total = sum(counts.values(), Counter())
     print(f"| all | {total.total()} | {total['refused']} | {total['read']} | {total['broken']} | |")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

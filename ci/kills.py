@@ -18,8 +18,25 @@ from pathlib import Path
 
 XRESET = [sys.executable, "-m", "xreset"]
 SMALL = [
-    *("--config.model.lstm", "16", "--config.model.mlp", "16", "--config.model.pointnet", "8", "8", "--config.ppo.horizon", "8"),
-    *("--config.ppo.minibatch-size", "64", "--config.save-interval", "2", "--config.task.observation.cloud-points", "16"),
+    *(
+        "--config.model.lstm",
+        "16",
+        "--config.model.mlp",
+        "16",
+        "--config.model.pointnet",
+        "8",
+        "8",
+        "--config.ppo.horizon",
+        "8",
+    ),
+    *(
+        "--config.ppo.minibatch-size",
+        "64",
+        "--config.save-interval",
+        "2",
+        "--config.task.observation.cloud-points",
+        "16",
+    ),
 ]
 
 
@@ -35,9 +52,25 @@ def main() -> int:
         folder = Path(name)
         demos, moved, bank, run = (folder / f for f in ("demos.npz", "retargeted.npz", "bank.npz", "run"))
         subprocess.run(
-            [*XRESET, "demos", "synth", "--out", demos, "--objects", "soup", "--per-object", "2"], check=True, capture_output=True
+            [*XRESET, "demos", "synth", "--out", demos, "--objects", "soup", "--per-object", "2"],
+            check=True,
+            capture_output=True,
         )
-        train = ["train", "--out", run, "--robot", "openarm", "--resets", bank, "--backend", "mujoco", "--device", "cpu", "--num-envs", "4"]
+        train = [
+            "train",
+            "--out",
+            run,
+            "--robot",
+            "openarm",
+            "--resets",
+            bank,
+            "--backend",
+            "mujoco",
+            "--device",
+            "cpu",
+            "--num-envs",
+            "4",
+        ]
         train += ["--iterations", "60", *SMALL]
         verbs: dict[str, tuple[Path, Callable[[], list]]] = {
             "retarget": (moved, lambda: ["retarget", demos, "--robot", "openarm", "--out", moved]),
@@ -61,7 +94,9 @@ def main() -> int:
                     before = found
             argv = resume(command(), run) if verb == "train" else command()
             done = attempt(argv, None)
-            left = [p.name for p in folder.rglob("*") if p.name.endswith((".part", ".lock")) or p.name.endswith(".partial")]
+            left = [
+                p.name for p in folder.rglob("*") if p.name.endswith((".part", ".lock")) or p.name.endswith(".partial")
+            ]
             good = done == 0 and result.exists() and not left
             failed |= not good
             rows.append(f"| {verb} | {killed} | {'yes' if good else 'NO'} | {', '.join(left) or '-'} |")
@@ -80,7 +115,12 @@ def resume(argv: list, run: Path) -> list:
 def attempt(argv: list, delay: float | None) -> int | None:
     """Exit status, or None if it was killed after ``delay`` seconds; an error is shown."""
     process = subprocess.Popen(
-        [*XRESET, *map(str, argv)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, env=os.environ, text=True
+        [*XRESET, *map(str, argv)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+        env=os.environ,
+        text=True,
     )
     try:
         said, _ = process.communicate(timeout=delay)

@@ -31,7 +31,12 @@ def broken(page: Path) -> list[str]:
 def main() -> None:
     """Print what is broken, and exit with 1 if anything is."""
     pages = subprocess.run(["git", "ls-files", "*.md"], capture_output=True, text=True, check=True).stdout.split()
-    problems = [problem for page in pages if not page.startswith("docs/") and Path(page).exists() for problem in broken(Path(page))]
+    problems = [
+        problem
+        for page in pages
+        if not page.startswith("docs/") and Path(page).exists()
+        for problem in broken(Path(page))
+    ]
     print("\n".join(problems), file=sys.stderr, end="\n" if problems else "")
     raise SystemExit(bool(problems))
 

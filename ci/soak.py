@@ -31,7 +31,9 @@ GROWTH = 8.0
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0, help="for all engines together")
-    parser.add_argument("--backend", action="append", default=[], help="engine; again for more (default: all that work here)")
+    parser.add_argument(
+        "--backend", action="append", default=[], help="engine; again for more (default: all that work here)"
+    )
     parser.add_argument("--one", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.one:
@@ -43,7 +45,9 @@ def main() -> int:
         + "|"
     )
     each = str(options.minutes / len(names))  # each in a process of its own, whose memory is only that engine's
-    return max(subprocess.run([sys.executable, __file__, "--one", name, "--minutes", each]).returncode for name in names)
+    return max(
+        subprocess.run([sys.executable, __file__, "--one", name, "--minutes", each]).returncode for name in names
+    )
 
 
 def soak(name: str, seconds: float) -> int:
@@ -70,10 +74,15 @@ def soak(name: str, seconds: float) -> int:
             if time.monotonic() > begin + len(used) * seconds / 200:
                 used.append(memory())
             steps += 1
-        assert int(env.nonfinite_count) >= broken - 1, f"{broken} worlds were broken, {int(env.nonfinite_count)} noticed"
+        assert int(env.nonfinite_count) >= broken - 1, (
+            f"{broken} worlds were broken, {int(env.nonfinite_count)} noticed"
+        )
     first, last = (float(np.mean(part)) for part in (used[20:40], used[-20:]))
     verdict = "constant" if last - first < GROWTH else "GREW"
-    print(f"| {name} | {seconds / 60:.0f} | {steps:,} | {starts:,} | {broken} | {first:.1f} MB, {last:.1f} MB | {verdict} |", flush=True)
+    print(
+        f"| {name} | {seconds / 60:.0f} | {steps:,} | {starts:,} | {broken} | {first:.1f} MB, {last:.1f} MB | {verdict} |",
+        flush=True,
+    )
     return int(verdict == "GREW")
 
 

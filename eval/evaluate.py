@@ -64,11 +64,15 @@ class Subject:
         """Its own task as evaluations play it, with the objects of a bank."""
         objects = load_objects(sorted({*map(str, bank.sequence_object)}), self.meshes(setting.objects))
         task = evaluation_task(self.task)
-        return Trial(robot=self.robot, objects=tuple(objects), bank=bank, task=task, seed=setting.seed, num_envs=setting.num_envs)
+        return Trial(
+            robot=self.robot, objects=tuple(objects), bank=bank, task=task, seed=setting.seed, num_envs=setting.num_envs
+        )
 
     def episodes(self, demos: Path, setting: Setting) -> tuple[Trial, Retargeted | None]:
         """The episodes of a file of demonstrations, and the trajectories that the ik baseline follows."""
-        bank, trajectories = load_motion(demos, self.robot, self.meshes(setting.objects), trajectories=self.label == "ik")
+        bank, trajectories = load_motion(
+            demos, self.robot, self.meshes(setting.objects), trajectories=self.label == "ik"
+        )
         return self.trial(bank, setting), trajectories
 
 
@@ -90,7 +94,15 @@ def resolve(policy: str, robot: str | None, seed: int) -> Subject:
             "ik": lambda _, trajectories: KinematicRetargeting(_given(trajectories)),
         }
         folder = Path("runs") / f"{policy}-{spec.name}" / "eval"
-        return Subject(policy=makers[policy], label=policy, robot=spec, task=TaskConfig(), folder=folder, objects_folder=None, inputs={})
+        return Subject(
+            policy=makers[policy],
+            label=policy,
+            robot=spec,
+            task=TaskConfig(),
+            folder=folder,
+            objects_folder=None,
+            inputs={},
+        )
     path, ours = Path(policy), shipped()
     objects_folder = None
     if path.is_dir():
@@ -105,7 +117,9 @@ def resolve(policy: str, robot: str | None, seed: int) -> Subject:
         file, folder, label = ours[policy], results_folder(policy) / "eval", policy
     else:
         known = ", ".join(BASELINES) + (f", or a policy that ships with xreset: {', '.join(ours)}" if ours else "")
-        raise PolicyError(f"there is no policy {policy!r}: expected a run folder, a .onnx file, or one of {known}. Check the name or path.")
+        raise PolicyError(
+            f"there is no policy {policy!r}: expected a run folder, a .onnx file, or one of {known}. Check the name or path."
+        )
     contract = OnnxPolicy(file).contract
     spec = load_robot(robot or contract["robot"])
     task = from_dict(TaskConfig, contract["task"], f"{file}: task")
@@ -122,7 +136,9 @@ def resolve(policy: str, robot: str | None, seed: int) -> Subject:
     )
 
 
-def load_motion(path: Path, robot: RobotSpec, objects_folder: Path | None, *, trajectories: bool) -> tuple[ResetBank, Retargeted | None]:
+def load_motion(
+    path: Path, robot: RobotSpec, objects_folder: Path | None, *, trajectories: bool
+) -> tuple[ResetBank, Retargeted | None]:
     """Starts and goals of demonstrations, and the robot's trajectories if asked for.
 
     Args:
@@ -142,7 +158,9 @@ def load_motion(path: Path, robot: RobotSpec, objects_folder: Path | None, *, tr
         else:
             return starts_and_goals(rest_on_table(demos, objects), robot), None
     else:
-        raise FileFormatError(f"{path} states schema {schema!r}, expected {DEMOS!r} (xreset demos) or {RETARGETED!r} (xreset retarget).")
+        raise FileFormatError(
+            f"{path} states schema {schema!r}, expected {DEMOS!r} (xreset demos) or {RETARGETED!r} (xreset retarget)."
+        )
     return starts_and_goals(data, robot), data
 
 
@@ -171,7 +189,9 @@ def evaluate(
     """
     choice = read_choice(subject.folder.parent) if subject.inputs else None
     if choice is not None and choice.policy_hash == subject.inputs["policy"] and choice.seed == setting.seed:
-        raise PolicyError(f"the starts of seed {setting.seed} are those by which this policy was chosen: evaluate it with another --seed.")
+        raise PolicyError(
+            f"the starts of seed {setting.seed} are those by which this policy was chosen: evaluate it with another --seed."
+        )
     trial, trajectories = subject.episodes(demos, setting)
     folder, inputs = subject.meshes(setting.objects), subject.inputs | {"demos": file_hash(demos)}
     summaries = []

@@ -120,7 +120,9 @@ def by_stage(tried: list[Tried]) -> list[dict[str, Any]]:
     for stage in STAGES:
         mine = [t for t in tried if t.stage == stage]
         if mine:
-            reached, stayed = (round(float(np.mean([getattr(t, what) for t in mine])), 6) for what in ("reached", "stayed"))
+            reached, stayed = (
+                round(float(np.mean([getattr(t, what) for t in mine])), 6) for what in ("reached", "stayed")
+            )
             out.append({"stage": stage, "states": len(mine), "reached": reached, "stayed": stayed})
     return out
 
@@ -150,7 +152,9 @@ def frontier(
     """
     bank = read_bank(resets, robot=subject.robot)
     if not bank.num_states:
-        raise DemoError(f"{resets} holds no state to try: every candidate was rejected. Look at its reasons (xreset resets).")
+        raise DemoError(
+            f"{resets} holds no state to try: every candidate was rejected. Look at its reasons (xreset resets)."
+        )
     trial = subject.trial(bank, setting)
     check_objects(resets, bank, trial.objects)
     rows = np.sort(np.random.default_rng(setting.seed).permutation(bank.num_states)[:states])

@@ -40,7 +40,9 @@ class MetricsConfig:
 class EpisodeMetrics:
     """Accumulates one episode in N worlds; a world that has ended is no longer looked at."""
 
-    def __init__(self, start: Reading, goal_pos: Tensor, goal_quat: Tensor, keypoints: Tensor, config: MetricsConfig) -> None:
+    def __init__(
+        self, start: Reading, goal_pos: Tensor, goal_quat: Tensor, keypoints: Tensor, config: MetricsConfig
+    ) -> None:
         """Begin.
 
         Args:
@@ -91,4 +93,6 @@ class EpisodeMetrics:
         self._best = torch.where(live, torch.minimum(self._best, self._distance(reading)), self._best)
 
     def _distance(self, reading: Reading) -> Tensor:
-        return keypoint_distance(reading.state.object_pos, reading.state.object_quat, self._goal_pos, self._goal_quat, self._keypoints)
+        return keypoint_distance(
+            reading.state.object_pos, reading.state.object_quat, self._goal_pos, self._goal_quat, self._keypoints
+        )

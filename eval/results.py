@@ -169,7 +169,10 @@ def mesh_folder(given: Path | None, recorded: str | None) -> Path | None:
 def write_results(folder: Path, summary: EvalResult, rollouts: Rollouts, joint_names: tuple[str, ...]) -> Path:
     """Write ``BACKEND.json``, ``BACKEND.episodes.json`` and ``BACKEND.trace.npz``; returns the first."""
     name = summary.backend
-    write_json(folder / f"{name}.episodes.json", {"schema": EPISODES_SCHEMA, "episodes": [asdict(e) for e in rollouts.episodes]})
+    write_json(
+        folder / f"{name}.episodes.json",
+        {"schema": EPISODES_SCHEMA, "episodes": [asdict(e) for e in rollouts.episodes]},
+    )
     traces = rollouts.traces
     recorded = [t.joint_target for t in traces if t.joint_target is not None]
     targets = np.stack(recorded) if len(recorded) == len(traces) else None

@@ -120,13 +120,23 @@ def roll_out(
             steps += env.max_episode_length * env.backend.num_worlds
             traces += recorder.traces(env, names)
             for world in np.flatnonzero(fresh):
-                found[int(items[world])] = _episode(result, int(world), int(sequences[items[world]]), int(repetition[items[world]]), demos)
+                found[int(items[world])] = _episode(
+                    result, int(world), int(sequences[items[world]]), int(repetition[items[world]]), demos
+                )
     episodes = tuple(found[i] for i in sorted(found))
-    return Rollouts(episodes=episodes, traces=tuple(sorted(traces, key=lambda t: t.sequence)), control_steps_per_second=steps / spent)
+    return Rollouts(
+        episodes=episodes,
+        traces=tuple(sorted(traces, key=lambda t: t.sequence)),
+        control_steps_per_second=steps / spent,
+    )
 
 
 def play(
-    policy: Policy, env: ManipulationEnv, points: torch.Tensor, metrics: MetricsConfig, look: Callable[[int, Reading], None]
+    policy: Policy,
+    env: ManipulationEnv,
+    points: torch.Tensor,
+    metrics: MetricsConfig,
+    look: Callable[[int, Reading], None],
 ) -> tuple[EpisodeMetrics, float]:
     """One episode in every world, from where it is now.
 
@@ -189,7 +199,9 @@ class _Recorder:
     def add(self, time: float, reading: Reading) -> None:
         if self._worlds:
             self._time.append(time)
-            self._frames.append({name: getattr(reading.state, name)[self._worlds].cpu().numpy().copy() for name in _STATES})
+            self._frames.append(
+                {name: getattr(reading.state, name)[self._worlds].cpu().numpy().copy() for name in _STATES}
+            )
 
     def add_targets(self, targets: torch.Tensor) -> None:
         if self._worlds:
@@ -200,7 +212,10 @@ class _Recorder:
             Trace(
                 sequence=int(env.sequence[world]),
                 object=names[int(env.backend.object_index[world])],
-                goal_pos=env.goal_pos[world].cpu().numpy().copy(),  # the environment writes the next round's goals in place
+                goal_pos=env.goal_pos[world]
+                .cpu()
+                .numpy()
+                .copy(),  # the environment writes the next round's goals in place
                 goal_quat=env.goal_quat[world].cpu().numpy().copy(),
                 time=np.array(self._time),
                 joint_target=np.stack([targets[i] for targets in self._targets]),

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 
-def bootstrap_ci95(values: np.ndarray, groups: np.ndarray | None = None, *, draws: int = 2000, seed: int = 0) -> tuple[float, float]:
+def bootstrap_ci95(
+    values: np.ndarray, groups: np.ndarray | None = None, *, draws: int = 2000, seed: int = 0
+) -> tuple[float, float]:
     """95 % percentile bootstrap interval of the mean.
 
     Args:

@@ -56,13 +56,35 @@ PROPERTIES = (
     Property(name="hand-damping", field="hand_damping", values=_SCALES, needs="drives"),
     Property(name="effort", field="effort", values=(0.4, 0.6, 0.8), needs="drives"),
     Property(name="action-latency", field="action_latency", values=(0.5, 1.0, 2.0), nominal=0.0, unit="control steps"),
-    Property(name="observation-latency", field="observation_latency", values=(0.5, 1.0, 2.0), nominal=0.0, unit="control steps"),
+    Property(
+        name="observation-latency",
+        field="observation_latency",
+        values=(0.5, 1.0, 2.0),
+        nominal=0.0,
+        unit="control steps",
+    ),
     Property(name="force-gain", field="force_gain", values=(0.5, 2.0)),
-    Property(name="object-friction", field="friction", values=(0.4, 0.55, 0.95, 1.2), nominal=0.75, unit="coefficient", needs="friction"),
-    Property(name="hand-friction", field="hand_friction", values=(0.4, 0.8), nominal=0.1, unit="coefficient", needs="friction"),
+    Property(
+        name="object-friction",
+        field="friction",
+        values=(0.4, 0.55, 0.95, 1.2),
+        nominal=0.75,
+        unit="coefficient",
+        needs="friction",
+    ),
+    Property(
+        name="hand-friction",
+        field="hand_friction",
+        values=(0.4, 0.8),
+        nominal=0.1,
+        unit="coefficient",
+        needs="friction",
+    ),
     Property(name="torsional-friction", field="torsional_friction", values=(0.0, 0.3, 2.0), needs="torsional_friction"),
     Property(name="object-inertia", field="object_inertia", values=(0.5, 2.0), needs="object_inertia"),
-    Property(name="object-com", field="object_com", values=(0.005, 0.01, 0.02), nominal=0.0, unit="m", needs="object_com"),
+    Property(
+        name="object-com", field="object_com", values=(0.005, 0.01, 0.02), nominal=0.0, unit="m", needs="object_com"
+    ),
     Property(name="object-mass", field="mass_scale", values=(0.5, 0.7, 1.3, 2.0), needs="object_mass"),
 )
 """What can be swept. Nominal values of the frictions are those of an evaluation with the default materials."""
@@ -97,8 +119,20 @@ class Curve:
     def bears(self) -> str:
         """The range in which fewer than ten points are lost, as far as was tried."""
         low, high = self.points[0].value, self.points[-1].value
-        below = f"from {self.lower:.2g}" if self.lower is not None else f"from {low:g} or less" if low < self.nominal else ""
-        above = f"up to {self.upper:.2g}" if self.upper is not None else f"up to {high:g} or more" if high > self.nominal else ""
+        below = (
+            f"from {self.lower:.2g}"
+            if self.lower is not None
+            else f"from {low:g} or less"
+            if low < self.nominal
+            else ""
+        )
+        above = (
+            f"up to {self.upper:.2g}"
+            if self.upper is not None
+            else f"up to {high:g} or more"
+            if high > self.nominal
+            else ""
+        )
         return " ".join(filter(None, (below, above, "" if self.unit == "x" else self.unit)))
 
     def is_certain(self, limit: float) -> bool:
@@ -128,12 +162,18 @@ class Stress:
                 if value is not None:
                     size = abs(math.log(value)) if curve.unit == "x" else math.inf
                     costs[curve.is_certain(value)].append((size, f"{curve.property} {_amount(curve.unit, value)}"))
-        sure, perhaps = (", or ".join(text for _, text in sorted(costs[certain], key=lambda c: c[0])) for certain in (True, False))
+        sure, perhaps = (
+            ", or ".join(text for _, text in sorted(costs[certain], key=lambda c: c[0])) for certain in (True, False)
+        )
         borne = sum(curve.lower is None and curve.upper is None for curve in self.curves)
         points = f"{100 * COSTLY:.0f} points"
         parts = [f"{points} less with {sure}"] if sure else []
         parts += [f"perhaps {points} less, within chance, with {perhaps}"] if perhaps else []
-        parts += [f"fewer than {points} less with {borne} of {len(self.curves)} properties, as far as was tried"] if borne else []
+        parts += (
+            [f"fewer than {points} less with {borne} of {len(self.curves)} properties, as far as was tried"]
+            if borne
+            else []
+        )
         return f"{self.backend}, {self.episodes} episodes: {'; '.join((f'{100 * self.task_progress:.0f} %', *parts))}."
 
 
@@ -160,9 +200,13 @@ def chosen(wanted: Sequence[str]) -> tuple[Property, ...]:
             try:
                 numbers = sorted({float(v) for v in values.split(",")} - {prop.nominal})
             except ValueError:
-                raise XResetError(f"{text!r} states values that are no numbers, expected {name}=VALUE,VALUE...") from None
+                raise XResetError(
+                    f"{text!r} states values that are no numbers, expected {name}=VALUE,VALUE..."
+                ) from None
             if not numbers or not all(0 <= v < float("inf") for v in numbers):
-                raise XResetError(f"{text!r}: expected finite values, 0 or more, other than the nominal one, which is {prop.nominal:g}.")
+                raise XResetError(
+                    f"{text!r}: expected finite values, 0 or more, other than the nominal one, which is {prop.nominal:g}."
+                )
             prop = replace(prop, values=tuple(numbers))
         found.append(prop)
     return tuple(found) or PROPERTIES
@@ -176,7 +220,9 @@ def stressed(task: TaskConfig, prop: Property | None = None, value: float = 1.0)
     """
     r = task.randomization
     middle = sum(r.friction) / 2
-    still = RandomizationConfig(friction=(middle, middle), mass_scale=(1.0, 1.0), elastomer=r.elastomer, metal=r.metal, table=r.table)
+    still = RandomizationConfig(
+        friction=(middle, middle), mass_scale=(1.0, 1.0), elastomer=r.elastomer, metal=r.metal, table=r.table
+    )
     if prop is not None:
         try:
             return replace(task, randomization=replace(still, **{prop.field: (value, value)}))
@@ -208,7 +254,9 @@ def stress(
         What was written, in the order of the engines.
     """
     trial, trajectories = subject.episodes(demos, setting)
-    tasks = {(p.name, v): stressed(trial.task, p, v) for p in properties for v in p.values}  # all are checked before the first is played
+    tasks = {
+        (p.name, v): stressed(trial.task, p, v) for p in properties for v in p.values
+    }  # all are checked before the first is played
     about: dict[str, Any] = {
         "schema": SCHEMA,
         "policy": subject.label,
@@ -317,7 +365,14 @@ def write_plot(path: Path, found: Sequence[Stress], title: str) -> None:
                     x = [p.value for p in curve.points]
                     band = ([100 * (stress.task_progress + p.difference_ci95[i]) for p in curve.points] for i in (0, 1))
                     ax.fill_between(x, *band, color=color, alpha=0.15, linewidth=0)
-                    ax.plot(x, [100 * p.task_progress for p in curve.points], color=color, marker="o", markersize=3, label=stress.backend)
+                    ax.plot(
+                        x,
+                        [100 * p.task_progress for p in curve.points],
+                        color=color,
+                        marker="o",
+                        markersize=3,
+                        label=stress.backend,
+                    )
                     ax.axvline(curve.nominal, color="grey", linewidth=0.7, linestyle=":")
                     ax.set_xlabel(curve.unit if curve.unit != "x" else "factor")
             ax.set_title(name)
@@ -331,5 +386,7 @@ def write_plot(path: Path, found: Sequence[Stress], title: str) -> None:
         for row in axes:
             row[0].set_ylabel("task progress [%]")
         figure.suptitle(
-            f"{title}\n(shaded: difference to the nominal value, 95 %; dashed: ten points less)", fontsize="medium", fontweight="bold"
+            f"{title}\n(shaded: difference to the nominal value, 95 %; dashed: ten points less)",
+            fontsize="medium",
+            fontweight="bold",
         )

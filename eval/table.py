@@ -68,12 +68,16 @@ class Figure:
 
 FIGURES = {
     "task progress": Figure(
-        lambda s: f"{s.task_progress.mean:.1%}", share=lambda s: s.task_progress.mean, interval=lambda s: s.task_progress.ci95
+        lambda s: f"{s.task_progress.mean:.1%}",
+        share=lambda s: s.task_progress.mean,
+        interval=lambda s: s.task_progress.ci95,
     ),
     "approach": Figure(lambda s: f"{s.approach_rate:.0%}"),
     "grasp": Figure(lambda s: f"{s.grasp_rate:.0%}"),
     "reorient": Figure(lambda s: f"{s.reorient_rate:.0%}"),
-    "reorientation progress": Figure(lambda s: f"{s.reorientation_progress:.1%}", share=lambda s: s.reorientation_progress),
+    "reorientation progress": Figure(
+        lambda s: f"{s.reorientation_progress:.1%}", share=lambda s: s.reorientation_progress
+    ),
     "not finite": Figure(lambda s: str(s.health.nonfinite), fault=True),
     "overflow": Figure(lambda s: str(s.health.overflow), fault=True),
     "left the scene": Figure(lambda s: str(s.health.out_of_bounds)),
@@ -88,7 +92,9 @@ def result_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
     for name, figure in FIGURES.items():
         found.append((name, *map(figure.text, summaries)))
         if (interval := figure.interval) is not None:
-            found.append(("  95 % interval", *("{:.0f}-{:.0f}%".format(*(100 * x for x in interval(s))) for s in summaries)))
+            found.append(
+                ("  95 % interval", *("{:.0f}-{:.0f}%".format(*(100 * x for x in interval(s))) for s in summaries))
+            )
     known = [name for name in first.objects if name not in first.unseen]
     parts = {"  trained objects": known, "  unseen objects": first.unseen} if known and first.unseen else {}
     for place, (part, objects) in enumerate(parts.items(), 3):

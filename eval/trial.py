@@ -106,7 +106,10 @@ class Trial:
         with engine.make(self.scene, len(object_index), object_index) as backend:
             resets = ResetDistribution(self.bank, self.robot, self.names, self.task.reset, backend.device)
             points = torch.stack([torch.as_tensor(keypoints(o), dtype=torch.float32) for o in self.objects])
-            yield ManipulationEnv(backend, self.task, resets, seed=self.seed), points.to(backend.device)[backend.object_index]
+            yield (
+                ManipulationEnv(backend, self.task, resets, seed=self.seed),
+                points.to(backend.device)[backend.object_index],
+            )
 
 
 def nominal_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:

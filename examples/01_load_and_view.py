@@ -23,7 +23,9 @@ def main(out: Path) -> None:
     write_png(out / "demos.png", Drawer(view, smooth=True).draw(row=60))
 
     print(f"{robot.name}: {len(robot.joints)} joints, fingertips {', '.join(robot.fingertip_names)}")
-    print(f"{can.name}: {can.mass:.2f} kg, {len(can.pieces)} convex pieces; {len(demos)} demonstrations, {demos.num_frames} frames")
+    print(
+        f"{can.name}: {can.mass:.2f} kg, {len(can.pieces)} convex pieces; {len(demos)} demonstrations, {demos.num_frames} frames"
+    )
 
 
 if __name__ == "__main__":

@@ -26,7 +26,13 @@ def main(out: Path) -> None:
     """Write ``recorded.npz`` and ``bank.npz``."""
     record(out / "recorded.npz")
     convention = Convention(
-        order="mediapipe", units="mm", frame="table", quat="xyzw", fps=30.0, object_name="005_tomato_soup_can", side="right"
+        order="mediapipe",
+        units="mm",
+        frame="table",
+        quat="xyzw",
+        fps=30.0,
+        object_name="005_tomato_soup_can",
+        side="right",
     )  # what the numbers mean is said, never guessed
     demos = read_keypoints(out / "recorded.npz", convention)
 

@@ -28,9 +28,18 @@ class KinematicWorld(World):
         self._state |= {"joint_pos": self._state["joint_target"], "joint_vel": np.zeros(len(self._robot.joints))}
 
     def links(self):
-        q, velocity, links = torch.as_tensor(self._state["joint_pos"]), self._state["joint_vel"], self._robot.tracked_links
+        q, velocity, links = (
+            torch.as_tensor(self._state["joint_pos"]),
+            self._state["joint_vel"],
+            self._robot.tracked_links,
+        )
         T, J = self._kinematics.link_poses(q, links), self._kinematics.jacobian(q, links)
-        return T[:, :3, 3].numpy(), matrix_to_quat(T[:, :3, :3]).numpy(), J.linear.numpy() @ velocity, J.angular.numpy() @ velocity
+        return (
+            T[:, :3, 3].numpy(),
+            matrix_to_quat(T[:, :3, :3]).numpy(),
+            J.linear.numpy() @ velocity,
+            J.angular.numpy() @ velocity,
+        )
 
     def contacts(self):
         fingers = len(self._robot.fingertips)

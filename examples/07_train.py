@@ -15,7 +15,9 @@ def main(bank: Path, out: Path) -> None:
         ppo=PpoConfig(horizon=8, minibatch_size=64),
         iterations=2,
     )
-    config = replace(config, task=replace(config.task, termination=replace(config.task.termination, episode_seconds=2.0)))
+    config = replace(
+        config, task=replace(config.task, termination=replace(config.task.termination, episode_seconds=2.0))
+    )
     inputs = load_inputs("openarm", bank, objects=None)
     info = start_run(inputs, backend="mujoco", device="cpu", num_envs=8, seed=0, config=config, out=out)
     train(out, info, inputs)  # train(out, info, resume=True) goes on after a kill
@@ -23,4 +25,7 @@ def main(bank: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "bank.npz"), Path(sys.argv[2] if len(sys.argv) > 2 else "runs/example"))
+    main(
+        Path(sys.argv[1] if len(sys.argv) > 1 else "bank.npz"),
+        Path(sys.argv[2] if len(sys.argv) > 2 else "runs/example"),
+    )

@@ -20,14 +20,23 @@ def main(out: Path, engines: tuple[str, ...] = ("mujoco", "sapien")) -> None:
     write_demos(out / "unseen.npz", xreset.synthesize(["005_tomato_soup_can"], 1, seed=1))
     subject = resolve("soup-can", None, 0)  # a policy that ships with xreset; a run folder or a .onnx file will do
     setting = Setting(num_envs=1)
-    results = xreset.evaluate(subject, [engine(name) for name in engines], out / "unseen.npz", setting, out / "eval", episodes=1)
+    results = xreset.evaluate(
+        subject, [engine(name) for name in engines], out / "unseen.npz", setting, out / "eval", episodes=1
+    )
 
     figure, axes = pyplot.subplots(figsize=(5, 3), layout="constrained")
     parts = ("approach_rate", "grasp_rate", "reorient_rate", "reorientation_progress")
     for number, result in enumerate(results):
         means = [getattr(result, part) for part in parts]
-        axes.bar([i + 0.4 * number for i in range(len(parts))], means, width=0.38, label=f"{result.backend} {result.backend_version}")
-        print(f"{result.policy} in {result.backend}: task progress {result.task_progress.mean:.0%} in {result.episodes} episodes")
+        axes.bar(
+            [i + 0.4 * number for i in range(len(parts))],
+            means,
+            width=0.38,
+            label=f"{result.backend} {result.backend_version}",
+        )
+        print(
+            f"{result.policy} in {result.backend}: task progress {result.task_progress.mean:.0%} in {result.episodes} episodes"
+        )
     axes.set_xticks([i + 0.2 for i in range(len(parts))], [part.replace("_", "\n") for part in parts])
     axes.set(ylim=(0, 1), ylabel="share")
     axes.legend(loc="lower left")

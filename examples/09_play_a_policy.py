@@ -23,7 +23,9 @@ def main(demos: Path, policy: Path | None = None) -> None:
     session = onnxruntime.InferenceSession(policy or shipped()["soup-can"])
     contract = json.loads(session.get_modelmeta().custom_metadata_map["xreset"])
     for group in ("policy", "proprio"):  # in this order they are the input `flat`
-        print(f"{group}: {', '.join(f'{name} {width}' for name, width in contract['observation_layout'][group].items())}")
+        print(
+            f"{group}: {', '.join(f'{name} {width}' for name, width in contract['observation_layout'][group].items())}"
+        )
     print(f"one action for each of {len(contract['joint_names'])} joints, every {contract['control_dt'] * 1e3:.1f} ms")
 
     robot = xreset.load_robot(contract["robot"])

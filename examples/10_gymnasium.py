@@ -16,7 +16,9 @@ def main(bank: Path, iterations: int = 3, num_envs: int = 8) -> None:
     """Train actor and critic on the flat observations for a few iterations; ``bank``: a file of example 02."""
     robot, states = xreset.load_robot("openarm"), xreset.read_bank(bank)
     objects, joints = [xreset.load_object(name) for name in states.object_names], len(robot.joints)
-    envs = xreset.VectorEnv(xreset.make_env(robot, objects, states, num_envs=num_envs))  # says so where gymnasium is missing
+    envs = xreset.VectorEnv(
+        xreset.make_env(robot, objects, states, num_envs=num_envs)
+    )  # says so where gymnasium is missing
 
     def flat(seen) -> torch.Tensor:
         return torch.cat([torch.as_tensor(seen[group]) for group in ("policy", "proprio")], dim=1)
@@ -35,7 +37,9 @@ def main(bank: Path, iterations: int = 3, num_envs: int = 8) -> None:
                 after, (reward, terminated, truncated) = flat(observations), map(torch.as_tensor, outcome)
                 future = critic(after)[:, 0] * ~terminated  # an episode whose time is over goes on in its value
             begins, ended = ended, terminated | truncated
-            rows.append((seen, action, policy.log_prob(action).sum(1), value, reward + DISCOUNT * future, reward, begins, ended))
+            rows.append(
+                (seen, action, policy.log_prob(action).sum(1), value, reward + DISCOUNT * future, reward, begins, ended)
+            )
             seen = after
         obs, act, logp, value, target, reward, begins, end = (torch.stack(part) for part in zip(*rows, strict=True))
         advantage, carry = target - value, torch.zeros(num_envs)
@@ -46,7 +50,10 @@ def main(bank: Path, iterations: int = 3, num_envs: int = 8) -> None:
         gain = (gain - gain.mean()) / (gain.std() + 1e-8)
         for _ in range(EPOCHS):
             ratio = (Normal(actor(obs), log_std.exp()).log_prob(act).sum(1) - logp).exp()
-            loss = -torch.min(ratio * gain, ratio.clamp(1 - CLIP, 1 + CLIP) * gain).mean() + (critic(obs)[:, 0] - aim).square().mean()
+            loss = (
+                -torch.min(ratio * gain, ratio.clamp(1 - CLIP, 1 + CLIP) * gain).mean()
+                + (critic(obs)[:, 0] - aim).square().mean()
+            )
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

@@ -43,12 +43,20 @@ class Part(Protocol):
 def chained(root: Link, fingers: Iterable[Sequence[ArmLink]]) -> list[tuple[str, ArmLink]]:
     """Fingers, each of whose links carries the next, as links with their parents' names."""
     return [
-        (parent, link) for finger in fingers for parent, link in zip((root.name, *(link.name for link in finger)), finger, strict=False)
+        (parent, link)
+        for finger in fingers
+        for parent, link in zip((root.name, *(link.name for link in finger)), finger, strict=False)
     ]
 
 
 def robot(
-    name: str, base: Link, arm: Sequence[ArmLink], mount: np.ndarray, palm: Link, hand: Iterable[tuple[str, Part]], frames: Iterable[Frame]
+    name: str,
+    base: Link,
+    arm: Sequence[ArmLink],
+    mount: np.ndarray,
+    palm: Link,
+    hand: Iterable[tuple[str, Part]],
+    frames: Iterable[Frame],
 ) -> tuple[RobotTree, dict[str, float]]:
     """An arm that carries a hand, and the effort limit of each joint that has a drive.
 

@@ -25,7 +25,14 @@ _CARRIER = 0.3
 """Mass of each of the links that carry the hand [kg]; their inertia is 0.003 kg m^2."""
 _FINGERS = {"index": (0, 3), "middle": (4, 7), "ring": (8, 11), "thumb": (12, 15)}
 """First and last joint of each finger in the package's numbering."""
-_CARRY = (("x", "prismatic"), ("y", "prismatic"), ("z", "prismatic"), ("z", "revolute"), ("x", "revolute"), ("y", "revolute"))
+_CARRY = (
+    ("x", "prismatic"),
+    ("y", "prismatic"),
+    ("z", "prismatic"),
+    ("z", "revolute"),
+    ("x", "revolute"),
+    ("y", "revolute"),
+)
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 _HOME = (0.0, 0.15, 0.10, 0.0, 0.0, 0.0)
 
@@ -63,7 +70,9 @@ def flying(hand: RobotTree) -> RobotTree:
     joints = []
     for number, (axis, kind) in enumerate(_CARRY):
         reach = 1.0 if kind == "prismatic" else 3.0
-        links.append(Link(name=f"carrier{number}", mass=_CARRIER, com=np.zeros(3), inertia=0.003 * np.eye(3), collisions=()))
+        links.append(
+            Link(name=f"carrier{number}", mass=_CARRIER, com=np.zeros(3), inertia=0.003 * np.eye(3), collisions=())
+        )
         joints.append(
             Joint(
                 name=f"fly{number}", type=kind, parent=links[-2].name, child=links[-1].name, T_parent_joint=np.eye(4),
@@ -73,9 +82,14 @@ def flying(hand: RobotTree) -> RobotTree:
     # the package's palm: fingers along z, the palm's inner side looks along x, index finger at +y
     joints.append(fixed(links[-1].name, hand.root, axes(x=(0, 0, -1), z=(0, -1, 0))))
     moving = {joint.child for joint in hand.joints if joint.type == "revolute"}
-    links += [replace(link, inertia=link.inertia + _ROTOR * np.eye(3)) if link.name in moving else link for link in hand.links]
+    links += [
+        replace(link, inertia=link.inertia + _ROTOR * np.eye(3)) if link.name in moving else link for link in hand.links
+    ]
     joints += hand.joints
-    for name, T in (("palm", pose((0.015, 0, -0.045)) @ axes(x=(0, 0, 1), z=(1, 0, 0))), ("wrist", pose((0, 0, -0.095)))):
+    for name, T in (
+        ("palm", pose((0.015, 0, -0.045)) @ axes(x=(0, 0, 1), z=(1, 0, 0))),
+        ("wrist", pose((0, 0, -0.095))),
+    ):
         links.append(frame(name))
         joints.append(fixed(hand.root, name, T))
     return RobotTree(name=NAME, root="ground", links=tuple(links), joints=tuple(joints))
@@ -93,16 +107,22 @@ def description(hand: RobotTree) -> str:
     for number, (_, kind) in enumerate(_CARRY):
         kp, kd = (2000.0, 130.0) if kind == "prismatic" else (100.0, 4.0)
         effort = efforts(hand)[f"fly{number}"]
-        rows.append(f'{{ name = "fly{number}", group = "arm", home = {_HOME[number]}, kp = {kp}, kd = {kd}, effort = {effort} }}')
+        rows.append(
+            f'{{ name = "fly{number}", group = "arm", home = {_HOME[number]}, kp = {kp}, kd = {kd}, effort = {effort} }}'
+        )
     for joint in hand.joints:
         if joint.type == "revolute":
             home = 0.7 if joint.name == "joint_12.0" else 0.2 if joint.lower < 0.0 and joint.upper > 1.0 else 0.0
-            rows.append(f'{{ name = "{joint.name}", group = "hand", home = {home}, kp = 3.0, kd = 0.14, effort = 1.0 }}')
+            rows.append(
+                f'{{ name = "{joint.name}", group = "hand", home = {home}, kp = 3.0, kd = 0.14, effort = 1.0 }}'
+            )
     tips, keypoints = [], ['wrist = "wrist"']
     for finger in ("thumb", "index", "middle", "ring"):
         first, last = _FINGERS[finger]
         tip = f"link_{last}.0_tip"
-        tips.append(f'{{ name = "{finger}", link = "{tip}", contact_links = ["{tip}", "link_{last}.0"], keypoint = "{finger}4" }}')
+        tips.append(
+            f'{{ name = "{finger}", link = "{tip}", contact_links = ["{tip}", "link_{last}.0"], keypoint = "{finger}4" }}'
+        )
         middle = [f"link_{i}.0" for i in range(first + 1, last + 1)]
         keypoints += [f'{finger}{i} = "{link}"' for i, link in enumerate([*middle, tip], start=1)]
     listed = ",\n    "

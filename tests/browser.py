@@ -45,7 +45,9 @@ class Browser:
         self.problems: list[str] = []
         self._profile = tempfile.TemporaryDirectory(prefix="xreset-chromium-", ignore_cleanup_errors=True)
         self._process = subprocess.Popen(
-            [program, *_FLAGS, f"--user-data-dir={self._profile.name}", "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            [program, *_FLAGS, f"--user-data-dir={self._profile.name}", "about:blank"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         )
         port_file = Path(self._profile.name) / "DevToolsActivePort"
         wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), "Chromium to start", seconds=60)
@@ -83,7 +85,9 @@ class Browser:
         if event == "Runtime.exceptionThrown":
             self.problems.append(json.dumps(params["exceptionDetails"])[:500])
         elif event == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert"):
-            self.problems.append(" ".join(str(arg.get("value", arg.get("description"))) for arg in params["args"])[:500])
+            self.problems.append(
+                " ".join(str(arg.get("value", arg.get("description"))) for arg in params["args"])[:500]
+            )
         elif event == "Log.entryAdded" and params["entry"]["level"] == "error":
             self.problems.append(f"{params['entry']['text']} ({params['entry'].get('url')})")
 

@@ -22,7 +22,9 @@ def copy(state: State) -> State:
     return State(**{f.name: getattr(state, f.name).clone() for f in fields(State)})
 
 
-def body(name: str, *shapes: Geometry | Shape, mass: float = 0.4, com=(0.0, 0.0, 0.0), inertia: np.ndarray | None = None) -> ObjectSpec:
+def body(
+    name: str, *shapes: Geometry | Shape, mass: float = 0.4, com=(0.0, 0.0, 0.0), inertia: np.ndarray | None = None
+) -> ObjectSpec:
     return ObjectSpec(
         name=name,
         pieces=tuple(s if isinstance(s, Shape) else Shape(geometry=s) for s in shapes),
@@ -51,7 +53,11 @@ FLAT = (
     body("box", Geometry(kind="box", size=(0.05, 0.06, 0.02))),
     body("hull", hull_box(0.05, 0.06, 0.02)),
     body("hull with a low centre of mass", hull_box(0.05, 0.06, 0.02), com=(0.0, 0.0, -0.005)),
-    body("two hulls", moved(hull_box(0.025, 0.06, 0.02), 0.025, 0.0, 0.0), moved(hull_box(0.025, 0.06, 0.02), -0.025, 0.0, 0.0)),
+    body(
+        "two hulls",
+        moved(hull_box(0.025, 0.06, 0.02), 0.025, 0.0, 0.0),
+        moved(hull_box(0.025, 0.06, 0.02), -0.025, 0.0, 0.0),
+    ),
     body("cylinder", Geometry(kind="cylinder", size=(0.06, 0.02))),
 )
 """Objects that rest 20 mm above the table."""
@@ -109,7 +115,9 @@ class EngineChecks:
                 backend.step()
             distance = (backend.state().object_pos - start.object_pos) @ direction
             expected = 1.0 / (2 * 0.6 * GRAVITY)
-            torch.testing.assert_close(distance, torch.full((len(FLAT),), expected), atol=0, rtol=0.06, msg=f"{angle}: {distance}")
+            torch.testing.assert_close(
+                distance, torch.full((len(FLAT),), expected), atol=0, rtol=0.06, msg=f"{angle}: {distance}"
+            )
 
     def test_torsional_friction_brakes_a_spinning_ball(self):
         ball = body("ball", Geometry(kind="sphere", size=(0.03,)))
@@ -152,7 +160,9 @@ class EngineChecks:
             com = com + velocity * dt
         state = backend.state()
         np.testing.assert_allclose(state.object_angvel[0], omega, atol=0.05)  # engines are of first order, at 7 rad/s
-        np.testing.assert_allclose(state.object_linvel[0], velocity - np.cross(omega, turn.apply(uneven.com)), atol=1e-3)
+        np.testing.assert_allclose(
+            state.object_linvel[0], velocity - np.cross(omega, turn.apply(uneven.com)), atol=1e-3
+        )
         np.testing.assert_allclose(state.object_pos[0], com - turn.apply(uneven.com), atol=2e-3)
         found = Rotation.from_quat(state.object_quat[0].double().numpy(), scalar_first=True)
         self.assertLess((found * turn.inv()).magnitude(), 4e-3)
@@ -215,7 +225,9 @@ class EngineChecks:
         state = backend.state()
         drive = robot.joints[jaw].drive.kp * float(state.joint_pos[0, jaw] - state.joint_target[0, jaw])
         along = Kinematics(robot).link_poses(state.joint_pos[0].double(), ["wrist"])[0, :3, 0].float()
-        force = (backend.contacts().tip_force[0] @ along).abs()  # equal, since the brick does not move: F + 1.1 F = drive
+        force = (
+            backend.contacts().tip_force[0] @ along
+        ).abs()  # equal, since the brick does not move: F + 1.1 F = drive
         torch.testing.assert_close(force, torch.full((2,), drive / 2.1), rtol=0.03, atol=0.0)
 
     def test_the_robot_falls_where_its_weight_is_not_compensated(self):

@@ -101,7 +101,15 @@ def readers() -> Iterator[dict[str, Reader]]:
 
         partial = Partial(folder, "key")
         add("finished batch", "batch_0000.npz", lambda p: partial.read(0), "npz", ("hand_error", "wrist_error"))
-        partial.write(0, Batch(joint_pos=np.zeros((5, 4)), reason=np.zeros(5, int), hand_error=np.full(5, np.inf), wrist_error=np.ones(5)))
+        partial.write(
+            0,
+            Batch(
+                joint_pos=np.zeros((5, 4)),
+                reason=np.zeros(5, int),
+                hand_error=np.full(5, np.inf),
+                wrist_error=np.ones(5),
+            ),
+        )
 
         soup = load_object("soup")
         home = torch.as_tensor(openarm.home, dtype=torch.float32)[None]
@@ -139,7 +147,9 @@ def readers() -> Iterator[dict[str, Reader]]:
         writer.close()
         (events,) = (folder / "curves").iterdir()
         add("event file", f"curves/{events.name}", lambda p: read_scalars(p.parent), "bytes", may_hold=("value",))
-        add("study", "study.toml", read_study, "text", ("config",)).write_bytes((SHIPPED / "first_grasp.toml").read_bytes())
+        add("study", "study.toml", read_study, "text", ("config",)).write_bytes(
+            (SHIPPED / "first_grasp.toml").read_bytes()
+        )
 
         stored = json.loads((Path(__file__).with_name("engines") / "conformance.json").read_text())
         stored["runs"] = [run | {"checks": run["checks"][:4]} for run in stored["runs"][:2]]
@@ -149,7 +159,9 @@ def readers() -> Iterator[dict[str, Reader]]:
         write_policy(add("policy", "policy.onnx", OnnxPolicy, "bytes"), contract)
         path = add("checkpoint", "000001.pt", read_checkpoint, "bytes")
         keys = ("actor_state_dict", "critic_state_dict", "optimizer_state_dict", "random")
-        torch.save({**{k: {} for k in keys}, "iteration": 1, "env_steps": 1, "elapsed": 0.1, "learning_rate": 1e-3}, path)
+        torch.save(
+            {**{k: {} for k in keys}, "iteration": 1, "env_steps": 1, "elapsed": 0.1, "learning_rate": 1e-3}, path
+        )
 
         described = openarm.urdf.with_name("robot.toml")
         (folder / "robot.toml").write_bytes(described.read_bytes())
@@ -163,17 +175,43 @@ def readers() -> Iterator[dict[str, Reader]]:
         poses = {"apriltag": np.eye(4)[:3].ravel().tolist(), "837": np.eye(4)[:3].ravel().tolist()}
         calibration.write_text(yaml.safe_dump({"extrinsics": poses, "master": "837"}))
         found["DexYCB calibration"] = Reader(calibration, lambda p: _extrinsics(folder, "1"), "yaml")
-        meta = {"extrinsics": "1", "mano_sides": ["right"], "num_frames": 4, "serials": ["837"], "ycb_grasp_ind": 0, "ycb_ids": [2]}
+        meta = {
+            "extrinsics": "1",
+            "mano_sides": ["right"],
+            "num_frames": 4,
+            "serials": ["837"],
+            "ycb_grasp_ind": 0,
+            "ycb_ids": [2],
+        }
         add("DexYCB meta", "meta.yml", _meta, "yaml").write_text(yaml.safe_dump(meta))
-        np.savez(add("DexYCB poses", "pose.npz", lambda p: _npz(p, ("pose_y",)), "npz", ("pose_y",)), pose_y=np.zeros((4, 1, 7)))
+        np.savez(
+            add("DexYCB poses", "pose.npz", lambda p: _npz(p, ("pose_y",)), "npz", ("pose_y",)),
+            pose_y=np.zeros((4, 1, 7)),
+        )
 
         once = synthesize(["soup"], per_object=1, fps=5)
         turn = Rotation.from_quat(once.object_quat_wxyz, scalar_first=True)
-        path = add("tracker's npz", "tracked.npz", lambda p: read_keypoints(p, PLAIN), "npz", ("hand_keypoints", "wrist_quat_wxyz"))
+        path = add(
+            "tracker's npz",
+            "tracked.npz",
+            lambda p: read_keypoints(p, PLAIN),
+            "npz",
+            ("hand_keypoints", "wrist_quat_wxyz"),
+        )
         texts = {"object": np.array(SOUP), "side": np.array("right")}
-        arrays = {"keypoints": once.hand_keypoints, "object_pos": once.object_pos, "object_quat_wxyz": once.object_quat_wxyz}
+        arrays = {
+            "keypoints": once.hand_keypoints,
+            "object_pos": once.object_pos,
+            "object_quat_wxyz": once.object_quat_wxyz,
+        }
         np.savez(path, **arrays, **texts)
-        path = add("tracker's CSV", "tracked.csv", lambda p: read_keypoints(p, PLAIN), "text", ("hand_keypoints", "wrist_quat_wxyz"))
+        path = add(
+            "tracker's CSV",
+            "tracked.csv",
+            lambda p: read_keypoints(p, PLAIN),
+            "text",
+            ("hand_keypoints", "wrist_quat_wxyz"),
+        )
         write_csv(path, once.hand_keypoints, once.object_pos, turn, columns=[("object", SOUP), ("side", "right")])
         np.savetxt(add("camera, text", "camera.txt", read_transform, "text"), np.eye(4))
         np.save(add("camera, npy", "camera.npy", read_transform, "bytes"), np.eye(4))
@@ -231,15 +269,24 @@ def unsound(content: Any, may_hold: tuple[str, ...], name: str = "content") -> s
         parts = ((f.name, getattr(content, f.name)) for f in fields(content))
         return next((p for n, part in parts if n not in may_hold and (p := unsound(part, may_hold, n))), None)
     if isinstance(content, dict):
-        return next((p for n, part in content.items() if n not in may_hold and (p := unsound(part, may_hold, str(n)))), None)
+        return next(
+            (p for n, part in content.items() if n not in may_hold and (p := unsound(part, may_hold, str(n)))), None
+        )
     if isinstance(content, tuple | list):
         return next((p for part in content if (p := unsound(part, may_hold, name))), None)
-    array = np.asarray(content) if isinstance(content, np.ndarray | float) or type(content).__name__ == "Tensor" else None
+    array = (
+        np.asarray(content) if isinstance(content, np.ndarray | float) or type(content).__name__ == "Tensor" else None
+    )
     if array is None or array.dtype.kind != "f":
         return None
     if not np.isfinite(array).all() and name not in ("within", "velocity", "lower", "upper"):
         return f"{name} = {array.ravel()[~np.isfinite(array.ravel())][0]}"
-    if "quat" in name and array.shape[-1:] == (4,) and array.size and np.abs(np.linalg.norm(array, axis=-1) - 1).max() > 2e-3:
+    if (
+        "quat" in name
+        and array.shape[-1:] == (4,)
+        and array.size
+        and np.abs(np.linalg.norm(array, axis=-1) - 1).max() > 2e-3
+    ):
         return f"{name}, which is not unit"
     return None
 
@@ -252,12 +299,33 @@ JUNK = (
     [], [1], ["x"], {}, {"x": 1}, [[[[]]]],
 )  # fmt: skip
 NUMBERS = (np.nan, np.inf, -np.inf, 1e30, -1e30, 1e-300, -1.0, 0.0, 2.0**63)
-TYPES = ("u1", "u4", "u8", ">u4", ">i8", "i2", "f2", ">f4", ">f8", "longdouble", "complex64", "U3", "S3", "bool", "M8[s]")
+TYPES = (
+    "u1",
+    "u4",
+    "u8",
+    ">u4",
+    ">i8",
+    "i2",
+    "f2",
+    ">f4",
+    ">f8",
+    "longdouble",
+    "complex64",
+    "U3",
+    "S3",
+    "bool",
+    "M8[s]",
+)
 
 
 def damages(kind: str) -> st.SearchStrategy[Damage]:
     """Ways to damage a file of that kind; any file may also be damaged byte by byte."""
-    own = {"npz": [_arrays], "json": [_tree(json.loads, _dump_json)], "yaml": [_tree(yaml.safe_load, _dump_yaml)], "text": [_words]}
+    own = {
+        "npz": [_arrays],
+        "json": [_tree(json.loads, _dump_json)],
+        "yaml": [_tree(yaml.safe_load, _dump_yaml)],
+        "text": [_words],
+    }
     return st.one_of(*(make() if callable(make) else make for make in own.get(kind, [])), _bytes())
 
 
@@ -285,7 +353,22 @@ def _words() -> st.SearchStrategy[Damage]:
     """Replaces one number or quoted text of a text file by junk."""
     import re
 
-    junk = ("nan", "inf", "-1", "1e300", "0", "", "x", "1 2", '"', "\x00", "\x9b", "../../etc/passwd", "1" * 5000, "[" * 2000)
+    junk = (
+        "nan",
+        "inf",
+        "-1",
+        "1e300",
+        "0",
+        "",
+        "x",
+        "1 2",
+        '"',
+        "\x00",
+        "\x9b",
+        "../../etc/passwd",
+        "1" * 5000,
+        "[" * 2000,
+    )
 
     def replaced(at: float, text: str) -> Damage:
         def damage(whole: bytes) -> bytes:
@@ -317,13 +400,17 @@ def _arrays() -> st.SearchStrategy[Damage]:
                         if array.dtype.kind == "f":
                             array.ravel()[int(place * array.size)] = number
                         else:
-                            array.ravel()[int(place * array.size)] = int(np.nan_to_num(number, posinf=2**31, neginf=-(2**31))) % 2**31 - 5
+                            array.ravel()[int(place * array.size)] = (
+                                int(np.nan_to_num(number, posinf=2**31, neginf=-(2**31))) % 2**31 - 5
+                            )
                     elif how == "all":
                         array = np.full(array.shape, number) if array.dtype.kind == "f" else np.zeros_like(array)
                     elif how == "type":
                         array = array.astype(kind)
                     elif how == "shape":
-                        array = array[..., None] if place < 0.3 else array.reshape(-1)[: max(0, int(place * array.size))]
+                        array = (
+                            array[..., None] if place < 0.3 else array.reshape(-1)[: max(0, int(place * array.size))]
+                        )
                     elif how == "text":
                         array = np.full(array.shape, "\x1b[31m[/bold]")
                     elif how == "swap" and len(array.shape) and len(array) > 1:

@@ -19,7 +19,9 @@ class AccountsTest(unittest.TestCase):
         self.rows = accounts(self.names, self.post, self.reason)
 
     def test_every_item_is_kept_or_lost_for_one_reason(self):
-        self.assertEqual([(r.object_name, r.phase) for r in self.rows][:2], [("box", "pre-contact"), ("box", "post-contact")])
+        self.assertEqual(
+            [(r.object_name, r.phase) for r in self.rows][:2], [("box", "pre-contact"), ("box", "post-contact")]
+        )
         for row in with_totals(self.rows):
             self.assertEqual(row.total, row.kept + sum(row.lost.values()))
         for row in self.rows:

@@ -28,7 +28,9 @@ try:
 except ImportError as error:
     raise unittest.SkipTest(str(error)) from error
 
-CONFIG = PlaceConfig(x=(0.2, 0.7), y=(0.4, 0.8), z=(0.4, 0.7), frames=10, final_frames=20, candidates=8, rounds=2, elite=1)
+CONFIG = PlaceConfig(
+    x=(0.2, 0.7), y=(0.4, 0.8), z=(0.4, 0.7), frames=10, final_frames=20, candidates=8, rounds=2, elite=1
+)
 
 
 def wrists_around_home(robot, count: int) -> ArmTargets:
@@ -79,7 +81,8 @@ class PlaceTest(unittest.TestCase):
         )
         base = torch.tensor(self.own.pos, dtype=torch.float64)
         there = Placement(
-            pos=tuple((turn @ base).tolist()), quat=tuple(quat_multiply(quat, torch.tensor(self.own.quat, dtype=torch.float64)).tolist())
+            pos=tuple((turn @ base).tolist()),
+            quat=tuple(quat_multiply(quat, torch.tensor(self.own.quat, dtype=torch.float64)).tolist()),
         )
         here = placing.reach(self.robot, self.own, self.wrists, CONFIG)
         self.assertAlmostEqual(placing.reach(self.robot, there, moved, CONFIG).reached, here.reached, delta=0.03)
@@ -91,7 +94,9 @@ class PlaceTest(unittest.TestCase):
         found = placing.place(lost, [self.wrists], avoid, CONFIG, lambda done, best: seen.append((done, best.rank)))
         self.assertEqual((found.own.reach.reached, found.own.followed), (0.0, 0.0))
         self.assertGreater(found.best.reach.reached, 0.2)
-        self.assertAlmostEqual(found.best.followed, found.best.reach.reached, delta=0.2)  # here, every path is one frame long
+        self.assertAlmostEqual(
+            found.best.followed, found.best.reach.reached, delta=0.2
+        )  # here, every path is one frame long
         self.assertEqual(found.frames, 40)
         self.assertGreaterEqual(np.linalg.norm(avoid - found.best.placement.pos, axis=1).min(), CONFIG.clear)
         self.assertEqual(seen, sorted(seen))  # the best yet never gets worse
@@ -103,7 +108,9 @@ class PlaceTest(unittest.TestCase):
         self.assertEqual((first.best, first.own), (second.best, second.own))
 
     def test_a_process_that_is_killed_is_an_error(self):
-        trial = placing._Trial(robot=self.robot, config=CONFIG, tried=self.wrists, kept=self.wrists, paths=[self.wrists])
+        trial = placing._Trial(
+            robot=self.robot, config=CONFIG, tried=self.wrists, kept=self.wrists, paths=[self.wrists]
+        )
         with self.assertRaisesRegex(RobotError, "was killed; is there memory"), placing._tried_by(trial, 2) as each:
             list(each(_die, [9]))
 
@@ -112,7 +119,9 @@ class PlaceTest(unittest.TestCase):
         self.assertEqual(placing.reach(self.robot, self.own, self.wrists, CONFIG, whole.rank[0]).rank[0], whole.rank[0])
         far = Placement(pos=(0.45, 0.6, 3.0), quat=self.robot.base_quat)
         given_up = placing.reach(self.robot, far, self.wrists, CONFIG, whole.rank[0])
-        self.assertEqual(given_up.reached, 1 - placing._FIRST / 40)  # what was tried fails, what was not counts as reached
+        self.assertEqual(
+            given_up.reached, 1 - placing._FIRST / 40
+        )  # what was tried fails, what was not counts as reached
         self.assertLess(given_up.rank[0], whole.rank[0])
 
     def test_without_a_round_the_own_placement_is_measured(self):
@@ -170,7 +179,9 @@ class DirectionTest(unittest.TestCase):
         joints[:, cls.model.arm] = joints[:, cls.model.arm].clamp(cls.model.lower, cls.model.upper)
         root = cls.model.kinematics.link_poses(joints, [robot.hand_root])[:, 0]
         pos, quat = root[:, :3, 3].clone(), matrix_to_quat(root[:, :3, :3])
-        pos[:6] += torch.tensor([0.0, 1.0, -1.5], dtype=start.dtype)  # out of reach, where the arm gets stuck at its limits
+        pos[:6] += torch.tensor(
+            [0.0, 1.0, -1.5], dtype=start.dtype
+        )  # out of reach, where the arm gets stuck at its limits
         quat[:6] = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=start.dtype)
         cls.targets = ArmTargets(
             root_pos=pos[None],
@@ -193,7 +204,12 @@ class DirectionTest(unittest.TestCase):
     def test_frames_between_two_bad_ends_are_found_from_the_middle(self):
         back = self.targets.root_pos.shape[1]
         pieces = (self.targets, self.targets.reversed())
-        both = ArmTargets(**{name: torch.cat((getattr(pieces[0], name), getattr(pieces[1], name)), dim=1) for name in vars(self.targets)})
+        both = ArmTargets(
+            **{
+                name: torch.cat((getattr(pieces[0], name), getattr(pieces[1], name)), dim=1)
+                for name in vars(self.targets)
+            }
+        )
         thresholds = Thresholds(table_depth=1e9, self_depth=1e9)
         valid = []
         for reseeds in (0, 2):
@@ -213,7 +229,13 @@ class SpliceTest(unittest.TestCase):
         paths[0, 1] = distance
         worth = torch.tensor([[[1.0, 1, 1, 0, 0, 0], [0, 0, 0, 1, 1, 1]]], dtype=torch.float64)
         annotated = torch.ones(1, 6, dtype=torch.bool)
-        arguments = {"worth": worth, "cost": torch.zeros_like(worth), "annotated": annotated, "jump": 0.35, "switch_cost": 0.5}
+        arguments = {
+            "worth": worth,
+            "cost": torch.zeros_like(worth),
+            "annotated": annotated,
+            "jump": 0.35,
+            "switch_cost": 0.5,
+        }
         return splice(paths, **(arguments | changes))[0, :, 0].tolist()
 
     def test_each_path_is_followed_where_it_is_good(self):
@@ -240,11 +262,19 @@ class SpliceTest(unittest.TestCase):
             for chosen in product(range(3), repeat=5):
                 value = 0.0
                 for t, k in enumerate(chosen):
-                    jumps = t > 0 and bool(annotated[s, t - 1] & ((paths[s, k, t] - paths[s, chosen[t - 1], t - 1]).abs().max() > 0.5))
-                    value += float(worth[s, k, t]) * (not jumps) - float(cost[s, k, t]) - 0.2 * (t > 0 and chosen[t - 1] != k)
+                    jumps = t > 0 and bool(
+                        annotated[s, t - 1] & ((paths[s, k, t] - paths[s, chosen[t - 1], t - 1]).abs().max() > 0.5)
+                    )
+                    value += (
+                        float(worth[s, k, t]) * (not jumps)
+                        - float(cost[s, k, t])
+                        - 0.2 * (t > 0 and chosen[t - 1] != k)
+                    )
                 if value > best:
                     best, way = value, chosen
-            torch.testing.assert_close(found[s], torch.stack([paths[s, k, t] for t, k in enumerate(way)]), atol=0, rtol=0)
+            torch.testing.assert_close(
+                found[s], torch.stack([paths[s, k, t] for t, k in enumerate(way)]), atol=0, rtol=0
+            )
 
     def test_chosen_frames_are_spread_over_those_that_are_set(self):
         flags = torch.zeros(3, 20, dtype=torch.bool)
@@ -261,7 +291,9 @@ class WritePlacementTest(unittest.TestCase):
         shutil.copytree(robot_folder("openarm"), self.folder)
         self.file = self.folder / DESCRIPTION
         best = Finalist(
-            placement=Placement(pos=(0.1, 0.2, 0.3), quat=(0.6, 0.0, 0.8, 0.0)), reach=Reach(reached=0.9123, dexterity=0.5), followed=0.8765
+            placement=Placement(pos=(0.1, 0.2, 0.3), quat=(0.6, 0.0, 0.8, 0.0)),
+            reach=Reach(reached=0.9123, dexterity=0.5),
+            followed=0.8765,
         )
         own = Finalist(
             placement=Placement(pos=(0.45, 0.60, 0.55), quat=(0.38268343, 0.92387953, 0.0, 0.0)),
@@ -275,10 +307,14 @@ class WritePlacementTest(unittest.TestCase):
         for _ in range(2):  # the second one replaces the first
             write_placement(self.file, before, self.found, 'xreset robots place openarm --demos "my demos.npz"')
             after = load(self.folder)
-            self.assertEqual((after.base_pos, after.base_quat), (self.found.best.placement.pos, self.found.best.placement.quat))
+            self.assertEqual(
+                (after.base_pos, after.base_quat), (self.found.best.placement.pos, self.found.best.placement.quat)
+            )
             np.testing.assert_allclose(after.home[after.arm_indices], self.found.home, atol=1e-3)
             np.testing.assert_allclose(after.home[after.hand_indices], before.home[before.hand_indices])
-            self.assertEqual((after.placement.reached, after.placement.followed, after.placement.frames), (0.912, 0.876, 321))
+            self.assertEqual(
+                (after.placement.reached, after.placement.followed, after.placement.frames), (0.912, 0.876, 321)
+            )
             self.assertIn('"my demos.npz"', after.placement.command)
         self.assertEqual([joint.drive for joint in after.joints], [joint.drive for joint in before.joints])
 
@@ -288,14 +324,20 @@ class WritePlacementTest(unittest.TestCase):
         after = load(self.folder)
         self.assertEqual(after.fingerprint, before.fingerprint)
         self.assertEqual((after.placement.followed, after.placement.command), (0.75, r"a \\g<1> \b"))
-        without = "".join(line for line in self.file.read_text().splitlines(keepends=True) if not line.startswith("placement"))
-        self.assertEqual(without, "".join(line for line in text.splitlines(keepends=True) if not line.startswith("placement")))
+        without = "".join(
+            line for line in self.file.read_text().splitlines(keepends=True) if not line.startswith("placement")
+        )
+        self.assertEqual(
+            without, "".join(line for line in text.splitlines(keepends=True) if not line.startswith("placement"))
+        )
 
     def test_the_figure_is_no_part_of_the_fingerprint(self):
         before = load(self.folder)
         stated = dataclasses.replace(before, placement=None).fingerprint
         lines = [line for line in self.file.read_text().splitlines() if not line.startswith("placement")]
-        lines.insert(lines.index("[base]") + 1, "placement = { reached = 0.5, followed = 0.4, frames = 3, command = 'x' }")
+        lines.insert(
+            lines.index("[base]") + 1, "placement = { reached = 0.5, followed = 0.4, frames = 3, command = 'x' }"
+        )
         self.file.write_text("\n".join(lines))
         self.assertEqual(load(self.folder).fingerprint, stated)
         findings = [finding.message for finding in check_description(self.folder)[1] if finding.topic == "placement"]

@@ -70,7 +70,9 @@ class ProbesTest(unittest.TestCase):
 
     def test_a_softer_contact_gives_more(self):
         """With the square of its time constant, or less where MuJoCo's impedance grows with depth."""
-        hard, soft = (measure(altered_engine(mujoco(), Alteration(contact_time=factor)), SCENE) for factor in (1.0, 2.0))
+        hard, soft = (
+            measure(altered_engine(mujoco(), Alteration(contact_time=factor)), SCENE) for factor in (1.0, 2.0)
+        )
         self.assertTrue(3.0 < soft.contact_give / hard.contact_give < 4.1, (hard.contact_give, soft.contact_give))
 
     def test_engines_that_step_finer_are_seen(self):
@@ -127,7 +129,11 @@ class AlteredBackendTest(unittest.TestCase):
         backend, plain = self.make(timestep=0.5), self.make()
         for b in (backend, plain):
             start = State(**{name: value.clone() for name, value in vars(b.state()).items()})
-            b.set_state(replace(start, object_pos=torch.tensor([[0.9, 0.5, 0.5]] * 2), object_linvel=torch.tensor([[1.0, 0, 0]] * 2)))
+            b.set_state(
+                replace(
+                    start, object_pos=torch.tensor([[0.9, 0.5, 0.5]] * 2), object_linvel=torch.tensor([[1.0, 0, 0]] * 2)
+                )
+            )
             b.step(3)
             b.step()
         self.assertAlmostEqual(float(backend.state().object_pos[0, 0]), 0.9 + 7 / 240, places=5)
@@ -152,7 +158,9 @@ class PropertiesTest(unittest.TestCase):
 
     def test_equal_values_are_not_tried(self):
         for p in PROPERTIES:
-            self.assertEqual(p.change(STATED, STATED, "mujoco", SCENE), "the same in both, as far as is measured", p.name)
+            self.assertEqual(
+                p.change(STATED, STATED, "mujoco", SCENE), "the same in both, as far as is measured", p.name
+            )
             self.assertNotIn(Alteration(), p.what_if, p.name)
 
     def test_a_factor_leads_to_the_other_value(self):
@@ -164,9 +172,14 @@ class PropertiesTest(unittest.TestCase):
         self.assertEqual(self.change("torsional friction", torsional_friction=0.0), Alteration(torsional_friction=0.0))
         none = replace(STATED, torsional_friction=0.0)
         self.assertIn("nothing times any factor", self.change("torsional friction", a=none, torsional_friction=0.002))
-        self.assertEqual(self.change("patch torsional friction", patch_torsional_friction=0.3), Alteration(torsional_friction=0.3))
+        self.assertEqual(
+            self.change("patch torsional friction", patch_torsional_friction=0.3), Alteration(torsional_friction=0.3)
+        )
         left = replace(STATED, patch_torsional_friction=0.3)
-        self.assertIn("not changeable in sapien", self.change("patch torsional friction", "sapien", a=left, patch_torsional_friction=1.0))
+        self.assertIn(
+            "not changeable in sapien",
+            self.change("patch torsional friction", "sapien", a=left, patch_torsional_friction=1.0),
+        )
 
     def test_a_finer_timestep_leaves_contacts_as_they_are(self):
         self.assertEqual(self.change("timestep", timestep=1 / 480), Alteration(timestep=0.5, contact_time=2.0))
@@ -174,7 +187,10 @@ class PropertiesTest(unittest.TestCase):
 
     def test_what_cannot_be_changed_says_why(self):
         self.assertIn("as stiff as its timestep allows", self.change("contact softness", contact_give=0.0))
-        self.assertIn("not changeable in sapien: PhysX's contacts are rigid", self.change("contact softness", "sapien", contact_give=1e-3))
+        self.assertIn(
+            "not changeable in sapien: PhysX's contacts are rigid",
+            self.change("contact softness", "sapien", contact_give=1e-3),
+        )
         self.assertIn("cannot be made to come earlier", self.change("latency", a=replace(STATED, delay=1.0), delay=0.0))
         self.assertIn("no other timestep comes nearer", self.change("timestep", timestep=1.1 / 240))
         self.assertIn("could not be measured in B", self.change("tip friction", tip_friction=math.nan))
@@ -200,8 +216,12 @@ class AttributeTest(unittest.TestCase):
         self.assertIn("'tip friction' alone brings about 100% of it", verdict(found))
 
     def test_half_the_drives_stiffness_is_told_from_friction(self):
-        found = self.attribute(replace(altered_engine(mujoco(), Alteration(hand_stiffness=0.5, table_friction=0.7)), name="weak"))
-        self.assertEqual([row.name for row in found.rows if row.kind == "towards"], ["table friction", "hand stiffness"])
+        found = self.attribute(
+            replace(altered_engine(mujoco(), Alteration(hand_stiffness=0.5, table_friction=0.7)), name="weak")
+        )
+        self.assertEqual(
+            [row.name for row in found.rows if row.kind == "towards"], ["table friction", "hand stiffness"]
+        )
         worst = found.costs()
         assert worst is not None
         self.assertEqual(worst.name, "hand stiffness")
@@ -211,7 +231,8 @@ class AttributeTest(unittest.TestCase):
     def test_the_same_engine_leaves_nothing_to_attribute(self):
         found = self.attribute(replace(mujoco(), name="same"), only=["tip friction"], what_if=True)
         self.assertEqual(
-            [(row.kind, row.name) for row in found.rows], [("as it is", "mujoco"), ("what if", "tip friction"), ("other", "same")]
+            [(row.kind, row.name) for row in found.rows],
+            [("as it is", "mujoco"), ("what if", "tip friction"), ("other", "same")],
         )
         self.assertIsNone(found.costs())
         self.assertIn("nothing to attribute", verdict(found))
@@ -221,10 +242,15 @@ class AttributeTest(unittest.TestCase):
         found = self.attribute(replace(mujoco(), name="same"), only=["torsional friction"], what_if=True)
         tried = [(row.name, row.alteration, amount(row)) for row in found.rows if row.kind == "what if"]
         name = "torsional friction"
-        self.assertEqual(tried, [(name, Alteration(torsional_friction=0.0), "none"), (name, Alteration(torsional_friction=2.0), "x 2")])
+        self.assertEqual(
+            tried,
+            [(name, Alteration(torsional_friction=0.0), "none"), (name, Alteration(torsional_friction=2.0), "x 2")],
+        )
 
     def test_a_change_that_goes_too_far_is_told_from_the_others(self):
-        b = replace(altered_engine(engine("sapien", workers=0), Alteration(table_friction=0.7, mass=1.1)), name="sapien")
+        b = replace(
+            altered_engine(engine("sapien", workers=0), Alteration(table_friction=0.7, mass=1.1)), name="sapien"
+        )
         found = self.attribute(b, only=["table friction", "patch torsional friction", "object mass"])
         kinds = [(row.kind, row.name) for row in found.rows]
         self.assertEqual(
@@ -261,7 +287,9 @@ def row(kind: str, name: str, *scores: float) -> Row:
 
 class OutcomeTest(unittest.TestCase):
     def found(self, *rows: Row) -> Attribution:
-        return Attribution(a="mujoco", b="sapien", measured_a=STATED, measured_b=replace(STATED, mass=0.8), rows=rows, skipped={})
+        return Attribution(
+            a="mujoco", b="sapien", measured_a=STATED, measured_b=replace(STATED, mass=0.8), rows=rows, skipped={}
+        )
 
     def test_shares_of_the_gap(self):
         found = self.found(
@@ -282,7 +310,9 @@ class OutcomeTest(unittest.TestCase):
         self.assertEqual(found.costs(), found.rows[2])
         found = self.found(ends[0], bound, ends[1])
         self.assertEqual(found.costs(), bound)
-        self.assertIn("'patch torsional friction' may bring about 200% of it, at most (changed in every contact", verdict(found))
+        self.assertIn(
+            "'patch torsional friction' may bring about 200% of it, at most (changed in every contact", verdict(found)
+        )
         self.assertEqual(label(bound), "patch torsional friction (at most)")
 
     def test_a_difference_of_one_demonstration_among_many_does_not_matter(self):
@@ -293,7 +323,9 @@ class OutcomeTest(unittest.TestCase):
 
     def test_json_table_and_plot(self):
         found = self.found(
-            row("as it is", "mujoco", *[0.66] * 8), row("towards", "object mass", *[0.33] * 8), row("other", "sapien", *[0.33] * 8)
+            row("as it is", "mujoco", *[0.66] * 8),
+            row("towards", "object mass", *[0.33] * 8),
+            row("other", "sapien", *[0.33] * 8),
         )
         data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
         self.assertEqual((data["schema"], data["costs_most"]), ("xreset-attribution/1", "object mass"))
@@ -319,8 +351,12 @@ class CommandTest(unittest.TestCase):
 
     def test_bad_input(self):
         rest = ("--demos", "none.npz", "--robot", "ur7e-sharpa")
-        self.assertIn("does not differ from itself", self.refuse("zero", *rest, "--backend", "mujoco", "--towards", "mujoco"))
-        self.assertIn("expected a whole number from 1", self.refuse("zero", *rest, "--towards", "sapien", "--episodes", "0"))
+        self.assertIn(
+            "does not differ from itself", self.refuse("zero", *rest, "--backend", "mujoco", "--towards", "mujoco")
+        )
+        self.assertIn(
+            "expected a whole number from 1", self.refuse("zero", *rest, "--towards", "sapien", "--episodes", "0")
+        )
         self.assertIn("there is no backend 'havok'", self.refuse("zero", *rest, "--towards", "havok"))
         self.assertIn("there is no none.npz", self.refuse("zero", *rest, "--towards", "sapien"))
         self.assertIn("there is no policy", self.refuse("none", *rest, "--towards", "sapien"))

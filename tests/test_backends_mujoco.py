@@ -99,7 +99,9 @@ class Model(unittest.TestCase):
         wrist, palm = tree.link("wrist"), tree.link("palm")
         mount = tree.joint("palm_mount").T_parent_joint
         body = model.body("robot/wrist")
-        com = (wrist.mass * wrist.com + palm.mass * (mount[:3, :3] @ palm.com + mount[:3, 3])) / (wrist.mass + palm.mass)
+        com = (wrist.mass * wrist.com + palm.mass * (mount[:3, :3] @ palm.com + mount[:3, 3])) / (
+            wrist.mass + palm.mass
+        )
         np.testing.assert_allclose(body.ipos, com, atol=1e-12)
 
     def test_actuators_are_drives_in_joint_order(self):
@@ -115,7 +117,10 @@ class Model(unittest.TestCase):
     def test_a_drive_at_its_target_rests_and_off_it_pulls_with_its_stiffness_where_joints_are_coupled_too(self):
         at, robot, data = self.at, self.scene.robot, mujoco.MjData(self.at.model)
         q = robot.home + 0.01
-        data.qpos[at.joint_qpos], data.qpos[at.mimic_qpos] = q, at.mimic_multiplier * q[at.mimic_source] + at.mimic_offset
+        data.qpos[at.joint_qpos], data.qpos[at.mimic_qpos] = (
+            q,
+            at.mimic_multiplier * q[at.mimic_source] + at.mimic_offset,
+        )
         off = np.linspace(-1e-4, 1e-4, len(q))
         data.ctrl[:] = q + off
         mujoco.mj_forward(at.model, data)
@@ -143,7 +148,10 @@ class Model(unittest.TestCase):
         thing = "object/box/0"
         expected = {frozenset((thing, other)) for other in ("table", base, column, wrist, jaw_a, pad_b)}
         expected |= {frozenset(("table", link)) for link in (column, wrist, jaw_a, pad_b)}  # the base is excluded
-        expected |= {frozenset((jaw_a, pad_b)), frozenset((column, pad_b))}  # jaw_a and column are excluded, the wrist not listed
+        expected |= {
+            frozenset((jaw_a, pad_b)),
+            frozenset((column, pad_b)),
+        }  # jaw_a and column are excluded, the wrist not listed
         self.assertEqual(pairs, expected)
 
     def test_links_of_one_body_are_told_apart(self):
@@ -168,7 +176,9 @@ class Model(unittest.TestCase):
         robot = replace(self.scene.robot, self_collision_links=("base", "column", "wrist"), collision_exclude=())
         pairs = colliding_geoms(compile_scene(replace(self.scene, robot=robot), 0).model)
         own = {pair for pair in pairs if all(name.startswith("robot/") for name in pair)}
-        self.assertEqual(own, {frozenset(("robot/base/0", "robot/wrist/0")), frozenset(("robot/column/0", "robot/wrist/0"))})
+        self.assertEqual(
+            own, {frozenset(("robot/base/0", "robot/wrist/0")), frozenset(("robot/column/0", "robot/wrist/0"))}
+        )
 
     def test_roles(self):
         names = [self.at.model.geom(i).name for i in range(self.at.model.ngeom)]
@@ -289,7 +299,9 @@ class BothBackends(unittest.TestCase):
     def test_readings_are_those_of_a_plain_computation(self):
         """The engine's sensors against loops over links and contacts: while a grasped box is swung about, and right after a set."""
         state, _ = grasp(self.bench)
-        moving = replace(state, joint_vel=state.joint_vel + 0.3, object_angvel=state.object_angvel + torch.tensor([0.5, -1.0, 2.0]))
+        moving = replace(
+            state, joint_vel=state.joint_vel + 0.3, object_angvel=state.object_angvel + torch.tensor([0.5, -1.0, 2.0])
+        )
         touched, plain, sense = set(), {}, mujoco.mj_sensorAcc
 
         def sense_and_look(model, data):
@@ -316,13 +328,17 @@ class BothBackends(unittest.TestCase):
                 np.testing.assert_allclose(contacts.tip_force[i], tip_force, rtol=1e-5, atol=1e-6)
                 np.testing.assert_allclose(contacts.table_force[i], table_force, rtol=1e-5, atol=1e-6)
                 self.assertEqual(contacts.tip_touch[i].tolist(), touch)
-                touched |= {("tip", tip) for tip in np.flatnonzero(touch)} | ({("table",)} if table_force.any() else set())
+                touched |= {("tip", tip) for tip in np.flatnonzero(touch)} | (
+                    {("table",)} if table_force.any() else set()
+                )
         self.assertEqual(touched, {("tip", 0), ("tip", 1), ("table",)}, "nothing was compared")
 
     def test_looking_changes_no_motion(self):
         """Links take the first half of the next step in advance: whoever looks must end up where one goes who does not."""
         state, _ = grasp(self.bench)
-        friction = torch.tensor([[self.scene.friction.tip, self.scene.friction.link, self.scene.friction.table]]).expand(4, 3)
+        friction = torch.tensor(
+            [[self.scene.friction.tip, self.scene.friction.link, self.scene.friction.table]]
+        ).expand(4, 3)
         self.addCleanup(self.c.set_friction, friction)
         for looks in ((), ("links",), ("contacts", "links"), ("links", "contacts")):
             ends = []
@@ -399,12 +415,17 @@ class Steps(unittest.TestCase):
             ):
                 state = snapshot(backend.state())
                 backend.set_state(replace(state, object_linvel=state.object_linvel + torch.tensor([0.3, 0.0, -0.5])))
-                backend.set_object_com(torch.tensor([0.01, 0.0, 0.0]).expand(8, 3))  # a parameter that moves what positions lead to
+                backend.set_object_com(
+                    torch.tensor([0.01, 0.0, 0.0]).expand(8, 3)
+                )  # a parameter that moves what positions lead to
                 for target in torch.linspace(0.0, 0.3, 40):
                     backend.set_joint_targets(state.joint_target + target)
                     backend.step(2)
                 now, contacts = snapshot(backend.state()), backend.contacts()
-                results.append([getattr(now, f.name) for f in fields(now)] + [contacts.tip_force.clone(), contacts.table_force.clone()])
+                results.append(
+                    [getattr(now, f.name) for f in fields(now)]
+                    + [contacts.tip_force.clone(), contacts.table_force.clone()]
+                )
         self.assertGreater(float(results[0][-1].abs().max()), 0.1, "something touches")
         for other in results[1:]:
             for a, b in zip(results[0], other, strict=True):
@@ -426,7 +447,11 @@ class Limits(unittest.TestCase):
 
     def test_an_object_of_many_pieces_has_room_for_its_contacts(self):
         """Sixteen feet on the table: 256 rows of constraints."""
-        feet = [shape("box", (0.002, 0.002, 0.005), (x, y, 0.0)) for x in (-0.03, -0.01, 0.01, 0.03) for y in (-0.03, -0.01, 0.01, 0.03)]
+        feet = [
+            shape("box", (0.002, 0.002, 0.005), (x, y, 0.0))
+            for x in (-0.03, -0.01, 0.01, 0.03)
+            for y in (-0.03, -0.01, 0.01, 0.03)
+        ]
         standing = replace(scene(), objects=(solid("feet", 0.4, tuple(feet)),))
         for options, overflows in (({}, False), ({"constraints_per_world": 220}, True)):
             with MujocoWarpBackend(standing, 2, **options) as backend:

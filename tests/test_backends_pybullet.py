@@ -37,7 +37,11 @@ class PybulletTest(EngineChecks, unittest.TestCase):
         np.testing.assert_allclose(S.T @ full @ S, mass_matrix(robot, q), rtol=1e-6, atol=1e-9)
 
     def test_roll_pitch_yaw(self):
-        rotations = [*Rotation.random(50, random_state=0), Rotation.from_euler("xyz", [0.3, np.pi / 2, -0.2]), Rotation.identity()]
+        rotations = [
+            *Rotation.random(50, random_state=0),
+            Rotation.from_euler("xyz", [0.3, np.pi / 2, -0.2]),
+            Rotation.identity(),
+        ]
         for rotation in rotations:
             T = np.eye(4)
             T[:3, :3] = rotation.as_matrix()
@@ -48,11 +52,17 @@ class PybulletTest(EngineChecks, unittest.TestCase):
         """Round pads hold a box, its hull, and the hulls of its halves, all off their frames' origins, with the same opening."""
 
         def rounded(pad: Shape) -> Shape:
-            return replace(pad, geometry=Geometry(kind="sphere", size=(min(pad.geometry.size),))) if pad.geometry.kind == "box" else pad
+            return (
+                replace(pad, geometry=Geometry(kind="sphere", size=(min(pad.geometry.size),)))
+                if pad.geometry.kind == "box"
+                else pad
+            )
 
         def round_pads(robot):
             made = mechanism(robot)
-            bodies = [replace(b, shapes=tuple(replace(s, shape=rounded(s.shape)) for s in b.shapes)) for b in made.bodies]
+            bodies = [
+                replace(b, shapes=tuple(replace(s, shape=rounded(s.shape)) for s in b.shapes)) for b in made.bodies
+            ]
             return replace(made, bodies=tuple(bodies))
 
         def opening(*pieces: Shape) -> float:
@@ -85,7 +95,10 @@ class PybulletTest(EngineChecks, unittest.TestCase):
             PybulletBackend(replace(scene(), objects=(bad,)), 1)
 
     def test_a_missing_engine_says_how_to_get_it(self):
-        with mock.patch.dict(sys.modules, {"pybullet": None}), self.assertRaisesRegex(BackendUnavailableError, r"xreset\[pybullet\]"):
+        with (
+            mock.patch.dict(sys.modules, {"pybullet": None}),
+            self.assertRaisesRegex(BackendUnavailableError, r"xreset\[pybullet\]"),
+        ):
             PybulletBackend.engine_version()
 
 

@@ -25,7 +25,10 @@ class SapienTest(EngineChecks, unittest.TestCase):
     backend_class = SapienBackend
 
     def test_a_missing_engine_says_how_to_get_it(self):
-        with mock.patch.dict(sys.modules, {"sapien": None}), self.assertRaisesRegex(BackendUnavailableError, r"xreset\[sapien\]"):
+        with (
+            mock.patch.dict(sys.modules, {"sapien": None}),
+            self.assertRaisesRegex(BackendUnavailableError, r"xreset\[sapien\]"),
+        ):
             SapienBackend.engine_version()
 
     def test_a_mimic_joint_far_below_its_source_follows_it(self):
@@ -36,7 +39,9 @@ class SapienTest(EngineChecks, unittest.TestCase):
             mimics=(*robot.mimics, MimicSpec(joint="finger_b_bend", source="swing", multiplier=0.5)),
         )
         (result,) = run(SapienBackend, robot=far, only=["mimic_joints"])
-        self.assertLess(max(measure.measured for measure in result.measures), 4e-3)  # 0.002 rad through three links; alone it would stay
+        self.assertLess(
+            max(measure.measured for measure in result.measures), 4e-3
+        )  # 0.002 rad through three links; alone it would stay
 
     def test_a_mimic_joint_on_another_branch_than_its_source_is_refused(self):
         def joint(parent, child):
@@ -55,7 +60,9 @@ class SapienTest(EngineChecks, unittest.TestCase):
 class CollisionBitsTest(unittest.TestCase):
     def test_exactly_the_pairs_of_the_rule(self):
         robot = replace(
-            gripper(), self_collision_links=("base", "column", "wrist", "jaw_a", "pad_b"), collision_exclude=(("base", "jaw_a"),)
+            gripper(),
+            self_collision_links=("base", "column", "wrist", "jaw_a", "pad_b"),
+            collision_exclude=(("base", "jaw_a"),),
         )
         mech = mechanism(robot)
         bits = self_collision_bits(mech)

@@ -13,7 +13,20 @@ from xreset.cli import COMMANDS, MOVED, main
 from xreset.cli._terminal import Console, Progress
 from xreset.cli.engines import COMMANDS as ENGINES
 
-HEAVY = ("torch", "warp", "mujoco", "mujoco_warp", "pybullet", "sapien", "matplotlib", "trimesh", "scipy", "rsl_rl", "tyro", "numpy")
+HEAVY = (
+    "torch",
+    "warp",
+    "mujoco",
+    "mujoco_warp",
+    "pybullet",
+    "sapien",
+    "matplotlib",
+    "trimesh",
+    "scipy",
+    "rsl_rl",
+    "tyro",
+    "numpy",
+)
 
 
 def modules_after(code: str) -> set[str]:
@@ -53,7 +66,10 @@ class LightnessTest(unittest.TestCase):
             "print(loaded)"
         )
         self.assertEqual(
-            subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.splitlines()[-1], "{}"
+            subprocess.run(
+                [sys.executable, "-c", code], check=True, capture_output=True, text=True
+            ).stdout.splitlines()[-1],
+            "{}",
         )
 
 
@@ -90,7 +106,10 @@ class UsageTest(unittest.TestCase):
     def test_impossible_options_are_refused_before_work_begins(self):
         long, demos = "x" * 300, ("--demos", "none.npz")
         for words, argv in (
-            (r"--seed is -1, expected a whole number from 0 to 4294967295", ("demos", "synth", "--out", "x.npz", "--seed", "-1")),
+            (
+                r"--seed is -1, expected a whole number from 0 to 4294967295",
+                ("demos", "synth", "--out", "x.npz", "--seed", "-1"),
+            ),
             (r"--seed is 9{20}, expected", ("eval", "zero", "--robot", "openarm", *demos, "--seed", "9" * 20)),
             (r"--seed is -1, expected", ("train", "--out", "x", "--seed", "-1")),
             (r"--num-envs is 0, expected a whole number from 1", ("train", "--out", "x", "--num-envs", "0")),
@@ -102,7 +121,10 @@ class UsageTest(unittest.TestCase):
                 r"no device 'quantum'; expected cpu, cuda or",
                 ("retarget", "none.npz", "--robot", "openarm", "--out", "x.npz", "--device", "quantum"),
             ),
-            (r"fps is 1000000000.0, expected at least 1, and 5 to 1000", ("demos", "synth", "--out", "x.npz", "--fps", "1e9")),
+            (
+                r"fps is 1000000000.0, expected at least 1, and 5 to 1000",
+                ("demos", "synth", "--out", "x.npz", "--fps", "1e9"),
+            ),
             (r"(File name too long|there is no)", ("demos", "info", long)),
             (r"(File name too long|there is no)", ("eval", long, *demos)),
             (r"(File name too long|there is no)", ("robots", "check", long)),
@@ -134,7 +156,9 @@ class UsageTest(unittest.TestCase):
             task = bar.add_task("[placements]", total=4)
             for done in (1, 2, 3):
                 bar.update(task, completed=done)
-        self.assertEqual([line for line in out.getvalue().splitlines() if "%" in line and "━" not in line], ["[placements]: 50 %"])
+        self.assertEqual(
+            [line for line in out.getvalue().splitlines() if "%" in line and "━" not in line], ["[placements]: 50 %"]
+        )
 
     def test_an_engine_that_does_not_exist(self):
         code, _, err = run("engines", "check", "--backend", "bulet")
@@ -149,7 +173,15 @@ class UsageTest(unittest.TestCase):
 
     def test_naming_engines_replaces_the_default(self):
         for given, expected in (((), ["mujoco"]), (("sapien", "pybullet", "sapien"), ["sapien", "pybullet"])):
-            argv = ["eval", "zero", "--robot", "openarm", "--demos", "x.npz", *(w for name in given for w in ("--backend", name))]
+            argv = [
+                "eval",
+                "zero",
+                "--robot",
+                "openarm",
+                "--demos",
+                "x.npz",
+                *(w for name in given for w in ("--backend", name)),
+            ]
             with mock.patch("xreset.eval.evaluate.evaluate", side_effect=KeyboardInterrupt) as evaluate:
                 self.assertEqual(run(*argv)[0], 130)
             self.assertEqual([engine.name for engine in evaluate.call_args.args[1]], expected)

@@ -95,9 +95,13 @@ class ClosingTest(unittest.TestCase):
 
     def dense(self, data: Retargeted | None = None, **config):
         none = torch.zeros(10, 2, 3)
-        fingers = Fingers(links=("a", "b"), finger=torch.tensor([0, 1]), gap=torch.as_tensor(self.gap), point=none, inward=none)
+        fingers = Fingers(
+            links=("a", "b"), finger=torch.tensor([0, 1]), gap=torch.as_tensor(self.gap), point=none, inward=none
+        )
         with mock.patch("xreset.resets.closing.fingers_in", lambda *_: fingers):
-            return with_closing_frames(data or self.data, ROBOT, (toy_grasp.brick(),), ClosingConfig(**({"spacing": 0.005} | config)))
+            return with_closing_frames(
+                data or self.data, ROBOT, (toy_grasp.brick(),), ClosingConfig(**({"spacing": 0.005} | config))
+            )
 
     def test_fingertips_move_by_no_more_than_the_spacing(self):
         dense, frame, part = self.dense()
@@ -115,7 +119,9 @@ class ClosingTest(unittest.TestCase):
         for name in ("joint_pos", "palm_pos", "object_pos", "fingertip_pos"):
             old = getattr(self.data, name)
             share = part.reshape(-1, *[1] * (old.ndim - 1))
-            np.testing.assert_allclose(getattr(dense, name), (1 - share) * old[frame] + share * old[nxt], atol=1e-12, err_msg=name)
+            np.testing.assert_allclose(
+                getattr(dense, name), (1 - share) * old[frame] + share * old[nxt], atol=1e-12, err_msg=name
+            )
         angle = 2 * np.arctan2(dense.object_quat_wxyz[:, 3], dense.object_quat_wxyz[:, 0])
         np.testing.assert_allclose(angle, 0.2 * (frame + part), atol=1e-9)
 
@@ -123,7 +129,16 @@ class ClosingTest(unittest.TestCase):
         dense, frame, part = self.dense()
         here = part == 0
         self.assertEqual(frame[here].tolist(), list(range(10)))
-        for name in ("joint_pos", "palm_pos", "palm_quat_wxyz", "fingertip_pos", "object_pos", "object_quat_wxyz", "hand_error", "contact"):
+        for name in (
+            "joint_pos",
+            "palm_pos",
+            "palm_quat_wxyz",
+            "fingertip_pos",
+            "object_pos",
+            "object_quat_wxyz",
+            "hand_error",
+            "contact",
+        ):
             self.assertEqual(getattr(dense, name)[here].tobytes(), getattr(self.data, name).tobytes(), name)
         self.assertEqual((dense.goal_pos.tobytes(), dense.fps), (self.data.goal_pos.tobytes(), 30.0))
 
@@ -137,7 +152,11 @@ class ClosingTest(unittest.TestCase):
         valid = np.ones(10, dtype=bool)
         valid[[2, 7]] = False
         dense, frame, part = self.dense(replace(self.data, valid=valid, reason=(~valid).astype(int)))
-        self.assertEqual(sorted(set(frame[part > 0].tolist())), [0, 3, 5, 8], "not 1 and 6 to an invalid frame, 2 and 7 from it, 4 to 5")
+        self.assertEqual(
+            sorted(set(frame[part > 0].tolist())),
+            [0, 3, 5, 8],
+            "not 1 and 6 to an invalid frame, 2 and 7 from it, 4 to 5",
+        )
         self.assertEqual(np.diff(dense.frame_offsets).tolist(), [9, 9])
         self.assertEqual(dense.valid[part > 0].tolist(), [True] * 8)
 
@@ -202,7 +221,9 @@ class FingersTest(unittest.TestCase):
         fingers, joints = self.fingers(0.0201, 0.0501)
         for force in (1.0, 2.5):
             target = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=force))
-            self.assertAlmostEqual(target[0, JAW] - joints[0, JAW], -(force + 1.1 * force) / 800, delta=2e-5)  # jaw_b mimics jaw_a
+            self.assertAlmostEqual(
+                target[0, JAW] - joints[0, JAW], -(force + 1.1 * force) / 800, delta=2e-5
+            )  # jaw_b mimics jaw_a
             np.testing.assert_array_equal(target[1], joints[1], "30 mm away nothing is pressed on")
             arm = ROBOT.arm_indices
             np.testing.assert_array_equal(target[:, arm], joints[:, arm])
@@ -215,7 +236,10 @@ class FingersTest(unittest.TestCase):
     def test_a_squeeze_is_within_the_drives_torque(self):
         fingers, joints = self.fingers(0.0201)
         weak = replace(
-            ROBOT, joints=tuple(replace(j, drive=replace(j.drive, effort=0.8)) if j.name == "jaw_a_slide" else j for j in ROBOT.joints)
+            ROBOT,
+            joints=tuple(
+                replace(j, drive=replace(j.drive, effort=0.8)) if j.name == "jaw_a_slide" else j for j in ROBOT.joints
+            ),
         )
         target = squeeze_targets(weak, fingers, joints, SqueezeConfig(force=50.0))
         self.assertAlmostEqual(target[0, JAW] - joints[0, JAW], -0.8 / 800, places=9)
@@ -236,7 +260,9 @@ class TargetsTest(unittest.TestCase):
         found = read_bank(self.folder / "b.npz")
         np.testing.assert_array_equal(found.targets, found.joint_pos + 0.25)
         np.testing.assert_array_equal(found.select(pre_contact_only=True).targets, found.targets[[0, 2, 4]])
-        self.assertEqual((found.num_pressing, found.rejected_frame_part, found.finger_gap, found.bands()), (6, None, None, []))
+        self.assertEqual(
+            (found.num_pressing, found.rejected_frame_part, found.finger_gap, found.bands()), (6, None, None, [])
+        )
         old = toy_bank(ROBOT)
         write_bank(self.folder / "old.npz", old, config={}, inputs={})
         with np.load(self.folder / "old.npz") as file:
@@ -257,7 +283,10 @@ class TargetsTest(unittest.TestCase):
 class Held(unittest.TestCase):
     def test_engines_are_told_apart_state_by_state(self):
         """As many held does not mean alike."""
-        bank, drops = toy_bank(ROBOT), {"a": [0, 1], "b": [0, 2], "c": [0, 1]}  # three states are lifted: soup, spam, soup
+        bank, drops = (
+            toy_bank(ROBOT),
+            {"a": [0, 1], "b": [0, 2], "c": [0, 1]},
+        )  # three states are lifted: soup, spam, soup
 
         def spawn(name, scene, index, states, **_):
             start = State.at_rest(*(torch.as_tensor(array, dtype=torch.float32) for array in states))
@@ -265,13 +294,19 @@ class Held(unittest.TestCase):
             end[drops[name], 2] -= 0.1
             backend = mock.Mock(device="cpu")
             backend.state.return_value = replace(start, object_pos=end)
-            backend.health.return_value = Health(nonfinite=torch.zeros(3, dtype=torch.bool), overflow=torch.zeros(3, dtype=torch.bool))
+            backend.health.return_value = Health(
+                nonfinite=torch.zeros(3, dtype=torch.bool), overflow=torch.zeros(3, dtype=torch.bool)
+            )
             yield backend, start, np.arange(3), np.ones(3, dtype=bool)
 
         with mock.patch("xreset.resets.hold.spawn", spawn):
-            rows = hold_bank(bank, ROBOT, [replace(toy_grasp.brick(), name=name) for name in bank.object_names], list(drops))
+            rows = hold_bank(
+                bank, ROBOT, [replace(toy_grasp.brick(), name=name) for name in bank.object_names], list(drops)
+            )
         found = {row.backend: (row.held, row.lifted, row.alike) for row in rows if row.object_name == "all"}
-        self.assertEqual(found, {"a": (1, 3, {"b": 1, "c": 3}), "b": (1, 3, {"a": 1, "c": 1}), "c": (1, 3, {"a": 3, "b": 1})})
+        self.assertEqual(
+            found, {"a": (1, 3, {"b": 1, "c": 3}), "b": (1, 3, {"a": 1, "c": 1}), "c": (1, 3, {"a": 3, "b": 1})}
+        )
 
 
 class CommandTest(unittest.TestCase):
@@ -298,14 +333,27 @@ class CommandTest(unittest.TestCase):
         np.testing.assert_allclose(bank.frame_part * 6, [0, 1, 2, 3, 4, 5, 0, 0], atol=1e-5)
         self.assertEqual(bank.frame_index.tolist(), [0] * 6 + [1, 2])
         self.assertEqual((bank.targets != bank.joint_pos).any(axis=1).tolist(), [False] * 6 + [True] * 2)
-        counts = [(band["nearer"], band["tried"], band["kept"], band["added"], band["added_kept"]) for band in account["bands"]]
+        counts = [
+            (band["nearer"], band["tried"], band["kept"], band["added"], band["added_kept"])
+            for band in account["bands"]
+        ]
         self.assertEqual(
             counts,
-            [(None, 0, 0, 0, 0), (0.1, 0, 0, 0, 0), (0.05, 1, 1, 2, 2), (0.02, 0, 0, 2, 2), (0.01, 0, 0, 1, 1), (0.001, 2, 2, 0, 0)],
+            [
+                (None, 0, 0, 0, 0),
+                (0.1, 0, 0, 0, 0),
+                (0.05, 1, 1, 2, 2),
+                (0.02, 0, 0, 2, 2),
+                (0.01, 0, 0, 1, 1),
+                (0.001, 2, 2, 0, 0),
+            ],
         )
         self.assertEqual(sum(row["total"] for row in account["rows"] if row["phase"] == "both"), 3, "frames only")
         self.assertEqual(account["pressing"], 2)
-        self.assertEqual([(row["object_name"], row["lifted"], row["held"]) for row in account["hold"]], [("brick", 1, 1), ("all", 1, 1)])
+        self.assertEqual(
+            [(row["object_name"], row["lifted"], row["held"]) for row in account["hold"]],
+            [("brick", 1, 1), ("all", 1, 1)],
+        )
         for words in ("5 to 2 cm", "2 of 2 states after contact press with 2.5 N", "1 (100%)", "8 states of 8"):
             self.assertIn(words, out)
         with np.load(self.folder / "b.npz") as file:
@@ -326,7 +374,9 @@ class CommandTest(unittest.TestCase):
         np.testing.assert_array_equal(bank.targets, bank.joint_pos)
 
     def test_bad_options(self):
-        code, out, err = run("resets", str(self.folder / "r.npz"), "--out", str(self.folder / "b.npz"), "--closing.spacing", "0")
+        code, out, err = run(
+            "resets", str(self.folder / "r.npz"), "--out", str(self.folder / "b.npz"), "--closing.spacing", "0"
+        )
         self.assertNotEqual(code, 0)
         self.assertIn("spacing is 0.0, expected a number above 0", " ".join((out + err).split()))
         self.assertFalse((self.folder / "b.npz").exists())

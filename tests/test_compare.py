@@ -38,10 +38,14 @@ STEPS = WORLDS * HORIZON
 def rollouts_with(*progress: float) -> Rollouts:
     """The toy's four episodes with other task progress."""
     base = toy_rollouts()
-    return replace(base, episodes=tuple(replace(e, task_progress=p) for e, p in zip(base.episodes, progress, strict=True)))
+    return replace(
+        base, episodes=tuple(replace(e, task_progress=p) for e, p in zip(base.episodes, progress, strict=True))
+    )
 
 
-def curves_of(seconds: tuple[float, ...], success: tuple[float, ...], first: int = 1, steps: float = STEPS) -> dict[str, Curve]:
+def curves_of(
+    seconds: tuple[float, ...], success: tuple[float, ...], first: int = 1, steps: float = STEPS
+) -> dict[str, Curve]:
     """Scalars of a training whose iterations took that long and had ``steps`` each."""
     iteration = np.arange(first, first + len(seconds))
 
@@ -74,7 +78,9 @@ class InFolder(unittest.TestCase):
     def write_results(self, name: str, rollouts: Rollouts | None = None, engines=("mujoco",), **changes) -> Path:
         rollouts = rollouts or toy_rollouts()
         for engine in engines:
-            write_results(self.folder / name / "eval", toy_summary(engine, rollouts, **changes), rollouts, ("a", "b", "c"))
+            write_results(
+                self.folder / name / "eval", toy_summary(engine, rollouts, **changes), rollouts, ("a", "b", "c")
+            )
         return self.folder / name
 
     def write_curves(self, name: str, curves: dict[str, Curve]) -> Path:
@@ -136,7 +142,11 @@ class ReadTest(InFolder):
             *((name, whole[name][:80], f"{name} is not valid JSON") for name in files),
             ("eval/mujoco.json", lacks("eval/mujoco.json", "seed"), "does not fit EvalResult .missing: seed"),
             ("run.json", lacks("run.json", "config"), "run.json lacks config"),
-            ("eval/mujoco.json", whole["eval/mujoco.json"].replace('"episodes": 4', '"episodes": 5'), "5 episodes, .* holds 4"),
+            (
+                "eval/mujoco.json",
+                whole["eval/mujoco.json"].replace('"episodes": 4', '"episodes": 5'),
+                "5 episodes, .* holds 4",
+            ),
         ):
             (a / name).write_text(text)
             with self.subTest(message), self.assertRaisesRegex(FileFormatError, message):
@@ -144,7 +154,9 @@ class ReadTest(InFolder):
             (a / name).write_text(whole[name])
         read_training("a", a)
         (a / "events.out.tfevents.1.x").write_bytes(b"no events")
-        with self.assertRaisesRegex(FileFormatError, "hold no learning curve.*Compare its evaluations alone: a=.*/eval"):
+        with self.assertRaisesRegex(
+            FileFormatError, "hold no learning curve.*Compare its evaluations alone: a=.*/eval"
+        ):
             read_training("a", a)
 
     def test_event_files_that_are_not_whole(self):
@@ -273,7 +285,13 @@ class LiftTest(InFolder):
 
     def test_the_share_of_runs_is_a_step_curve_with_censored_runs(self):
         """Of five runs, passed after 2, 4 and 8 minutes, ended without after 3 and 9: 1 - 4/5, then times 2/3, then times 1/2."""
-        found = [Fate(2.0, True, 5.0), Fate(3.0, False, 3.0), Fate(4.0, True, 8.0), Fate(8.0, True, 11.0), Fate(9.0, False, 9.0)]
+        found = [
+            Fate(2.0, True, 5.0),
+            Fate(3.0, False, 3.0),
+            Fate(4.0, True, 8.0),
+            Fate(8.0, True, 11.0),
+            Fate(9.0, False, 9.0),
+        ]
         line = share_of_runs(found[::-1])
         np.testing.assert_allclose(line.x, [0, 2, 3, 4, 8, 9, 11], err_msg="until the last run ended")
         np.testing.assert_allclose(line.mean, [0, 1 / 5, 1 / 5, 1 - 8 / 15, 1 - 4 / 15, 1 - 4 / 15, 1 - 4 / 15])
@@ -282,7 +300,9 @@ class LiftTest(InFolder):
         whole = share_of_runs([Fate(t, t < 9, 9.0) for t in (1.0, 5.0, 9.0, 9.0)])
         np.testing.assert_allclose(whole.mean, [0, 0.25, 0.5, 0.5], err_msg="none ended early: the share of all runs")
         at_once = share_of_runs([Fate(2.0, True, 2.0), Fate(2.0, False, 2.0), Fate(2.0, True, 2.0)])
-        np.testing.assert_allclose(at_once.mean, [0, 2 / 3], err_msg="who ends when another passes was watched until then")
+        np.testing.assert_allclose(
+            at_once.mean, [0, 2 / 3], err_msg="who ends when another passes was watched until then"
+        )
 
     def test_wilsons_interval(self):
         """Its ends are where |p - share| is 1.96 standard deviations of p."""
@@ -305,7 +325,8 @@ class LiftTest(InFolder):
         success = (0.0, 0.04, 0.02, 0.3, 0.3)  # from home half of it: 2 % after 2 minutes, 15 % after 4.5
         old = self.training("old", curves_of((60.0, 60.0, 60.0, 90.0, 30.0), success))
         self.assertEqual(
-            [fates([old], s, "minutes") for s in (0.01, 0.1, 0.5)], [[(2.0, True, 5.0)], [(4.5, True, 5.0)], [(5.0, False, 5.0)]]
+            [fates([old], s, "minutes") for s in (0.01, 0.1, 0.5)],
+            [[(2.0, True, 5.0)], [(4.5, True, 5.0)], [(5.0, False, 5.0)]],
         )
         self.assertEqual(fates([old], 0.1, "steps"), [(4.0 * STEPS, True, 5.0 * STEPS)])
         slow = self.training("old", {k: v for k, v in old.scalars.items() if k != "speed/learn_seconds"})
@@ -321,7 +342,9 @@ class LiftTest(InFolder):
         made = self.compare(*names, "old")
         head, *body = [list(made.lifted.head), *map(list, made.lifted.body)]
         self.assertEqual(head, ["", "runs", "1 % [min]", "10 % [min]", "50 % [min]"])
-        self.assertEqual(body[0], ["x", "2", "100 % (34-100); 6.0, 7.0", "50 % (9-91); 8.5, >10.0", "0 % (0-79); >12.0, >10.0"])
+        self.assertEqual(
+            body[0], ["x", "2", "100 % (34-100); 6.0, 7.0", "50 % (9-91); 8.5, >10.0", "0 % (0-79); >12.0, >10.0"]
+        )
         self.assertEqual(body[1], ["other", "1", *["0 % (0-79); >8.0"] * 3])
         self.assertEqual(body[2][2], "100 % (21-100); 2.0")
         text = "\n".join(made.notes)
@@ -343,7 +366,9 @@ class LiftTest(InFolder):
         self.lifted("a", 3.0)
         self.write_run("b")
         self.write_results("b")
-        self.assertIn("neither lift.json nor the curve task/success_from_home: b.", "\n".join(self.compare("a", "b").notes))
+        self.assertIn(
+            "neither lift.json nor the curve task/success_from_home: b.", "\n".join(self.compare("a", "b").notes)
+        )
 
     def test_steps_are_drawn_as_steps(self):
         with figure_style({}) as figure_class:
@@ -373,10 +398,18 @@ class GroupTest(InFolder):
 
     def test_what_differs_in_the_seed_only_is_one(self):
         names = [
-            self.run_and_results(f"soup-seed{i}", seed=i, device=f"cuda:{i}", resets=f"/{i}/b.npz", config=TrainConfig(iterations=1000 * i))
+            self.run_and_results(
+                f"soup-seed{i}",
+                seed=i,
+                device=f"cuda:{i}",
+                resets=f"/{i}/b.npz",
+                config=TrainConfig(iterations=1000 * i),
+            )
             for i in (1, 2, 10)
         ]
-        other = self.run_and_results("fixed", config=TrainConfig(task=TaskConfig(reset=ResetConfig(random_gravity=False))))
+        other = self.run_and_results(
+            "fixed", config=TrainConfig(task=TaskConfig(reset=ResetConfig(random_gravity=False)))
+        )
         bank = self.run_and_results("bank", seed=3, resets_hash="aa" * 32)
         baseline = "ik"
         self.write_results(baseline)
@@ -442,9 +475,13 @@ class ScoreTest(InFolder):
 
     def test_seeds_widen_the_interval(self):
         alike = score(self.group((0.4, 0.6, 0.4, 0.6), (0.4, 0.6, 0.4, 0.6)), "mujoco")
-        self.assertEqual((alike.task_progress, alike.ci95), (0.5, (0.5, 0.5)), "neither seeds nor demonstrations differ")
+        self.assertEqual(
+            (alike.task_progress, alike.ci95), (0.5, (0.5, 0.5)), "neither seeds nor demonstrations differ"
+        )
         apart = score(self.group((0.0, 0.2, 0.0, 0.2), (0.8, 1.0, 0.8, 1.0)), "mujoco")
-        np.testing.assert_allclose(apart.ci95, (0.1, 0.9), err_msg="one of the two seeds only is drawn in half of the resamples")
+        np.testing.assert_allclose(
+            apart.ci95, (0.1, 0.9), err_msg="one of the two seeds only is drawn in half of the resamples"
+        )
         self.assertEqual({k: round(v, 9) for k, v in apart.each.items()}, {"s-0": 0.1, "s-1": 0.9})
 
     def test_a_seed_that_was_not_evaluated_is_left_out(self):
@@ -492,17 +529,42 @@ class FairnessTest(InFolder):
         for what, rollouts, changes, expected in (
             ("seed", None, {"seed": 4}, r"not the same seed of the evaluation \(3: a; 4: seed\)"),
             ("robot", None, {"robot": "other"}, r"not the same robot \(toy: a; other: robot\)"),
-            ("meshes", None, {"objects_folder": "/ycb"}, r"not the same object meshes \(stand-ins: a; /ycb: meshes\)\.\n"),
-            ("engine", None, {"backend_version": "5.1"}, r"(?s)version of mujoco \(4.0.0: a; 5.1: engine\).*version of sapien \("),
-            ("demos", replace(base, episodes=renamed), {"inputs": {"demos": "cd"}}, r"not the same demonstrations \(ab: a; cd: demos\)"),
-            ("file", None, {"inputs": {"demos": "cd"}}, r"files of demonstrations differ \(ab: a; cd: file\), .* same names"),
+            (
+                "meshes",
+                None,
+                {"objects_folder": "/ycb"},
+                r"not the same object meshes \(stand-ins: a; /ycb: meshes\)\.\n",
+            ),
+            (
+                "engine",
+                None,
+                {"backend_version": "5.1"},
+                r"(?s)version of mujoco \(4.0.0: a; 5.1: engine\).*version of sapien \(",
+            ),
+            (
+                "demos",
+                replace(base, episodes=renamed),
+                {"inputs": {"demos": "cd"}},
+                r"not the same demonstrations \(ab: a; cd: demos\)",
+            ),
+            (
+                "file",
+                None,
+                {"inputs": {"demos": "cd"}},
+                r"files of demonstrations differ \(ab: a; cd: file\), .* same names",
+            ),
             (
                 "objects",
                 replace(base, episodes=soups),
                 {},
                 r"not the same objects \(potted meat can, tomato soup can: a; tomato soup can: ob",
             ),
-            ("fewer", replace(base, episodes=base.episodes[::2]), {}, r"not the same number of episodes \(4: a; 2: fewer\)"),
+            (
+                "fewer",
+                replace(base, episodes=base.episodes[::2]),
+                {},
+                r"not the same number of episodes \(4: a; 2: fewer\)",
+            ),
         ):
             with self.subTest(what):
                 self.write_results(what, rollouts, ("mujoco", "sapien"), **changes)
@@ -514,14 +576,19 @@ class FairnessTest(InFolder):
         self.write_results("a")
         self.write_results("a", engines=("sapien",), seed=9)
         self.write_results("b", engines=("mujoco", "sapien"))
-        self.assertRegex(self.notes("a", "b"), r"a: These results are not comparable: the seed differs \(mujoco: 3, sapien: 9\)")
+        self.assertRegex(
+            self.notes("a", "b"), r"a: These results are not comparable: the seed differs \(mujoco: 3, sapien: 9\)"
+        )
 
     def test_policies_that_play_another_task(self):
         self.write_run("short", TrainConfig(task=TaskConfig(termination=TerminationConfig(episode_seconds=2.5))))
         self.write_run("usual")
         for name in ("short", "usual"):
             self.write_results(name)
-        self.assertRegex(self.notes("short", "usual"), r"own task, whose task.termination.episode_seconds differs \(2.5: short; 5: usual\)")
+        self.assertRegex(
+            self.notes("short", "usual"),
+            r"own task, whose task.termination.episode_seconds differs \(2.5: short; 5: usual\)",
+        )
 
     def test_a_training_that_began_with_the_networks_of_another(self):
         for name, weights in (("new", None), ("onwards", "runs/joint/checkpoints/000900.pt")):
@@ -530,7 +597,9 @@ class FairnessTest(InFolder):
         made = self.compare("new", "onwards")
         expected = "onwards began with the networks of another training (runs/joint/checkpoints/000900.pt): "
         self.assertEqual([note[: len(expected)] for note in made.notes if "networks" in note], [expected])
-        self.assertIn(["weights", "new", "runs/joint/checkpoints/000900.pt"], [list(row) for row in made.different.body])
+        self.assertIn(
+            ["weights", "new", "runs/joint/checkpoints/000900.pt"], [list(row) for row in made.different.body]
+        )
 
     def test_what_is_missing(self):
         self.write_results("a", engines=("mujoco", "sapien"))
@@ -610,7 +679,9 @@ class WrittenTest(InFolder):
 
     def test_a_wrong_curve_names_those_that_exist(self):
         self.write_three()
-        with self.assertRaisesRegex(RunError, r"no curve task/sucess; there are speed/.*task/success, task/success_from_home\. "):
+        with self.assertRaisesRegex(
+            RunError, r"no curve task/sucess; there are speed/.*task/success, task/success_from_home\. "
+        ):
             self.compare("fixed", curves=["task/success", "task/sucess"])
         self.assertFalse((self.folder / "out").exists(), "nothing is written")
         with self.assertRaisesRegex(RunError, "no curve task/success; none of these runs has learning curves"):
@@ -619,7 +690,10 @@ class WrittenTest(InFolder):
     def test_a_curve_that_only_some_have(self):
         self.write_results("a")
         curves = curves_of((1.0,), (0.5,))
-        whole, part = self.training("a", curves), self.training("a", {k: v for k, v in curves.items() if k != "task/success"})
+        whole, part = (
+            self.training("a", curves),
+            self.training("a", {k: v for k, v in curves.items() if k != "task/success"}),
+        )
         self.assertEqual(choose_curves([whole, part], []), ("task/success", "task/success_from_home"))
         with self.assertRaisesRegex(RunError, "no curve task/success;"):
             choose_curves([part], [])
@@ -650,7 +724,10 @@ class DrawTest(InFolder):
         from matplotlib.collections import PolyCollection
 
         x, mean = np.array([1e6, 3e6]), np.array([0.1, 0.3])
-        lines = {"a": Line(x=x, mean=mean, low=mean, high=mean), "c": Line(x=x, mean=mean, low=mean - 0.1, high=mean + 0.1)}
+        lines = {
+            "a": Line(x=x, mean=mean, low=mean, high=mean),
+            "c": Line(x=x, mean=mean, low=mean - 0.1, high=mean + 0.1),
+        }
         ax = self.draw(draw_lines, lines, "at the goal", "steps", ["a", "b", "c"], percent=True, of="worlds")
         np.testing.assert_allclose(ax.lines[0].get_xydata(), [[1, 10], [3, 30]])
         self.assertEqual([curve.get_color() for curve in ax.lines], [COLORS[0], COLORS[2]])
@@ -684,7 +761,9 @@ class DrawTest(InFolder):
 
         self.write_results("a", rollouts_with(1.0, 0.5, 0.5, 0.0), ("mujoco", "sapien"))
         self.write_results("b", rollouts_with(0.2, 0.2, 0.2, 0.2), ("sapien",))
-        found = {n: {e: score(g, e) for e in g.members[0].episodes} for n in "ab" for g in grouped([self.training(n)])[0]}
+        found = {
+            n: {e: score(g, e) for e in g.members[0].episodes} for n in "ab" for g in grouped([self.training(n)])[0]
+        }
         ax = self.draw(draw_scores, found, ["a", "b"])
         np.testing.assert_allclose([bar.get_height() for bar in ax.patches], [50, 50, 20])
         self.assertEqual([label.get_text() for label in ax.get_xticklabels()], ["mujoco", "sapien"])
@@ -704,13 +783,25 @@ class CommandTest(InFolder):
         out = self.folder / "made"
         code, printed = self.run_command(f"[one]={self.folder}/a", str(self.folder / "b"), "--out", str(out))
         self.assertEqual(code, 0, printed)
-        for expected in (*ENGINES, "[one]", "49.8", "75/50/25", "num_envs", "67", "note: These results are not comparable", "compare.png"):
+        for expected in (
+            *ENGINES,
+            "[one]",
+            "49.8",
+            "75/50/25",
+            "num_envs",
+            "67",
+            "note: These results are not comparable",
+            "compare.png",
+        ):
             self.assertIn(expected, printed)
         self.assertLessEqual(max(map(len, printed.split("picture:")[0].splitlines())), 160)
         self.assertEqual(sorted(f.name for f in out.iterdir()), ["compare.md", "compare.png"])
 
     def test_mistakes_are_one_line(self):
-        for arguments, message in (((), "there is nothing to compare"), ((str(self.folder / "x"),), "there is no folder")):
+        for arguments, message in (
+            ((), "there is nothing to compare"),
+            ((str(self.folder / "x"),), "there is no folder"),
+        ):
             code, printed = self.run_command(*arguments)
             self.assertEqual(code, 1)
             self.assertRegex(printed.strip(), f"^xreset compare: {message}[^\n]*$")

@@ -46,7 +46,8 @@ def outcome(defect: Defect, *checks: str, **attributes) -> dict[str, CheckResult
     else:
         broken = type("Broken", (MujocoBackend,), {"world_class": defect, **attributes})
     results = run(
-        lambda scene, num_worlds, *, object_index=None: broken(scene, num_worlds, object_index=object_index, workers=0), only=checks
+        lambda scene, num_worlds, *, object_index=None: broken(scene, num_worlds, object_index=object_index, workers=0),
+        only=checks,
     )
     return {result.name: result for result in results}
 
@@ -255,7 +256,9 @@ class PrincipalAxesDropped(_Remodelled):
 @breaks("mass_properties")
 class CentreOfMassAtTheOrigin(MujocoWorld):
     def mass_properties(self):
-        return [Inertia(mass=b.mass, com=np.zeros(3), quat=b.quat, moments=b.moments) for b in super().mass_properties()]
+        return [
+            Inertia(mass=b.mass, com=np.zeros(3), quat=b.quat, moments=b.moments) for b in super().mass_properties()
+        ]
 
 
 @breaks("joint_tracking", "drive_equation")
@@ -517,7 +520,9 @@ class TheSuiteCanFail(unittest.TestCase):
         self.assertEqual({check.name for check in CHECKS} - noticed, set())
 
     def test_a_body_frame_velocity_passes_a_round_trip(self):
-        self.assertEqual(outcome(AngularVelocityInTheBodyFrame, "state_round_trip")["state_round_trip"].verdict, "passed")
+        self.assertEqual(
+            outcome(AngularVelocityInTheBodyFrame, "state_round_trip")["state_round_trip"].verdict, "passed"
+        )
 
     def test_contact_force_that_survives_the_state(self):
         class World(_Stepping):
@@ -567,14 +572,21 @@ class Harness(unittest.TestCase):
 
     def test_a_known_difference_is_accepted_up_to_its_bound(self):
         known = KnownDifference(check="free_fall", measure="x", bound=2.0, reason="r")
-        for measured, verdict in ((0.5, "passed"), (1.5, "known difference"), (2.5, "failed"), (float("nan"), "failed")):
+        for measured, verdict in (
+            (0.5, "passed"),
+            (1.5, "known difference"),
+            (2.5, "failed"),
+            (float("nan"), "failed"),
+        ):
             self.assertEqual(Measure(what="x", measured=measured, tolerance=1.0, known=known).verdict, verdict)
 
     def test_a_backend_declares_its_known_differences(self):
         def differing(bound, robot=None):
             class Different(MujocoBackend):
                 known_differences: ClassVar = (
-                    KnownDifference(check="free_fall", measure="velocity", bound=bound, reason="it is upside down", robot=robot),
+                    KnownDifference(
+                        check="free_fall", measure="velocity", bound=bound, reason="it is upside down", robot=robot
+                    ),
                 )
 
                 def state(self):

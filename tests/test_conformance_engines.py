@@ -23,11 +23,17 @@ BACKENDS = ("mujoco", "mujoco-warp", "pybullet", "sapien")
 def make_local(name: str):
     """A maker of the backend with its worlds in this process, where it has a choice."""
     options = {"workers": 0} if name in ("mujoco", "pybullet", "sapien") else {}
-    return lambda scene, num_worlds, *, object_index=None: make_backend(name, scene, num_worlds, object_index=object_index, **options)
+    return lambda scene, num_worlds, *, object_index=None: make_backend(
+        name, scene, num_worlds, object_index=object_index, **options
+    )
 
 
 def explain(result: CheckResult) -> str:
-    wrong = "; ".join(f"{m.what} {m.measured:.3g} > {m.tolerance:.3g} {m.unit} {m.where}" for m in result.measures if m.verdict == "failed")
+    wrong = "; ".join(
+        f"{m.what} {m.measured:.3g} > {m.tolerance:.3g} {m.unit} {m.where}"
+        for m in result.measures
+        if m.verdict == "failed"
+    )
     return f"{result.name}: {result.check.statement}: {result.problem or wrong}"
 
 
@@ -39,10 +45,14 @@ def panda() -> RobotSpec:
     home = (0.0, -0.6, 0.0, -2.2, 0.0, 1.6, 0.8)
     stiffness, effort = (1500.0,) * 4 + (300.0,) * 3, (87.0,) * 4 + (12.0,) * 3
     arm = [
-        JointSpec(name=f"panda_joint{i + 1}", group="arm", home=q, drive=DriveSpec(kp=kp, kd=0.0, effort=limit, armature=0.1))
+        JointSpec(
+            name=f"panda_joint{i + 1}", group="arm", home=q, drive=DriveSpec(kp=kp, kd=0.0, effort=limit, armature=0.1)
+        )
         for i, (q, kp, limit) in enumerate(zip(home, stiffness, effort, strict=True))
     ]
-    jaw = JointSpec(name="panda_finger_joint1", group="hand", home=0.02, drive=DriveSpec(kp=1000.0, kd=0.0, effort=20.0))
+    jaw = JointSpec(
+        name="panda_finger_joint1", group="hand", home=0.02, drive=DriveSpec(kp=1000.0, kd=0.0, effort=20.0)
+    )
     robot = RobotSpec(
         name="panda",
         urdf=Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf",
@@ -52,8 +62,12 @@ def panda() -> RobotSpec:
         base_quat=(0.70710678, 0.0, 0.0, 0.70710678),
         palm="panda_grasptarget",
         fingertips=(
-            FingertipSpec(name="thumb", link="panda_leftfinger", contact_links=("panda_leftfinger",), keypoint="thumb4"),
-            FingertipSpec(name="index", link="panda_rightfinger", contact_links=("panda_rightfinger",), keypoint="index4"),
+            FingertipSpec(
+                name="thumb", link="panda_leftfinger", contact_links=("panda_leftfinger",), keypoint="thumb4"
+            ),
+            FingertipSpec(
+                name="index", link="panda_rightfinger", contact_links=("panda_rightfinger",), keypoint="index4"
+            ),
         ),
         keypoints=(KeypointSpec(keypoint="wrist", link="panda_hand"),),
         hand_root="panda_hand",
@@ -102,8 +116,20 @@ class AnyProcessor(unittest.TestCase):
             self.skipTest("numpy does not use OpenBLAS here, whose kernels this test chooses")
         if (reason := backend_status("pybullet").reason) is not None:
             self.skipTest(f"pybullet: {reason}")
-        command = [sys.executable, "-m", "xreset", "engines", "check", "--backend", "pybullet", "--check", "set_as_built"]
+        command = [
+            sys.executable,
+            "-m",
+            "xreset",
+            "engines",
+            "check",
+            "--backend",
+            "pybullet",
+            "--check",
+            "set_as_built",
+        ]
         for kernel in ("Haswell", *["SkylakeX"] * ("avx512f" in Path("/proc/cpuinfo").read_text())):
             with self.subTest(kernel=kernel):
-                done = subprocess.run(command, env=os.environ | {"OPENBLAS_CORETYPE": kernel}, capture_output=True, text=True, timeout=300)
+                done = subprocess.run(
+                    command, env=os.environ | {"OPENBLAS_CORETYPE": kernel}, capture_output=True, text=True, timeout=300
+                )
                 self.assertEqual(done.returncode, 0, done.stdout + done.stderr)

@@ -76,10 +76,22 @@ class Archive(WithFolder):
     def test_bad_values_name_sequence_and_frame(self):
         second = self.demos.frames(1)
         cases = [
-            (self.changed("hand_keypoints", (second.start + 3, 8, 1), np.nan), r"hand_keypoints is not finite in frame 3 of sequence 1"),
-            (self.changed("wrist_quat_wxyz", second.start + 4, np.nan), r"wrist_quat_wxyz is not finite in frame 4 of sequence 1"),
-            (self.changed("object_pos", (second.start, 2), np.inf), r"object_pos is not finite in frame 0 of sequence 1"),
-            (self.changed("object_quat_wxyz", second.stop - 1, (1, 1, 0, 0)), r"length 1.4142 in frame \d+ of sequence 1 .* unit"),
+            (
+                self.changed("hand_keypoints", (second.start + 3, 8, 1), np.nan),
+                r"hand_keypoints is not finite in frame 3 of sequence 1",
+            ),
+            (
+                self.changed("wrist_quat_wxyz", second.start + 4, np.nan),
+                r"wrist_quat_wxyz is not finite in frame 4 of sequence 1",
+            ),
+            (
+                self.changed("object_pos", (second.start, 2), np.inf),
+                r"object_pos is not finite in frame 0 of sequence 1",
+            ),
+            (
+                self.changed("object_quat_wxyz", second.stop - 1, (1, 1, 0, 0)),
+                r"length 1.4142 in frame \d+ of sequence 1 .* unit",
+            ),
             (self.changed("hand_side", 2, "Right"), r"sequence 2 .* hand_side 'Right', expected 'right' or 'left'"),
             (self.changed("frame_offsets", 2, 0), "frame_offsets must increase"),
             (self.changed("frame_offsets", -1, 5), "expected 0 to"),
@@ -98,7 +110,9 @@ class Archive(WithFolder):
             arrays = dict(file)
         arrays["hand_keypoints"][7, 0, 0] = np.nan
         np.savez(self.folder / "nan.npz", **arrays)
-        with self.assertRaisesRegex(FileFormatError, r"nan\.npz.*hand_keypoints is not finite in frame 7 of sequence 0 \(synthetic/005"):
+        with self.assertRaisesRegex(
+            FileFormatError, r"nan\.npz.*hand_keypoints is not finite in frame 7 of sequence 0 \(synthetic/005"
+        ):
             read_demos(self.folder / "nan.npz")
         arrays.pop("hand_valid")
         np.savez(self.folder / "short.npz", **arrays)
@@ -115,7 +129,9 @@ class Archive(WithFolder):
         self.assertEqual(self.demos.select(max_per_object=1).num_sequences, 2)
         picked = self.demos.select(indices=[3, 0])
         self.assertEqual(picked.sequence_name.tolist(), self.demos.sequence_name[[3, 0]].tolist())
-        np.testing.assert_array_equal(picked.hand_keypoints[picked.frames(0)], self.demos.hand_keypoints[self.demos.frames(3)])
+        np.testing.assert_array_equal(
+            picked.hand_keypoints[picked.frames(0)], self.demos.hand_keypoints[self.demos.frames(3)]
+        )
         np.testing.assert_array_equal(picked.goal_pose[0][1], self.demos.object_pos[self.demos.frames(0)][-1])
         np.testing.assert_array_equal(picked.start_pose[1][1], self.demos.object_quat_wxyz[0])
         name = str(self.demos.sequence_name[1])
@@ -151,7 +167,9 @@ class Archive(WithFolder):
         T = np.eye(4)
         T[:3, :3] = Rotation.from_rotvec([0.02, 0, 0]).as_matrix()
         T[:3, 3] = (0, 0, 0.01)
-        demos = replace(self.demos, subjects=np.array(["other", "synthetic"]), T_level_from_table=np.stack([np.eye(4), T]))
+        demos = replace(
+            self.demos, subjects=np.array(["other", "synthetic"]), T_level_from_table=np.stack([np.eye(4), T])
+        )
         level = levelled(demos)
         np.testing.assert_allclose(level.object_pos, demos.object_pos @ T[:3, :3].T + T[:3, 3], atol=1e-6)
         np.testing.assert_allclose(level.hand_keypoints, demos.hand_keypoints @ T[:3, :3].T + T[:3, 3], atol=1e-6)
@@ -163,7 +181,9 @@ class Archive(WithFolder):
 
     def test_grounded_puts_the_first_frame_on_the_table(self):
         up = np.array([0, 0, 0.013])
-        raised = replace(self.demos, object_pos=self.demos.object_pos + up, hand_keypoints=self.demos.hand_keypoints + up)
+        raised = replace(
+            self.demos, object_pos=self.demos.object_pos + up, hand_keypoints=self.demos.hand_keypoints + up
+        )
         down = grounded(raised, demo_objects(raised))
         np.testing.assert_allclose(down.object_pos, self.demos.object_pos, atol=1e-6)
         np.testing.assert_allclose(down.hand_keypoints, self.demos.hand_keypoints, atol=1e-6)
@@ -172,12 +192,16 @@ class Archive(WithFolder):
         first = self.demos.frames(0)
         up = np.zeros((self.demos.num_frames, 3))
         up[:, 2], up[first, 2] = -0.03, 0.05  # the others are below the table: they are lifted, however far
-        moved = replace(self.demos, object_pos=self.demos.object_pos + up, hand_keypoints=self.demos.hand_keypoints + up[:, None])
+        moved = replace(
+            self.demos, object_pos=self.demos.object_pos + up, hand_keypoints=self.demos.hand_keypoints + up[:, None]
+        )
         objects = demo_objects(moved)
         self.assertEqual(on_something(moved, objects).tolist(), [True] + [False] * (len(moved) - 1))
         after = grounded(moved, objects)
         np.testing.assert_allclose(after.object_pos[first], self.demos.object_pos[first] + [0, 0, 0.05], atol=1e-6)
-        np.testing.assert_allclose(after.hand_keypoints[first], self.demos.hand_keypoints[first] + [0, 0, 0.05], atol=1e-6)
+        np.testing.assert_allclose(
+            after.hand_keypoints[first], self.demos.hand_keypoints[first] + [0, 0, 0.05], atol=1e-6
+        )
         np.testing.assert_allclose(after.object_pos[first.stop :], self.demos.object_pos[first.stop :], atol=1e-6)
 
     def test_summary(self):
@@ -185,7 +209,9 @@ class Archive(WithFolder):
         self.assertEqual((soup.object_name, soup.sequences, soup.right), ("005_tomato_soup_can", 2, 2))
         self.assertEqual(banana.frames, self.demos.frames(3).stop - self.demos.frames(2).start)
         goal, start = self.demos.goal_pose, self.demos.start_pose
-        self.assertAlmostEqual(banana.goal_distance, np.median(np.linalg.norm(goal[0] - start[0], axis=1)[2:]), places=6)
+        self.assertAlmostEqual(
+            banana.goal_distance, np.median(np.linalg.norm(goal[0] - start[0], axis=1)[2:]), places=6
+        )
         self.assertAlmostEqual(banana.goal_angle, np.median(angles(start[1], goal[1])[2:]), places=5)
 
 
@@ -336,7 +362,9 @@ class RealData(unittest.TestCase):
         np.testing.assert_allclose(own.hand_keypoints[valid], expected["hand_keypoints_table"][valid], atol=1e-4)
         np.testing.assert_allclose(own.object_pos, expected["object_pose_table"][:, :3, 3], atol=1e-4)
         for quat, pose in ((own.object_quat_wxyz, "object_pose_table"), (own.wrist_quat_wxyz, "wrist_pose_table")):
-            turn = Rotation.from_quat(quat[valid], scalar_first=True).inv() * Rotation.from_matrix(expected[pose][valid, :3, :3])
+            turn = Rotation.from_quat(quat[valid], scalar_first=True).inv() * Rotation.from_matrix(
+                expected[pose][valid, :3, :3]
+            )
             self.assertLess(np.degrees(turn.magnitude()).max(), 0.1)
 
     def test_archives_agree_with_the_official_layout(self):
@@ -392,13 +420,17 @@ class Hand(unittest.TestCase):
             self.assertAlmostEqual(np.linalg.det(axes), 1)
             points = hand.keypoints(np.zeros(17), side) @ axes.T
             np.testing.assert_allclose(points[12] / np.linalg.norm(points[12]), [0, -1, 0], atol=0.05)
-            self.assertGreater(sign * points[4, 0], 0.02)  # palm down, seen from behind: a right hand's thumb is on the left, towards +x
+            self.assertGreater(
+                sign * points[4, 0], 0.02
+            )  # palm down, seen from behind: a right hand's thumb is on the left, towards +x
 
 
 class Synthetic(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        cls.demos = concatenate([synthesize(None, per_object=1, seed=0), synthesize(["soup", "banana"], per_object=1, seed=0, side="left")])
+        cls.demos = concatenate(
+            [synthesize(None, per_object=1, seed=0), synthesize(["soup", "banana"], per_object=1, seed=0, side="left")]
+        )
         cls.objects = demo_objects(cls.demos)
 
     def sequences(self):
@@ -463,7 +495,11 @@ class Synthetic(unittest.TestCase):
             to_fingers = tips[1:3].mean(axis=0) - tips[0]
             span = np.linalg.norm(to_fingers)
             points = tips[0] + np.linspace(0, 1, 41)[1:-1, None] * to_fingers
-            solid = Solid.of(obj, one.object_pos[lifted].astype(float), Rotation.from_quat(one.object_quat_wxyz[lifted], scalar_first=True))
+            solid = Solid.of(
+                obj,
+                one.object_pos[lifted].astype(float),
+                Rotation.from_quat(one.object_quat_wxyz[lifted], scalar_first=True),
+            )
             inside = solid.distance(points) < 0
             self.assertGreater(inside.mean() * span, 0.008)  # the object is between them
             self.assertGreater(inside.mean(), 0.5)
@@ -525,7 +561,9 @@ class Commands(WithFolder):
 
     def test_synth_then_info(self):
         file = self.folder / "demos.npz"
-        code, out, err = self.run_command("synth", "--out", file, "--objects", "soup", "--per-object", 1, "--side", "both", "--fps", 10)
+        code, out, err = self.run_command(
+            "synth", "--out", file, "--objects", "soup", "--per-object", 1, "--side", "both", "--fps", 10
+        )
         self.assertEqual(code, 0, err)
         first = file.read_bytes()
         self.assertEqual(read_demos(file).hand_side.tolist(), ["right", "left"])
@@ -591,7 +629,10 @@ class Plausible(unittest.TestCase):
             demos = read_demos(data_dir() / name)
             objects = demo_objects(demos)
             self.assertEqual(doubts(demos, objects), [])
-            for field, words in (("object_quat_wxyz", "of the objects stand on the table if"), ("wrist_quat_wxyz", "put w first")):
+            for field, words in (
+                ("object_quat_wxyz", "of the objects stand on the table if"),
+                ("wrist_quat_wxyz", "put w first"),
+            ):
                 (doubt,) = doubts(replace(demos, **{field: getattr(demos, field)[:, [1, 2, 3, 0]]}), objects)
                 self.assertIn(words, doubt)
 

@@ -38,9 +38,24 @@ class TwoProcesses(unittest.TestCase):
         cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         robot = robots.load("openarm")
         cls.bank = cls.folder / "bank.npz"
-        write_bank(cls.bank, toy_bank(robot, joint_pos=np.tile(robot.home, (6, 1)).astype(np.float32)), config={}, inputs={})
+        write_bank(
+            cls.bank, toy_bank(robot, joint_pos=np.tile(robot.home, (6, 1)).astype(np.float32)), config={}, inputs={}
+        )
         cls.out = cls.folder / "run"
-        new = ["--robot", "openarm", "--resets", cls.bank, "--backend", "mujoco", "--device", "cpu", "--num-envs", "8", "--seed", "3"]
+        new = [
+            "--robot",
+            "openarm",
+            "--resets",
+            cls.bank,
+            "--backend",
+            "mujoco",
+            "--device",
+            "cpu",
+            "--num-envs",
+            "8",
+            "--seed",
+            "3",
+        ]
         cls.first = cls.train("--out", cls.out, "--iterations", "2", *new, *SMALL)
         cls.made = sorted(path.name for path in cls.out.rglob("*") if path.is_file())
         cls.second = cls.train("--out", cls.out, "--iterations", "3", "--resume")
@@ -48,10 +63,23 @@ class TwoProcesses(unittest.TestCase):
     @classmethod
     def train(cls, *arguments) -> list[dict]:
         """What the two processes end with."""
-        command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "tests/train_worker.py"]
+        command = [
+            sys.executable,
+            "-m",
+            "torch.distributed.run",
+            "--standalone",
+            "--nproc-per-node",
+            "2",
+            "tests/train_worker.py",
+        ]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
         done = subprocess.run(
-            [*command, str(cls.folder), *map(str, arguments)], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300
+            [*command, str(cls.folder), *map(str, arguments)],
+            cwd=ROOT,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=300,
         )
         if done.returncode:
             raise AssertionError(f"torchrun ended with {done.returncode}:\n{done.stdout}\n{done.stderr}")
@@ -74,7 +102,9 @@ class TwoProcesses(unittest.TestCase):
             self.assertFalse(torch.equal(one["random"]["torch"], two["random"]["torch"]))
 
     def test_steps_of_all_are_counted(self):
-        self.assertEqual([end["env_steps"] for end in (*self.first, *self.second)], [2 * 2 * 8 * 8] * 2 + [3 * 2 * 8 * 8] * 2)
+        self.assertEqual(
+            [end["env_steps"] for end in (*self.first, *self.second)], [2 * 2 * 8 * 8] * 2 + [3 * 2 * 8 * 8] * 2
+        )
 
     def test_the_main_process_alone_writes(self):
         self.assertEqual(self.made.count("run.json"), 1)

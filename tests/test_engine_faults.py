@@ -28,7 +28,10 @@ class NotFinite(unittest.TestCase):
         spec = scene()
         index = torch.arange(WORLDS) % len(spec.objects)
         start = State.initial(spec, index)
-        with make_local(name)(spec, WORLDS, object_index=index) as backend, make_local(name)(spec, WORLDS, object_index=index) as same:
+        with (
+            make_local(name)(spec, WORLDS, object_index=index) as backend,
+            make_local(name)(spec, WORLDS, object_index=index) as same,
+        ):
             begin = start.to(backend.device)
             for worlds in (backend, same):
                 worlds.set_state(begin)
@@ -41,7 +44,9 @@ class NotFinite(unittest.TestCase):
                 same.set_state(start[[BROKEN]].to(backend.device), one)
                 for worlds in (backend, same):
                     worlds.step(4)
-                self.assertEqual(backend.health().nonfinite.tolist(), [world == BROKEN for world in range(WORLDS)], field)
+                self.assertEqual(
+                    backend.health().nonfinite.tolist(), [world == BROKEN for world in range(WORLDS)], field
+                )
                 for f in fields(State):
                     found, expected = (getattr(worlds.state(), f.name).cpu()[SOUND] for worlds in (backend, same))
                     self.assertTrue(torch.equal(found, expected), f"{field} = {value}: {f.name} of another world")
@@ -53,7 +58,9 @@ class NotFinite(unittest.TestCase):
                 self.assertFalse(backend.health().nonfinite.any(), field)
                 for f in fields(State):
                     found, expected = (getattr(worlds.state(), f.name).cpu() for worlds in (backend, same))
-                    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5, msg=lambda m, f=f: f"{f.name} after a new start: {m}")
+                    torch.testing.assert_close(
+                        found, expected, rtol=0, atol=1e-5, msg=lambda m, f=f: f"{f.name} after a new start: {m}"
+                    )
 
 
 if __name__ == "__main__":

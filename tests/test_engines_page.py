@@ -134,7 +134,9 @@ class PageTest(unittest.TestCase):
     def test_grasps(self):
         text = self.page_of(CONFORMANCE, GRASPS)
         self.assertEqual(self.row(text, "total force"), ["total force", "at most 0.1", "-", "0.05 (12)"])
-        self.assertEqual(self.row(text, "same outcome"), ["same outcome", "at least 0.8", "-", "**missed: not measured (0)**"])
+        self.assertEqual(
+            self.row(text, "same outcome"), ["same outcome", "at least 0.8", "-", "**missed: not measured (0)**"]
+        )
         self.assertIn("12 closings and 24 holds of 005_tomato_soup_can, against mujoco 4.0.0", text)
         self.assertIn(GRASPS["command"], text)
 
@@ -163,7 +165,11 @@ class DocsTest(unittest.TestCase):
         for engine in ("mujoco", "mujoco-warp", "pybullet", "sapien", "drake", "newton"):
             self.assertRegex(text, rf"[|;] {engine} \d+\.\d+[\d.]* with [\w-]+ on \w+", engine)
             self.assertRegex(text, rf"`xreset engines check [^`]*--backend {engine}\b", engine)
-        for robot in ("conformance-gripper", "ur7e-sharpa", "openarm"):  # on cuda, too, once today's suite has run there
+        for robot in (
+            "conformance-gripper",
+            "ur7e-sharpa",
+            "openarm",
+        ):  # on cuda, too, once today's suite has run there
             self.assertRegex(text, rf"\bmujoco-warp [\d.]+ with {robot} on cpu\b")
         self.assertIn("## Agreement on grasps", text)
         self.assertIn("## Known differences", text)

@@ -44,10 +44,16 @@ except ImportError as error:
     raise unittest.SkipTest(str(error)) from error
 
 N = 3
-TASK = TaskConfig(termination=TerminationConfig(episode_seconds=0.5), observation=ObservationConfig(cloud_points=16), distance_points=64)
+TASK = TaskConfig(
+    termination=TerminationConfig(episode_seconds=0.5),
+    observation=ObservationConfig(cloud_points=16),
+    distance_points=64,
+)
 QUIET = replace(
     TASK,
-    observation=replace(TASK.observation, noise=NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)),
+    observation=replace(
+        TASK.observation, noise=NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
+    ),
 )
 
 
@@ -85,7 +91,9 @@ class Waiting(TorchDispatchMode):
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         self.operations += 1
         indices = args[1] if "index" in str(func) and len(args) > 1 and isinstance(args[1], (list, tuple)) else ()
-        if any(name in str(func) for name in self.NAMES) or any(isinstance(i, torch.Tensor) and i.dtype == torch.bool for i in indices):
+        if any(name in str(func) for name in self.NAMES) or any(
+            isinstance(i, torch.Tensor) and i.dtype == torch.bool for i in indices
+        ):
             self.found.append(str(func))
         return func(*args, **(kwargs or {}))
 
@@ -97,10 +105,14 @@ class WithEnv(unittest.TestCase):
         cls.objects = load_objects((SOUP, SPAM))
         cls.bank = toy_bank(cls.robot)
 
-    def make(self, task: TaskConfig = TASK, seed: int = 0, kind: type[MujocoBackend] = MujocoBackend) -> ManipulationEnv:
+    def make(
+        self, task: TaskConfig = TASK, seed: int = 0, kind: type[MujocoBackend] = MujocoBackend
+    ) -> ManipulationEnv:
         backend = kind(make_scene(self.robot, self.objects, task), N, object_index=torch.tensor([0, 1, 0]), workers=0)
         self.addCleanup(backend.close)
-        return ManipulationEnv(backend, task, ResetDistribution(self.bank, self.robot, (SOUP, SPAM), task.reset), seed=seed)
+        return ManipulationEnv(
+            backend, task, ResetDistribution(self.bank, self.robot, (SOUP, SPAM), task.reset), seed=seed
+        )
 
     def actions(self, steps: int, seed: int = 0) -> torch.Tensor:
         return 2 * torch.rand(steps, N, 7, generator=torch.Generator().manual_seed(seed)) - 1
@@ -132,7 +144,9 @@ class StepTest(WithEnv):
         middle, half = (env.actions.upper + env.actions.lower) / 2, (env.actions.upper - env.actions.lower) / 2
         torch.testing.assert_close(observations["proprio"][:, :7], (state.joint_pos - middle) / half)
         cloud = observations["perception"][:, -1]
-        size = torch.tensor([np.linalg.norm(o.vertices, axis=1).max() for o in self.objects], dtype=torch.float32)[env.backend.object_index]
+        size = torch.tensor([np.linalg.norm(o.vertices, axis=1).max() for o in self.objects], dtype=torch.float32)[
+            env.backend.object_index
+        ]
         self.assertTrue(bool(((cloud - state.object_pos[:, None]).norm(dim=-1).amax(dim=-1) <= size + 1e-5).all()))
 
     def test_actions_reach_the_drives(self):
@@ -165,11 +179,16 @@ class StepTest(WithEnv):
         with mock.patch("xreset.task.rewards.contact_gate", lambda *_, **__: torch.ones(N, dtype=torch.bool)):
             reading, reward = env.advance(torch.zeros(N, 7))
         for world in range(N):
-            demo, corners = int(env.sequence[world]), torch.as_tensor(keypoints(self.objects[int(env.backend.object_index[world])])).float()
+            demo, corners = (
+                int(env.sequence[world]),
+                torch.as_tensor(keypoints(self.objects[int(env.backend.object_index[world])])).float(),
+            )
             poses = [torch.as_tensor(array[demo]) for array in (self.bank.start_pos, self.bank.start_quat_wxyz)]
             poses += [reading.state.object_pos[world], reading.state.object_quat[world]]
             poses += [torch.as_tensor(array[demo]) for array in (self.bank.goal_pos, self.bank.goal_quat_wxyz)]
-            start, now, goal = (pos + quat_rotate(quat, corners) for pos, quat in zip(poses[::2], poses[1::2], strict=True))
+            start, now, goal = (
+                pos + quat_rotate(quat, corners) for pos, quat in zip(poses[::2], poses[1::2], strict=True)
+            )
             far, farthest = (math.tanh(float((points - goal).norm(dim=-1).max()) / 0.3) for points in (now, start))
             self.assertAlmostEqual(float(reward.terms["progress"][world]), 8 * (1 - far / farthest), places=4)
 
@@ -209,10 +228,15 @@ class ResetTest(WithEnv):
             self.assertTrue(torch.equal(observations[group][[0, 2]], expected[group][[0, 2]]), group)
         cloud = observations["perception"]
         torch.testing.assert_close(cloud[[0, 2], :-1], last_cloud[[0, 2], 1:])
-        torch.testing.assert_close(cloud[1], cloud[1, :1].expand_as(cloud[1]), msg="the new episode's history is its first frame")
+        torch.testing.assert_close(
+            cloud[1], cloud[1, :1].expand_as(cloud[1]), msg="the new episode's history is its first frame"
+        )
         self.assertEqual(float(observations["policy"][1, 15:].abs().max()), 0.0, "no previous action")
         self.assertEqual(float(observations["privileged"][1, -1]), 0.0, "no previous reward")
-        self.assertTrue(torch.equal(env.joint_target[1], env.backend.state().joint_pos[1]), "the drives hold the new joint positions")
+        self.assertTrue(
+            torch.equal(env.joint_target[1], env.backend.state().joint_pos[1]),
+            "the drives hold the new joint positions",
+        )
 
     def test_every_world_times_out_in_the_end(self):
         env = self.make()
@@ -261,7 +285,9 @@ class ResetTest(WithEnv):
         self.assertFalse(bool(env._reached.any()), "a new episode has reached nothing yet")
         other = self.make(replace(TASK, reset=ResetConfig(demo_probability=1.0, frontier=0.5)), seed=1)
         self.assertTrue(other.restore(env.snapshot()))
-        self.assertTrue(torch.equal(other.resets.reached_from_bank, expected) and torch.equal(other.bank_state, env.bank_state))
+        self.assertTrue(
+            torch.equal(other.resets.reached_from_bank, expected) and torch.equal(other.bank_state, env.bank_state)
+        )
 
     def test_what_became_of_episodes_from_home_moves_the_frontier_of_everything(self):
         env = self.make(replace(TASK, reset=ResetConfig(demo_probability=0.0, frontier=1.0, frontier_over="all")))
@@ -297,7 +323,9 @@ class RobustnessTest(WithEnv):
         env = self.make(self.task(action_latency=(1.0, 1.0)))
         actions, held = self.actions(4), env.joint_target.clone()
         heard = []
-        with mock.patch.object(env.backend, "set_joint_targets", side_effect=lambda targets: heard.append(targets.clone())):
+        with mock.patch.object(
+            env.backend, "set_joint_targets", side_effect=lambda targets: heard.append(targets.clone())
+        ):
             commanded = [env.step(action) and env.joint_target.clone() for action in actions]
         for late, command in zip(heard, [held, *commanded], strict=False):
             torch.testing.assert_close(late, command)
@@ -318,7 +346,9 @@ class RobustnessTest(WithEnv):
             env.reset(torch.tensor([1]))
         scale, worlds = drives.call_args.args
         self.assertEqual((worlds.tolist(), tuple(scale.shape)), ([1], (1, 3, 7)))
-        self.assertTrue(bool((scale[0, 0, :3] < 0.6001).all() and (scale[0, 1, 3:] > 1.999).all() and (scale[0, 2] == 1).all()))
+        self.assertTrue(
+            bool((scale[0, 0, :3] < 0.6001).all() and (scale[0, 1, 3:] > 1.999).all() and (scale[0, 2] == 1).all())
+        )
         plain = self.make()
         with mock.patch.object(plain.backend, "set_drives") as drives:
             plain.reset(torch.tensor([1]))
@@ -328,7 +358,9 @@ class RobustnessTest(WithEnv):
         env = self.make(self.task(torsional_friction=(0.5, 2.0), object_inertia=(0.5, 2.0), object_com=(0.01, 0.01)))
         found = {}
         for name in ("torsional_friction", "object_inertia", "object_com"):
-            patch = mock.patch.object(env.backend, f"set_{name}", side_effect=lambda value, worlds, name=name: found.update({name: value}))
+            patch = mock.patch.object(
+                env.backend, f"set_{name}", side_effect=lambda value, worlds, name=name: found.update({name: value})
+            )
             self.enterContext(patch)
         env.reset(torch.tensor([0, 2]))
         torsional = found["torsional_friction"] / env.backend.scene.friction.torsional
@@ -342,12 +374,18 @@ class RobustnessTest(WithEnv):
         task = self.task(effort=(0.5, 1.0), object_com=(0.0, 0.01))
         with mock.patch.object(MujocoBackend, "capabilities", able):
             self.make()
-            with self.assertRaisesRegex(CapabilityError, "'mujoco' cannot set drives, object com world by world, which this task draws"):
+            with self.assertRaisesRegex(
+                CapabilityError, "'mujoco' cannot set drives, object com world by world, which this task draws"
+            ):
                 self.make(task)
 
     def test_a_snapshot_holds_what_is_late_and_scaled(self):
         task = self.task(
-            action_latency=(0.0, 2.0), observation_latency=(0.0, 2.0), effort=(0.5, 1.0), force_gain=(0.5, 1.0), object_com=(0.0, 0.01)
+            action_latency=(0.0, 2.0),
+            observation_latency=(0.0, 2.0),
+            effort=(0.5, 1.0),
+            force_gain=(0.5, 1.0),
+            object_com=(0.0, 0.01),
         )
         env, other = self.make(task), self.make(task, seed=1)
         for action in self.actions(5):
@@ -460,12 +498,16 @@ class RolloutTest(WithEnv):
         def make(scene, num_worlds, object_index):
             return backend(scene, num_worlds, workers=0, object_index=object_index)
 
-        trial = Trial(robot=self.robot, objects=tuple(self.objects), bank=self.bank, task=self.TASK, num_envs=num_envs, **options)
+        trial = Trial(
+            robot=self.robot, objects=tuple(self.objects), bank=self.bank, task=self.TASK, num_envs=num_envs, **options
+        )
         return roll_out(policy, Engine(name="mujoco", make=make, version=""), trial, repetitions=2)
 
     def test_every_demonstration_is_played_as_often_as_asked(self):
         found = self.roll_out(ZeroPolicy(7), 4)
-        self.assertEqual([(e.sequence, e.repetition) for e in found.episodes], [(s, r) for s in range(3) for r in range(2)])
+        self.assertEqual(
+            [(e.sequence, e.repetition) for e in found.episodes], [(s, r) for s in range(3) for r in range(2)]
+        )
         self.assertEqual([e.object for e in found.episodes], [SOUP, SOUP, SPAM, SPAM, SOUP, SOUP])
         self.assertEqual(found.episodes[2].sequence_name, "demo_b")
         self.assertEqual([(t.sequence, t.object) for t in found.traces], [(0, SOUP), (1, SPAM), (2, SOUP)])
@@ -495,7 +537,9 @@ class RolloutTest(WithEnv):
         found = starts()
         np.testing.assert_array_equal(found, starts())
         self.assertGreater(np.abs(found - starts(seed=1)).max(axis=1).min(), 1e-4)
-        self.assertGreater(np.abs(found[0::2] - found[1::2]).max(axis=1).min(), 1e-4, "the repetitions of a demonstration differ")
+        self.assertGreater(
+            np.abs(found[0::2] - found[1::2]).max(axis=1).min(), 1e-4, "the repetitions of a demonstration differ"
+        )
         away = np.abs(found - self.bank.start_pos[[0, 0, 2, 2, 1, 1]])
         self.assertTrue(0 < away[:, :2].max() <= 0.02 and away[:, 2].max() < 1e-6)
 
@@ -540,7 +584,9 @@ class KinematicRetargetingTest(WithEnv):
                 np.testing.assert_allclose(targets[step][world], path[frame], atol=1e-4)
             np.testing.assert_allclose(targets[-1][world], path[-1], atol=1e-4, err_msg="it holds the last frame")
             half = 0.5 * (0.01 + path[0])
-            np.testing.assert_allclose(targets[2][world], half, atol=1e-4, err_msg="half-way to the first frame after half the lead-in")
+            np.testing.assert_allclose(
+                targets[2][world], half, atol=1e-4, err_msg="half-way to the first frame after half the lead-in"
+            )
 
 
 if __name__ == "__main__":

@@ -34,7 +34,9 @@ START, GOAL = torch.tensor([0.5, 0.3, 0.05]), torch.tensor([0.5, 0.3, 0.25])
 PRESS, LIGHT = (1.0, 0.0, 1.0), (0.0, 1.0, 1.0)
 
 
-def reading(pos=START, quat=IDENTITY, tips=(0.2, 0.2, 0.2), press=(0.0, 0.0, 0.0), nonfinite=False, overflow=False) -> Reading:
+def reading(
+    pos=START, quat=IDENTITY, tips=(0.2, 0.2, 0.2), press=(0.0, 0.0, 0.0), nonfinite=False, overflow=False
+) -> Reading:
     """One world with three fingers (thumb first): the object's pose, fingertip distances [m], contact forces [N]."""
     zero3, quats = torch.zeros(1, 3), IDENTITY.expand(1, 4, 4)
     joints = torch.zeros(1, 2)
@@ -59,7 +61,9 @@ def turned(degrees: float) -> torch.Tensor:
     return quat_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(degrees)]))
 
 
-def episode(*steps: Reading, start: Reading | None = None, goal_quat=IDENTITY, lost_at: int | None = None) -> EpisodeMetrics:
+def episode(
+    *steps: Reading, start: Reading | None = None, goal_quat=IDENTITY, lost_at: int | None = None
+) -> EpisodeMetrics:
     metrics = EpisodeMetrics(start or reading(), GOAL[None], goal_quat[None], CORNERS[None], MetricsConfig())
     for i, step in enumerate(steps):
         metrics.update(step, torch.tensor([i == lost_at]))
@@ -109,7 +113,9 @@ class MetricsTest(unittest.TestCase):
     def test_pose_error_is_the_largest_keypoint_distance(self):
         """Half a turn about z moves every corner of the tetrahedron by 2 sqrt(2) 5 cm; a shift adds to it in the worst corner."""
         args = (START[None], IDENTITY[None], START[None])
-        self.assertAlmostEqual(float(keypoint_distance(*args, turned(180)[None], CORNERS[None])), 0.1 * math.sqrt(2), places=6)
+        self.assertAlmostEqual(
+            float(keypoint_distance(*args, turned(180)[None], CORNERS[None])), 0.1 * math.sqrt(2), places=6
+        )
         shift = torch.tensor([[0.1, 0.1, 0.0]])
         found = keypoint_distance(START[None] + shift, IDENTITY[None], START[None], turned(180)[None], CORNERS[None])
         self.assertAlmostEqual(float(found), 0.2 * math.sqrt(2), places=6)
@@ -120,7 +126,9 @@ class MetricsTest(unittest.TestCase):
         self.assertAlmostEqual(float(m.reorientation_progress), 0.75, places=5)
         self.assertEqual(float(episode(reading(raised(-0.1))).reorientation_progress), 0.0)
         self.assertEqual(float(episode(reading(GOAL)).reorientation_progress), 1.0)
-        there = episode(reading(GOAL), start=reading(GOAL))  # a start at the goal leaves nothing to do: no division by zero
+        there = episode(
+            reading(GOAL), start=reading(GOAL)
+        )  # a start at the goal leaves nothing to do: no division by zero
         self.assertTrue(0.0 <= float(there.reorientation_progress) <= 1.0)
 
     def test_a_world_that_left_the_scene_is_no_longer_looked_at(self):
@@ -255,11 +263,16 @@ class ResultsTest(unittest.TestCase):
             ("grasp_rate is -5.0, expected a number from 0 to 1", {"grasp_rate": -5}),
             ("mean is 7.0, expected a number from 0 to 1", {"task_progress": {"mean": 7, "ci95": [0, 1]}}),
             ("ci95 has 1 entries", {"task_progress": {"mean": 0.5, "ci95": [0]}}),
-            ("nonfinite is '<script>alert", {"health": {"nonfinite": "<script>alert(1)</script>", "overflow": 0, "out_of_bounds": 0}}),
+            (
+                "nonfinite is '<script>alert",
+                {"health": {"nonfinite": "<script>alert(1)</script>", "overflow": 0, "out_of_bounds": 0}},
+            ),
             ("inputs.demos is 3", {"inputs": {"demos": 3}}),
             ("no object or no demonstration", {"per_demo": []}),
         ):
-            changed = {name: value for name, value in (good | changes).items() if value is not None or name == "objects_folder"}
+            changed = {
+                name: value for name, value in (good | changes).items() if value is not None or name == "objects_folder"
+            }
             path.write_text(json.dumps(changed))
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
                 read_results(self.folder)
@@ -313,7 +326,10 @@ class ResultsTest(unittest.TestCase):
         bad = replace(rollouts.episodes[0], reorientation_progress=math.nan)
         with self.assertRaises(ValueError):
             write_results(
-                self.folder, toy_summary(rollouts=replace(rollouts, episodes=(bad,))), replace(rollouts, episodes=(bad,)), self.JOINTS
+                self.folder,
+                toy_summary(rollouts=replace(rollouts, episodes=(bad,))),
+                replace(rollouts, episodes=(bad,)),
+                self.JOINTS,
             )
         self.assertEqual(list(self.folder.iterdir()), [])
 

@@ -85,7 +85,9 @@ class PluginTest(unittest.TestCase):
         self.assert_unavailable("expected a class that inherits from xreset.physics.Backend")
 
     def test_a_plugin_that_says_what_to_install_is_quoted(self):
-        self.plugin("from xreset.errors import BackendUnavailableError\nraise BackendUnavailableError('pip install their-engine')\n")
+        self.plugin(
+            "from xreset.errors import BackendUnavailableError\nraise BackendUnavailableError('pip install their-engine')\n"
+        )
         self.assert_unavailable("^pip install their-engine$")
 
     def test_a_defect_of_one_plugin_does_not_hide_the_others(self):
@@ -138,7 +140,9 @@ class EngineTest(unittest.TestCase):
         try:
             importlib.import_module(EXAMPLES[cls.engine])
         except ImportError:
-            raise unittest.SkipTest(f"{cls.engine} is not installed: pip install -e examples/xreset-{cls.engine}") from None
+            raise unittest.SkipTest(
+                f"{cls.engine} is not installed: pip install -e examples/xreset-{cls.engine}"
+            ) from None
         cls.enterClassContext(mock.patch.object(sys, "path", [str(folder_of(cls.engine)), *sys.path]))
         cls.backend = declared(cls.engine).load()
 
@@ -156,7 +160,15 @@ class EngineTest(unittest.TestCase):
 class NewtonTest(EngineTest):
     engine = "newton"
     checks = (
-        *("state_round_trip", "links_after_set", "nothing_stays", "mass_properties", "free_spin", "object_gravity", "object_wrench"),
+        *(
+            "state_round_trip",
+            "links_after_set",
+            "nothing_stays",
+            "mass_properties",
+            "free_spin",
+            "object_gravity",
+            "object_wrench",
+        ),
         *("resting_weight", "held_object", "tip_friction", "broken_world"),
     )
 
@@ -166,15 +178,33 @@ class NewtonTest(EngineTest):
     def test_what_it_lacks_is_refused(self):
         stiff = scene().robot
         joints = tuple(replace(joint, drive=replace(joint.drive, friction_loss=0.1)) for joint in stiff.joints)
-        with self.assertRaisesRegex(CapabilityError, "no dry friction of joints on the CPU: give the robot's drives a friction_loss of 0"):
+        with self.assertRaisesRegex(
+            CapabilityError, "no dry friction of joints on the CPU: give the robot's drives a friction_loss of 0"
+        ):
             self.make(replace(scene(), robot=replace(stiff, joints=joints)), 1)
 
 
 class DrakeTest(EngineTest):
     engine = "drake"
     checks = (
-        *("state_round_trip", "links_after_set", "nothing_stays", "masked_set", "mass_properties", "drive_equation", "free_spin"),
-        *("object_gravity", "object_wrench", "resting_weight", "object_mass", "held_object", "tip_friction", "broken_world"),
+        *(
+            "state_round_trip",
+            "links_after_set",
+            "nothing_stays",
+            "masked_set",
+            "mass_properties",
+            "drive_equation",
+            "free_spin",
+        ),
+        *(
+            "object_gravity",
+            "object_wrench",
+            "resting_weight",
+            "object_mass",
+            "held_object",
+            "tip_friction",
+            "broken_world",
+        ),
     )
 
     def test_checks_of_the_suite(self):
@@ -194,7 +224,9 @@ class DrakeTest(EngineTest):
             [world] = backend._team._worlds
             with (
                 mock.patch.object(world, "_simulator") as simulator,
-                self.assertWarnsRegex(UserWarning, "gives up on a world, which counts as not finite from now on: too much"),
+                self.assertWarnsRegex(
+                    UserWarning, "gives up on a world, which counts as not finite from now on: too much"
+                ),
             ):
                 simulator.AdvanceTo.side_effect = RuntimeError("too much")
                 backend.step()

@@ -93,7 +93,9 @@ class FromABankTest(unittest.TestCase):
 
     @unittest.skipUnless(has("onnxruntime"), "onnxruntime is not installed")
     def test_a_policy_plays_where_nothing_can_train(self):
-        hidden = "import sys; sys.modules.update(dict.fromkeys(('rsl_rl', 'warp', 'mujoco_warp', 'onnx', 'tensorboard')))"
+        hidden = (
+            "import sys; sys.modules.update(dict.fromkeys(('rsl_rl', 'warp', 'mujoco_warp', 'onnx', 'tensorboard')))"
+        )
         program = f"{hidden}; sys.path.insert(0, {str(EXAMPLES)!r}); __import__('09_play_a_policy').main(sys.argv[1])"
         done = subprocess.run(
             [sys.executable, "-c", program, self.folder / "demos.npz"],

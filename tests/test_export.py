@@ -34,7 +34,9 @@ class Case(unittest.TestCase):
     def evaluate(self, name="eval", engines=("mujoco", "sapien"), change=lambda rollouts: rollouts):
         rollouts = change(toy_rollouts(np.array([joint.home for joint in self.robot.joints])))
         for engine in engines:
-            write_results(self.folder / name, toy_summary(engine, rollouts, robot="ur7e-sharpa"), rollouts, self.robot.joint_names)
+            write_results(
+                self.folder / name, toy_summary(engine, rollouts, robot="ur7e-sharpa"), rollouts, self.robot.joint_names
+            )
         return self.folder / name
 
     def change_first(self, **changes):
@@ -67,10 +69,14 @@ class Episodes(Case):
         self.assertEqual([len(e.action) for e in recording.episodes], [3, 5])
 
     def test_refusals(self):
-        without = self.evaluate("without", change=lambda r: replace(r, traces=tuple(replace(t, joint_target=None) for t in r.traces)))
+        without = self.evaluate(
+            "without", change=lambda r: replace(r, traces=tuple(replace(t, joint_target=None) for t in r.traces))
+        )
         with self.assertRaisesRegex(FileFormatError, "without the actions"):
             read_recorded([without])
-        slower = self.evaluate("slower", change=lambda r: replace(r, traces=tuple(replace(t, time=2 * t.time) for t in r.traces)))
+        slower = self.evaluate(
+            "slower", change=lambda r: replace(r, traces=tuple(replace(t, time=2 * t.time) for t in r.traces))
+        )
         with self.assertRaisesRegex(RunError, "different rates.*20 in.*10 in"):
             read_recorded([self.evaluate(), slower])
         with self.assertRaisesRegex(RunError, "no folder"):
@@ -84,7 +90,9 @@ class Arrays(Case):
         with np.load(self.folder / "out.npz") as file:
             arrays = dict(file)
         page = (Path(__file__).parents[1] / "docs/rollouts.md").read_text().split("## npz")[1]
-        documented = {name for line in page.splitlines() if line.startswith("| `") for name in line.split("|")[1].split("`")[1::2]}
+        documented = {
+            name for line in page.splitlines() if line.startswith("| `") for name in line.split("|")[1].split("`")[1::2]
+        }
         self.assertEqual(documented, set(arrays) - {"meta"})
         self.assertEqual(str(arrays["schema"]), "xreset-rollouts/1")
         self.assertEqual(arrays["joint_pos"].shape, (20, len(self.robot.joints)))
@@ -107,17 +115,24 @@ class LeRobot(Case):
         self.assertEqual(set(data), set(info["features"]))
         self.assertEqual(data["index"], list(range(20)))
         np.testing.assert_allclose(data["action"][5], recording.episodes[1].action[0], rtol=1e-6)
-        np.testing.assert_allclose(data["observation.environment_state"][19][7:], [0.5, 0.35, 0.15, 1, 0, 0, 0], rtol=1e-6)
+        np.testing.assert_allclose(
+            data["observation.environment_state"][19][7:], [0.5, 0.35, 0.15, 1, 0, 0, 0], rtol=1e-6
+        )
         stats = json.loads((root / "meta/stats.json").read_text())
         np.testing.assert_allclose(stats["action"]["mean"], np.mean(data["action"], axis=0), rtol=1e-6)
         episodes = parquet.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-        self.assertEqual([(e["dataset_from_index"], e["dataset_to_index"]) for e in episodes], [(0, 5), (5, 10), (10, 15), (15, 20)])
+        self.assertEqual(
+            [(e["dataset_from_index"], e["dataset_to_index"]) for e in episodes], [(0, 5), (5, 10), (10, 15), (15, 20)]
+        )
         self.assertEqual([(e["engine"], e["success"]) for e in episodes][1:3], [("mujoco", False), ("sapien", True)])
         self.assertEqual([p.name for p in self.folder.iterdir() if p.name.startswith(".")], [])
 
     def test_refuses_without_a_trace(self):
         recording = read_recorded([self.evaluate()])
-        for words, options in (("is there already", {"folder": self.folder / "eval"}), ("must be even", {"size": (321, 240)})):
+        for words, options in (
+            ("is there already", {"folder": self.folder / "eval"}),
+            ("must be even", {"size": (321, 240)}),
+        ):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
                 write_lerobot(options.pop("folder", self.folder / "set"), recording, **options)
         lost = replace(recording, episodes=(replace(recording.episodes[0], objects=self.folder / "nowhere"),))
@@ -140,7 +155,9 @@ class LeRobot(Case):
             np.testing.assert_allclose(item["observation.state"], expected.trace.joint_pos[frame], atol=1e-6)
             np.testing.assert_allclose(item["action"][0], expected.action[frame], atol=1e-6)
             np.testing.assert_allclose(item["action"][1], expected.action[min(frame + 1, 4)], atol=1e-6)
-            np.testing.assert_allclose(item["observation.environment_state"][:3], expected.trace.object_pos[frame], atol=1e-6)
+            np.testing.assert_allclose(
+                item["observation.environment_state"][:3], expected.trace.object_pos[frame], atol=1e-6
+            )
             self.assertEqual((item["task"], item["engine"]), (expected.task, "sapien"))
             self.assertEqual(tuple(item["observation.images.front"].shape), (3, 48, 64))
         self.assertEqual(set(found.meta.stats), set(found.meta.features) - {"engine"})

@@ -113,7 +113,9 @@ class Budget(unittest.TestCase):
         budget = FaultBudget(1000)
         self.assertAlmostEqual(budget.allowed, MAX_SHARE * WINDOW * 1000)
         self.assertIsNone(budget.add(FaultCounts(nonfinite=150, overflow=50)))
-        self.assertRegex(budget.add(FaultCounts(nonfinite=1, overflow=0)) or "", "151 worlds were not finite and 50 dropped .* 0.1%")
+        self.assertRegex(
+            budget.add(FaultCounts(nonfinite=1, overflow=0)) or "", "151 worlds were not finite and 50 dropped .* 0.1%"
+        )
 
     def test_old_faults_are_forgotten(self):
         budget = FaultBudget(1000)
@@ -137,7 +139,9 @@ class WithEnv(unittest.TestCase):
         self.addCleanup(backend.close)
         backend.plan = plan
         torch.manual_seed(0)
-        return ManipulationEnv(backend, CONFIG.task, ResetDistribution(self.bank, self.robot, (SOUP, SPAM), CONFIG.task.reset), seed=0)
+        return ManipulationEnv(
+            backend, CONFIG.task, ResetDistribution(self.bank, self.robot, (SOUP, SPAM), CONFIG.task.reset), seed=0
+        )
 
 
 class Environment(WithEnv):
@@ -151,7 +155,9 @@ class Environment(WithEnv):
         *_, extras = env.step(action)
         self.assertEqual(extras["faulty"].tolist(), [False, False, True, False])
         kept = env.faults.arrays()
-        self.assertEqual((kept["world"].tolist(), kept["episode_step"].tolist()), ([2.0], [2.0]))  # two steps were done before
+        self.assertEqual(
+            (kept["world"].tolist(), kept["episode_step"].tolist()), ([2.0], [2.0])
+        )  # two steps were done before
         np.testing.assert_allclose(kept["before_joint_pos"][0], before.joint_pos[2])
         np.testing.assert_allclose(kept["before_object_pos"][0], before.object_pos[2])
         self.assertTrue(np.isnan(kept["after_object_pos"][0]).all())
@@ -159,7 +165,9 @@ class Environment(WithEnv):
         np.testing.assert_allclose((kept["gravity_fraction"][0], kept["sequence"][0]), (gravity[2], sequence[2]))
         self.assertGreater(kept["object_mass"][0], 0)
         moved = kept["target"][0] - kept["before_joint_target"][0]
-        np.testing.assert_allclose(moved[:3], 0.3 * CONFIG.task.action.arm_step, atol=1e-6)  # the arm's first three joints
+        np.testing.assert_allclose(
+            moved[:3], 0.3 * CONFIG.task.action.arm_step, atol=1e-6
+        )  # the arm's first three joints
 
     def test_a_world_that_drops_contacts_begins_anew_and_is_counted_once(self):
         env = self.make({2: ("overflow", 1)})
@@ -186,7 +194,9 @@ class Learning(unittest.TestCase):
             return TensorDict({k: torch.randn(N, *w, generator=g) for k, w in widths.items()}, batch_size=[N])
 
         torch.manual_seed(0)
-        alg = SequencePpo.construct_algorithm(observations(0), Nothing(), rsl_rl_config(CONFIG, N) | {"multi_gpu": None}, "cpu")
+        alg = SequencePpo.construct_algorithm(
+            observations(0), Nothing(), rsl_rl_config(CONFIG, N) | {"multi_gpu": None}, "cpu"
+        )
         with torch.no_grad():
             for t in range(8):
                 alg.act(observations(t))
@@ -225,7 +235,9 @@ class Run(WithEnv):
         self.assertFalse(list(folder.glob("faults*")))
 
     def test_too_many_end_the_run_with_what_they_were_like(self):
-        plan = {step: ("nonfinite" if step % 2 else "overflow", step % N) for step in range(9, 17)}  # all in the second iteration
+        plan = {
+            step: ("nonfinite" if step % 2 else "overflow", step % N) for step in range(9, 17)
+        }  # all in the second iteration
         self.assertGreater(len(plan), FaultBudget(8 * N).allowed)
         with self.assertRaisesRegex(RunError, "4 worlds were not finite and 4 dropped contacts.*faults.npz.*--resume"):
             self.train("many", plan)
@@ -233,7 +245,9 @@ class Run(WithEnv):
             self.assertEqual(str(file["schema"]), "xreset-faults/1")
             self.assertIn('"horizon": 8', str(file["meta"]))
             np.testing.assert_array_equal(file["world"], [step % N for step in plan])
-            np.testing.assert_array_equal(np.isnan(file["after_object_pos"]).all(axis=1), [step % 2 == 1 for step in plan])
+            np.testing.assert_array_equal(
+                np.isnan(file["after_object_pos"]).all(axis=1), [step % 2 == 1 for step in plan]
+            )
             self.assertTrue(np.isfinite(file["before_object_pos"]).all())
             self.assertEqual(file["before_joint_pos"].shape, (8, len(self.robot.joints)))
             self.assertEqual(file["joint_names"].tolist(), list(self.robot.joint_names))

@@ -95,7 +95,10 @@ class AtomicWriteTest(InFolder):
         path = self.folder / "a.json"
         write_json(path, {"old": 1})
         full = OSError(ENOSPC, os.strerror(ENOSPC))
-        with mock.patch("os.fsync", side_effect=full), self.assertRaisesRegex(XResetError, "No space left.*free some space"):
+        with (
+            mock.patch("os.fsync", side_effect=full),
+            self.assertRaisesRegex(XResetError, "No space left.*free some space"),
+        ):
             write_json(path, {"new": 2})
         self.assertEqual(read_json(path), {"old": 1})
         self.assert_only("a.json")
@@ -115,7 +118,9 @@ class AtomicWriteTest(InFolder):
             "except XResetError as error:\n"
             "    print('refused:', error)\n"
         )
-        result = subprocess.run([sys.executable, "-c", program, str(self.file)], capture_output=True, text=True, check=True)
+        result = subprocess.run(
+            [sys.executable, "-c", program, str(self.file)], capture_output=True, text=True, check=True
+        )
         self.assertIn("refused: cannot write", result.stdout)
         self.assertEqual(self.file.read_bytes(), before)
         self.assert_only("file.npz")
@@ -142,9 +147,7 @@ class AtomicFolderTest(InFolder):
 
 class ClaimTest(InFolder):
     def test_one_writer_at_a_time(self):
-        program = (
-            "import sys\nfrom xreset.files import claim\nwith claim(sys.argv[1]):\n    print('mine', flush=True)\n    sys.stdin.read()\n"
-        )
+        program = "import sys\nfrom xreset.files import claim\nwith claim(sys.argv[1]):\n    print('mine', flush=True)\n    sys.stdin.read()\n"
         for path in (self.folder, self.file):
             with self.subTest(path):
                 command = [sys.executable, "-c", program, str(path)]
@@ -202,7 +205,13 @@ class JsonTest(InFolder):
 
 class NpzTest(InFolder):
     def write(self, schema: str = "test/1", **changes):
-        write_npz(self.file, schema, {k: v for k, v in (ARRAYS | changes).items() if v is not None}, config={"p": 0.5}, inputs={"a": "ff"})
+        write_npz(
+            self.file,
+            schema,
+            {k: v for k, v in (ARRAYS | changes).items() if v is not None},
+            config={"p": 0.5},
+            inputs={"a": "ff"},
+        )
 
     def read(self):
         return read_npz(self.file, "test/1", SCHEMA, what="a test file")
@@ -220,7 +229,10 @@ class NpzTest(InFolder):
     def test_the_same_content_gives_the_same_bytes(self):
         self.write()
         first = self.file.read_bytes()
-        with mock.patch("time.time", return_value=2e9), mock.patch("time.localtime", return_value=(2033, 5, 18, 3, 33, 20, 2, 138, 0)):
+        with (
+            mock.patch("time.time", return_value=2e9),
+            mock.patch("time.localtime", return_value=(2033, 5, 18, 3, 33, 20, 2, 138, 0)),
+        ):
             self.write()
         self.assertEqual(self.file.read_bytes(), first)
         self.write(points=ARRAYS["points"] + 1)
@@ -230,7 +242,9 @@ class NpzTest(InFolder):
         with self.assertRaisesRegex(TypeError, "object"):
             self.write(names=np.array([{}, {}], dtype=object))
         self.assert_only()
-        np.savez(self.file, schema="test/1", **(ARRAYS | {"names": np.array(["a", None], dtype=object)}), allow_pickle=True)
+        np.savez(
+            self.file, schema="test/1", **(ARRAYS | {"names": np.array(["a", None], dtype=object)}), allow_pickle=True
+        )
         with self.refused("cannot be read as a test file"):
             self.read()
 
@@ -329,7 +343,10 @@ class NpzTest(InFolder):
             self.read()
         with mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="10"):
             self.read()
-        with mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="many"), self.assertRaisesRegex(XResetError, "expected a whole number"):
+        with (
+            mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="many"),
+            self.assertRaisesRegex(XResetError, "expected a whole number"),
+        ):
             self.read()
 
     def test_text_that_controls_a_terminal(self):
@@ -442,7 +459,12 @@ class BankTest(InFolder):
         self.assertEqual(chosen.sequence_name.tolist(), ["demo_a", "demo_b", "demo_c"])
 
     def test_a_bank_of_another_robot(self):
-        other = replace(toy_bank(self.robot), robot="openarm", joint_names=("j1", "j2"), joint_pos=np.zeros((6, 2), dtype=np.float32))
+        other = replace(
+            toy_bank(self.robot),
+            robot="openarm",
+            joint_names=("j1", "j2"),
+            joint_pos=np.zeros((6, 2), dtype=np.float32),
+        )
         write_bank(self.file, other, config={}, inputs={})
         with self.refused("for the robot 'openarm' with 2 joints", "--robot toy"):
             read_bank(self.file, robot=self.robot)
@@ -484,7 +506,14 @@ class BankTest(InFolder):
         def obj(name: str, source: str) -> ObjectSpec:
             nothing = np.zeros((0, 3))
             return ObjectSpec(
-                name=name, pieces=(), mass=1.0, com=np.zeros(3), inertia=np.eye(3), vertices=nothing, faces=nothing, source=source
+                name=name,
+                pieces=(),
+                mass=1.0,
+                com=np.zeros(3),
+                inertia=np.eye(3),
+                vertices=nothing,
+                faces=nothing,
+                source=source,
             )
 
         bank = toy_bank(self.robot, object_sources=("stand-in", "ab12"))

@@ -88,7 +88,9 @@ class FrontierTest(unittest.TestCase):
         )  # fmt: skip
 
     def run_frontier(self, resets: Path, states: int = 100, num_envs: int = 4) -> list[dict]:
-        return frontier(self.subject(), [engine("mujoco")], resets, Setting(num_envs=num_envs), self.folder / "out", states=states)
+        return frontier(
+            self.subject(), [engine("mujoco")], resets, Setting(num_envs=num_envs), self.folder / "out", states=states
+        )
 
     def test_every_state_is_tried_once_and_what_became_of_it_is_written(self):
         (result,) = self.run_frontier(self.resets)
@@ -97,9 +99,13 @@ class FrontierTest(unittest.TestCase):
         self.assertEqual([t["state"] for t in tried], list(range(6)))
         self.assertEqual([t["object"] for t in tried], self.names)
         self.assertEqual([t["frame"] for t in tried], self.bank.frame_index.tolist())
-        self.assertEqual([t["reached"] for t in tried], [False, True, False, False, True, False], "there, or falling from there")
         self.assertEqual(
-            [t["stayed"] for t in tried], [False, True, False, False, False, False], "at full gravity nothing stays in the air"
+            [t["reached"] for t in tried], [False, True, False, False, True, False], "there, or falling from there"
+        )
+        self.assertEqual(
+            [t["stayed"] for t in tried],
+            [False, True, False, False, False, False],
+            "at full gravity nothing stays in the air",
         )
         self.assertEqual(tried[4]["stage"], "lifted by over 10 cm")
         self.assertEqual(sum(row["states"] for row in result["stages"]), 6)

@@ -15,8 +15,12 @@ from xreset.learning.model import PointNet
 ON_GPU = torch.cuda.is_available()
 
 
-@unittest.skipUnless(importlib.util.find_spec("triton"), "Triton is not installed (it comes with PyTorch's CUDA builds)")
-@unittest.skipUnless(ON_GPU or os.environ.get("TRITON_INTERPRET") == "1", "no GPU here, and TRITON_INTERPRET=1 is not set")
+@unittest.skipUnless(
+    importlib.util.find_spec("triton"), "Triton is not installed (it comes with PyTorch's CUDA builds)"
+)
+@unittest.skipUnless(
+    ON_GPU or os.environ.get("TRITON_INTERPRET") == "1", "no GPU here, and TRITON_INTERPRET=1 is not set"
+)
 class FusedPointNetTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
@@ -29,7 +33,9 @@ class FusedPointNetTest(unittest.TestCase):
         """Relative differences of the embeddings and of every gradient."""
         torch.manual_seed(clouds)
         net = PointNet(dims).to(self.device)
-        cloud = 0.05 * torch.randn(clouds, points, 3, device=self.device) + torch.tensor([0.5, 0.1, 0.05], device=self.device)
+        cloud = 0.05 * torch.randn(clouds, points, 3, device=self.device) + torch.tensor(
+            [0.5, 0.1, 0.05], device=self.device
+        )
         weight = torch.randn(clouds, dims[-1], device=self.device)
         parameters = list(net.parameters())
         with mock.patch.object(self.fused, "FACTORS", torch.bfloat16 if ON_GPU else torch.float32):
@@ -46,7 +52,11 @@ class FusedPointNetTest(unittest.TestCase):
     def test_it_computes_what_the_plain_layers_compute(self):
         # bfloat16 factors move some maxima to another point, and some gradient with them: plain layers in bfloat16 differ as much.
         forward, backward = (6e-3, 8e-2) if ON_GPU else (1e-6, 1e-5)
-        for clouds, dims, points in ((5, [64, 128, 64], 64), (3, [16, 32, 16], 16), (300 if ON_GPU else 2, [32, 32, 64], 32)):
+        for clouds, dims, points in (
+            (5, [64, 128, 64], 64),
+            (3, [16, 32, 16], 16),
+            (300 if ON_GPU else 2, [32, 32, 64], 32),
+        ):
             for name, difference in self.compare(clouds, dims, points).items():
                 with self.subTest(clouds=clouds, dims=dims, what=name):
                     self.assertLess(difference, forward if name == "embedding" else backward)
@@ -60,7 +70,13 @@ class FusedPointNetTest(unittest.TestCase):
 
     def test_what_the_kernels_cannot_take(self):
         self.assertTrue(self.fused.supports(64, (64, 128, 64)))
-        for points, widths in ((48, (64, 128, 64)), (64, (64, 100, 64)), (64, (64, 64)), (64, (8, 16, 16)), (64, (64, 256, 64))):
+        for points, widths in (
+            (48, (64, 128, 64)),
+            (64, (64, 100, 64)),
+            (64, (64, 64)),
+            (64, (8, 16, 16)),
+            (64, (64, 256, 64)),
+        ):
             with self.subTest(points=points, widths=widths):
                 self.assertFalse(self.fused.supports(points, widths))
 

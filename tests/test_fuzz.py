@@ -55,7 +55,13 @@ class EveryReader(unittest.TestCase):
     def fuzz(self, reader: Reader) -> None:
         whole = reader.file.read_bytes()
 
-        @settings(max_examples=EXAMPLES, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
+        @settings(
+            max_examples=EXAMPLES,
+            deadline=None,
+            derandomize=True,
+            database=None,
+            suppress_health_check=list(HealthCheck),
+        )
         @given(damages(reader.kind))
         def run(damage):
             outcome(reader, damage(whole))

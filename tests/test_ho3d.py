@@ -72,7 +72,10 @@ class Ho3d(Case):
                 same = np.abs((found.object_quat_wxyz * self.demos.object_quat_wxyz).sum(axis=1))
                 np.testing.assert_allclose(same, 1, atol=1e-5)
                 np.testing.assert_array_equal(found.hand_valid, self.demos.hand_valid)
-        self.assertEqual((found.sequence_name[0], found.object_name[0], found.hand_side[0]), ("SM2", self.demos.object_name[0], "right"))
+        self.assertEqual(
+            (found.sequence_name[0], found.object_name[0], found.hand_side[0]),
+            ("SM2", self.demos.object_name[0], "right"),
+        )
 
     def test_a_frame_that_is_missing_is_interpolated(self):
         self.write(leave_out=(7,))
@@ -92,7 +95,14 @@ class Ho3d(Case):
             (r"shape \[2\], expected \[3\]", {"objTrans": lambda i, v: np.zeros(2)}),
             ("not finite", {"objTrans": lambda i, v: v * np.nan}),
             ("object changes", {"objName": lambda i, v: f"thing_{i}"}),
-            ("Say --order", {"handJoints3D": lambda i, v: None if v is None else v[[0, 13, 14, 15, 16, *range(1, 13), *range(17, 21)]]}),
+            (
+                "Say --order",
+                {
+                    "handJoints3D": lambda i, v: (
+                        None if v is None else v[[0, 13, 14, 15, 16, *range(1, 13), *range(17, 21)]]
+                    )
+                },
+            ),
         )
         for words, changes in cases:
             self.write(**changes)

@@ -52,11 +52,23 @@ _PLACES = {
     "f4": ("0.02 0.045 0", "0 0 0.9"),
 }
 """The fourth is a right hand's thumb: seen from the back of the hand, fingers up, it is on the left."""
-HAND = '<robot name="hand">' + _PALM + "".join(_FINGER.format(name, *place) for name, place in _PLACES.items()) + "</robot>"
+HAND = (
+    '<robot name="hand">'
+    + _PALM
+    + "".join(_FINGER.format(name, *place) for name, place in _PLACES.items())
+    + "</robot>"
+)
 
 ARM = '<robot name="arm"><link name="base"><collision><geometry><cylinder radius="0.06" length="0.1"/></geometry></collision></link>'
 for _number, (_xyz, _axis) in enumerate(
-    [("0 0 0.15", "0 0 1"), ("0 0 0.1", "0 1 0"), ("0 0 0.4", "0 1 0"), ("0 0 0.2", "0 0 1"), ("0 0 0.2", "0 1 0"), ("0 0 0.1", "0 0 1")]
+    [
+        ("0 0 0.15", "0 0 1"),
+        ("0 0 0.1", "0 1 0"),
+        ("0 0 0.4", "0 1 0"),
+        ("0 0 0.2", "0 0 1"),
+        ("0 0 0.2", "0 1 0"),
+        ("0 0 0.1", "0 0 1"),
+    ]
 ):
     ARM += f"""<link name="l{_number}"><inertial><mass value="2"/><origin xyz="0 0 0.03"/>
       <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
@@ -103,7 +115,9 @@ class Toy(WithFolder):
         self.assertEqual(spec.fingertip_names, ("thumb", "index", "middle", "ring"))
         self.assertEqual([tip.contact_links for tip in spec.fingertips], [("f4_b",), ("f1_b",), ("f2_b",), ("f3_b",)])
         self.assertEqual(len(spec.hand_indices), 4)
-        self.assertEqual({(m.joint, m.multiplier, m.offset) for m in spec.mimics}, {(f"f{i}_2", 0.8, 0.1) for i in range(1, 5)})
+        self.assertEqual(
+            {(m.joint, m.multiplier, m.offset) for m in spec.mimics}, {(f"f{i}_2", 0.8, 0.1) for i in range(1, 5)}
+        )
         self.assertTrue(any("thumb is the finger of f4_a, f4_b" in note for note in made.guessed), made.guessed)
         self.assertIn("--offset", made.to_say[0])
         self.assertEqual([path.name for path in self.folder.iterdir() if path.name.startswith(".")], [])
@@ -111,7 +125,9 @@ class Toy(WithFolder):
         self.assertEqual([keypoints[f"index{i}"] for i in (1, 2, 4)], ["f1_a", "f1_b", "index_tip_frame"])
 
     def test_centres_of_mass_that_lie_in_the_joints_are_doubted(self):
-        at_joint = HAND.replace('<mass value="0.05"/><origin xyz="0.02 0 0"/>', '<mass value="0.05"/><origin xyz="0 0 0"/>')
+        at_joint = HAND.replace(
+            '<mass value="0.05"/><origin xyz="0.02 0 0"/>', '<mass value="0.05"/><origin xyz="0 0 0"/>'
+        )
         folder = import_robot(self.arm, self.file("at_joint.urdf", at_joint), self.folder / "mine").folder
         found = [f.message for f in check_description(folder)[1] if f.topic == "inertias" and f.level == "warning"]
         self.assertEqual(len(found), 1, found)
@@ -119,7 +135,8 @@ class Toy(WithFolder):
 
     def test_a_coupled_joint_has_the_limits_that_its_source_gives_it(self):
         narrow = HAND.replace(
-            '<limit lower="0" upper="1.5" effort="1" velocity="5"/><mimic', '<limit lower="0" upper="1" effort="1"/><mimic'
+            '<limit lower="0" upper="1.5" effort="1" velocity="5"/><mimic',
+            '<limit lower="0" upper="1" effort="1"/><mimic',
         )
         folder = import_robot(self.arm, self.file("narrow.urdf", narrow), self.folder / "mine").folder
         tree = load_urdf(folder / "robot.urdf")
@@ -132,11 +149,15 @@ class Toy(WithFolder):
 
     def test_origins_beside_a_finger_do_not_turn_its_palm(self):
         beside = HAND
-        for name, (xyz, rpy) in _PLACES.items():  # every knuckle's origin 15 mm along its axis; the links stay where they are
+        for name, (
+            xyz,
+            rpy,
+        ) in _PLACES.items():  # every knuckle's origin 15 mm along its axis; the links stay where they are
             x, y, z = (float(v) for v in xyz.split())
             if rpy == "0 0 0":
                 beside = beside.replace(
-                    f'<child link="{name}_a"/><origin xyz="{xyz}"', f'<child link="{name}_a"/><origin xyz="{x} {y + 0.015} {z}"'
+                    f'<child link="{name}_a"/><origin xyz="{xyz}"',
+                    f'<child link="{name}_a"/><origin xyz="{x} {y + 0.015} {z}"',
                 )
                 head, tail = beside.split(f'<link name="{name}_a">')
                 link, rest = tail.split("</link>", 1)
@@ -159,15 +180,22 @@ class Toy(WithFolder):
         poses = dict(zip(kinematics.link_names, kinematics.link_poses(torch.tensor(spec.home)).numpy(), strict=True))
         in_hand = np.linalg.inv(poses["hand_base"]) @ poses["palm_frame"]
         np.testing.assert_allclose(in_hand[:3, :3], np.stack([(1, 0, 0), (0, -1, 0), (0, 0, -1)], axis=1), atol=0.06)
-        np.testing.assert_allclose(poses["palm_frame"][:3, 2], (0, 0, -1), atol=0.05)  # at home it looks down at the table
+        np.testing.assert_allclose(
+            poses["palm_frame"][:3, 2], (0, 0, -1), atol=0.05
+        )  # at home it looks down at the table
 
     def test_check_warns_of_a_turned_palm_and_of_placeholders_for_inertias(self):
         folder = import_robot(self.arm, self.hand, self.folder / "mine").folder
         text = (folder / "robot.urdf").read_text()
-        turned, count = re.subn(r'(name="palm_frame_fixed"[^>]*>\s*<origin xyz="[^"]*" rpy=")[^"]*', r"\g<1>0 1.5708 0", text)
+        turned, count = re.subn(
+            r'(name="palm_frame_fixed"[^>]*>\s*<origin xyz="[^"]*" rpy=")[^"]*', r"\g<1>0 1.5708 0", text
+        )
         self.assertEqual(count, 1)
         turned, count = re.subn(
-            r'(<link name="f1_a">[\s\S]*?<inertia )[^/]*', r'\1ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0" ', turned, count=1
+            r'(<link name="f1_a">[\s\S]*?<inertia )[^/]*',
+            r'\1ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0" ',
+            turned,
+            count=1,
         )
         (folder / "robot.urdf").write_text(turned)
         warnings = "\n".join(f.message for f in check_description(folder)[1] if f.level == "warning")
@@ -181,17 +209,26 @@ class Toy(WithFolder):
             self.assertEqual((a.name, a.type, a.lower, a.upper), (b.name, b.type, b.lower, b.upper))
             np.testing.assert_allclose(a.T_parent_joint, b.T_parent_joint, atol=1e-6)
         for a, b in zip(mjcf.tree.links, urdf.tree.links, strict=True):
-            np.testing.assert_allclose(np.r_[a.mass, a.com, a.inertia.ravel()], np.r_[b.mass, b.com, b.inertia.ravel()], atol=1e-9)
+            np.testing.assert_allclose(
+                np.r_[a.mass, a.com, a.inertia.ravel()], np.r_[b.mass, b.com, b.inertia.ravel()], atol=1e-9
+            )
             self.assertEqual([s.geometry.size for s in a.collisions], [s.geometry.size for s in b.collisions])
-        self.assertEqual({(m.joint, m.source, m.multiplier) for m in mjcf.mimics}, {(m.joint, m.source, m.multiplier) for m in urdf.mimics})
+        self.assertEqual(
+            {(m.joint, m.source, m.multiplier) for m in mjcf.mimics},
+            {(m.joint, m.source, m.multiplier) for m in urdf.mimics},
+        )
         drive = mjcf.drives["f1_1"]
         self.assertEqual((drive.kp, drive.kd, mjcf.effort["f1_1"]), (3.0, 0.2, 2.0))
 
     def test_what_mjcf_has_and_robots_do_not_is_named_one_by_one(self):
         ball = MJCF.replace('<joint name="f1_2" axis="0 1 0" range="0 1.5"/>', '<joint name="f1_2" type="ball"/>')
-        ball = ball.replace('<joint joint1="f1_2" joint2="f1_1" polycoef="0.1 0.8 0 0 0"/>', "").replace("0.1 0.8 0 0 0", "0.1 0.8 1 0 0")
+        ball = ball.replace('<joint joint1="f1_2" joint2="f1_1" polycoef="0.1 0.8 0 0 0"/>', "").replace(
+            "0.1 0.8 0 0 0", "0.1 0.8 1 0 0"
+        )
         ball = ball.replace('type="box" pos="0.04 0 0"', 'name="egg" type="ellipsoid" pos="0.04 0 0"')
-        with self.assertRaisesRegex(RobotError, "(?s)ball joint 'f1_2'.*ellipsoid 'egg' of body 'base'.*couples joints by a curve"):
+        with self.assertRaisesRegex(
+            RobotError, "(?s)ball joint 'f1_2'.*ellipsoid 'egg' of body 'base'.*couples joints by a curve"
+        ):
             read_source(self.file("ball.xml", ball))
 
     def test_mjcf_in_place_of_a_urdf_is_told(self):
@@ -209,13 +246,17 @@ class Toy(WithFolder):
         np.testing.assert_array_equal(whole.tree.joint("hand_base_fixed").T_parent_joint, T)
         second = gripper.replace("claw", "thumb").replace("mount", "second")
         two = self.file("two.urdf", ARM.replace("</robot>", gripper.removesuffix("</robot>") + second))
-        with self.assertRaisesRegex(RobotError, "ends in claw, thumb, after base, l0, l1, l2, l3, l4, l5; say with --flange"):
+        with self.assertRaisesRegex(
+            RobotError, "ends in claw, thumb, after base, l0, l1, l2, l3, l4, l5; say with --flange"
+        ):
             combined(read_source(two), read_source(self.hand), flange=None, T_flange_hand=T, name="x")
         with self.assertRaisesRegex(RobotError, "no link 'wrist'"):
             combined(arm, read_source(self.hand), flange="wrist", T_flange_hand=T, name="x")
 
     def test_a_hand_whose_root_is_inside_it_stands_before_the_flange(self):
-        made = import_robot(self.arm, self.hand, self.folder / "mine", rpy=(0, -np.pi / 2, 0))  # its palm lies along x, from 0 to 80 mm
+        made = import_robot(
+            self.arm, self.hand, self.folder / "mine", rpy=(0, -np.pi / 2, 0)
+        )  # its palm lies along x, from 0 to 80 mm
         T = load_urdf(made.folder / "robot.urdf").joint("hand_base_fixed").T_parent_joint
         np.testing.assert_allclose(T[:3, 3], 0, atol=1e-9)
         self.assertRegex(made.to_say[0], r"its fingers point along \(0.05, 0.00, 1.00\) of 'l5'")
@@ -254,7 +295,20 @@ class Toy(WithFolder):
 
     def test_command(self):
         out, err = io.StringIO(), io.StringIO()
-        words = ["robots", "import", "--arm", self.arm, "--hand", self.hand, "--out", self.folder / "mine", "--offset", 0, 0, 0.02]
+        words = [
+            "robots",
+            "import",
+            "--arm",
+            self.arm,
+            "--hand",
+            self.hand,
+            "--out",
+            self.folder / "mine",
+            "--offset",
+            0,
+            0,
+            0.02,
+        ]
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             main([str(word) for word in words])
         self.assertIn("for you to say", out.getvalue())
@@ -301,13 +355,21 @@ class Reshaped(WithFolder):
     def test_another_hand_is_refused_and_leaves_nothing(self):
         for hand, expected in (
             (self.HAND.replace('xyz="0.085 0.03 0"', 'xyz="0.085 0.04 0"'), "f1_a is 10.0 mm and 0.0 degrees away"),
-            (self.HAND.replace("f1_a", "g1_a"), "'g1_a' has shapes, and neither it nor what it is fixed to is a link of 'mine'"),
+            (
+                self.HAND.replace("f1_a", "g1_a"),
+                "'g1_a' has shapes, and neither it nor what it is fixed to is a link of 'mine'",
+            ),
             (HAND, "f1_a hangs on base, in the robot on palm"),
-            (self.HAND.replace("<collision>", "<visual>").replace("</collision>", "</visual>"), "has no collision shapes"),
+            (
+                self.HAND.replace("<collision>", "<visual>").replace("</collision>", "</visual>"),
+                "has no collision shapes",
+            ),
         ):
             with self.assertRaisesRegex(RobotError, expected):
                 self.reshaped(hand)
-        self.assertEqual({path.name for path in self.folder.iterdir()}, {"arm.urdf", "hand.urdf", "shapes.urdf", "mine"})
+        self.assertEqual(
+            {path.name for path in self.folder.iterdir()}, {"arm.urdf", "hand.urdf", "shapes.urdf", "mine"}
+        )
         with self.assertRaisesRegex(RobotError, "is there already"):
             self.reshaped(self.HAND, "mine")
 
@@ -318,14 +380,18 @@ class Published(WithFolder):
     def unpacked(self, name):
         archive = Path(os.environ.get("XRESET_ROBOTS", ARCHIVES)) / f"{name}.tar.xz"
         if not archive.is_file():
-            raise unittest.SkipTest(f"no published robot at {archive}; set XRESET_ROBOTS to the folder with the archives")
+            raise unittest.SkipTest(
+                f"no published robot at {archive}; set XRESET_ROBOTS to the folder with the archives"
+            )
         with lzma.open(archive) as file, tarfile.open(fileobj=file) as tar:
             tar.extractall(self.folder, filter="data")
         return self.folder / name
 
     def test_inspires_coupled_joints_in_the_engines(self):
         arm, hand = self.unpacked("xarm7") / "xarm7.urdf", self.unpacked("inspire_hand") / "inspire_hand_right.urdf"
-        spec = load_robot(import_robot(arm, hand, self.folder / "mine").folder)  # a joint of the thumb follows one that is no neighbour
+        spec = load_robot(
+            import_robot(arm, hand, self.folder / "mine").folder
+        )  # a joint of the thumb follows one that is no neighbour
         for backend in ("mujoco", "pybullet", "sapien"):
             with self.subTest(backend):
                 found = check_engine(spec, backend)
@@ -342,12 +408,19 @@ class Published(WithFolder):
                 spec, found = check_description(folder)
                 self.assertEqual([f"{f.topic}: {f.message}" for f in found if f.level == "error"], [])
                 tree = load_urdf(spec.urdf)
-                self.assertEqual({len(tree.link(tip.contact_links[0]).collisions) for tip in spec.fingertips}, {2})  # its bone and its pad
+                self.assertEqual(
+                    {len(tree.link(tip.contact_links[0]).collisions) for tip in spec.fingertips}, {2}
+                )  # its bone and its pad
 
     def test_hands_on_xarm7(self):
         arm = self.unpacked("xarm7") / "xarm7.urdf"
         cases = {
-            "leap_hand": ("leap_hand_right.urdf", ("thumb_fingertip", "fingertip", "fingertip_2", "fingertip_3"), 16, 0),
+            "leap_hand": (
+                "leap_hand_right.urdf",
+                ("thumb_fingertip", "fingertip", "fingertip_2", "fingertip_3"),
+                16,
+                0,
+            ),
             "allegro_hand": ("allegro_hand_right.urdf", ("link_15.0", "link_3.0", "link_7.0", "link_11.0"), 16, 0),
             "inspire_hand": (
                 "inspire_hand_right.urdf",

@@ -43,7 +43,11 @@ def write_csv(path, points, pos, turn, scale=1.0, columns=(), quat="wxyz"):
     """One row for each frame, as a tracker would; ``columns``: (name, value or values) to add."""
     frames = len(points)
     added = {name: [value] * frames if np.ndim(value) == 0 else value for name, value in columns}
-    names = [f"{axis}{k}" for k in range(21) for axis in "xyz"] + [f"object_{a}" for a in "xyz"] + [f"object_q{a}" for a in quat]
+    names = (
+        [f"{axis}{k}" for k in range(21) for axis in "xyz"]
+        + [f"object_{a}" for a in "xyz"]
+        + [f"object_q{a}" for a in quat]
+    )
     quats = turn.as_quat(scalar_first=quat == "wxyz")
     with open(path, "w", newline="") as file:
         table = csv.writer(file)
@@ -120,7 +124,9 @@ class Synthetic(unittest.TestCase):
         self.assertLess(off.magnitude().max(), 1e-3)  # synthetic hands are the average hand
 
     def test_what_is_not_known_is_asked_for_in_one_go(self):
-        self.refused("(?s)--order mano, mediapipe or openpose.*--units m or mm.*--coordinates table or camera", Convention())
+        self.refused(
+            "(?s)--order mano, mediapipe or openpose.*--units m or mm.*--coordinates table or camera", Convention()
+        )
         self.refused("--table-from-camera FILE", replace(PLAIN, frame="camera"))
         self.refused("--coordinates says .* table frame already", replace(PLAIN, table_from_camera=np.eye(4)))
         self.refused("say it with --object", object=None)
@@ -137,11 +143,15 @@ class Synthetic(unittest.TestCase):
         self.refused("file says 20 frames per second, but --fps says 10", fps=np.array(20.0))
         self.refused("centred on the hand", keypoints=self.points - self.points.mean(axis=1, keepdims=True))
         swelling = np.linspace(0.4, 2.5, len(self.points))[:, None, None]
-        self.refused("are no metric keypoints", keypoints=self.points[:, :1] + swelling * (self.points - self.points[:, :1]))
+        self.refused(
+            "are no metric keypoints", keypoints=self.points[:, :1] + swelling * (self.points - self.points[:, :1])
+        )
         points, pos, turn = seen_from(CAMERA, self.demos)
         seen = {"keypoints": points, "object_pos": pos, "object_quat_wxyz": turn.as_quat(scalar_first=True)}
         self.refused("Are these the camera's coordinates", **seen)
-        inverse = Convention(order="mediapipe", units="m", frame="camera", table_from_camera=np.linalg.inv(CAMERA), fps=10.0)
+        inverse = Convention(
+            order="mediapipe", units="m", frame="camera", table_from_camera=np.linalg.inv(CAMERA), fps=10.0
+        )
         self.refused("or is that matrix the inverse", inverse, **seen)
 
     def test_damage_is_named(self):
@@ -189,7 +199,10 @@ class Synthetic(unittest.TestCase):
         self.assertIn("confidence", log.output[0])
         self.assertEqual(found.sequence_name.tolist(), ["a", "b"])
         self.same(found.select(names=["a"]))
-        with self.assertRaisesRegex(DemoError, "line 2, column x0: 'oops' is no number"), self.assertLogs("xreset.demos.keypoints"):
+        with (
+            self.assertRaisesRegex(DemoError, "line 2, column x0: 'oops' is no number"),
+            self.assertLogs("xreset.demos.keypoints"),
+        ):
             path.write_text(re.sub(r"(?m)(^a,[^,]*,right,0.9,)[^,]*", r"\1oops", first))
             read_keypoints(path, PLAIN)
         with self.assertRaisesRegex(DemoError, "lacks the columns .*z20"):
@@ -206,7 +219,9 @@ class Synthetic(unittest.TestCase):
             write_csv(self.folder / "in" / f"{name}.csv", self.points, self.demos.object_pos, turn, scale=1e3)
         out, err = io.StringIO(), io.StringIO()
         np.savetxt(self.folder / "T.txt", np.eye(4))
-        words = f"--order mediapipe --units mm --coordinates camera --table-from-camera {self.folder / 'T.txt'} --fps 10"
+        words = (
+            f"--order mediapipe --units mm --coordinates camera --table-from-camera {self.folder / 'T.txt'} --fps 10"
+        )
         words += f" --side right --object 005_tomato_soup_can --out {self.folder / 'out.npz'}"
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             main(["demos", "import", "keypoints", str(self.folder / "in"), *words.split()])
@@ -224,7 +239,11 @@ class Real(unittest.TestCase):
         with tempfile.TemporaryDirectory() as folder:
             for i in range(3):
                 one = demos.select(indices=[i])
-                columns = [("object", str(one.object_name[0])), ("side", "right"), ("time", np.arange(one.num_frames) / 30)]
+                columns = [
+                    ("object", str(one.object_name[0])),
+                    ("side", "right"),
+                    ("time", np.arange(one.num_frames) / 30),
+                ]
                 points, pos, turn = seen_from(CAMERA, one)
                 points = written(points, "mediapipe")
                 path = Path(folder, f"{i}.csv")

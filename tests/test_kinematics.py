@@ -77,10 +77,15 @@ class KinematicsTest(unittest.TestCase):
         for j in range(self.q.shape[-1]):
             shift = torch.zeros(self.q.shape[-1], dtype=torch.float64)
             shift[j] = step
-            ahead, behind = self.kinematics.link_poses(self.q + shift, links), self.kinematics.link_poses(self.q - shift, links)
+            ahead, behind = (
+                self.kinematics.link_poses(self.q + shift, links),
+                self.kinematics.link_poses(self.q - shift, links),
+            )
             points = [T[..., :3, 3] + (T[..., :3, :3] @ offsets[..., None])[..., 0] for T in (ahead, behind)]
             torch.testing.assert_close(jacobian.linear[..., j], (points[0] - points[1]) / (2 * step), atol=1e-8, rtol=0)
-            spin = (ahead - behind)[..., :3, :3] / (2 * step) @ jacobian.rot.mT  # the cross-product matrix of the angular velocity
+            spin = (
+                (ahead - behind)[..., :3, :3] / (2 * step) @ jacobian.rot.mT
+            )  # the cross-product matrix of the angular velocity
             omega = torch.stack((spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]), dim=-1)
             torch.testing.assert_close(jacobian.angular[..., j], omega, atol=1e-8, rtol=0)
 
@@ -91,7 +96,10 @@ class KinematicsTest(unittest.TestCase):
         moved = torch.eye(4, dtype=torch.float64)
         moved[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
         torch.testing.assert_close(
-            kinematics.link_poses(self.q, base=moved @ kinematics.base), moved @ kinematics.link_poses(self.q), atol=1e-12, rtol=0
+            kinematics.link_poses(self.q, base=moved @ kinematics.base),
+            moved @ kinematics.link_poses(self.q),
+            atol=1e-12,
+            rtol=0,
         )
 
     def test_a_subtree_moves_as_in_the_whole(self):
@@ -99,15 +107,22 @@ class KinematicsTest(unittest.TestCase):
         self.assertEqual(hand.joint_names, tuple(self.robot.joint_names[i] for i in self.robot.hand_indices))
         whole = self.kinematics.link_poses(self.q, hand.link_names)
         palm = self.kinematics.link_poses(self.q, ["palm"])[..., 0, :, :]
-        torch.testing.assert_close(hand.link_poses(self.q[..., hand.joint_indices], base=palm), whole, atol=1e-12, rtol=0)
+        torch.testing.assert_close(
+            hand.link_poses(self.q[..., hand.joint_indices], base=palm), whole, atol=1e-12, rtol=0
+        )
 
     def test_joint_order_is_the_descriptions(self):
         self.assertEqual(self.kinematics.joint_names, self.robot.joint_names)
-        self.assertNotEqual(self.robot.joint_names, tuple(j.name for j in self.kinematics.tree.joints if j.name in self.robot.joint_names))
+        self.assertNotEqual(
+            self.robot.joint_names,
+            tuple(j.name for j in self.kinematics.tree.joints if j.name in self.robot.joint_names),
+        )
 
     def test_limits_take_the_mimic_joint_into_account(self):
         column = self.robot.joint_names.index("jaw_a")
-        self.assertAlmostEqual(self.kinematics.upper[column].item(), 0.025)  # the mimic, at half its travel, is the first to end
+        self.assertAlmostEqual(
+            self.kinematics.upper[column].item(), 0.025
+        )  # the mimic, at half its travel, is the first to end
 
     def test_errors_name_the_cause(self):
         with self.assertRaisesRegex(RobotError, "no link 'nose' below"):
@@ -118,7 +133,9 @@ class KinematicsTest(unittest.TestCase):
         passive = dataclasses.replace(self.robot, mimics=())
         with self.assertRaisesRegex(RobotError, "jaw_b"):
             Kinematics(passive)
-        misnamed = dataclasses.replace(self.robot, urdf=write_urdf(self.folder / "other.urdf", rename={"arm_2": "arm_two"}))
+        misnamed = dataclasses.replace(
+            self.robot, urdf=write_urdf(self.folder / "other.urdf", rename={"arm_2": "arm_two"})
+        )
         with self.assertRaisesRegex(RobotError, "arm_two"):
             Kinematics(misnamed)
 

@@ -35,7 +35,9 @@ def observations(*batch: int, seed: int = 0) -> TensorDict:
 def make_model(kind: str = "actor") -> PointNetLstmModel:
     torch.manual_seed(0)
     gaussian = {"class_name": "GaussianDistribution", "std_type": "log"} if kind == "actor" else None
-    return PointNetLstmModel(observations(N), GROUPS, kind, A if kind == "actor" else 1, distribution_cfg=gaussian, **SMALL)
+    return PointNetLstmModel(
+        observations(N), GROUPS, kind, A if kind == "actor" else 1, distribution_cfg=gaussian, **SMALL
+    )
 
 
 def with_real_history(obs: TensorDict, first: torch.Tensor) -> TensorDict:
@@ -58,7 +60,9 @@ class ModelTest(unittest.TestCase):
         cloud = with_real_history(observations(T, N), first)["perception"]
         for begin in (0, 3):
             piece, starts = cloud[begin : begin + L], first[begin : begin + L]
-            torch.testing.assert_close(embed_sequences(model.trunk.pointnet, piece, starts), model.trunk.pointnet(piece))
+            torch.testing.assert_close(
+                embed_sequences(model.trunk.pointnet, piece, starts), model.trunk.pointnet(piece)
+            )
 
     def test_update_sees_what_the_rollout_saw(self):
         """Step by step with resets at episode ends gives the same outputs as one sequence with masks."""
@@ -88,7 +92,8 @@ class ModelTest(unittest.TestCase):
         obs["policy"].requires_grad_(True)
         together = model(obs, masks=first, hidden_state=(h.flatten(0, 1)[None], c.flatten(0, 1)[None]))
         apart = [
-            model(obs[i * L : (i + 1) * L], masks=first[i * L : (i + 1) * L], hidden_state=(h[i : i + 1], c[i : i + 1])) for i in range(2)
+            model(obs[i * L : (i + 1) * L], masks=first[i * L : (i + 1) * L], hidden_state=(h[i : i + 1], c[i : i + 1]))
+            for i in range(2)
         ]
         torch.testing.assert_close(together, torch.cat(apart))
         together[L:].sum().backward()
@@ -105,14 +110,18 @@ class ModelTest(unittest.TestCase):
 
         first = torch.zeros(T, N, dtype=torch.bool)
         first[2, 1] = first[6, 0] = True
-        states = tuple(torch.randn(1, 2 * N, SMALL["lstm_dim"], generator=torch.Generator().manual_seed(i)) for i in range(2))
+        states = tuple(
+            torch.randn(1, 2 * N, SMALL["lstm_dim"], generator=torch.Generator().manual_seed(i)) for i in range(2)
+        )
         obs, outputs, gradients = with_real_history(observations(T, N), first), [], []
         for on_gpu, low in ((False, False), (True, False), (True, True)):
             model = make_model()
             with (
                 mock.patch.object(torch.Tensor, "is_cuda", on_gpu),
                 mock.patch.object(torch.ops.aten, "_thnn_fused_lstm_cell", cell),
-                mock.patch.object(model.trunk.pointnet, "forward", lambda cloud, mlp=model.trunk.pointnet.mlp: mlp(cloud).amax(dim=-2)),
+                mock.patch.object(
+                    model.trunk.pointnet, "forward", lambda cloud, mlp=model.trunk.pointnet.mlp: mlp(cloud).amax(dim=-2)
+                ),
             ):
                 model.trunk.pointnet.use_bfloat16 = low
                 outputs.append(model(obs, masks=first, hidden_state=states))
@@ -138,7 +147,9 @@ class ModelTest(unittest.TestCase):
                 model.reset(dones[t])
         with torch.no_grad():
             for model in (plain, reusing):
-                model(obs, masks=first, hidden_state=(torch.zeros(1, N, 12), torch.zeros(1, N, 12)))  # as an update does
+                model(
+                    obs, masks=first, hidden_state=(torch.zeros(1, N, 12), torch.zeros(1, N, 12))
+                )  # as an update does
                 model.trunk.pointnet.mlp[0].weight.mul_(2.0)
         torch.testing.assert_close(reusing(obs[T - 1]), plain(obs[T - 1]))
 
@@ -172,8 +183,15 @@ def places(alg: SequencePpo) -> dict[str, int]:
     tensors = {f"actor {name}": value for name, value in alg.actor.state_dict().items()}
     tensors |= {f"critic {name}": value for name, value in alg.critic.state_dict().items()}
     tensors |= dict(storage.observations.items()) | {"rate": alg._rate, "sums": alg._sums}
-    tensors |= {name: getattr(storage, name) for name in ("actions", "values", "dones", "returns", "advantages", "actions_log_prob")}
-    lists = {"params": storage.distribution_params, "state a": storage.saved_hidden_state_a, "state c": storage.saved_hidden_state_c}
+    tensors |= {
+        name: getattr(storage, name)
+        for name in ("actions", "values", "dones", "returns", "advantages", "actions_log_prob")
+    }
+    lists = {
+        "params": storage.distribution_params,
+        "state a": storage.saved_hidden_state_a,
+        "state c": storage.saved_hidden_state_c,
+    }
     tensors |= {f"{name} {i}": value for name, values in lists.items() for i, value in enumerate(values)}
     return {name: value.data_ptr() for name, value in tensors.items()}
 
@@ -223,7 +241,9 @@ class StorageTest(unittest.TestCase):
         class Bandit:
             num_envs, num_actions = 64, A
 
-        model = ModelConfig(pointnet=(8, 6), lstm=12, mlp=(16,), initial_std=0.5, normalize_returns=ppo.pop("normalize_returns", False))
+        model = ModelConfig(
+            pointnet=(8, 6), lstm=12, mlp=(16,), initial_std=0.5, normalize_returns=ppo.pop("normalize_returns", False)
+        )
         config = TrainConfig(model=model, ppo=PpoConfig(horizon=8, minibatch_size=128, **ppo))
         torch.manual_seed(0)
         obs = observations(64).to(device)
@@ -264,7 +284,10 @@ class StorageTest(unittest.TestCase):
         # end 60 steps x 3e-4 away: 0.018. An adaptive rate multiplies that: a step more or less of it is a factor of 1.5.
         for tolerance, options in (
             (1e-2, {"schedule": "fixed", "learning_rate": 3e-4}),
-            (1e-2, {"schedule": "fixed", "learning_rate": 3e-4, "normalize_returns": True, "critic_learning_rate": 3e-4}),
+            (
+                1e-2,
+                {"schedule": "fixed", "learning_rate": 3e-4, "normalize_returns": True, "critic_learning_rate": 3e-4},
+            ),
             (5e-2, {}),
         ):
             (one, before, plain), (two, _, captured) = (
@@ -285,14 +308,20 @@ class StorageTest(unittest.TestCase):
                 with torch.no_grad():
                     act(alg, obs)
                 recorded.append(
-                    {name: value for name, value in vars(alg.transition).items() if value is not None and name != "observations"}
+                    {
+                        name: value
+                        for name, value in vars(alg.transition).items()
+                        if value is not None and name != "observations"
+                    }
                 )
                 done = torch.arange(64) % 4 == t
                 alg.process_env_step(obs, torch.ones(64), done, {"time_outs": done.float()})
             torch.testing.assert_close(*recorded, rtol=0, atol=0)
         torch.testing.assert_close(one.storage.rewards, two.storage.rewards, rtol=0, atol=0)
 
-    @unittest.skipUnless(torch.cuda.is_available(), "there is no CUDA device: values are computed beside the step on GPUs only")
+    @unittest.skipUnless(
+        torch.cuda.is_available(), "there is no CUDA device: values are computed beside the step on GPUs only"
+    )
     def test_values_beside_the_step_are_those_in_front_of_it(self):
         stored = []
         for beside in (True, False):
@@ -325,13 +354,17 @@ class ReturnCriticTest(unittest.TestCase):
         critic.take_returns(returns)
         critic.reset()
         torch.testing.assert_close(critic(obs), before, atol=1e-4, rtol=1e-4)
-        torch.testing.assert_close((critic.return_mean, critic.return_std), (returns.mean(), returns.std(unbiased=False)))
+        torch.testing.assert_close(
+            (critic.return_mean, critic.return_std), (returns.mean(), returns.std(unbiased=False))
+        )
         for _ in range(3):
             critic.take_returns(returns + 10.0)
         critic.reset()
         torch.testing.assert_close(critic(obs), before, atol=1e-4, rtol=1e-4)
         everything = torch.cat((returns, *[returns + 10.0] * 3))
-        torch.testing.assert_close((critic.return_mean, critic.return_std), (everything.mean(), everything.std(unbiased=False)))
+        torch.testing.assert_close(
+            (critic.return_mean, critic.return_std), (everything.mean(), everything.std(unbiased=False))
+        )
 
 
 class ExportTest(unittest.TestCase):
@@ -344,7 +377,10 @@ class ExportTest(unittest.TestCase):
         cls.model.update_normalization(observations(50, seed=9))
         task = TaskConfig(observation=ObservationConfig(cloud_points=10))
         widths = {"policy": {"all": 7}, "proprio": {"all": 9}, "perception": {"cloud": 5 * 10 * 3}}  # of observations()
-        contract = policy_contract(robots.load("openarm"), task, ()) | {"observation_layout": widths, "joint_names": list("abcde")}
+        contract = policy_contract(robots.load("openarm"), task, ()) | {
+            "observation_layout": widths,
+            "joint_names": list("abcde"),
+        }
         export_onnx(cls.model, cls.file, contract)
 
     def test_exported_equals_eager_over_50_steps(self):
@@ -393,7 +429,10 @@ class ConfigTest(unittest.TestCase):
 
     def test_numbers_that_make_no_sense_are_refused(self):
         for make, problem in (
-            (lambda: PpoConfig(sequence_length=5), "sequence_length is 5, expected a divisor of the horizon, which is 16"),
+            (
+                lambda: PpoConfig(sequence_length=5),
+                "sequence_length is 5, expected a divisor of the horizon, which is 16",
+            ),
             (lambda: PpoConfig(discount=1.01), "discount is 1.01, expected a number from 0 to 1"),
             (lambda: PpoConfig(entropy=float("nan")), "entropy is nan"),
             (lambda: ModelConfig(initial_std=0.0), "initial_std is 0.0, expected a number above 0"),
@@ -401,8 +440,14 @@ class ConfigTest(unittest.TestCase):
             (lambda: ModelConfig(mlp=(64, 0)), "mlp is .*expected one width or more"),
             (lambda: TrainConfig(save_interval=0), "save_interval is 0"),
             (lambda: ResetConfig(demo_probability=50.0), "demo_probability is 50.0, expected a number from 0 to 1"),
-            (lambda: RandomizationConfig(friction=(1.0, 0.5)), "friction is \\(1.0, 0.5\\), expected two finite numbers"),
-            (lambda: TerminationConfig(object_low=2.0), "object_low is 2.0, expected less than object_high, which is 1.0"),
+            (
+                lambda: RandomizationConfig(friction=(1.0, 0.5)),
+                "friction is \\(1.0, 0.5\\), expected two finite numbers",
+            ),
+            (
+                lambda: TerminationConfig(object_low=2.0),
+                "object_low is 2.0, expected less than object_high, which is 1.0",
+            ),
             (lambda: TaskConfig(substeps=0), "substeps is 0"),
         ):
             with self.subTest(problem), self.assertRaisesRegex(ValueError, problem):

@@ -16,7 +16,9 @@ def boxes(*parts: tuple[tuple[float, float, float], tuple[float, float, float]])
     """An object made of boxes (centre, size)."""
     pieces = tuple(box(center, size) for center, size in parts)
     vertices, faces = surface_of(pieces)
-    return ObjectSpec(name="block", pieces=pieces, mass=1.0, com=np.zeros(3), inertia=np.eye(3), vertices=vertices, faces=faces)
+    return ObjectSpec(
+        name="block", pieces=pieces, mass=1.0, com=np.zeros(3), inertia=np.eye(3), vertices=vertices, faces=faces
+    )
 
 
 class MirrorTest(unittest.TestCase):
@@ -35,7 +37,13 @@ class MirrorTest(unittest.TestCase):
         self.assertAlmostEqual(found.offset * np.sign(found.normal[2]), 0.01, delta=2e-4)
 
     def test_a_body_without_one_is_measured_to_have_none(self):
-        found = symmetry(boxes(((0, 0, 0), (0.12, 0.03, 0.04)), ((0.045, 0.05, 0), (0.03, 0.08, 0.04)), ((0, 0, 0.05), (0.03, 0.03, 0.08))))
+        found = symmetry(
+            boxes(
+                ((0, 0, 0), (0.12, 0.03, 0.04)),
+                ((0.045, 0.05, 0), (0.03, 0.08, 0.04)),
+                ((0, 0, 0.05), (0.03, 0.03, 0.08)),
+            )
+        )
         self.assertGreater(found.deviation, 0.008)
 
     def test_the_object_and_the_hand_are_where_their_reflections_are(self):

@@ -20,7 +20,10 @@ def across_an_edge() -> mujoco.MjModel:
     can = trimesh.creation.cylinder(0.033, 0.1, sections=24)
     spec = mujoco.MjSpec()
     spec.add_mesh(
-        name="can", uservert=can.vertices.ravel(), userface=can.faces.ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        name="can",
+        uservert=can.vertices.ravel(),
+        userface=can.faces.ravel(),
+        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX,
     )
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="can")
     body = spec.worldbody.add_body()

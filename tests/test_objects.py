@@ -222,7 +222,9 @@ class MeshImport(unittest.TestCase):
         result = import_with_notes(path, "thing")
         self.assertEqual(len(result.obj.pieces), 1)
         self.assertAlmostEqual(result.obj.mass, DEFAULT_DENSITY * 0.1 * 0.06 * 0.04)
-        np.testing.assert_allclose(np.diag(result.obj.inertia), result.obj.mass / 12 * np.array([0.0052, 0.0116, 0.0136]), rtol=1e-6)
+        np.testing.assert_allclose(
+            np.diag(result.obj.inertia), result.obj.mass / 12 * np.array([0.0052, 0.0116, 0.0136]), rtol=1e-6
+        )
         self.assertIn("mass is not known", result.notes[0])
         self.assertEqual(import_with_notes(path, "thing", mass=0.2).obj.mass, 0.2)
 
@@ -240,8 +242,12 @@ class MeshImport(unittest.TestCase):
         self.assertGreaterEqual(len(first.obj.pieces), 2)
         volume = sum(shape_mesh(piece).volume for piece in first.obj.pieces)
         self.assertAlmostEqual(volume / (0.0051 * 0.02), 1.0, delta=0.05)
-        np.testing.assert_allclose(first.obj.com[:2], (0.003 * 0.05 + 0.0021 * 0.015) / 0.0051, atol=1e-6)  # two rectangles
-        self.assertGreater(distance_to_pieces(np.array([[0.07, 0.07, 0.01]]), first.obj)[0], 0.02)  # the notch stays open
+        np.testing.assert_allclose(
+            first.obj.com[:2], (0.003 * 0.05 + 0.0021 * 0.015) / 0.0051, atol=1e-6
+        )  # two rectangles
+        self.assertGreater(
+            distance_to_pieces(np.array([[0.07, 0.07, 0.01]]), first.obj)[0], 0.02
+        )  # the notch stays open
         second = import_with_notes(path, "bracket", mass=0.1)
         self.assertTrue(second.cached)
         for a, b in zip(first.obj.pieces, second.obj.pieces, strict=True):
@@ -254,7 +260,10 @@ class MeshImport(unittest.TestCase):
 
     def test_without_manifold3d_the_error_names_the_remedy(self):
         path = self.write(self.bracket())
-        with mock.patch.dict("sys.modules", {"manifold3d": None}), self.assertRaisesRegex(ObjectError, r"pip install 'xreset\[objects\]'"):
+        with (
+            mock.patch.dict("sys.modules", {"manifold3d": None}),
+            self.assertRaisesRegex(ObjectError, r"pip install 'xreset\[objects\]'"),
+        ):
             import_with_notes(path, "bracket")
 
     def test_an_unwritable_cache_does_no_harm(self):
@@ -303,12 +312,19 @@ class MeshImport(unittest.TestCase):
             add_mesh(path, out, "other")
         with self.assertRaisesRegex(ObjectError, "is no name"):
             add_mesh(path, out, "../other", scale=0.001)
-        with mock.patch("xreset.objects.meshes.cached_pieces", side_effect=ObjectError("no")), self.assertRaises(ObjectError):
+        with (
+            mock.patch("xreset.objects.meshes.cached_pieces", side_effect=ObjectError("no")),
+            self.assertRaises(ObjectError),
+        ):
             add_mesh(path, out, "other", scale=0.001, properties=Properties(mass=1.0))
         self.assertEqual(sorted(p.name for p in out.iterdir()), ["brick.obj", "brick.toml"])
 
     def test_the_command_puts_a_mesh_into_a_folder_and_draws_it(self):
-        path, out, png = self.write(trimesh.creation.box((100, 60, 40)), "a brick"), self.folder / "objects", self.folder / "a.png"
+        path, out, png = (
+            self.write(trimesh.creation.box((100, 60, 40)), "a brick"),
+            self.folder / "objects",
+            self.folder / "a.png",
+        )
         with contextlib.redirect_stdout(io.StringIO()) as said:
             main(
                 [
@@ -381,7 +397,9 @@ class MeshImport(unittest.TestCase):
             for file in files:
                 mesh.export(self.folder / name / file)
         found = {name: path.name for name, path in mesh_files(self.folder).items()}
-        self.assertEqual(found, {"011_banana": "011_banana.obj", "024_bowl": "textured.obj", "025_mug": "textured_simple.obj"})
+        self.assertEqual(
+            found, {"011_banana": "011_banana.obj", "024_bowl": "textured.obj", "025_mug": "textured_simple.obj"}
+        )
         with self.assertLogs("xreset.objects.meshes", "WARNING") as log:
             self.assertEqual(load_object("banana", self.folder).mass, 0.066)
         self.assertIn("hollow", log.output[0])  # 66 g in a litre
@@ -433,7 +451,9 @@ class ThinWalls(unittest.TestCase):
         self.assertLess(len(pieces.shapes), 40)
         self.assertGreater(len(seen), 5)
         self.assertGreater(self.room(np.array([0, 0, 0.05]), pieces), 0.030)  # the cup's inner radius is 36.5 mm
-        self.assertGreater(self.room(np.array([0.051, 0, 0.045]), pieces), 0.008)  # a finger of 16 mm through the handle
+        self.assertGreater(
+            self.room(np.array([0.051, 0, 0.045]), pieces), 0.008
+        )  # a finger of 16 mm through the handle
         self.assertAlmostEqual(pieces.volume, mug.volume, delta=1e-9)
 
     def test_the_stated_deviation_is_the_measured_one(self):
@@ -447,7 +467,9 @@ class ThinWalls(unittest.TestCase):
 
     def test_a_small_bridge_on_a_large_piece_is_seen(self):
         """The middle of what covers a hollow is 4 mm from its walls; a few hundred points of the plate would miss it."""
-        hollow = trimesh.creation.box((0.008, 0.008, 0.012), transform=trimesh.transformations.translation_matrix((0.05, 0.03, 0.01)))
+        hollow = trimesh.creation.box(
+            (0.008, 0.008, 0.012), transform=trimesh.transformations.translation_matrix((0.05, 0.03, 0.01))
+        )
         plate = trimesh.boolean.difference([trimesh.creation.box((0.3, 0.3, 0.02)), hollow])
         pieces = decompose(plate)
         self.assertEqual(len(pieces.shapes), 1)
@@ -455,7 +477,9 @@ class ThinWalls(unittest.TestCase):
 
     def test_an_open_sheet_becomes_a_thin_wall(self):
         angle = np.linspace(0, 1.0, 6)
-        sheet = trimesh.creation.revolve(np.column_stack((0.05 * np.sin(angle), 0.05 - 0.05 * np.cos(angle))), sections=16)
+        sheet = trimesh.creation.revolve(
+            np.column_stack((0.05 * np.sin(angle), 0.05 - 0.05 * np.cos(angle))), sections=16
+        )
         self.assertFalse(sheet.is_volume)
         solid = as_solid(sheet)
         self.assertAlmostEqual(solid.volume(), sheet.area * 0.001, delta=0.1 * sheet.area * 0.001)

@@ -33,7 +33,9 @@ class PadsTest(unittest.TestCase):
         """A jaw turned by an angle [rad] about its axis of approach, its pads 2 mm from the box's edges, and keypoints that are its own."""
         turn = quat_from_axis_angle(torch.tensor([0.0, 0.0, angle], dtype=FLOAT)).expand(1, frames, 4)
         half = 0.025 * (math.cos(angle) + math.sin(angle)) + 0.002
-        joints = torch.full((1, frames, 1), half - 0.0005, dtype=FLOAT)  # 0.5 mm is either pad from the middle of the closed jaw
+        joints = torch.full(
+            (1, frames, 1), half - 0.0005, dtype=FLOAT
+        )  # 0.5 mm is either pad from the middle of the closed jaw
         middle = self.model.keypoints(joints, torch.zeros(1, frames, 3, dtype=FLOAT), turn)[:, :, 1:].mean(dim=2)
         state = HandState(joints=joints, root_pos=UP - middle, root_quat=turn)
         keypoints = self.model.keypoints(joints, state.root_pos, turn)
@@ -94,7 +96,9 @@ class PadsTest(unittest.TestCase):
                 )
                 costs.append(system(self.model, targets, config, moved).cost)
             slope = (costs[0] - costs[1]) / (4 * step)  # gradient is half the derivative
-            torch.testing.assert_close(found.gradient[:, 1, k], slope, rtol=2e-3, atol=2e-4 * float(found.gradient.abs().max()))
+            torch.testing.assert_close(
+                found.gradient[:, 1, k], slope, rtol=2e-3, atol=2e-4 * float(found.gradient.abs().max())
+            )
 
     def test_an_object_is_held_between_the_human_s_thumb_and_a_finger(self):
         demos = synthesize(["soup"], per_object=1, seed=1)

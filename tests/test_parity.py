@@ -68,7 +68,9 @@ def between(kinematics: Kinematics, q: torch.Tensor) -> torch.Tensor:
     return 0.5 * (points[:, 1:].mean(1) + points[:, 0])
 
 
-def frames_above(robot: RobotSpec, thing: ObjectSpec, offsets=OFFSETS, *, gap: float = 0.066, height: float = 0.06) -> Frames:
+def frames_above(
+    robot: RobotSpec, thing: ObjectSpec, offsets=OFFSETS, *, gap: float = 0.066, height: float = 0.06
+) -> Frames:
     """The home pose's hand lowered over an upright object at several places between its fingers, and the same lifted by 0.1 m."""
     kinematics = Kinematics(robot)
     home = torch.as_tensor(robot.home)[None]
@@ -104,7 +106,9 @@ def altered(base: Engine, name: str, **changes) -> Engine:
 
     def make(scene: SceneSpec, num_worlds: int, object_index: torch.Tensor):
         return base.make(
-            replace(scene, **{field: change(getattr(scene, field)) for field, change in changes.items()}), num_worlds, object_index
+            replace(scene, **{field: change(getattr(scene, field)) for field, change in changes.items()}),
+            num_worlds,
+            object_index,
         )
 
     return replace(base, name=name, make=make)
@@ -147,7 +151,9 @@ class Episodes(unittest.TestCase):
             moved = ((after - before) * line[:, None]).sum(-1)[0]
             expected = torch.full_like(moved, -distance)
             expected[0] = distance
-            torch.testing.assert_close(moved, expected, atol=0.2 * abs(distance), rtol=0, msg=f"{name} {distance}: {moved}")
+            torch.testing.assert_close(
+                moved, expected, atol=0.2 * abs(distance), rtol=0, msg=f"{name} {distance}: {moved}"
+            )
             arm = torch.as_tensor(kinematics.robot.arm_indices)
             torch.testing.assert_close(q[:, arm], home[:, arm], rtol=0, atol=0)
 
@@ -186,7 +192,10 @@ class Episodes(unittest.TestCase):
         closing = BRISK.closing_steps(DT)
         self.assertEqual(closing, 36)
         self.assertEqual(len(episode), 36 + 30 + 12 + 2 * 24)
-        gaps = [float((t[:, 1:].mean(1) - t[:, 0]).norm()) for t in (tips(self.kinematics, q.double()) for q in episode.targets)]
+        gaps = [
+            float((t[:, 1:].mean(1) - t[:, 0]).norm())
+            for t in (tips(self.kinematics, q.double()) for q in episode.targets)
+        ]
         self.assertAlmostEqual(gaps[5], gaps[0], places=6)  # settling
         self.assertGreater(gaps[5], gaps[closing - 1] + 0.05)
         torch.testing.assert_close(episode.start.joint_pos, episode.targets[0])
@@ -247,11 +256,18 @@ class Finding(unittest.TestCase):
             return Frames(**values | {"sequence_name": np.array(sequences), "frame": np.array(numbers)})
 
         cans, spams = repeated(one, ["a", "a", "a", "b"], [1, 2, 3, 9]), repeated(other, ["c", "c"], [4, 5])
-        joined = Frames(**{name: np.concatenate((getattr(cans, name), getattr(spams, name))) for name in Frames.__dataclass_fields__})
+        joined = Frames(
+            **{
+                name: np.concatenate((getattr(cans, name), getattr(spams, name)))
+                for name in Frames.__dataclass_fields__
+            }
+        )
         found = find_grasps(joined, self.robot, [self.can, spam], 6, where="table")
         self.assertEqual(found.label, ("a:3", "c:5", "b:9", "c:4", "a:2", "a:1"))
         self.assertEqual(found.object_index.tolist(), [0, 1, 0, 1, 0, 0])
-        self.assertEqual(find_grasps(joined, self.robot, [self.can, spam], 3, where="table").label, ("a:3", "c:5", "b:9"))
+        self.assertEqual(
+            find_grasps(joined, self.robot, [self.can, spam], 3, where="table").label, ("a:3", "c:5", "b:9")
+        )
 
 
 def recording(**changes) -> Recording:
@@ -295,7 +311,9 @@ class Numbers(unittest.TestCase):
     def test_only_the_last_steps_of_a_press_count(self):
         force = recording().tip_force.clone()
         force[0] *= 100
-        self.assertEqual([m.measured for m in press_metrics(recording(tip_force=force), recording(), steps=2)], [0.0, 0.0])
+        self.assertEqual(
+            [m.measured for m in press_metrics(recording(tip_force=force), recording(), steps=2)], [0.0, 0.0]
+        )
 
     def test_nothing_to_compare_misses_the_target(self):
         none = recording(tip_force=torch.zeros(3, 2, 2, 3))
@@ -308,7 +326,9 @@ class Numbers(unittest.TestCase):
         high = torch.zeros(3, 2, 3)
         high[-1, :, 2] = torch.tensor([0.06, 0.04])
         self.assertEqual(carried(recording(object_pos=high), 0.1).tolist(), [True, False])
-        self.assertEqual(carried(recording(object_pos=high, broken=torch.tensor([True, False])), 0.1).tolist(), [False, False])
+        self.assertEqual(
+            carried(recording(object_pos=high, broken=torch.tensor([True, False])), 0.1).tolist(), [False, False]
+        )
         flags = torch.tensor([True, True, True, False, False])
         metric = outcome_metric("x", "", 0.7, flags, torch.tensor([True, True, False, True, False]))
         self.assertAlmostEqual(metric.measured, 0.6)
@@ -376,7 +396,11 @@ class Comparing(unittest.TestCase):
         """Else an engine in which nothing, or everything, is carried would agree."""
         outcomes = self.result.reference.carried
         for kind in ("closing", "hold"):
-            self.assertEqual({flag for name, flags in outcomes.items() if name.startswith(kind) for flag in flags}, {True, False}, outcomes)
+            self.assertEqual(
+                {flag for name, flags in outcomes.items() if name.startswith(kind) for flag in flags},
+                {True, False},
+                outcomes,
+            )
 
     def test_the_timestep_matters_little(self):
         metrics = {metric.name: metric for metric in self.result.floor.metrics}
@@ -413,7 +437,10 @@ class Comparing(unittest.TestCase):
         self.assertEqual(data["schema"], "xreset-parity/1")
         self.assertFalse(data["ok"])
         row = data["engines"][0]["metrics"][0]
-        self.assertEqual({"metric", "target", "measured", "n", "verdict"} & set(row), {"metric", "target", "measured", "n", "verdict"})
+        self.assertEqual(
+            {"metric", "target", "measured", "n", "verdict"} & set(row),
+            {"metric", "target", "measured", "n", "verdict"},
+        )
         self.assertEqual(len(data["grasps"]["hold"]), len(data["engines"][0]["carried"]["hold 0.5"]))
 
 
@@ -496,7 +523,10 @@ class Command(unittest.TestCase):
 
     def test_a_file_is_measured_and_the_exit_code_says_the_verdict(self):
         path, out = self.retargeted(), self.folder / "parity.json"
-        good, bad = engine("mujoco", workers=0), altered(engine("mujoco", workers=0), "pybullet", robot=lambda r: with_drives(r, 0.3))
+        good, bad = (
+            engine("mujoco", workers=0),
+            altered(engine("mujoco", workers=0), "pybullet", robot=lambda r: with_drives(r, 0.3)),
+        )
         for made, code in ((replace(good, name="pybullet"), None), (bad, 1)):
             with (
                 mock.patch("xreset.eval.trial.engine", lambda name, made=made, **_: made),
@@ -524,7 +554,9 @@ class Command(unittest.TestCase):
 
     def test_files_that_show_grasps(self):
         robot, objects, frames = load_frames(self.retargeted())
-        self.assertEqual((robot.name, [o.name for o in objects], len(frames.frame)), ("ur7e-sharpa", ["005_tomato_soup_can"], 6))
+        self.assertEqual(
+            (robot.name, [o.name for o in objects], len(frames.frame)), ("ur7e-sharpa", ["005_tomato_soup_can"], 6)
+        )
         bank = toy_bank(robot)
         shown = Frames.of_bank(bank)
         self.assertEqual(shown.sequence_name.tolist(), ["demo_a", "demo_b", "demo_c"])

@@ -32,7 +32,9 @@ from xreset.policy import OnnxPolicy, policy_contract
 from xreset.task.config import ObservationConfig, TaskConfig, TerminationConfig
 
 TASK = TaskConfig(
-    observation=ObservationConfig(cloud_history=2, cloud_points=8), termination=TerminationConfig(episode_seconds=0.5), distance_points=32
+    observation=ObservationConfig(cloud_history=2, cloud_points=8),
+    termination=TerminationConfig(episode_seconds=0.5),
+    distance_points=32,
 )
 GROUPS = {"actor": ["policy", "proprio", "perception"]}
 
@@ -154,7 +156,10 @@ class ShrinkTest(WithPolicy):
             ),
             ("joint_names is missing", {"metadata": json.dumps(self.contract | {"joint_names": [1, 2]})}),
         ):
-            with self.subTest(words, **{k: str(v)[:40] for k, v in changes.items()}), self.assertRaisesRegex(PolicyError, words):
+            with (
+                self.subTest(words, **{k: str(v)[:40] for k, v in changes.items()}),
+                self.assertRaisesRegex(PolicyError, words),
+            ):
                 OnnxPolicy(write_policy(path, self.contract, **changes))
         write_policy(path, self.contract)
         path.write_bytes(path.read_bytes().replace(b'"schema"', b"\xff\xfe\xff\xfe\xff\xfe\xff\xfe"))
@@ -165,7 +170,9 @@ class ShrinkTest(WithPolicy):
         model, damaged = onnx.load(str(self.file)), self.folder / "damaged.onnx"
         entry = next(e for e in model.metadata_props if e.key == "xreset")
         contract = entry.value
-        partial = json.dumps({name: value for name, value in json.loads(contract).items() if name != "robot"} | {"task": []})
+        partial = json.dumps(
+            {name: value for name, value in json.loads(contract).items() if name != "robot"} | {"task": []}
+        )
         for text, said in (
             ("{nope", "not valid JSON"),
             ("[]", r"a JSON list, expected an object"),
@@ -212,7 +219,9 @@ class ShippedTest(WithPolicy):
     def test_a_name_means_the_shipped_file(self):
         self.assertEqual(list(policies.shipped()), ["skilled"])
         subject = resolve("skilled", None, 0)
-        self.assertEqual((subject.label, subject.robot.name, subject.folder), ("skilled", "openarm", Path("runs/skilled/eval")))
+        self.assertEqual(
+            (subject.label, subject.robot.name, subject.folder), ("skilled", "openarm", Path("runs/skilled/eval"))
+        )
         self.assertEqual(subject.task, TASK)
         self.assertEqual(subject.inputs, resolve(str(self.file), None, 0).inputs)
 
@@ -228,7 +237,18 @@ class ShippedTest(WithPolicy):
         card.write_text(text)
         code, out, err = run("policies", "list")
         self.assertEqual((code, err), (0, ""))
-        for part in ("skilled: Lifts.", "four demonstrations", "one minute", "MIT", "openarm", SOUP, "mujoco", "90 %", "sapien", "70 %"):
+        for part in (
+            "skilled: Lifts.",
+            "four demonstrations",
+            "one minute",
+            "MIT",
+            "openarm",
+            SOUP,
+            "mujoco",
+            "90 %",
+            "sapien",
+            "70 %",
+        ):
             self.assertIn(part, out)
         for wrong, problem in (
             (text.replace("card/1", "card/9"), "states schema"),

@@ -23,7 +23,17 @@ from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.workers import STATE_FIELDS, _sweep, _Worker
 from xreset.errors import CapabilityError, RobotError, XResetError
 from xreset.physics import State
-from xreset.spec import DriveSpec, FingertipSpec, Geometry, JointSpec, ObjectSpec, RobotSpec, SceneSpec, Shape, lowest_point
+from xreset.spec import (
+    DriveSpec,
+    FingertipSpec,
+    Geometry,
+    JointSpec,
+    ObjectSpec,
+    RobotSpec,
+    SceneSpec,
+    Shape,
+    lowest_point,
+)
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -103,7 +113,10 @@ class ToyBackend(PoolBackend):
 
 
 def toy_scene() -> SceneSpec:
-    joints = tuple(JointSpec(name=f"j{i}", group="arm", drive=DriveSpec(kp=1.0, kd=0.1, effort=1.0), home=0.1 * (i + 1)) for i in range(2))
+    joints = tuple(
+        JointSpec(name=f"j{i}", group="arm", drive=DriveSpec(kp=1.0, kd=0.1, effort=1.0), home=0.1 * (i + 1))
+        for i in range(2)
+    )
     tips = tuple(FingertipSpec(name=n, link=n, contact_links=(n,), keypoint="thumb4") for n in ("thumb", "index"))
     robot = RobotSpec(
         name="toy", urdf=Path("toy.urdf"), joints=joints, base_pos=(0, 0, 0), base_quat=(1, 0, 0, 0), palm="palm",
@@ -228,7 +241,9 @@ class PoolTest(unittest.TestCase):
             pool.set_object_wrench(torch.ones(5, 3), torch.zeros(5, 3))
             before = pool.state().object_linvel.clone()
             pool.step(1)
-            torch.testing.assert_close((pool.state().object_linvel - before)[:, 0], torch.tensor([0.125, 0.5, 1.0, 0.5, 0.25]))
+            torch.testing.assert_close(
+                (pool.state().object_linvel - before)[:, 0], torch.tensor([0.125, 0.5, 1.0, 0.5, 0.25])
+            )
             pool.set_object_mass(torch.tensor([1.0, 1.0]), torch.tensor([4, 0]))
 
     def test_every_broken_number_of_a_state_is_noticed(self):
@@ -260,7 +275,9 @@ class PoolTest(unittest.TestCase):
             targets = torch.zeros(5, 2)
             targets[3, 0] = 13.0
             pool.set_joint_targets(targets)
-            with self.assertRaisesRegex(RuntimeError, r"(?s)'toy', world 3, step: ZeroDivisionError: unlucky.*in set_joint_targets"):
+            with self.assertRaisesRegex(
+                RuntimeError, r"(?s)'toy', world 3, step: ZeroDivisionError: unlucky.*in set_joint_targets"
+            ):
                 pool.step(1)
             targets[3, 0] = 14.0
             pool.set_joint_targets(targets)
@@ -399,7 +416,9 @@ class RestHeightTest(unittest.TestCase):
         ]
         for geometry, points, margin in cases:
             expected = (points @ T[:3, :3].T + T[:3, 3])[:, 2].min() - margin
-            self.assertAlmostEqual(lowest_point([Shape(geometry=geometry, T_body_shape=T)]), expected, places=5, msg=geometry.kind)
+            self.assertAlmostEqual(
+                lowest_point([Shape(geometry=geometry, T_body_shape=T)]), expected, places=5, msg=geometry.kind
+            )
 
 
 class LeftBehind(unittest.TestCase):

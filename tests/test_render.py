@@ -89,11 +89,15 @@ class Pictures(unittest.TestCase):
             orange = (picture[..., 0] > picture[..., 2] + 60) & self.changed(picture, empty)
             y, x = np.nonzero(orange)
             expected = pixel(self.camera, self.size, position)
-            np.testing.assert_allclose((x.min() / 2 + x.max() / 2 + 0.5, y.min() / 2 + y.max() / 2 + 0.5), expected, atol=2.0)
+            np.testing.assert_allclose(
+                (x.min() / 2 + x.max() / 2 + 0.5, y.min() / 2 + y.max() / 2 + 0.5), expected, atol=2.0
+            )
 
     def test_object_index_picks_the_object(self):
         empty = self.renderer.draw(self.home)
-        small, large = (self.changed(self.renderer.draw(self.home, at(0.4, 0.1, 0.4), object_index=i), empty).sum() for i in (0, 1))
+        small, large = (
+            self.changed(self.renderer.draw(self.home, at(0.4, 0.1, 0.4), object_index=i), empty).sum() for i in (0, 1)
+        )
         self.assertGreater(large, 2.5 * small)
 
     def test_the_robot_moves_with_its_joints(self):
@@ -108,7 +112,9 @@ class Pictures(unittest.TestCase):
         picture = self.renderer.draw(self.home, front)
         self.assertGreater(int(picture[centre][0]), int(picture[centre][2]) + 40)  # orange
         behind = at(*(eye + 3.0 * (target - eye)))
-        np.testing.assert_array_equal(self.renderer.draw(self.home, behind)[centre], self.renderer.draw(self.home)[centre])
+        np.testing.assert_array_equal(
+            self.renderer.draw(self.home, behind)[centre], self.renderer.draw(self.home)[centre]
+        )
 
     def test_shadow_falls_on_the_table_away_from_the_light(self):
         above = np.array([0.35, 0.1, 0.25])
@@ -151,7 +157,9 @@ class Pictures(unittest.TestCase):
     def test_overlays_outside_the_picture_or_behind_the_camera_do_no_harm(self):
         far = Points(pos=np.array([[50.0, 0, 0], [1.3, -1.5, 0.9], [1.28, -0.5, 0.9]]))
         frames = Frames(poses=np.stack((at(50, 0, 0), at(1.3, -1.5, 0.9))))
-        np.testing.assert_array_equal(self.renderer.draw(self.home, points=[far], frames=[frames]), self.renderer.draw(self.home))
+        np.testing.assert_array_equal(
+            self.renderer.draw(self.home, points=[far], frames=[frames]), self.renderer.draw(self.home)
+        )
 
     def test_a_picture_may_have_its_own_camera(self):
         near = Camera(eye=(0.8, -0.1, 0.5), target=(0.4, 0.1, 0.1))
@@ -176,7 +184,9 @@ class Pictures(unittest.TestCase):
             robot = load(name)
             colors = dict(zip(Kinematics(robot).link_names, link_colors(robot), strict=True))
             self.assertEqual(colors[robot.hand_root], meshes.PALM_COLOR)
-            self.assertEqual({colors[link] for tip in robot.fingertips for link in tip.contact_links}, {meshes.TIP_COLOR})
+            self.assertEqual(
+                {colors[link] for tip in robot.fingertips for link in tip.contact_links}, {meshes.TIP_COLOR}
+            )
             self.assertEqual(colors[Kinematics(robot).link_names[0]], meshes.ARM_COLOR)
         self.assertEqual(colors["right_index_MP"], meshes.HAND_COLOR)
 

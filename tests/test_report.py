@@ -148,7 +148,11 @@ class CollectTest(InFolder):
     def test_engines_that_were_not_evaluated_alike_are_pointed_out(self):
         alike = (toy_summary("mujoco"), toy_summary("sapien"))
         self.assertEqual(differences(alike), [])
-        for what, change in (("seed", {"seed": 4}), ("policy", {"policy": "ik"}), ("demonstrations", {"inputs": {"demos": "cd"}})):
+        for what, change in (
+            ("seed", {"seed": 4}),
+            ("policy", {"policy": "ik"}),
+            ("demonstrations", {"inputs": {"demos": "cd"}}),
+        ):
             notes = differences((toy_summary("mujoco"), toy_summary("sapien", **change)))
             self.assertEqual(len(notes), 1)
             self.assertRegex(notes[0], f"not comparable: the {what} differs .mujoco: .*sapien: ")
@@ -160,11 +164,21 @@ class CollectTest(InFolder):
         for i, engine in enumerate(("mujoco", "sapien")):
             point = {"task_progress": 0.8, "ci95": (0.7, 0.9), "difference_ci95": (-0.3, 0.1)}
             points = [point | {"value": v, "difference": d} for v, d in ((0.6, -0.3), (1.0, 0.0), (1.6, -0.05))]
-            curve = {"property": "arm-stiffness", "unit": "x", "nominal": 1.0, "points": points, "lower": 0.8 + i / 10, "upper": None}
+            curve = {
+                "property": "arm-stiffness",
+                "unit": "x",
+                "nominal": 1.0,
+                "points": points,
+                "lower": 0.8 + i / 10,
+                "upper": None,
+            }
             card = {"backend": engine, "backend_version": "4", "episodes": 4, "task_progress": 0.8, "ci95": (0.7, 0.9)}
             card |= {"schema": "xreset-stress/1", "curves": [curve], "left_out": []}
             write_json(self.folder / "stress" / f"{engine}.json", card)
-        tried = (Candidate(name="2.pt", task_progress={"mujoco": 0.5}), Candidate(name="1.pt", task_progress={"mujoco": 0.7}))
+        tried = (
+            Candidate(name="2.pt", task_progress={"mujoco": 0.5}),
+            Candidate(name="1.pt", task_progress={"mujoco": 0.7}),
+        )
         choice = Choice(
             chosen="1.pt", policy_hash="ab12", candidates=tried, engines={"mujoco": "4"}, seed=9, episodes_per_demo=2, demos="cd",
         )  # fmt: skip
@@ -206,8 +220,12 @@ class ClipTest(InFolder):
         self.assertEqual(choose_sequence(episodes, traces), 0)
         worse = tuple(replace(e, task_progress=0.0) if e.sequence == 0 else e for e in self.ROLLOUTS.episodes)
         self.assertEqual(choose_sequence(episodes | {"sapien": worse, "pybullet": worse}, traces), 1)
-        self.assertEqual(choose_sequence(episodes, traces | {"sapien": self.ROLLOUTS.traces[1:]}), 1, "recorded in every engine")
-        self.assertIsNone(choose_sequence(episodes, {"mujoco": self.ROLLOUTS.traces[:1], "sapien": self.ROLLOUTS.traces[1:]}))
+        self.assertEqual(
+            choose_sequence(episodes, traces | {"sapien": self.ROLLOUTS.traces[1:]}), 1, "recorded in every engine"
+        )
+        self.assertIsNone(
+            choose_sequence(episodes, {"mujoco": self.ROLLOUTS.traces[:1], "sapien": self.ROLLOUTS.traces[1:]})
+        )
         self.assertIsNone(choose_sequence({}, {}))
 
     def test_the_recorded_episode_is_the_first_repetition(self):
@@ -225,7 +243,9 @@ class ClipTest(InFolder):
         self.assertEqual(clip.frames.shape, (3, 300, 400, 3))  # 5 states of 0.05 s, every second one
         self.assertAlmostEqual(clip.fps, 10.0)
         self.assertTrue(clip.finite)
-        orange = [np.argwhere((f[..., 0] > 180) & (f[..., 2] < 100)).mean(axis=0)[0] for f in clip.frames[:2].astype(int)]
+        orange = [
+            np.argwhere((f[..., 0] > 180) & (f[..., 2] < 100)).mean(axis=0)[0] for f in clip.frames[:2].astype(int)
+        ]
         self.assertLess(orange[1], orange[0] - 3, "the object rises in the picture")
 
     def test_a_clip_stands_still_once_a_state_is_not_finite(self):
@@ -261,7 +281,9 @@ class ClipTest(InFolder):
         out = self.folder / "film.mp4"
         with (
             mock.patch("xreset.eval.report.film.load_robot", lambda _: robot),
-            mock.patch("xreset.eval.report.film.encode_mp4", lambda frames, fps: repr((frames.shape, round(fps))).encode()),
+            mock.patch(
+                "xreset.eval.report.film.encode_mp4", lambda frames, fps: repr((frames.shape, round(fps))).encode()
+            ),
         ):
             film = make_film(self.folder, out)
         names = tuple(sorted({trace.object for trace in rollouts.traces}))
@@ -273,7 +295,8 @@ class FailureTest(InFolder):
     def episodes(self, *progress: float):
         first = toy_rollouts().episodes[0]
         return tuple(
-            replace(first, sequence=i, task_progress=p, reorient=p == 1.0, reorientation_progress=0.1 * i) for i, p in enumerate(progress)
+            replace(first, sequence=i, task_progress=p, reorient=p == 1.0, reorientation_progress=0.1 * i)
+            for i, p in enumerate(progress)
         )
 
     def traces(self, *objects: str):
@@ -351,9 +374,13 @@ class PageTest(InFolder):
     def setUpClass(cls):
         frames = np.zeros((2, 48, 64, 3), dtype=np.uint8)
         episode = toy_rollouts().episodes[0]
-        cls.clips = [Clip(engine=name, episode=episode, frames=frames, fps=10.0, finite=name != "sapien") for name in ENGINES]
+        cls.clips = [
+            Clip(engine=name, episode=episode, frames=frames, fps=10.0, finite=name != "sapien") for name in ENGINES
+        ]
         missed = toy_rollouts().episodes[2]
-        cls.strips = [Strip(episode=missed, picture=np.zeros((18, 144, 3), dtype=np.uint8), times=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))]
+        cls.strips = [
+            Strip(episode=missed, picture=np.zeros((18, 144, 3), dtype=np.uint8), times=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))
+        ]
 
     def data(self, **changes):
         self.write()
@@ -369,7 +396,10 @@ class PageTest(InFolder):
                 value = attributes.get(name)
                 if value is not None:
                     self.assertRegex(value, "^(data:|#)", f"<{tag} {name}>")
-        styles = "".join(a.get("style") or "" for _, a in outline.tags) + text[text.index("<style>") : text.index("</style>")]
+        styles = (
+            "".join(a.get("style") or "" for _, a in outline.tags)
+            + text[text.index("<style>") : text.index("</style>")]
+        )
         self.assertNotIn("@import", styles)
         for target in re.findall(r"url\(([^)]*)\)", styles):
             self.assertTrue(target.startswith("#"), target)
@@ -395,7 +425,8 @@ class PageTest(InFolder):
         (strip,) = outline.of("img")
         self.assertRegex(strip["alt"], "at 0.0, 1.0, .* 5.0 s: .*demo_1: grasped and lifted, 50% of the way")
         self.assertIn(
-            "Of 4 episodes in mujoco: 1 never near the object; 1 near it, but no grasp; 1 grasped, never at the goal.", outline.text
+            "Of 4 episodes in mujoco: 1 never near the object; 1 near it, but no grasp; 1 grasped, never at the goal.",
+            outline.text,
         )
         charts = " ".join(a["aria-label"] for a in outline.of("svg"))
         self.assertIn("mujoco-warp approach 75%, grasp 50%, reorient 25%", charts)
@@ -437,7 +468,8 @@ class PageTest(InFolder):
         self.assertIn("25%", text)
         self.assertNotIn("worst", headline(replace(data, summaries=tuple(made[:1]))))
         self.assertIn(
-            "40% in each of the 4 engines", headline(replace(data, summaries=tuple(replace(made[0], backend=n) for n in ENGINES)))
+            "40% in each of the 4 engines",
+            headline(replace(data, summaries=tuple(replace(made[0], backend=n) for n in ENGINES))),
         )
 
     def test_the_same_results_give_the_same_page(self):

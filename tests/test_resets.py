@@ -55,7 +55,9 @@ class FilterTest(unittest.TestCase):
 
     def test_thresholds_count(self):
         pos = [0.5, 0.3, self.height - 0.02]
-        self.assertIsNone(self.try_one(pos, config=FilterConfig(linear_velocity=1e3, angular_velocity=1e3, joint_velocity=1e3)))
+        self.assertIsNone(
+            self.try_one(pos, config=FilterConfig(linear_velocity=1e3, angular_velocity=1e3, joint_velocity=1e3))
+        )
 
     def test_broken_and_overflowing_worlds_are_rejected(self):
         for field, reason in (("nonfinite", "not finite"), ("overflow", "overflow")):
@@ -105,14 +107,25 @@ class FilterTest(unittest.TestCase):
     def test_the_bank_holds_what_was_accepted_and_why_the_rest_was_not(self):
         calls = []
         bank = make_bank(
-            self.retargeted(), self.robot, self.objects, ["mujoco"], num_envs=2, progress=lambda done, total: calls.append((done, total))
+            self.retargeted(),
+            self.robot,
+            self.objects,
+            ["mujoco"],
+            num_envs=2,
+            progress=lambda done, total: calls.append((done, total)),
         )
-        self.assertEqual(list(zip(bank.sequence_index.tolist(), bank.frame_index.tolist())), [(0, 0), (0, 2), (1, 1), (1, 2)])
-        self.assertEqual(bank.post_contact.tolist(), [False, True, False, False])  # -1: the hand never touches the object
+        self.assertEqual(
+            list(zip(bank.sequence_index.tolist(), bank.frame_index.tolist())), [(0, 0), (0, 2), (1, 1), (1, 2)]
+        )
+        self.assertEqual(
+            bank.post_contact.tolist(), [False, True, False, False]
+        )  # -1: the hand never touches the object
         self.assertEqual(bank.object_name.tolist(), [SOUP, SOUP, SPAM, SPAM])
         self.assertEqual([REASONS[r] for r in bank.rejected_reason], ["object linear velocity"])
         self.assertEqual((bank.rejected_sequence_index.tolist(), bank.rejected_frame_index.tolist()), ([0], [1]))
-        np.testing.assert_allclose(bank.start_pos[1], self.retargeted().object_pos[3], atol=1e-6)  # frame 0 counts although it is not valid
+        np.testing.assert_allclose(
+            bank.start_pos[1], self.retargeted().object_pos[3], atol=1e-6
+        )  # frame 0 counts although it is not valid
         np.testing.assert_allclose(bank.goal_pos, self.retargeted().goal_pos, atol=1e-6)
         self.assertEqual(calls[-1], (5, 5))
 
@@ -146,7 +159,9 @@ class FilterTest(unittest.TestCase):
 
             def state(self):
                 state = super().state()
-                return replace(state, joint_vel=state.joint_vel + 9.0 * ((state.object_pos[:, :1] - 0.53).abs() < 0.005))
+                return replace(
+                    state, joint_vel=state.joint_vel + 9.0 * ((state.object_pos[:, :1] - 0.53).abs() < 0.005)
+                )
 
         def made(name, *args, **options):
             return (Moves if name == "moves" else MujocoBackend)(*args, workers=0, **options)

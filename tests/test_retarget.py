@@ -50,7 +50,9 @@ def box_object(*boxes: tuple[tuple[float, float, float], tuple[float, float, flo
     """An object made of boxes (centre, size)."""
     pieces = tuple(box(center, size) for center, size in boxes)
     vertices, faces = surface_of(pieces)
-    return ObjectSpec(name="block", pieces=pieces, mass=1.0, com=np.zeros(3), inertia=np.eye(3), vertices=vertices, faces=faces)
+    return ObjectSpec(
+        name="block", pieces=pieces, mass=1.0, com=np.zeros(3), inertia=np.eye(3), vertices=vertices, faces=faces
+    )
 
 
 FAR_OBJECT = Surface(box_object(((0, 0, 0), (0.1, 0.1, 0.1))))
@@ -87,7 +89,9 @@ class SurfaceTest(unittest.TestCase):
     def test_signed_distance_of_a_box(self):
         distance, _ = self.surface.signed_distance(torch.as_tensor(self.points))
         near = self.exact < 0.01
-        np.testing.assert_allclose(distance[near], self.exact[near], atol=2.1e-3)  # half a cell where the field has an edge
+        np.testing.assert_allclose(
+            distance[near], self.exact[near], atol=2.1e-3
+        )  # half a cell where the field has an edge
         np.testing.assert_allclose(distance, self.exact, atol=4e-3)
         self.assertLess(np.abs(distance.numpy() - self.exact).mean(), 4e-4)
 
@@ -97,7 +101,9 @@ class SurfaceTest(unittest.TestCase):
         step = 1e-8
         for axis in range(3):
             shift = step * torch.eye(3, dtype=FLOAT)[axis]
-            slope = (self.surface.signed_distance(points + shift)[0] - self.surface.signed_distance(points - shift)[0]) / (2 * step)
+            slope = (
+                self.surface.signed_distance(points + shift)[0] - self.surface.signed_distance(points - shift)[0]
+            ) / (2 * step)
             self.assertGreater((torch.isclose(slope, gradient[:, axis], atol=1e-5)).double().mean().item(), 0.99)
 
     def test_nearest_point_is_exact(self):
@@ -108,7 +114,9 @@ class SurfaceTest(unittest.TestCase):
     def test_faces_inside_the_solid_do_not_count(self):
         two = Surface(box_object(((-0.02, 0, 0), (0.08, 0.06, 0.06)), ((0.02, 0, 0), (0.08, 0.06, 0.06))))
         distance, _ = two.signed_distance(torch.zeros(1, 3, dtype=FLOAT))
-        self.assertAlmostEqual(distance.item(), -0.03, delta=2.1e-3)  # to the outer faces, not to the ends of the boxes at x = +-0.02
+        self.assertAlmostEqual(
+            distance.item(), -0.03, delta=2.1e-3
+        )  # to the outer faces, not to the ends of the boxes at x = +-0.02
 
     def test_solid_nodes_survive_a_missing_triangle(self):
         whole = box_object(((0, 0, 0), (0.1, 0.1, 0.1)))
@@ -140,7 +148,14 @@ class CollisionTest(unittest.TestCase):
     )
 
     def test_support_points_span_the_shape(self):
-        extents = ((0.02, 0.03, 0.01), (0.02, 0.02, 0.02), (0.01, 0.01, 0.04), (0.01, 0.01, 0.03), (0.03, 0.03, 0.01), (0.05, 0.05, 0.05))
+        extents = (
+            (0.02, 0.03, 0.01),
+            (0.02, 0.02, 0.02),
+            (0.01, 0.01, 0.04),
+            (0.01, 0.01, 0.03),
+            (0.03, 0.03, 0.01),
+            (0.05, 0.05, 0.05),
+        )
         for geometry, extent in zip(self.SHAPES, extents, strict=True):
             points, radius = support_points(geometry)
             np.testing.assert_allclose(points.max(axis=0) + radius, extent, atol=1e-9)
@@ -169,9 +184,14 @@ class CollisionTest(unittest.TestCase):
         self.assertLessEqual(steps.max(), SPACING + 1e-9)
 
     def test_near_points_of_several_solids_are_those_that_looking_at_all_of_them_finds(self):
-        fields = DistanceFields.join([link_field([box((0, 0, 0), size)]) for size in ((0.06, 0.04, 0.02), (0.02, 0.02, 0.1))])
+        fields = DistanceFields.join(
+            [link_field([box((0, 0, 0), size)]) for size in ((0.06, 0.04, 0.02), (0.02, 0.02, 0.1))]
+        )
         rng = np.random.default_rng(0)
-        points, than = torch.as_tensor(rng.uniform(-0.06, 0.06, (5000, 3))), torch.as_tensor(rng.uniform(-0.01, 0.03, 5000))
+        points, than = (
+            torch.as_tensor(rng.uniform(-0.06, 0.06, (5000, 3))),
+            torch.as_tensor(rng.uniform(-0.01, 0.03, 5000)),
+        )
         which = torch.as_tensor(rng.integers(2, size=5000))
         value, slope = fields.signed_distance(points, which)
         near, distance, gradient = fields.nearer(points, which, than)
@@ -291,7 +311,10 @@ class CollisionTest(unittest.TestCase):
         kinematics = Kinematics(robot)
         collision = SelfCollision(robot, kinematics)
         self.assertFalse(
-            any("right_index_MP" in pair and "right_index_DP" in pair for pair in self._names(kinematics, collision.link_pairs))
+            any(
+                "right_index_MP" in pair and "right_index_DP" in pair
+                for pair in self._names(kinematics, collision.link_pairs)
+            )
         )
         q = torch.as_tensor(robot.home)[None].repeat(2, 1)
         q[1, robot.joint_names.index("right_index_MCP_AA")] = 0.35
@@ -316,7 +339,9 @@ class HandTest(unittest.TestCase):
         motion = toy_motion(cls.model, torch.Generator().manual_seed(1), margin=0.1, turn=0.3)
         cls.joints, cls.root_pos, cls.root_quat = motion.joints, motion.root_pos, motion.root_quat
         cls.keypoints = cls.model.keypoints(cls.joints, cls.root_pos, cls.root_quat)
-        cls.seen = [name for name in cls.model.kinematics.joint_names if name != "jaw_a"]  # no keypoint follows the jaws
+        cls.seen = [
+            name for name in cls.model.kinematics.joint_names if name != "jaw_a"
+        ]  # no keypoint follows the jaws
         cls.columns = [cls.model.kinematics.joint_names.index(name) for name in cls.seen]
 
     def targets(self, **changes) -> HandTargets:
@@ -338,9 +363,14 @@ class HandTest(unittest.TestCase):
         """What the clearance term acts on."""
         bodies = self.model.bodies(*(value.flatten(0, 1) for value in vars(state).values()))
         objects = Objects.at(
-            targets.object_pos.flatten(0, 1), targets.object_quat.flatten(0, 1), targets.object_index.repeat_interleave(12), targets.fields
+            targets.object_pos.flatten(0, 1),
+            targets.object_quat.flatten(0, 1),
+            targets.object_index.repeat_interleave(12),
+            targets.fields,
         )
-        return too_near(self.model, bodies, objects, targets.annotated.flatten(), config.object_clearance, config.self_depth)
+        return too_near(
+            self.model, bodies, objects, targets.annotated.flatten(), config.object_clearance, config.self_depth
+        )
 
     def test_gradient_is_the_derivative_of_the_cost(self):
         """All terms at once: bones, alignment, contact (beyond and below the knee), object, smoothness, jumps."""
@@ -374,7 +404,9 @@ class HandTest(unittest.TestCase):
                     )
                     costs.append(system(self.model, targets, config, moved).cost)
                 slope = (costs[0] - costs[1]) / (4 * step)  # gradient is half the derivative
-                torch.testing.assert_close(found.gradient[:, frame, k], slope, rtol=2e-3, atol=2e-4 * float(found.gradient.abs().max()))
+                torch.testing.assert_close(
+                    found.gradient[:, frame, k], slope, rtol=2e-3, atol=2e-4 * float(found.gradient.abs().max())
+                )
 
     def test_recovers_a_motion_from_its_own_keypoints(self):
         config = HandConfig(smoothness_weight=1e-6, clearance_weight=0.0, iterations=60, tolerance=1e-9)
@@ -454,7 +486,9 @@ class HandTest(unittest.TestCase):
         mask = torch.zeros(self.keypoints.shape[:3], dtype=torch.bool)
         mask[:, :, tip] = True
         free = retarget_hand(self.model, self.targets())
-        pulled = retarget_hand(self.model, self.targets(contact_points=aim, in_contact=mask), HandConfig(contact_weight=50.0))
+        pulled = retarget_hand(
+            self.model, self.targets(contact_points=aim, in_contact=mask), HandConfig(contact_weight=50.0)
+        )
         gap = [(motion.keypoints - aim)[:, :, tip].norm(dim=-1).mean().item() for motion in (free, pulled)]
         self.assertGreater(gap[0], 0.035)
         self.assertLess(gap[1], 0.025)
@@ -464,7 +498,9 @@ class HandTest(unittest.TestCase):
         depth = []
         for weight in (0.0, 2000.0):
             motion = retarget_hand(self.model, inside, HandConfig(clearance_weight=weight))
-            distance = self.too_near(inside, HandState(motion.joints, motion.root_pos, motion.root_quat), HandConfig()).value
+            distance = self.too_near(
+                inside, HandState(motion.joints, motion.root_pos, motion.root_quat), HandConfig()
+            ).value
             depth.append(-distance.min().item() if len(distance) else 0.0)
         self.assertGreater(depth[0], 0.02)
         self.assertLess(depth[1], 0.005)
@@ -503,12 +539,18 @@ class ConfigTest(unittest.TestCase):
             (ArmConfig, "position_weight", (-50.0, np.nan)),
         ):
             for value in values:
-                with self.subTest(name=name, value=value), self.assertRaisesRegex(ValueError, f"^{name} is .*, expected"):
+                with (
+                    self.subTest(name=name, value=value),
+                    self.assertRaisesRegex(ValueError, f"^{name} is .*, expected"),
+                ):
                     config(**{name: value})
         HandConfig(object_clearance=-0.001, jump_limit=np.inf)  # deeper than the surface; no limit
 
     def test_the_command_line_says_so_too(self):
-        for option, value, said in (("--hand.jump-weight", "nan", "jump_weight is nan"), ("--arm.reseeds", "-1", "reseeds is -1")):
+        for option, value, said in (
+            ("--hand.jump-weight", "nan", "jump_weight is nan"),
+            ("--arm.reseeds", "-1", "reseeds is -1"),
+        ):
             code, out, err = run("retarget", "demos.npz", "--robot", "openarm", "--out", "out.npz", option, value)
             self.assertEqual(code, 2)
             self.assertIn(said, out + err)
@@ -541,7 +583,9 @@ class ArmTest(unittest.TestCase):
 
     def home_path(self, frames: int = 8) -> torch.Tensor:
         home = torch.as_tensor(self.robot.home[self.robot.arm_indices])
-        return home + torch.linspace(0, 0.4, frames, dtype=FLOAT)[:, None] * torch.tensor([1.0, 0.3, -0.5, 0.4, 0.3, 1.0], dtype=FLOAT)
+        return home + torch.linspace(0, 0.4, frames, dtype=FLOAT)[:, None] * torch.tensor(
+            [1.0, 0.3, -0.5, 0.4, 0.3, 1.0], dtype=FLOAT
+        )
 
     def test_follows_a_path_that_the_arm_can_follow(self):
         joints, measures = track(self.model, self.along(self.home_path()), Thresholds(), self.config)
@@ -583,7 +627,11 @@ class ArmTest(unittest.TestCase):
             of_carrier = model.carrier_of[[kinematics.link_index(link) for link in support.links]]
             for carrier in range(len(model.carriers)):
                 own = low[low.carrier == carrier]
-                expected = heights[:, of_carrier == carrier].amin(1) if (of_carrier == carrier).any() else torch.full((300,), np.inf)
+                expected = (
+                    heights[:, of_carrier == carrier].amin(1)
+                    if (of_carrier == carrier).any()
+                    else torch.full((300,), np.inf)
+                )
                 self.assertEqual(own.frame.tolist(), (expected < 0.02).nonzero()[:, 0].tolist())
                 torch.testing.assert_close(own.height, expected[own.frame].to(FLOAT), atol=1e-12, rtol=0)
             self.assertGreater(len(low.frame), 40)
@@ -660,10 +708,19 @@ class ValidityTest(unittest.TestCase):
 
     def test_the_first_reason_counts(self):
         self.assertEqual(self.reason(arm_jump=1.0, hand_error=1.0), "hand error")
-        self.assertEqual(self.reason(**{k: v for changes in self.BAD.values() for k, v in changes.items()}), "not annotated")
+        self.assertEqual(
+            self.reason(**{k: v for changes in self.BAD.values() for k, v in changes.items()}), "not annotated"
+        )
 
     def test_not_a_number_is_invalid(self):
-        for name in ("hand_error", "wrist_position", "wrist_orientation", "arm_jump", "table_clearance", "self_clearance"):
+        for name in (
+            "hand_error",
+            "wrist_position",
+            "wrist_orientation",
+            "arm_jump",
+            "table_clearance",
+            "self_clearance",
+        ):
             self.assertNotEqual(self.reason(**{name: float("nan")}), "valid", name)
 
 
@@ -695,21 +752,28 @@ class PipelineTest(unittest.TestCase):
         links = kinematics.link_poses(torch.as_tensor(self.result.joint_pos), self.robot.tracked_links).numpy()
         np.testing.assert_allclose(self.result.palm_pos, links[:, 0, :3, 3], atol=1e-12)
         np.testing.assert_allclose(self.result.fingertip_pos, links[:, 1:, :3, 3], atol=1e-12)
-        np.testing.assert_allclose(quat_to_matrix(torch.as_tensor(self.result.palm_quat_wxyz)), links[:, 0, :3, :3], atol=1e-9)
+        np.testing.assert_allclose(
+            quat_to_matrix(torch.as_tensor(self.result.palm_quat_wxyz)), links[:, 0, :3, :3], atol=1e-9
+        )
         q = torch.as_tensor(self.result.joint_pos)
         self.assertTrue(((q >= kinematics.lower - 1e-12) & (q <= kinematics.upper + 1e-12)).all())
         seen = self.result.annotated & self.result.valid
         tips = [KEYPOINTS.index(tip.keypoint) for tip in self.robot.fingertips]
         rested = rest_on_table(self.demos, self.objects)
         gap = np.linalg.norm(self.result.fingertip_pos - rested.hand_keypoints[:, tips], axis=-1).mean(axis=1)
-        np.testing.assert_allclose(gap[seen], self.result.hand_error[seen], atol=0.011)  # apart by the wrist's error at most
+        np.testing.assert_allclose(
+            gap[seen], self.result.hand_error[seen], atol=0.011
+        )  # apart by the wrist's error at most
 
     def test_the_object_rests_on_the_table_and_keeps_its_goal(self):
         spec = self.objects[0]
         for i in range(2):
             rows = self.demos.frames(i)
             quat = torch.as_tensor(self.result.object_quat_wxyz[rows.start])
-            lowest = quat_rotate(quat, torch.as_tensor(spec.vertices))[:, 2].min().item() + self.result.object_pos[rows.start, 2]
+            lowest = (
+                quat_rotate(quat, torch.as_tensor(spec.vertices))[:, 2].min().item()
+                + self.result.object_pos[rows.start, 2]
+            )
             self.assertAlmostEqual(lowest, 0.0, delta=1e-6)
             np.testing.assert_array_equal(self.result.goal_pos[i], self.result.object_pos[rows.stop - 1])
 
@@ -722,7 +786,9 @@ class PipelineTest(unittest.TestCase):
 
     def test_a_sequence_without_a_hand_stays_at_home(self):
         rows = self.demos.frames(1)
-        np.testing.assert_array_equal(self.result.joint_pos[rows], np.tile(self.robot.home, (rows.stop - rows.start, 1)))
+        np.testing.assert_array_equal(
+            self.result.joint_pos[rows], np.tile(self.robot.home, (rows.stop - rows.start, 1))
+        )
         self.assertEqual({REASONS[r] for r in self.result.reason[rows]}, {"not annotated"})
         self.assertEqual(self.result.first_contact[1], -1)
 
@@ -752,7 +818,9 @@ class PipelineTest(unittest.TestCase):
             ({"first_contact": np.array([10_000, -1])}, "first_contact"),
         ):
             with self.subTest(message):
-                write_retargeted(self.folder / "d.npz", dataclasses.replace(self.result, **changes), config={}, inputs={})
+                write_retargeted(
+                    self.folder / "d.npz", dataclasses.replace(self.result, **changes), config={}, inputs={}
+                )
                 with self.assertRaisesRegex(FileFormatError, message):
                     read_retargeted(self.folder / "d.npz")
 
@@ -816,7 +884,12 @@ class StopAndContinueTest(unittest.TestCase):
                     raise KeyboardInterrupt
 
         return retarget_demos(
-            demos or self.demos, robot or self.robot, self.objects, config or self.CONFIG, progress=progress, partial=self.folder
+            demos or self.demos,
+            robot or self.robot,
+            self.objects,
+            config or self.CONFIG,
+            progress=progress,
+            partial=self.folder,
         )
 
     def stopped(self, batch: int = 2) -> None:

@@ -44,8 +44,12 @@ class TermTest(unittest.TestCase):
         gap = torch.tensor([0.05, 0.11, 0.5], dtype=FLOAT)[:, None] * torch.nn.functional.normalize(self.x, dim=-1)
         found = self.check(lambda x: terms.contact(x, self.target, self.weight, 0.1, 0.02), self.target + gap)
         self.assertTrue((found.gradient[:, 0] == 0).all())
-        cornered = terms.contact(self.target + gap, self.target, self.weight, 0.1, 1e-9).cost  # the paper's: 0, 1 cm and 40 cm beyond
-        torch.testing.assert_close(cornered, self.weight @ torch.tensor([0.0, 0.01, 0.4], dtype=FLOAT), atol=1e-8, rtol=0)
+        cornered = terms.contact(
+            self.target + gap, self.target, self.weight, 0.1, 1e-9
+        ).cost  # the paper's: 0, 1 cm and 40 cm beyond
+        torch.testing.assert_close(
+            cornered, self.weight @ torch.tensor([0.0, 0.01, 0.4], dtype=FLOAT), atol=1e-8, rtol=0
+        )
 
     def test_attraction(self):
         d = torch.tensor([[0.1, -0.3, 0.99, 1.2]], dtype=FLOAT)
@@ -54,7 +58,9 @@ class TermTest(unittest.TestCase):
         for k in range(4):
             shift = torch.zeros_like(d)
             shift[0, k] = STEP
-            slope = (terms.attraction(d + shift, weight, 1.0).cost - terms.attraction(d - shift, weight, 1.0).cost) / (4 * STEP)
+            slope = (terms.attraction(d + shift, weight, 1.0).cost - terms.attraction(d - shift, weight, 1.0).cost) / (
+                4 * STEP
+            )
             torch.testing.assert_close(found.gradient[:, k], slope, atol=1e-8, rtol=1e-6)
         self.assertEqual(found.gradient[0, 3].item(), 0.0)  # beyond its reach
         self.assertTrue((found.curvature >= 0).all())
@@ -69,7 +75,9 @@ class TermTest(unittest.TestCase):
         for k in range(3):
             shift = torch.zeros_like(d)
             shift[0, k] = STEP
-            slope = (terms.change(d + shift, weight, limit, 100.0)[0] - terms.change(d - shift, weight, limit, 100.0)[0]) / (4 * STEP)
+            slope = (
+                terms.change(d + shift, weight, limit, 100.0)[0] - terms.change(d - shift, weight, limit, 100.0)[0]
+            ) / (4 * STEP)
             torch.testing.assert_close(gradient[:, k], slope, atol=1e-8, rtol=1e-6)
         torch.testing.assert_close(curvature, torch.tensor([[2.0, 103.0, 4.0]], dtype=FLOAT))
         torch.testing.assert_close(cost, torch.tensor([2 * 0.01 + 3 * 0.09 + 4 * 0.25 + 100 * 0.01], dtype=FLOAT))

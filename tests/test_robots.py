@@ -56,7 +56,9 @@ class BuiltIn(unittest.TestCase):
 
     def test_degrees_of_freedom(self):
         counts = {name: (len(load(name).arm_indices), len(load(name).hand_indices)) for name in BUILT_IN}
-        self.assertEqual(counts, {"ur7e-sharpa": (6, 22), "openarm": (7, 1), "panda-allegro": (7, 16), "xarm7-leap": (7, 16)})
+        self.assertEqual(
+            counts, {"ur7e-sharpa": (6, 22), "openarm": (7, 1), "panda-allegro": (7, 16), "xarm7-leap": (7, 16)}
+        )
 
     def test_efforts_in_the_description_are_those_of_the_urdf(self):
         for name, build in BUILT_IN.items():
@@ -74,7 +76,9 @@ class BuiltIn(unittest.TestCase):
         thumb, fingers = tips[0][:3, 3], np.array([tip[:3, 3] for tip in tips[1:]])
         self.assertLess(palm[2, 2], -0.8)  # the palm looks down
         self.assertLess(palm[1, 0], -0.8)  # fingers away from the person, who stands at +y
-        self.assertTrue((thumb[0] > fingers[:, 0]).all())  # seen by that person, a right hand's thumb is on the left: +x
+        self.assertTrue(
+            (thumb[0] > fingers[:, 0]).all()
+        )  # seen by that person, a right hand's thumb is on the left: +x
         self.assertTrue((np.diff(fingers[:, 0]) < 0).all())  # index, middle, ring, pinky
 
     def test_sharpa_thumb_meets_the_index_finger(self):
@@ -214,7 +218,14 @@ class Registry(unittest.TestCase):
         self.edit("robot.toml", "pos = [0.45, 0.60, 0.55]", "pos = [0.45, 0.60]")
         with self.assertRaises(RobotError) as caught:
             load(self.folder)
-        for part in ("unknown: plam (palm?); missing: palm", "joints[0].home", "joints[0].kp", "index5", "base.pos has 2", "5 places"):
+        for part in (
+            "unknown: plam (palm?); missing: palm",
+            "joints[0].home",
+            "joints[0].kp",
+            "index5",
+            "base.pos has 2",
+            "5 places",
+        ):
             self.assertIn(part, str(caught.exception))
 
     def test_contradictions(self):
@@ -242,7 +253,14 @@ class Registry(unittest.TestCase):
         self.edit("robot.toml", "mimics = [{", "mimics = [{ multiplier = 2.0,")
         self.edit("robot.urdf", 'ixx="0.000143"', 'ixx="0.00143"')
         found = self.errors()
-        for part in ("'joint9' is not in the URDF", "'joint7' moves", "'joint4' is at home at 2.6", "'link77'", "finger_joint2", "'link6'"):
+        for part in (
+            "'joint9' is not in the URDF",
+            "'joint7' moves",
+            "'joint4' is at home at 2.6",
+            "'link77'",
+            "finger_joint2",
+            "'link6'",
+        ):
             self.assertIn(part, found)
 
     def test_a_check_that_asks_for_what_is_missing_hides_no_other(self):

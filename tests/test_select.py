@@ -56,13 +56,16 @@ class SelectTest(unittest.TestCase):
         self.assertEqual(choice, read_choice(self.folder))
         self.assertEqual({seed for *_, seed in self.played}, {SEED})
         self.assertEqual(
-            choice.sentence(), "200.onnx, 75.0 % in its worst engine (b), of 4 checkpoints in 3 engines; the newest, 300.onnx, has 60.0 %."
+            choice.sentence(),
+            "200.onnx, 75.0 % in its worst engine (b), of 4 checkpoints in 3 engines; the newest, 300.onnx, has 60.0 %.",
         )
 
     def test_one_that_cannot_win_is_given_up(self):
         self.choose()
         self.assertEqual([e for name, e, _ in self.played if name == "300.onnx"], ["a", "b", "c"])
-        self.assertEqual([e for name, e, _ in self.played if name == "200.onnx"], ["b", "c", "a"])  # where the best is worst first
+        self.assertEqual(
+            [e for name, e, _ in self.played if name == "200.onnx"], ["b", "c", "a"]
+        )  # where the best is worst first
         self.assertEqual([e for name, e, _ in self.played if name == "050.onnx"], ["b"])
 
     def test_of_equals_the_newer_one(self):
@@ -79,8 +82,12 @@ class SelectTest(unittest.TestCase):
     def test_the_starts_that_decided_are_not_reported(self):
         choice = self.choose()
         inputs = {"policy": choice.policy_hash}
-        subject = SimpleNamespace(folder=self.folder / "eval", inputs=inputs, episodes=mock.Mock(side_effect=InterruptedError))
-        with self.assertRaisesRegex(PolicyError, f"the starts of seed {SEED} are those by which this policy was chosen"):
+        subject = SimpleNamespace(
+            folder=self.folder / "eval", inputs=inputs, episodes=mock.Mock(side_effect=InterruptedError)
+        )
+        with self.assertRaisesRegex(
+            PolicyError, f"the starts of seed {SEED} are those by which this policy was chosen"
+        ):
             evaluating.evaluate(subject, [], self.demos, Setting(seed=SEED), self.folder, episodes=1)  # pyright: ignore[reportArgumentType]
         for seed, policy in ((0, choice.policy_hash), (SEED, "another")):
             subject.inputs = {"policy": policy}

@@ -45,7 +45,15 @@ class SharedMemory(unittest.TestCase):
             backend.step()
             for name, tensor in self.published(backend).items():
                 self.assertEqual(tensor.data_ptr(), before[name].data_ptr(), name)
-            for name in ("joint_pos", "joint_vel", "joint_target", "object_pos", "link_pos", "link_linvel", "table_force"):
+            for name in (
+                "joint_pos",
+                "joint_vel",
+                "joint_target",
+                "object_pos",
+                "link_pos",
+                "link_linvel",
+                "table_force",
+            ):
                 self.assertFalse(torch.equal(before[name], start[name]), name)
 
     @unittest.skipUnless(torch.cuda.is_available(), "no CUDA device")
@@ -69,9 +77,13 @@ class SharedMemory(unittest.TestCase):
 
         control_step()
         names = device_work(control_step)
-        self.assertTrue([name for name in names if "read_state" in name], f"the profiler saw no kernel that publishes: {names}")
+        self.assertTrue(
+            [name for name in names if "read_state" in name], f"the profiler saw no kernel that publishes: {names}"
+        )
         self.assertEqual([name for name in names if "DtoH" in name or "HtoD" in name], [])
-        self.assertTrue([name for name in device_work(lambda: targets.cpu()) if "DtoH" in name], "a copy to the host must show")
+        self.assertTrue(
+            [name for name in device_work(lambda: targets.cpu()) if "DtoH" in name], "a copy to the host must show"
+        )
 
 
 if __name__ == "__main__":

@@ -22,7 +22,19 @@ LARGEST = 5e6
 FLOOR = 0.6
 """Mean task progress of the episodes below; an object that is grasped and lifted makes 0.66."""
 
-ABSENT = ("rsl_rl", "onnx", "onnxscript", "tensorboard", "warp", "mujoco_warp", "mujoco", "pybullet", "sapien", "coal", "viser")
+ABSENT = (
+    "rsl_rl",
+    "onnx",
+    "onnxscript",
+    "tensorboard",
+    "warp",
+    "mujoco_warp",
+    "mujoco",
+    "pybullet",
+    "sapien",
+    "coal",
+    "viser",
+)
 ACT = """
 import json, sys
 sys.modules.update(dict.fromkeys(sys.argv[2].split(",")))
@@ -67,7 +79,8 @@ class ShippedPolicyTest(unittest.TestCase):
                 found = card(file)
                 self.assertTrue(found.licence and found.data and found.recipe)
                 self.assertLessEqual(
-                    {"mujoco", "mujoco-warp", "pybullet", "sapien"}, {e for figures in found.results.values() for e in figures}
+                    {"mujoco", "mujoco-warp", "pybullet", "sapien"},
+                    {e for figures in found.results.values() for e in figures},
                 )
 
     def test_its_objects_have_stand_ins(self):
@@ -82,7 +95,9 @@ class ShippedPolicyTest(unittest.TestCase):
                 with tempfile.TemporaryDirectory() as folder:
                     demos = Path(folder) / "demos.npz"
                     write_demos(demos, synthesize(OnnxPolicy(file).contract["objects"][:1], 2))
-                    (result,) = evaluate(resolve(name, None, 0), [engine("mujoco")], demos, Setting(num_envs=2), Path(folder), episodes=1)
+                    (result,) = evaluate(
+                        resolve(name, None, 0), [engine("mujoco")], demos, Setting(num_envs=2), Path(folder), episodes=1
+                    )
                 self.assertEqual(result.episodes, 2)
                 self.assertGreaterEqual(result.task_progress.mean, FLOOR)
 

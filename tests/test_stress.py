@@ -21,10 +21,18 @@ from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
 
 
 def episodes(progress: list[float]) -> tuple[Episode, ...]:
-    flags = dict.fromkeys(("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow"), False)
+    flags = dict.fromkeys(
+        ("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow"), False
+    )
     return tuple(
         Episode(
-            sequence=i // 2, sequence_name=f"s{i // 2}", object="o", repetition=i % 2, reorientation_progress=0.0, task_progress=p, **flags
+            sequence=i // 2,
+            sequence_name=f"s{i // 2}",
+            object="o",
+            repetition=i % 2,
+            reorientation_progress=0.0,
+            task_progress=p,
+            **flags,
         )
         for i, p in enumerate(progress)
     )
@@ -32,10 +40,13 @@ def episodes(progress: list[float]) -> tuple[Episode, ...]:
 
 class StressedTest(unittest.TestCase):
     def test_nothing_is_random_and_one_thing_differs(self):
-        task = evaluation_task(TaskConfig(randomization=RandomizationConfig(arm_stiffness=(0.5, 2.0), friction=(0.4, 0.8), metal=0.2)))
+        task = evaluation_task(
+            TaskConfig(randomization=RandomizationConfig(arm_stiffness=(0.5, 2.0), friction=(0.4, 0.8), metal=0.2))
+        )
         plain = stressed(task).randomization
         self.assertEqual(
-            (plain.friction, plain.mass_scale, plain.arm_stiffness, plain.metal), ((0.6000000000000001,) * 2, (1, 1), (1, 1), 0.2)
+            (plain.friction, plain.mass_scale, plain.arm_stiffness, plain.metal),
+            ((0.6000000000000001,) * 2, (1, 1), (1, 1), 0.2),
         )
         self.assertTrue(plain.enabled and not plain.scales_drives)
         for prop in PROPERTIES:
@@ -60,7 +71,9 @@ class StressedTest(unittest.TestCase):
             with self.subTest(text), self.assertRaisesRegex(XResetError, words):
                 chosen([text])
         (late,) = chosen(["action-latency=300"])
-        with self.assertRaisesRegex(XResetError, "action-latency of 300 control steps cannot be tried: .* fewer than an episode has"):
+        with self.assertRaisesRegex(
+            XResetError, "action-latency of 300 control steps cannot be tried: .* fewer than an episode has"
+        ):
             stressed(TaskConfig(), late, 300.0)
         (light,) = chosen(["object-mass=0"])
         with self.assertRaisesRegex(XResetError, "object-mass x 0 cannot be tried: mass_scale begins with 0"):
@@ -91,7 +104,10 @@ class CurveTest(unittest.TestCase):
         borne = _curve(mass, {v: episodes(base) for v in (0.5, 1.0, 2.0)})
         soft = replace(curve, property="hand-stiffness", lower=0.9)
         (gain,) = chosen(["force-gain=2"])
-        scattered = _curve(gain, {1.0: episodes(base), 2.0: episodes([p + d for p, d in zip(base, (-0.6, -0.6, 0.2, 0.2), strict=True)])})
+        scattered = _curve(
+            gain,
+            {1.0: episodes(base), 2.0: episodes([p + d for p, d in zip(base, (-0.6, -0.6, 0.2, 0.2), strict=True)])},
+        )
         assert scattered.upper is not None
         self.assertEqual((scattered.is_certain(scattered.upper), curve.is_certain(curve.lower)), (False, True))
         self.assertEqual(
@@ -114,9 +130,21 @@ class CommandTest(unittest.TestCase):
                 main(["demos", "synth", "--objects", "005_tomato_soup_can", "--per-object", "2", "--out", demos])
                 options = ["--robot", "openarm", "--demos", demos, "--episodes", "1", "--out", str(folder)]
                 with mock.patch.object(MujocoBackend, "capabilities", MujocoBackend.capabilities - {"drives"}):
-                    main(["stress", "zero", *options, "--property", "arm-stiffness=0.5", "--property", "action-latency=1"])
+                    main(
+                        [
+                            "stress",
+                            "zero",
+                            *options,
+                            "--property",
+                            "arm-stiffness=0.5",
+                            "--property",
+                            "action-latency=1",
+                        ]
+                    )
             found = json.loads((folder / "mujoco.json").read_text())
-            self.assertEqual((found["schema"], found["episodes"], found["left_out"]), ("xreset-stress/1", 2, ["arm-stiffness"]))
+            self.assertEqual(
+                (found["schema"], found["episodes"], found["left_out"]), ("xreset-stress/1", 2, ["arm-stiffness"])
+            )
             (curve,) = found["curves"]
             self.assertEqual([p["value"] for p in curve["points"]], [0.0, 1.0])
             (card,) = read_stress(folder)

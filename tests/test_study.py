@@ -56,7 +56,10 @@ class FileTest(InFolder):
         for text, message in (
             ("schema = ", "is not valid TOML"),
             ("about = 'x'", "states schema None, expected 'xreset-study/1'"),
-            (HEAD + DATA + RUN + run + "minuets = 3\n", r"runs\.a does not fit Runs \(unknown: minuets \(minutes\?\)\)"),
+            (
+                HEAD + DATA + RUN + run + "minuets = 3\n",
+                r"runs\.a does not fit Runs \(unknown: minuets \(minutes\?\)\)",
+            ),
             (HEAD + DATA + RUN + "[runs.a]\nseeds = [0, 0]\n", r"runs\.a: seeds is \[0, 0\]"),
             (HEAD + DATA + RUN + "[runs.a]\nminutes = 0\n", r"runs\.a: minutes is 0"),
             (HEAD + DATA + RUN + "[runs.a]\npolicy = 'best'\n", r"runs\.a\.policy is 'best'"),
@@ -64,9 +67,18 @@ class FileTest(InFolder):
             (HEAD + DATA + RUN + "[runs.a]\nweights = 'a'\n", r"runs\.a\.weights is 'a', expected one of none"),
             (HEAD + DATA + RUN + "[runs.'../a']\n", "'../a' is no name for a folder"),
             (HEAD + DATA + RUN + run + "[evaluations.checkpoints]\n", "would be a folder of that name"),
-            (HEAD + DATA + RUN + run + "[[tables]]\nruns = { b = 'B' }\n", r"tables\[0\]\.runs is 'b', expected one of 'a'"),
-            (HEAD + DATA + RUN + run + "[[tables]]\npaper = 'X'\nruns = { a = 'A' }\n", r"tables\[0\]\.paper is 'X', expected one of 'I'"),
-            (HEAD + DATA + RUN + run + "[[tables]]\npaper = 'I'\nruns = { a = 'A' }\n", r"runs is 'A', expected one of 'IK Oracle'"),
+            (
+                HEAD + DATA + RUN + run + "[[tables]]\nruns = { b = 'B' }\n",
+                r"tables\[0\]\.runs is 'b', expected one of 'a'",
+            ),
+            (
+                HEAD + DATA + RUN + run + "[[tables]]\npaper = 'X'\nruns = { a = 'A' }\n",
+                r"tables\[0\]\.paper is 'X', expected one of 'I'",
+            ),
+            (
+                HEAD + DATA + RUN + run + "[[tables]]\npaper = 'I'\nruns = { a = 'A' }\n",
+                r"runs is 'A', expected one of 'IK Oracle'",
+            ),
         ):
             with self.subTest(message), self.assertRaisesRegex(FileFormatError, message):
                 read_study(self.file(text))
@@ -86,15 +98,21 @@ class PaperTest(unittest.TestCase):
         """So a figure that is copied wrongly is found, where the paper gives an average."""
         tables = paper_tables()
         nine = tables["I"]
-        for column, average in zip(zip(*(v for k, v in nine.values.items() if k != ALL), strict=True), nine.values[ALL], strict=True):
+        for column, average in zip(
+            zip(*(v for k, v in nine.values.items() if k != ALL), strict=True), nine.values[ALL], strict=True
+        ):
             self.assertAlmostEqual(sum(column) / 9, average, delta=0.06)
         for method in nine.names:
-            self.assertEqual(nine.figure(method, ALL, "task_progress"), tables["II"].figure(method, ALL, "task_progress"))
+            self.assertEqual(
+                nine.figure(method, ALL, "task_progress"), tables["II"].figure(method, ALL, "task_progress")
+            )
         for number in ("VI", "VII"):
             for method, (*each, average) in tables[number].values.items():
                 with self.subTest(number, method=method):
                     self.assertAlmostEqual(sum(each) / 3, average, delta=0.06)
-        for row in (row for table in tables.values() for row in (*table.values.values(), *table.standard_error.values())):
+        for row in (
+            row for table in tables.values() for row in (*table.values.values(), *table.standard_error.values())
+        ):
             self.assertTrue(all(0 <= value <= 100 for value in row))
         self.assertEqual(tables["III"].figure("80", SOUP, "grasp"), 100.0)
         self.assertIsNone(tables["IV"].figure("80", SOUP, "grasp"))
@@ -103,7 +121,10 @@ class PaperTest(unittest.TestCase):
 class PlanTest(InFolder):
     def test_runs_by_object_and_seed(self):
         plan = self.plan(
-            HEAD + DATA + RUN + "[runs.a]\nseeds = [3, 4]\n[runs.b]\nalone = true\nweights = 'a'\nseeds = [3]\n[runs.ik]\npolicy = 'ik'\n"
+            HEAD
+            + DATA
+            + RUN
+            + "[runs.a]\nseeds = [3, 4]\n[runs.b]\nalone = true\nweights = 'a'\nseeds = [3]\n[runs.ik]\npolicy = 'ik'\n"
         )
         names = ["a-seed3", "a-seed4", "b-tomato_soup_can-seed3", "b-potted_meat_can-seed3", "ik"]
         self.assertEqual([r.name for r in plan.runs], names)
@@ -116,14 +137,14 @@ class PlanTest(InFolder):
         self.assertEqual(len(self.plan((self.folder / "study.toml").read_text(), only=("ik",)).runs), 1)
 
     def test_changes_of_the_recipe_are_flags(self):
-        changes = (
-            "task.reset = { random_gravity = false, demo_probability = 0.25 }\nmodel.pointnet = [8, 6]\ntask.action.hand_zero = 'middle'\n"
-        )
+        changes = "task.reset = { random_gravity = false, demo_probability = 0.25 }\nmodel.pointnet = [8, 6]\ntask.action.hand_zero = 'middle'\n"
         plan = self.plan(HEAD + DATA + RUN + "[runs.a]\nsteps = 1e6\nnum_envs = 64\n[runs.a.config]\n" + changes)
         (train,) = (s for s in plan.steps.values() if isinstance(s, TrainStep))
         base = RECIPES["minutes"].config
         self.assertEqual(train.run.config.iterations, 977)
-        self.assertEqual(train.run.config.task.reset, replace(base.task.reset, random_gravity=False, demo_probability=0.25))
+        self.assertEqual(
+            train.run.config.task.reset, replace(base.task.reset, random_gravity=False, demo_probability=0.25)
+        )
         (command,) = train.commands()
         module = "xreset.learning.train"
         with (
@@ -138,7 +159,9 @@ class PlanTest(InFolder):
     def test_several_gpus_are_torchrun(self):
         plan = self.plan(HEAD + DATA + RUN + "[runs.a]\ndevice = 'cuda'\ngpus = 4\nminutes = 8\n")
         (command,) = plan.steps["train a-seed0"].commands()
-        self.assertEqual(command[1:8], ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "4", "-m", "xreset"])
+        self.assertEqual(
+            command[1:8], ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "4", "-m", "xreset"]
+        )
         self.assertEqual(plan.steps["train a-seed0"].gpus, 4)
 
     def test_what_does_not_fit_is_refused(self):
@@ -153,7 +176,11 @@ class PlanTest(InFolder):
                 FileFormatError,
                 r"runs\.a\.config\.task\.reset.*unknown: gravity",
             ),
-            (HEAD + DATA + RUN + "[runs.a]\nobjects = ['cup']\n", DemoError, r"runs\.a\.objects: there is no object 'cup'"),
+            (
+                HEAD + DATA + RUN + "[runs.a]\nobjects = ['cup']\n",
+                DemoError,
+                r"runs\.a\.objects: there is no object 'cup'",
+            ),
         ):
             with self.subTest(message), self.assertRaisesRegex(error, message):
                 self.plan(text)
@@ -187,7 +214,9 @@ class LaunchTest(InFolder):
         return launch(plan, steps, cluster="local", say=said.append, **options), said
 
     def step(self, name: str, command: str, *needs: str, gpus: int = 0) -> ShellStep:
-        return ShellStep(name=name, needs=needs, writes=self.folder / name.replace(" ", "-"), kind="data", gpus=gpus, command=command)
+        return ShellStep(
+            name=name, needs=needs, writes=self.folder / name.replace(" ", "-"), kind="data", gpus=gpus, command=command
+        )
 
     def test_submitit_that_is_missing(self):
         with (
@@ -217,7 +246,10 @@ class LaunchTest(InFolder):
         say = "echo $CUDA_VISIBLE_DEVICES > gpus; touch done"
         with mock.patch("xreset.eval.study.launch.visible_gpus", return_value=(2, 5)):
             problems, said = self.launch(
-                self.step("a", say, gpus=1), self.step("b", say, gpus=1), self.step("c", say), self.step("d", say, gpus=2)
+                self.step("a", say, gpus=1),
+                self.step("b", say, gpus=1),
+                self.step("c", say),
+                self.step("d", say, gpus=2),
             )
         self.assertEqual(problems, [])
         a, b, c, d = ((self.folder / name / "gpus").read_text().strip() for name in "abcd")
@@ -240,7 +272,9 @@ class LaunchTest(InFolder):
             held.__exit__(None, None, None)
 
         threading.Thread(target=finish, daemon=True).start()
-        problems = launch(mock.Mock(spec=Plan, out=self.out, steps={"a": step}), [step], cluster="local", say=said.append)
+        problems = launch(
+            mock.Mock(spec=Plan, out=self.out, steps={"a": step}), [step], cluster="local", say=said.append
+        )
         self.assertEqual((problems, said), ([], ["a: another command is at it; waiting for its end"]))
 
     @SUBMITIT
@@ -270,8 +304,15 @@ class TablesTest(InFolder):
 
     def write(self, name: str, *progress: float) -> None:
         toy = toy_rollouts()
-        rollouts = replace(toy, episodes=tuple(replace(e, task_progress=p) for e, p in zip(toy.episodes, progress, strict=True)))
-        write_results(self.out / name / "eval", toy_summary("mujoco", rollouts, robot="openarm", seed=0), rollouts, ("a", "b", "c"))
+        rollouts = replace(
+            toy, episodes=tuple(replace(e, task_progress=p) for e, p in zip(toy.episodes, progress, strict=True))
+        )
+        write_results(
+            self.out / name / "eval",
+            toy_summary("mujoco", rollouts, robot="openarm", seed=0),
+            rollouts,
+            ("a", "b", "c"),
+        )
 
     def test_ours_beside_the_papers(self):
         self.write("ours-seed0", 1.0, 1.0, 0.33, 0.33)
@@ -303,7 +344,10 @@ class TablesTest(InFolder):
         toy = toy_rollouts()
         soup = replace(toy, episodes=toy.episodes[:2], traces=toy.traces[:1])
         write_results(
-            self.out / "ours-tomato_soup_can-seed0" / "eval", toy_summary("mujoco", soup, robot="openarm", seed=0), soup, ("a", "b", "c")
+            self.out / "ours-tomato_soup_can-seed0" / "eval",
+            toy_summary("mujoco", soup, robot="openarm", seed=0),
+            soup,
+            ("a", "b", "c"),
         )
         plan = self.plan(self.TEXT.replace("[runs.ours]\n", "[runs.ours]\nalone = true\n"))
         rows = as_rows(fill(plan, plan.study.tables[0]), "mujoco")
@@ -312,7 +356,9 @@ class TablesTest(InFolder):
 
     def test_results_of_other_episodes_are_refused(self):
         self.write("ik", 0.33, 0.33, 0.33, 0.33)
-        with self.assertRaisesRegex(RunError, r"ik/eval/mujoco\.json is an evaluation of another kind: seed is 0 there and 7 in the study"):
+        with self.assertRaisesRegex(
+            RunError, r"ik/eval/mujoco\.json is an evaluation of another kind: seed is 0 there and 7 in the study"
+        ):
             self.plan(self.TEXT.replace("episodes = 2\n", "episodes = 2\nseed = 7\n"))
 
 
@@ -360,12 +406,17 @@ class WholeTest(unittest.TestCase):
         step = plan.steps["train x-reset-seed0"]
         self.assertFalse(step.done())
         (command,) = step.commands()
-        self.assertEqual(command[3:], ["train", "--out", str(self.out / "x-reset-seed0"), "--iterations", "4", "--resume"])
+        self.assertEqual(
+            command[3:], ["train", "--out", str(self.out / "x-reset-seed0"), "--iterations", "4", "--resume"]
+        )
 
     def test_another_configuration_under_the_same_name_is_refused(self):
         before = latest_checkpoint(self.out / "x-reset-seed0").read_bytes()
         for change, message in (
-            (("lstm = 12", "lstm = 16"), r"x-reset-seed0 holds a run of another configuration: config\.model\.lstm is 12 there and 16"),
+            (
+                ("lstm = 12", "lstm = 16"),
+                r"x-reset-seed0 holds a run of another configuration: config\.model\.lstm is 12 there and 16",
+            ),
             (("num_envs = 8", "num_envs = 16"), "num_envs is 8 there and 16 in the study"),
             (
                 ("synthetic_per_object = 1", "synthetic_per_object = 2"),
@@ -401,7 +452,8 @@ class WholeTest(unittest.TestCase):
         code, said, _ = run("study", "seconds", "--out", str(self.folder / "none"), "--dry-run")
         self.assertEqual(code, 0)
         self.assertRegex(
-            said, r"(?s)train x-reset-seed0: not begun \(CPU, after data .*\n    xreset train --out .*/none/x-reset-seed0 --iterations 2"
+            said,
+            r"(?s)train x-reset-seed0: not begun \(CPU, after data .*\n    xreset train --out .*/none/x-reset-seed0 --iterations 2",
         )
         self.assertFalse((self.folder / "none").exists())
 

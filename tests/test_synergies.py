@@ -17,7 +17,9 @@ from xreset.task.config import ActionConfig
 
 def gaussian(seed: int, joints: int = 5, directions: int = 2) -> SynergyGaussian:
     g = torch.Generator().manual_seed(seed)
-    found = SynergyGaussian(joints, torch.randn(joints, directions, generator=torch.Generator().manual_seed(0)), 0.4, init_std=0.3)
+    found = SynergyGaussian(
+        joints, torch.randn(joints, directions, generator=torch.Generator().manual_seed(0)), 0.4, init_std=0.3
+    )
     with torch.no_grad():
         found.log_std_param += 0.3 * torch.randn(joints, generator=g)
         found.log_synergy_param += 0.3 * torch.randn(directions, generator=g)

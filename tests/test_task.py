@@ -110,13 +110,17 @@ class RewardTest(unittest.TestCase):
         far, config = torch.tensor(1e3), RewardConfig(contact="opposing")
         self.assert_terms(self.reward(config, best_reach=far, tip_force=self.PRESS), grasp=1)
         squeeze = torch.tensor([[3.0, 0, 1], [0, 0, 0], [-3.0, 0, 1]])
-        self.assert_terms(self.reward(config, best_reach=far, tip_force=squeeze), grasp=1, position=4, rotation=4, success=10)
+        self.assert_terms(
+            self.reward(config, best_reach=far, tip_force=squeeze), grasp=1, position=4, rotation=4, success=10
+        )
 
     def test_every_tracking_term_needs_contact(self):
         """At the goal with no contact nothing but reach is paid; with it, 1 + 4 + 4 + 10."""
         far = torch.tensor(1e3)
         self.assert_terms(self.reward(best_reach=far))
-        self.assert_terms(self.reward(best_reach=far, tip_force=self.PRESS), grasp=1, position=4, rotation=4, success=10)
+        self.assert_terms(
+            self.reward(best_reach=far, tip_force=self.PRESS), grasp=1, position=4, rotation=4, success=10
+        )
 
     def test_position_and_rotation(self):
         reward = self.reward(
@@ -159,7 +163,9 @@ class RewardTest(unittest.TestCase):
         for start in (at, torch.tensor([0.5, 0.3, 0.1]), torch.tensor([0.5, 0.3, 0.11])):
             reward = self.reward(config, tip_force=self.PRESS, object_pos=at, start_pos=start)
             known = max(0.02, float((start - torch.tensor([0.5, 0.3, 0.1])).norm()))
-            self.assertAlmostEqual(float(reward.terms["progress"]), 8 * (1 - math.tanh(0.04 / 0.15) / math.tanh(known / 0.15)), places=4)
+            self.assertAlmostEqual(
+                float(reward.terms["progress"]), 8 * (1 - math.tanh(0.04 / 0.15) / math.tanh(known / 0.15)), places=4
+            )
 
     def test_a_term_of_the_users_own_is_added(self):
         config = RewardConfig(own={f"{__name__}:height": 0.5})
@@ -205,7 +211,9 @@ class RewardTest(unittest.TestCase):
         self.assert_terms(reward, action=-0.005 * 1.25, action_rate=-0.005 * 1.04)
 
     def test_leaving_the_scene(self):
-        self.assert_terms(self.reward(best_reach=torch.tensor(1e3), out_of_bounds=torch.tensor(True)), out_of_bounds=-500)
+        self.assert_terms(
+            self.reward(best_reach=torch.tensor(1e3), out_of_bounds=torch.tensor(True)), out_of_bounds=-500
+        )
 
     def test_weights_and_scale_come_from_the_configuration(self):
         config = RewardConfig(grasp=3.0, position=0.0, rotation=0.0, success=0.0, reach=0.0, scale=1.0)
@@ -218,7 +226,9 @@ class RewardTest(unittest.TestCase):
 
     def test_an_opposing_gate_tells_a_squeeze_from_a_press(self):
         down, left, right, none = [0.0, 0, -5], [-5.0, 0, -1], [5.0, 0, -1], [0.0, 0, 0]
-        hands = torch.tensor([[down, down, down], [left, right, none], [left, none, right], [left, left, down], [none, left, right]])
+        hands = torch.tensor(
+            [[down, down, down], [left, right, none], [left, none, right], [left, left, down], [none, left, right]]
+        )
         self.assertEqual(contact_gate(hands, 0.1).tolist(), [True, True, True, True, False])
         self.assertEqual(contact_gate(hands, 0.1, opposing=True).tolist(), [False, True, True, False, False])
 
@@ -227,7 +237,14 @@ class TerminationTest(unittest.TestCase):
     def test_bounds(self):
         table, c = TableSpec(center=(0.5, 0.3), half_size=(0.7, 0.5, 0.02)), TerminationConfig()
         inside = [[0.5, 0.3, 0.0], [1.29, 0.3, 0.5], [0.5, -0.29, 0.99], [0.5, 0.3, -0.049]]
-        outside = [[1.31, 0.3, 0.1], [-0.31, 0.3, 0.1], [0.5, 0.91, 0.1], [0.5, -0.31, 0.1], [0.5, 0.3, -0.051], [0.5, 0.3, 1.01]]
+        outside = [
+            [1.31, 0.3, 0.1],
+            [-0.31, 0.3, 0.1],
+            [0.5, 0.91, 0.1],
+            [0.5, -0.31, 0.1],
+            [0.5, 0.3, -0.051],
+            [0.5, 0.3, 1.01],
+        ]
         self.assertEqual(out_of_bounds(torch.tensor(inside), table, c).tolist(), [False] * 4)
         self.assertEqual(out_of_bounds(torch.tensor(outside), table, c).tolist(), [True] * 6)
 
@@ -254,7 +271,9 @@ class ActionTest(WithRobot):
         torch.testing.assert_close(still[:, 3:], torch.tensor([[-0.55, 0.55, 0.8, 0.02]]))
         full = space.targets(torch.ones(1, 7), target, target)
         torch.testing.assert_close(full, torch.tensor([[0.15, 0.55, -0.45, 0.5, 1.6, 1.6, 0.04]]))
-        torch.testing.assert_close(space.targets(torch.full((1, 7), 5.0), target, target), full, msg="actions are limited to [-1, 1]")
+        torch.testing.assert_close(
+            space.targets(torch.full((1, 7), 5.0), target, target), full, msg="actions are limited to [-1, 1]"
+        )
 
     def test_arm_targets_stay_near_the_joint_and_within_its_limits(self):
         space = self.space(arm_step=0.05, arm_lead=0.15)
@@ -286,7 +305,9 @@ class ActionTest(WithRobot):
     def test_a_relative_hand_that_does_nothing_holds_its_targets(self):
         space = self.space(hand="relative", hand_step=0.05, hand_lead=0.4)
         target = torch.tensor([[0.1, 0.5, -0.5, -0.2, 0.4, 0.3, 0.01]])  # the last one slides, by 4 cm in all
-        pressed = target - torch.tensor([0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.004])  # joints that an object keeps from following
+        pressed = target - torch.tensor(
+            [0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.004]
+        )  # joints that an object keeps from following
         torch.testing.assert_close(space.targets(torch.zeros(1, 7), target, pressed)[:, 3:], target[:, 3:])
         moved = space.targets(torch.tensor([[0.0, 0, 0, 1, -1, 0.5, 1]]), target, pressed)
         torch.testing.assert_close(moved[:, 3:], torch.tensor([[-0.15, 0.35, 0.325, 0.012]]))
@@ -359,7 +380,9 @@ class RandomizationTest(unittest.TestCase):
 
     def test_a_pairs_friction_is_the_mean_of_its_materials(self):
         c = RandomizationConfig(elastomer=0.8, metal=0.1, table=0.5)
-        torch.testing.assert_close(pair_friction(torch.tensor([0.5, 1.0]), c), torch.tensor([[0.65, 0.3, 0.5], [0.9, 0.55, 0.75]]))
+        torch.testing.assert_close(
+            pair_friction(torch.tensor([0.5, 1.0]), c), torch.tensor([[0.65, 0.3, 0.5], [0.9, 0.55, 0.75]])
+        )
 
     def test_friction_comes_from_the_buckets(self):
         c = RandomizationConfig(friction=(0.5, 1.0), friction_buckets=250)
@@ -409,7 +432,9 @@ class ResetTest(WithRobot):
 
     def test_objects_may_come_in_another_order_and_be_fewer_than_the_banks(self):
         for objects in ((SPAM, SOUP), (SPAM,)):
-            reset = self.distribution(objects, demo_probability=0.5).sample(torch.zeros(200, dtype=torch.long), generator())
+            reset = self.distribution(objects, demo_probability=0.5).sample(
+                torch.zeros(200, dtype=torch.long), generator()
+            )
             self.assertEqual(set(reset.sequence.tolist()), {1})
             self.assertEqual(set(((reset.object_pos[reset.from_bank, 0] - 0.6) * 100).round().tolist()), {2.0, 3.0})
 
@@ -430,11 +455,16 @@ class ResetTest(WithRobot):
         both = torch.tensor([0, 1] * 4000)
         resets = self.distribution(demo_probability=1.0, frontier=0.75)
         names = ((resets.sample(both, generator()).object_pos[:, 0] - 0.6) * 100).round().long()
-        resets.reached_from_bank.copy_(torch.tensor([0.0, 0.5, 0.9, 1.0, 0.2, 0.1]))  # soup, soup, soup, soup, spam, spam: sorted by object
+        resets.reached_from_bank.copy_(
+            torch.tensor([0.0, 0.5, 0.9, 1.0, 0.2, 0.1])
+        )  # soup, soup, soup, soup, spam, spam: sorted by object
         reset = resets.sample(both, generator())
         chosen = reset.state
         self.assertEqual(sorted(set(names.tolist())), [0, 1, 2, 3, 4, 5])
-        for first, weights in ((0, (0.01, 0.25, 0.09, 0.01)), (4, (0.16, 0.09))):  # a state never has less than the floor
+        for first, weights in (
+            (0, (0.01, 0.25, 0.09, 0.01)),
+            (4, (0.16, 0.09)),
+        ):  # a state never has less than the floor
             share = torch.bincount(chosen[both == (first > 0)] - first, minlength=len(weights)) / 4000
             weight = torch.tensor(weights)
             torch.testing.assert_close(share, 0.25 / len(weights) + 0.75 * weight / weight.sum(), atol=0.03, rtol=0)
@@ -454,8 +484,12 @@ class ResetTest(WithRobot):
         both = torch.tensor([0, 1] * 4000)
         resets = self.distribution(demo_probability=0.25, frontier=1.0, frontier_over="all")
         even = resets.sample(both, generator())
-        self.assertAlmostEqual(float(even.from_bank.float().mean()), 0.25, delta=0.02, msg="as long as nothing is known")
-        resets.reached_from_bank.copy_(torch.tensor([1.0, 1.0, 0.5, 0.0, 0.5, 0.5]))  # soup (demonstrations 0, 2), then spam
+        self.assertAlmostEqual(
+            float(even.from_bank.float().mean()), 0.25, delta=0.02, msg="as long as nothing is known"
+        )
+        resets.reached_from_bank.copy_(
+            torch.tensor([1.0, 1.0, 0.5, 0.0, 0.5, 0.5])
+        )  # soup (demonstrations 0, 2), then spam
         resets.reached[:3] = torch.tensor([0.5, 0.0, 0.1])
         reset = resets.sample(both, generator())
         soup, spam = both == 0, both == 1
@@ -464,7 +498,9 @@ class ResetTest(WithRobot):
         found = torch.bincount(torch.where(reset.from_bank, reset.state, 4 + reset.sequence)[soup], minlength=7) / 4000
         expected = torch.tensor([*states, home[0], 0.0, home[1]], dtype=torch.float32) / total
         torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
-        self.assertAlmostEqual(float(reset.from_bank[spam].float().mean()), 0.25 * 0.25 / (0.25 * 0.25 + 0.75 * 0.01), delta=0.02)
+        self.assertAlmostEqual(
+            float(reset.from_bank[spam].float().mean()), 0.25 * 0.25 / (0.25 * 0.25 + 0.75 * 0.01), delta=0.02
+        )
 
     def test_one_table_where_either_part_is_empty(self):
         for p, expected in ((0.0, 0.0), (1.0, 1.0)):
@@ -483,10 +519,14 @@ class ResetTest(WithRobot):
         resets.learn(state, sequence, ended, reached)
         three = 0.5 * 0.9**3 + (1 - 0.9**3) * 2 / 3
         torch.testing.assert_close(resets.reached_from_bank, torch.tensor([three, 0.45, 0.55, 0.5, 0.5, 0.5]))
-        torch.testing.assert_close(resets.reached_from_home, torch.tensor([0.5, 0.5, 0.55]), msg="demonstrations 0, 2 (soup) and 1 (spam)")
+        torch.testing.assert_close(
+            resets.reached_from_home, torch.tensor([0.5, 0.5, 0.55]), msg="demonstrations 0, 2 (soup) and 1 (spam)"
+        )
         for _ in range(100):
             resets.learn(state, sequence, ended, reached)
-        torch.testing.assert_close(resets.reached_from_bank, torch.tensor([2 / 3, 0.0, 1.0, 0.5, 0.5, 0.5]), atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            resets.reached_from_bank, torch.tensor([2 / 3, 0.0, 1.0, 0.5, 0.5, 0.5]), atol=1e-4, rtol=0
+        )
         torch.testing.assert_close(resets.reached_from_home, torch.tensor([0.5, 0.5, 1.0]), atol=1e-4, rtol=0)
         empty = self.distribution(bank=toy_bank(self.robot).select(sequences=np.zeros(3, dtype=bool)), frontier=0.5)
         empty.learn(torch.full((7,), -1), sequence, ended, reached)
@@ -499,7 +539,9 @@ class ResetTest(WithRobot):
                 ResetConfig(**changes)
 
     def test_an_object_without_demonstration_is_an_error(self):
-        with self.assertRaisesRegex(DemoError, "no demonstration of 011_banana; it has 005_tomato_soup_can, 010_potted_meat_can"):
+        with self.assertRaisesRegex(
+            DemoError, "no demonstration of 011_banana; it has 005_tomato_soup_can, 010_potted_meat_can"
+        ):
             self.distribution((SOUP, "011_banana"))
 
     def test_gravity_of_bank_resets_is_uniform_and_may_be_fixed(self):
@@ -514,7 +556,11 @@ class ResetTest(WithRobot):
         gravity = self.distribution(demo_probability=0.0).sample(self.SOUPS, generator()).gravity_fraction
         self.assertAlmostEqual(float(gravity.mean()), 1.0, delta=0.01)
         self.assertAlmostEqual(float(gravity.std()), 1 / 9.81, delta=0.005)
-        clipped = self.distribution(demo_probability=0.0, home_gravity_clip=0.1).sample(self.SOUPS, generator()).gravity_fraction
+        clipped = (
+            self.distribution(demo_probability=0.0, home_gravity_clip=0.1)
+            .sample(self.SOUPS, generator())
+            .gravity_fraction
+        )
         self.assertAlmostEqual(float(clipped.min()), 0.9, places=6)
         self.assertAlmostEqual(float(clipped.max()), 1.1, places=6)
         exact = self.distribution(demo_probability=0.0, home_gravity_std=0.0).sample(self.SOUPS, generator())
@@ -611,7 +657,9 @@ class ObservationTest(unittest.TestCase):
             torch.testing.assert_close(self.proprio[f"palm_{name}"], getattr(self.x.links, name)[:, 0])
         torch.testing.assert_close(self.proprio["tip_pos"], self.x.links.pos[:, 1:].reshape(self.N, -1))
         torch.testing.assert_close(self.proprio["joint_vel"], 0.2 * self.x.state.joint_vel)
-        torch.testing.assert_close(self.proprio["joint_pos"], (self.x.state.joint_pos - 0.5) / 2.5)  # limits -2, 3 become -1, 1
+        torch.testing.assert_close(
+            self.proprio["joint_pos"], (self.x.state.joint_pos - 0.5) / 2.5
+        )  # limits -2, 3 become -1, 1
         force = self.proprio["tip_force"]
         self.assertEqual(float(force.abs().max()), 1.0)
         small = self.x.tip_force.abs() < 10
@@ -619,7 +667,9 @@ class ObservationTest(unittest.TestCase):
 
     def test_how_far_targets_are_ahead_is_shown_if_asked_for(self):
         config = replace(self.config, joint_target=True)
-        terms = self.split(obs.proprio_group(self.x, config, generator()), obs.layout(self.J, self.E, config)["proprio"])
+        terms = self.split(
+            obs.proprio_group(self.x, config, generator()), obs.layout(self.J, self.E, config)["proprio"]
+        )
         torch.testing.assert_close(terms["joint_target"], self.x.joint_target - self.x.state.joint_pos)
         torch.testing.assert_close(terms["tip_force"], self.proprio["tip_force"])
 
@@ -631,10 +681,15 @@ class ObservationTest(unittest.TestCase):
             seen_quat=-self.x.seen_quat,
             goal_quat=-self.x.goal_quat,
         )
-        torch.testing.assert_close(obs.policy_group(negated, self.config, generator()), obs.policy_group(self.x, self.config, generator()))
+        torch.testing.assert_close(
+            obs.policy_group(negated, self.config, generator()), obs.policy_group(self.x, self.config, generator())
+        )
         again = obs.proprio_group(negated, self.config, generator())
         torch.testing.assert_close(again, obs.proprio_group(self.x, self.config, generator()))
-        for name, quat, own in (("object_quat", self.policy, self.x.seen_quat), ("palm_quat", self.proprio, self.x.links.quat[:, 0])):
+        for name, quat, own in (
+            ("object_quat", self.policy, self.x.seen_quat),
+            ("palm_quat", self.proprio, self.x.links.quat[:, 0]),
+        ):
             self.assertTrue(bool((quat[name][:, 0] >= 0).all()), name)
             torch.testing.assert_close(quat_angle(quat[name], own), torch.zeros(self.N), atol=1e-3, rtol=0)
         torch.testing.assert_close(
@@ -644,12 +699,16 @@ class ObservationTest(unittest.TestCase):
     def test_privileged_group(self):
         found = obs.privileged_group(self.x)
         self.assertEqual(tuple(found.shape), (self.N, 15))
-        expected = torch.cat((self.x.state.object_linvel, self.x.state.object_angvel, self.x.goal_pos - self.x.state.object_pos), 1)
+        expected = torch.cat(
+            (self.x.state.object_linvel, self.x.state.object_angvel, self.x.goal_pos - self.x.state.object_pos), 1
+        )
         torch.testing.assert_close(found[:, :9], expected)
         axis = torch.tensor([1.0, 0, 0]).expand(self.N, 3)
         corrected = quat_rotate(quat_from_axis_angle(found[:, 9:12]), quat_rotate(self.x.state.object_quat, axis))
         torch.testing.assert_close(corrected, quat_rotate(self.x.goal_quat, axis), atol=1e-5, rtol=0)
-        torch.testing.assert_close(found[:, 12:], torch.stack((self.x.tip_distance.amin(1), self.x.gravity_fraction, self.x.reward), 1))
+        torch.testing.assert_close(
+            found[:, 12:], torch.stack((self.x.tip_distance.amin(1), self.x.gravity_fraction, self.x.reward), 1)
+        )
 
     def test_cloud(self):
         points = torch.randn(self.N, 10, 3, generator=generator(1))
@@ -659,7 +718,11 @@ class ObservationTest(unittest.TestCase):
         torch.testing.assert_close(cloud[2, 7], expected)
 
         scaled = obs.cloud_frame(
-            points, self.x.state.object_pos, self.x.state.object_quat, replace(self.config, cloud_scale=5.0), generator()
+            points,
+            self.x.state.object_pos,
+            self.x.state.object_quat,
+            replace(self.config, cloud_scale=5.0),
+            generator(),
         )
         torch.testing.assert_close(scaled, 5.0 * cloud)
 
@@ -688,7 +751,9 @@ class ObservationTest(unittest.TestCase):
         self.assertEqual(float(policy[:, 7:].abs().max()), 0.0)
         noisy = obs.policy_group(x, c, generator())[:, 3:7]
         torch.testing.assert_close(noisy.norm(dim=-1), torch.ones(many))
-        self.assertAlmostEqual(float(quat_angle(noisy, x.seen_quat).square().mean().sqrt()), 0.05 * math.sqrt(3), delta=0.005)
+        self.assertAlmostEqual(
+            float(quat_angle(noisy, x.seen_quat).square().mean().sqrt()), 0.05 * math.sqrt(3), delta=0.005
+        )
         proprio = obs.proprio_group(x, c, generator()) - obs.proprio_group(x, self.config, generator())
         self.assertAlmostEqual(float(proprio[:, : self.J].std()), 0.01 / 2.5, delta=2e-4)
         self.assertAlmostEqual(float(proprio[:, self.J : 2 * self.J].std()), 0.1 * 0.2, delta=1e-3)
@@ -708,7 +773,9 @@ class EvaluationTaskTest(unittest.TestCase):
         self.assertEqual((faster.timestep, faster.substeps), (1 / 240, 4))
         odd = evaluation_task(replace(task, timestep=1 / 100, substeps=1))
         self.assertEqual((odd.timestep, odd.substeps), (1 / 100, 1))
-        self.assertEqual((found.reset.demo_probability, found.reset.home_gravity_std, found.randomization.enabled), (0.0, 0.0, False))
+        self.assertEqual(
+            (found.reset.demo_probability, found.reset.home_gravity_std, found.randomization.enabled), (0.0, 0.0, False)
+        )
         back = replace(found, observation=task.observation, reset=task.reset, randomization=task.randomization)
         self.assertEqual(back, task)
         self.assertEqual(found.reset.spawn_xy, 0.05)
@@ -748,7 +815,10 @@ class PolicyTest(WithRobot):
         fewer = replace(self.TASK, observation=replace(self.TASK.observation, cloud_history=3))
         self.refused("observation layout .perception.cloud: 960 in the policy, 576 here", task=fewer)
         extra = policy_contract(self.robot, self.TASK, ())["observation_layout"]
-        self.refused(r"policy.tactile: 4 in the policy, None here", observation_layout=extra | {"policy": extra["policy"] | {"tactile": 4}})
+        self.refused(
+            r"policy.tactile: 4 in the policy, None here",
+            observation_layout=extra | {"policy": extra["policy"] | {"tactile": 4}},
+        )
         home = replace(self.TASK, action=ActionConfig(hand_zero="home"))
         self.refused("another action mapping .hand_zero: 'middle' in the policy, 'home' here", task=home)
         scaled = replace(self.TASK, observation=replace(self.TASK.observation, cloud_scale=5.0))

@@ -67,7 +67,9 @@ class ThirdHandTest(unittest.TestCase):
         kinematics = Kinematics(self.robot, root=hand.root)
         tips = [tip.link for tip in self.robot.fingertips]
         generator = torch.Generator().manual_seed(0)
-        q = kinematics.lower + (kinematics.upper - kinematics.lower) * torch.rand(20, 16, generator=generator, dtype=torch.float64)
+        q = kinematics.lower + (kinematics.upper - kinematics.lower) * torch.rand(
+            20, 16, generator=generator, dtype=torch.float64
+        )
         found = kinematics.points(q, tips).numpy()
         names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, i) for i in range(model.njnt)]
         for row, expected in zip(q.numpy(), found, strict=True):
@@ -102,7 +104,9 @@ def _for_mujoco(urdf: Path) -> str:
     for link in root.findall("link"):
         for visual in link.findall("visual"):
             link.remove(visual)
-    ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", fusestatic="false", balanceinertia="true")
+    ElementTree.SubElement(
+        ElementTree.SubElement(root, "mujoco"), "compiler", fusestatic="false", balanceinertia="true"
+    )
     return ElementTree.tostring(root, encoding="unicode")
 
 

@@ -53,7 +53,9 @@ def wave_actions() -> Actions:
     actions = grasp_actions(30)
     home = torch.as_tensor(actions.robot.home, dtype=torch.float32)
     step = torch.tensor([0.02 if "jaw" not in name else 0.0 for name in actions.robot.joint_names])
-    start = replace(actions.start, object_pos=torch.tensor([[0.9, 0.5, 0.02]]), object_quat=torch.tensor([[1.0, 0, 0, 0]]))
+    start = replace(
+        actions.start, object_pos=torch.tensor([[0.9, 0.5, 0.02]]), object_quat=torch.tensor([[1.0, 0, 0, 0]])
+    )
     return replace(actions, start=start, joint_target=(home + step).expand(30, -1).clone(), phases=())
 
 
@@ -107,7 +109,9 @@ class PartingsTest(unittest.TestCase):
     def test_position_and_orientation(self):
         pos, quat = torch.zeros(20, 1, 3), torch.tensor([1.0, 0, 0, 0]).repeat(20, 1, 1)
         pos[10:, 0, 1] = 0.006
-        quat[15:] = -quat_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(6)]))  # the sign of a quaternion means nothing
+        quat[15:] = -quat_from_axis_angle(
+            torch.tensor([0.0, 0.0, math.radians(6)])
+        )  # the sign of a quaternion means nothing
         found = compare(recording(pos=pos, quat=quat), recording())
         self.assertAlmostEqual(found["object position"].time or 0.0, 11 * DT)
         self.assertAlmostEqual(found["object position"].end, 0.006, places=6)
@@ -138,7 +142,12 @@ class PartingsTest(unittest.TestCase):
         d = differences(recording(pos=pos), recording(), DT, Thresholds())
         self.assertEqual(len(d.time), 8)
         self.assertEqual(
-            partings(differences(recording(pos=pos * math.nan), recording(), DT, Thresholds()), toy_grasp.robot(), Thresholds()), ()
+            partings(
+                differences(recording(pos=pos * math.nan), recording(), DT, Thresholds()),
+                toy_grasp.robot(),
+                Thresholds(),
+            ),
+            (),
         )
 
 
@@ -162,7 +171,10 @@ class TraceTest(unittest.TestCase):
 
     def test_half_a_drives_gain_is_found_in_its_joint_at_once(self):
         result = self.run_against(
-            wave_actions(), "weak", lambda scene: toy_grasp.with_drive(scene, "turn", kp=0.5), thresholds=Thresholds(joint=0.002)
+            wave_actions(),
+            "weak",
+            lambda scene: toy_grasp.with_drive(scene, "turn", kp=0.5),
+            thresholds=Thresholds(joint=0.002),
         )
         found = {p.quantity: p for p in result.engines[0].partings}
         self.assertEqual((found["joints"].where, found["joints"].largest_where), ("turn", "turn"))
@@ -253,7 +265,9 @@ class ActionsTest(unittest.TestCase):
         self.addCleanup(folder.cleanup)
         self.path = Path(folder.name) / "actions.npz"
         actions = grasp_actions()
-        self.actions = replace(actions, scene=replace(actions.scene, friction=PairFriction(tip=0.7, link=0.4, table=0.3)))
+        self.actions = replace(
+            actions, scene=replace(actions.scene, friction=PairFriction(tip=0.7, link=0.4, table=0.3))
+        )
         write_actions(self.path, self.actions)
 
     def test_round_trip(self):
@@ -282,7 +296,9 @@ class EvaluationTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
         task = TaskConfig(
-            reset=ResetConfig(demo_probability=0.0, home_gravity_std=0.0, spawn_xy=0.0, spawn_yaw=0.0, home_noise=False),
+            reset=ResetConfig(
+                demo_probability=0.0, home_gravity_std=0.0, spawn_xy=0.0, spawn_yaw=0.0, home_noise=False
+            ),
             randomization=RandomizationConfig(enabled=False),
             termination=TerminationConfig(episode_seconds=0.7),
         )
@@ -296,7 +312,9 @@ class EvaluationTest(unittest.TestCase):
         self.assertEqual(len(actions.joint_target), 42)
         replayed = trace(actions, engine("mujoco"), [], perturbed=0).reference.recording
         every = 3  # control steps of 1/60 s between recorded states
-        np.testing.assert_allclose(replayed.object_pos[every - 1 :: every, 0].numpy(), episode.object_pos[1:], atol=1e-6)
+        np.testing.assert_allclose(
+            replayed.object_pos[every - 1 :: every, 0].numpy(), episode.object_pos[1:], atol=1e-6
+        )
         np.testing.assert_allclose(replayed.joint_pos[every - 1 :: every, 0].numpy(), episode.joint_pos[1:], atol=1e-6)
 
     def test_a_policy_that_plays_gives_the_same_actions(self):
@@ -307,7 +325,9 @@ class EvaluationTest(unittest.TestCase):
     def test_another_control_rate_is_refused(self):
         (episode,) = self.rollouts.traces
         with self.assertRaisesRegex(FileFormatError, "another control rate"):
-            recorded_actions(toy_grasp.robot(), toy_grasp.brick(), replace(episode, time=2 * episode.time), label="episode")
+            recorded_actions(
+                toy_grasp.robot(), toy_grasp.brick(), replace(episode, time=2 * episode.time), label="episode"
+            )
 
     def test_from_files(self):
         from tests.toy_results import toy_rollouts, toy_summary
@@ -320,9 +340,13 @@ class EvaluationTest(unittest.TestCase):
             write_results(Path(folder), summary, rollouts, robot.joint_names)
             path = Path(folder) / "sapien.trace.npz"
             actions = from_file(path, Sequence(object="010_potted_meat_can", episode=0), Place())
-            self.assertEqual((actions.object.name, actions.label), ("010_potted_meat_can", "zero in sapien, demonstration 1"))
+            self.assertEqual(
+                (actions.object.name, actions.label), ("010_potted_meat_can", "zero in sapien, demonstration 1")
+            )
             np.testing.assert_allclose(actions.joint_target.numpy(), rollouts.traces[1].joint_target, atol=1e-6)
-            with self.assertRaisesRegex(DemoError, "records 1 episodes of 010_potted_meat_can, so --episode is at most 0"):
+            with self.assertRaisesRegex(
+                DemoError, "records 1 episodes of 010_potted_meat_can, so --episode is at most 0"
+            ):
                 from_file(path, Sequence(object="010_potted_meat_can", episode=1), Place())
             soup = replace(rollouts, traces=tuple(replace(t, object="005_tomato_soup_can") for t in rollouts.traces))
             write_results(Path(folder), summary, soup, robot.joint_names)

@@ -31,7 +31,15 @@ from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.recipes import RECIPES
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt, read_checkpoint
-from xreset.learning.train import current_choice, ensure_policy, export_checkpoint, load_inputs, resumed, start_run, train
+from xreset.learning.train import (
+    current_choice,
+    ensure_policy,
+    export_checkpoint,
+    load_inputs,
+    resumed,
+    start_run,
+    train,
+)
 from xreset.plugins import make_backend
 from xreset.policy import OnnxPolicy, check_contract
 from xreset.resets.bank import write_bank
@@ -115,7 +123,9 @@ class TrainingTest(unittest.TestCase):
         self.assertGreater(after["elapsed"], before["elapsed"])
         self.assertEqual(read_run(out).config.iterations, 3)
         steps = [int(s["step"]) for s in after["optimizer_state_dict"]["state"].values()]
-        self.assertEqual(set(steps), {3 * 2 * 2})  # iterations x epochs x minibatches: the optimiser was not started anew
+        self.assertEqual(
+            set(steps), {3 * 2 * 2}
+        )  # iterations x epochs x minibatches: the optimiser was not started anew
 
     def test_resume_goes_on_in_the_middle_of_episodes(self):
         """Two iterations and one more are three in one go, up to the engine's warm start and the single precision of the saved state."""
@@ -137,8 +147,15 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual([content["iteration"] for content in worlds], [3, 3, 3])
         one, two, other = (content["processes"][0]["env"] for content in worlds)
         self.assertTrue(torch.equal(one["env._episode_length"], two["env._episode_length"]))
-        self.assertFalse(torch.equal(one["env._episode_length"], other["env._episode_length"]))  # new episodes, at random times
-        for name, atol in (("state.joint_pos", 2e-3), ("state.object_pos", 1e-4), ("env._cloud", 1e-4), ("env.goal_pos", 0.0)):
+        self.assertFalse(
+            torch.equal(one["env._episode_length"], other["env._episode_length"])
+        )  # new episodes, at random times
+        for name, atol in (
+            ("state.joint_pos", 2e-3),
+            ("state.object_pos", 1e-4),
+            ("env._cloud", 1e-4),
+            ("env.goal_pos", 0.0),
+        ):
             torch.testing.assert_close(two[name], one[name], rtol=0, atol=atol, msg=name)
         one, two, _ = (content["log"] for content in worlds)
         torch.testing.assert_close(two["lengths"], one["lengths"])
@@ -146,11 +163,43 @@ class TrainingTest(unittest.TestCase):
 
     def test_a_killed_run_loses_no_more_than_the_last_save_interval(self):
         out = self.folder / "killed"
-        small = ["--config.task.observation.cloud-points", "16", "--config.task.distance-points", "64", "--config.model.pointnet", "8", "6"]
+        small = [
+            "--config.task.observation.cloud-points",
+            "16",
+            "--config.task.distance-points",
+            "64",
+            "--config.model.pointnet",
+            "8",
+            "6",
+        ]
         small += ["--config.model.lstm", "12", "--config.model.mlp", "16", "--config.ppo.minibatch-size", "32"]
-        new = ["--robot", "openarm", "--resets", str(self.bank), "--backend", "mujoco", "--device", "cpu", "--num-envs", "8"]
-        command = [sys.executable, "-m", "xreset", "train", "--out", str(out), *new, "--config.save-interval", "2", *small]
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True) as process:
+        new = [
+            "--robot",
+            "openarm",
+            "--resets",
+            str(self.bank),
+            "--backend",
+            "mujoco",
+            "--device",
+            "cpu",
+            "--num-envs",
+            "8",
+        ]
+        command = [
+            sys.executable,
+            "-m",
+            "xreset",
+            "train",
+            "--out",
+            str(out),
+            *new,
+            "--config.save-interval",
+            "2",
+            *small,
+        ]
+        with subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+        ) as process:
             self.addCleanup(process.kill)
             end = time.monotonic() + 120
             while len(checkpoints(out)) < 3 and process.poll() is None and time.monotonic() < end:
@@ -162,7 +211,9 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual(newest["env_steps"], newest["iteration"] * 16 * 8)
         train(out, resumed(out, iterations=newest["iteration"] + 1), resume=True)
         content = read_checkpoint(latest_checkpoint(out))
-        self.assertEqual((content["iteration"], content["env_steps"]), (newest["iteration"] + 1, newest["env_steps"] + 16 * 8))
+        self.assertEqual(
+            (content["iteration"], content["env_steps"]), (newest["iteration"] + 1, newest["env_steps"] + 16 * 8)
+        )
         self.assertTrue((out / "policy.onnx").is_file())
 
     def test_the_same_ctrl_c_told_twice_is_one(self):
@@ -204,7 +255,9 @@ class TrainingTest(unittest.TestCase):
         minutes = parsed("--like", "minutes", "--config.ppo.entropy", "0.001")
         self.assertEqual((minutes.ppo.desired_kl, minutes.ppo.entropy, minutes.model.initial_std), (0.02, 0.001, 0.3))
         robust = parsed("--like", "robust")
-        self.assertEqual(replace(robust, task=replace(robust.task, randomization=RandomizationConfig())), RECIPES["minutes"].config)
+        self.assertEqual(
+            replace(robust, task=replace(robust.task, randomization=RandomizationConfig())), RECIPES["minutes"].config
+        )
         random = robust.task.randomization
         for f in fields(RandomizationConfig):  # all that is off by default is on
             if getattr(RandomizationConfig(), f.name) in (None, (0.0, 0.0), (1.0, 1.0)):
@@ -212,7 +265,10 @@ class TrainingTest(unittest.TestCase):
                 self.assertLess(low, high, f.name)
         self.assertEqual(parsed(f"--like={self.out}", "--config.save-interval", "7"), replace(CONFIG, save_interval=7))
         for arguments, problem in (
-            (("--like", "nothing"), "no recipe and no run folder 'nothing'. Recipes: paper, the paper's tables .*; minutes, what taught"),
+            (
+                ("--like", "nothing"),
+                "no recipe and no run folder 'nothing'. Recipes: paper, the paper's tables .*; minutes, what taught",
+            ),
             (("--like", str(self.folder)), "is not a run folder"),
             (("--like", "minutes", "--resume"), "leave out --like"),
             (("--weights", str(self.out), "--resume"), "leave out --weights"),
@@ -231,7 +287,10 @@ class TrainingTest(unittest.TestCase):
             self.assertRegex(said.getvalue(), problem)
 
     def test_a_run_begins_with_the_networks_of_another(self):
-        out, still = self.folder / "onwards", replace(CONFIG, ppo=replace(CONFIG.ppo, learning_rate=1e-12, schedule="fixed"), iterations=1)
+        out, still = (
+            self.folder / "onwards",
+            replace(CONFIG, ppo=replace(CONFIG.ppo, learning_rate=1e-12, schedule="fixed"), iterations=1),
+        )
         info = self.start(out, config=still, weights=self.out)
         given = latest_checkpoint(self.out)
         self.assertEqual((info.weights, info.weights_hash), (str(given), file_hash(given)))
@@ -277,7 +336,9 @@ class TrainingTest(unittest.TestCase):
         with self.assertRaisesRegex(PolicyError, "another observation layout"):
             self.start(self.folder / "b", config=replace(CONFIG, task=task), weights=self.out)
         with self.assertRaisesRegex(RunError, "'lstm': 12.*'lstm': 16.*--like"):
-            self.start(self.folder / "c", config=replace(CONFIG, model=replace(CONFIG.model, lstm=16)), weights=self.out)
+            self.start(
+                self.folder / "c", config=replace(CONFIG, model=replace(CONFIG.model, lstm=16)), weights=self.out
+            )
         self.assertFalse([name for name in "abc" if (self.folder / name).exists()])
 
     def test_a_run_ends_when_its_time_is_over_and_can_go_on(self):
@@ -295,7 +356,9 @@ class TrainingTest(unittest.TestCase):
         state = read_checkpoint(latest_checkpoint(out))["actor_state_dict"]
         (log_std,) = (value for name, value in state.items() if name.endswith("log_std_param"))
         is_arm = torch.tensor([joint.group == "arm" for joint in robots.load("openarm").joints])
-        torch.testing.assert_close(log_std.exp(), torch.where(is_arm, 0.3, 0.1), rtol=0.05, atol=0.0)  # one iteration moves them a little
+        torch.testing.assert_close(
+            log_std.exp(), torch.where(is_arm, 0.3, 0.1), rtol=0.05, atol=0.0
+        )  # one iteration moves them a little
 
     def test_a_policy_that_is_missing_is_exported_from_the_checkpoint(self):
         out = self.folder / "exported"
@@ -311,7 +374,10 @@ class TrainingTest(unittest.TestCase):
             with self.subTest(resume=resume):
                 out = self.folder / f"early-{resume}"
                 info = self.start(out)
-                with mock.patch.object(TrainingRunner, "learn", side_effect=ZeroDivisionError), self.assertRaises(ZeroDivisionError):
+                with (
+                    mock.patch.object(TrainingRunner, "learn", side_effect=ZeroDivisionError),
+                    self.assertRaises(ZeroDivisionError),
+                ):
                     train_only(out, info)
                 (out / "events.out.tfevents.old").write_bytes(b"half")
                 (out / ".worlds.pt.abc.part").write_bytes(b"half")
@@ -362,7 +428,11 @@ class TrainingTest(unittest.TestCase):
         train_only(out, self.start(out, config=config))
         for size, said in ((20_000, "cannot write .*worlds.pt"), (200, "cannot write the learning curves.*--resume")):
             full_at(size)
-            with self.subTest(size), mock.patch("xreset.learning.train.write_run"), self.assertRaisesRegex(XResetError, said):
+            with (
+                self.subTest(size),
+                mock.patch("xreset.learning.train.write_run"),
+                self.assertRaisesRegex(XResetError, said),
+            ):
                 train_only(out, resumed(out, iterations=3), resume=True)
             full_at(limits[0])
             self.assertEqual(read_checkpoint(latest_checkpoint(out))["iteration"], 1)
@@ -448,7 +518,13 @@ class TrainingTest(unittest.TestCase):
             ("contract in which joint_names", {"contract": good["contract"] | {"joint_names": 3}}),
         ):
             (out / "run.json").write_text(
-                json.dumps({k: v for k, v in (good | changes).items() if v is not None or k in ("objects", "weights", "weights_hash")})
+                json.dumps(
+                    {
+                        k: v
+                        for k, v in (good | changes).items()
+                        if v is not None or k in ("objects", "weights", "weights_hash")
+                    }
+                )
             )
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
                 read_run(out)

@@ -56,12 +56,19 @@ class VectorEnvTest(WithEnv):
             with warnings.catch_warnings(record=True) as found:
                 warnings.simplefilter("always")
                 check_env(OneWorld(envs, world))
-            expected = ("spec", "infinity")  # it was not made by gymnasium.make; and joint speeds and forces have no bounds
-            self.assertEqual([str(w.message) for w in found if not any(word in str(w.message) for word in expected)], [])
+            expected = (
+                "spec",
+                "infinity",
+            )  # it was not made by gymnasium.make; and joint speeds and forces have no bounds
+            self.assertEqual(
+                [str(w.message) for w in found if not any(word in str(w.message) for word in expected)], []
+            )
 
     def test_the_batch_is_what_gymnasium_makes_of_the_single_spaces(self):
         envs = self.vector_env(0.5)
-        self.assertEqual(envs.observation_space, gymnasium.vector.utils.batch_space(envs.single_observation_space, envs.num_envs))
+        self.assertEqual(
+            envs.observation_space, gymnasium.vector.utils.batch_space(envs.single_observation_space, envs.num_envs)
+        )
         self.assertEqual(envs.action_space, gymnasium.vector.utils.batch_space(envs.single_action_space, envs.num_envs))
         first, _ = envs.reset(seed=0)
         kept = {name: value.copy() for name, value in first.items()}
@@ -101,7 +108,11 @@ class VectorEnvTest(WithEnv):
         """The frontier learns from it, and a broken world is counted, in the step that ends it; not again in the one that resets it."""
         from xreset.vector_env import VectorEnv
 
-        task = replace(TASK, reset=ResetConfig(demo_probability=1.0, frontier=0.5), termination=TerminationConfig(episode_seconds=0.1))
+        task = replace(
+            TASK,
+            reset=ResetConfig(demo_probability=1.0, frontier=0.5),
+            termination=TerminationConfig(episode_seconds=0.1),
+        )
         inner = self.make(task, kind=BreakableBackend)
         env, still = VectorEnv(inner), np.zeros((N, inner.num_actions), np.float32)
         inner.backend.broken[0] = True

@@ -132,7 +132,9 @@ class Data(WithFiles):
         load_view(file)
         data.joint_pos[6, 2] += 50.0
         write_retargeted(file, data, config={}, inputs={})
-        with self.assertRaisesRegex(FileFormatError, "beyond.npz holds joint3 = 50.08 in frame 6, but it goes from -1.571 to 1.571. Make"):
+        with self.assertRaisesRegex(
+            FileFormatError, "beyond.npz holds joint3 = 50.08 in frame 6, but it goes from -1.571 to 1.571. Make"
+        ):
             load_view(file)
 
     def test_demonstrations(self):
@@ -154,7 +156,13 @@ class Data(WithFiles):
         self.assertEqual([bool(reason) for reason in view.reason], [False, True, False, False] * 2)
         self.assertEqual(view.text(1)[:2], ("not valid: joint limit", SOUP))
         self.assertEqual(
-            view.text(6)[2:], ("sequence 1: demo_b", "frame 2", "after contact, human touches", "off by 12 mm (fingertips), 3 mm (wrist)")
+            view.text(6)[2:],
+            (
+                "sequence 1: demo_b",
+                "frame 2",
+                "after contact, human touches",
+                "off by 12 mm (fingertips), 3 mm (wrist)",
+            ),
         )
         np.testing.assert_array_equal(view.choose(phase="before contact"), [0, 1, 4, 5])
         self.assertIsNone(view.human)
@@ -162,7 +170,10 @@ class Data(WithFiles):
     def test_human_hands_are_found_by_sequence_name(self):
         swapped = self.folder / "swapped.npz"
         write_demos(swapped, toy_demos().select(indices=[1, 0]))
-        human, same = load_view(self.retargeted, demos=swapped).human, load_view(self.retargeted, demos=self.demos).human
+        human, same = (
+            load_view(self.retargeted, demos=swapped).human,
+            load_view(self.retargeted, demos=self.demos).human,
+        )
         assert human is not None and same is not None
         np.testing.assert_array_equal(human.keypoints, same.keypoints)
         np.testing.assert_array_equal(np.flatnonzero(human.touching.all(axis=1)), [2, 6])
@@ -177,7 +188,9 @@ class Data(WithFiles):
         np.testing.assert_array_equal(np.isfinite(view.human.contacts).all(axis=-1), view.human.touching)
         can = view.objects[0]
         low, high = can.vertices.min(axis=0), can.vertices.max(axis=0)
-        touched = (view.human.contacts[2] - view.object_pos[2] - (low + high) / 2) / ((high - low) / 2)  # upright: of an upright unit can
+        touched = (view.human.contacts[2] - view.object_pos[2] - (low + high) / 2) / (
+            (high - low) / 2
+        )  # upright: of an upright unit can
         on_wall_or_lid = np.maximum(np.linalg.norm(touched[:, :2], axis=1), np.abs(touched[:, 2]))
         np.testing.assert_allclose(on_wall_or_lid, 1.0, atol=0.02)
 
@@ -208,7 +221,11 @@ class Data(WithFiles):
         )  # fmt: skip
         write_bank(bank, between, config={}, inputs={})
         view = load_view(bank, retargeted=made_from)
-        self.assertEqual(list(zip(view.sequence.tolist(), view.frame.tolist())), [(0, 0), (0, 2), (1, 0), (1, 2)], "whole frames only")
+        self.assertEqual(
+            list(zip(view.sequence.tolist(), view.frame.tolist())),
+            [(0, 0), (0, 2), (1, 0), (1, 2)],
+            "whole frames only",
+        )
         self.assertEqual(view.reason, ("", "joint velocity", "", ""))
         with self.assertRaisesRegex(XResetError, "was not made from"):
             load_view(self.bank, retargeted=made_from)
@@ -261,7 +278,9 @@ class Pictures(WithFiles):
         view = load_view(self.demos)
         draw = Drawer(view, size=(160, 120)).draw
         hand_away, touching, unknown = draw(0).astype(int), draw(2).astype(int), draw(3).astype(int)
-        yellow = [((p[..., 0] > 240) & (p[..., 1] > 190) & (p[..., 2] < 60)).sum() for p in (hand_away, touching, unknown)]
+        yellow = [
+            ((p[..., 0] > 240) & (p[..., 1] > 190) & (p[..., 2] < 60)).sum() for p in (hand_away, touching, unknown)
+        ]
         self.assertGreater(yellow[1], 0)
         self.assertEqual((yellow[0], yellow[2]), (0, 0))
 
@@ -284,7 +303,9 @@ class Pictures(WithFiles):
         view = load_view(self.demos)
         self.assertEqual([tile.row for tile in moment_tiles(view)], [2, 2, 2, 6, 6, 6])  # no hand in the last frame
         never = replace(view, post_contact=np.zeros(8, dtype=bool))
-        self.assertEqual([(tile.row, tile.caption[1]) for tile in moment_tiles(never)], [(None, "no example in this file")] * 6)
+        self.assertEqual(
+            [(tile.row, tile.caption[1]) for tile in moment_tiles(never)], [(None, "no example in this file")] * 6
+        )
 
     def test_mid_lift_is_half_way_up(self):
         view = load_view(self.demos)

@@ -18,7 +18,9 @@ from xreset.pictures.view.load import load_view
 from xreset.resets.bank import write_bank
 from xreset.retarget.file import write_retargeted
 
-INPUT = "document.getElementById([...document.querySelectorAll('label')].find(e => e.textContent === '{label}').htmlFor)"
+INPUT = (
+    "document.getElementById([...document.querySelectorAll('label')].find(e => e.textContent === '{label}').htmlFor)"
+)
 SLIDER = INPUT + ".querySelector('[role=slider]')"
 BUTTON = "[...document.querySelectorAll('button')].find(e => e.textContent === '{label}')"
 OPTION = "[...document.querySelectorAll('[role=option]')].find(e => e.textContent === '{label}' && e.offsetParent)"
@@ -33,7 +35,9 @@ class InTheBrowser(unittest.TestCase):
         folder = tempfile.TemporaryDirectory()
         cls.addClassCleanup(folder.cleanup)
         robot = robots.load("openarm")
-        cls.demos, cls.retargeted, cls.bank = (Path(folder.name) / f"{name}.npz" for name in ("demos", "retargeted", "bank"))
+        cls.demos, cls.retargeted, cls.bank = (
+            Path(folder.name) / f"{name}.npz" for name in ("demos", "retargeted", "bank")
+        )
         write_demos(cls.demos, toy_demos())
         write_retargeted(cls.retargeted, toy_retargeted(robot), config={}, inputs={})
         write_bank(cls.bank, toy_bank(robot), config={}, inputs={})
@@ -91,13 +95,19 @@ class InTheBrowser(unittest.TestCase):
         np.testing.assert_allclose(can.position, page.view.object_pos[0])
         self.browser.evaluate(f"{SLIDER.format(label='frame')}.focus()")
         self.browser.key("ArrowRight")
-        self.until(lambda: np.allclose(can.position, page.view.object_pos[1], rtol=0, atol=1e-6), "the can to move to frame 1")
+        self.until(
+            lambda: np.allclose(can.position, page.view.object_pos[1], rtol=0, atol=1e-6), "the can to move to frame 1"
+        )
         self.until(lambda: "not valid: joint limit" in self.text(), "the reason in the browser")
         self.assertIn("joint limit 1", self.text())
         self.browser.key("End")
-        self.until(lambda: page.row == 3 and not page._scene._keypoints.visible, "the last frame, where no hand is annotated")
+        self.until(
+            lambda: page.row == 3 and not page._scene._keypoints.visible, "the last frame, where no hand is annotated"
+        )
         self.choose("sequence", "1: demo_b")
-        self.until(lambda: [body.visible for body in page._scene._objects] == [False, True], "the other sequence's object")
+        self.until(
+            lambda: [body.visible for body in page._scene._objects] == [False, True], "the other sequence's object"
+        )
         self.assertEqual(page.row, 4)
         self.until(lambda: "sequence 1: demo_b" in self.text(), "its name in the browser")
         self.assertGreater(self.orange_pixels(), 20, "the object is not to be seen")

@@ -67,7 +67,13 @@ def bank() -> ResetBank:
     def six(row: np.ndarray) -> np.ndarray:
         return np.tile(row, (6, 1)).astype(np.float32)
 
-    return replace(toy_grasp.bank(), joint_pos=six(robot.home), joint_target=six(closing), object_pos=six(pos), object_quat_wxyz=six(quat))
+    return replace(
+        toy_grasp.bank(),
+        joint_pos=six(robot.home),
+        joint_target=six(closing),
+        object_pos=six(pos),
+        object_quat_wxyz=six(quat),
+    )
 
 
 def random_policy(seed: int, backend: Backend) -> Shares:

@@ -36,7 +36,10 @@ def write_policy(
         value: of every weight.
         metadata: in place of the contract.
     """
-    layout, cloud = contract["observation_layout"], from_dict(TaskConfig, json.loads(json.dumps(contract["task"]))).observation
+    layout, cloud = (
+        contract["observation_layout"],
+        from_dict(TaskConfig, json.loads(json.dumps(contract["task"]))).observation,
+    )
     flat = sum(width for terms in (layout["policy"], layout["proprio"]) for width in terms.values())
     shapes = {
         "flat": ["n", flat],
@@ -44,8 +47,13 @@ def write_policy(
         "h_in": [1, "n", lstm],
         "c_in": [1, "n", lstm],
     }
-    inputs = [helper.make_tensor_value_info(name, kind if name == "flat" else TensorProto.FLOAT, shape) for name, shape in shapes.items()]
-    given = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in ("actions", "h_out", "c_out")[:outputs]]
+    inputs = [
+        helper.make_tensor_value_info(name, kind if name == "flat" else TensorProto.FLOAT, shape)
+        for name, shape in shapes.items()
+    ]
+    given = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in ("actions", "h_out", "c_out")[:outputs]
+    ]
     width = len(contract["joint_names"]) if actions is None else actions
     weights = numpy_helper.from_array(np.full((flat, width), value, dtype=np.float32), "w")
     nodes = [

@@ -22,9 +22,17 @@ def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
     joints = np.zeros(3) if joint_pos is None else joint_pos
 
     def episode(sequence: int, repetition: int, **changes: Any) -> Episode:
-        flags = dict.fromkeys(("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow"), False)
+        flags = dict.fromkeys(
+            ("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow"), False
+        )
         values = flags | {"reorientation_progress": 0.0, "task_progress": 0.0} | changes
-        return Episode(sequence=sequence, sequence_name=f"demo_{sequence}", object=OBJECTS[sequence], repetition=repetition, **values)
+        return Episode(
+            sequence=sequence,
+            sequence_name=f"demo_{sequence}",
+            object=OBJECTS[sequence],
+            repetition=repetition,
+            **values,
+        )
 
     def trace(sequence: int) -> Trace:
         time = np.arange(5) * 0.05
@@ -42,7 +50,16 @@ def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
         )
 
     episodes = (
-        episode(0, 0, approach=True, grasp=True, reorient=True, reorient_once=True, reorientation_progress=0.9, task_progress=1.0),
+        episode(
+            0,
+            0,
+            approach=True,
+            grasp=True,
+            reorient=True,
+            reorient_once=True,
+            reorientation_progress=0.9,
+            task_progress=1.0,
+        ),
         episode(0, 1, approach=True, reorientation_progress=0.1, task_progress=0.33, overflow=True),
         episode(1, 0, approach=True, grasp=True, reorientation_progress=0.5, task_progress=0.66, out_of_bounds=True),
         episode(1, 1, nonfinite=True),

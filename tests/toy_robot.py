@@ -58,7 +58,9 @@ def toy_hand_arm(folder: Path) -> RobotSpec:
     return RobotSpec(
         name="toy",
         urdf=write_urdf(folder / "toy.urdf"),
-        joints=tuple(JointSpec(name=n, group="arm" if n.startswith("arm") else "hand", drive=drive, home=0.01) for n in order),
+        joints=tuple(
+            JointSpec(name=n, group="arm" if n.startswith("arm") else "hand", drive=drive, home=0.01) for n in order
+        ),
         mimics=(MimicSpec(joint="jaw_b", source="jaw_a", multiplier=2.0, offset=0.005),),
         base_pos=(0.1, -0.2, 0.3),
         base_quat=(0.5, 0.5, 0.5, 0.5),
@@ -86,7 +88,9 @@ def toy_motion(model: HandModel, generator: torch.Generator, *, margin: float, t
 
     low, high = model.kinematics.lower, model.kinematics.upper
     share = torch.linspace(0, 1, 12, dtype=low.dtype)[:, None]
-    ends = low + (high - low) * (margin + (1.0 - 2.0 * margin) * torch.rand(2, 3, 1, len(low), dtype=low.dtype, generator=generator))
+    ends = low + (high - low) * (
+        margin + (1.0 - 2.0 * margin) * torch.rand(2, 3, 1, len(low), dtype=low.dtype, generator=generator)
+    )
     line = low.new_tensor([0.2, 0.3, 1.0]) + share * low.new_tensor([0.1, -0.2, 0.1])
     root_quat = quat_from_axis_angle(torch.randn(3, 1, 3, dtype=low.dtype, generator=generator) + turn * share)
     return HandState(joints=ends[0] + (ends[1] - ends[0]) * share, root_pos=line.expand(3, 12, 3), root_quat=root_quat)

@@ -42,7 +42,13 @@ class Account:
     def without(self, reason: str) -> Account:
         """The account of what was not lost for that reason."""
         lost = {name: n for name, n in self.lost.items() if name != reason}
-        return Account(object_name=self.object_name, phase=self.phase, total=self.kept + sum(lost.values()), kept=self.kept, lost=lost)
+        return Account(
+            object_name=self.object_name,
+            phase=self.phase,
+            total=self.kept + sum(lost.values()),
+            kept=self.kept,
+            lost=lost,
+        )
 
 
 def accounts(object_name: np.ndarray, post_contact: np.ndarray, reason: np.ndarray) -> list[Account]:
@@ -59,7 +65,13 @@ def accounts(object_name: np.ndarray, post_contact: np.ndarray, reason: np.ndarr
             mine = reason[(object_name == name) & (post_contact == post)]
             lost = Counter(mine[mine != ""].tolist())
             rows.append(
-                Account(object_name=name, phase=phase, total=len(mine), kept=len(mine) - lost.total(), lost=dict(lost.most_common()))
+                Account(
+                    object_name=name,
+                    phase=phase,
+                    total=len(mine),
+                    kept=len(mine) - lost.total(),
+                    lost=dict(lost.most_common()),
+                )
             )
     return rows
 

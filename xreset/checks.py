@@ -26,7 +26,9 @@ Positive = Annotated[T, Rule("a number above 0", lambda x: 0 < x <= inf)]
 NotNegative = Annotated[T, Rule("a finite number, 0 or more", lambda x: 0 <= x < inf)]
 Finite = Annotated[T, Rule("a finite number", isfinite)]
 Share = Annotated[T, Rule("a number from 0 to 1", lambda x: 0 <= x <= 1)]
-Range = Annotated[tuple[float, float], Rule("two finite numbers, 0 or more, the lower one first", lambda x: 0 <= x[0] <= x[1] < inf)]
+Range = Annotated[
+    tuple[float, float], Rule("two finite numbers, 0 or more, the lower one first", lambda x: 0 <= x[0] <= x[1] < inf)
+]
 
 Text = Annotated[str, Rule("a text", lambda text: bool(text.strip()) and text.isprintable())]
 Number = Annotated[float, Rule("a finite number, and no huge one", lambda x: abs(x) <= 1e9)]
@@ -56,7 +58,9 @@ def without_effect(settings: Any, defaults: Any, path: tuple[str, ...] = ()) -> 
         for rule in (mark for mark in marks if isinstance(mark, Only)):
             if value != default and (found := getattr(settings, rule.field)) != rule.choice:
                 where = ".".join((*path, name))
-                sentences.append(f"{where} is {value}, which means something where {rule.field} is {rule.choice}; it is {found}")
+                sentences.append(
+                    f"{where} is {value}, which means something where {rule.field} is {rule.choice}; it is {found}"
+                )
     return sentences
 
 
@@ -92,7 +96,9 @@ def _marks_in(hint: Any) -> list[Rule | Only]:
 def is_rigid(T: np.ndarray) -> bool:
     """Whether a matrix [4, 4] is a rotation and a translation: right-handed, without scale, to three digits as people write them."""
     R = T[:3, :3]
-    straight = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=2e-3) and np.array_equal(T[3], (0, 0, 0, 1))
+    straight = (
+        np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=2e-3) and np.array_equal(T[3], (0, 0, 0, 1))
+    )
     return bool(straight and np.linalg.det(R) > 0)
 
 

@@ -16,7 +16,16 @@ from xreset.checks import Number, Text
 from xreset.errors import RobotError
 from xreset.files import read_toml
 from xreset.plugins import robot_folder
-from xreset.spec import KEYPOINTS, DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, PlacementSpec, RobotSpec
+from xreset.spec import (
+    KEYPOINTS,
+    DriveSpec,
+    FingertipSpec,
+    JointSpec,
+    KeypointSpec,
+    MimicSpec,
+    PlacementSpec,
+    RobotSpec,
+)
 from xreset.typed import parsed
 
 DESCRIPTION = "robot.toml"
@@ -69,7 +78,9 @@ class Joint:
 
     def spec(self) -> JointSpec:
         """As the rest of xreset knows it."""
-        drive = DriveSpec(kp=self.kp, kd=self.kd, effort=self.effort, armature=self.armature, friction_loss=self.friction_loss)
+        drive = DriveSpec(
+            kp=self.kp, kd=self.kd, effort=self.effort, armature=self.armature, friction_loss=self.friction_loss
+        )
         return JointSpec(name=self.name, group=self.group, home=self.home, drive=drive)
 
 

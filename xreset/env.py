@@ -126,7 +126,8 @@ class ManipulationEnv:
         self._surface_points = per_object(lambda o: surface_points(o, task.distance_points))
         self._keypoints = per_object(keypoints)
         self._limits = tuple(
-            torch.where(limit.isfinite(), limit, sign * torch.pi) for limit, sign in ((self.actions.lower, -1.0), (self.actions.upper, 1.0))
+            torch.where(limit.isfinite(), limit, sign * torch.pi)
+            for limit, sign in ((self.actions.lower, -1.0), (self.actions.upper, 1.0))
         )
 
         self._allocate()
@@ -162,7 +163,9 @@ class ManipulationEnv:
         self._state_before = {f.name: getattr(state, f.name).clone() for f in fields(state)}
         self._faulty = zeros(dtype=torch.bool)
         self._worlds = torch.arange(n, device=self.device)
-        self.faults = FaultRecorder({name: tuple(value.shape[1:]) for name, value in self._fault_values(state).items()}, self.device)
+        self.faults = FaultRecorder(
+            {name: tuple(value.shape[1:]) for name, value in self._fault_values(state).items()}, self.device
+        )
         self._log_names: tuple[str, ...] = ()
         self._log_values = torch.zeros(0, device=self.device)
         self._observations = TensorDict({}, batch_size=[n], device=self.device)
@@ -212,7 +215,12 @@ class ManipulationEnv:
         """
         self._apply_action(action)
         self._graphs.run(self._compute_rewards)
-        reward, done, time_out, faulty = self._reward.clone(), self._reset_mask.long(), self._time_out.float(), self._faulty.clone()
+        reward, done, time_out, faulty = (
+            self._reward.clone(),
+            self._reset_mask.long(),
+            self._time_out.float(),
+            self._faulty.clone(),
+        )
         log = dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True))
         if begin is not None:
             self._over |= self._reset_mask
@@ -278,7 +286,9 @@ class ManipulationEnv:
 
     def restore(self, snapshot: dict[str, Tensor]) -> bool:
         """Go on from a snapshot; False, and nothing is changed, if it is of another number of worlds or of another task."""
-        if {name: value.shape for name, value in snapshot.items()} != {name: value.shape for name, value in self.snapshot().items()}:
+        if {name: value.shape for name, value in snapshot.items()} != {
+            name: value.shape for name, value in self.snapshot().items()
+        }:
             return False
         for name, value in self._lasting.items():
             value.copy_(snapshot[f"env.{name}"])
@@ -308,7 +318,9 @@ class ManipulationEnv:
         state = self.backend.state()
         for name, value in self._state_before.items():
             value.copy_(getattr(state, name))
-        self._bad_action |= ~self._action.isfinite().all(dim=1)  # a world without an action ends as one whose engine failed
+        self._bad_action |= ~self._action.isfinite().all(
+            dim=1
+        )  # a world without an action ends as one whose engine failed
         self._action.nan_to_num_(0.0, 0.0, 0.0)
         if not self.task.reward.raw_actions:
             self._action.clamp_(-1.0, 1.0)
@@ -406,7 +418,9 @@ class ManipulationEnv:
 
     def _set_worlds(self, state: State) -> None:
         """Give the worlds of the mask states [N, ...] and their physical parameters."""
-        self.backend.set_where(self._reset_mask, state, Parameters(**self.variation.parameters, object_gravity=self.gravity_fraction))
+        self.backend.set_where(
+            self._reset_mask, state, Parameters(**self.variation.parameters, object_gravity=self.gravity_fraction)
+        )
 
     def _compute_observations(self) -> None:
         """Refresh the observations; fresh worlds start with a cloud history of copies, and with this reach as their best."""

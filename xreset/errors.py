@@ -50,4 +50,6 @@ def needs(package: str, extra: str, error: type[XResetError] = XResetError) -> I
     try:
         yield
     except ImportError as problem:
-        raise error(f"{package} cannot be imported ({problem}). Install it with: pip install 'xreset[{extra}]'") from problem
+        raise error(
+            f"{package} cannot be imported ({problem}). Install it with: pip install 'xreset[{extra}]'"
+        ) from problem

@@ -56,7 +56,9 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
         temporary.replace(path)
     except OSError as error:
         reason = error.strerror or str(error)
-        raise XResetError(f"cannot write {path}: {reason}. Nothing was changed; free some space or choose another place.") from error
+        raise XResetError(
+            f"cannot write {path}: {reason}. Nothing was changed; free some space or choose another place."
+        ) from error
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
@@ -132,7 +134,9 @@ def _locked(path: Path, lock: Path) -> int:
                     return descriptor
             except BlockingIOError:
                 os.close(descriptor)
-                raise XResetError(f"another command is writing {path}. Wait for its end, or choose another --out.") from None
+                raise XResetError(
+                    f"another command is writing {path}. Wait for its end, or choose another --out."
+                ) from None
             except FileNotFoundError:  # the owner has just finished and removed it
                 pass
             except OSError as error:
@@ -165,7 +169,9 @@ def read_json(path: str | Path, schema: str | None = None) -> dict[str, Any]:
     return data
 
 
-def read_toml(path: Path, schema: str | None = None, *, error: type[XResetError] = FileFormatError, hint: str = "") -> dict[str, Any]:
+def read_toml(
+    path: Path, schema: str | None = None, *, error: type[XResetError] = FileFormatError, hint: str = ""
+) -> dict[str, Any]:
     """Read a TOML file; with ``schema``, its ``schema`` entry must be that. ``hint``: what to say where it cannot be read.
 
     Raises:
@@ -248,4 +254,6 @@ def check_schema(path: Path, found: Any, expected: str) -> None:
             f"{path} has schema version {shown(found)}; this xreset ({__version__}) reads {expected!r}. Make the file again."
         )
     stated = f"states schema {shown(found)}" if found else "states no schema"
-    raise FileFormatError(f"{path} {stated}, expected {expected!r} (version {version} of {name}). Is it the right file?")
+    raise FileFormatError(
+        f"{path} {stated}, expected {expected!r} (version {version} of {name}). Is it the right file?"
+    )

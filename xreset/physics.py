@@ -17,7 +17,9 @@ from xreset.errors import BackendUnavailableError, CapabilityError
 from xreset.spec import SceneSpec, lowest_point
 from xreset.tensors import Tensors
 
-Parameter = Literal["friction", "torsional_friction", "object_mass", "object_inertia", "object_com", "object_gravity", "drives"]
+Parameter = Literal[
+    "friction", "torsional_friction", "object_mass", "object_inertia", "object_com", "object_gravity", "drives"
+]
 """A physical parameter that each world has its own value of: ``Backend.set_...`` sets it."""
 Capability = Literal[Parameter, "object_wrench", "overflow", "mass_properties"]
 """What a backend may be unable to do: setting a parameter world by world; a wrench; counting overflows; reading back masses, centres of
@@ -44,7 +46,9 @@ class State(Tensors):
     """[N, 3] world frame, rad/s."""
 
     @classmethod
-    def at_rest(cls, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, joint_target: Tensor | None = None) -> Self:
+    def at_rest(
+        cls, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, joint_target: Tensor | None = None
+    ) -> Self:
         """Nothing moves; the drives hold the joint positions [N, J], or are told targets [N, J]."""
         q, pos, still = joint_pos.float(), object_pos.float(), torch.zeros_like(object_pos, dtype=torch.float32)
         return cls(
@@ -174,7 +178,9 @@ class Backend(ABC):
     known_differences: ClassVar[tuple[KnownDifference, ...]] = ()
     """What cannot agree with the reference, each with its size and reason."""
 
-    def __init__(self, scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None, device: str = "cpu") -> None:
+    def __init__(
+        self, scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None, device: str = "cpu"
+    ) -> None:
         """Build the worlds; every world starts with the robot at home and its object at rest height at the table's centre.
 
         Args:
@@ -191,7 +197,9 @@ class Backend(ABC):
         if object_index is None:
             object_index = torch.arange(num_worlds) % len(scene.objects)
         self.object_index = torch.as_tensor(object_index, dtype=torch.long).to(self.device)
-        if self.object_index.shape != (num_worlds,) or bool(((self.object_index < 0) | (self.object_index >= len(scene.objects))).any()):
+        if self.object_index.shape != (num_worlds,) or bool(
+            ((self.object_index < 0) | (self.object_index >= len(scene.objects))).any()
+        ):
             raise ValueError(f"object_index must be [{num_worlds}] indices below {len(scene.objects)}")
 
     # Availability ----------------------------------------------------------------------------------------------------------------
@@ -327,12 +335,16 @@ class Backend(ABC):
     def _require(self, capability: Capability) -> None:
         """Raise the error that the contract asks for if a capability is missing."""
         if capability not in self.capabilities:
-            raise CapabilityError(f"the backend {self.name!r} cannot set {capability.replace('_', ' ')}: {_REMEDIES[capability]}")
+            raise CapabilityError(
+                f"the backend {self.name!r} cannot set {capability.replace('_', ' ')}: {_REMEDIES[capability]}"
+            )
 
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         """Set a physical parameter [M, ...], as the setter of that name says: what all of them do."""
         self._require(name)
-        raise NotImplementedError(f"the backend {self.name!r} says that it can set {name.replace('_', ' ')}, and does not")
+        raise NotImplementedError(
+            f"the backend {self.name!r} says that it can set {name.replace('_', ' ')}, and does not"
+        )
 
 
 _REMEDIES: dict[str, str] = {

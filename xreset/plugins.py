@@ -24,7 +24,10 @@ ENGINES = "xreset.backends"
 """Entry-point group of engines: ``name = "package.module:BackendClass"``."""
 ROBOTS = "xreset.robots"
 """Entry-point group of robots: ``name = "package.module"``, the module beside a ``robot.toml``."""
-_KINDS: Mapping[str, tuple[str, type[XResetError]]] = {ENGINES: ("backend", BackendUnavailableError), ROBOTS: ("robot", RobotError)}
+_KINDS: Mapping[str, tuple[str, type[XResetError]]] = {
+    ENGINES: ("backend", BackendUnavailableError),
+    ROBOTS: ("robot", RobotError),
+}
 
 
 def plugins(group: str) -> dict[str, EntryPoint]:
@@ -78,7 +81,9 @@ def robot_folder(name_or_folder: str | Path) -> Path:
         raise RobotError(f"there is no robot {name!r}, and no folder of that name. Robots: {known_plugins(ROBOTS)}.")
     module = load_plugin(ROBOTS, name)
     if not isinstance(module, ModuleType) or not module.__file__:
-        raise RobotError(f"the robot {name!r}: {module!r} is no module with a file; put an __init__.py beside its robot.toml.")
+        raise RobotError(
+            f"the robot {name!r}: {module!r} is no module with a file; put an __init__.py beside its robot.toml."
+        )
     return Path(module.__file__).resolve().parent
 
 
@@ -113,7 +118,9 @@ def backend_class(name: str) -> type[Backend]:
     from xreset.physics import Backend
 
     if not (isinstance(cls, type) and issubclass(cls, Backend)):
-        raise BackendUnavailableError(f"the backend {name!r} is {cls!r}, expected a class that inherits from xreset.physics.Backend.")
+        raise BackendUnavailableError(
+            f"the backend {name!r} is {cls!r}, expected a class that inherits from xreset.physics.Backend."
+        )
     return cls
 
 
@@ -125,7 +132,9 @@ def device_for(name: str, device: str) -> str:
     """
     kind = device.partition(":")[0]
     if kind not in ("cpu", "cuda"):
-        raise BackendUnavailableError(f"there is no device {device!r}; expected cpu, cuda or one of several GPUs, such as cuda:1.")
+        raise BackendUnavailableError(
+            f"there is no device {device!r}; expected cpu, cuda or one of several GPUs, such as cuda:1."
+        )
     return device if kind in backend_class(name).devices() else "cpu"
 
 

@@ -82,7 +82,9 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
                 f"{source} was trained with another {what}: {contract[key]}, here it is {here[key]}. Use --robot {contract['robot']}."
             )
     if contract["robot_fingerprint"] != here["robot_fingerprint"]:
-        raise PolicyError(f"{source} was trained on another version of {robot.name!r}: its URDF or description has changed. Train again.")
+        raise PolicyError(
+            f"{source} was trained on another version of {robot.name!r}: its URDF or description has changed. Train again."
+        )
     if contract["observation_layout"] != here["observation_layout"]:
         differing = [
             f"{group}.{term}: {theirs.get(term)} in the policy, {ours.get(term)} here"
@@ -98,7 +100,11 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
     quiet = NoiseConfig()
     meanings = (
         ("another action mapping", trained.action, task.action),
-        ("other scales of observations", replace(trained.observation, noise=quiet), replace(task.observation, noise=quiet)),
+        (
+            "other scales of observations",
+            replace(trained.observation, noise=quiet),
+            replace(task.observation, noise=quiet),
+        ),
     )
     for what, of_policy, of_task in meanings:
         differing = [
@@ -107,9 +113,13 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
             if getattr(of_policy, f.name) != getattr(of_task, f.name)
         ]
         if differing:
-            raise PolicyError(f"{source} was trained with {what} ({'; '.join(differing)}). Use the run's own configuration.")
+            raise PolicyError(
+                f"{source} was trained with {what} ({'; '.join(differing)}). Use the run's own configuration."
+            )
     if abs(contract["control_dt"] - here["control_dt"]) > 1e-9:
-        raise PolicyError(f"{source} acts every {contract['control_dt']:.6f} s, here a control step lasts {here['control_dt']:.6f} s.")
+        raise PolicyError(
+            f"{source} acts every {contract['control_dt']:.6f} s, here a control step lasts {here['control_dt']:.6f} s."
+        )
 
 
 _ENTRIES: dict[str, type | tuple[type, ...]] = {
@@ -121,14 +131,18 @@ _ENTRIES: dict[str, type | tuple[type, ...]] = {
 def check_contract_entries(source: str, contract: dict[str, Any]) -> None:
     """Refuse a contract that lacks an entry or holds one of another type; ``PolicyError``."""
     if contract.get("schema") != SCHEMA:
-        raise PolicyError(f"{source} has policy schema {contract.get('schema')!r}, expected {SCHEMA!r}. Export it again.")
+        raise PolicyError(
+            f"{source} has policy schema {contract.get('schema')!r}, expected {SCHEMA!r}. Export it again."
+        )
     wrong = [name for name, kind in _ENTRIES.items() if not isinstance(contract.get(name), kind)]
     texts = ("joint_names", "fingertip_names", "objects")
     wrong += [name for name in texts if name not in wrong and not all(isinstance(text, str) for text in contract[name])]
     if "observation_layout" not in wrong and not _is_layout(contract["observation_layout"]):
         wrong.append("observation_layout")
     if wrong:
-        raise PolicyError(f"{source} states a contract in which {', '.join(wrong)} is missing or of another type. Export it again.")
+        raise PolicyError(
+            f"{source} states a contract in which {', '.join(wrong)} is missing or of another type. Export it again."
+        )
 
 
 def _is_layout(layout: dict[str, Any]) -> bool:
@@ -175,11 +189,15 @@ class OnnxPolicy:
             )  # to nothing else, which it would announce
             metadata = self._session.get_modelmeta().custom_metadata_map
         except Exception as error:
-            raise PolicyError(f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?") from error
+            raise PolicyError(
+                f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?"
+            ) from error
         self.contract = _read_contract(path, metadata)
         inputs = tuple(given.name for given in self._session.get_inputs())
         if inputs != INPUTS:
-            raise PolicyError(f"{path} takes the inputs {shown(inputs)}; a policy takes {', '.join(INPUTS)}. Export it again.")
+            raise PolicyError(
+                f"{path} takes the inputs {shown(inputs)}; a policy takes {', '.join(INPUTS)}. Export it again."
+            )
         self._lstm_dim = self._try(path)
         self.name = path.stem if path.stem != "policy" else path.resolve().parent.name
         self._state: list[np.ndarray] | None = None
@@ -189,7 +207,9 @@ class OnnxPolicy:
         shape = self._session.get_inputs()[2].shape
         width = shape[2] if len(shape) == 3 else None
         if not isinstance(width, int) or not 0 < width <= _MAX_LSTM:
-            raise PolicyError(f"{path} has an LSTM state of shape {shown(shape)}, expected (1, worlds, 1 to {_MAX_LSTM}). Export it again.")
+            raise PolicyError(
+                f"{path} has an LSTM state of shape {shown(shape)}, expected (1, worlds, 1 to {_MAX_LSTM}). Export it again."
+            )
         task = from_dict(TaskConfig, self.contract["task"], f"{path}: task").observation
         layout_, worlds = self.contract["observation_layout"], 2
         shapes = {
@@ -199,19 +219,26 @@ class OnnxPolicy:
             "c_in": (1, worlds, width),
         }
         try:
-            found: Any = self._session.run(None, {name: np.zeros(shape, dtype=np.float32) for name, shape in shapes.items()})
+            found: Any = self._session.run(
+                None, {name: np.zeros(shape, dtype=np.float32) for name, shape in shapes.items()}
+            )
         except Exception as error:
             raise PolicyError(f"{path} cannot act: {shown(str(error))}. Export it again.") from error
         expected = [(worlds, len(self.contract["joint_names"])), shapes["h_in"], shapes["c_in"]]
-        if [getattr(value, "shape", None) for value in found] != expected or any(value.dtype != np.float32 for value in found):
+        if [getattr(value, "shape", None) for value in found] != expected or any(
+            value.dtype != np.float32 for value in found
+        ):
             described = ", ".join(
-                f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__ for value in found
+                f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+                for value in found
             )
             raise PolicyError(
                 f"{path} gives {described} for {worlds} worlds, expected float32 {', '.join(map(str, expected))}. Export it again."
             )
         if not all(np.isfinite(value).all() for value in found):
-            raise PolicyError(f"{path} gives numbers that are not finite: its training broke down, or the file is damaged.")
+            raise PolicyError(
+                f"{path} gives numbers that are not finite: its training broke down, or the file is damaged."
+            )
         return width
 
     def begin(self, env: ManipulationEnv) -> None:

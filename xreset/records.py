@@ -120,7 +120,9 @@ def read_npz(
     if problem:
         raise FileFormatError(f"{path} is not valid as {what}: {problem}")
     if unknown := sorted(set(found) - set(own)):
-        logging.getLogger(__name__).warning("%s also holds %s, which this xreset (%s) leaves aside.", path, shown(unknown), __version__)
+        logging.getLogger(__name__).warning(
+            "%s also holds %s, which this xreset (%s) leaves aside.", path, shown(unknown), __version__
+        )
     return arrays
 
 
@@ -198,7 +200,9 @@ def _headers(archive: zipfile.ZipFile) -> dict[str, _Header]:
             read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
             shape, _, dtype = read(stream)
         if dtype.kind not in "fiubU":
-            raise _BadArray(f"the array {shown(member)} holds {dtype}, expected numbers, bool or text; objects are never read")
+            raise _BadArray(
+                f"the array {shown(member)} holds {dtype}, expected numbers, bool or text; objects are never read"
+            )
         if min(shape, default=0) < 0:
             raise _BadArray(f"the array {shown(member)} has the shape {shape}")
         headers[member.removesuffix(".npy")] = _Header(member, shape, dtype)
@@ -342,10 +346,21 @@ def arrays_of(record: Any) -> dict[str, np.ndarray]:
 
 
 def read_record(
-    cls: type[T], path: str | Path, schema_name: str, *, what: str, check: Callable[[dict[str, np.ndarray]], str | None] | None = None
+    cls: type[T],
+    path: str | Path,
+    schema_name: str,
+    *,
+    what: str,
+    check: Callable[[dict[str, np.ndarray]], str | None] | None = None,
 ) -> T:
     """Read a dataclass of :func:`schema_of`'s kind; arguments and errors as of :func:`read_npz`."""
     arrays = read_npz(path, schema_name, schema_of(cls), what=what, check=check)
-    make: dict[Any, Callable[[np.ndarray], Any]] = {str: str, float: float, tuple[str, ...]: lambda array: tuple(array.tolist())}
+    make: dict[Any, Callable[[np.ndarray], Any]] = {
+        str: str,
+        float: float,
+        tuple[str, ...]: lambda array: tuple(array.tolist()),
+    }
     hints = get_type_hints(cls)
-    return cls(**{name: make.get(hints[name], lambda array: array)(array) for name, array in arrays.items() if name in hints})
+    return cls(
+        **{name: make.get(hints[name], lambda array: array)(array) for name, array in arrays.items() if name in hints}
+    )

@@ -42,4 +42,8 @@ def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
         position = np.arange(num_rounds * width).reshape(num_rounds, width)
         columns.append(queue[np.minimum(position, count - 1)])
         fresh.append(position < count)
-    return Schedule(object_index=np.repeat(objects, worlds), rounds=np.concatenate(columns, axis=1), fresh=np.concatenate(fresh, axis=1))
+    return Schedule(
+        object_index=np.repeat(objects, worlds),
+        rounds=np.concatenate(columns, axis=1),
+        fresh=np.concatenate(fresh, axis=1),
+    )

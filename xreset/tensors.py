@@ -23,7 +23,9 @@ class Tensors:
     def map(self, function: Callable[..., Tensor], *others: Self) -> Self:
         """A bundle of ``function(own, *the others')``, tensor by tensor."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}
-        mapped = {name: function(x, *(getattr(o, name) for o in others)) for name, x in own.items() if isinstance(x, Tensor)}
+        mapped = {
+            name: function(x, *(getattr(o, name) for o in others)) for name, x in own.items() if isinstance(x, Tensor)
+        }
         return replace(self, **mapped)
 
     def __getitem__(self, rows: Any) -> Self:

@@ -43,14 +43,22 @@ def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
     before = len(problems)
     hints = typing.get_type_hints(cls, include_extras=not issubclass(cls, Checked))  # which looks at its rules itself
     needed = {f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(cls)}
-    unknown, missing = sorted(set(data) - set(needed)), sorted(name for name in needed if needed[name] and name not in data)
+    unknown, missing = (
+        sorted(set(data) - set(needed)),
+        sorted(name for name in needed if needed[name] and name not in data),
+    )
     if unknown or missing:
         named = [
-            f"{name} ({guess[0]}?)" if (guess := get_close_matches(str(name), list(needed), cutoff=0.75)) else str(name) for name in unknown
+            f"{name} ({guess[0]}?)" if (guess := get_close_matches(str(name), list(needed), cutoff=0.75)) else str(name)
+            for name in unknown
         ]
         found = [f"unknown: {', '.join(named)}"] * bool(unknown) + [f"missing: {', '.join(missing)}"] * bool(missing)
-        problems.append(f"{where} does not fit {cls.__name__} ({'; '.join(found)}). Was it written by another version of xreset?")
-    values = {name: _value(hints[name], value, f"{where}.{name}", problems) for name, value in data.items() if name in needed}
+        problems.append(
+            f"{where} does not fit {cls.__name__} ({'; '.join(found)}). Was it written by another version of xreset?"
+        )
+    values = {
+        name: _value(hints[name], value, f"{where}.{name}", problems) for name, value in data.items() if name in needed
+    }
     if len(problems) > before:
         return None
     try:
@@ -83,7 +91,10 @@ def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:
         kinds = [args[0]] * len(value) if len(args) == 2 and args[1] is Ellipsis else list(args)
         if len(kinds) != len(value):
             return problems.append(f"{where} has {len(value)} entries, expected {len(kinds)}.")
-        return tuple(_value(kind, item, f"{where}[{i}]", problems) for i, (kind, item) in enumerate(zip(kinds, value, strict=True)))
+        return tuple(
+            _value(kind, item, f"{where}[{i}]", problems)
+            for i, (kind, item) in enumerate(zip(kinds, value, strict=True))
+        )
     if hint is Any:
         return value
     if origin is dict:
@@ -92,7 +103,9 @@ def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:
         return {name: _value(args[1], item, f"{where}.{name}", problems) for name, item in value.items()}
     if origin is typing.Literal:
         return value if value in args else wrong(f"one of {', '.join(map(repr, args))}")
-    fits = isinstance(value, (int, float) if hint is float else hint) and not (hint in (int, float) and isinstance(value, bool))
+    fits = isinstance(value, (int, float) if hint is float else hint) and not (
+        hint in (int, float) and isinstance(value, bool)
+    )
     if not fits or (isinstance(value, int) and not -_LARGEST <= value <= _LARGEST):
         return wrong(hint.__name__)
     return float(value) if hint is float else value

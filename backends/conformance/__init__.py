@@ -58,7 +58,9 @@ def run(
     """
     wanted = None if only is None else set(only)
     if wanted and (unknown := wanted - {check.name for check in CHECKS}):
-        raise ValueError(f"there are no checks {sorted(unknown)}; there are {', '.join(check.name for check in CHECKS)}")
+        raise ValueError(
+            f"there are no checks {sorted(unknown)}; there are {', '.join(check.name for check in CHECKS)}"
+        )
     bench = Bench(make, scene(robot))
     results = []
     try:
@@ -75,7 +77,9 @@ def _run_one(check: Check, bench: Bench) -> CheckResult:
     start = time.perf_counter()
 
     def result(verdict: Verdict, problem: str = "", measures: tuple[Measure, ...] = ()) -> CheckResult:
-        return CheckResult(check=check, verdict=verdict, measures=measures, problem=problem, seconds=time.perf_counter() - start)
+        return CheckResult(
+            check=check, verdict=verdict, measures=measures, problem=problem, seconds=time.perf_counter() - start
+        )
 
     if check.own_robot_only and not bench.own_robot:
         return result("skipped", "it needs the suite's own robot")

@@ -74,7 +74,9 @@ def resting_on_a_side(bench: Bench) -> list[Measure]:
 
 def _height_on_side(thing: ObjectSpec) -> float:
     T = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    return -lowest_point([Shape(geometry=piece.geometry, T_body_shape=T @ piece.T_body_shape) for piece in thing.pieces])
+    return -lowest_point(
+        [Shape(geometry=piece.geometry, T_body_shape=T @ piece.T_body_shape) for piece in thing.pieces]
+    )
 
 
 @check(
@@ -93,7 +95,9 @@ def rest_and_bounce(bench: Bench) -> list[Measure]:
 
         def heights(above: float) -> torch.Tensor:
             """[T, N] heights over 1 s, one each physics step."""
-            backend.set_state(replace_fields(start, object_pos=start.object_pos + torch.tensor([0.0, 0.0, above])).to(backend.device))
+            backend.set_state(
+                replace_fields(start, object_pos=start.object_pos + torch.tensor([0.0, 0.0, above])).to(backend.device)
+            )
             rows = []
             for _ in range(round(1.0 / scene.timestep)):
                 backend.step(1)
@@ -163,7 +167,9 @@ def set_as_built(bench: Bench) -> list[Measure]:
 def _slide(bench: Bench, backend: Backend, worlds: Sequence[int]) -> tuple[State, torch.Tensor]:
     """State and table force after the objects of some of the bench's worlds have slid and turned on the table for a moment."""
     start = bench.start()[list(worlds)]
-    start = replace_fields(start, object_linvel=torch.tensor([0.25, 0.1, 0.0]), object_angvel=torch.tensor([0.0, 0.0, 3.0]))
+    start = replace_fields(
+        start, object_linvel=torch.tensor([0.25, 0.1, 0.0]), object_angvel=torch.tensor([0.0, 0.0, 3.0])
+    )
     end = advanced(backend, start, 4)  # later, the patter of contacts has made much of a difference in the last bit
     return end, backend.contacts().table_force.cpu().clone()
 
@@ -180,7 +186,9 @@ def object_inertia_set(bench: Bench) -> list[Measure]:
     def built(thing: ObjectSpec, i: int) -> ObjectSpec:
         return replace(thing, inertia=float(factors[i]) * np.asarray(thing.inertia))
 
-    return _compared(bench, lambda backend, worlds: backend.set_object_inertia(factors.to(backend.device)[worlds], worlds), built)
+    return _compared(
+        bench, lambda backend, worlds: backend.set_object_inertia(factors.to(backend.device)[worlds], worlds), built
+    )
 
 
 @check(
@@ -190,12 +198,16 @@ def object_inertia_set(bench: Bench) -> list[Measure]:
 )
 def object_com_set(bench: Bench) -> list[Measure]:
     """Move the centre of mass of some worlds' objects, and build others so: tumbling and sliding objects must do the same in both."""
-    offsets = torch.tensor([[0.0078125, 0.0, 0.0], [0.0, -0.0078125, 0.00390625], [0.00390625, 0.00390625, -0.00390625], [0.0, 0.0, 0.0]])
+    offsets = torch.tensor(
+        [[0.0078125, 0.0, 0.0], [0.0, -0.0078125, 0.00390625], [0.00390625, 0.00390625, -0.00390625], [0.0, 0.0, 0.0]]
+    )
 
     def built(thing: ObjectSpec, i: int) -> ObjectSpec:
         return replace(thing, com=np.asarray(thing.com) + offsets[i].numpy())
 
-    return _compared(bench, lambda backend, worlds: backend.set_object_com(offsets.to(backend.device)[worlds], worlds), built)
+    return _compared(
+        bench, lambda backend, worlds: backend.set_object_com(offsets.to(backend.device)[worlds], worlds), built
+    )
 
 
 def _compared(

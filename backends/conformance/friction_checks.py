@@ -42,7 +42,9 @@ def sliding_distance(bench: Bench) -> list[Measure]:
     speed = (2.0 * mu * GRAVITY * _DISTANCE).sqrt()
     with bench.other(scene, len(which), which) as backend:
         backend.set_friction(_pairs(bench, mu).to(backend.device))
-        end = advanced(backend, replace_fields(start, object_linvel=speed[:, None] * direction), round(1.0 / scene.timestep))
+        end = advanced(
+            backend, replace_fields(start, object_linvel=speed[:, None] * direction), round(1.0 / scene.timestep)
+        )
     way = ((end.object_pos - start.object_pos) * direction).sum(-1)
     off = (way / _DISTANCE - 1.0).abs().view(len(_CASES), len(shapes))
     names = [shape.name for shape in shapes]
@@ -138,7 +140,9 @@ def _spin_lost(bench: Bench, count: int, seconds: float, prepare: Callable[[Back
     with bench.other(scene, count, which) as backend:
         prepare(backend)
         lost = 10.0 - advanced(backend, start, steps).object_angvel[:, 2]
-    return lost / (scene.friction.torsional * thing.mass * GRAVITY / float(thing.inertia[2, 2]) * steps * scene.timestep)
+    return lost / (
+        scene.friction.torsional * thing.mass * GRAVITY / float(thing.inertia[2, 2]) * steps * scene.timestep
+    )
 
 
 def _cases(bench: Bench, each: int) -> tuple[Tensor, Tensor]:

@@ -32,7 +32,9 @@ def held_object(bench: Bench) -> list[Measure]:
     force = contacts.tip_force.cpu()[held]
     weight = GRAVITY * bench.objects[0].mass
     total = force.sum(1)
-    squeeze = torch.stack((force[:, 0] @ closing, -force[:, 1] @ closing), dim=1)  # of thumb and index finger, each towards the other
+    squeeze = torch.stack(
+        (force[:, 0] @ closing, -force[:, 1] @ closing), dim=1
+    )  # of thumb and index finger, each towards the other
     return [
         Measure("vertical force", largest(total[:, 2] / weight - 1.0), 0.05, "of m g"),
         Measure("horizontal force", largest(total[:, :2] / weight), 0.05, "of m g"),
@@ -113,7 +115,9 @@ def grasp(bench: Bench) -> tuple[State, Tensor]:
     T_world_wrist = bench.kinematics.link_poses(pos[0].double(), ["wrist"])[0]
     T_wrist_box = torch.eye(4, dtype=torch.float64)
     T_wrist_box[2, 3] = 0.075  # between the pads
-    T_world_object = T_world_wrist @ T_wrist_box @ torch.linalg.inv(torch.as_tensor(bench.objects[0].pieces[0].T_body_shape))
+    T_world_object = (
+        T_world_wrist @ T_wrist_box @ torch.linalg.inv(torch.as_tensor(bench.objects[0].pieces[0].T_body_shape))
+    )
     held = bricks(bench)
     object_pos, object_quat = state.object_pos.clone(), state.object_quat.clone()
     object_pos[held] = T_world_object[:3, 3].float()

@@ -88,7 +88,9 @@ class Bench:
             backend.close()
 
     @contextmanager
-    def reference(self, scene: SceneSpec, num_worlds: int, object_index: Tensor | None = None) -> Iterator[tuple[Backend, int]]:
+    def reference(
+        self, scene: SceneSpec, num_worlds: int, object_index: Tensor | None = None
+    ) -> Iterator[tuple[Backend, int]]:
         """The same worlds in the reference engine, and how many of its steps make one step of the scene.
 
         The reference itself, if it is what is tested, is compared with finer steps of its own.
@@ -134,7 +136,9 @@ def replace_fields(state: State, **changes: Tensor) -> State:
     """The state with some fields replaced; values broadcast over the worlds."""
     values = {f.name: getattr(state, f.name) for f in fields(State)}
     for name, value in changes.items():
-        values[name] = torch.as_tensor(value, dtype=torch.float32, device=values[name].device).expand_as(values[name]).clone()
+        values[name] = (
+            torch.as_tensor(value, dtype=torch.float32, device=values[name].device).expand_as(values[name]).clone()
+        )
     return State(**values)
 
 
@@ -168,7 +172,9 @@ def rotation_angle(a: Tensor, b: Tensor) -> Tensor:
     return 2.0 * torch.atan2(vector.norm(dim=-1), (a.double() * b.double()).sum(-1).abs())
 
 
-def random_state(bench: Bench, scene: SceneSpec, num_worlds: int, seed: int, device: torch.device | str = "cpu") -> State:
+def random_state(
+    bench: Bench, scene: SceneSpec, num_worlds: int, seed: int, device: torch.device | str = "cpu"
+) -> State:
     """[N] states with every field away from its default: joints well within their limits, the object in the air, spinning.
 
     A robot that would reach into the table is brought nearer to home until it does not: an arm deep inside it is thrown out, and no two
@@ -211,7 +217,9 @@ def small_motion(kinematics: Kinematics) -> Tensor:
     return torch.where(home > (lower + upper) / 2, -step, step).float()
 
 
-def compare_states(found: State, expected: State, tolerances: Mapping[str, tuple[float, str]], of: str = "") -> list[Measure]:
+def compare_states(
+    found: State, expected: State, tolerances: Mapping[str, tuple[float, str]], of: str = ""
+) -> list[Measure]:
     """A measure for each field, named after what it is a state ``of``; quaternions are the same with the opposite sign."""
     measures = []
     for name, (tolerance, unit) in tolerances.items():

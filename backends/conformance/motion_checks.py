@@ -90,7 +90,10 @@ def free_spin(bench: Bench) -> list[Measure]:
             (found * turn.inv()).magnitude(),
             np.abs(end.object_angvel[i].double().numpy() - omega).max(),
         ))  # fmt: skip
-    return [Measure(name, float(error), *limit) for error, (name, limit) in zip(np.max(errors, axis=0), limits.items(), strict=True)]
+    return [
+        Measure(name, float(error), *limit)
+        for error, (name, limit) in zip(np.max(errors, axis=0), limits.items(), strict=True)
+    ]
 
 
 @check(
@@ -141,7 +144,9 @@ def object_wrench(bench: Bench) -> list[Measure]:
         arm = Rotation.from_quat(state.object_quat[i].double().numpy(), scalar_first=True).apply(thing.com)
         com_velocity = state.object_linvel[i].double().numpy() + np.cross(state.object_angvel[i].double().numpy(), arm)
         linear = max(linear, float(np.abs(com_velocity - gained).max() / np.abs(gained).max()))
-        angular = max(angular, float(np.abs(state.object_angvel[i].double().numpy() - omega).max() / np.abs(omega).max()))
+        angular = max(
+            angular, float(np.abs(state.object_angvel[i].double().numpy() - omega).max() / np.abs(omega).max())
+        )
     rest = largest(advanced(backend, _in_the_air(bench), steps).object_linvel[:, :2])
     return [
         Measure("velocity of the centre of mass", linear, 0.01, "of its own"),

@@ -12,7 +12,15 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, advanced, largest, replace_fields, rotation_angle, snapshot, worst_of
+from xreset.backends.conformance.harness import (
+    Bench,
+    advanced,
+    largest,
+    replace_fields,
+    rotation_angle,
+    snapshot,
+    worst_of,
+)
 from xreset.backends.conformance.results import Measure, Skipped, checks_of
 from xreset.backends.conformance.scene import without_collisions
 from xreset.geometry.kinematics import Kinematics
@@ -80,7 +88,10 @@ def mass_properties(bench: Bench) -> list[Measure]:
     found = bench.backend().mass_properties()
     bodies = _bodies(bench.scene.robot)
     rows = [(0, i, name, *values) for i, (name, values) in enumerate(bodies.items())]
-    rows += [(world, len(bodies), o.name, o.mass, np.asarray(o.com), np.asarray(o.inertia)) for world, o in enumerate(bench.objects)]
+    rows += [
+        (world, len(bodies), o.name, o.mass, np.asarray(o.com), np.asarray(o.inertia))
+        for world, o in enumerate(bench.objects)
+    ]
     limits = {
         "mass": (1e-5, "of it"),
         "centre of mass": (1e-6, "m"),
@@ -98,7 +109,10 @@ def mass_properties(bench: Bench) -> list[Measure]:
             np.abs(matrix - inertia).max() / moments[-1],
         ))  # fmt: skip
     names = [row[2] for row in rows]
-    return [worst_of(what, values, *limits[what], names) for what, values in zip(limits, zip(*errors, strict=True), strict=True)]
+    return [
+        worst_of(what, values, *limits[what], names)
+        for what, values in zip(limits, zip(*errors, strict=True), strict=True)
+    ]
 
 
 def _bodies(robot: RobotSpec) -> dict[str, tuple[float, np.ndarray, np.ndarray]]:
@@ -148,7 +162,9 @@ def _alone(bench: Bench, scene: SceneSpec) -> tuple[State, Tensor]:
     """[J] worlds: in world i joint i has room for its way on both sides, the others are at home; and each joint's way [J]."""
     kinematics = Kinematics(scene.robot)
     count = len(scene.robot.joints)
-    slides = torch.tensor([robot_tree(scene.robot).joint(joint.name).type == "prismatic" for joint in scene.robot.joints])
+    slides = torch.tensor(
+        [robot_tree(scene.robot).joint(joint.name).type == "prismatic" for joint in scene.robot.joints]
+    )
     lower, upper = kinematics.lower, kinematics.upper
     way = torch.where(slides, _SLIDE_WAY, _WAY).double().minimum(0.3 * (upper - lower))
     home = torch.as_tensor(scene.robot.home)
@@ -159,7 +175,9 @@ def _alone(bench: Bench, scene: SceneSpec) -> tuple[State, Tensor]:
     return replace_fields(start, joint_pos=pos, joint_target=pos), way.float()
 
 
-def _against_reference(bench: Bench, scene: SceneSpec, start: State, way: Tensor, signals: dict[str, Tensor]) -> list[Measure]:
+def _against_reference(
+    bench: Bench, scene: SceneSpec, start: State, way: Tensor, signals: dict[str, Tensor]
+) -> list[Measure]:
     """Root mean square and peak of the difference between a joint's path and that in the reference engine, of the worst joint of a group.
 
     A slide's path counts in proportion to its way, as if that were 0.2 rad.
@@ -285,8 +303,12 @@ def drive_scale(bench: Bench) -> list[Measure]:
         mask = torch.tensor([True, False, True], device=backend.device)
         ones = torch.ones(count, device=backend.device)
         mass = torch.full_like(ones, scene.objects[0].mass)
-        friction = torch.tensor([[scene.friction.tip, scene.friction.link, scene.friction.table]], device=backend.device).expand(count, 3)
-        parameters = Parameters(friction=friction, object_mass=mass, object_gravity=ones, drives=factors.to(backend.device))
+        friction = torch.tensor(
+            [[scene.friction.tip, scene.friction.link, scene.friction.table]], device=backend.device
+        ).expand(count, 3)
+        parameters = Parameters(
+            friction=friction, object_mass=mass, object_gravity=ones, drives=factors.to(backend.device)
+        )
         backend.set_where(mask, start.to(backend.device), parameters)
         masked = path(backend, slice(None))
     return [
@@ -336,7 +358,9 @@ def joint_limits(bench: Bench) -> list[Measure]:
             inside, beyond = limit - side * 0.5 * way, limit + side * 0.5 * way
             pos[joints, joints] = torch.where(limited, inside, pos.diagonal())
             target[joints, joints] = torch.where(limited, beyond, pos.diagonal())
-            end = advanced(backend, replace_fields(start, joint_pos=pos, joint_target=target), round(1.0 / scene.timestep))
+            end = advanced(
+                backend, replace_fields(start, joint_pos=pos, joint_target=target), round(1.0 / scene.timestep)
+            )
             off = ((end.joint_pos.diagonal() - limit).abs() / way).where(limited, torch.tensor(0.0))
             measures.append(worst_of(f"way off the {name} limit", off, 0.1, "of the way", scene.robot.joint_names))
     if not measures:

@@ -30,7 +30,10 @@ def objects() -> tuple[ObjectSpec, ...]:
     """A brick (a box), a can (a cylinder) and a bracket (two hulls); the centres of mass are off the origin of the mesh frame."""
     brick = shape("box", (0.02, 0.03, 0.025), (0.01, 0.005, -0.004), yaw=0.3)
     can = shape("cylinder", (0.033, 0.05), (0.0, 0.0, 0.01))
-    foot, arm = shape("hull", (0.05, 0.02, 0.01), (0.0, 0.0, -0.02)), shape("hull", (0.012, 0.02, 0.03), (-0.038, 0.0, 0.02))
+    foot, arm = (
+        shape("hull", (0.05, 0.02, 0.01), (0.0, 0.0, -0.02)),
+        shape("hull", (0.012, 0.02, 0.03), (-0.038, 0.0, 0.02)),
+    )
     return (
         solid("brick", 0.25, (brick,), shift=(0.004, -0.003, 0.002), twist=0.2),
         solid("can", 0.35, (can,), shift=(0.002, 0.0, -0.003), twist=0.0),
@@ -59,7 +62,11 @@ def ball() -> ObjectSpec:
 
 def scene(robot: RobotSpec | None = None) -> SceneSpec:
     """The suite's scene: its own robot or another one, and its three objects."""
-    return SceneSpec(robot=robot or gripper(), objects=objects(), friction=PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002))
+    return SceneSpec(
+        robot=robot or gripper(),
+        objects=objects(),
+        friction=PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002),
+    )
 
 
 def without_collisions(scene: SceneSpec) -> SceneSpec:
@@ -85,7 +92,9 @@ def shape(kind: str, size: tuple[float, ...], pos: tuple[float, float, float], y
     return Shape(geometry=geometry, T_body_shape=T)
 
 
-def solid(name: str, mass: float, pieces: tuple[Shape, ...], *, shift: Sequence[float] = (0, 0, 0), twist: float = 0.0) -> ObjectSpec:
+def solid(
+    name: str, mass: float, pieces: tuple[Shape, ...], *, shift: Sequence[float] = (0, 0, 0), twist: float = 0.0
+) -> ObjectSpec:
     """An object with the inertia of its shape at even density, then its centre of mass shifted and its principal axes turned.
 
     Its mass is a number of float32, as the interface to a backend has it: no rounding comes between a mass that is set and one built.

@@ -30,7 +30,11 @@ check = checks_of("state")
 
 
 def link_measures(
-    kinematics: Kinematics, state: State, links: Links, which: Sequence[int] | slice = slice(None), tolerance: float = 1e-5
+    kinematics: Kinematics,
+    state: State,
+    links: Links,
+    which: Sequence[int] | slice = slice(None),
+    tolerance: float = 1e-5,
 ) -> list[Measure]:
     """Tracked links (some or all of them) against the project's own kinematics of the same state."""
     q, qd = state.joint_pos.double().cpu(), state.joint_vel.double().cpu()
@@ -118,13 +122,18 @@ def _on_the_way(bench: Bench, which: list[int], tolerance: float) -> list[Measur
     worst: dict[str, Measure] = {}
     for _ in range(6):
         backend.step(4)
-        for measure in link_measures(bench.kinematics, snapshot(backend.state()), backend.links(), which, tolerance)[:2]:
+        for measure in link_measures(bench.kinematics, snapshot(backend.state()), backend.links(), which, tolerance)[
+            :2
+        ]:
             if measure.what not in worst or not measure.measured <= worst[measure.what].measured:
                 worst[measure.what] = measure
     return list(worst.values())
 
 
-@check("joints go by name, whatever order the robot spec has", "the engine's own joint order shows through in states or in targets")
+@check(
+    "joints go by name, whatever order the robot spec has",
+    "the engine's own joint order shows through in states or in targets",
+)
 def joint_order(bench: Bench) -> list[Measure]:
     """Name the joints in another order: states still go by name, and a target moves the joint that it names."""
     scene = reorder_joints(bench.scene)
@@ -136,7 +145,9 @@ def joint_order(bench: Bench) -> list[Measure]:
         backend.set_state(state.to(backend.device))
         links = backend.links()
         measures = link_measures(kinematics, state, links)[:2]
-        measures += compare_states(snapshot(backend.state()), state, {name: ROUND_TRIP[name] for name in ("joint_pos", "joint_vel")})
+        measures += compare_states(
+            snapshot(backend.state()), state, {name: ROUND_TRIP[name] for name in ("joint_pos", "joint_vel")}
+        )
 
         start = bench.placed(State.initial(scene, which)).to(backend.device)
         motion = small_motion(kinematics).to(backend.device)

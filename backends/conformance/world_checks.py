@@ -130,7 +130,9 @@ def objects_in_a_batch(bench: Bench) -> list[Measure]:
         with bench.other(bench.scene, 1, object_index=which) as alone:
             state = advanced(alone, drop(bench.placed(State.initial(bench.scene, which))), 48)
             force = alone.contacts().table_force[0, 2].cpu()
-        measures.append(Measure(f"pos of {thing.name}", largest(together.object_pos[i] - state.object_pos[0]), 1e-4, "m"))
+        measures.append(
+            Measure(f"pos of {thing.name}", largest(together.object_pos[i] - state.object_pos[0]), 1e-4, "m")
+        )
         quat, other = together.object_quat[i], state.object_quat[0]
         error = min(largest(quat - other), largest(quat + other))
         measures.append(Measure(f"quat of {thing.name}", error, 2e-3))
@@ -254,5 +256,7 @@ def broken_world(bench: Bench) -> list[Measure]:
     backend.set_state(good[[1]].to(backend.device), torch.tensor([1], device=backend.device))
     backend.step(1)
     measures.append(Measure("worlds broken after healing", float(backend.health().nonfinite.sum()), 0.5))
-    measures.append(Measure("healed object_pos", largest(backend.state().object_pos[1].cpu() - good.object_pos[1]), 1e-3))
+    measures.append(
+        Measure("healed object_pos", largest(backend.state().object_pos[1].cpu() - good.object_pos[1]), 1e-3)
+    )
     return measures

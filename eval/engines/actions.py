@@ -90,7 +90,9 @@ def grasp_and_lift(robot: RobotSpec, thing: ObjectSpec, grasps: Grasps, number: 
     motion, scene = Motion(), SceneSpec(robot=robot, objects=(thing,))
     chosen = slice(number, number + 1)
     dt = scene.control_dt
-    episode = closing_episode(robot, grasps.joint_pos[chosen], grasps.object_pos[chosen], grasps.object_quat[chosen], dt, motion)
+    episode = closing_episode(
+        robot, grasps.joint_pos[chosen], grasps.object_pos[chosen], grasps.object_quat[chosen], dt, motion
+    )
     durations = {
         "settle": motion.settle,
         "close": motion.close,
@@ -101,7 +103,9 @@ def grasp_and_lift(robot: RobotSpec, thing: ObjectSpec, grasps: Grasps, number: 
         "shake y": motion.shake,
     }
     label = f"grasp and lift of {thing.name}, {grasps.label[number]}"
-    return Actions(scene=scene, label=label, start=episode.start, joint_target=episode.targets[:, 0], phases=_phases(durations, dt))
+    return Actions(
+        scene=scene, label=label, start=episode.start, joint_target=episode.targets[:, 0], phases=_phases(durations, dt)
+    )
 
 
 def play_policy(
@@ -147,7 +151,9 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
         FileFormatError: the episode was not played at the control rate of the default task.
     """
     assert trace.joint_target is not None, "the trace holds no actions"
-    first = (torch.as_tensor(x[:1], dtype=torch.float32) for x in (trace.joint_pos, trace.object_pos, trace.object_quat))
+    first = (
+        torch.as_tensor(x[:1], dtype=torch.float32) for x in (trace.joint_pos, trace.object_pos, trace.object_quat)
+    )
     scene = nominal_scene(robot, (thing,), TaskConfig())
     interval, length = float(trace.time[1] - trace.time[0]), len(trace.joint_target) * scene.control_dt
     if not trace.time[-1] <= length + 1e-6 < trace.time[-1] + interval + 1e-6:
@@ -190,9 +196,13 @@ def read_actions(path: str | Path, robot: RobotSpec, objects: Callable[[str], Ob
         FileFormatError: the file is damaged, or for another robot or object geometry.
     """
     empty = "it has no control step."
-    a = read_npz(path, SCHEMA, _FIELDS, what="an action sequence", check=lambda a: None if len(a["joint_target"]) else empty)
+    a = read_npz(
+        path, SCHEMA, _FIELDS, what="an action sequence", check=lambda a: None if len(a["joint_target"]) else empty
+    )
     names = tuple(a["joint_names"].tolist())
-    check_robot(path, "action sequence", robot, name=str(a["robot"]), joint_names=names, fingerprint=str(a["robot_fingerprint"]))
+    check_robot(
+        path, "action sequence", robot, name=str(a["robot"]), joint_names=names, fingerprint=str(a["robot_fingerprint"])
+    )
     thing = objects(str(a["object_name"]))
     if thing.source != str(a["object_source"]):
         raise FileFormatError(
@@ -202,7 +212,9 @@ def read_actions(path: str | Path, robot: RobotSpec, objects: Callable[[str], Ob
     tip, link, table = a["friction"].tolist()
     friction = PairFriction(tip=tip, link=link, table=table)
     return Actions(
-        scene=SceneSpec(robot=robot, objects=(thing,), friction=friction, timestep=float(a["timestep"]), substeps=int(a["substeps"])),
+        scene=SceneSpec(
+            robot=robot, objects=(thing,), friction=friction, timestep=float(a["timestep"]), substeps=int(a["substeps"])
+        ),
         label=str(a["label"]),
         start=State(**{name: torch.as_tensor(a[key], dtype=torch.float32)[None] for name, key in _STATE_KEYS.items()}),
         joint_target=torch.as_tensor(a["joint_target"], dtype=torch.float32),

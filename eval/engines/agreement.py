@@ -17,7 +17,15 @@ from torch import Tensor
 
 from xreset.eval.engines.episodes import Recording
 from xreset.eval.engines.grasps import Frames, Grasps, find_grasps
-from xreset.eval.engines.trials import Closings, CommonStates, ParityConfig, common_states, try_closings, try_holds, try_paths
+from xreset.eval.engines.trials import (
+    Closings,
+    CommonStates,
+    ParityConfig,
+    common_states,
+    try_closings,
+    try_holds,
+    try_paths,
+)
 from xreset.eval.trial import Engine, MakeBackend, engine
 from xreset.objects.sampling import surface_points
 from xreset.physics import Backend
@@ -162,7 +170,9 @@ class _Tries:
     paths: dict[str, Recording] = field(default_factory=dict)
 
 
-def _judged(reference: Engine, tries: _Tries, points: Tensor, config: ParityConfig, dt: float, e: Engine) -> EngineParity:
+def _judged(
+    reference: Engine, tries: _Tries, points: Tensor, config: ParityConfig, dt: float, e: Engine
+) -> EngineParity:
     """An engine against the reference; points [G, P, 3] of the objects that are held."""
     lift, metrics, recordings = config.motion.height, [], {}
     everything = [tries.paths[e.name]] if e.name in tries.paths else []
@@ -172,12 +182,18 @@ def _judged(reference: Engine, tries: _Tries, points: Tensor, config: ParityConf
         metrics += press_metrics(mine.press, other.press, round(config.press_time / dt))
         metrics += _hold_metrics(holds, tries.holds[reference.name], points, config)
         claim = "hand closes, lifts and shakes: share of the grasps that end alike, carried or not"
-        metrics.append(outcome_metric("closing, outcome", claim, 0.80, carried(mine.whole, lift), carried(other.whole, lift)))
-        recordings = {"closing": mine.whole} | {f"hold {mu:g}": r for mu, r in zip(config.frictions, holds, strict=True)}
+        metrics.append(
+            outcome_metric("closing, outcome", claim, 0.80, carried(mine.whole, lift), carried(other.whole, lift))
+        )
+        recordings = {"closing": mine.whole} | {
+            f"hold {mu:g}": r for mu, r in zip(config.frictions, holds, strict=True)
+        }
         everything += [*recordings.values(), mine.press]
     if e.path:
         nothing = torch.zeros(0, 0), torch.zeros(0, 0)
-        metrics += path_metrics(*(path_difference(tries.paths[e.name], tries.paths[reference.name]) if tries.paths else nothing))
+        metrics += path_metrics(
+            *(path_difference(tries.paths[e.name], tries.paths[reference.name]) if tries.paths else nothing)
+        )
     return EngineParity(
         engine=e,
         metrics=tuple(metrics) if e is not reference else (),
@@ -186,14 +202,14 @@ def _judged(reference: Engine, tries: _Tries, points: Tensor, config: ParityConf
     )
 
 
-def _hold_metrics(found: Sequence[Recording], reference: Sequence[Recording], points: Tensor, config: ParityConfig) -> list[Metric]:
+def _hold_metrics(
+    found: Sequence[Recording], reference: Sequence[Recording], points: Tensor, config: ParityConfig
+) -> list[Metric]:
     """Outcome and object pose, over all frictions together."""
     lift = config.motion.height
     mine, other = (torch.cat([carried(r, lift) for r in recordings]) for recordings in (found, reference))
     distances = torch.cat([palm_distance(a, b, points) for a, b in zip(found, reference, strict=True)])
-    claim = (
-        f"lift and shake from one common state at pair frictions {', '.join(f'{mu:g}' for mu in config.frictions)}: share that end alike"
-    )
+    claim = f"lift and shake from one common state at pair frictions {', '.join(f'{mu:g}' for mu in config.frictions)}: share that end alike"
     return [outcome_metric("hold, outcome", claim, 0.85, mine, other), palm_metric(distances[mine & other])]
 
 
@@ -271,7 +287,9 @@ _TARGETS: dict[str, tuple[str, str, float]] = {
 
 def _metric(name: str, measured: float, n: int, **detail: Any) -> Metric:
     claim, unit, target = _TARGETS[name]
-    return Metric(name=name, claim=claim, unit=unit, target=target, sense="at most", measured=measured, n=n, detail=detail)
+    return Metric(
+        name=name, claim=claim, unit=unit, target=target, sense="at most", measured=measured, n=n, detail=detail
+    )
 
 
 def press_metrics(found: Recording, reference: Recording, steps: int) -> list[Metric]:
@@ -286,8 +304,21 @@ def press_metrics(found: Recording, reference: Recording, steps: int) -> list[Me
     p90, median_force = _rounded(_quantile(error, 0.9)), _rounded(_median(other_total))
     same = _rounded(_share((press > PRESS_FLOOR) == (other > PRESS_FLOOR)))
     return [
-        _metric("press, total", _median(error), len(error), bias=_rounded(_median(bias)), p90=p90, median_force_N=median_force),
-        _metric("press, fingertip", _median(tip_error), len(tip_error), p90=_rounded(_quantile(tip_error, 0.9)), touch_same=same),
+        _metric(
+            "press, total",
+            _median(error),
+            len(error),
+            bias=_rounded(_median(bias)),
+            p90=p90,
+            median_force_N=median_force,
+        ),
+        _metric(
+            "press, fingertip",
+            _median(tip_error),
+            len(tip_error),
+            p90=_rounded(_quantile(tip_error, 0.9)),
+            touch_same=same,
+        ),
     ]
 
 

@@ -84,7 +84,9 @@ class Attribution:
         """
         if not self.matters(self.rows[-1]):
             return None
-        found = [row for row in self.rows if row.kind in ("towards", "at most") and self.matters(row) and self.share(row) > 0]
+        found = [
+            row for row in self.rows if row.kind in ("towards", "at most") and self.matters(row) and self.share(row) > 0
+        ]
         return max(found, key=lambda row: (row.kind == "towards", self.share(row)), default=None)
 
     def as_dict(self) -> dict[str, Any]:
@@ -105,7 +107,10 @@ class Attribution:
                 "reorientation_progress": _round(r.score("reorientation_progress").mean()),
                 "difference": {"mean": _round(d), "ci95": [_round(x) for x in interval]},
                 "share_of_gap": None if math.isnan(share) else _round(share),
-                "health": {name: sum(getattr(e, name) for e in r.episodes) for name in ("nonfinite", "overflow", "out_of_bounds")},
+                "health": {
+                    name: sum(getattr(e, name) for e in r.episodes)
+                    for name in ("nonfinite", "overflow", "out_of_bounds")
+                },
             }
 
         found = self.costs()
@@ -169,7 +174,9 @@ def attribute(
     def run(kind: Kind, name: str, engine: Engine, alteration: Alteration) -> Row:
         label = name if kind in ("as it is", "other") else f"{a.name}, {kind} {name}"
         altered = altered_engine(engine, alteration)
-        rollouts = roll_out(policy(), altered, trial, repetitions=episodes, only=sequences, progress=partial(progress, label))
+        rollouts = roll_out(
+            policy(), altered, trial, repetitions=episodes, only=sequences, progress=partial(progress, label)
+        )
         return Row(kind=kind, name=name, alteration=alteration, episodes=rollouts.episodes)
 
     rows, everything, changed = [run("as it is", a.name, a, Alteration())], Alteration(), 0
@@ -193,7 +200,9 @@ def attribute(
     if changed > 1:
         rows.append(run("all", f"all {changed} at once", a, _allowed(everything, a)))
     rows.append(run("other", b.name, b, Alteration()))
-    return Attribution(a=a.name, b=b.name, measured_a=measured_a, measured_b=measured_b, rows=tuple(rows), skipped=skipped)
+    return Attribution(
+        a=a.name, b=b.name, measured_a=measured_a, measured_b=measured_b, rows=tuple(rows), skipped=skipped
+    )
 
 
 def _allowed(alteration: Alteration, engine: Engine) -> Alteration:

@@ -44,7 +44,11 @@ def not_tried(found: Attribution) -> Iterator[str]:
     """A line for each property that was not changed towards B: its value in both, and why not."""
     for name, reason in found.skipped.items():
         p = _BY_NAME.get(name)
-        values = "" if p is None else f" ({_value(p, found.measured_a)} in {found.a}, {_value(p, found.measured_b)} in {found.b})"
+        values = (
+            ""
+            if p is None
+            else f" ({_value(p, found.measured_a)} in {found.a}, {_value(p, found.measured_b)} in {found.b})"
+        )
         yield f"not tried: {name}{values}: {reason}"
 
 
@@ -60,7 +64,9 @@ def verdict(found: Attribution) -> str:
         )
     row = found.costs()
     if row is None:
-        return f"{found.b} differs from {found.a} by {size}, and none of the properties that could be changed explains it."
+        return (
+            f"{found.b} differs from {found.a} by {size}, and none of the properties that could be changed explains it."
+        )
     best = f"{row.name!r} alone brings about {found.share(row):.0%} of it"
     if row.kind == "at most":
         best = f"{row.name!r} may bring about {found.share(row):.0%} of it, at most ({_BY_NAME[row.name].at_most})"
@@ -78,7 +84,8 @@ def amount(row: Row) -> str:
     """By how much a run's physics was changed."""
     changed = {name: value for name, value in vars(row.alteration).items() if value != (0 if name == "delay" else 1.0)}
     return ", ".join(
-        f"{value:+d} control step" if name == "delay" else f"x {value:g}" if value else "none" for name, value in changed.items()
+        f"{value:+d} control step" if name == "delay" else f"x {value:g}" if value else "none"
+        for name, value in changed.items()
     )
 
 
@@ -97,7 +104,14 @@ def _change(row: Row, found: Attribution) -> str:
     return amount(row)
 
 
-_COLOR = {"as it is": COLORS[0], "towards": COLORS[4], "at most": COLORS[5], "all": COLORS[2], "what if": COLORS[7], "other": COLORS[1]}
+_COLOR = {
+    "as it is": COLORS[0],
+    "towards": COLORS[4],
+    "at most": COLORS[5],
+    "all": COLORS[2],
+    "what if": COLORS[7],
+    "other": COLORS[1],
+}
 
 
 def write_plot(path: Path, found: Attribution, title: str) -> None:
@@ -108,7 +122,9 @@ def write_plot(path: Path, found: Attribution, title: str) -> None:
             mean = 100 * row.score().mean()
             low, high = (100 * x for x in bootstrap_ci95(row.score(), row.sequences))
             ax.barh(y, mean, color=_COLOR[row.kind], height=0.62)
-            ax.errorbar(mean, y, xerr=[[max(mean - low, 0)], [max(high - mean, 0)]], color="black", capsize=3, linewidth=1.2)
+            ax.errorbar(
+                mean, y, xerr=[[max(mean - low, 0)], [max(high - mean, 0)]], color="black", capsize=3, linewidth=1.2
+            )
             d, _ = found.difference(row)
             text = f"{mean:.0f} %" if row.kind == "as it is" else f"{mean:.0f} % ({100 * d:+.1f})"
             ax.text(high + 1.5, y, text, va="center", fontweight="bold" if found.matters(row) else "normal")

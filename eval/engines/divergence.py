@@ -82,7 +82,9 @@ class Differences:
     """[T, E] bool"""
 
 
-def differences(found: Recording, reference: Recording, dt: float, thresholds: Thresholds, *, world: int = 0) -> Differences:
+def differences(
+    found: Recording, reference: Recording, dt: float, thresholds: Thresholds, *, world: int = 0
+) -> Differences:
     """Compare a world of a recording with the first one of the reference's.
 
     Args:
@@ -119,14 +121,23 @@ def partings(d: Differences, robot: RobotSpec, thresholds: Thresholds) -> tuple[
     if not len(d.time):
         return ()
     tree = robot_tree(robot)
-    limit = np.array([thresholds.travel if tree.joint(n).type == "prismatic" else thresholds.joint for n in robot.joint_names])
+    limit = np.array(
+        [thresholds.travel if tree.joint(n).type == "prismatic" else thresholds.joint for n in robot.joint_names]
+    )
     fingers = robot.fingertip_names
     return (
         _joints(d, robot.joint_names, limit, thresholds),
         _parting("object position", "m", d.time, d.position, thresholds.position),
         _parting("object orientation", "rad", d.time, d.angle, thresholds.angle),
         _contacts(d, fingers, thresholds),
-        _parting("contact force", "N", d.time, d.force.max(axis=1), thresholds.force, lambda step: fingers[int(d.force[step].argmax())]),
+        _parting(
+            "contact force",
+            "N",
+            d.time,
+            d.force.max(axis=1),
+            thresholds.force,
+            lambda step: fingers[int(d.force[step].argmax())],
+        ),
     )
 
 
@@ -168,7 +179,9 @@ def _joints(d: Differences, names: Sequence[str], limit: np.ndarray, thresholds:
     joint = int(share[most].argmax())
     kind, unit = limit == limit[joint], "rad" if limit[joint] == thresholds.joint else "m"
     found = _parting("joints", unit, d.time, share.max(axis=1), 1.0, lambda step: names[int(share[step].argmax())])
-    return replace(found, threshold=float(limit[joint]), end=float(d.joint[-1, kind].max()), largest=float(d.joint[most, joint]))
+    return replace(
+        found, threshold=float(limit[joint]), end=float(d.joint[-1, kind].max()), largest=float(d.joint[most, joint])
+    )
 
 
 def _contacts(d: Differences, fingers: Sequence[str], thresholds: Thresholds) -> Parting:

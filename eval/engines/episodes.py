@@ -97,7 +97,9 @@ class Recording:
 
     def state_after(self, step: int) -> State:
         """[G] the state after a control step, brought to rest: positions and targets, without velocities."""
-        return State.at_rest(self.joint_pos[step], self.object_pos[step], self.object_quat[step], self.joint_target[step])
+        return State.at_rest(
+            self.joint_pos[step], self.object_pos[step], self.object_quat[step], self.joint_target[step]
+        )
 
     def in_palm(self, step: int, points: Tensor) -> Tensor:
         """[G, P, 3] where points [G, P, 3] of the objects (in their mesh frames) are in the palm's frame after a control step [m]."""
@@ -128,7 +130,12 @@ def play(backend: Backend, episode: Episode) -> Recording:
 
 
 def closing_episode(
-    robot: RobotSpec, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, dt: float, motion: Motion | None = None
+    robot: RobotSpec,
+    joint_pos: Tensor,
+    object_pos: Tensor,
+    object_quat: Tensor,
+    dt: float,
+    motion: Motion | None = None,
 ) -> Episode:
     """A whole try: the open hand around an object at rest closes, lifts and shakes.
 
@@ -162,7 +169,9 @@ def holding_episode(start: State, seconds: float, dt: float) -> Episode:
     return Episode(start=start, targets=start.joint_target.expand(round(seconds / dt), *start.joint_target.shape))
 
 
-def squeezing_state(robot: RobotSpec, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, motion: Motion | None = None) -> State:
+def squeezing_state(
+    robot: RobotSpec, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, motion: Motion | None = None
+) -> State:
     """[G] a state at rest in which the drives already squeeze; arguments as in :func:`closing_episode`."""
     closed = squeezed(Kinematics(robot), joint_pos.double(), motion or Motion())
     return State.at_rest(joint_pos, object_pos, object_quat, closed)
@@ -216,7 +225,11 @@ def _closing_direction(kinematics: Kinematics, q: Tensor) -> Tensor:
 def _tip_jacobian(kinematics: Kinematics, q: Tensor) -> Tensor:
     """[G, 3 E, H] of the fingertips' positions, over the hand's joints."""
     robot = kinematics.robot
-    return kinematics.jacobian(q, [tip.link for tip in robot.fingertips]).linear[..., torch.as_tensor(robot.hand_indices)].flatten(-3, -2)
+    return (
+        kinematics.jacobian(q, [tip.link for tip in robot.fingertips])
+        .linear[..., torch.as_tensor(robot.hand_indices)]
+        .flatten(-3, -2)
+    )
 
 
 def carried_palm(kinematics: Kinematics, joint_pos: Tensor, offset: Tensor) -> Tensor:
@@ -234,7 +247,9 @@ def carried_palm(kinematics: Kinematics, joint_pos: Tensor, offset: Tensor) -> T
         for _ in range(_ARM_ITERATIONS):
             palm = kinematics.jacobian(q, [robot.palm])
             R = palm.rot[:, 0]
-            turn = 0.5 * torch.linalg.cross(R, start[:, :3, :3], dim=-2).sum(-1)  # rotation vector back to the start, for small angles
+            turn = 0.5 * torch.linalg.cross(R, start[:, :3, :3], dim=-2).sum(
+                -1
+            )  # rotation vector back to the start, for small angles
             error = torch.cat((start[:, :3, 3] + here - palm.pos[:, 0], _TURN_LENGTH * turn), dim=-1)
             jacobian = torch.cat((palm.linear[:, 0], _TURN_LENGTH * palm.angular[:, 0]), dim=-2)[..., arm]
             q = kinematics.clamp(q.index_add(-1, arm, _least_squares(jacobian, error, _ARM_DAMPING)))

@@ -43,7 +43,9 @@ def write_strip(
             axes[0].set_ylabel(engine.name, color=COLORS[row % len(COLORS)], fontweight="bold")
 
 
-def write_film(path: Path, result: TraceResult, *, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+def write_film(
+    path: Path, result: TraceResult, *, progress: Callable[[int, int], None] = lambda done, total: None
+) -> None:
     """Write an mp4 at the sequence's own speed, engines side by side, the reference first."""
     engines = (result.reference, *result.engines)
     dt = result.actions.scene.control_dt
@@ -63,7 +65,9 @@ def _picture(renderer: Renderer, engine: EngineTrace, step: int) -> np.ndarray:
     """[H, W, 3] the state after a control step; the last finite one where the engine's is not."""
     step = min(step, max(len(engine.differences.time) - 1, 0))
     r = engine.recording
-    return renderer.draw(r.joint_pos[step, 0].numpy(), pose_matrix(r.object_pos[step, 0].numpy(), r.object_quat[step, 0].numpy()))
+    return renderer.draw(
+        r.joint_pos[step, 0].numpy(), pose_matrix(r.object_pos[step, 0].numpy(), r.object_quat[step, 0].numpy())
+    )
 
 
 def _renderer(result: TraceResult) -> Renderer:

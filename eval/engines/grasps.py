@@ -106,7 +106,9 @@ class Grasps:
         return len(self.label)
 
 
-def find_grasps(frames: Frames, robot: RobotSpec, objects: Sequence[ObjectSpec], count: int, *, where: Literal["table", "air"]) -> Grasps:
+def find_grasps(
+    frames: Frames, robot: RobotSpec, objects: Sequence[ObjectSpec], count: int, *, where: Literal["table", "air"]
+) -> Grasps:
     """Choose grasps, alike many of each object and spread over the sequences; the same arguments give the same grasps.
 
     In the frames that count, the thumb's tip and another are near the object's surface. ``table``: the object still rests where it started;
@@ -122,7 +124,8 @@ def find_grasps(frames: Frames, robot: RobotSpec, objects: Sequence[ObjectSpec],
     """
     names = [o.name for o in objects]
     turned = (
-        Rotation.from_quat(frames.object_quat, scalar_first=True) * Rotation.from_quat(frames.start_quat, scalar_first=True).inv()
+        Rotation.from_quat(frames.object_quat, scalar_first=True)
+        * Rotation.from_quat(frames.start_quat, scalar_first=True).inv()
     ).magnitude()
     if where == "table":
         fits = (np.linalg.norm(frames.object_pos - frames.start_pos, axis=1) < REST_DISTANCE) & (turned < REST_ANGLE)
@@ -167,7 +170,9 @@ def _at_hand(frames: Frames, rows: np.ndarray, robot: RobotSpec, objects: Sequen
             continue
         chosen = rows[mine]
         tips = kinematics.points(torch.as_tensor(frames.joint_pos[chosen], dtype=torch.float64), links)
-        pos, quat = (torch.as_tensor(x[chosen], dtype=torch.float64)[:, None] for x in (frames.object_pos, frames.object_quat))
+        pos, quat = (
+            torch.as_tensor(x[chosen], dtype=torch.float64)[:, None] for x in (frames.object_pos, frames.object_quat)
+        )
         local = quat_rotate_inverse(quat.expand(-1, len(links), -1), tips - pos)
         distance, _ = Surface(thing).signed_distance(local.flatten(0, 1))
         near = (distance < NEAR).view(len(chosen), len(links)).numpy()

@@ -152,9 +152,13 @@ class _Bench:
             for name, values in rows.items():
                 values.append(getattr(state, name).cpu().clone())
         log = {name: torch.stack(values).double() for name, values in rows.items()}
-        broken = [self._names[i] for i in range(n) if not all(bool(torch.isfinite(v[:, i]).all()) for v in log.values())]
+        broken = [
+            self._names[i] for i in range(n) if not all(bool(torch.isfinite(v[:, i]).all()) for v in log.values())
+        ]
         if broken:
-            raise XResetError(f"{backend.name}: the experiments {', '.join(broken)} are not finite, so nothing can be measured.")
+            raise XResetError(
+                f"{backend.name}: the experiments {', '.join(broken)} are not finite, so nothing can be measured."
+            )
         return log
 
     def evaluate(self, log: dict[str, Tensor]) -> Measured:
@@ -171,7 +175,11 @@ class _Bench:
         def pulled(name: str) -> float:
             _, normal, along = self._presses[name]
             begin, end = (round((_SETTLE + t) / dt) for t in _PULL_WINDOW)
-            gained = mass * _SLAB_MASS * (log["object_linvel"][end, at[name]] - log["object_linvel"][begin, at[name]]).numpy()
+            gained = (
+                mass
+                * _SLAB_MASS
+                * (log["object_linvel"][end, at[name]] - log["object_linvel"][begin, at[name]]).numpy()
+            )
             time = (end - begin) * dt
             carried = self._pull(name) * time - float(gained @ along)
             pressed = _PRESS * time + float(gained @ normal)  # the press pushes against the normal
@@ -179,7 +187,9 @@ class _Bench:
 
         shares = []
         for i, name in enumerate(("torque x", "torque y", "torque z")):
-            turned = quat_rotate_inverse(log["object_quat"][_PUSH_STEPS, at[name]], log["object_angvel"][_PUSH_STEPS, at[name]]).numpy()
+            turned = quat_rotate_inverse(
+                log["object_quat"][_PUSH_STEPS, at[name]], log["object_angvel"][_PUSH_STEPS, at[name]]
+            ).numpy()
             shares.append(self._push_torque(i) * t / float(turned @ self._axes[i]) / self._principal(i))
         stiffness, damping, delay = self._drives(log["joint_pos"][:, -1].numpy(), log["joint_vel"][:, -1].numpy())
         inertia = float(np.median(shares)) / mass
@@ -255,7 +265,9 @@ class _Bench:
                 force[i, 0] = self._push_force()
             elif name.startswith("torque") and step < _PUSH_STEPS:
                 axis = "xyz".index(name[-1])
-                torque[i] = self._push_torque(axis) * self._axes[axis]  # the object starts unturned, and turns about this axis only
+                torque[i] = (
+                    self._push_torque(axis) * self._axes[axis]
+                )  # the object starts unturned, and turns about this axis only
         return torch.as_tensor(force, dtype=torch.float32), torch.as_tensor(torque, dtype=torch.float32)
 
     def _pull(self, name: str) -> float:
@@ -309,7 +321,9 @@ class _Bench:
 
 
 def _block(name: str, *, inertia: np.ndarray) -> ObjectSpec:
-    return replace(solid(name, _SLAB_MASS, (shape("box", _SLAB_HALF, (0, 0, 0)),)), com=np.zeros(3), inertia=np.diag(inertia))
+    return replace(
+        solid(name, _SLAB_MASS, (shape("box", _SLAB_HALF, (0, 0, 0)),)), com=np.zeros(3), inertia=np.diag(inertia)
+    )
 
 
 def _top(name: str, points: Sequence[Sequence[float]]) -> ObjectSpec:
@@ -346,12 +360,18 @@ def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, 
         along /= np.linalg.norm(along)
         if along[2] < 0:
             along = -along  # away from the table
-        lowest = point[2] + min(0.0, 2 * _SLAB_HALF[2] * normal[2]) - np.hypot(*_SLAB_HALF[:2]) * np.sqrt(max(0.0, 1 - normal[2] ** 2))
+        lowest = (
+            point[2]
+            + min(0.0, 2 * _SLAB_HALF[2] * normal[2])
+            - np.hypot(*_SLAB_HALF[:2]) * np.sqrt(max(0.0, 1 - normal[2] ** 2))
+        )
         if lowest > 0.03 and (best is None or margin > best[0]):
             best = margin, point, normal, along
     if best is None or best[0] <= 0.002:
         what = "fingertip" if tip else "link beside the fingertips"
-        raise XResetError(f"no {what} of {robot.name!r} at home can be reached from outside, so its friction cannot be measured.")
+        raise XResetError(
+            f"no {what} of {robot.name!r} at home can be reached from outside, so its friction cannot be measured."
+        )
     return best[1:]
 
 

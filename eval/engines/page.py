@@ -79,7 +79,9 @@ def read(paths: Iterable[Path]) -> Results:
         data = read_json(path)
         schema = data.get("schema")
         if schema not in (CONFORMANCE, PARITY):
-            raise FileFormatError(f"{path} has the schema {schema!r}, expected {CONFORMANCE} or {PARITY}. Make it again with --json.")
+            raise FileFormatError(
+                f"{path} has the schema {schema!r}, expected {CONFORMANCE} or {PARITY}. Make it again with --json."
+            )
         add = _add_conformance if schema == CONFORMANCE else _add_parity
         try:
             alone = Results()
@@ -107,7 +109,9 @@ def _add_conformance(results: Results, name: str, data: Mapping[str, Any]) -> No
     covers = []
     for run in data["runs"]:
         column = Column(run["engine"], run["engine_version"], run["device"])
-        results.checks.setdefault(run["robot"], {}).setdefault(column, {}).update({check["check"]: check for check in run["checks"]})
+        results.checks.setdefault(run["robot"], {}).setdefault(column, {}).update(
+            {check["check"]: check for check in run["checks"]}
+        )
         results.capabilities.setdefault(column, set()).update(run["capabilities"])
         covers.append(f"{column.engine} {column.version} with {run['robot']} on {column.device}")
     results.sources.append(Source(name, data["command"], data["xreset_version"], "; ".join(covers)))
@@ -135,7 +139,13 @@ def page(results: Results) -> str:
         for name, check in of.items()
     ]
     known = [
-        (title, robot, f"`{name}`: {m['what']}", *(_amount(m[key], m) for key in ("measured", "tolerance", "bound")), m["reason"])
+        (
+            title,
+            robot,
+            f"`{name}`: {m['what']}",
+            *(_amount(m[key], m) for key in ("measured", "tolerance", "bound")),
+            m["reason"],
+        )
         for title, robot, name, check in found
         for m in check["measures"]
         if m["verdict"] == "known difference"
@@ -151,7 +161,9 @@ def page(results: Results) -> str:
         commands=_table(("what", "command", "xreset"), commands),
         capabilities=_capabilities(results.capabilities),
         summaries={robot: _summary(checks) for robot, checks in results.checks.items()},
-        known_differences=_table(("engine", "robot", "measure", "measured", "tolerance", "accepted up to", "why"), known),
+        known_differences=_table(
+            ("engine", "robot", "measure", "measured", "tolerance", "accepted up to", "why"), known
+        ),
         not_done=_table(("engine", "robot", "check", "", "why"), not_done),
         parities=[_parity(source, data) for source, data in results.parities],
         numbers={robot: _every_number(checks) for robot, checks in results.checks.items()},
@@ -194,7 +206,9 @@ def _verdict(check: Mapping[str, Any] | None) -> str:
 
 def _failures(check: Mapping[str, Any]) -> str:
     failed = [m for m in check["measures"] if m["verdict"] == "failed"]
-    return "; ".join(f"{m['what']}: {_amount(m['measured'], m)}, tolerance {_amount(m['tolerance'], m)}" for m in failed)
+    return "; ".join(
+        f"{m['what']}: {_amount(m['measured'], m)}, tolerance {_amount(m['tolerance'], m)}" for m in failed
+    )
 
 
 def _parity(source: Source, data: Mapping[str, Any]) -> dict[str, Any]:
@@ -250,4 +264,8 @@ _NONE = "-"
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     """In Markdown, which cells may hold; empty without a row."""
-    return markdown(Rows(head=head, body=tuple(rows)), escape=lambda cell: " ".join(cell.replace("|", "\\|").split())) if rows else ""
+    return (
+        markdown(Rows(head=head, body=tuple(rows)), escape=lambda cell: " ".join(cell.replace("|", "\\|").split()))
+        if rows
+        else ""
+    )

@@ -95,7 +95,10 @@ class Alteration:
         return replace(
             scene,
             robot=replace(scene.robot, joints=tuple(self._joint(joint) for joint in scene.robot.joints)),
-            objects=tuple(replace(o, mass=o.mass * self.mass, inertia=o.inertia * (self.mass * self.inertia)) for o in scene.objects),
+            objects=tuple(
+                replace(o, mass=o.mass * self.mass, inertia=o.inertia * (self.mass * self.inertia))
+                for o in scene.objects
+            ),
             friction=replace(
                 friction,
                 tip=friction.tip * self.tip_friction,
@@ -122,7 +125,9 @@ def altered_engine(base: Engine, alteration: Alteration) -> Engine:
     if alteration.contact_time != 1.0:
         dial = contact_dial(base.name)
         if dial is None:
-            raise CapabilityError(f"the backend {base.name!r} has no dial for the softness of contacts. Leave contact_time at 1.")
+            raise CapabilityError(
+                f"the backend {base.name!r} has no dial for the softness of contacts. Leave contact_time at 1."
+            )
         base = engine(base.name, device=base.device, **dial.options(alteration.contact_time))
 
     def make(scene: SceneSpec, num_worlds: int, object_index: Tensor) -> Backend:

@@ -48,7 +48,9 @@ class Property:
         """The change of A that gives it B's value, or why there is none."""
         x, y = self.value(a), self.value(b)
         if not (math.isfinite(x) and math.isfinite(y)):
-            return "could not be measured in " + " and ".join(w for w, v in (("A", x), ("B", y)) if not math.isfinite(v))
+            return "could not be measured in " + " and ".join(
+                w for w, v in (("A", x), ("B", y)) if not math.isfinite(v)
+            )
         if self.same(a, b):
             return "the same in both, as far as is measured"
         if self.towards is not None:

@@ -13,7 +13,16 @@ import torch
 
 from xreset.errors import XResetError
 from xreset.eval.engines.actions import Actions
-from xreset.eval.engines.divergence import Differences, Parting, Thresholds, differences, first_of, lifted, partings, worst
+from xreset.eval.engines.divergence import (
+    Differences,
+    Parting,
+    Thresholds,
+    differences,
+    first_of,
+    lifted,
+    partings,
+    worst,
+)
 from xreset.eval.engines.episodes import Episode, Recording, play
 from xreset.eval.trial import Engine
 from xreset.files import write_json
@@ -133,7 +142,9 @@ def trace(
     """
     thresholds = thresholds or Thresholds()
     if perturbed < 0 or not perturbation > 0:
-        raise XResetError(f"the number of perturbed starts is {perturbed} and their size {perturbation}; expected at least 0, and above 0.")
+        raise XResetError(
+            f"the number of perturbed starts is {perturbed} and their size {perturbation}; expected at least 0, and above 0."
+        )
     dt = actions.scene.control_dt
     progress(reference.name)
     theirs = _replay(actions, reference, _perturbed(actions.start, perturbed, perturbation, seed))
@@ -193,7 +204,9 @@ def _replay(actions: Actions, engine: Engine, start: State) -> Recording:
         return play(backend, Episode(start=start, targets=targets.contiguous()))
 
 
-def _engine_trace(engine: Engine, found: Recording, reference: Recording, actions: Actions, thresholds: Thresholds) -> EngineTrace:
+def _engine_trace(
+    engine: Engine, found: Recording, reference: Recording, actions: Actions, thresholds: Thresholds
+) -> EngineTrace:
     d = differences(found, reference, actions.scene.control_dt, thresholds)
     return EngineTrace(
         name=engine.name,

@@ -62,13 +62,17 @@ def load_frames(
         data = retarget_demos(demos, spec, objects, progress=lambda done, total: progress("retargeting", done, total))
         return spec, objects, Frames.of_retargeted(data)
     if schema not in (RETARGETED, BANK):
-        raise FileFormatError(f"{path} states schema {schema!r}; grasps come from {RETARGETED!r}, {BANK!r} or {DEMOS!r}.")
+        raise FileFormatError(
+            f"{path} states schema {schema!r}; grasps come from {RETARGETED!r}, {BANK!r} or {DEMOS!r}."
+        )
     data = read_retargeted(path) if schema == RETARGETED else read_bank(path)
     spec = load_robot(robot or data.robot)
     if not isinstance(data, ResetBank):
         check_retargeted(path, data, spec)
         return spec, wanted(np.asarray(data.object_name).tolist()), Frames.of_retargeted(data)
-    check_robot(path, "reset bank", spec, name=data.robot, joint_names=data.joint_names, fingerprint=data.robot_fingerprint)
+    check_robot(
+        path, "reset bank", spec, name=data.robot, joint_names=data.joint_names, fingerprint=data.robot_fingerprint
+    )
     objects = wanted(data.object_names)
     check_objects(path, data, objects)
     return spec, objects, Frames.of_bank(data)
@@ -83,7 +87,9 @@ def from_file(source: Path, sequence: Sequence, place: Place) -> Actions:
     """
     schema = npz_schema(source)
     if schema == ACTIONS:
-        return read_actions(source, load_robot(place.robot or robot_of(source)), lambda name: load_object(name, place.objects))
+        return read_actions(
+            source, load_robot(place.robot or robot_of(source)), lambda name: load_object(name, place.objects)
+        )
     if schema == TRACE_SCHEMA:
         return _from_evaluation(source, sequence, place)
     if schema not in (DEMOS, RETARGETED, BANK):
@@ -97,12 +103,18 @@ def from_file(source: Path, sequence: Sequence, place: Place) -> Actions:
     thing = next(o for o in objects if o.name == name)
     grasps = find_grasps(frames, spec, (thing,), len(frames.frame), where="table")
     if sequence.episode >= len(grasps):
-        raise DemoError(f"{source} shows {len(grasps)} grasps of {name} on the table, so --episode is at most {len(grasps) - 1}.")
+        raise DemoError(
+            f"{source} shows {len(grasps)} grasps of {name} on the table, so --episode is at most {len(grasps) - 1}."
+        )
     return grasp_and_lift(spec, thing, grasps, sequence.episode)
 
 
 def from_policy(
-    source: Path, engine: Engine, sequence: Sequence, place: Place, progress: Callable[[int, int], None] = lambda done, total: None
+    source: Path,
+    engine: Engine,
+    sequence: Sequence,
+    place: Place,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Actions:
     """The actions of a policy in one engine.
 
@@ -142,7 +154,9 @@ def _from_evaluation(source: Path, sequence: Sequence, place: Place) -> Actions:
 def _object(source: Path, wanted: str | None, there: list[str]) -> str:
     names = list(dict.fromkeys(there))
     if not names:
-        raise DemoError(f"{source} shows no frame after first contact, so there is no grasp in it. Retarget more demonstrations.")
+        raise DemoError(
+            f"{source} shows no frame after first contact, so there is no grasp in it. Retarget more demonstrations."
+        )
     if wanted is None:
         return names[0]
     if wanted not in names:

@@ -38,8 +38,13 @@ def rich_table(result: TraceResult) -> Table:
     table.add_column(f"{reference.name}, {len(result.noise_differences)} starts moved by {result.perturbation:.0e}")
     table.add_row("object lifted by", *(_height(e.lifted) for e in result.engines), _height(reference.lifted))
     for i, noise in enumerate(result.noise):
-        cells = [_cell(result, e.partings[i], dim=result.within_noise(e.partings[i])) if e.partings else "-" for e in result.engines]
-        table.add_row(f"{noise.quantity}\n(from {shown(noise, noise.threshold)})", *cells, _cell(result, noise, dim=False))
+        cells = [
+            _cell(result, e.partings[i], dim=result.within_noise(e.partings[i])) if e.partings else "-"
+            for e in result.engines
+        ]
+        table.add_row(
+            f"{noise.quantity}\n(from {shown(noise, noise.threshold)})", *cells, _cell(result, noise, dim=False)
+        )
     return table
 
 
@@ -113,7 +118,14 @@ def write_plot(path: Path, result: TraceResult) -> None:
             for name, start in result.actions.phases:
                 ax.axvline(start, color="black", alpha=0.15, linewidth=0.8)
                 if ax is axes[0]:
-                    ax.annotate(name, (start, 1), xycoords=("data", "axes fraction"), xytext=(2, -2), textcoords="offset points", va="top")
+                    ax.annotate(
+                        name,
+                        (start, 1),
+                        xycoords=("data", "axes fraction"),
+                        xytext=(2, -2),
+                        textcoords="offset points",
+                        va="top",
+                    )
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
 
@@ -125,7 +137,12 @@ def _draw_differences(ax: Axes, result: TraceResult, value, threshold: float) ->
         ax.plot(d.time, np.maximum(value(d), floor), **style)
 
     for i, d in enumerate(result.noise_differences):
-        draw(d, color=_NOISE, linewidth=0.7, label=f"{result.reference.name}, start moved by {result.perturbation:.0e}" if i == 0 else None)
+        draw(
+            d,
+            color=_NOISE,
+            linewidth=0.7,
+            label=f"{result.reference.name}, start moved by {result.perturbation:.0e}" if i == 0 else None,
+        )
     for i, engine in enumerate(result.engines, start=1):
         draw(engine.differences, color=COLORS[i % len(COLORS)], linewidth=1.3, label=engine.name)
     ax.axhline(threshold, color="black", linestyle="--", linewidth=0.8, label="threshold")
@@ -141,12 +158,16 @@ def _draw_touches(ax: Axes, engines: list[tuple[str, Differences]], fingers: tup
         flags = d.touch[:, finger]
         edges = np.flatnonzero(np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))).reshape(-1, 2)
         dt = float(d.time[0])
-        ax.broken_barh([(start * dt, (stop - start) * dt) for start, stop in edges], (y - 0.4, 0.8), color=COLORS[k % len(COLORS)])
+        ax.broken_barh(
+            [(start * dt, (stop - start) * dt) for start, stop in edges], (y - 0.4, 0.8), color=COLORS[k % len(COLORS)]
+        )
         if k == 0:
             ax.axhline(y - 0.5, color="black", alpha=0.15, linewidth=0.8)
     middle = (len(engines) - 1) / 2
     ax.set_yticks([i * len(engines) + middle for i in range(len(fingers))], list(fingers))
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.set_title(
-        f"which fingers touch the object (in each, from above: {', '.join(name for name, _ in engines)})", loc="left", fontsize="medium"
+        f"which fingers touch the object (in each, from above: {', '.join(name for name, _ in engines)})",
+        loc="left",
+        fontsize="medium",
     )

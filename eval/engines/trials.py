@@ -11,7 +11,15 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from xreset.eval.engines.episodes import Motion, Recording, closing_episode, holding_episode, lifting_episode, play, squeezing_state
+from xreset.eval.engines.episodes import (
+    Motion,
+    Recording,
+    closing_episode,
+    holding_episode,
+    lifting_episode,
+    play,
+    squeezing_state,
+)
 from xreset.eval.engines.grasps import Grasps
 from xreset.eval.trial import Engine
 from xreset.physics import State
@@ -97,7 +105,13 @@ def try_paths(tested: Engine, scene: SceneSpec, common: CommonStates, config: Pa
 
 
 def common_states(
-    robot: RobotSpec, table: Grasps, air: Grasps, closings: Mapping[str, Recording], count: int, dt: float, config: ParityConfig
+    robot: RobotSpec,
+    table: Grasps,
+    air: Grasps,
+    closings: Mapping[str, Recording],
+    count: int,
+    dt: float,
+    config: ParityConfig,
 ) -> CommonStates:
     """States that favour no engine: some as demonstrations show them in the air, the others from the closings of all engines in turn.
 
@@ -110,7 +124,9 @@ def common_states(
     """
     shown = min(round(count * config.in_air), len(air))
     labels = [f"{label} as demonstrated" for label in air.label[:shown]]
-    states = [squeezing_state(robot, air.joint_pos[:shown], air.object_pos[:shown], air.object_quat[:shown], config.motion)]
+    states = [
+        squeezing_state(robot, air.joint_pos[:shown], air.object_pos[:shown], air.object_quat[:shown], config.motion)
+    ]
     index = [air.object_index[:shown]]
     last = config.motion.closing_steps(dt) - 1
     names = list(closings)

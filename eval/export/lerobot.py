@@ -60,15 +60,21 @@ def write_lerobot(
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise XResetError(f"{folder} is there already. Nothing was changed; choose another --out.")
     if video and (min(size) < 16 or size[0] % 2 or size[1] % 2):
-        raise XResetError(f"films of {size[0]} x {size[1]} pixels cannot be encoded; width and height must be even, from 16 on.")
+        raise XResetError(
+            f"films of {size[0]} x {size[1]} pixels cannot be encoded; width and height must be even, from 16 on."
+        )
     try:
         with atomic_folder(folder) as part:
             _write(pa, part, recording, _Films(recording, size) if video else None, progress)
     except OSError as error:
-        raise XResetError(f"cannot write {folder}: {error.strerror or error}. Nothing was changed; choose another place.") from error
+        raise XResetError(
+            f"cannot write {folder}: {error.strerror or error}. Nothing was changed; choose another place."
+        ) from error
 
 
-def _write(pa: ModuleType, root: Path, recording: Recording, films: _Films | None, progress: Callable[[int, int], None]) -> None:
+def _write(
+    pa: ModuleType, root: Path, recording: Recording, films: _Films | None, progress: Callable[[int, int], None]
+) -> None:
     import pyarrow.parquet as parquet
 
     def write(name: str, table: Any) -> None:
@@ -83,12 +89,22 @@ def _write(pa: ModuleType, root: Path, recording: Recording, films: _Films | Non
         progress(i, len(episodes))
         arrays = _arrays(episode, i, int(offsets[i]), tasks.index(episode.task), recording.fps)
         sample = dict(arrays)
-        place = {"data/chunk_index": 0, "data/file_index": 0, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        place = {
+            "data/chunk_index": 0,
+            "data/file_index": 0,
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+        }
         if films is not None:
             chunk, file = divmod(i, _CHUNK)
-            sample[VIDEO] = films.write(root / f"videos/{VIDEO}" / (_FILE.format(chunk=chunk, file=file) + ".mp4"), episode)
+            sample[VIDEO] = films.write(
+                root / f"videos/{VIDEO}" / (_FILE.format(chunk=chunk, file=file) + ".mp4"), episode
+            )
             place |= {f"videos/{VIDEO}/{key}": value for key, value in (("chunk_index", chunk), ("file_index", file))}
-            place |= {f"videos/{VIDEO}/from_timestamp": 0.0, f"videos/{VIDEO}/to_timestamp": len(episode.action) / recording.fps}
+            place |= {
+                f"videos/{VIDEO}/from_timestamp": 0.0,
+                f"videos/{VIDEO}/to_timestamp": len(episode.action) / recording.fps,
+            }
         rows.append(
             {
                 "episode_index": i,
@@ -104,7 +120,11 @@ def _write(pa: ModuleType, root: Path, recording: Recording, films: _Films | Non
                 "success": episode.episode.reorient,
                 "task_progress": episode.episode.task_progress,
                 **place,
-                **{f"stats/{key}/{name}": value.tolist() for key, some in sample.items() for name, value in _stats(key, some).items()},
+                **{
+                    f"stats/{key}/{name}": value.tolist()
+                    for key, some in sample.items()
+                    for name, value in _stats(key, some).items()
+                },
             }
         )
         samples.append(sample)
@@ -114,7 +134,9 @@ def _write(pa: ModuleType, root: Path, recording: Recording, films: _Films | Non
     write("meta/episodes/" + _FILE.format(chunk=0, file=0) + ".parquet", pa.Table.from_pylist(rows))
     write("meta/tasks.parquet", _task_table(pa, tasks))
     stats = {key: _stats(key, np.concatenate([sample[key] for sample in samples])) for key in samples[0]}
-    write_json(root / "meta/stats.json", {key: {name: v.tolist() for name, v in some.items()} for key, some in stats.items()})
+    write_json(
+        root / "meta/stats.json", {key: {name: v.tolist() for name, v in some.items()} for key, some in stats.items()}
+    )
     write_json(root / "meta/info.json", _info(recording, len(tasks), features, films is not None))
     progress(len(episodes), len(episodes))
 
@@ -157,7 +179,12 @@ def _features(recording: Recording, films: _Films | None) -> dict[str, dict[str,
             "video.channels": 3,
             "has_audio": False,
         }
-        features[VIDEO] = {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}
+        features[VIDEO] = {
+            "dtype": "video",
+            "shape": [height, width, 3],
+            "names": ["height", "width", "channels"],
+            "info": info,
+        }
     kinds = {"engine": "string", "timestamp": "float32"} | dict.fromkeys(_INDICES, "int64")
     return features | {key: {"dtype": kind, "shape": [1], "names": None} for key, kind in kinds.items()}
 
@@ -169,7 +196,9 @@ def _arrays(episode: Recorded, index: int, first: int, task: int, fps: float) ->
     frame = np.arange(count)
     return {
         "observation.state": trace.joint_pos.astype(np.float32),
-        "observation.environment_state": np.hstack((trace.object_pos, trace.object_quat, np.tile(goal, (count, 1)))).astype(np.float32),
+        "observation.environment_state": np.hstack(
+            (trace.object_pos, trace.object_quat, np.tile(goal, (count, 1)))
+        ).astype(np.float32),
         "action": episode.action.astype(np.float32),
         "timestamp": (frame[:, None] / fps).astype(np.float32),
         "frame_index": frame[:, None],
@@ -193,7 +222,13 @@ def _task_table(pa: ModuleType, tasks: list[str]) -> Any:
         "index_columns": ["task"],
         "column_indexes": [],
         "columns": [
-            {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": None},
+            {
+                "name": "task_index",
+                "field_name": "task_index",
+                "pandas_type": "int64",
+                "numpy_type": "int64",
+                "metadata": None,
+            },
             {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None},
         ],
         "pandas_version": "2.0.0",
@@ -227,7 +262,9 @@ class _Films:
             self._renderers[key] = Renderer(SceneSpec(robot=self._robot, objects=(thing,)), size=self.size)
         renderer, goal = self._renderers[key], pose_matrix(trace.goal_pos, trace.goal_quat)
         states = zip(trace.joint_pos, trace.object_pos, trace.object_quat, strict=True)
-        frames = np.stack([renderer.draw(joints, pose_matrix(pos, quat), goal_pose=goal) for joints, pos, quat in states])
+        frames = np.stack(
+            [renderer.draw(joints, pose_matrix(pos, quat), goal_pose=goal) for joints, pos, quat in states]
+        )
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(encode_mp4(frames, self._fps, keyframes=_KEYFRAMES))
         return frames[::10, ::8, ::8].reshape(-1, 3) / 255.0

@@ -113,9 +113,13 @@ def read_recorded(
                 found += _finite(whole, results)
     if not found:
         what = f" of {', '.join(backends)}" if backends else ""
-        raise RunError(f"{', '.join(map(str, folders))}: there are no recorded episodes{what}. Make them first: xreset eval")
+        raise RunError(
+            f"{', '.join(map(str, folders))}: there are no recorded episodes{what}. Make them first: xreset eval"
+        )
     if len(robots) > 1:
-        raise RunError(f"the episodes are of the robots {', '.join(sorted(robots))}; a data set is of one. Export them one by one.")
+        raise RunError(
+            f"the episodes are of the robots {', '.join(sorted(robots))}; a data set is of one. Export them one by one."
+        )
     if len(intervals) > 1:
         listing = ", ".join(f"{1 / dt:.4g} in {path}" for dt, path in intervals.items())
         raise RunError(f"the episodes have different rates, frames per second: {listing}. Export them one by one.")
@@ -124,17 +128,23 @@ def read_recorded(
 
 def _actions(trace: Trace, results: Path, engine: str) -> np.ndarray:
     if trace.joint_target is None:
-        raise FileFormatError(f"{results / engine}.trace.npz holds states without the actions that led to them. Evaluate again.")
+        raise FileFormatError(
+            f"{results / engine}.trace.npz holds states without the actions that led to them. Evaluate again."
+        )
     frames, steps = len(trace.time), len(trace.joint_target)
     every = steps // (frames - 1)
     if every < 1:
-        raise FileFormatError(f"{results / engine}.trace.npz has {steps} actions for {frames} states, expected as many or more.")
+        raise FileFormatError(
+            f"{results / engine}.trace.npz has {steps} actions for {frames} states, expected as many or more."
+        )
     return trace.joint_target[np.minimum(np.arange(1, frames + 1) * every - 1, steps - 1)]
 
 
 def _finite(whole: Recorded, results: Path) -> list[Recorded]:
     trace = whole.trace
-    sound = np.isfinite(np.concatenate((trace.joint_pos, trace.object_pos, trace.object_quat, whole.action), axis=1)).min(axis=1)
+    sound = np.isfinite(
+        np.concatenate((trace.joint_pos, trace.object_pos, trace.object_quat, whole.action), axis=1)
+    ).min(axis=1)
     last = len(sound) if sound.all() else int(np.argmin(sound))
     if last == len(sound):
         return [whole]

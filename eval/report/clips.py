@@ -47,7 +47,9 @@ def choose_sequence(episodes: dict[str, tuple[Episode, ...]], traces: dict[str, 
 
     def quality(sequence: int) -> tuple[float, float, int]:
         shown = [recorded_episode(episodes[engine], sequence) for engine in traces]
-        progress, reorientation = (float(np.mean([getattr(e, n) for e in shown])) for n in ("task_progress", "reorientation_progress"))
+        progress, reorientation = (
+            float(np.mean([getattr(e, n) for e in shown])) for n in ("task_progress", "reorientation_progress")
+        )
         return progress, reorientation, -sequence
 
     return max(common, key=quality, default=None)
@@ -66,7 +68,10 @@ def camera_for(traces: list[Trace], *, distance: float = 1.0) -> Camera:
         distance: factor on the camera's distance.
     """
     start, goal = traces[0].object_pos[0].astype(float), traces[0].goal_pos.astype(float)
-    return camera_at((start + goal) / 2 + (0.0, 0.0, 0.06), distance * float(np.clip(0.75 + 1.2 * np.linalg.norm(goal - start), 0.85, 1.3)))
+    return camera_at(
+        (start + goal) / 2 + (0.0, 0.0, 0.06),
+        distance * float(np.clip(0.75 + 1.2 * np.linalg.norm(goal - start), 0.85, 1.3)),
+    )
 
 
 def camera_at(center: np.ndarray, distance: float) -> Camera:
@@ -117,7 +122,8 @@ def choose_failures(episodes: Sequence[Episode], traces: Sequence[Trace], count:
     """
     found = [(recorded_episode(tuple(episodes), trace.sequence), trace) for trace in traces]
     missed = sorted(
-        ((e, t) for e, t in found if not e.reorient), key=lambda x: (x[0].task_progress, x[0].reorientation_progress, x[0].sequence)
+        ((e, t) for e, t in found if not e.reorient),
+        key=lambda x: (x[0].task_progress, x[0].reorientation_progress, x[0].sequence),
     )
     seen: dict[str, int] = {}
     turns = []
@@ -139,7 +145,9 @@ def count_failures(episodes: Sequence[Episode]) -> dict[str, int]:
 
 def draw_strip(episode: Episode, trace: Trace, robot: RobotSpec, obj: ObjectSpec) -> Strip:
     """Draw an episode's strip, the goal as a translucent object; states that are not finite are left grey."""
-    renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=STRIP_SIZE, camera=camera_for([trace], distance=0.7))
+    renderer = Renderer(
+        SceneSpec(robot=robot, objects=(obj,)), size=STRIP_SIZE, camera=camera_for([trace], distance=0.7)
+    )
     goal = pose_matrix(trace.goal_pos, trace.goal_quat)
     rows = np.linspace(0, len(trace.time) - 1, MOMENTS).round().astype(int)
     pictures = []
@@ -149,7 +157,9 @@ def draw_strip(episode: Episode, trace: Trace, robot: RobotSpec, obj: ObjectSpec
             pictures.append(renderer.draw(state[0], pose_matrix(*state[1:]), goal_pose=goal))
         else:
             pictures.append(np.full((STRIP_SIZE[1], STRIP_SIZE[0], 3), 128, dtype=np.uint8))
-    return Strip(episode=episode, picture=np.concatenate(pictures, axis=1), times=tuple(float(trace.time[row]) for row in rows))
+    return Strip(
+        episode=episode, picture=np.concatenate(pictures, axis=1), times=tuple(float(trace.time[row]) for row in rows)
+    )
 
 
 def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) -> bytes:

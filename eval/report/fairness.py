@@ -21,12 +21,16 @@ def notes(trainings: Sequence[Training]) -> tuple[str, ...]:
 
     def compare(what: str, get: Callable[[EvalResult], Any], advice: str = "") -> None:
         values = {(t.label, engine): get(s) for t in evaluated for engine, s in t.summaries.items()}
-        first = {get(next(iter(t.summaries.values()))) for t in evaluated}  # what differs within a training has been said above
+        first = {
+            get(next(iter(t.summaries.values()))) for t in evaluated
+        }  # what differs within a training has been said above
         if len(first) > 1:
             found.append(f"These results are not comparable: not the same {what} ({_listing(values)}).{advice}")
 
     if len({_sequences(t) for t in evaluated}) == 1:
-        files = {(t.label, engine): ASPECTS["demonstrations"](s) for t in evaluated for engine, s in t.summaries.items()}
+        files = {
+            (t.label, engine): ASPECTS["demonstrations"](s) for t in evaluated for engine, s in t.summaries.items()
+        }
         if len(set(files.values())) > 1:
             found.append(
                 f"The files of demonstrations differ ({_listing(files)}), their sequences have the same names. That is so if one was made "
@@ -51,7 +55,9 @@ def notes(trainings: Sequence[Training]) -> tuple[str, ...]:
         facts = {(t.label, ""): t.facts[field] for t in evaluated if field in t.facts}
         if len({fact.value for fact in facts.values()}) > 1:
             texts = {name: fact.text for name, fact in facts.items()}
-            found.append(f"These results are not comparable: each policy plays its own task, whose {field} differs ({_listing(texts)}).")
+            found.append(
+                f"These results are not comparable: each policy plays its own task, whose {field} differs ({_listing(texts)})."
+            )
     return tuple(found)
 
 

@@ -34,7 +34,11 @@ TITLES = {
     "episode/length": "episode length [control steps]",
 }
 """Title of a curve's panel; others have their TensorBoard name."""
-AXES: dict[X, str] = {"minutes": "minutes of training", "steps": "million environment steps", "iterations": "iterations"}
+AXES: dict[X, str] = {
+    "minutes": "minutes of training",
+    "steps": "million environment steps",
+    "iterations": "iterations",
+}
 """Label of the horizontal axis."""
 _STYLES = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 2, 1, 2)))
 _HATCHES = ("", "///", "...", "xxx")
@@ -60,7 +64,14 @@ def draw_progress(ax: Axes, summaries: Summaries) -> None:
     for i, s in enumerate(summaries):
         mean, (low, high) = s.task_progress.mean, s.task_progress.ci95
         ax.barh(i, 100 * mean, color=COLORS[i % len(COLORS)], height=0.62)
-        ax.errorbar(100 * mean, i, xerr=[[100 * max(mean - low, 0)], [100 * max(high - mean, 0)]], color=INK, capsize=3, linewidth=1.2)
+        ax.errorbar(
+            100 * mean,
+            i,
+            xerr=[[100 * max(mean - low, 0)], [100 * max(high - mean, 0)]],
+            color=INK,
+            capsize=3,
+            linewidth=1.2,
+        )
         ax.text(100 * high + 2, i, f"{mean:.0%}", va="center")
     ax.set_yticks(range(len(summaries)), [s.backend for s in summaries])
     ax.invert_yaxis()
@@ -74,7 +85,13 @@ def draw_stages(ax: Axes, summaries: Summaries) -> None:
     width = 0.8 / len(summaries)
     for i, s in enumerate(summaries):
         at = np.arange(len(STAGES)) - 0.4 + width * (i + 0.5)
-        bars = ax.bar(at, [100 * getattr(s, key) for key, _ in STAGES], width=0.9 * width, color=COLORS[i % len(COLORS)], label=s.backend)
+        bars = ax.bar(
+            at,
+            [100 * getattr(s, key) for key, _ in STAGES],
+            width=0.9 * width,
+            color=COLORS[i % len(COLORS)],
+            label=s.backend,
+        )
         ax.bar_label(bars, fmt="%.0f", fontsize="small", padding=1)
     ax.set_xticks(range(len(STAGES)), [label for _, label in STAGES])
     percent_axis(ax, "y")
@@ -88,7 +105,9 @@ def draw_objects(ax: Axes, summaries: Summaries) -> None:
         found = object_progress(s)
         offset = 0.5 * ((i + 0.5) / len(summaries) - 0.5)
         rows = [(100 * found[name], j + offset) for j, name in enumerate(names) if name in found]
-        ax.scatter(*zip(*rows, strict=True), s=34, color=COLORS[i % len(COLORS)], label=s.backend, zorder=3, clip_on=False)
+        ax.scatter(
+            *zip(*rows, strict=True), s=34, color=COLORS[i % len(COLORS)], label=s.backend, zorder=3, clip_on=False
+        )
     ax.set_yticks(range(len(names)), [short_name(name) for name in names])
     ax.set_ylim(len(names) - 0.5, -0.5)
     percent_axis(ax, "x")
@@ -98,7 +117,13 @@ def draw_objects(ax: Axes, summaries: Summaries) -> None:
 def draw_curve(ax: Axes, curve: Curve) -> None:
     """One learning curve."""
     percent = curve.label.startswith("worlds")
-    ax.plot(curve.iteration, curve.value * (100 if percent else 1), color=COLORS[0], linewidth=1.6, marker="o" * (len(curve.value) < 10))
+    ax.plot(
+        curve.iteration,
+        curve.value * (100 if percent else 1),
+        color=COLORS[0],
+        linewidth=1.6,
+        marker="o" * (len(curve.value) < 10),
+    )
     curve_axes(ax, curve.label, "iteration", percent=percent)
 
 
@@ -113,7 +138,15 @@ def curve_axes(ax: Axes, title: str, x: str, *, percent: bool) -> None:
 
 
 def draw_lines(
-    ax: Axes, lines: Mapping[str, Line], title: str, x: X, order: Sequence[str], *, percent: bool, of: str = "", steps: bool = False
+    ax: Axes,
+    lines: Mapping[str, Line],
+    title: str,
+    x: X,
+    order: Sequence[str],
+    *,
+    percent: bool,
+    of: str = "",
+    steps: bool = False,
 ) -> None:
     """One line for each group, with a band from ``low`` to ``high`` where they differ.
 
@@ -131,7 +164,9 @@ def draw_lines(
         if (curve.high > curve.low).any():
             alpha, step = (0.12, "post") if steps else (0.2, None)
             ax.fill_between(at, scale * curve.low, scale * curve.high, step=step, color=color, alpha=alpha, linewidth=0)
-        drawn: dict[str, Any] = {"drawstyle": "steps-post"} if steps else {"marker": "o" * (len(at) < 10), "markersize": 4}
+        drawn: dict[str, Any] = (
+            {"drawstyle": "steps-post"} if steps else {"marker": "o" * (len(at) < 10), "markersize": 4}
+        )
         # over the axis, for many curves stay at zero
         ax.plot(at, scale * curve.mean, color=color, linestyle=_STYLES[style], linewidth=1.5, zorder=3, **drawn)
     curve_axes(ax, title, AXES[x], percent=percent)
@@ -149,7 +184,9 @@ def draw_scores(ax: Axes, found: Scores, order: Sequence[str]) -> None:
         mean, low, high = 100 * np.array([(s.task_progress, *s.ci95) for s in row.values()]).T
         ax.bar(at, mean, width=0.9 * width, color=color, hatch=_HATCHES[style], edgecolor="white", linewidth=0)
         error = np.maximum([mean - low, high - mean], 0)
-        ax.errorbar(at, mean, yerr=error, fmt="none", ecolor=INK, capsize=min(3.0, 60 * width / len(engines)), linewidth=1.0)
+        ax.errorbar(
+            at, mean, yerr=error, fmt="none", ecolor=INK, capsize=min(3.0, 60 * width / len(engines)), linewidth=1.0
+        )
         if len(engines) * len(found) <= _MAX_NUMBERS:
             for place, value, top in zip(at, mean, high, strict=True):
                 ax.text(place, max(top, value) + 1.5, f"{value:.0f}", ha="center", va="bottom", fontsize="small")
@@ -247,7 +284,9 @@ def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], foun
         if lifted:
             panels = next(parts).subplots(1, len(lifted), squeeze=False)[0]
             for ax, (s, lines) in zip(panels, lifted.items(), strict=True):
-                draw_lines(ax, lines, f"runs past {100 * s:g} % from home", x, order, percent=True, of="runs", steps=True)
+                draw_lines(
+                    ax, lines, f"runs past {100 * s:g} % from home", x, order, percent=True, of="runs", steps=True
+                )
                 ax.set_ylim(-2, 102)
         if found:
             draw_scores(next(parts).subplots(), found, order)

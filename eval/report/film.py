@@ -68,10 +68,13 @@ def make_film(
             columns[name].append(clip.frames[:, ::2, ::2])
             rate = clip.fps
     if not columns:
-        raise RunError(f"no demonstration in {data.results} was recorded in every engine. Evaluate all engines in one command.")
+        raise RunError(
+            f"no demonstration in {data.results} was recorded in every engine. Evaluate all engines in one command."
+        )
     length = max(len(frames) for column in columns.values() for frames in column)
     whole = [
-        np.concatenate([frames[np.minimum(np.arange(length), len(frames) - 1)] for frames in column], axis=1) for column in columns.values()
+        np.concatenate([frames[np.minimum(np.arange(length), len(frames) - 1)] for frames in column], axis=1)
+        for column in columns.values()
     ]
     film = encode_mp4(np.concatenate(whole, axis=2), rate)
     write_whole(out, film)

@@ -46,7 +46,9 @@ def grouped(trainings: Sequence[Training]) -> tuple[tuple[Group, ...], tuple[str
             groups.append(Group(label=_label([m.label for m in members]), members=tuple(members)))
         else:
             groups += singles(members)
-            notes.append(f"{', '.join(m.label for m in members)} have the same configuration and are not taken together: {reason}.")
+            notes.append(
+                f"{', '.join(m.label for m in members)} have the same configuration and are not taken together: {reason}."
+            )
     labels = [group.label for group in groups]
     if len(set(labels)) < len(labels):  # names that were shortened to the same
         groups = [Group(label=" + ".join(m.label for m in group.members), members=group.members) for group in groups]
@@ -89,7 +91,9 @@ def _label(labels: Sequence[str]) -> str:
     """What the names have in common: ``soup-seed0`` and ``soup-seed1`` are ``soup``."""
     if len(labels) == 1:
         return labels[0]
-    common = "".join(letters[0] for letters in takewhile(lambda letters: len(set(letters)) == 1, zip(*labels, strict=False)))
+    common = "".join(
+        letters[0] for letters in takewhile(lambda letters: len(set(letters)) == 1, zip(*labels, strict=False))
+    )
     if any(label[len(common) :][:1].isdigit() for label in labels):
         common = common.rstrip("0123456789")
     return re.sub(r"[-_. ]+(seed|s)?[-_. ]*$", "", common) or " + ".join(labels)

@@ -52,7 +52,11 @@ def lift_of(training: Training) -> Lift | None:
     for share in SHARES:
         if (curve.value >= share).any():
             i = int(np.argmax(curve.value >= share))
-            passed.append(Passing(share=share, iteration=int(curve.iteration[i]), env_steps=round(steps[i]), minutes=float(minutes[i])))
+            passed.append(
+                Passing(
+                    share=share, iteration=int(curve.iteration[i]), env_steps=round(steps[i]), minutes=float(minutes[i])
+                )
+            )
     return Lift(
         passed=tuple(passed), iteration=int(curve.iteration[-1]), env_steps=round(steps[-1]), minutes=float(minutes[-1]),
         success_from_home=float(curve.value[-1]),
@@ -99,7 +103,9 @@ def notes(groups: Sequence[Group]) -> tuple[str, ...]:
     if derived := [m.label for g in groups for m in g.members if m.lift is None and known.get(m.label)]:
         found.append(f"No lift.json, so when they lifted is taken from the learning curves: {', '.join(derived)}.")
     if unknown := [label for label, lift in known.items() if lift is None]:
-        found.append(f"When they lifted is not known, for they have neither lift.json nor the curve {CURVE}: {', '.join(unknown)}.")
+        found.append(
+            f"When they lifted is not known, for they have neither lift.json nor the curve {CURVE}: {', '.join(unknown)}."
+        )
     if single := [g.label for g in groups if len(g.members) == 1 and known.get(g.members[0].label)]:
         found.append(f"One run only, which says little about how surely another seed lifts: {', '.join(single)}.")
     return tuple(found)

@@ -10,7 +10,16 @@ from xreset.description import load_robot
 from xreset.errors import RunError, XResetError
 from xreset.eval.pages import render
 from xreset.eval.report import fairness, lifting, tables
-from xreset.eval.report.clips import Clip, Strip, camera_for, choose_failures, choose_sequence, draw_clip, draw_strip, recorded_episode
+from xreset.eval.report.clips import (
+    Clip,
+    Strip,
+    camera_for,
+    choose_failures,
+    choose_sequence,
+    draw_clip,
+    draw_strip,
+    recorded_episode,
+)
 from xreset.eval.report.figures import write_overview, write_picture
 from xreset.eval.report.groups import Group, grouped, scores, singles
 from xreset.eval.report.page import headline, page
@@ -65,7 +74,9 @@ def make_report(
         return _make(data, out, robot, objects, progress)
 
 
-def _make(data: ReportData, out: Path, robot: str | None, objects: Path | None, progress: Callable[[int, int], None]) -> Report:
+def _make(
+    data: ReportData, out: Path, robot: str | None, objects: Path | None, progress: Callable[[int, int], None]
+) -> Report:
     clips, strips = [], []
     try:
         clips, strips = _draw(data, robot, objects, progress)
@@ -104,7 +115,11 @@ def _draw(
     clips, strips, total = [], [], len(traces) + len(missed)
     for engine, trace in traces.items():
         progress(len(clips), total)
-        clips.append(draw_clip(engine, recorded_episode(data.episodes[engine], sequence), trace, spec, things[trace.object], camera))
+        clips.append(
+            draw_clip(
+                engine, recorded_episode(data.episodes[engine], sequence), trace, spec, things[trace.object], camera
+            )
+        )
     for episode, trace in missed:
         progress(len(clips) + len(strips), total)
         strips.append(draw_strip(episode, trace, spec, things[trace.object]))
@@ -138,7 +153,9 @@ class Comparison:
     """What the figures are."""
 
 
-def compare(runs: Sequence[str], out: Path, *, x: X = "minutes", curves: Sequence[str] = (), apart: bool = False) -> Comparison:
+def compare(
+    runs: Sequence[str], out: Path, *, x: X = "minutes", curves: Sequence[str] = (), apart: bool = False
+) -> Comparison:
     """Write ``compare.png`` and ``compare.md``.
 
     Args:

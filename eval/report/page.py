@@ -69,7 +69,8 @@ def _facts(data: ReportData) -> dict[str, str]:
         "Robot": s.robot,
         "Policy": s.policy,
         "Engines": ", ".join(f"{x.backend} {x.backend_version}" for x in data.summaries),
-        "Objects": ", ".join(map(short_name, s.objects)) + (" (meshes)" if s.objects_folder else " (built-in stand-ins)"),
+        "Objects": ", ".join(map(short_name, s.objects))
+        + (" (meshes)" if s.objects_folder else " (built-in stand-ins)"),
         "Episodes": f"{s.episodes} in each engine: {demos} demonstration{'s' * (demos != 1)}, {each} start{'s' * (each != 1)} each",
         "Seed": str(s.seed),
     }
@@ -84,7 +85,15 @@ def _facts(data: ReportData) -> dict[str, str]:
 
 def outcome_of(e: Episode) -> str:
     """What an episode reached, in words."""
-    stage = "object at its goal" if e.reorient else "grasped and lifted" if e.grasp else "approached" if e.approach else "no stage reached"
+    stage = (
+        "object at its goal"
+        if e.reorient
+        else "grasped and lifted"
+        if e.grasp
+        else "approached"
+        if e.approach
+        else "no stage reached"
+    )
     return f"{stage}, {e.reorientation_progress:.0%} of the way to the goal"
 
 
@@ -97,16 +106,26 @@ def _charts(data: ReportData) -> dict[str, str]:
 
     stages = listing(lambda x: " " + ", ".join(f"{label} {percent(getattr(x, key))}" for key, label in figures.STAGES))
     charts = {
-        "progress": (figures.figure_progress(s), f"Bar chart of task progress. {listing(lambda x: ' ' + percent(x.task_progress.mean))}."),
+        "progress": (
+            figures.figure_progress(s),
+            f"Bar chart of task progress. {listing(lambda x: ' ' + percent(x.task_progress.mean))}.",
+        ),
         "stages": (figures.figure_stages(s), f"Bar chart of stage rates. {stages}."),
     }
     if len(s[0].objects) > 1:
-        by_object = listing(lambda x: ": " + ", ".join(f"{short_name(o)} {percent(p)}" for o, p in figures.object_progress(x).items()))
+        by_object = listing(
+            lambda x: ": " + ", ".join(f"{short_name(o)} {percent(p)}" for o, p in figures.object_progress(x).items())
+        )
         charts["objects"] = figures.figure_objects(s), f"Dot chart of task progress by object. {by_object}."
     if data.curves:
-        ends = "; ".join(f"{c.label} from {c.value[0]:.3g} to {c.value[-1]:.3g} at iteration {c.iteration[-1]}" for c in data.curves)
+        ends = "; ".join(
+            f"{c.label} from {c.value[0]:.3g} to {c.value[-1]:.3g} at iteration {c.iteration[-1]}" for c in data.curves
+        )
         charts["curves"] = figures.figure_curves(data.curves), f"Line charts: {ends}."
-    return {name: svg.replace("<svg", f'<svg role="img" aria-label="{escape(alt)}"', 1) for name, (svg, alt) in charts.items()}
+    return {
+        name: svg.replace("<svg", f'<svg role="img" aria-label="{escape(alt)}"', 1)
+        for name, (svg, alt) in charts.items()
+    }
 
 
 def _inputs(data: ReportData) -> dict[str, str]:

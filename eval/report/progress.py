@@ -50,7 +50,9 @@ def amounts(training: Training, x: X) -> tuple[np.ndarray, np.ndarray]:
         return iteration, iteration.astype(float)
     missing = [tag for tag in (*_SECONDS, _STEPS_PER_SECOND) if tag not in training.scalars]
     if missing:
-        raise RunError(f"{training.label} did not log {', '.join(missing)}, so {x} are not known. Choose --x iterations.")
+        raise RunError(
+            f"{training.label} did not log {', '.join(missing)}, so {x} are not known. Choose --x iterations."
+        )
     iteration = training.scalars[_SECONDS[0]].iteration
     seconds = sum(_at(training, tag, iteration) for tag in _SECONDS)
     each = seconds / 60 if x == "minutes" else seconds * _at(training, _STEPS_PER_SECOND, iteration)

@@ -132,7 +132,9 @@ def results_in(folder: Path) -> Path:
         RunError: the folder does not exist.
     """
     if not folder.is_dir():
-        raise RunError(f"there is no folder {folder}. Give a run folder, or a folder that xreset eval wrote results into.")
+        raise RunError(
+            f"there is no folder {folder}. Give a run folder, or a folder that xreset eval wrote results into."
+        )
     return folder / "eval" if (folder / "eval").is_dir() or (folder / "run.json").is_file() else folder
 
 
@@ -149,7 +151,9 @@ def differences(summaries: tuple[EvalResult, ...]) -> list[str]:
         values = {s.backend: get(s) for s in summaries}
         if len(set(values.values())) > 1:
             listing = ", ".join(f"{engine}: {value}" for engine, value in values.items())
-            notes.append(f"These results are not comparable: the {what} differs ({listing}). Evaluate all engines in one command.")
+            notes.append(
+                f"These results are not comparable: the {what} differs ({listing}). Evaluate all engines in one command."
+            )
     return notes
 
 
@@ -171,7 +175,9 @@ def read_scalars(folder: Path) -> dict[str, Curve]:
     """
     latest: dict[str, dict[int, float]] = {}
     for file in sorted(folder.glob("events.out.tfevents.*")):
-        for tag, step, value in _scalars(file):  # a resumed run repeats the steps after its checkpoint: the later ones count
+        for tag, step, value in _scalars(
+            file
+        ):  # a resumed run repeats the steps after its checkpoint: the later ones count
             latest.setdefault(tag, {})[step] = value
     curves = {}
     for tag, values in latest.items():
@@ -201,7 +207,9 @@ def _scalars(file: Path) -> Iterator[tuple[str, int, float]]:
                 "Put back a whole copy, or move it out of the folder."
             ) from error
         if not (whole := whole or bool(event.file_version)):
-            raise FileFormatError(f"{file} is damaged: its beginning is missing. Put back a whole copy, or move it out of the folder.")
+            raise FileFormatError(
+                f"{file} is damaged: its beginning is missing. Put back a whole copy, or move it out of the folder."
+            )
         for value in event.summary.value:
             if value.HasField("simple_value"):
                 last = max(last, event.step)
@@ -298,7 +306,9 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
         )
     file = folder / "run.json"
     facts = run_facts(read_json(file, RUN_SCHEMA), file) if file.is_file() else {}
-    return Training(label=label, folder=folder, facts=facts, scalars=scalars, summaries=summaries, episodes=episodes, lift=lift)
+    return Training(
+        label=label, folder=folder, facts=facts, scalars=scalars, summaries=summaries, episodes=episodes, lift=lift
+    )
 
 
 def run_facts(run: dict[str, Any], file: Path) -> dict[str, Fact]:
@@ -315,7 +325,9 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, Fact]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         wrong.append("contract")
     if wrong:
-        raise FileFormatError(f"{file} lacks {', '.join(wrong)}, or holds it as another type. Train again, or leave this run out.")
+        raise FileFormatError(
+            f"{file} lacks {', '.join(wrong)}, or holds it as another type. Train again, or leave this run out."
+        )
     bank = str(run["resets_hash"])
     facts = {
         "robot": Fact((run["robot"], contract.get("robot_fingerprint")), str(run["robot"])),

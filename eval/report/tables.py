@@ -24,16 +24,26 @@ def results(groups: Sequence[Group], found: Scores) -> Rows:
     for label, row in found.items():
         several = max(len(s.each) for s in row.values()) > 1
         lines = {
-            "task progress (95 % interval)": lambda s: f"{_percent(s.task_progress, 1)} ({100 * s.ci95[0]:.0f}-{100 * s.ci95[1]:.0f})",
-            **({"task progress of each seed": lambda s: ", ".join(f"{100 * x:.1f}" for x in s.each.values()) + " %"} if several else {}),
-            "approach / grasp / reorient": lambda s: " / ".join(f"{100 * x:.0f}" for x in (s.approach, s.grasp, s.reorient)) + " %",
+            "task progress (95 % interval)": lambda s: (
+                f"{_percent(s.task_progress, 1)} ({100 * s.ci95[0]:.0f}-{100 * s.ci95[1]:.0f})"
+            ),
+            **(
+                {"task progress of each seed": lambda s: ", ".join(f"{100 * x:.1f}" for x in s.each.values()) + " %"}
+                if several
+                else {}
+            ),
+            "approach / grasp / reorient": lambda s: (
+                " / ".join(f"{100 * x:.0f}" for x in (s.approach, s.grasp, s.reorient)) + " %"
+            ),
             "at the goal at any time; reorientation progress": lambda s: (
                 f"{_percent(s.reorient_once)}; {_percent(s.reorientation_progress, 1)}"
             ),
         }
         for i, (name, text) in enumerate(lines.items()):
             body.append(("" if i else label, name, *(text(row[e]) if e in row else "-" for e in engines)))
-    return Rows(title="evaluation", head=("", "", *(f"{e} {', '.join(sorted(versions[e]))}" for e in engines)), body=tuple(body))
+    return Rows(
+        title="evaluation", head=("", "", *(f"{e} {', '.join(sorted(versions[e]))}" for e in engines)), body=tuple(body)
+    )
 
 
 LIFTED = (
@@ -45,13 +55,21 @@ LIFTED = (
 
 def lifted(groups: Sequence[Group], x: X) -> Rows:
     """One row for each group, one column for each share of success: the share of its trainings that passed it, and when each did."""
-    scale, unit, digits = {"minutes": (1.0, "min", 1), "steps": (1e6, "M steps", 1), "iterations": (1.0, "iterations", 0)}[x]
+    scale, unit, digits = {
+        "minutes": (1.0, "min", 1),
+        "steps": (1e6, "M steps", 1),
+        "iterations": (1.0, "iterations", 0),
+    }[x]
     body = []
     for group in groups:
         known = [fates(group.members, share, x) for share in SHARES]
         if any(known):
             body.append((group.label, str(len(group.members)), *(_lifted(found, scale, digits) for found in known)))
-    return Rows(title="first success from home", head=("", "runs", *(f"{100 * share:g} % [{unit}]" for share in SHARES)), body=tuple(body))
+    return Rows(
+        title="first success from home",
+        head=("", "runs", *(f"{100 * share:g} % [{unit}]" for share in SHARES)),
+        body=tuple(body),
+    )
 
 
 def _lifted(found: Sequence[Fate], scale: float, digits: int) -> str:
@@ -59,7 +77,9 @@ def _lifted(found: Sequence[Fate], scale: float, digits: int) -> str:
         return "-"
     line = share_of_runs(found)
     share, low, high = (f"{100 * value[-1]:.0f}" for value in (line.mean, line.low, line.high))
-    return f"{share} % ({low}-{high}); " + ", ".join(f"{'' if passed else '>'}{at / scale:.{digits}f}" for at, passed, _ in found)
+    return f"{share} % ({low}-{high}); " + ", ".join(
+        f"{'' if passed else '>'}{at / scale:.{digits}f}" for at, passed, _ in found
+    )
 
 
 def different(groups: Sequence[Group]) -> Rows:
@@ -94,7 +114,11 @@ def _extent(columns: Sequence[Group]) -> Iterator[tuple[str, list[list[str]]]]:
             return "-"
         return f"{done:,.0f}" if what == "iterations" else f"{done / 1e6 if what == 'steps' else done:.1f}"
 
-    kinds: dict[str, X] = {"iterations trained": "iterations", "million environment steps": "steps", "minutes of training": "minutes"}
+    kinds: dict[str, X] = {
+        "iterations trained": "iterations",
+        "million environment steps": "steps",
+        "minutes of training": "minutes",
+    }
     for name, what in kinds.items():
         cells = [[amount(m, what) for m in g.members] for g in columns]
         if any(cell != "-" for column in cells for cell in column):

@@ -155,7 +155,9 @@ def study_path(name: str) -> Path:
     path, shipped = Path(name), {file.stem: file for file in sorted(SHIPPED.glob("*.toml"))}
     if path.is_file() or name not in shipped:
         if not path.is_file():
-            raise RunError(f"there is no study {name!r}: expected a file, or one that ships with xreset: {', '.join(shipped)}.")
+            raise RunError(
+                f"there is no study {name!r}: expected a file, or one that ships with xreset: {', '.join(shipped)}."
+            )
         return path
     return shipped[name]
 
@@ -168,7 +170,11 @@ def read_study(path: Path) -> Study:
     """
     raw = read_toml(path, SCHEMA)
     defaults, runs = raw.pop("defaults", {}), raw.get("runs", {})
-    if not isinstance(defaults, dict) or not isinstance(runs, dict) or not all(isinstance(run, dict) for run in runs.values()):
+    if (
+        not isinstance(defaults, dict)
+        or not isinstance(runs, dict)
+        or not all(isinstance(run, dict) for run in runs.values())
+    ):
         raise FileFormatError(f"{path}: defaults, runs and each of the runs must be tables.")
     raw["runs"] = {name: merged(defaults, run) for name, run in runs.items()}
     study = from_dict(Study, raw, str(path))
@@ -188,7 +194,11 @@ def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 def _problem(study: Study) -> str | None:
     def unknown(what: str, name: str | None, known: Any) -> str | None:
-        return None if name is None or name in known else f"{what} is {name!r}, expected one of {', '.join(map(repr, known)) or 'none'}."
+        return (
+            None
+            if name is None or name in known
+            else f"{what} is {name!r}, expected one of {', '.join(map(repr, known)) or 'none'}."
+        )
 
     for name in (*study.data, *study.runs, *study.evaluations):
         if not _NAME.fullmatch(name):
@@ -201,7 +211,11 @@ def _problem(study: Study) -> str | None:
     for name, run in study.runs.items():
         problems = (
             unknown(f"runs.{name}.data", run.data, study.data),
-            unknown(f"runs.{name}.weights", run.weights, [n for n, r in study.runs.items() if n != name and r.policy is None]),
+            unknown(
+                f"runs.{name}.weights",
+                run.weights,
+                [n for n, r in study.runs.items() if n != name and r.policy is None],
+            ),
             *(unknown(f"runs.{name}.evaluations", evaluation, study.evaluations) for evaluation in run.evaluations),
         )
         if found := next(filter(None, problems), None):
@@ -217,6 +231,8 @@ def _problem(study: Study) -> str | None:
         if found := next(filter(None, problems), None):
             return found
         methods = papers[table.paper].methods if table.paper else ()
-        if table.paper and (found := next(filter(None, (unknown(f"tables[{i}].runs", m, methods) for m in table.runs.values())), None)):
+        if table.paper and (
+            found := next(filter(None, (unknown(f"tables[{i}].runs", m, methods) for m in table.runs.values())), None)
+        ):
             return found
     return None

@@ -41,7 +41,10 @@ class Places:
     def take(self, gpus: int) -> list[int] | None:
         """Room for a step, or None while there is none. A step of several GPUs has each to itself."""
         each = self.per_gpu if gpus > 1 else 1
-        room = sorted((p for p, free in self.free.items() if free >= each and (p == self.CPU) == (gpus == 0)), key=lambda p: -self.free[p])
+        room = sorted(
+            (p for p, free in self.free.items() if free >= each and (p == self.CPU) == (gpus == 0)),
+            key=lambda p: -self.free[p],
+        )
         taken = room[: max(gpus, 1)]
         if len(taken) < max(gpus, 1):
             return None
@@ -107,7 +110,9 @@ def launch(
                     problems.append(f"{name} could not begin: {', '.join(undone)} is not done.")
                     del waiting[name]
                 elif cluster == "local" and step.gpus > len(places.free) - 1:
-                    problems.append(f"{name} could not begin: it needs {_count(step.gpus)}, and here is {len(places.free) - 1}.")
+                    problems.append(
+                        f"{name} could not begin: it needs {_count(step.gpus)}, and here is {len(places.free) - 1}."
+                    )
                     del waiting[name]
                 elif step.busy():
                     if name not in told:
@@ -157,7 +162,9 @@ class Job:
         """Called by submitit when a job's time is over: the training writes its checkpoint, and the job goes on in another."""
         if self.process is not None:
             self.process.terminate()
-            os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOWAIT)  # a signal handler inside of wait(), which has a lock
+            os.waitid(
+                os.P_PID, self.process.pid, os.WEXITED | os.WNOWAIT
+            )  # a signal handler inside of wait(), which has a lock
         return _submitit().helpers.DelayedSubmission(Job(self.step, self.out))
 
     def _run(self, command: list[str]) -> int:
@@ -188,7 +195,9 @@ def _submitit() -> Any:
     return submitit
 
 
-def _executor(submitit: Any, out: Path, cluster: Cluster, step: Step, gpus: Sequence[int], options: dict[str, Any]) -> Any:
+def _executor(
+    submitit: Any, out: Path, cluster: Cluster, step: Step, gpus: Sequence[int], options: dict[str, Any]
+) -> Any:
     folder = out / "logs" / "jobs"
     try:
         if cluster == "local":

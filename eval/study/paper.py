@@ -56,7 +56,9 @@ class PaperTable:
             thing: official name of the object, or :data:`ALL`.
             metric: of :data:`METRICS`.
         """
-        if self.metric not in (None, metric) or ("object" not in (self.rows, self.columns) and (self.object or ALL) != thing):
+        if self.metric not in (None, metric) or (
+            "object" not in (self.rows, self.columns) and (self.object or ALL) != thing
+        ):
             return None
         key = {"method": method, "object": thing, "metric": metric}
         if key[self.rows] not in self.values or key[self.columns] not in self.names:
@@ -68,7 +70,10 @@ class PaperTable:
 def paper_tables() -> dict[str, PaperTable]:
     """Number -> table."""
     raw = tomllib.loads(FILE.read_text())["tables"]
-    return {number: _official(from_dict(PaperTable, {"standard_error": {}} | table, f"{FILE}: {number}")) for number, table in raw.items()}
+    return {
+        number: _official(from_dict(PaperTable, {"standard_error": {}} | table, f"{FILE}: {number}"))
+        for number, table in raw.items()
+    }
 
 
 @cache

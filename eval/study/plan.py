@@ -76,7 +76,11 @@ class Run:
         from xreset.learning.runner import read_checkpoint
 
         content = read_checkpoint(latest_checkpoint(self.folder))
-        return Lift(iteration=int(content["iteration"]), env_steps=int(content["env_steps"]), minutes=float(content["elapsed"]) / 60)
+        return Lift(
+            iteration=int(content["iteration"]),
+            env_steps=int(content["env_steps"]),
+            minutes=float(content["elapsed"]) / 60,
+        )
 
     def check(self) -> None:
         """Refuse a folder with a run of another configuration. Its length is no part of that: it can go on."""
@@ -163,7 +167,9 @@ class TrainStep(Step):
         run = self.run
         assert run.config is not None
         now = run.trained()
-        return now.iteration >= run.config.iterations or (run.runs.minutes is not None and now.minutes >= _ENOUGH * run.runs.minutes)
+        return now.iteration >= run.config.iterations or (
+            run.runs.minutes is not None and now.minutes >= _ENOUGH * run.runs.minutes
+        )
 
     def commands(self) -> list[list[str]]:
         run, spec = self.run, self.run.runs
@@ -177,9 +183,20 @@ class TrainStep(Step):
         if checkpoints(run.folder):
             return [[*command, "--resume"]]
         if run.begun:
-            raise RunError(f"{run.folder} cannot go on: it has a policy and no checkpoint. Bring its checkpoints, or choose another --out.")
+            raise RunError(
+                f"{run.folder} cannot go on: it has a policy and no checkpoint. Bring its checkpoints, or choose another --out."
+            )
         command += ["--robot", spec.robot, "--resets", str(run.bank), *run.subset.meshes, "--backend", spec.backend]
-        command += ["--device", spec.device, "--num-envs", str(spec.num_envs), "--seed", str(run.seed), "--like", spec.recipe]
+        command += [
+            "--device",
+            spec.device,
+            "--num-envs",
+            str(spec.num_envs),
+            "--seed",
+            str(run.seed),
+            "--like",
+            spec.recipe,
+        ]
         if run.weights is not None:
             command += ["--weights", str(run.weights)]
         return [command + list(flags(spec.config))]
@@ -219,20 +236,30 @@ class EvalStep(Step):
     def demos(self) -> Path:
         """Starts and goals; for ik, the trajectories too."""
         folder = self.subset.folder
-        return folder / Path(self.run.runs.robot).name / "retargeted.npz" if self.run.runs.policy == "ik" else self.subset.demos
+        return (
+            folder / Path(self.run.runs.robot).name / "retargeted.npz"
+            if self.run.runs.policy == "ik"
+            else self.subset.demos
+        )
 
     def check(self) -> None:
         """Refuse results of other episodes under this name."""
         for engine in self.evaluation.engines:
             if (result := _result(self.writes, engine)) is None:
                 continue
-            settings: dict[str, Any] = {"robot": result.robot, "seed": result.seed, "episodes_per_demo": result.episodes_per_demo}
+            settings: dict[str, Any] = {
+                "robot": result.robot,
+                "seed": result.seed,
+                "episodes_per_demo": result.episodes_per_demo,
+            }
             wanted: dict[str, Any] = {
                 "robot": Path(self.run.runs.robot).name, "seed": self.evaluation.seed, "episodes_per_demo": self.evaluation.episodes,
             }  # fmt: skip
             if self.demos.is_file():
                 settings["demos"], wanted["demos"] = result.inputs.get("demos", "")[:12], file_hash(self.demos)[:12]
-            refuse_other(f"{self.writes / engine}.json is an evaluation of another kind", "evaluation", settings, wanted)
+            refuse_other(
+                f"{self.writes / engine}.json is an evaluation of another kind", "evaluation", settings, wanted
+            )
 
     def missing(self) -> list[str]:
         """Engines that are there and have no result of this policy."""
@@ -247,8 +274,21 @@ class EvalStep(Step):
     def commands(self) -> list[list[str]]:
         run, e = self.run, self.evaluation
         policy = run.folder / "policy.onnx" if run.begun and not checkpoints(run.folder) else run.folder
-        command = [*_XRESET, "eval", *([run.runs.policy, "--robot", run.runs.robot] if run.runs.policy else [str(policy)])]
-        command += ["--demos", str(self.demos), "--episodes", str(e.episodes), "--seed", str(e.seed), "--num-envs", str(e.num_envs)]
+        command = [
+            *_XRESET,
+            "eval",
+            *([run.runs.policy, "--robot", run.runs.robot] if run.runs.policy else [str(policy)]),
+        ]
+        command += [
+            "--demos",
+            str(self.demos),
+            "--episodes",
+            str(e.episodes),
+            "--seed",
+            str(e.seed),
+            "--num-envs",
+            str(e.num_envs),
+        ]
         for engine in self.missing():
             command += ["--backend", engine]
         return [[*command, *self.subset.meshes, "--out", str(self.writes)]]
@@ -308,7 +348,16 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
 
     def bank(of: Subset, robot: str) -> str:
         writes = of.folder / Path(robot).name
-        return add(BankStep(name=f"data {of.folder.name} {writes.name}", needs=(), writes=writes, kind="data", subset=of, robot=robot))
+        return add(
+            BankStep(
+                name=f"data {of.folder.name} {writes.name}",
+                needs=(),
+                writes=writes,
+                kind="data",
+                subset=of,
+                robot=robot,
+            )
+        )
 
     evaluations = []
     trained = {run.folder: f"train {run.name}" for run in runs if run.config is not None}
@@ -328,7 +377,13 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
                 continue
             own = data == run.runs.data
             of = subset(data, objects, evaluation.per_object or (run.runs.per_object if own else None))
-            needs = (bank(of, run.runs.robot),) if run.runs.policy == "ik" else (trained[run.folder],) if run.config is not None else ()
+            needs = (
+                (bank(of, run.runs.robot),)
+                if run.runs.policy == "ik"
+                else (trained[run.folder],)
+                if run.config is not None
+                else ()
+            )
             step = EvalStep(
                 name=f"{key} {run.name}", needs=needs, writes=run.folder / key, kind="eval", run=run, evaluation=evaluation, subset=of,
                 engines=tuple(e for e in evaluation.engines if e in available),
@@ -340,7 +395,15 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
             add(step)
     for made in subsets.values():
         made.check()
-    return Plan(study=study, name=name, out=out, runs=runs, steps=steps, subsets=tuple(subsets.values()), unavailable=unavailable)
+    return Plan(
+        study=study,
+        name=name,
+        out=out,
+        runs=runs,
+        steps=steps,
+        subsets=tuple(subsets.values()),
+        unavailable=unavailable,
+    )
 
 
 def _objects_of(name: str, data: Data, given: Path) -> tuple[str, ...]:
@@ -348,7 +411,9 @@ def _objects_of(name: str, data: Data, given: Path) -> tuple[str, ...]:
         return object_names()
     for what, file in (("demos", data.demos), ("meshes", data.meshes)):
         if file is not None and not (given / file).exists():
-            raise FileFormatError(f"there is no {given / file} (data.{name}.{what}). Put it there, or say with --data where it is.")
+            raise FileFormatError(
+                f"there is no {given / file} (data.{name}.{what}). Put it there, or say with --data where it is."
+            )
     return tuple(sorted(set(read_demos(given / data.demos).object_name.tolist())))
 
 
@@ -366,7 +431,9 @@ def _runs(study: Study, group: str, spec: Runs, objects: tuple[str, ...], out: P
         base = asdict(starting_config(spec.recipe))
         config, seeds = from_dict(TrainConfig, merged(base, spec.config), f"runs.{group}.config"), spec.seeds
         if spec.steps is not None:
-            config = replace(config, iterations=max(1, round(spec.steps / (spec.num_envs * spec.gpus * config.ppo.horizon))))
+            config = replace(
+                config, iterations=max(1, round(spec.steps / (spec.num_envs * spec.gpus * config.ppo.horizon)))
+            )
     weights = study.runs[spec.weights] if spec.weights and config else None
     for chosen in [(name,) for name in objects] if spec.alone and config else [objects]:
         for seed in seeds:

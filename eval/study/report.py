@@ -36,19 +36,27 @@ def write_page(plan: Plan, out: Path) -> Page:
     """Write ``study.md``, its pictures, and comparisons of the trainings of each object."""
     amounts = {run.name: run.trained() for run in plan.runs if run.config is not None}
     tables = tuple(fill(plan, table) for table in plan.study.tables)
-    notes = tuple(dict.fromkeys([*_incomplete(plan), *(note for made in tables for note in _unfair(plan, made, amounts))]))
+    notes = tuple(
+        dict.fromkeys([*_incomplete(plan), *(note for made in tables for note in _unfair(plan, made, amounts))])
+    )
     made = Page(path=out / "study.md", tables=tables, notes=notes, runs=_runs(plan, amounts))
     for i, table in enumerate(tables, 1):
         if table.cells:
             draw(out / f"table-{i}.png", table)
-    text = render("study.md.j2", plan=plan, compared=_compare(plan, out), as_rows=as_rows, versions=versions, **vars(made))
+    text = render(
+        "study.md.j2", plan=plan, compared=_compare(plan, out), as_rows=as_rows, versions=versions, **vars(made)
+    )
     write_whole(made.path, text)
     return made
 
 
 def _incomplete(plan: Plan) -> Iterator[str]:
     """What the study asks for and does not have yet."""
-    undone = [step.name for step in plan.steps.values() if not isinstance(step, TrainStep) and step.kind == "eval" and not step.done()]
+    undone = [
+        step.name
+        for step in plan.steps.values()
+        if not isinstance(step, TrainStep) and step.kind == "eval" and not step.done()
+    ]
     for run in plan.runs:
         if run.config is not None and not plan.steps[f"train {run.name}"].done():
             yield f"The training {run.name} is not finished: {_extent(run, run.trained())}."
@@ -67,7 +75,11 @@ def _unfair(plan: Plan, made: Made, amounts: dict[str, Lift]) -> Iterator[str]:
     lengths: dict[str, float] = {}
     for name in made.members:
         mine = [run for run in plan.runs if run.group == name and run.name in amounts]
-        yield from (f"{run.name} began with the networks of {run.weights.name}, whose training counts, too." for run in mine if run.weights)
+        yield from (
+            f"{run.name} began with the networks of {run.weights.name}, whose training counts, too."
+            for run in mine
+            if run.weights
+        )
         if found := [amounts[run.name].env_steps * 1e-6 for run in mine if amounts[run.name].env_steps]:
             lengths[name] = sum(found) / len(found)
             if max(found) > (1 + _ALIKE) * min(found):
@@ -86,7 +98,17 @@ def _unfair(plan: Plan, made: Made, amounts: dict[str, Lift]) -> Iterator[str]:
 
 
 def _runs(plan: Plan, amounts: dict[str, Lift]) -> Rows:
-    head = ("run", "objects", "seed", "worlds", "minutes", "million steps", "iterations", "from home 10 % after", "evaluated")
+    head = (
+        "run",
+        "objects",
+        "seed",
+        "worlds",
+        "minutes",
+        "million steps",
+        "iterations",
+        "from home 10 % after",
+        "evaluated",
+    )
     body = []
     for run in plan.runs:
         done = sorted({f.stem.removesuffix(".episodes") for f in run.folder.glob("eval*/*.episodes.json")})
@@ -97,9 +119,23 @@ def _runs(plan: Plan, amounts: dict[str, Lift]) -> Rows:
         now, spec = amounts[run.name], run.runs
         lift = next((p for p in read_lift(run.folder).passed if p.share == 0.1), None)
         asked = "" if spec.minutes is None else f" of {spec.minutes:g}"
-        amount = (f"{now.minutes:.1f}{asked}", f"{now.env_steps / 1e6:.3g}", f"{now.iteration} of {run.config.iterations}")
+        amount = (
+            f"{now.minutes:.1f}{asked}",
+            f"{now.env_steps / 1e6:.3g}",
+            f"{now.iteration} of {run.config.iterations}",
+        )
         lifted = f"{lift.minutes:.1f} min" if lift else "-"
-        body.append((run.name, objects, str(run.seed), f"{spec.gpus} x {spec.num_envs}", *amount, lifted, ", ".join(done) or "-"))
+        body.append(
+            (
+                run.name,
+                objects,
+                str(run.seed),
+                f"{spec.gpus} x {spec.num_envs}",
+                *amount,
+                lifted,
+                ", ".join(done) or "-",
+            )
+        )
     return Rows(head=head, body=tuple(body))
 
 
@@ -115,7 +151,9 @@ def _compare(plan: Plan, out: Path) -> list[str]:
     """Comparisons of the trainings that have the same objects, a folder each."""
     by_objects: dict[tuple[str, ...], list[Run]] = {}
     for run in plan.runs:
-        if run.config is not None and (any(run.folder.glob("events.out.tfevents.*")) or any(run.folder.glob("eval/*.episodes.json"))):
+        if run.config is not None and (
+            any(run.folder.glob("events.out.tfevents.*")) or any(run.folder.glob("eval/*.episodes.json"))
+        ):
             by_objects.setdefault(run.objects, []).append(run)
     names = []
     for objects, runs in by_objects.items():
@@ -135,5 +173,12 @@ def plan_rows(plan: Plan, steps: Sequence[str]) -> Rows:
             state = _extent(step.run, step.run.trained())
         else:
             state = f"in {', '.join(step.missing())}" if isinstance(step, EvalStep) else "to do"
-        body.append((name, state, f"{step.gpus} GPU" if step.gpus else "CPU", ", ".join(n for n in step.needs if not plan.steps[n].done())))
+        body.append(
+            (
+                name,
+                state,
+                f"{step.gpus} GPU" if step.gpus else "CPU",
+                ", ".join(n for n in step.needs if not plan.steps[n].done()),
+            )
+        )
     return Rows(head=("step", "state", "on", "after"), body=tuple(body))

@@ -56,7 +56,11 @@ class Subset:
             else {"synthetic_per_object": self.data.synthetic_per_object, "synthetic_seed": self.data.synthetic_seed}
         )
         options = {name: list(getattr(self.data, name)) for name in ("retarget", "resets")}
-        return source | options | {"objects": list(self.objects), "per_object": self.per_object, "meshes": self.data.meshes}
+        return (
+            source
+            | options
+            | {"objects": list(self.objects), "per_object": self.per_object, "meshes": self.data.meshes}
+        )
 
     def check(self) -> None:
         """Refuse files that were made of something else."""

@@ -65,7 +65,9 @@ def fill(plan: Plan, table: Table) -> Made:
 
     def cell(engine: str, key: Mapping[str, str]) -> Cell:
         expected = set(objects_of(plan, run_of[key["method"]], table)) if key["object"] == ALL else {key["object"]}
-        found = [chosen for t in members[run_of[key["method"]]] if (chosen := _of(t.episodes.get(engine, ()), expected))]
+        found = [
+            chosen for t in members[run_of[key["method"]]] if (chosen := _of(t.episodes.get(engine, ()), expected))
+        ]
         mean, ci95 = estimate(found, key["metric"]) if found else (None, (0.0, 0.0))
         figure = paper.figure(key["method"], key["object"], key["metric"]) if paper else None
         return Cell(mean=mean, ci95=ci95, seeds=len(found), paper=figure, paper_error=_paper_error(paper, key))
@@ -76,7 +78,10 @@ def fill(plan: Plan, table: Table) -> Made:
         rows=tuple(_shown(row_axis, name) for name in row_names),
         columns=tuple(_shown(column_axis, name) for name in column_names),
         cells={
-            engine: tuple(tuple(cell(engine, fixed | {row_axis: row, column_axis: column}) for column in column_names) for row in row_names)
+            engine: tuple(
+                tuple(cell(engine, fixed | {row_axis: row, column_axis: column}) for column in column_names)
+                for row in row_names
+            )
             for engine in engines
         },
         members=members,
@@ -102,7 +107,9 @@ def _joined(label: str, parts: Sequence[Training]) -> Training:
     number = {name: i for i, name in enumerate(names)}
     engines = sorted({engine for t in parts for engine in t.episodes})
     episodes = {
-        engine: tuple(replace(e, sequence=number[e.object, e.sequence_name]) for t in parts for e in t.episodes.get(engine, ()))
+        engine: tuple(
+            replace(e, sequence=number[e.object, e.sequence_name]) for t in parts for e in t.episodes.get(engine, ())
+        )
         for engine in engines
     }
     summaries = {}
@@ -110,7 +117,9 @@ def _joined(label: str, parts: Sequence[Training]) -> Training:
         mine = [t.summaries[engine] for t in parts if engine in t.summaries]
         demos = "+".join(sorted({s.inputs.get("demos", "")[:12] for s in mine}))
         summaries[engine] = replace(mine[0], policy=label, episodes=len(episodes[engine]), inputs={"demos": demos})
-    return Training(label=label, folder=parts[0].folder, facts=parts[0].facts, scalars={}, summaries=summaries, episodes=episodes)
+    return Training(
+        label=label, folder=parts[0].folder, facts=parts[0].facts, scalars={}, summaries=summaries, episodes=episodes
+    )
 
 
 def _of(episodes: Sequence[Episode], objects: set[str]) -> list[Episode]:
@@ -125,7 +134,9 @@ def objects_of(plan: Plan, group: str, table: Table) -> tuple[str, ...]:
     return tuple(sorted({o for s in steps if s.run.group == group for o in (s.subset.objects or s.run.objects)}))  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _axes(plan: Plan, table: Table, paper: PaperTable | None) -> tuple[tuple[str, list[str]], tuple[str, list[str]], dict[str, str]]:
+def _axes(
+    plan: Plan, table: Table, paper: PaperTable | None
+) -> tuple[tuple[str, list[str]], tuple[str, list[str]], dict[str, str]]:
     """Rows, columns, and what is the same in all cells."""
     there = sorted({o for name in table.runs for o in objects_of(plan, name, table)})
     methods, metrics = list(table.runs.values()), list(METRICS)
@@ -141,7 +152,11 @@ def _axes(plan: Plan, table: Table, paper: PaperTable | None) -> tuple[tuple[str
 
 
 def _paper_error(paper: PaperTable | None, key: Mapping[str, str]) -> float | None:
-    if paper is None or key[paper.rows] not in paper.standard_error or paper.figure(key["method"], key["object"], key["metric"]) is None:
+    if (
+        paper is None
+        or key[paper.rows] not in paper.standard_error
+        or paper.figure(key["method"], key["object"], key["metric"]) is None
+    ):
         return None
     return paper.standard_error[key[paper.rows]][paper.names.index(key[paper.columns])]
 
@@ -163,7 +178,9 @@ def cell_text(cell: Cell) -> str:
     ours = "-" if cell.mean is None else f"{100 * cell.mean:.1f} ({100 * cell.ci95[0]:.0f}-{100 * cell.ci95[1]:.0f})"
     if cell.paper is None:
         return ours
-    return f"{ours}, paper {cell.paper:.1f}" + (f" \N{PLUS-MINUS SIGN} {cell.paper_error:.1f}" if cell.paper_error is not None else "")
+    return f"{ours}, paper {cell.paper:.1f}" + (
+        f" \N{PLUS-MINUS SIGN} {cell.paper_error:.1f}" if cell.paper_error is not None else ""
+    )
 
 
 def draw(path: Path, made: Made) -> None:
@@ -196,7 +213,11 @@ def draw(path: Path, made: Made) -> None:
 
 def versions(made: Made, engine: str) -> str:
     """Those that a table's runs were evaluated in."""
-    return ", ".join(sorted({t.summaries[engine].backend_version for ts in made.members.values() for t in ts if engine in t.summaries}))
+    return ", ".join(
+        sorted(
+            {t.summaries[engine].backend_version for ts in made.members.values() for t in ts if engine in t.summaries}
+        )
+    )
 
 
 def broken(made: Made) -> Scores:

@@ -44,7 +44,14 @@ BASE = Link(
 
 
 def _arm(
-    number: int, xyz: Vector, roll: float, limits: tuple[float, float], mass: float, com: Vector, inertia: Vector, *shapes: Shape
+    number: int,
+    xyz: Vector,
+    roll: float,
+    limits: tuple[float, float],
+    mass: float,
+    com: Vector,
+    inertia: Vector,
+    *shapes: Shape,
 ) -> ArmLink:
     velocity, effort = (2.175, 87.0) if number <= 4 else (2.61, 12.0)
     return ArmLink(
@@ -77,7 +84,9 @@ HAND_ROOT = Link(
     name="palm_body",
     mass=0.4154,
     com=np.array([-0.009, 0, -0.0475]),  # of the boxes: the description has the frame's origin
-    inertia=np.diag([0.4154 * (a**2 + b**2) / 12 for a, b in ((0.112, 0.0945), (0.0414, 0.0945), (0.0414, 0.112))]),  # of a solid box
+    inertia=np.diag(
+        [0.4154 * (a**2 + b**2) / 12 for a, b in ((0.112, 0.0945), (0.0414, 0.0945), (0.0414, 0.112))]
+    ),  # of a solid box
     collisions=(
         box((0.0414, 0.112, 0.0448), (-0.009, 0, -0.023)),
         box((0.0414, 0.0538, 0.0428), (-0.009, -0.0253, -0.0667)),
@@ -151,7 +160,15 @@ FRAMES: tuple[Frame, ...] = (
 
 def tree() -> tuple[RobotTree, dict[str, float]]:
     """The robot's tree, and the effort limit of each moving joint."""
-    return robot("panda_allegro", BASE, ARM, pose((0, 0, FLANGE + ADAPTER + HAND_LENGTH)), HAND_ROOT, chained(HAND_ROOT, FINGERS), FRAMES)
+    return robot(
+        "panda_allegro",
+        BASE,
+        ARM,
+        pose((0, 0, FLANGE + ADAPTER + HAND_LENGTH)),
+        HAND_ROOT,
+        chained(HAND_ROOT, FINGERS),
+        FRAMES,
+    )
 
 
 def text() -> str:

@@ -41,7 +41,9 @@ ARM_BASE = Link(
     name="base_link",
     mass=4.0,
     com=np.array([0, 0, 0.05]),
-    inertia=np.diag([4.0 * (3 * 0.075**2 + 0.1**2) / 12] * 2 + [4.0 * 0.075**2 / 2]),  # a solid cylinder: no figure is published
+    inertia=np.diag(
+        [4.0 * (3 * 0.075**2 + 0.1**2) / 12] * 2 + [4.0 * 0.075**2 / 2]
+    ),  # a solid cylinder: no figure is published
     collisions=(cylinder((0, 0, 0), (0, 0, 0.10), 0.075),),
 )
 
@@ -132,7 +134,9 @@ class HandLink:
             T_parent_joint=pose(self.pos, quat=self.quat), axis=np.array([0.0, 0, 1]), lower=self.range[0], upper=self.range[1],
             velocity=HAND_SPEED,
         )  # fmt: skip
-        return joint, Link(name=joint.child, mass=self.mass, com=np.array(self.com), inertia=inertia, collisions=self.shapes)
+        return joint, Link(
+            name=joint.child, mass=self.mass, com=np.array(self.com), inertia=inertia, collisions=self.shapes
+        )
 
 
 CMC_EFFORT, MCP_EFFORT, PIP_EFFORT, DIP_EFFORT = 3.3, 1.864, 0.638, 0.638

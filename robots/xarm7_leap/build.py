@@ -88,7 +88,9 @@ _MOTOR = box((0.034, 0.026, 0.022), (0.0075, 0, -0.011))
 _MOTOR_INERTIA = (4.798e-06, 1.2e-08, 4e-09, 2.862e-06, 1.1e-08, 4.234e-06)
 
 
-def _link(name: str, xyz: Vector, rpy: Vector, limits: tuple[float, float], mass: float, inertia: Vector, *shapes: Shape) -> ArmLink:
+def _link(
+    name: str, xyz: Vector, rpy: Vector, limits: tuple[float, float], mass: float, inertia: Vector, *shapes: Shape
+) -> ArmLink:
     return ArmLink(
         name=name, joint=f"{name}_joint", xyz=xyz, rpy=rpy, axis=(0, 0, -1), range=limits, velocity=SPEED, effort=TORQUE,
         mass=mass, com=np.mean([shape.T_body_shape[:3, 3] for shape in shapes], axis=0), inertia=with_rotor(inertia), shapes=shapes,
@@ -133,7 +135,12 @@ FRAMES: tuple[Frame, ...] = (
     *(
         (f"{finger}_{name}", f"{finger}_{link}", (0, y, 0.0145), (0, -1, 0), (-1, 0, 0))
         for finger in ("index", "middle", "ring")
-        for name, link, y in (("knuckle", "mcp", 0.0), ("middle", "pip", 0.0), ("last", "dip", 0.0), ("tip", "dip", -0.05))
+        for name, link, y in (
+            ("knuckle", "mcp", 0.0),
+            ("middle", "pip", 0.0),
+            ("last", "dip", 0.0),
+            ("tip", "dip", -0.05),
+        )
     ),
 )
 

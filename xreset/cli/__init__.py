@@ -153,7 +153,9 @@ class _Lazily(Loader):
         self.loader = loader
 
     @classmethod
-    def find_spec(cls, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
+    def find_spec(
+        cls, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
         if not name.startswith("xreset.") or name.startswith("xreset.cli"):
             return None
         spec = PathFinder.find_spec(name, path, target)
@@ -172,5 +174,11 @@ def _usage(group: str, commands: dict[str, str]) -> str:
     width = max(map(len, commands))
     lines = [f"  {name:<{width}}  {text}" for name, text in commands.items()]
     return "\n".join(
-        [f"usage: xreset{group} COMMAND ...", "", *lines, "", f"xreset{group} COMMAND --help shows the options of one command."]
+        [
+            f"usage: xreset{group} COMMAND ...",
+            "",
+            *lines,
+            "",
+            f"xreset{group} COMMAND --help shows the options of one command.",
+        ]
     )

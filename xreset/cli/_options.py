@@ -76,7 +76,9 @@ def check_device(device: str) -> None:
         count = torch.cuda.device_count()
         if int(number or 0) >= count:
             found = f"{count} of them" if count else "none that torch can use"
-            raise XResetError(f"--device is {device}, but of GPUs there is {found}. Check the driver with nvidia-smi, or use --device cpu.")
+            raise XResetError(
+                f"--device is {device}, but of GPUs there is {found}. Check the driver with nvidia-smi, or use --device cpu."
+            )
 
 
 def _check_overwriting(options: dict[str, Any]) -> None:
@@ -96,6 +98,8 @@ def _claimed(options: dict[str, Any]) -> Iterator[None]:
     with ExitStack() as claims:
         for name in _WRITTEN:
             path = options.get(name)
-            if isinstance(path, Path) and path.suffix and path.parent.is_dir():  # a folder is claimed by what writes into it
+            if (
+                isinstance(path, Path) and path.suffix and path.parent.is_dir()
+            ):  # a folder is claimed by what writes into it
                 claims.enter_context(claim(path))
         yield

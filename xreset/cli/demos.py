@@ -91,7 +91,15 @@ def import_keypoints(
     """
     T = None if table_from_camera is None else keypoints.read_transform(table_from_camera)
     convention = keypoints.Convention(
-        order=order, units=units, frame=coordinates, table_from_camera=T, quat=quat, fps=fps, object_name=object, side=side, subject=subject
+        order=order,
+        units=units,
+        frame=coordinates,
+        table_from_camera=T,
+        quat=quat,
+        fps=fps,
+        object_name=object,
+        side=side,
+        subject=subject,
     )
     with _progress("reading keypoints") as progress:
         demos = keypoints.read_keypoints(path, convention, progress=progress)
@@ -123,7 +131,10 @@ def synthesize(
     """
     with _progress("making demonstrations") as progress:
         demos = archive.concatenate(
-            [synth.synthesize(objects or None, per_object, seed, fps=fps, side=s, meshes=meshes, progress=progress) for s in _sides(side)]
+            [
+                synth.synthesize(objects or None, per_object, seed, fps=fps, side=s, meshes=meshes, progress=progress)
+                for s in _sides(side)
+            ]
         )
     config = {"objects": list(objects), "per_object": per_object, "seed": seed, "fps": fps, "side": side}
     archive.write_demos(out, demos, config=config)
@@ -151,10 +162,14 @@ def reflect(
     symmetries = {name: mirror.symmetry(spec) for name, spec in archive.demo_objects(demos, objects).items()}
     table = Table("object", "off its reflection [mm]", "mirrored")
     for name, found in sorted(symmetries.items()):
-        table.add_row(name, f"{1e3 * found.deviation:.1f}", "yes" if found.deviation <= tolerance else "no: not symmetric enough")
+        table.add_row(
+            name, f"{1e3 * found.deviation:.1f}", "yes" if found.deviation <= tolerance else "no: not symmetric enough"
+        )
     Console().print(table)
     result = mirror.mirrored(demos, symmetries, tolerance=tolerance)
-    archive.write_demos(out, result, config={"mirrored": True, "tolerance": tolerance}, inputs={"demos": file_hash(file)})
+    archive.write_demos(
+        out, result, config={"mirrored": True, "tolerance": tolerance}, inputs={"demos": file_hash(file)}
+    )
     _print_summary(result, out)
 
 
@@ -206,7 +221,9 @@ def _print_summary(demos: archive.Demos, path: Path, objects: dict[str, ObjectSp
     console = Console()
     console.print(table)
     console.print(
-        f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second", soft_wrap=True, highlight=False
+        f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second",
+        soft_wrap=True,
+        highlight=False,
     )
     for doubt in plausible.doubts(demos, objects):
         console.print(f"note: {doubt}", style="yellow", soft_wrap=True, highlight=False)

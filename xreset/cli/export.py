@@ -45,7 +45,9 @@ def lerobot(
     _say(recording, out)
 
 
-def npz(folders: Folders, *, out: Path, backend: Backends = (), robot: str | None = None, task: str | None = None) -> None:
+def npz(
+    folders: Folders, *, out: Path, backend: Backends = (), robot: str | None = None, task: str | None = None
+) -> None:
     """Write recorded evaluation episodes as plain arrays in one npz file (docs/rollouts.md has the schema).
 
     Args:

@@ -37,7 +37,9 @@ def frontier(
         out: Folder for the results; default: frontier/ in the run folder or beside the policy.
     """
     if policy == "ik":
-        raise PolicyError("ik follows a demonstration from its beginning and cannot go on from a state. Give a policy, zero or random.")
+        raise PolicyError(
+            "ik follows a demonstration from its beginning and cannot go on from a state. Give a policy, zero or random."
+        )
     engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
     console = Console()
     subject = evaluate.resolve(policy, setting.robot, setting.seed)
@@ -45,13 +47,19 @@ def frontier(
     with engine_bars(console, [e.name for e in engines]) as progress:
         results = frontiers.frontier(subject, engines, resets, setting, folder, states=states, progress=progress)
     title = f"{subject.label} on {subject.robot.name} goes on from {len(results[0]['tried'])} demonstrated states:"
-    table = Table("the episode begins with", title=f"{title}\nof them, at the goal at any time / at the end", title_justify="left")
+    table = Table(
+        "the episode begins with", title=f"{title}\nof them, at the goal at any time / at the end", title_justify="left"
+    )
     for result in results:
         table.add_column(result["backend"], justify="right", no_wrap=True)
-    for stage in frontiers.STAGES:  # (a state at the edge between two stages may count to another one in another engine)
+    for (
+        stage
+    ) in frontiers.STAGES:  # (a state at the edge between two stages may count to another one in another engine)
         rows = [next((row for row in result["stages"] if row["stage"] == stage), None) for result in results]
         if any(rows):
-            table.add_row(stage, *(f"{row['states']}: {row['reached']:.0%} / {row['stayed']:.0%}" if row else "-" for row in rows))
+            table.add_row(
+                stage, *(f"{row['states']}: {row['reached']:.0%} / {row['stayed']:.0%}" if row else "-" for row in rows)
+            )
     console.print(table)
     console.print(f"results in {folder}")
 

@@ -91,7 +91,10 @@ def import_(
     for note in notes:
         console.print(note, highlight=False)
     if png is not None:
-        captions = [f"{r.obj.name}: {len(r.obj.pieces)} pieces, at most {1e3 * r.deviation:.1f} mm off the surface" for r in found]
+        captions = [
+            f"{r.obj.name}: {len(r.obj.pieces)} pieces, at most {1e3 * r.deviation:.1f} mm off the surface"
+            for r in found
+        ]
         raster.write_png(png, pieces.draw_pieces([r.obj for r in found], captions))
         console.print(f"{png}: meshes and their pieces", soft_wrap=True, highlight=False)
 

@@ -43,9 +43,13 @@ def shrink(policy: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, t
         policy: Exported policy (.onnx).
         out: File to write.
     """
-    before = policy.stat().st_size if policy.is_file() else 0  # now, for the output may replace it; of what is no file, shrinking complains
+    before = (
+        policy.stat().st_size if policy.is_file() else 0
+    )  # now, for the output may replace it; of what is no file, shrinking complains
     shrinking.shrink(policy, out)
-    Console().print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, was {before / 1e6:.2f} MB", highlight=False, soft_wrap=True)
+    Console().print(
+        f"{out}: {out.stat().st_size / 1e6:.2f} MB, was {before / 1e6:.2f} MB", highlight=False, soft_wrap=True
+    )
 
 
 COMMAND = {"list": list_, "shrink": shrink}

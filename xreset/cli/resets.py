@@ -83,7 +83,9 @@ def resets(
     if closing.spacing is not None:
         console.print(_closing(bands))
     if squeeze.force > 0:
-        console.print(f"{bank.num_pressing} of {int(bank.post_contact.sum())} states after contact press with {squeeze.force:g} N")
+        console.print(
+            f"{bank.num_pressing} of {int(bank.post_contact.sum())} states after contact press with {squeeze.force:g} N"
+        )
     if hold:
         console.print(_holding(held, backends))
         if len(backends) > 1:
@@ -95,8 +97,19 @@ def resets(
 
 def _accepted(data: file.Retargeted, bank: banks.ResetBank, title: str) -> Table:
     """How many states of each object and phase are kept."""
-    annotated = {(row.object_name, row.phase): row.without("not annotated").total for row in with_totals(data.accounts())}
-    table = Table("object", "phase", "annotated frames", "valid: tried", "accepted", "of annotated", "rejected because of", title=title)
+    annotated = {
+        (row.object_name, row.phase): row.without("not annotated").total for row in with_totals(data.accounts())
+    }
+    table = Table(
+        "object",
+        "phase",
+        "annotated frames",
+        "valid: tried",
+        "accepted",
+        "of annotated",
+        "rejected because of",
+        title=title,
+    )
     for row in with_totals(bank.accounts()):
         frames = annotated.get((row.object_name, row.phase), 0)
         table.add_row(
@@ -113,11 +126,15 @@ def _accepted(data: file.Retargeted, bank: banks.ResetBank, title: str) -> Table
 
 def _closing(bands: Sequence[banks.Band]) -> Table:
     """States by the distance between finger and object."""
-    table = Table("finger to object", "frames: tried", "accepted", "added: tried", "accepted", title="where the hand closes in")
+    table = Table(
+        "finger to object", "frames: tried", "accepted", "added: tried", "accepted", title="where the hand closes in"
+    )
     for band in bands:
         counts = (band.tried, band.kept, band.added, band.added_kept)
         far, near = ("" if edge is None else f"{100 * edge:g}" for edge in (band.nearer, band.farther))
-        table.add_row(f"{far} to {near} cm" if far and near else f"beyond {near} cm" if near else "contact", *map(str, counts))
+        table.add_row(
+            f"{far} to {near} cm" if far and near else f"beyond {near} cm" if near else "contact", *map(str, counts)
+        )
     return table
 
 

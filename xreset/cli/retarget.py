@@ -72,13 +72,16 @@ def retarget(
             )  # fmt: skip
     except KeyboardInterrupt:
         if kept.is_dir():
-            console.print(f"What is finished is kept in {kept}; give the same command again to continue, with --restart to begin anew.")
+            console.print(
+                f"What is finished is kept in {kept}; give the same command again to continue, with --restart to begin anew."
+            )
         raise
     pipeline.write_retargeted(
         out,
         result,
         config={"retarget": asdict(config), "robot": robot, "max_per_object": max_per_object},
-        inputs={"demos": file_hash(demos), "robot": spec.fingerprint} | {f"object {s.name}": s.source for s in specs.values()},
+        inputs={"demos": file_hash(demos), "robot": spec.fingerprint}
+        | {f"object {s.name}": s.source for s in specs.values()},
     )
     partial.discard(kept)
 
@@ -96,17 +99,30 @@ def retarget(
     console.print(_table(result))
     if colliding:
         console.print(_meeting(colliding))
-        console.print("Links that meet in every position of their joints belong into collision.exclude of the robot.toml.")
+        console.print(
+            "Links that meet in every position of their joints belong into collision.exclude of the robot.toml."
+        )
     for index in np.flatnonzero(align.on_something(align.levelled(chosen), specs)):
-        console.print(f"{chosen.sequence_name[index]}: the object starts on top of something that the scene does not have; not lowered.")
+        console.print(
+            f"{chosen.sequence_name[index]}: the object starts on top of something that the scene does not have; not lowered."
+        )
     console.print(f"hand {timing.hand:.1f} s, arm {timing.arm:.1f} s", highlight=False)
-    console.print(f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}; counts in {accounts_path(out)}")
+    console.print(
+        f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}; counts in {accounts_path(out)}"
+    )
 
 
 def _table(result: file.Retargeted) -> Table:
     """What became of the frames, by object and phase."""
     table = Table(
-        "object", "phase", "frames", "annotated", "valid", "fingertips [mm]", "invalid because of", title=f"retargeted to {result.robot}"
+        "object",
+        "phase",
+        "frames",
+        "annotated",
+        "valid",
+        "fingertips [mm]",
+        "invalid because of",
+        title=f"retargeted to {result.robot}",
     )
     names = result.object_name[result.sequence_of_frame]
     for row in with_totals(result.accounts()):

@@ -162,7 +162,9 @@ def place(
 
         found = places.place(spec, paths, avoid, search, report, processes or min(workers.usable_cores(), 8))
     for title, finalist in (("as described", found.own), ("best found", found.best)):
-        pos, quat = (", ".join(f"{v:.4f}" for v in values) for values in (finalist.placement.pos, finalist.placement.quat))
+        pos, quat = (
+            ", ".join(f"{v:.4f}" for v in values) for values in (finalist.placement.pos, finalist.placement.quat)
+        )
         console.print(
             f"{title:12}  follows {finalist.followed:.1%}, reaches {finalist.reach.reached:.1%}, dexterity {finalist.reach.dexterity:.3f}: "
             f"pos [{pos}], quat [{quat}]",
@@ -174,7 +176,17 @@ def place(
     console.print(f"of {found.frames} annotated frames of {chosen.num_sequences} sequences", highlight=False)
     if write:
         given = [] if objects is None else ["--objects", objects.name]
-        command = ["xreset", "robots", "place", spec.name, "--demos", demos.name, *given, "--max-per-object", str(max_per_object)]
+        command = [
+            "xreset",
+            "robots",
+            "place",
+            spec.name,
+            "--demos",
+            demos.name,
+            *given,
+            "--max-per-object",
+            str(max_per_object),
+        ]
         for field in fields(search):
             if (value := getattr(search, field.name)) != field.default:
                 command += [f"--search.{field.name}", *map(str, value if isinstance(value, tuple) else (value,))]

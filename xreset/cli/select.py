@@ -39,7 +39,9 @@ def select(
         setting: Robot, meshes, device and worlds; --seed is not used, see --starts.
         starts: Seed of the starts that decide; default: one that no evaluation uses unless it is told to.
     """
-    engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco", "pybullet", "sapien"))]
+    engines = [
+        trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco", "pybullet", "sapien"))
+    ]
     console = Console()
 
     def say(name: str, engine: str, score: float | None) -> None:
@@ -53,7 +55,10 @@ def select(
         table.add_column(e.name, justify="right")
     table.add_column("worst", justify="right")
     for candidate in choice.candidates:
-        cells = [f"{100 * candidate.task_progress[e.name]:.1f} %" if e.name in candidate.task_progress else "" for e in engines]
+        cells = [
+            f"{100 * candidate.task_progress[e.name]:.1f} %" if e.name in candidate.task_progress else ""
+            for e in engines
+        ]
         mark = " (chosen)" if candidate.name == choice.chosen else ""
         at_most = "" if len(candidate.task_progress) == len(engines) else "at most "
         table.add_row(candidate.name + mark, *cells, f"{at_most}{100 * candidate.worst:.1f} %")

@@ -43,7 +43,9 @@ def stress(
     subject = evaluate.resolve(policy, setting.robot, setting.seed)
     folder = out or subject.folder.parent / "stress"
     with engine_bars(console, [e.name for e in engines]) as progress:
-        found = sweeps.stress(subject, engines, demos, setting, folder, properties=properties, repetitions=episodes, progress=progress)
+        found = sweeps.stress(
+            subject, engines, demos, setting, folder, properties=properties, repetitions=episodes, progress=progress
+        )
     sweeps.write_plot(folder / "stress.png", found, f"{subject.label}: what it bears")
     table = Table("property", title=f"{subject.label}: task progress, and its difference to the same episodes (95 %)")
     table.add_column("value", justify="right")
@@ -57,7 +59,11 @@ def stress(
             for curve in curves:
                 point = curve.points[i] if curve is not None else None
                 low, high = (100 * x for x in point.difference_ci95) if point else (0, 0)
-                change = f" ({100 * point.difference:+.1f}; {low:+.1f} to {high:+.1f})" if point and value != prop.nominal else ""
+                change = (
+                    f" ({100 * point.difference:+.1f}; {low:+.1f} to {high:+.1f})"
+                    if point and value != prop.nominal
+                    else ""
+                )
                 cells.append(f"{100 * point.task_progress:.1f} %{change}" if point else "cannot be set")
             named = prop.name if prop.unit == "x" else f"{prop.name} [{prop.unit}]"
             amount = f"x {value:g}" if prop.unit == "x" else f"{value:g}"

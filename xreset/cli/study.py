@@ -44,7 +44,9 @@ def study(
         raise RunError("--slurm goes with --cluster slurm.")
     if wrong := [text for text in slurm if "=" not in text]:
         raise RunError(f"--slurm {wrong[0]} is not KEY=VALUE.")
-    options = {key: int(value) if value.isdecimal() else value for key, _, value in (text.partition("=") for text in slurm)}
+    options = {
+        key: int(value) if value.isdecimal() else value for key, _, value in (text.partition("=") for text in slurm)
+    }
     path, console = files.study_path(file), Console()
 
     def planned() -> plan.Plan:
@@ -54,7 +56,9 @@ def study(
     wanted = [step for step in todo.steps.values() if only in ("all", step.kind)]
     if dry_run:
         for name, state, on, after in report.plan_rows(todo, [step.name for step in wanted]).body:
-            console.print(f"{name}: {state} ({on}{', after ' + after if after else ''})", highlight=False, soft_wrap=True)
+            console.print(
+                f"{name}: {state} ({on}{', after ' + after if after else ''})", highlight=False, soft_wrap=True
+            )
             for command in [] if todo.steps[name].done() else todo.steps[name].commands():
                 console.print(f"    {launch.shown_command(command)}", highlight=False, soft_wrap=True)
         return

@@ -58,7 +58,9 @@ def train(
     if resume and like != "paper":
         raise RunError("--resume continues with the run's own configuration; leave out --like.")
     if resume and weights is not None:
-        raise RunError("--resume continues with the run's own networks; leave out --weights, or start another run with it.")
+        raise RunError(
+            "--resume continues with the run's own networks; leave out --weights, or start another run with it."
+        )
     if resume:
         training.train(out, training.resumed(out, iterations=iterations), resume=True, seconds=60 * minutes)
         return

@@ -73,7 +73,10 @@ def _serve(shown: data.View, host: str, port: int, sequence: int | None, frame: 
     opened = page.Page(shown, host=host, port=port, sequence=sequence, frame=frame)
     number = opened.url.rpartition(":")[2]
     print(f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {shown.kind} at {opened.url}", flush=True)
-    print(f"From another machine: ssh -L {number}:localhost:{number} THIS_MACHINE, then open the same address. Ctrl-C ends.", flush=True)
+    print(
+        f"From another machine: ssh -L {number}:localhost:{number} THIS_MACHINE, then open the same address. Ctrl-C ends.",
+        flush=True,
+    )
     try:
         opened.serve()
     except KeyboardInterrupt:  # the way to end it, not a failure

@@ -36,13 +36,15 @@ def levelled(demos: Demos) -> Demos:
     turn = Rotation.from_matrix(T[:, :3, :3]).as_quat()
 
     def moved(points: np.ndarray) -> np.ndarray:
-        return (np.einsum("fij,f...j->f...i", T[:, :3, :3], points) + T[:, :3, 3].reshape(-1, *[1] * (points.ndim - 2), 3)).astype(
-            points.dtype
-        )
+        return (
+            np.einsum("fij,f...j->f...i", T[:, :3, :3], points) + T[:, :3, 3].reshape(-1, *[1] * (points.ndim - 2), 3)
+        ).astype(points.dtype)
 
     def turned(quats: np.ndarray, known: np.ndarray) -> np.ndarray:
         out = quats.copy()
-        out[known] = (Rotation.from_quat(turn[known]) * Rotation.from_quat(quats[known], scalar_first=True)).as_quat(scalar_first=True)
+        out[known] = (Rotation.from_quat(turn[known]) * Rotation.from_quat(quats[known], scalar_first=True)).as_quat(
+            scalar_first=True
+        )
         return out
 
     return replace(
@@ -58,7 +60,12 @@ def levelled(demos: Demos) -> Demos:
 def start_height(demos: Demos, objects: Mapping[str, ObjectSpec]) -> np.ndarray:
     """[S] height of the object's lowest vertex in each sequence's first frame [m]."""
     pos, quat = demos.start_pose
-    return np.array([z - rest_height(objects[name], q) for name, z, q in zip(demos.object_name.tolist(), pos[:, 2], quat, strict=True)])
+    return np.array(
+        [
+            z - rest_height(objects[name], q)
+            for name, z, q in zip(demos.object_name.tolist(), pos[:, 2], quat, strict=True)
+        ]
+    )
 
 
 def on_something(demos: Demos, objects: Mapping[str, ObjectSpec]) -> np.ndarray:

@@ -123,7 +123,9 @@ class Demos(ObjectMotions):
         """
         chosen = np.arange(self.num_sequences) if indices is None else np.asarray(list(indices), dtype=np.int64)
         if ((chosen < 0) | (chosen >= self.num_sequences)).any():
-            raise DemoError(f"sequence indices {chosen.tolist()} asked for; there are {self.num_sequences} sequences, counted from 0.")
+            raise DemoError(
+                f"sequence indices {chosen.tolist()} asked for; there are {self.num_sequences} sequences, counted from 0."
+            )
         if names is not None:
             chosen = chosen[np.isin(self.sequence_name[chosen], _all_there("sequences", names, self.sequence_name))]
         if objects is not None:
@@ -172,7 +174,9 @@ def concatenate(parts: Sequence[Demos]) -> Demos:
         raise DemoError("there are no demonstrations to concatenate.")
     rates = sorted({round(float(part.fps), 3) for part in parts})
     if len(rates) > 1:
-        raise DemoError(f"demonstrations with different frame rates ({', '.join(map(str, rates))} per second) cannot share a file.")
+        raise DemoError(
+            f"demonstrations with different frame rates ({', '.join(map(str, rates))} per second) cannot share a file."
+        )
     joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in (*_PER_SEQUENCE, *_PER_FRAME)}
     levels: dict[str, np.ndarray] = {}
     for part in parts:
@@ -227,7 +231,11 @@ def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSp
         try:
             canonical_name(name, known)
         except ObjectError as error:
-            where = "among the built-in stand-ins; give a folder of meshes with --objects" if folder is None else f"in {folder}"
+            where = (
+                "among the built-in stand-ins; give a folder of meshes with --objects"
+                if folder is None
+                else f"in {folder}"
+            )
             raise DemoError(f"sequence {sequence!r} needs the object {name!r}, which is not {where}: {error}") from None
         objects[name] = load_object(name, folder)
     return objects
@@ -261,7 +269,9 @@ def _problem(arrays: Mapping[str, Any]) -> str | None:
     if (arrays.get("subjects") is None) != (arrays.get("T_level_from_table") is None):
         return "subjects and T_level_from_table belong together, but one of them is missing."
     level = arrays.get("T_level_from_table")
-    if level is not None and not (np.isfinite(level).all() and all(is_rigid(T) for T in np.asarray(level, dtype=float))):
+    if level is not None and not (
+        np.isfinite(level).all() and all(is_rigid(T) for T in np.asarray(level, dtype=float))
+    ):
         return "T_level_from_table has a matrix that is no rotation and translation."
 
     def first(bad: np.ndarray) -> str:
@@ -270,7 +280,12 @@ def _problem(arrays: Mapping[str, Any]) -> str | None:
         return f"frame {frame - offsets[sequence]} of sequence {sequence} ({names[sequence]!s})"
 
     valid = np.asarray(arrays["hand_valid"])
-    for name, where in (("object_pos", True), ("object_quat_wxyz", True), ("hand_keypoints", valid), ("wrist_quat_wxyz", valid)):
+    for name, where in (
+        ("object_pos", True),
+        ("object_quat_wxyz", True),
+        ("hand_keypoints", valid),
+        ("wrist_quat_wxyz", valid),
+    ):
         bad = ~np.isfinite(arrays[name]).reshape(frames, -1).all(axis=1) & where
         if bad.any():
             hint = "; mark the frame in hand_valid if the hand is not known there" if where is valid else ""

@@ -79,10 +79,16 @@ def read_dexycb(
             f"there is no DexYCB sequence in {root}: expected SUBJECT/SEQUENCE/meta.yml below it, such as"
             " 20200709-subject-01/20200709_141754/meta.yml. Give the folder that holds the subjects' folders."
         )
-    chosen = [sequence for sequence in found if sequence.side in set(sides) and (wanted is None or sequence.object_name in wanted)]
+    chosen = [
+        sequence
+        for sequence in found
+        if sequence.side in set(sides) and (wanted is None or sequence.object_name in wanted)
+    ]
     if not chosen:
         there = ", ".join(sorted({f"{sequence.object_name} ({sequence.side})" for sequence in found}))
-        raise DemoError(f"none of the {len(found)} sequences in {root} has the objects and hands asked for; there are {there}.")
+        raise DemoError(
+            f"none of the {len(found)} sequences in {root} has the objects and hands asked for; there are {there}."
+        )
     calibrations: dict[str, Mapping[str, np.ndarray]] = {}
     parts = []
     for done, sequence in enumerate(chosen):
@@ -104,11 +110,17 @@ def _read(sequence: _Sequence, extrinsics: Mapping[str, np.ndarray]) -> Demos:
     pose_hand = poses["pose_m"][:, 0].astype(float)
     for name, values in (("pose_y", pose_object), ("pose_m", pose_hand)):
         if not (np.abs(values) < 1e3).all():
-            raise DemoError(f"sequence {sequence.name}: {name} of pose.npz holds numbers that are not finite, or far too large.")
+            raise DemoError(
+                f"sequence {sequence.name}: {name} of pose.npz holds numbers that are not finite, or far too large."
+            )
     if (np.linalg.norm(pose_object[:, :4], axis=1) < 0.5).any():
-        raise DemoError(f"sequence {sequence.name}: frame {np.argmin(np.linalg.norm(pose_object[:, :4], axis=1))} has no object pose.")
+        raise DemoError(
+            f"sequence {sequence.name}: frame {np.argmin(np.linalg.norm(pose_object[:, :4], axis=1))} has no object pose."
+        )
 
-    keypoints = np.stack([_joints(sequence, frame, extrinsics) for frame in range(frames)])  # world frame, NaN where there is no hand
+    keypoints = np.stack(
+        [_joints(sequence, frame, extrinsics) for frame in range(frames)]
+    )  # world frame, NaN where there is no hand
     valid = np.isfinite(keypoints).all(axis=(1, 2)) & (pose_hand != 0).any(axis=1)
     keypoints[~valid] = np.nan
     wrist = np.full((frames, 4), np.nan)
@@ -127,7 +139,9 @@ def _read(sequence: _Sequence, extrinsics: Mapping[str, np.ndarray]) -> Demos:
         hand_valid=valid,
         wrist_quat_wxyz=wrist.astype(np.float32),
         object_pos=to_table(pose_object[:, 4:]).astype(np.float32),
-        object_quat_wxyz=(turn * Rotation.from_quat(pose_object[:, :4])).as_quat(canonical=True, scalar_first=True).astype(np.float32),
+        object_quat_wxyz=(turn * Rotation.from_quat(pose_object[:, :4]))
+        .as_quat(canonical=True, scalar_first=True)
+        .astype(np.float32),
         fps=FPS,
     )
 
@@ -164,13 +178,19 @@ def _meta(path: Path) -> _Sequence:
     missing = [key for key in _META if key not in meta]
     if missing:
         raise DemoError(f"{path} has no {', '.join(missing)}; it is not a DexYCB meta.yml.")
-    ids, index, frames, sides, serials = (meta[key] for key in ("ycb_ids", "ycb_grasp_ind", "num_frames", "mano_sides", "serials"))
+    ids, index, frames, sides, serials = (
+        meta[key] for key in ("ycb_ids", "ycb_grasp_ind", "num_frames", "mano_sides", "serials")
+    )
     for key, value, fits in (
         ("ycb_ids", ids, isinstance(ids, list) and all(type(i) is int for i in ids)),
         ("ycb_grasp_ind", index, type(index) is int),
         ("num_frames", frames, type(frames) is int and 0 < frames <= _MAX_FRAMES),
         ("mano_sides", sides, isinstance(sides, list) and all(isinstance(side, str) for side in sides)),
-        ("serials", serials, isinstance(serials, list) and all(isinstance(s, str | int) and is_plain(str(s)) for s in serials)),
+        (
+            "serials",
+            serials,
+            isinstance(serials, list) and all(isinstance(s, str | int) and is_plain(str(s)) for s in serials),
+        ),
         ("extrinsics", meta["extrinsics"], isinstance(meta["extrinsics"], str | int)),
     ):
         if not fits:
@@ -178,7 +198,9 @@ def _meta(path: Path) -> _Sequence:
     if not 0 <= index < len(ids):
         raise DemoError(f"{path}: ycb_grasp_ind is {index}, but there are {len(ids)} objects in ycb_ids.")
     if ids[index] not in NAME_OF_ID:
-        raise DemoError(f"{path}: the grasped object has YCB id {ids[index]}; DexYCB's ids go from 1 to {len(NAME_OF_ID)}.")
+        raise DemoError(
+            f"{path}: the grasped object has YCB id {ids[index]}; DexYCB's ids go from 1 to {len(NAME_OF_ID)}."
+        )
     if len(sides) != 1 or sides[0] not in SIDES:
         raise DemoError(f"{path}: mano_sides is {shown(sides)}, expected one of right and left.")
     return _Sequence(
@@ -208,7 +230,9 @@ def _extrinsics(root: Path, name: str) -> dict[str, np.ndarray]:
         T = np.eye(4)
         T[:3] = np.asarray(values, dtype=float).reshape(3, 4)
         if not is_rigid(T):
-            raise DemoError(f"{path}: the pose {shown(key)} is no rotation and translation: it is scaled, mirrored or damaged.")
+            raise DemoError(
+                f"{path}: the pose {shown(key)} is no rotation and translation: it is scaled, mirrored or damaged."
+            )
         poses[str(key)] = T
     return poses
 

@@ -63,7 +63,9 @@ class Solid:
         """[...] signed distance of points [..., 3] to the surface, negative inside; outside it is a lower bound near edges."""
         return np.min([(points @ plane[:, :3].T + plane[:, 3]).max(axis=-1) for plane in self.planes], axis=0)
 
-    def crossings(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def crossings(
+        self, origins: np.ndarray, directions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Where lines [L, 3] cross each piece.
 
         Returns:
@@ -127,7 +129,9 @@ def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str = "right") -> li
     found: list[Contacts] = []
     for azimuth in azimuths:
         closing = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        across = np.array([closing[1], -closing[0], 0.0]) * (1.0 if side == "right" else -1.0)  # horizontal, away from the hand
+        across = np.array([closing[1], -closing[0], 0.0]) * (
+            1.0 if side == "right" else -1.0
+        )  # horizontal, away from the hand
         centers = _centers(low, high, closing, across, from_above)
         for tilt in (np.pi / 2,) if from_above else _SIDE_TILTS:
             approach = across * np.cos(tilt) - np.array([0.0, 0.0, np.sin(tilt)])
@@ -136,7 +140,9 @@ def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str = "right") -> li
     return sorted(found, key=lambda contacts: contacts.cost)
 
 
-def _centers(low: np.ndarray, high: np.ndarray, closing: np.ndarray, across: np.ndarray, from_above: bool) -> np.ndarray:
+def _centers(
+    low: np.ndarray, high: np.ndarray, closing: np.ndarray, across: np.ndarray, from_above: bool
+) -> np.ndarray:
     """[n, 3] a grid of points that the thumb and the fingers may close upon."""
     middle, half = (low + high) / 2, (high - low) / 2
     reach_c, reach_a = float(np.abs(closing) @ half), float(np.abs(across) @ half)
@@ -151,8 +157,12 @@ def _centers(low: np.ndarray, high: np.ndarray, closing: np.ndarray, across: np.
     return middle * flat + c * closing + a * across + z * (0.0, 0.0, 1.0)
 
 
-def _contacts_at(solid: Solid, centers: np.ndarray, approach: np.ndarray, closing: np.ndarray, side: str, effort: float) -> list[Contacts]:
-    up_hand = np.cross(approach, closing) * (1.0 if side == "right" else -1.0)  # from the little finger to the thumb's side of the hand
+def _contacts_at(
+    solid: Solid, centers: np.ndarray, approach: np.ndarray, closing: np.ndarray, side: str, effort: float
+) -> list[Contacts]:
+    up_hand = np.cross(approach, closing) * (
+        1.0 if side == "right" else -1.0
+    )  # from the little finger to the thumb's side of the hand
     offsets = np.concatenate(([0.0], _STACK))
     origins = centers[:, None] + offsets[:, None] * up_hand  # [n, 5, 3]: the thumb's line, then the fingers'
     lines = origins.reshape(-1, 3)
@@ -178,7 +188,12 @@ def _contacts_at(solid: Solid, centers: np.ndarray, approach: np.ndarray, closin
     height = origins[..., 2]
     finger = np.isfinite(start) & (room_before > _FINGER_ROOM) & (facing_fingers > 0.6) & (height > 0.007)
     finger &= np.abs(start - np.median(np.where(finger, start, 0.0)[:, 1:3], axis=1, keepdims=True)) < 0.025
-    thumb = np.isfinite(end[:, 0]) & (room_after[:, 0] > _FINGER_ROOM) & (facing_thumb[:, 0] > 0.75) & (height[:, 0] > 0.007)
+    thumb = (
+        np.isfinite(end[:, 0])
+        & (room_after[:, 0] > _FINGER_ROOM)
+        & (facing_thumb[:, 0] > 0.75)
+        & (height[:, 0] > 0.007)
+    )
     width = end[:, 0] - start[:, 0]
     with np.errstate(invalid="ignore"):
         good = thumb & finger[:, 1] & finger[:, 2] & (width < MAX_OPENING) & (width > MIN_WIDTH)

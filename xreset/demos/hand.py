@@ -23,7 +23,9 @@ THUMB_LENGTHS = np.array([42, 33, 30]) * 1e-3
 DIP_PER_PIP = 0.6
 """Flexion of a finger's last joint per flexion of its middle joint: one tendon bends both."""
 
-FINGER_JOINTS = tuple(f"{finger}_{joint}" for finger in ("index", "middle", "ring", "little") for joint in ("abduction", "mcp", "pip"))
+FINGER_JOINTS = tuple(
+    f"{finger}_{joint}" for finger in ("index", "middle", "ring", "little") for joint in ("abduction", "mcp", "pip")
+)
 THUMB_JOINTS = ("thumb_radial", "thumb_palmar", "thumb_twist", "thumb_mcp", "thumb_ip")
 JOINTS = FINGER_JOINTS + THUMB_JOINTS
 """The 17 joint angles [rad] in the order of :func:`keypoints`; flexion is positive."""
@@ -40,14 +42,24 @@ def keypoints(angles: np.ndarray, side: str = "right") -> np.ndarray:
     angles = np.asarray(angles, dtype=float)
     fingers = angles[..., :12].reshape(*angles.shape[:-1], 4, 3)
     turn = fingers[..., 0] + FINGER_SPLAY
-    flexion = np.stack((fingers[..., 1], fingers[..., 1] + fingers[..., 2], fingers[..., 1] + (1 + DIP_PER_PIP) * fingers[..., 2]), axis=-1)
+    flexion = np.stack(
+        (fingers[..., 1], fingers[..., 1] + fingers[..., 2], fingers[..., 1] + (1 + DIP_PER_PIP) * fingers[..., 2]),
+        axis=-1,
+    )
     cos, sin = np.cos(flexion), np.sin(flexion)
-    bones = np.stack((-cos * np.cos(turn)[..., None], -sin, cos * np.sin(turn)[..., None]), axis=-1) * FINGER_LENGTHS[..., None]
-    finger_points = FINGER_BASES[:, None] + np.concatenate((np.zeros_like(bones[..., :1, :]), np.cumsum(bones, axis=-2)), axis=-2)
+    bones = (
+        np.stack((-cos * np.cos(turn)[..., None], -sin, cos * np.sin(turn)[..., None]), axis=-1)
+        * FINGER_LENGTHS[..., None]
+    )
+    finger_points = FINGER_BASES[:, None] + np.concatenate(
+        (np.zeros_like(bones[..., :1, :]), np.cumsum(bones, axis=-2)), axis=-2
+    )
 
     radial, palmar, twist, mcp, ip = np.moveaxis(angles[..., 12:], -1, 0)
     first = np.stack((-np.cos(radial) * np.cos(palmar), -np.sin(palmar), np.sin(radial) * np.cos(palmar)), axis=-1)
-    bend = np.stack((np.zeros_like(twist), -np.sin(twist), -np.cos(twist)), axis=-1)  # where the thumb's tip goes when it flexes
+    bend = np.stack(
+        (np.zeros_like(twist), -np.sin(twist), -np.cos(twist)), axis=-1
+    )  # where the thumb's tip goes when it flexes
     bend = bend - (bend * first).sum(axis=-1, keepdims=True) * first
     bend /= np.linalg.norm(bend, axis=-1, keepdims=True)
     bent = np.stack((np.zeros_like(mcp), mcp, mcp + ip), axis=-1)[..., None]

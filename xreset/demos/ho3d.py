@@ -27,7 +27,11 @@ _FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def read_ho3d(
-    root: str | Path, *, fps: float, cameras: str | Path, progress: Callable[[int, int, str], None] = lambda done, total, name: None
+    root: str | Path,
+    *,
+    fps: float,
+    cameras: str | Path,
+    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> Demos:
     """Read the training sequences below an HO-3D folder whose camera's place is known.
 
@@ -45,14 +49,24 @@ def read_ho3d(
     folders = {path.parent.name: path for path in sorted((root / "train").glob("*/meta")) if path.is_dir()}
     if not folders:
         raise DemoError(f"there is no HO-3D sequence in {root}: expected train/SEQUENCE/meta/0000.pkl below it.")
-    places = {name: [cameras / f"{name}.txt", cameras / f"{name}.npy"] if cameras.is_dir() else [cameras] for name in folders}
-    poses = {name: next(path for path in paths if path.is_file()) for name, paths in places.items() if any(map(Path.is_file, paths))}
+    places = {
+        name: [cameras / f"{name}.txt", cameras / f"{name}.npy"] if cameras.is_dir() else [cameras] for name in folders
+    }
+    poses = {
+        name: next(path for path in paths if path.is_file())
+        for name, paths in places.items()
+        if any(map(Path.is_file, paths))
+    }
     if not poses:
-        raise DemoError(f"{cameras} says of no sequence where its camera stands; expected {next(iter(folders))}.txt, or a file for all.")
+        raise DemoError(
+            f"{cameras} says of no sequence where its camera stands; expected {next(iter(folders))}.txt, or a file for all."
+        )
     parts = []
     for done, (name, place) in enumerate(poses.items()):
         progress(done, len(poses), name)
-        convention = Convention(order="mano", units="m", frame="camera", table_from_camera=read_transform(place), fps=fps, side="right")
+        convention = Convention(
+            order="mano", units="m", frame="camera", table_from_camera=read_transform(place), fps=fps, side="right"
+        )
         parts.append(_sequence(folders[name], name, convention))
     return concatenate(parts)
 
@@ -74,7 +88,9 @@ def _sequence(folder: Path, name: str, convention: Convention) -> Demos:
         raise DemoError(f"{folder} has no frame with an object's pose (objRot and objTrans).")
     frames = frames[known[0] : known[-1] + 1]
     if missing := [frame.number for frame in frames if frame.pose is None]:
-        raise DemoError(f"{folder}: the object's pose is not known in {len(missing)} frames amid others, first in {missing[0]:04d}.pkl.")
+        raise DemoError(
+            f"{folder}: the object's pose is not known in {len(missing)} frames amid others, first in {missing[0]:04d}.pkl."
+        )
     if len(names := {frame.name for frame in frames}) > 1:
         raise DemoError(f"{folder}: the object changes within the sequence: {shown(sorted(names))}.")
     numbers = np.array([frame.number for frame in frames])
@@ -95,7 +111,9 @@ def _frame(path: Path) -> _Frame:
         raise DemoError(f"{path} is not named by a frame's number, such as 0000.pkl.")
     data = read_pickle(path)
     if lacking := sorted({"handJoints3D", "objRot", "objTrans", "objName"} - set(data)):
-        raise DemoError(f"{path} lacks {', '.join(lacking)}; is it an annotation of HO-3D? It has {shown(sorted(data))}.")
+        raise DemoError(
+            f"{path} lacks {', '.join(lacking)}; is it an annotation of HO-3D? It has {shown(sorted(data))}."
+        )
     joints = _numbers(path, data, "handJoints3D", (21, 3))
     rotation, position = _numbers(path, data, "objRot", (3,)), _numbers(path, data, "objTrans", (3,))
     pose = None
@@ -113,7 +131,11 @@ def _numbers(path: Path, data: dict[str, Any], name: str, shape: tuple[int, ...]
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fi":
         raise DemoError(f"{path}: {name} is {shown(value)}, expected numbers {list(shape)}.")
     if value.size != np.prod(shape) or (value.ndim > 1 and value.shape[0] != shape[0]):
-        evaluation = " The evaluation split gives the wrist alone: use train." if name == "handJoints3D" and value.size == 3 else ""
+        evaluation = (
+            " The evaluation split gives the wrist alone: use train."
+            if name == "handJoints3D" and value.size == 3
+            else ""
+        )
         raise DemoError(f"{path}: {name} has shape {list(value.shape)}, expected {list(shape)}.{evaluation}")
     if not np.isfinite(value).all():
         raise DemoError(f"{path}: {name} holds numbers that are not finite.")

@@ -132,7 +132,9 @@ def read_keypoints(
         files = sorted(file for file in path.rglob("*") if file.suffix in (".npz", ".csv") and file.is_file())
         names = [file.relative_to(path).with_suffix("").as_posix() for file in files]
         if not files:
-            raise DemoError(f"there is no .npz and no .csv file below {path}; give a folder with one file for each sequence.")
+            raise DemoError(
+                f"there is no .npz and no .csv file below {path}; give a folder with one file for each sequence."
+            )
     else:
         files, names = [path], [path.stem]
     parts = []
@@ -156,7 +158,9 @@ def read_transform(path: str | Path) -> np.ndarray:
         T = np.load(path, mmap_mode="r", allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, ndmin=2)
     except Exception as error:  # numpy's own parsers raise whatever they meet
         problem = shown(str(error))
-        raise DemoError(f"{path} cannot be read as a matrix: {problem}. Write its four rows as four lines of four numbers.") from error
+        raise DemoError(
+            f"{path} cannot be read as a matrix: {problem}. Write its four rows as four lines of four numbers."
+        ) from error
     if T.shape != (4, 4) or not is_rigid(T):
         raise DemoError(
             f"{path} holds no 4x4 matrix of a rotation and a translation (last row 0 0 0 1), but {T.shape}: {shown(T.tolist())}."
@@ -181,7 +185,9 @@ def _must_be_known(convention: Convention) -> None:
     if missing:
         raise DemoError("the numbers alone do not tell\n  - " + "\n  - ".join(missing))
     if convention.frame == "table" and convention.table_from_camera is not None:
-        raise DemoError("--table-from-camera was given, but --coordinates says that the coordinates are in the table frame already.")
+        raise DemoError(
+            "--table-from-camera was given, but --coordinates says that the coordinates are in the table frame already."
+        )
 
 
 # Files -----------------------------------------------------------------------------------------------------------------------------------
@@ -195,7 +201,9 @@ def _read_csv(path: Path, name: str) -> list[dict[str, np.ndarray]]:
     """The sequences of a table with one row for each frame, in their order; frames of one must stand together."""
     try:
         if path.stat().st_size > max_bytes():
-            raise DemoError(f"{path} has {path.stat().st_size >> 20} MB; set XRESET_MAX_FILE_MB to read it, or split it.")
+            raise DemoError(
+                f"{path} has {path.stat().st_size >> 20} MB; set XRESET_MAX_FILE_MB to read it, or split it."
+            )
         with open(path, newline="", encoding="utf-8-sig") as file:
             rows = list(csv.reader(file, strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -229,10 +237,14 @@ def _read_csv(path: Path, name: str) -> list[dict[str, np.ndarray]]:
         for text in set(_TEXTS[1:]) & set(at):
             values = {row[at[text]].strip() for _, row in part}
             if len(values) > 1:
-                raise DemoError(f"{path}, sequence {owners[begin]}: the column {text} changes within it: {shown(sorted(values))}.")
+                raise DemoError(
+                    f"{path}, sequence {owners[begin]}: the column {text} changes within it: {shown(sorted(values))}."
+                )
             arrays[text] = np.array(values.pop())
         for field, columns in fields.items():
-            arrays[field] = np.array([[_number(row[at[column]], path, number, column) for column in columns] for number, row in part])
+            arrays[field] = np.array(
+                [[_number(row[at[column]], path, number, column) for column in columns] for number, row in part]
+            )
         arrays["keypoints"] = arrays["keypoints"].reshape(-1, 21, 3)
         if "time" in arrays:
             arrays["time"] = arrays["time"][:, 0]
@@ -349,7 +361,9 @@ def _check_hand(points: np.ndarray, what: str, convention: Convention, side: str
             f"{what}: the keypoints are centred on the hand in every frame, as MediaPipe's world landmarks are: they do not say where"
             " the hand is. Add the hand's position in the camera's or the table's frame first."
         )
-    palm_normal = np.cross(ordered[:, 5] - ordered[:, 0], ordered[:, 17] - ordered[:, 0]) * (1 if side == "right" else -1)
+    palm_normal = np.cross(ordered[:, 5] - ordered[:, 0], ordered[:, 17] - ordered[:, 0]) * (
+        1 if side == "right" else -1
+    )
     palm_normal /= np.linalg.norm(palm_normal, axis=1, keepdims=True)
     bent = ordered[:, [8, 12, 16, 20]] - ordered[:, [5, 9, 13, 17]]
     curl = float(np.median((bent * palm_normal[:, None]).sum(axis=-1)))
@@ -360,7 +374,9 @@ def _check_hand(points: np.ndarray, what: str, convention: Convention, side: str
         )
 
 
-def _object(arrays: Mapping[str, np.ndarray], what: str, convention: Convention, scale: float) -> tuple[np.ndarray, Rotation]:
+def _object(
+    arrays: Mapping[str, np.ndarray], what: str, convention: Convention, scale: float
+) -> tuple[np.ndarray, Rotation]:
     """Position [F, 3] in metres and orientation of the object, still in the file's frame."""
     given = [name for name in ("object_pose", "object_quat", "object_quat_wxyz", "object_quat_xyzw") if name in arrays]
     if len(given) != 1 or ("object_pos" in arrays) != (given[0] != "object_pose"):
@@ -370,24 +386,39 @@ def _object(arrays: Mapping[str, np.ndarray], what: str, convention: Convention,
         )
     values = np.asarray(arrays[given[0]], dtype=float)
     if not np.isfinite(values).all() or ("object_pos" in arrays and not np.isfinite(arrays["object_pos"]).all()):
-        raise DemoError(f"{what}: the object's pose is not known in every frame; leave out those at the ends, interpolate the others.")
+        raise DemoError(
+            f"{what}: the object's pose is not known in every frame; leave out those at the ends, interpolate the others."
+        )
     if given[0] == "object_pose":
         bad = ~np.array([is_rigid(T) for T in values])
         if bad.any():
-            raise DemoError(f"{what}: object_pose of frame {np.argmax(bad)} is no rotation and translation with the last row 0 0 0 1.")
+            raise DemoError(
+                f"{what}: object_pose of frame {np.argmax(bad)} is no rotation and translation with the last row 0 0 0 1."
+            )
         return values[:, :3, 3] * scale, Rotation.from_matrix(values[:, :3, :3])
     order = given[0].removeprefix("object_quat").removeprefix("_") or convention.quat
     if order is None:
-        raise DemoError(f"{what}: nothing says whether object_quat is (w, x, y, z) or (x, y, z, w); say --quat wxyz or xyzw.")
+        raise DemoError(
+            f"{what}: nothing says whether object_quat is (w, x, y, z) or (x, y, z, w); say --quat wxyz or xyzw."
+        )
     bad = np.abs(np.linalg.norm(values, axis=1) - 1) > UNIT_TOLERANCE
     if bad.any():
         frame = int(np.argmax(bad))
-        raise DemoError(f"{what}: the quaternion of frame {frame} has length {np.linalg.norm(values[frame]):.4f}, expected 1.")
-    return np.asarray(arrays["object_pos"], dtype=float) * scale, Rotation.from_quat(values, scalar_first=order == "wxyz")
+        raise DemoError(
+            f"{what}: the quaternion of frame {frame} has length {np.linalg.norm(values[frame]):.4f}, expected 1."
+        )
+    return np.asarray(arrays["object_pos"], dtype=float) * scale, Rotation.from_quat(
+        values, scalar_first=order == "wxyz"
+    )
 
 
 def _evenly(
-    arrays: Mapping[str, np.ndarray], what: str, convention: Convention, points: np.ndarray, pos: np.ndarray, turn: Rotation
+    arrays: Mapping[str, np.ndarray],
+    what: str,
+    convention: Convention,
+    points: np.ndarray,
+    pos: np.ndarray,
+    turn: Rotation,
 ) -> tuple[float, tuple[np.ndarray, np.ndarray, Rotation]]:
     """The rate, and the sequence at that rate: as it is, or interpolated between its own times."""
     stated = float(arrays["fps"]) if "fps" in arrays else None
@@ -416,7 +447,9 @@ def _evenly(
     at = time[0] + np.arange(int((time[-1] - time[0]) * rate + 1e-6) + 1) / rate
     after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
     share = np.clip((at - time[after - 1]) / steps[after - 1], 0.0, 1.0)
-    points = points[after - 1] * (1 - share)[:, None, None] + points[after] * share[:, None, None]  # NaN beside a frame without a hand
+    points = (
+        points[after - 1] * (1 - share)[:, None, None] + points[after] * share[:, None, None]
+    )  # NaN beside a frame without a hand
     pos = pos[after - 1] * (1 - share)[:, None] + pos[after] * share[:, None]
     return rate, (points, pos, Slerp(time, turn)(np.clip(at, time[0], time[-1])))
 

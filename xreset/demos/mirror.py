@@ -50,12 +50,19 @@ def symmetry(obj: ObjectSpec) -> Symmetry:
     axes = np.linalg.svd(points - centre)[2]
     options = {"maxfev": 80, "initial_simplex": 0.1 * np.eye(4, 3)}
     found = [
-        minimize(lambda p, axis=axis: np.square(deviations(p, axis)).mean(), np.zeros(3), method="Nelder-Mead", options=options)
+        minimize(
+            lambda p, axis=axis: np.square(deviations(p, axis)).mean(),
+            np.zeros(3),
+            method="Nelder-Mead",
+            options=options,
+        )
         for axis in axes
     ]
     best = int(np.argmin([result.fun for result in found]))
     normal, offset = _plane(found[best].x, axes[best], centre)
-    return Symmetry(normal=normal, offset=offset, deviation=float(np.percentile(deviations(found[best].x, axes[best]), 95)))
+    return Symmetry(
+        normal=normal, offset=offset, deviation=float(np.percentile(deviations(found[best].x, axes[best]), 95))
+    )
 
 
 def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: float) -> Demos:
@@ -72,7 +79,9 @@ def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: flo
     kept = [name for name, deviation in measured.items() if deviation <= tolerance]
     if not kept:
         listed = ", ".join(f"{name} {1e3 * deviation:.1f} mm" for name, deviation in measured.items())
-        raise DemoError(f"no object is its own mirror image within {1e3 * tolerance:g} mm: {listed}. Raise the tolerance, or go without.")
+        raise DemoError(
+            f"no object is its own mirror image within {1e3 * tolerance:g} mm: {listed}. Raise the tolerance, or go without."
+        )
     demos = levelled(demos).select(objects=kept)
     across = np.array([-1.0, 1.0, 1.0])
     shift = np.array([2.0 * TableSpec().center[0], 0.0, 0.0])
@@ -81,7 +90,9 @@ def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: flo
     turn = Rotation.from_quat(demos.object_quat_wxyz, scalar_first=True).as_matrix()
     own = np.eye(3) - 2.0 * normals[:, :, None] * normals[:, None, :]
     pos = demos.object_pos + np.einsum("fij,fj->fi", turn, 2.0 * offsets[:, None] * normals)
-    wrist = demos.wrist_quat_wxyz * np.array([1.0, 1.0, -1.0, -1.0])  # S R S with S the reflection in x: the axis is an axial vector
+    wrist = demos.wrist_quat_wxyz * np.array(
+        [1.0, 1.0, -1.0, -1.0]
+    )  # S R S with S the reflection in x: the axis is an axial vector
     kind = demos.object_pos.dtype
     return replace(
         demos,

@@ -50,13 +50,21 @@ class HandPath:
 def random_timing(fps: float, rng: np.random.Generator) -> Timing:
     """A demonstration of about 2.4 s whose object leaves the table after about 1.15 s."""
     seconds = np.cumsum(
-        [rng.uniform(0.75, 0.95), rng.uniform(0.15, 0.25), rng.uniform(0.05, 0.1), rng.uniform(0.8, 1.0), rng.uniform(0.25, 0.45)]
+        [
+            rng.uniform(0.75, 0.95),
+            rng.uniform(0.15, 0.25),
+            rng.uniform(0.05, 0.1),
+            rng.uniform(0.8, 1.0),
+            rng.uniform(0.25, 0.45),
+        ]
     )
     reach, close, lift, end, last = (round(float(s) * fps) for s in seconds)
     return Timing(frames=last + 1, reach=reach, close=close, lift=lift, end=end)
 
 
-def object_path(pos: np.ndarray, rest: Rotation, timing: Timing, rng: np.random.Generator) -> tuple[np.ndarray, Rotation]:
+def object_path(
+    pos: np.ndarray, rest: Rotation, timing: Timing, rng: np.random.Generator
+) -> tuple[np.ndarray, Rotation]:
     """Object position [T, 3] and T orientations: at rest, lifted, turned, at the goal.
 
     Args:
@@ -68,12 +76,16 @@ def object_path(pos: np.ndarray, rest: Rotation, timing: Timing, rng: np.random.
     turn = Rotation.from_rotvec(tilt) * Rotation.from_euler("z", np.radians(rng.uniform(-45.0, 45.0)))
     frame = np.arange(timing.frames)
     rise = _minimum_jerk(frame, timing.lift, timing.end)
-    late = _minimum_jerk(frame, timing.lift + 0.2 * (timing.end - timing.lift), timing.end)  # turns when it is clear of the table
+    late = _minimum_jerk(
+        frame, timing.lift + 0.2 * (timing.end - timing.lift), timing.end
+    )  # turns when it is clear of the table
     object_rot = Rotation.from_rotvec(late[:, None] * turn.as_rotvec()) * rest
     return pos + rise[:, None] * (goal - pos), object_rot
 
 
-def clear_approach(solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, side: str, rng: np.random.Generator) -> HandPath:
+def clear_approach(
+    solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, side: str, rng: np.random.Generator
+) -> HandPath:
     """The first of some random approaches in which no keypoint comes too near to object or table, or the best of them.
 
     Args:
@@ -95,11 +107,19 @@ def place_hand(pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: st
     return np.einsum("nij,nkj->nki", rotation.as_matrix(), hand.keypoints(angles, side)) + pos[:, None]
 
 
-def _approach(solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, side: str, rng: np.random.Generator) -> HandPath:
+def _approach(
+    solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, side: str, rng: np.random.Generator
+) -> HandPath:
     """To a place before the object while the hand opens, forward, close; each a minimum-jerk motion, overlapping."""
     frame = np.arange(timing.frames)
     mirror = 1.0 if side == "right" else -1.0
-    start = np.array([pos[0] - mirror * rng.uniform(-0.05, 0.20), rng.uniform(0.60, 0.80), grasp.wrist_pos[2] + rng.uniform(0.02, 0.18)])
+    start = np.array(
+        [
+            pos[0] - mirror * rng.uniform(-0.05, 0.20),
+            rng.uniform(0.60, 0.80),
+            grasp.wrist_pos[2] + rng.uniform(0.02, 0.18),
+        ]
+    )
     start_rot = Rotation.from_rotvec(rng.normal(0.0, 0.2, 3)) * grasp.wrist_rot
     fingers = grasp.wrist_rot.apply([-1.0, 0.0, 0.0] if side == "right" else [1.0, 0.0, 0.0])
     palm = grasp.wrist_rot.apply([0.0, -1.0, 0.0])

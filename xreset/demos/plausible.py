@@ -44,7 +44,11 @@ def doubts(demos: Demos, objects: Mapping[str, ObjectSpec] | None = None) -> lis
         right = (demos.hand_side[demos.sequence_of_frame] == "right")[valid]
         along, other = _along_fingers(hand, wxyz, right), _along_fingers(hand, wxyz[:, [3, 0, 1, 2]], right)
         if along < _ALONG:
-            order = "Read as (x, y, z, w) they would: put w first." if other > _ALONG else "Are they MANO's root, in the table frame?"
+            order = (
+                "Read as (x, y, z, w) they would: put w first."
+                if other > _ALONG
+                else "Are they MANO's root, in the table frame?"
+            )
             found.append(
                 f"the wrist's orientations do not point along the fingers (cosine {along:.2f}, expected 1). {order} "
                 "Are the objects' in the right order?"
@@ -59,17 +63,23 @@ def doubts(demos: Demos, objects: Mapping[str, ObjectSpec] | None = None) -> lis
         )
     elif objects:
         names = demos.object_name.tolist()
-        ours, other = (_standing(objects, names, start[0][:, 2], start[1][:, order]) for order in ([0, 1, 2, 3], [3, 0, 1, 2]))
+        ours, other = (
+            _standing(objects, names, start[0][:, 2], start[1][:, order]) for order in ([0, 1, 2, 3], [3, 0, 1, 2])
+        )
         if ours < 0.5 < other:
             found.append(
                 f"{ours:.0%} of the objects stand on the table if their orientations are (w, x, y, z), "
                 f"{other:.0%} if they are (x, y, z, w). Put w first."
             )
-    turned = (Rotation.from_quat(start[1], scalar_first=True).inv() * Rotation.from_quat(goal[1], scalar_first=True)).magnitude()
+    turned = (
+        Rotation.from_quat(start[1], scalar_first=True).inv() * Rotation.from_quat(goal[1], scalar_first=True)
+    ).magnitude()
     same = (np.linalg.norm(goal[0] - start[0], axis=1) < _SAME[0]) & (turned < _SAME[1])
     if same.any():
         i = int(np.argmax(same))
-        found.append(f"{_some(same, 'ends')} where it starts ({demos.sequence_name[i]}): whatever lets the object stand solves it.")
+        found.append(
+            f"{_some(same, 'ends')} where it starts ({demos.sequence_name[i]}): whatever lets the object stand solves it."
+        )
     return found
 
 
@@ -84,7 +94,9 @@ def _along_fingers(hand: np.ndarray, quat_wxyz: np.ndarray, right: np.ndarray) -
 def _standing(objects: Mapping[str, ObjectSpec], names: list[str], height: np.ndarray, quat_wxyz: np.ndarray) -> float:
     """Share of objects whose lowest point is at the table's height."""
     turns = Rotation.from_quat(quat_wxyz, scalar_first=True)
-    lowest = [z + turn.apply(objects[name].vertices)[:, 2].min() for name, z, turn in zip(names, height, turns, strict=True)]
+    lowest = [
+        z + turn.apply(objects[name].vertices)[:, 2].min() for name, z, turn in zip(names, height, turns, strict=True)
+    ]
     return float(np.mean(np.abs(lowest) < _TILT))
 
 

@@ -91,7 +91,9 @@ def synthesize(
     return concatenate(parts)
 
 
-def _sequence(obj: ObjectSpec, starts: Sequence[_Start], name: str, side: str, fps: float, rng: np.random.Generator) -> Demos:
+def _sequence(
+    obj: ObjectSpec, starts: Sequence[_Start], name: str, side: str, fps: float, rng: np.random.Generator
+) -> Demos:
     start = starts[int(rng.integers(len(starts)))]
     timing = random_timing(fps, rng)
     best: tuple[Rotation, np.ndarray, Grasp, HandPath] | None = None
@@ -109,7 +111,9 @@ def _sequence(obj: ObjectSpec, starts: Sequence[_Start], name: str, side: str, f
     moved = object_rot * rest.inv()
     held = np.arange(timing.frames) >= timing.lift
     wrist_pos = np.where(held[:, None], moved.apply(grasp.wrist_pos - pos) + object_pos, path.wrist_pos)
-    wrist_rot = Rotation.from_quat(np.where(held[:, None], (moved * grasp.wrist_rot).as_quat(), path.wrist_rot.as_quat()))
+    wrist_rot = Rotation.from_quat(
+        np.where(held[:, None], (moved * grasp.wrist_rot).as_quat(), path.wrist_rot.as_quat())
+    )
     points = place_hand(wrist_pos, wrist_rot, path.angles, side)
     return Demos(
         sequence_name=np.array([name]),
@@ -132,8 +136,12 @@ def _start(obj: ObjectSpec, up: np.ndarray, side: str) -> _Start:
     height = np.array([0.0, 0.0, rest_height(obj, quat)])
     plans = plan_contacts(Solid.of(obj, height, upright), np.radians(np.arange(0.0, 360.0, 20.0)), side)
     if not plans:
-        raise DemoError(f"no way was found to hold {obj.name} between thumb and fingers: nothing within reach is narrow enough.")
-    return _Start(rest=upright, height=height, plans=tuple(plan for plan in plans if plan.cost < plans[0].cost + _NEAR_BEST))
+        raise DemoError(
+            f"no way was found to hold {obj.name} between thumb and fingers: nothing within reach is narrow enough."
+        )
+    return _Start(
+        rest=upright, height=height, plans=tuple(plan for plan in plans if plan.cost < plans[0].cost + _NEAR_BEST)
+    )
 
 
 def _grasped(obj: ObjectSpec, start: _Start, side: str, rng: np.random.Generator) -> tuple[Rotation, np.ndarray, Grasp]:
@@ -148,7 +156,10 @@ def _grasped(obj: ObjectSpec, start: _Start, side: str, rng: np.random.Generator
         place = np.array([rng.uniform(*WORKSPACE[0]), rng.uniform(*WORKSPACE[1]), 0.0])
         rest, pos = yaw * start.rest, place + start.height
         contacts = Contacts(
-            points=yaw.apply(plan.points) + place, approach=yaw.apply(plan.approach), closing=yaw.apply(plan.closing), cost=plan.cost
+            points=yaw.apply(plan.points) + place,
+            approach=yaw.apply(plan.approach),
+            closing=yaw.apply(plan.closing),
+            cost=plan.cost,
         )
         grasp = fit_hand(Solid.of(obj, pos, rest), contacts, side)
         if best is None or _badness(grasp) < _badness(best[2]):

@@ -70,7 +70,9 @@ class Spans(Tensors):
             torch.unique_consecutive(piece, return_counts=True)[1].tolist()
         ):
             asking = torch.repeat_interleave(places, counts[places])
-            within = torch.arange(len(asking), device=groups.device) - (ends - counts)[asking] + (ends - counts)[places[0]]
+            within = (
+                torch.arange(len(asking), device=groups.device) - (ends - counts)[asking] + (ends - counts)[places[0]]
+            )
             yield asking, self.start[groups][asking] + within
 
 
@@ -95,7 +97,9 @@ class Clusters(Tensors):
         parts = [_halved(own) for own in centers]
         first = np.cumsum([0, *map(len, radii)])
         rows = [part + start for own, start in zip(parts, first, strict=False) for part in own]
-        balls = [bounding_ball(c[part], r[part]) for c, r, own in zip(centers, radii, parts, strict=True) for part in own]
+        balls = [
+            bounding_ball(c[part], r[part]) for c, r, own in zip(centers, radii, parts, strict=True) for part in own
+        ]
         return Clusters(
             centers=torch.as_tensor(np.array([middle for middle, _ in balls]).reshape(-1, 3)),
             radii=torch.as_tensor(np.array([radius for _, radius in balls])),
@@ -149,7 +153,10 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
         collision: decides which links must not overlap.
     """
     links = [name for name in hand.link_names if hand.tree.link(name).collisions]
-    balls = [[np.concatenate(part) for part in zip(*map(shape_balls, hand.tree.link(name).collisions), strict=True)] for name in links]
+    balls = [
+        [np.concatenate(part) for part in zip(*map(shape_balls, hand.tree.link(name).collisions), strict=True)]
+        for name in links
+    ]
     centers, radii = [part[0] for part in balls], [part[1] for part in balls]
     guards = [_apart(c, r, APART) for c, r in zip(centers, radii, strict=True)]
     stand_in = [_near_others(c, g) for c, g in zip(centers, guards, strict=True)]
@@ -161,16 +168,22 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
     return Balls(
         links=tuple(links),
         clusters=Clusters.of(centers, radii),
-        link=torch.repeat_interleave(torch.arange(len(links)), torch.tensor([len(part) for part in radii], dtype=torch.long)),
+        link=torch.repeat_interleave(
+            torch.arange(len(links)), torch.tensor([len(part) for part in radii], dtype=torch.long)
+        ),
         centers=torch.as_tensor(np.concatenate([np.zeros((0, 3)), *centers])),
         radii=torch.as_tensor(np.concatenate([np.zeros(0), *radii])),
         bound_centers=torch.as_tensor(np.array([middle for middle, _ in bounds]).reshape(-1, 3)),
         bound_radii=torch.as_tensor(np.array([radius for _, radius in bounds])),
-        guards=torch.as_tensor(np.concatenate([np.zeros(0, dtype=np.int64), *(g + f for g, f in zip(guards, first, strict=False))])),
+        guards=torch.as_tensor(
+            np.concatenate([np.zeros(0, dtype=np.int64), *(g + f for g, f in zip(guards, first, strict=False))])
+        ),
         guard_radii=torch.as_tensor(np.concatenate([np.zeros(0), *guard_radii])),
         guard_clusters=Clusters.of([c[g] for c, g in zip(centers, guards, strict=True)], guard_radii),
         fields=DistanceFields.join([link_field(hand.tree.link(name).collisions) for name in links]),
-        link_pairs=torch.as_tensor(np.array([*link_pairs, *((b, a) for a, b in link_pairs)], dtype=np.int64).reshape(-1, 2)),
+        link_pairs=torch.as_tensor(
+            np.array([*link_pairs, *((b, a) for a, b in link_pairs)], dtype=np.int64).reshape(-1, 2)
+        ),
     )
 
 
@@ -204,7 +217,9 @@ def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray
 
 def _near_others(centers: np.ndarray, guards: np.ndarray) -> np.ndarray:
     """[R] whether another of the balls at centres [n, 3] is nearer than :data:`APART` to each of some of them."""
-    return np.array([(np.linalg.norm(centers - centers[ball], axis=1) <= APART).sum() > 1 for ball in guards], dtype=bool)
+    return np.array(
+        [(np.linalg.norm(centers - centers[ball], axis=1) <= APART).sum() > 1 for ball in guards], dtype=bool
+    )
 
 
 def inscribed_balls(geometry: Geometry) -> tuple[np.ndarray, float]:
@@ -227,7 +242,10 @@ def inscribed_balls(geometry: Geometry) -> tuple[np.ndarray, float]:
     else:
         points, _ = support_points(geometry)
         low, high = points.min(axis=0), points.max(axis=0)
-        center, sides = (low + high) / 2, (high - low) / 2 * (ConvexHull(points).volume / np.prod(high - low)) ** (1 / 3)
+        center, sides = (
+            (low + high) / 2,
+            (high - low) / 2 * (ConvexHull(points).volume / np.prod(high - low)) ** (1 / 3),
+        )
     radius = float(sides.min())
     return center + _grid(tuple(sides - radius), radius), radius
 
@@ -275,7 +293,9 @@ def shape_balls(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     shell, small = shell_balls(shape.geometry, inner, radius)
     sharp = sharp_points(shape.geometry, max(min(radius, small), SPACING))
     points = np.concatenate((inner, shell, sharp)) @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
-    return points, np.concatenate([np.full(len(part), r) for part, r in ((inner, radius), (shell, small), (sharp, 0.0))])
+    return points, np.concatenate(
+        [np.full(len(part), r) for part, r in ((inner, radius), (shell, small), (sharp, 0.0))]
+    )
 
 
 def _grid(half: tuple[float, ...], radius: float) -> np.ndarray:

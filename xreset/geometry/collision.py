@@ -71,7 +71,9 @@ def table_points(robot: RobotSpec, kinematics: Kinematics) -> SupportPoints:
             points.append(local @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3])
             links += [name] * len(local)
             radii += [radius] * len(local)
-    return SupportPoints(links=tuple(links), points=np.concatenate(points) if points else np.zeros((0, 3)), radii=np.array(radii))
+    return SupportPoints(
+        links=tuple(links), points=np.concatenate(points) if points else np.zeros((0, 3)), radii=np.array(radii)
+    )
 
 
 def height_above_table(points: Tensor, radii: Tensor, table: TableSpec) -> Tensor:
@@ -102,7 +104,12 @@ class SelfCollision:
     """Distances between the shapes of a robot's links."""
 
     def __init__(
-        self, robot: RobotSpec, kinematics: Kinematics, *, moved_by_arm: bool = False, only: Collection[str] | None = None
+        self,
+        robot: RobotSpec,
+        kinematics: Kinematics,
+        *,
+        moved_by_arm: bool = False,
+        only: Collection[str] | None = None,
     ) -> None:
         """Choose the pairs of links that count: never neighbours, excluded pairs, or pairs that overlap at home (a matter of modelling).
 
@@ -145,7 +152,9 @@ class SelfCollision:
         count = {(a, b) for a, b in linked if _may_collide(robot, tree, names[a], names[b], moved_by_arm)}
         pairs = [(i, j) for i, j in combinations(range(len(self._link)), 2) if (self._link[i], self._link[j]) in count]
         self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-        home = kinematics.link_poses(kinematics.clamp(kinematics.lower.new_tensor(robot.home[kinematics.joint_indices])))[None].numpy()
+        home = kinematics.link_poses(
+            kinematics.clamp(kinematics.lower.new_tensor(robot.home[kinematics.joint_indices]))
+        )[None].numpy()
         overlapping = self.near(home, 0.0)
         never = {tuple(sorted(pair)) for pair in overlapping.links.tolist()}
         self.overlapping_at_home: tuple[tuple[str, str], ...] = tuple(
@@ -189,7 +198,9 @@ class SelfCollision:
                     transforms.append(coal.Transform3s(pose[:3, :3], pose[:3, 3]))
                 i, j = self._pairs[pair]
                 result.clear()
-                distance = coal.distance(self._geometry[i], transforms[0], self._geometry[j], transforms[1], request, result)
+                distance = coal.distance(
+                    self._geometry[i], transforms[0], self._geometry[j], transforms[1], request, result
+                )
                 if distance < margin:
                     rows.append((begin + b, self._link[i], self._link[j], distance))
                     points.append((np.array(result.getNearestPoint1()), np.array(result.getNearestPoint2())))

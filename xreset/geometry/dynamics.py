@@ -48,7 +48,11 @@ def drive_shares(robot: RobotSpec) -> np.ndarray:
     for row, mimic in zip(U[len(joints) :], mimics, strict=True):
         source = robot.joint_names.index(mimic.source)
         row[source] = mimic.multiplier
-        free.append(JointSpec(name=mimic.joint, group="hand", drive=idle, home=mimic.multiplier * robot.home[source] + mimic.offset))
+        free.append(
+            JointSpec(
+                name=mimic.joint, group="hand", drive=idle, home=mimic.multiplier * robot.home[source] + mimic.offset
+            )
+        )
     uncoupled = replace(robot, joints=(*joints, *free), mimics=())
     M = mass_matrix(uncoupled, uncoupled.home) + np.diag([joint.drive.armature for joint in uncoupled.joints])
     return np.linalg.solve(U.T @ M @ U, U.T @ M)

@@ -37,7 +37,9 @@ class DistanceFields(Tensors):
             raise ValueError(f"grids must have one spacing, found {sorted({part.spacing for part in parts})}")
         sizes = torch.tensor([len(part.values) for part in parts], device=parts[0].start.device)
         shift = sizes.cumsum(0) - sizes
-        return replace(DistanceFields.cat(parts), start=torch.cat([part.start + shift[i] for i, part in enumerate(parts)]))
+        return replace(
+            DistanceFields.cat(parts), start=torch.cat([part.start + shift[i] for i, part in enumerate(parts)])
+        )
 
     def beside(self, points: Tensor, which: Tensor) -> Tensor:
         """[...] distance of points [..., 3] from the bounding box of their object [...]; 0 inside."""
@@ -81,7 +83,12 @@ class DistanceFields(Tensors):
         slope_z = along_y[:, 1] - along_y[:, 0]
         slope_x = slope_x[:, 0] + fy * (slope_x[:, 1] - slope_x[:, 0])
         gradient = torch.stack(
-            (slope_x[:, 0] + fz * (slope_x[:, 1] - slope_x[:, 0]), slope_y[:, 0] + fz * (slope_y[:, 1] - slope_y[:, 0]), slope_z), dim=-1
+            (
+                slope_x[:, 0] + fz * (slope_x[:, 1] - slope_x[:, 0]),
+                slope_y[:, 0] + fz * (slope_y[:, 1] - slope_y[:, 0]),
+                slope_z,
+            ),
+            dim=-1,
         )
         gradient = torch.where(beyond == 0, gradient / self.spacing, beyond / excess[:, None].clamp_min(1e-12))
         return along_y[:, 0] + fz * slope_z + excess * self.spacing, gradient

@@ -173,7 +173,9 @@ class Kinematics:
     def link_index(self, name: str) -> int:
         """Index of a link in :attr:`link_names`; ``RobotError`` if there is none of that name below the root."""
         if name not in self._link_index:
-            raise RobotError(f"robot {self.robot.name!r} has no link {name!r} below {self.root!r}; it has {', '.join(self.link_names)}.")
+            raise RobotError(
+                f"robot {self.robot.name!r} has no link {name!r} below {self.root!r}; it has {', '.join(self.link_names)}."
+            )
         return self._link_index[name]
 
     def link_poses(self, q: Tensor, links: Sequence[str] | None = None, *, base: Tensor | None = None) -> Tensor:
@@ -196,7 +198,9 @@ class Kinematics:
         poses[..., 3, 3] = 1.0
         return poses
 
-    def points(self, q: Tensor, links: Sequence[str], offsets: Tensor | None = None, *, base: Tensor | None = None) -> Tensor:
+    def points(
+        self, q: Tensor, links: Sequence[str], offsets: Tensor | None = None, *, base: Tensor | None = None
+    ) -> Tensor:
         """[..., P, 3] positions of points on links.
 
         Args:
@@ -206,9 +210,15 @@ class Kinematics:
             base: [..., 4, 4] pose of the root; default :attr:`base`.
         """
         poses = self.link_poses(q, links, base=base)
-        return poses[..., :3, 3] if offsets is None else poses[..., :3, 3] + (poses[..., :3, :3] @ offsets[..., None])[..., 0]
+        return (
+            poses[..., :3, 3]
+            if offsets is None
+            else poses[..., :3, 3] + (poses[..., :3, :3] @ offsets[..., None])[..., 0]
+        )
 
-    def jacobian(self, q: Tensor, links: Sequence[str], offsets: Tensor | None = None, *, base: Tensor | None = None) -> PointJacobian:
+    def jacobian(
+        self, q: Tensor, links: Sequence[str], offsets: Tensor | None = None, *, base: Tensor | None = None
+    ) -> PointJacobian:
         """Points on links and their geometric Jacobian; arguments as in :meth:`points`.
 
         A revolute joint with world axis a through o moves the point p by a x (p - o), a prismatic one by a; mimic joints add to the
@@ -252,7 +262,9 @@ class Kinematics:
     def _forward(self, q: Tensor, base: Tensor | None, wanted: Sequence[int]):
         """Rotations [B, 3, 3] and positions [B, 3] of the wanted links and their ancestors; axes and origins of the joints between."""
         if q.shape[-1] != len(self.joint_names):
-            raise ValueError(f"q has {q.shape[-1]} joints, expected {len(self.joint_names)} ({', '.join(self.joint_names)})")
+            raise ValueError(
+                f"q has {q.shape[-1]} joints, expected {len(self.joint_names)} ({', '.join(self.joint_names)})"
+            )
         values = q.reshape(-1, q.shape[-1]) @ self._coupling.T + self._constant  # [B, M]
         sines, cosines = torch.sin(values), 1.0 - torch.cos(values)
         base = (self.base if base is None else base).expand(*q.shape[:-1], 4, 4).reshape(-1, 4, 4)
@@ -274,7 +286,11 @@ class Kinematics:
                     origin = origin + axis * values[:, step.moving, None]
                 else:
                     still, turn, turn_twice = rotation.split(3, dim=-1)
-                    rotation = still + sines[:, step.moving, None, None] * turn + cosines[:, step.moving, None, None] * turn_twice
+                    rotation = (
+                        still
+                        + sines[:, step.moving, None, None] * turn
+                        + cosines[:, step.moving, None, None] * turn_twice
+                    )
             rotations[i], positions[i] = rotation, origin
         return rotations, positions, axes, origins
 

@@ -63,7 +63,9 @@ def quat_to_axis_angle(q: Tensor) -> Tensor:
 
 def quat_to_matrix(q: Tensor) -> Tensor:
     """[..., 3, 3] rotation matrix of a unit quaternion [..., 4]."""
-    turned = quat_rotate(q[..., None, :], torch.eye(3, dtype=q.dtype, device=q.device))  # the unit vectors: the matrix's columns
+    turned = quat_rotate(
+        q[..., None, :], torch.eye(3, dtype=q.dtype, device=q.device)
+    )  # the unit vectors: the matrix's columns
     return turned.mT
 
 

@@ -25,12 +25,16 @@ CYLINDER_SECTIONS = 48
 
 def box(center: ArrayLike, size: Sequence[float]) -> Shape:
     """An axis-aligned box of edge lengths ``size``."""
-    return Shape(geometry=Geometry(kind="box", size=tuple(float(s) / 2 for s in size)), T_body_shape=_translation(center))
+    return Shape(
+        geometry=Geometry(kind="box", size=tuple(float(s) / 2 for s in size)), T_body_shape=_translation(center)
+    )
 
 
 def cylinder(center: ArrayLike, radius: float, height: float) -> Shape:
     """A cylinder along z."""
-    return Shape(geometry=Geometry(kind="cylinder", size=(float(radius), float(height) / 2)), T_body_shape=_translation(center))
+    return Shape(
+        geometry=Geometry(kind="cylinder", size=(float(radius), float(height) / 2)), T_body_shape=_translation(center)
+    )
 
 
 def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
@@ -49,7 +53,9 @@ def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
         points = _outermost(points, tolerance) if tolerance > 0 and len(points) > _FEW else points
         convex = ConvexHull(points)
     except (QhullError, ValueError) as error:
-        raise ObjectError(f"{len(points)} points span no volume, so they have no convex hull: {str(error).splitlines()[0]}") from error
+        raise ObjectError(
+            f"{len(points)} points span no volume, so they have no convex hull: {str(error).splitlines()[0]}"
+        ) from error
     index = np.full(len(points), -1)
     index[convex.vertices] = np.arange(len(convex.vertices))
     corners = points[convex.simplices]
@@ -81,7 +87,9 @@ def loft(sections: Iterable[np.ndarray]) -> Shape:
     return hull(np.concatenate(list(sections)))
 
 
-def section(center: ArrayLike, half_u: ArrayLike, half_v: ArrayLike, *, power: float = 2.0, count: int = 16) -> np.ndarray:
+def section(
+    center: ArrayLike, half_u: ArrayLike, half_v: ArrayLike, *, power: float = 2.0, count: int = 16
+) -> np.ndarray:
     """[count, 3] points of a superellipse |u|^power + |v|^power = 1 with half axes ``half_u`` and ``half_v`` (vectors).
 
     A power of 2 is an ellipse; larger ones approach a rectangle.
@@ -114,10 +122,16 @@ def shape_mesh(shape: Shape, *, coarse: bool = False) -> trimesh.Trimesh:
     elif geometry.kind == "sphere":
         mesh = trimesh.creation.icosphere(2 if coarse else 3, geometry.size[0])
     elif geometry.kind == "cylinder":
-        mesh = trimesh.creation.cylinder(geometry.size[0], 2 * geometry.size[1], sections=24 if coarse else CYLINDER_SECTIONS)
+        mesh = trimesh.creation.cylinder(
+            geometry.size[0], 2 * geometry.size[1], sections=24 if coarse else CYLINDER_SECTIONS
+        )
     elif geometry.kind == "capsule":
-        mesh = trimesh.creation.capsule(radius=geometry.size[0], height=2 * geometry.size[1], count=(10, 14) if coarse else (32, 32))
-        mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])  # trimesh has had its origin at one end or in the middle
+        mesh = trimesh.creation.capsule(
+            radius=geometry.size[0], height=2 * geometry.size[1], count=(10, 14) if coarse else (32, 32)
+        )
+        mesh.apply_translation(
+            [0, 0, -mesh.bounds.mean(axis=0)[2]]
+        )  # trimesh has had its origin at one end or in the middle
     else:
         mesh = trimesh.Trimesh(geometry.vertices, geometry.faces, process=False)
     mesh.apply_transform(shape.T_body_shape)

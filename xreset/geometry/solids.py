@@ -68,7 +68,11 @@ def signed_distance(shape: Shape, points: np.ndarray) -> np.ndarray:
         return np.linalg.norm(local, axis=1) - size[0]
     if kind == "hull":
         return _from_hull(shape, points)
-    beyond = np.abs(local) - size if kind == "box" else np.column_stack((np.hypot(*local[:, :2].T), np.abs(local[:, 2]))) - size
+    beyond = (
+        np.abs(local) - size
+        if kind == "box"
+        else np.column_stack((np.hypot(*local[:, :2].T), np.abs(local[:, 2]))) - size
+    )
     return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
 
 

@@ -48,10 +48,14 @@ class Surface:
 
         count = int(np.clip(mesh.area / _SAMPLE_SPACING**2, 2_000, 40_000))
         drawn = trimesh.sample.sample_surface(mesh, count, seed=0)
-        samples = np.concatenate((drawn[0], self._triangles.mean(axis=1)))  # so that no small triangle goes without a sample
+        samples = np.concatenate(
+            (drawn[0], self._triangles.mean(axis=1))
+        )  # so that no small triangle goes without a sample
         owners = np.concatenate((drawn[1], np.arange(len(self._triangles))))
         outward = _GRID_SPACING * np.asarray(mesh.face_normals)[owners]
-        buried = self._at_nodes(inside, samples + outward) & self._at_nodes(inside, samples - outward)  # where the parts of a mesh overlap
+        buried = self._at_nodes(inside, samples + outward) & self._at_nodes(
+            inside, samples - outward
+        )  # where the parts of a mesh overlap
         self._owners, self._tree = owners[~buried], cKDTree(samples[~buried])
 
         nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

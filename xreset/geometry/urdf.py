@@ -218,7 +218,9 @@ def check_tree(tree: RobotTree, path: Path) -> None:
         if not ((np.abs(joint.T_parent_joint) < _LARGEST).all() and np.isfinite(joint.axis).all()):
             raise RobotError(f"{path}: joint {joint.name!r} has a number that is not finite, or far too large.")
         if math.isnan(joint.velocity) or not joint.lower <= joint.upper:
-            raise RobotError(f"{path}: joint {joint.name!r} has the limits {joint.lower} to {joint.upper}, expected the lower one first.")
+            raise RobotError(
+                f"{path}: joint {joint.name!r} has the limits {joint.lower} to {joint.upper}, expected the lower one first."
+            )
 
 
 def _link(link, path: Path) -> Link:
@@ -256,7 +258,9 @@ def _hull(mesh, link: str, path: Path) -> Geometry:
 
     file = find_mesh(mesh.filename, path)
     if file is None:
-        raise RobotError(f"{path}: link {link!r} uses the mesh {shown(mesh.filename)}, which is not in its folders. Put it there.")
+        raise RobotError(
+            f"{path}: link {link!r} uses the mesh {shown(mesh.filename)}, which is not in its folders. Put it there."
+        )
     try:
         if file.stat().st_size > max_bytes():
             raise ValueError(f"it has {file.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows")
@@ -268,7 +272,9 @@ def _hull(mesh, link: str, path: Path) -> Geometry:
         scale = np.ones(3) if mesh.scale is None else np.broadcast_to(np.asarray(mesh.scale, dtype=float), 3)
         return hull(np.asarray(loaded.vertices) * scale, HULL_TOLERANCE).geometry
     except Exception as error:  # trimesh and qhull raise whatever they meet
-        raise RobotError(f"{path}: link {link!r} uses the mesh {mesh.filename!r}, which cannot be read: {shown(str(error))}") from error
+        raise RobotError(
+            f"{path}: link {link!r} uses the mesh {mesh.filename!r}, which cannot be read: {shown(str(error))}"
+        ) from error
 
 
 _ABOVE = 3
@@ -279,7 +285,9 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
     """The file that a URDF's mesh name means, or None: a name cannot lead out of the robot's folders."""
     relative = Path(name.split("://", 1)[1]) if "://" in name else Path(name)
     folders = [folder for folder in urdf.parents[: _ABOVE + 1] if folder != folder.parent]
-    names = [relative, Path(*relative.parts[1:])] if name.startswith("package://") else [relative]  # a package's own folder may be above
+    names = (
+        [relative, Path(*relative.parts[1:])] if name.startswith("package://") else [relative]
+    )  # a package's own folder may be above
     candidates = (Path(os.path.normpath(folder / each)) for each in names for folder in folders)
     try:
         return next((file for file in candidates if file.is_relative_to(folders[-1]) and file.is_file()), None)
@@ -289,7 +297,9 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
 
 def _joint(joint, path: Path) -> Joint:
     if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
-        raise RobotError(f"{path}: joint {joint.name!r} has type {joint.type!r}; supported are revolute, continuous, prismatic and fixed.")
+        raise RobotError(
+            f"{path}: joint {joint.name!r} has type {joint.type!r}; supported are revolute, continuous, prismatic and fixed."
+        )
     axis = np.array([1.0, 0, 0]) if joint.axis is None else np.asarray(joint.axis, dtype=float)
     if joint.type != "fixed" and not np.linalg.norm(axis) > _MASSLESS:
         raise RobotError(f"{path}: joint {joint.name!r} has the axis {axis}, expected a direction.")

@@ -26,9 +26,15 @@ FRAME_INERTIA = 1e-7
 """Its moment of inertia about every axis [kg m^2]."""
 
 
-def pose(xyz: Sequence[float] = (0, 0, 0), *, rpy: Sequence[float] = (0, 0, 0), quat: Sequence[float] | None = None) -> np.ndarray:
+def pose(
+    xyz: Sequence[float] = (0, 0, 0), *, rpy: Sequence[float] = (0, 0, 0), quat: Sequence[float] | None = None
+) -> np.ndarray:
     """[4, 4] pose from a position [m] and roll, pitch, yaw about fixed axes [rad], or a quaternion (w, x, y, z) of any length."""
-    rotation = Rotation.from_euler("xyz", rpy) if quat is None else Rotation.from_quat(np.array(quat, dtype=float), scalar_first=True)
+    rotation = (
+        Rotation.from_euler("xyz", rpy)
+        if quat is None
+        else Rotation.from_quat(np.array(quat, dtype=float), scalar_first=True)
+    )
     T = np.eye(4)
     T[:3, :3] = rotation.as_matrix()
     T[:3, 3] = xyz
@@ -118,10 +124,14 @@ class ArmLink:
             name=self.joint, type=self.type, parent=parent, child=self.name, T_parent_joint=pose(self.xyz, rpy=self.rpy),
             axis=np.array(self.axis, dtype=float), lower=self.range[0], upper=self.range[1], velocity=self.velocity,
         )  # fmt: skip
-        return joint, Link(name=self.name, mass=self.mass, com=np.array(self.com), inertia=inertia, collisions=self.shapes)
+        return joint, Link(
+            name=self.name, mass=self.mass, com=np.array(self.com), inertia=inertia, collisions=self.shapes
+        )
 
 
-def urdf_text(tree: RobotTree, effort: Mapping[str, float], *, mimics: Sequence[MimicSpec] = (), comment: str = "") -> str:
+def urdf_text(
+    tree: RobotTree, effort: Mapping[str, float], *, mimics: Sequence[MimicSpec] = (), comment: str = ""
+) -> str:
     """The URDF of a tree.
 
     Args:
@@ -145,10 +155,17 @@ def urdf_text(tree: RobotTree, effort: Mapping[str, float], *, mimics: Sequence[
         if joint.type == "fixed":
             continue
         SubElement(element, "axis", xyz=_numbers(joint.axis))
-        limit = {"lower": joint.lower, "upper": joint.upper, "effort": effort.get(joint.name, 0.0), "velocity": joint.velocity}
+        limit = {
+            "lower": joint.lower,
+            "upper": joint.upper,
+            "effort": effort.get(joint.name, 0.0),
+            "velocity": joint.velocity,
+        }
         SubElement(element, "limit", {key: _number(value) for key, value in limit.items()})
         if mimic := by_joint.get(joint.name):
-            SubElement(element, "mimic", joint=mimic.source, multiplier=_number(mimic.multiplier), offset=_number(mimic.offset))
+            SubElement(
+                element, "mimic", joint=mimic.source, multiplier=_number(mimic.multiplier), offset=_number(mimic.offset)
+            )
     ElementTree.indent(robot)
     head = "".join(f"  {line}\n" for line in comment.splitlines())
     return f'<?xml version="1.0"?>\n<!--\n{head}-->\n{ElementTree.tostring(robot, encoding="unicode")}\n'
@@ -163,7 +180,9 @@ def write_meshes(tree: RobotTree, folder: Path) -> None:
                 continue
             file = folder / _mesh_name(link.name, number)
             file.parent.mkdir(parents=True, exist_ok=True)
-            lines = [f"v {_numbers(vertex)}" for vertex in geometry.vertices] + [f"f {a} {b} {c}" for a, b, c in geometry.faces + 1]
+            lines = [f"v {_numbers(vertex)}" for vertex in geometry.vertices] + [
+                f"f {a} {b} {c}" for a, b, c in geometry.faces + 1
+            ]
             file.write_text("\n".join(lines) + "\n")
 
 
@@ -171,7 +190,9 @@ def _mesh_name(link: str, number: int) -> str:
     return f"meshes/{link.replace('/', '_')}_{number}.obj"
 
 
-def _between(kind: Literal["capsule", "cylinder"], start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
+def _between(
+    kind: Literal["capsule", "cylinder"], start: Sequence[float], end: Sequence[float], radius: float
+) -> Shape:
     a, b = np.array(start, dtype=float), np.array(end, dtype=float)
     length = float(np.linalg.norm(b - a))
     direction = (b - a) / length

@@ -64,9 +64,13 @@ class Choice(Checked):
     def sentence(self) -> str:
         """What was chosen and by what, in one line."""
         last, own = self.candidates[0], self.candidate
-        worst = f"{100 * own.worst:.1f} % in its worst engine ({min(own.task_progress, key=own.task_progress.__getitem__)})"
+        worst = (
+            f"{100 * own.worst:.1f} % in its worst engine ({min(own.task_progress, key=own.task_progress.__getitem__)})"
+        )
         against = "it is the newest" if last is own else f"the newest, {last.name}, has {100 * last.worst:.1f} %"
-        return f"{self.chosen}, {worst}, of {len(self.candidates)} checkpoints in {len(self.engines)} engines; {against}."
+        return (
+            f"{self.chosen}, {worst}, of {len(self.candidates)} checkpoints in {len(self.engines)} engines; {against}."
+        )
 
 
 def write_choice(folder: Path, choice: Choice) -> None:

@@ -80,7 +80,9 @@ class PpoConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.horizon % self.sequence_length:
-            raise ValueError(f"sequence_length is {self.sequence_length}, expected a divisor of the horizon, which is {self.horizon}")
+            raise ValueError(
+                f"sequence_length is {self.sequence_length}, expected a divisor of the horizon, which is {self.horizon}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +117,12 @@ def rsl_rl_config(config: TrainConfig, num_envs: int, synergies: Any = None) -> 
         "lstm_dim": m.lstm,
         "bfloat16_clouds": p.precision == "bfloat16",
     }
-    gaussian = {"class_name": "xreset.learning.model:Gaussian", "init_std": m.initial_std, "std_type": "log", "learn_std": True}
+    gaussian = {
+        "class_name": "xreset.learning.model:Gaussian",
+        "init_std": m.initial_std,
+        "std_type": "log",
+        "learn_std": True,
+    }
     if m.synergy_std is not None and synergies is not None and synergies.shape[1]:
         gaussian |= {
             "class_name": "xreset.learning.synergies:SynergyGaussian", "directions": synergies.tolist(), "synergy_std": m.synergy_std,
@@ -128,7 +135,9 @@ def rsl_rl_config(config: TrainConfig, num_envs: int, synergies: Any = None) -> 
             "critic": ["policy", "proprio", "privileged", "perception"],
         },
         "actor": network | {"distribution_cfg": gaussian},
-        "critic": network | {"class_name": "xreset.learning.model:ReturnCritic"} if m.normalize_returns else dict(network),
+        "critic": network | {"class_name": "xreset.learning.model:ReturnCritic"}
+        if m.normalize_returns
+        else dict(network),
         "algorithm": {
             "class_name": "xreset.learning.ppo:SequencePpo",
             "sequence_length": p.sequence_length,

@@ -34,7 +34,9 @@ class Processes:
             int(os.environ.get(name, default)) for name, default in (("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1))
         )
         if not 0 <= local_rank <= rank < count:
-            raise RunError(f"RANK={rank}, LOCAL_RANK={local_rank}, WORLD_SIZE={count} contradict one another; start with torchrun.")
+            raise RunError(
+                f"RANK={rank}, LOCAL_RANK={local_rank}, WORLD_SIZE={count} contradict one another; start with torchrun."
+            )
         return cls(rank=rank, local_rank=local_rank, count=count)
 
     @property

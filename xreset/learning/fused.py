@@ -97,7 +97,9 @@ def _backward(
         a1_low = a1.to(second.dtype)
         a2 = _elu(tl.dot(a1_low, second) + bias2[None, :])
         at = frame * C + c
-        g3 = tl.where(tl.load(winner + at).to(tl.int32)[None, :] == p[:, None], tl.load(gradient + at)[None, :], 0.0).to(second.dtype)
+        g3 = tl.where(
+            tl.load(winner + at).to(tl.int32)[None, :] == p[:, None], tl.load(gradient + at)[None, :], 0.0
+        ).to(second.dtype)
         if LOWER:
             points = tl.trans(_points(cloud, frame, second.dtype, P))
             g2 = (tl.dot(g3, third_t) * _elu_slope(a2)).to(second.dtype)
@@ -120,11 +122,15 @@ class _FusedPointNet(torch.autograd.Function):
     """(cloud [F, P, 3], weights and biases of three layers) -> [F, C]. Clouds are observations: they get no gradient."""
 
     @staticmethod
-    def forward(ctx: Any, cloud: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, cloud: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor
+    ) -> Tensor:
         frames, points, _ = cloud.shape
         sizes = {"P": points, "A": len(w1), "B": len(w2), "C": len(w3)}
         if cloud.numel() >= 2**31:
-            raise ValueError(f"{frames} clouds of {points} points are more than the kernels can address at once; pass fewer")
+            raise ValueError(
+                f"{frames} clouds of {points} points are more than the kernels can address at once; pass fewer"
+            )
         low2, low3 = w2.to(FACTORS), w3.to(FACTORS)
         out = torch.empty(frames, len(w3), device=cloud.device)
         winner = torch.empty(frames, len(w3), dtype=torch.int16, device=cloud.device)
@@ -151,7 +157,15 @@ class _FusedPointNet(torch.autograd.Function):
                 **ctx.sizes, LOWER=lower, **_BACKWARD,
             )  # fmt: skip
         first = d1.sum(dim=0)
-        return None, (first[:3] + first[4:7]).T, first[3], d2.sum(dim=0).T, db2[:, 3].sum(dim=0), d3.sum(dim=0).T, gradient.sum(dim=0)
+        return (
+            None,
+            (first[:3] + first[4:7]).T,
+            first[3],
+            d2.sum(dim=0).T,
+            db2[:, 3].sum(dim=0),
+            d3.sum(dim=0).T,
+            gradient.sum(dim=0),
+        )
 
 
 @functools.cache
@@ -162,7 +176,12 @@ def _processors(device: torch.device) -> int:
 
 def supports(points: int, widths: tuple[int, ...]) -> bool:
     """Whether the kernels can take clouds of that many points through layers of these widths: three of them, powers of two."""
-    return len(widths) == 3 and all(n >= 16 and n & (n - 1) == 0 for n in (points, *widths)) and max(widths) <= 128 and points <= 128
+    return (
+        len(widths) == 3
+        and all(n >= 16 and n & (n - 1) == 0 for n in (points, *widths))
+        and max(widths) <= 128
+        and points <= 128
+    )
 
 
 def fused_pointnet(cloud: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor) -> Tensor:

@@ -44,7 +44,9 @@ class PointNet(nn.Module):
             from xreset.learning import fused
 
             if fused.supports(cloud.shape[-2], tuple(layer.out_features for layer in linear)):
-                return fused.fused_pointnet(cloud, *(parameter for layer in linear for parameter in (layer.weight, layer.bias)))
+                return fused.fused_pointnet(
+                    cloud, *(parameter for layer in linear for parameter in (layer.weight, layer.bias))
+                )
         with torch.autocast("cuda", dtype=torch.bfloat16):
             return self.mlp(cloud).amax(dim=-2).float()
 
@@ -59,8 +61,12 @@ def embed_sequences(pointnet: PointNet, cloud: Tensor, first: Tensor) -> Tensor:
     frames = torch.cat((cloud[0, :, :-1].transpose(0, 1), cloud[:, :, -1]))  # [H - 1 + L, N, P, 3]
     embedded = pointnet(frames)
     step = torch.arange(steps, device=cloud.device)
-    begin = torch.where(first, step[:, None], -history).cummax(dim=0).values  # [L, N] step of this episode's beginning, if it is in here
-    shifted = step[:, None, None] + torch.arange(1 - history, 1, device=cloud.device)  # [L, 1, H] step whose newest frame it was
+    begin = (
+        torch.where(first, step[:, None], -history).cummax(dim=0).values
+    )  # [L, N] step of this episode's beginning, if it is in here
+    shifted = step[:, None, None] + torch.arange(
+        1 - history, 1, device=cloud.device
+    )  # [L, 1, H] step whose newest frame it was
     source = torch.maximum(shifted, begin[..., None]) + history - 1
     return embedded.transpose(0, 1)[torch.arange(cloud.shape[1], device=cloud.device)[:, None], source]
 
@@ -94,7 +100,10 @@ def run_lstm(lstm: nn.LSTM, x: Tensor, keep: Tensor, state: LstmState) -> tuple[
     recurrent = recurrent.to(low)
     h, c = h[0], c[0]
     for step, kept in zip(inputs, keep.to(h.dtype)[..., None], strict=True):
-        gates = (step.to(h.dtype), nn.functional.linear((h * kept).to(low), recurrent).to(h.dtype))  # one step's, while it is in the cache
+        gates = (
+            step.to(h.dtype),
+            nn.functional.linear((h * kept).to(low), recurrent).to(h.dtype),
+        )  # one step's, while it is in the cache
         h, c, _ = torch.ops.aten._thnn_fused_lstm_cell(*gates, c * kept, bias, recurrent_bias)
         out.append(h)
     return torch.stack(out), (h[None], c[None])
@@ -104,7 +113,13 @@ class Trunk(nn.Module):
     """From observations to the MLP's input: what training and the exported policy share."""
 
     def __init__(
-        self, flat_dim: int, history: int, pointnet_dims: list[int], lstm_dim: int, activation: str, normalizer: nn.Module
+        self,
+        flat_dim: int,
+        history: int,
+        pointnet_dims: list[int],
+        lstm_dim: int,
+        activation: str,
+        normalizer: nn.Module,
     ) -> None:
         """Build normaliser, PointNet, LSTM and layer norm."""
         super().__init__()
@@ -164,7 +179,9 @@ class PointNetLstmModel(MLPModel):
         self.cloud_group = next(group for group in obs_groups[obs_set] if obs[group].ndim == 4)
         super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims, activation, False, distribution_cfg)
         normalizer = EmpiricalNormalization(self.obs_dim) if obs_normalization else nn.Identity()
-        self.trunk = Trunk(self.obs_dim, obs[self.cloud_group].shape[1], list(pointnet_dims), lstm_dim, activation, normalizer)
+        self.trunk = Trunk(
+            self.obs_dim, obs[self.cloud_group].shape[1], list(pointnet_dims), lstm_dim, activation, normalizer
+        )
         self.trunk.pointnet.use_bfloat16 = bfloat16_clouds
         self.state: LstmState | None = None
         self.reuse_embeddings = False
@@ -184,7 +201,9 @@ class PointNetLstmModel(MLPModel):
                 zero = flat.new_zeros(1, flat.shape[0], self._latent_dim)
                 self.state = (zero, zero.clone())
             joined = trunk.join(flat, self._embed(cloud))
-            out, self.state = run_lstm(trunk.lstm, joined[None], torch.ones_like(joined[None, :, 0], dtype=torch.bool), self.state)
+            out, self.state = run_lstm(
+                trunk.lstm, joined[None], torch.ones_like(joined[None, :, 0], dtype=torch.bool), self.state
+            )
             return trunk.norm(out[0])
         assert isinstance(hidden_state, tuple), "an update needs the LSTM state that each sequence began with"
         self._embeddings = None  # the weights are about to change
@@ -284,7 +303,11 @@ class ReturnCritic(PointNetLstmModel):
         rate = (1.0 / self.rollouts).clamp_min(self.RATE)
         shift = returns.mean() - self.return_mean
         mean = self.return_mean + rate * shift
-        variance = (1 - rate) * self.return_std.square() + rate * returns.var(unbiased=False) + rate * (1 - rate) * shift.square()
+        variance = (
+            (1 - rate) * self.return_std.square()
+            + rate * returns.var(unbiased=False)
+            + rate * (1 - rate) * shift.square()
+        )
         std = variance.sqrt().clamp_min(1e-3)
         last = [layer for layer in self.mlp.modules() if isinstance(layer, nn.Linear)][-1]
         last.weight.mul_(self.return_std / std)
@@ -302,7 +325,9 @@ class ExportedPolicy(nn.Module):
         self.trunk = copy.deepcopy(model.trunk)
         self.trunk.pointnet.use_bfloat16 = False
         self.mlp = copy.deepcopy(model.mlp)
-        self.output = model.distribution.as_deterministic_output_module() if model.distribution is not None else nn.Identity()
+        self.output = (
+            model.distribution.as_deterministic_output_module() if model.distribution is not None else nn.Identity()
+        )
         self.flat_dim, self.lstm_dim = model.obs_dim, model._latent_dim
         self.cpu().eval()
 

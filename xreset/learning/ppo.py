@@ -41,7 +41,9 @@ class SequenceStorage(RolloutStorage):
         # step 0 begins with the state that was saved there, zeroed where an episode had ended
         first[1:] = self.dones[:-1, worlds, 0].bool()
         states = tuple(
-            tuple(s[:: self.sequence_length, 0, worlds].flatten(0, 1)[None] for s in saved) if saved is not None else None
+            tuple(s[:: self.sequence_length, 0, worlds].flatten(0, 1)[None] for s in saved)
+            if saved is not None
+            else None
             for saved in (self.saved_hidden_state_a, self.saved_hidden_state_c)
         )  # [T, 1, N, lstm] -> [1, pieces * M, lstm]
         return RolloutStorage.Batch(
@@ -69,7 +71,9 @@ SLOWEST, FASTEST = 1e-5, 1e-2
 class SequencePpo(PPO):
     """rsl-rl's PPO with :class:`SequenceStorage`, an update that never waits for a GPU, and a critic that may learn at its own rate."""
 
-    def __init__(self, *args: Any, critic_learning_rate: float | None = None, bounds_loss: float = 0.0, **options: Any) -> None:
+    def __init__(
+        self, *args: Any, critic_learning_rate: float | None = None, bounds_loss: float = 0.0, **options: Any
+    ) -> None:
         """Set up as rsl-rl does.
 
         Args:
@@ -81,10 +85,15 @@ class SequencePpo(PPO):
         super().__init__(*args, **options)
         self.critic_learning_rate, self.bounds_loss = critic_learning_rate, bounds_loss
         if critic_learning_rate is not None:
-            groups = [{"params": list(self.actor.parameters())}, {"params": list(self.critic.parameters()), "lr": critic_learning_rate}]
+            groups = [
+                {"params": list(self.actor.parameters())},
+                {"params": list(self.critic.parameters()), "lr": critic_learning_rate},
+            ]
             self.optimizer = type(self.optimizer)(groups, lr=self.learning_rate)
         device, count = torch.device(self.device), self.storage.num_envs
-        self._rate = torch.tensor(self.learning_rate, device=device, dtype=torch.float32 if device.type == "cuda" else torch.float64)
+        self._rate = torch.tensor(
+            self.learning_rate, device=device, dtype=torch.float32 if device.type == "cuda" else torch.float64
+        )
         self._sums = torch.zeros(4, device=device)
         self._worlds = torch.zeros(count // self.num_mini_batches, dtype=torch.long, device=device)
         self._beside = torch.cuda.Stream(device) if device.type == "cuda" else None
@@ -131,7 +140,9 @@ class SequencePpo(PPO):
             self._use_rate()
         advantages = batch.advantages.squeeze(-1)
         ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze(-1))
-        surrogate = torch.max(-advantages * ratio, -advantages * ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)).mean()
+        surrogate = torch.max(
+            -advantages * ratio, -advantages * ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        ).mean()
         value = self._value_loss(values, batch)
         excess = (self.actor.output_mean.abs() - BOUND).clamp_min(0.0).square().sum(dim=-1).mean()
         loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy + self.bounds_loss * excess
@@ -190,7 +201,9 @@ class SequencePpo(PPO):
         step.observations, step.hidden_states = obs, (self.actor.get_hidden_state(), critic.get_hidden_state())
         if self._beside is not None:
             self._beside.wait_stream(torch.cuda.current_stream())
-            self._needed = vars(critic).copy()  # what was allocated on one stream must not be freed while another reads it
+            self._needed = vars(
+                critic
+            ).copy()  # what was allocated on one stream must not be freed while another reads it
         actions = step.actions = self.actor(obs, stochastic_output=True).detach()
         step.actions_log_prob = self.actor.get_output_log_prob(actions).detach()
         step.distribution_params = tuple(p.detach() for p in self.actor.output_distribution_params)
@@ -205,7 +218,9 @@ class SequencePpo(PPO):
             self._needed = {}
         step = self.storage.step
         if not step:
-            self._faulty = torch.zeros(self.storage.num_transitions_per_env, *dones.shape, dtype=torch.bool, device=self.device)
+            self._faulty = torch.zeros(
+                self.storage.num_transitions_per_env, *dones.shape, dtype=torch.bool, device=self.device
+            )
         if "faulty" in extras:
             self._faulty[step] = extras["faulty"]
         super().process_env_step(obs, rewards, dones, extras)
@@ -218,7 +233,9 @@ class SequencePpo(PPO):
         storage, faulty, advantages = self.storage, self._faulty[..., None], self.storage.advantages
         storage.rewards = torch.where(faulty, storage.values, storage.rewards)
         super().compute_returns(obs)
-        storage.advantages = advantages.copy_(torch.where(faulty, 0.0, storage.advantages))  # where the update's graph finds them
+        storage.advantages = advantages.copy_(
+            torch.where(faulty, 0.0, storage.advantages)
+        )  # where the update's graph finds them
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> PPO:

@@ -25,7 +25,9 @@ _MINUTES = TrainConfig(
         substeps=2,
         action=ActionConfig(hand="relative"),
         observation=ObservationConfig(rotation="matrix", cloud_scale=5.0, contact_force_scale=0.03, joint_target=True),
-        reward=RewardConfig(reach_width=0.4, reach_near=1.0, reach_distance="present", contact="opposing", raw_actions=True),
+        reward=RewardConfig(
+            reach_width=0.4, reach_near=1.0, reach_distance="present", contact="opposing", raw_actions=True
+        ),
     ),
     model=ModelConfig(initial_std=0.3),
     ppo=PpoConfig(mini_epochs=3, minibatch_size=16384, precision="bfloat16", desired_kl=0.02, entropy=0.0),

@@ -70,7 +70,9 @@ def read_run(folder: str | Path) -> RunInfo:
 
     folder = Path(folder)
     if not (folder / "run.json").is_file():
-        raise RunError(f"{folder} is not a run folder: it has no run.json. Make one with: xreset train --out {folder} ...")
+        raise RunError(
+            f"{folder} is not a run folder: it has no run.json. Make one with: xreset train --out {folder} ..."
+        )
     data = read_json(folder / "run.json", SCHEMA)
     where = f"{folder / 'run.json'} (of xreset {shown(data.pop('xreset', None))})"
     info = from_dict(RunInfo, data, where)

@@ -60,10 +60,16 @@ class TrainingRunner(OnPolicyRunner):
             self.processes.count,
         )
         self.is_distributed = self.gpu_world_size > 1
-        ranks = {"global_rank": self.gpu_global_rank, "local_rank": self.gpu_local_rank, "world_size": self.gpu_world_size}
+        ranks = {
+            "global_rank": self.gpu_global_rank,
+            "local_rank": self.gpu_local_rank,
+            "world_size": self.gpu_world_size,
+        }
         self.cfg["multi_gpu"] = ranks if self.is_distributed else None
 
-    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False, *, seconds: float = math.inf) -> None:
+    def learn(
+        self, num_learning_iterations: int, init_at_random_ep_len: bool = False, *, seconds: float = math.inf
+    ) -> None:
         """Train until ``num_learning_iterations`` iterations are done in all; returns early, checkpoint written, after Ctrl-C.
 
         Args:
@@ -78,7 +84,11 @@ class TrainingRunner(OnPolicyRunner):
         if self.is_distributed:
             alg.broadcast_parameters()
         obs = env.get_observations()
-        log = _Log(self.folder, env.num_envs, str(env.device), num_learning_iterations) if self.processes.is_main else None
+        log = (
+            _Log(self.folder, env.num_envs, str(env.device), num_learning_iterations)
+            if self.processes.is_main
+            else None
+        )
         if log is not None:
             log.clock.resume(self.iteration)
             if self._log_state is not None:
@@ -87,7 +97,9 @@ class TrainingRunner(OnPolicyRunner):
         budget = FaultBudget(horizon * env.num_envs * self.gpu_world_size)
         end = time.perf_counter() + seconds
         with _stop_on_interrupt() as stop:
-            while self.iteration < num_learning_iterations and not self._agreed(bool(stop) or time.perf_counter() > end):
+            while self.iteration < num_learning_iterations and not self._agreed(
+                bool(stop) or time.perf_counter() > end
+            ):
                 start = time.perf_counter()
                 with torch.no_grad():
                     for _ in range(horizon):
@@ -145,7 +157,11 @@ class TrainingRunner(OnPolicyRunner):
         with _fits(path):
             self.alg.load(content, None, strict=True)
             self.alg.learning_rate = float(content["learning_rate"])
-            self.iteration, self.env_steps, self.elapsed = int(content["iteration"]), int(content["env_steps"]), float(content["elapsed"])
+            self.iteration, self.env_steps, self.elapsed = (
+                int(content["iteration"]),
+                int(content["env_steps"]),
+                float(content["elapsed"]),
+            )
             if self.processes.rank < len(content["random"]):
                 self._set_random_state(content["random"][self.processes.rank])
         self._continue_worlds()
@@ -174,7 +190,9 @@ class TrainingRunner(OnPolicyRunner):
         before = env.snapshot()
         try:
             content = torch.load(path, map_location=self.device, weights_only=True)
-            mine = content["processes"][self.processes.rank] if self.processes.rank < len(content["processes"]) else None
+            mine = (
+                content["processes"][self.processes.rank] if self.processes.rank < len(content["processes"]) else None
+            )
             if mine is None or content["iteration"] != self.iteration or not env.restore(mine["env"]):
                 return
             for name, model in (("actor", self.alg.actor), ("critic", self.alg.critic)):
@@ -260,7 +278,9 @@ def _fits(path: Path) -> Iterator[None]:
         yield
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         reason = shown(str(error).splitlines()[0] if str(error) else type(error).__name__)
-        raise RunError(f"{path} does not fit this run ({reason}). Was it written by another run, or another version of xreset?") from error
+        raise RunError(
+            f"{path} does not fit this run ({reason}). Was it written by another run, or another version of xreset?"
+        ) from error
 
 
 _CHECKPOINT_KEYS = (

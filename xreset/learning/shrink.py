@@ -72,7 +72,9 @@ def halve_matrices(model: ModelProto, source: str) -> int:
                 f"{source} has weights up to {np.abs(exact).max():.3g} in {name}, float16 ends at 65504. Use the file as it was exported."
             )
         weights.CopyFrom(numpy_helper.from_array(rounded, name + _SUFFIX))
-        casts.append(helper.make_node("Cast", [name + _SUFFIX], [name], name=f"{name}_to_float32", to=TensorProto.FLOAT))
+        casts.append(
+            helper.make_node("Cast", [name + _SUFFIX], [name], name=f"{name}_to_float32", to=TensorProto.FLOAT)
+        )
     nodes = [*casts, *graph.node]
     del graph.node[:]
     graph.node.extend(nodes)

@@ -52,7 +52,13 @@ def load_inputs(robot: str, resets: str | Path, objects: str | Path | None) -> R
     loaded = tuple(load_objects(bank.object_names, folder))
     check_objects(resets, bank, loaded)
     return RunInputs(
-        robot_name=robot, resets=Path(resets), resets_hash=file_hash(resets), objects_folder=folder, robot=spec, bank=bank, objects=loaded
+        robot_name=robot,
+        resets=Path(resets),
+        resets_hash=file_hash(resets),
+        objects_folder=folder,
+        robot=spec,
+        bank=bank,
+        objects=loaded,
     )
 
 
@@ -81,7 +87,9 @@ def start_run(
     if num_envs < 1:
         raise RunError(f"--num-envs is {num_envs}, expected at least 1.")
     if device_for(backend, device) != device:
-        raise RunError(f"the engine {backend!r} does not run on {device!r}. Leave out --device, or choose another --backend.")
+        raise RunError(
+            f"the engine {backend!r} does not run on {device!r}. Leave out --device, or choose another --backend."
+        )
     version = backend_class(backend).engine_version()
     if config.task.reset.demo_probability > 0 and not inputs.bank.num_states:
         raise RunError(
@@ -115,7 +123,9 @@ def start_run(
     )
 
 
-def train(out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: bool = False, seconds: float = math.inf) -> None:
+def train(
+    out: Path, info: RunInfo, inputs: RunInputs | None = None, *, resume: bool = False, seconds: float = math.inf
+) -> None:
     """Train a run that :func:`start_run` has set up, or continue it; export the policy at the end.
 
     With ``torchrun``, every process simulates ``num_envs`` worlds of its own, each on its own GPU, or all on the CPU.
@@ -155,13 +165,17 @@ def _too_little_memory(out: Path, info: RunInfo) -> str:
     )
 
 
-def _train(processes: Processes, out: Path, info: RunInfo, inputs: RunInputs | None, *, resume: bool, seconds: float) -> None:
+def _train(
+    processes: Processes, out: Path, info: RunInfo, inputs: RunInputs | None, *, resume: bool, seconds: float
+) -> None:
     device, seed = processes.device(info.device), processes.seed(info.seed)
     if device.startswith("cuda:"):
         torch.cuda.set_device(device)
     inputs = inputs or load_inputs(info.robot, info.resets, info.objects)
     if inputs.resets_hash != info.resets_hash:
-        raise RunError(f"{info.resets} is not the file that this run was started with. Put it back, or start a new run.")
+        raise RunError(
+            f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."
+        )
     config, world = info.config, (inputs.robot, inputs.objects, inputs.bank)
     torch.manual_seed(seed)
     with make_env(*world, config.task, engine=info.backend, num_envs=info.num_envs, device=device, seed=seed) as env:
@@ -184,7 +198,10 @@ def _begin(out: Path, info: RunInfo, iteration: int, *, resume: bool) -> None:
             events.unlink()
     write_run(out, info)
     if resume:
-        print(f"continuing after iteration {iteration}" if iteration else "there is no checkpoint yet: beginning anew", flush=True)
+        print(
+            f"continuing after iteration {iteration}" if iteration else "there is no checkpoint yet: beginning anew",
+            flush=True,
+        )
 
 
 def default_device(backend: str) -> str:
@@ -216,7 +233,11 @@ def ensure_policy(out: Path) -> Path:
 def current_choice(out: Path) -> Choice | None:
     """What ``xreset select`` chose, while the run has no newer checkpoint than it knew, and still has the chosen one."""
     choice, names = read_choice(out), [c.name for c in checkpoints(out)]
-    return choice if choice is not None and names and names[-1] == choice.candidates[0].name and choice.chosen in names else None
+    return (
+        choice
+        if choice is not None and names and names[-1] == choice.candidates[0].name and choice.chosen in names
+        else None
+    )
 
 
 def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
@@ -237,6 +258,8 @@ def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
         },
         batch_size=[1],
     )
-    actor = PointNetLstmModel(example, {"actor": cfg["obs_groups"]["actor"]}, "actor", len(info.contract["joint_names"]), **actor_cfg)
+    actor = PointNetLstmModel(
+        example, {"actor": cfg["obs_groups"]["actor"]}, "actor", len(info.contract["joint_names"]), **actor_cfg
+    )
     actor.load_state_dict(weights)
     export_onnx(actor, policy, info.contract)

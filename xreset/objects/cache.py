@@ -46,7 +46,14 @@ def cached_pieces(mesh: trimesh.Trimesh, source: str, progress: Progress) -> Pie
             arrays = read_npz(path, SCHEMA_NAME, SCHEMA, what="cached convex pieces")
             shapes = tuple(hull(part) for part in np.split(arrays["vertices"], arrays["offsets"][1:-1]))
             deviation, volume = float(arrays["deviation"]), float(arrays["volume"])
-            return Pieces(shapes=shapes, deviation=deviation, volume=volume, com=arrays["com"], inertia=arrays["inertia"], cached=True)
+            return Pieces(
+                shapes=shapes,
+                deviation=deviation,
+                volume=volume,
+                com=arrays["com"],
+                inertia=arrays["inertia"],
+                cached=True,
+            )
         except (FileFormatError, ObjectError):
             path.unlink(missing_ok=True)  # damaged: make it again
     pieces = decompose(mesh, settings, progress)

@@ -68,7 +68,9 @@ def load_object(name: str, folder: Path | None = None) -> ObjectSpec:
     try:
         full = canonical_name(name, files)
     except ObjectError as error:
-        raise ObjectError(f"{error} (looked for meshes in {folder}; without that folder the built-in stand-ins are used)") from None
+        raise ObjectError(
+            f"{error} (looked for meshes in {folder}; without that folder the built-in stand-ins are used)"
+        ) from None
     return import_mesh(files[full], full)
 
 

@@ -102,7 +102,9 @@ Progress = Callable[[int, float], None]
 """Called with the number of parts so far and how far the worst stands off the surface [m]."""
 
 
-def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings(), progress: Progress = lambda parts, worst: None) -> Pieces:
+def decompose(
+    mesh: trimesh.Trimesh, settings: Settings = Settings(), progress: Progress = lambda parts, worst: None
+) -> Pieces:
     """Convex pieces that together have the mesh's shape.
 
     Args:
@@ -151,7 +153,10 @@ def as_solid(mesh: trimesh.Trimesh, thickness: float = Settings.thickness) -> Ma
     if not mesh.is_volume:
         mesh = _capped(_thinned(mesh))
     if mesh.is_volume:
-        arrays = np.ascontiguousarray(mesh.vertices, dtype=np.float64), np.ascontiguousarray(mesh.faces, dtype=np.uint64)
+        arrays = (
+            np.ascontiguousarray(mesh.vertices, dtype=np.float64),
+            np.ascontiguousarray(mesh.faces, dtype=np.uint64),
+        )
         solid = m3.Manifold(m3.Mesh64(*arrays))
         if solid.status() == m3.Error.NoError and solid.volume() > 0:
             return solid
@@ -163,7 +168,9 @@ def as_solid(mesh: trimesh.Trimesh, thickness: float = Settings.thickness) -> Ma
     union = m3.Manifold.batch_boolean([m3.Manifold.hull_points(points) for points in ends], m3.OpType.Add)
     outer = [part for part in union.decompose() if part.volume() > 0]  # surfaces of cavities have negative volume
     if not outer:
-        raise ObjectError("the mesh encloses no solid, however its holes are closed; repair it, for example in MeshLab or Blender.")
+        raise ObjectError(
+            "the mesh encloses no solid, however its holes are closed; repair it, for example in MeshLab or Blender."
+        )
     return m3.Manifold.batch_boolean(outer, m3.OpType.Add)
 
 
@@ -240,7 +247,9 @@ class _Surface:
         near = self.vertices[self.faces[self._of[self._tree.query(middle, _NEAREST)[1]]]]
         points = np.stack((middle, *corners.transpose(1, 0, 2)))[:, :, None].repeat(_NEAREST, axis=2)
         near = np.broadcast_to(near, (4, *near.shape)).reshape(-1, 3, 3)
-        closest = closest_point(1e3 * near, 1e3 * points.reshape(-1, 3)) / 1e3  # its own tolerance is for triangles of millimetres
+        closest = (
+            closest_point(1e3 * near, 1e3 * points.reshape(-1, 3)) / 1e3
+        )  # its own tolerance is for triangles of millimetres
         return np.linalg.norm(points - closest.reshape(points.shape), axis=3)
 
     def bare(self, shapes: Sequence[Shape]) -> float:
@@ -320,7 +329,9 @@ def _cut_again(
     def add(piece: Manifold) -> None:
         effort.spend(surface.solid)
         shape = limited_hull(_arrays(piece)[0], settings.max_vertices)
-        heapq.heappush(queue, (-surface.excess(hull_points(shape.geometry.vertices), surface.deviation), next(count), piece, shape))
+        heapq.heappush(
+            queue, (-surface.excess(hull_points(shape.geometry.vertices), surface.deviation), next(count), piece, shape)
+        )
 
     for piece in pieces:
         add(piece)

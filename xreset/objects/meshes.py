@@ -57,12 +57,16 @@ def mesh_files(folder: str | Path) -> dict[str, Path]:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ObjectError(f"there is no folder {folder}; expected a folder of meshes such as NAME.obj or NAME/textured_simple.obj.")
+        raise ObjectError(
+            f"there is no folder {folder}; expected a folder of meshes such as NAME.obj or NAME/textured_simple.obj."
+        )
     found = {path.stem: path for path in folder.glob("*.obj")}
     for file in ("textured.obj", "textured_simple.obj"):  # the simpler one wins
         found |= {path.parent.name: path for path in folder.glob(f"*/{file}")}
     if not found:
-        raise ObjectError(f"there is no mesh in {folder}; expected NAME.obj, NAME/textured_simple.obj or NAME/textured.obj.")
+        raise ObjectError(
+            f"there is no mesh in {folder}; expected NAME.obj, NAME/textured_simple.obj or NAME/textured.obj."
+        )
     return dict(sorted(found.items()))
 
 
@@ -74,7 +78,9 @@ def import_mesh(path: str | Path, name: str) -> ObjectSpec:
     return result.obj
 
 
-def import_with_notes(path: str | Path, name: str, *, mass: float | None = None, progress: Progress = lambda parts, worst: None) -> Import:
+def import_with_notes(
+    path: str | Path, name: str, *, mass: float | None = None, progress: Progress = lambda parts, worst: None
+) -> Import:
     """Read a mesh, cut it into convex pieces and work out its mass properties.
 
     A closed mesh whose mass is that of no solid (below 120 kg/m^3) is a shell: its mass lies evenly on its surface.
@@ -112,9 +118,13 @@ def import_with_notes(path: str | Path, name: str, *, mass: float | None = None,
     elif mesh.is_volume and mass / pieces.volume < _HOLLOW:
         com, inertia = shell_properties(np.asarray(mesh.vertices), np.asarray(mesh.faces), mass)
         litres = pieces.volume * 1e3
-        notes.append(f"the mesh is solid, but {mass:.3f} kg in {litres:.2f} l is a hollow object: its mass is put on its surface")
+        notes.append(
+            f"the mesh is solid, but {mass:.3f} kg in {litres:.2f} l is a hollow object: its mass is put on its surface"
+        )
     if not pieces.finished:
-        notes.append("cutting it was stopped early, for it takes too long: a mesh with fewer triangles would fit better")
+        notes.append(
+            "cutting it was stopped early, for it takes too long: a mesh with fewer triangles would fit better"
+        )
     if len(pieces.shapes) > 1 and pieces.deviation > _FEW_MM:
         notes.append(f"its pieces stand up to {1e3 * pieces.deviation:.1f} mm off its surface")
     obj = ObjectSpec(
@@ -128,7 +138,13 @@ def import_with_notes(path: str | Path, name: str, *, mass: float | None = None,
         source=source,
         friction=own.friction,
     )
-    return Import(obj=obj, notes=tuple(notes), seconds=time.perf_counter() - start, cached=pieces.cached, deviation=pieces.deviation)
+    return Import(
+        obj=obj,
+        notes=tuple(notes),
+        seconds=time.perf_counter() - start,
+        cached=pieces.cached,
+        deviation=pieces.deviation,
+    )
 
 
 def add_mesh(
@@ -151,7 +167,9 @@ def add_mesh(
     target = folder / f"{name}.obj"
     facts = target.with_suffix(".toml")
     if target.exists() or facts.exists():
-        raise ObjectError(f"{target} or its .toml is there already. Nothing was changed; choose another --name or --out.")
+        raise ObjectError(
+            f"{target} or its .toml is there already. Nothing was changed; choose another --name or --out."
+        )
     mesh = read_mesh(path, scale=scale)
     text = mesh.export(file_type="obj", include_normals=False, include_color=False, include_texture=False, header="")
     try:
@@ -188,7 +206,9 @@ def read_mesh(path: Path, *, scale: float = 1.0) -> trimesh.Trimesh:
     if path.stat().st_size > max_bytes():
         raise ObjectError(f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
     try:
-        mesh = trimesh.load(path, force="mesh", skip_materials=True, process=False)  # processing would drop damaged vertices silently
+        mesh = trimesh.load(
+            path, force="mesh", skip_materials=True, process=False
+        )  # processing would drop damaged vertices silently
         if isinstance(mesh, trimesh.Trimesh) and scale != 1.0:
             mesh.apply_scale(scale)
         return _checked(mesh, path)
@@ -208,7 +228,9 @@ def _checked(mesh: object, path: Path) -> trimesh.Trimesh:
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise ObjectError(f"{path} has a triangle of a vertex that is not there; it is damaged.")
     if mesh.extents is not None and mesh.extents.max() > _LARGEST:  # before merging, which rounds by the size
-        raise ObjectError(f"{path} measures {_size(mesh)}; meshes must be in metres. Is it in millimetres (--scale 0.001)?")
+        raise ObjectError(
+            f"{path} measures {_size(mesh)}; meshes must be in metres. Is it in millimetres (--scale 0.001)?"
+        )
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # texture seams are no holes
     mesh.update_faces(mesh.nondegenerate_faces())
     mesh.remove_unreferenced_vertices()

@@ -20,7 +20,9 @@ def rest_height(obj: ObjectSpec, quat: np.ndarray) -> np.ndarray | float:
     """
     w, x, y, z = np.moveaxis(np.asarray(quat, dtype=float), -1, 0)
     norm = w * w + x * x + y * y + z * z
-    up = np.stack((2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z), axis=-1) / norm[..., None]  # R's last row
+    up = (
+        np.stack((2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z), axis=-1) / norm[..., None]
+    )  # R's last row
     height = -(up @ obj.vertices.T).min(axis=-1)
     return float(height) if np.ndim(height) == 0 else height
 
@@ -34,7 +36,9 @@ def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
     corners, normals = obj.vertices[convex.simplices], convex.equations[:, :3]
     distance = normals @ obj.com + convex.equations[:, 3]  # of the centre of mass, negative as it is inside
     foot = obj.com - distance[:, None] * normals
-    turn = np.sign(np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), normals))
+    turn = np.sign(
+        np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), normals)
+    )
     stable = np.ones(len(corners), dtype=bool)
     for i in range(3):
         edge, to_foot = corners[:, (i + 1) % 3] - corners[:, i], foot - corners[:, i]

@@ -55,7 +55,9 @@ def winding_number(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) 
     """
     corners = vertices[faces]
     block = max(1, 2_000_000 // len(faces))  # bounds memory
-    return np.concatenate([_winding(points[i : i + block], corners) for i in range(0, len(points), block)] or [np.empty(0)])
+    return np.concatenate(
+        [_winding(points[i : i + block], corners) for i in range(0, len(points), block)] or [np.empty(0)]
+    )
 
 
 def _winding(points: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -29,12 +29,17 @@ def stand_in(name: str) -> ObjectSpec:
     pieces = _MAKERS[name]()
     vertices, faces = surface_of(pieces)
     com, inertia = mass_properties(vertices, faces, MASSES[name])
-    return ObjectSpec(name=name, pieces=pieces, mass=MASSES[name], com=com, inertia=inertia, vertices=vertices, faces=faces)
+    return ObjectSpec(
+        name=name, pieces=pieces, mass=MASSES[name], com=com, inertia=inertia, vertices=vertices, faces=faces
+    )
 
 
 def _meat_can() -> tuple[Shape, ...]:
     u, v = _turned(3.5)
-    body = [section((-2.4 * MM, -0.5 * MM, z * MM), 49.5 * MM * u, 26.0 * MM * v, power=4.0, count=32) for z in (-49.5, 33.5)]
+    body = [
+        section((-2.4 * MM, -0.5 * MM, z * MM), 49.5 * MM * u, 26.0 * MM * v, power=4.0, count=32)
+        for z in (-49.5, 33.5)
+    ]
     return (loft(body),)
 
 
@@ -50,7 +55,8 @@ def _mustard_bottle() -> tuple[Shape, ...]:
         ((93, 11.0, 11.0, 2.0), (107, 8.5, 8.5, 2.0)),
     )
     return tuple(
-        loft(section(center + z * MM * UP, a * MM * u, b * MM * v, power=power, count=20) for z, a, b, power in part) for part in outline
+        loft(section(center + z * MM * UP, a * MM * u, b * MM * v, power=power, count=20) for z, a, b, power in part)
+        for part in outline
     )
 
 
@@ -81,8 +87,12 @@ def _pitcher() -> tuple[Shape, ...]:
     def ring(z: float, radius: float) -> np.ndarray:
         return section(center + z * MM * UP, radius * MM * out, radius * MM * side, count=20)
 
-    def across(outline: tuple[tuple[float, float], ...], half: float) -> Shape:  # outline: distance from the axis, height
-        return hull(np.array([center + r * MM * out + z * MM * UP + s * half * MM * side for r, z in outline for s in (-1, 1)]))
+    def across(
+        outline: tuple[tuple[float, float], ...], half: float
+    ) -> Shape:  # outline: distance from the axis, height
+        return hull(
+            np.array([center + r * MM * out + z * MM * UP + s * half * MM * side for r, z in outline for s in (-1, 1)])
+        )
 
     body = loft([ring(-146.0, 46.0), ring(-138.0, 52.5), ring(87.0, 65.0)])
     lid = loft([ring(87.0, 56.0), ring(94.5, 30.0)])
@@ -105,18 +115,39 @@ def _pitcher() -> tuple[Shape, ...]:
 
 def _power_drill() -> tuple[Shape, ...]:
     def along_x(x: float, low: float, high: float, depth: float, power: float = 2.5) -> np.ndarray:
-        return section((x * MM, (low + high) / 2 * MM, 0.0), (0, (high - low) / 2 * MM, 0), (0, 0, depth * MM), power=power, count=16)
+        return section(
+            (x * MM, (low + high) / 2 * MM, 0.0),
+            (0, (high - low) / 2 * MM, 0),
+            (0, 0, depth * MM),
+            power=power,
+            count=16,
+        )
 
     def along_y(y: float, left: float, right: float, depth: float, power: float = 3.0) -> np.ndarray:
-        return section(((left + right) / 2 * MM, y * MM, 0.0), ((right - left) / 2 * MM, 0, 0), (0, 0, depth * MM), power=power, count=16)
+        return section(
+            ((left + right) / 2 * MM, y * MM, 0.0),
+            ((right - left) / 2 * MM, 0, 0),
+            (0, 0, depth * MM),
+            power=power,
+            count=16,
+        )
 
     chuck = loft([along_x(-101, 38, 56, 9), along_x(-88, 28, 65, 19.5, 2.0), along_x(-45, 25, 68, 22.0, 2.0)])
-    head = loft([along_x(-45, 23, 71, 24.0), along_x(50, 24, 69, 24.0), along_x(78, 28, 65, 21.0), along_x(82.5, 36, 57, 13.0)])
+    head = loft(
+        [along_x(-45, 23, 71, 24.0), along_x(50, 24, 69, 24.0), along_x(78, 28, 65, 21.0), along_x(82.5, 36, 57, 13.0)]
+    )
     neck = loft([along_y(26, -32, 72, 20.0), along_y(10, -26, 60, 15.0)])
     trigger = loft([along_y(10, -26, 46, 15.5), along_y(-17, -14, 46, 14.0)])
     grip = loft([along_y(-14, 3, 46, 16.5), along_y(-45, 8, 53, 16.5)])
     shaft = loft([along_y(-45, 8, 53, 16.5), along_y(-80, 13, 53, 14.5)])
-    base = loft([along_y(-79, -8, 52, 20.0), along_y(-86, -38, 53, 22.0), along_y(-100, -44, 59, 26.5), along_y(-113, -44, 57, 27.5)])
+    base = loft(
+        [
+            along_y(-79, -8, 52, 20.0),
+            along_y(-86, -38, 53, 22.0),
+            along_y(-100, -44, 59, 26.5),
+            along_y(-113, -44, 57, 27.5),
+        ]
+    )
     return (chuck, head, neck, trigger, grip, shaft, base)
 
 
@@ -126,7 +157,11 @@ def _scissors() -> tuple[Shape, ...]:
     def part(*outline: tuple[float, float]) -> Shape:
         return prism([(x * MM, y * MM) for x, y in outline], low, high)
 
-    blades = prism([(x * MM, y * MM) for x, y in ((8, 44), (21, 44), (39, 108), (40, 127), (36, 128), (28, 115))], -2.0 * MM, 2.8 * MM)
+    blades = prism(
+        [(x * MM, y * MM) for x, y in ((8, 44), (21, 44), (39, 108), (40, 127), (36, 128), (28, 115))],
+        -2.0 * MM,
+        2.8 * MM,
+    )
     hub = part((5, 44), (12, 47), (20, 45), (22, 38), (20, 0), (18, -8), (0, -8), (-5, 0), (-4, 20), (2, 33))
     left = (
         part((-4, 20), (-20, 9), (-38, 0), (-50, -12), (-47, -15), (-20, -9), (-6, -8), (-4, 0)),

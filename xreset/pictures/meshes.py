@@ -108,14 +108,18 @@ class Bodies:
 
 def joined(parts: Sequence[Placed]) -> Placed:
     """All triangles of several."""
-    return Placed(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("corners", "normals", "colors")))
+    return Placed(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("corners", "normals", "colors"))
+    )
 
 
 def shaded_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     """A mesh with a normal at each corner: the mean over the faces around the vertex that meet this one at less than the crease angle."""
     vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces, dtype=np.int64)
     edges = vertices[faces]
-    cross = np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0])  # its length is twice the area: the weight in the mean
+    cross = np.cross(
+        edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0]
+    )  # its length is twice the area: the weight in the mean
     length = np.linalg.norm(cross, axis=1)
     keep = length > 0
     faces, cross, length = faces[keep], cross[keep], length[keep]

@@ -38,7 +38,10 @@ def draw_pieces(objects: Sequence[ObjectSpec], captions: Sequence[str]) -> np.nd
         camera = Camera(eye=tuple(eye.tolist()), target=tuple(middle.tolist()))
         pieces = [shape_mesh(piece) for piece in obj.pieces]
         hues = [colorsys.hsv_to_rgb(0.618 * i % 1, 0.55, 0.95) for i in range(len(pieces))]
-        sides = [([(obj.vertices, obj.faces)], [OBJECT_COLOR]), ([(mesh.vertices, mesh.faces) for mesh in pieces], hues)]
+        sides = [
+            ([(obj.vertices, obj.faces)], [OBJECT_COLOR]),
+            ([(mesh.vertices, mesh.faces) for mesh in pieces], hues),
+        ]
         picture = np.concatenate([draw_bodies(meshes, colors, camera, TILE_SIZE) for meshes, colors in sides], axis=1)
         rows.append(np.concatenate((picture, np.full((_CAPTION, picture.shape[1], 3), 255, np.uint8))))
     lines = [(6, i * (TILE_SIZE[1] + _CAPTION) + TILE_SIZE[1], (caption,)) for i, caption in enumerate(captions)]

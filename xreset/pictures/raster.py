@@ -81,7 +81,14 @@ class Frames:
 class Renderer:
     """Draws one scene again and again. Meshes are prepared once; a picture of 480 x 360 pixels then takes some tens of milliseconds."""
 
-    def __init__(self, scene: SceneSpec, *, size: tuple[int, int] = (480, 360), camera: Camera | None = None, smooth: bool = False) -> None:
+    def __init__(
+        self,
+        scene: SceneSpec,
+        *,
+        size: tuple[int, int] = (480, 360),
+        camera: Camera | None = None,
+        smooth: bool = False,
+    ) -> None:
         """Prepare the meshes.
 
         Args:
@@ -157,7 +164,9 @@ def draw_bodies(
     meshes: Sequence[tuple[np.ndarray, np.ndarray]], colors: Sequence[Color], camera: Camera, size: tuple[int, int]
 ) -> np.ndarray:
     """[H, W, 3] uint8 picture of meshes (vertices [V, 3], outward triangles [F, 3]), each in its colour, without table."""
-    bodies = Bodies([shaded_mesh(vertices, faces) for vertices, faces in meshes], colors).placed(np.tile(np.eye(4), (len(meshes), 1, 1)))
+    bodies = Bodies([shaded_mesh(vertices, faces) for vertices, faces in meshes], colors).placed(
+        np.tile(np.eye(4), (len(meshes), 1, 1))
+    )
     width, height = size
     picture, _ = _shade(_View(camera, (2 * width, 2 * height)), bodies, _Shadow(bodies))
     return (picture.reshape(height, 2, width, 2, 3).mean(axis=(1, 3)).clip(0, 1) * 255 + 0.5).astype(np.uint8)
@@ -185,7 +194,12 @@ def encode_png(picture: np.ndarray) -> bytes:
 
     rows = np.concatenate((np.zeros((height, 1), np.uint8), picture.reshape(height, width * 3)), axis=1)  # 0: no filter
     header = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes((8, 2, 0, 0, 0))  # 8 bits, RGB
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6)) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6))
+        + chunk(b"IEND", b"")
+    )
 
 
 # Projection and rasterisation --------------------------------------------------------------------------------------------------------
@@ -216,7 +230,9 @@ class _View:
 
     def unproject(self, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """World points [..., 3] of pixels at a distance along the view axis."""
-        local = np.stack(((x - self.size[0] / 2) / self.focal, (y - self.size[1] / 2) / self.focal, np.ones_like(x)), axis=-1)
+        local = np.stack(
+            ((x - self.size[0] / 2) / self.focal, (y - self.size[1] / 2) / self.focal, np.ones_like(x)), axis=-1
+        )
         return self.eye + (local * depth[..., None]) @ self.R
 
 
@@ -234,7 +250,9 @@ class _Shadow:
         self.depth = float(flat[:, 2].max() - self.low[2]) + 1e-6
         self.scale = (_SHADOW_SIZE - 2) / self.span
         face, height = _rasterize(
-            (local[..., :2] - self.low[:2]) * self.scale + 1, (local[..., 2] - self.low[2]) / self.depth, (_SHADOW_SIZE, _SHADOW_SIZE)
+            (local[..., :2] - self.low[:2]) * self.scale + 1,
+            (local[..., 2] - self.low[2]) / self.depth,
+            (_SHADOW_SIZE, _SHADOW_SIZE),
         )
         self.map = np.where(face < 0, -math.inf, height)
 
@@ -349,7 +367,9 @@ def _shade(view: _View, scene: Placed, shadow: _Shadow | None) -> tuple[np.ndarr
     gloss = np.einsum("pi,pi->p", normal, _unit(towards + light)).clip(0) ** 32 * lit
     fill = np.einsum("pi,pi->p", normal, towards).clip(0)
     brightness = single(0.40) + single(0.06) * normal[:, 2] + single(0.48) * diffuse + single(0.14) * fill
-    picture[y, x] = (scene.colors.astype(single)[triangle] * brightness[:, None] + single(0.10) * gloss[:, None]).clip(0, 1)
+    picture[y, x] = (scene.colors.astype(single)[triangle] * brightness[:, None] + single(0.10) * gloss[:, None]).clip(
+        0, 1
+    )
     return picture, nearness
 
 

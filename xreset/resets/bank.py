@@ -158,7 +158,9 @@ _DTYPES = {"f": np.float32, "i": np.int32, "b": np.bool_, "U": np.str_}
 def starts_and_goals(motions: ObjectMotions, robot: RobotSpec, sources: Mapping[str, str] | None = None) -> ResetBank:
     """A bank of demonstrations or trajectories without any state; ``sources``: of the objects, where banks are kept."""
     schema, named = schema_of(ResetBank), tuple(sorted({*map(str, motions.object_name)}))
-    of_states = {name: field for name, field in schema.items() if field.required and field.shape[0:1] in (("L",), ("C",))}
+    of_states = {
+        name: field for name, field in schema.items() if field.required and field.shape[0:1] in (("L",), ("C",))
+    }
     (start_pos, start_quat), (goal_pos, goal_quat) = motions.start_pose, motions.goal_pose
     return ResetBank(
         robot=robot.name,
@@ -175,7 +177,10 @@ def starts_and_goals(motions: ObjectMotions, robot: RobotSpec, sources: Mapping[
         object_sources=tuple((sources or {}).get(name, "") for name in named),
         reason_names=(),
         **{
-            name: np.zeros([{"J": len(robot.joints)}.get(n, 0) if isinstance(n, str) else n for n in field.shape], _DTYPES[field.kind])
+            name: np.zeros(
+                [{"J": len(robot.joints)}.get(n, 0) if isinstance(n, str) else n for n in field.shape],
+                _DTYPES[field.kind],
+            )
             for name, field in of_states.items()
         },
     )
@@ -197,11 +202,15 @@ def read_bank(path: str | Path, *, robot: RobotSpec | None = None) -> ResetBank:
     """
     bank = read_record(ResetBank, path, SCHEMA, what="a reset bank", check=_check)
     if robot is not None:
-        check_robot(path, "reset bank", robot, name=bank.robot, joint_names=bank.joint_names, fingerprint=bank.robot_fingerprint)
+        check_robot(
+            path, "reset bank", robot, name=bank.robot, joint_names=bank.joint_names, fingerprint=bank.robot_fingerprint
+        )
     return bank
 
 
-def check_robot(path: str | Path, what: str, robot: RobotSpec, *, name: str, joint_names: tuple[str, ...], fingerprint: str) -> None:
+def check_robot(
+    path: str | Path, what: str, robot: RobotSpec, *, name: str, joint_names: tuple[str, ...], fingerprint: str
+) -> None:
     """Refuse a file that was made for another robot, or for another version of this one."""
     if name != robot.name or joint_names != robot.joint_names:
         raise FileFormatError(
@@ -209,12 +218,21 @@ def check_robot(path: str | Path, what: str, robot: RobotSpec, *, name: str, joi
             f"{robot.name!r} has {len(robot.joints)}. Make it again with --robot {robot.name}, or use --robot {name}."
         )
     if fingerprint != robot.fingerprint:
-        raise FileFormatError(f"{path} is a {what} for another version of {name!r}: its URDF or robot.toml has changed. Make it again.")
+        raise FileFormatError(
+            f"{path} is a {what} for another version of {name!r}: its URDF or robot.toml has changed. Make it again."
+        )
 
 
 def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> None:
     """Refuse trajectories of another robot, or with joints outside this one's limits; ``FileFormatError``."""
-    check_robot(path, "retargeted file", robot, name=data.robot, joint_names=data.joint_names, fingerprint=data.robot_fingerprint)
+    check_robot(
+        path,
+        "retargeted file",
+        robot,
+        name=data.robot,
+        joint_names=data.joint_names,
+        fingerprint=data.robot_fingerprint,
+    )
     tree = robot_tree(robot)
     lower, upper = np.array([(tree.joint(name).lower, tree.joint(name).upper) for name in data.joint_names]).T
     beyond = np.where(data.valid[:, None], np.maximum(lower - data.joint_pos, data.joint_pos - upper), -np.inf)

@@ -36,7 +36,9 @@ class Closing(NamedTuple):
     """[F] how far it lies on the way to the next one, in [0, 1); 0 is the frame itself."""
 
 
-def with_closing_frames(retargeted: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec], config: ClosingConfig) -> Closing:
+def with_closing_frames(
+    retargeted: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec], config: ClosingConfig
+) -> Closing:
     """The same motion with frames added between valid ones where the hand closes in.
 
     That is where a finger is near the object, until the thumb and another one touch it or it has been moved. It is not until the human's
@@ -60,7 +62,9 @@ def with_closing_frames(retargeted: Retargeted, robot: RobotSpec, objects: Seque
         & ~over[:-1]
         & (np.minimum(gap[:-1], gap[1:]) < config.within)
     )
-    travel = np.linalg.norm(retargeted.fingertip_pos[before + 1] - retargeted.fingertip_pos[before], axis=-1).max(axis=-1)
+    travel = np.linalg.norm(retargeted.fingertip_pos[before + 1] - retargeted.fingertip_pos[before], axis=-1).max(
+        axis=-1
+    )
     pieces = np.ones(len(owner), dtype=int)
     pieces[before] = np.maximum(np.ceil(travel / config.spacing).astype(int), 1)
     row = np.repeat(np.arange(len(owner)), pieces)
@@ -69,7 +73,9 @@ def with_closing_frames(retargeted: Retargeted, robot: RobotSpec, objects: Seque
 
     def between(values: np.ndarray) -> np.ndarray:
         share = part.reshape(-1, *[1] * (values.ndim - 1))
-        return np.where(share > 0, values[row] + share * (values[following] - values[row]), values[row]).astype(values.dtype)
+        return np.where(share > 0, values[row] + share * (values[following] - values[row]), values[row]).astype(
+            values.dtype
+        )
 
     def turned(quats: np.ndarray) -> np.ndarray:
         first, second = (Rotation.from_quat(quats[at], scalar_first=True) for at in (row, following))
@@ -85,9 +91,15 @@ def with_closing_frames(retargeted: Retargeted, robot: RobotSpec, objects: Seque
         retargeted,
         frame_offsets=offsets.astype(retargeted.frame_offsets.dtype),
         first_contact=np.where(first >= 0, contact_row - offsets[:-1], first).astype(first.dtype),
-        **{name: between(getattr(retargeted, name)) for name in ("joint_pos", "palm_pos", "fingertip_pos", "object_pos")},
+        **{
+            name: between(getattr(retargeted, name))
+            for name in ("joint_pos", "palm_pos", "fingertip_pos", "object_pos")
+        },
         **{name: turned(getattr(retargeted, name)) for name in ("palm_quat_wxyz", "object_quat_wxyz")},
-        **{name: getattr(retargeted, name)[row] for name in ("annotated", "valid", "reason", "contact", "hand_error", "wrist_error")},
+        **{
+            name: getattr(retargeted, name)[row]
+            for name in ("annotated", "valid", "reason", "contact", "hand_error", "wrist_error")
+        },
     )
     return Closing(dense, row, part)
 

@@ -49,7 +49,9 @@ class Reset(Tensors):
 
 def _tensor(array: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
     """Numbers in single precision, or 64-bit integers."""
-    return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32 if array.dtype.kind == "f" else torch.long, device=device)
+    return torch.as_tensor(
+        np.ascontiguousarray(array), dtype=torch.float32 if array.dtype.kind == "f" else torch.long, device=device
+    )
 
 
 def bank_starts(bank: ResetBank, rows: np.ndarray) -> Reset:
@@ -81,7 +83,12 @@ class ResetDistribution:
     """Least s (1 - s) of a start at the frontier, so that there is one while every start fails, or none does."""
 
     def __init__(
-        self, bank: ResetBank, robot: RobotSpec, object_names: tuple[str, ...], config: ResetConfig, device: torch.device | str = "cpu"
+        self,
+        bank: ResetBank,
+        robot: RobotSpec,
+        object_names: tuple[str, ...],
+        config: ResetConfig,
+        device: torch.device | str = "cpu",
     ) -> None:
         """Prepare the tables.
 
@@ -97,7 +104,9 @@ class ResetDistribution:
             bank = bank.select(pre_contact_only=True)
         missing = [name for name in object_names if name not in bank.sequence_object]
         if missing:
-            raise DemoError(f"the reset bank has no demonstration of {', '.join(missing)}; it has {', '.join(bank.object_names)}.")
+            raise DemoError(
+                f"the reset bank has no demonstration of {', '.join(missing)}; it has {', '.join(bank.object_names)}."
+            )
 
         tensor = partial(_tensor, device=device)
 
@@ -106,7 +115,9 @@ class ResetDistribution:
         state_object = np.array([number.get(name, -1) for name in bank.object_name], dtype=np.int64)
         state_rows = np.flatnonzero(state_object >= 0)[np.argsort(state_object[state_object >= 0], kind="stable")]
         sequence_object = np.array([number.get(name, -1) for name in bank.sequence_object], dtype=np.int64)
-        sequence_rows = np.flatnonzero(sequence_object >= 0)[np.argsort(sequence_object[sequence_object >= 0], kind="stable")]
+        sequence_rows = np.flatnonzero(sequence_object >= 0)[
+            np.argsort(sequence_object[sequence_object >= 0], kind="stable")
+        ]
 
         def ranges(owner: np.ndarray) -> tuple[Tensor, Tensor]:
             count = np.bincount(owner, minlength=len(object_names))
@@ -181,7 +192,9 @@ class ResetDistribution:
     def home(self, sequence: Tensor, generator: torch.Generator) -> Reset:
         """Home resets for given demonstrations [M], perturbed as configured."""
         m, c, device = len(sequence), self.config, generator.device
-        noise = torch.randn(m, len(self._home), generator=generator, device=device) * self._home_std * float(c.home_noise)
+        noise = (
+            torch.randn(m, len(self._home), generator=generator, device=device) * self._home_std * float(c.home_noise)
+        )
         joint_pos = torch.minimum(torch.maximum(self._home + noise, self._lower), self._upper)
         shift = 2.0 * torch.rand(m, 3, generator=generator, device=device) - 1.0
         offset = torch.cat((shift[:, :2] * c.spawn_xy, torch.zeros(m, 1, device=device)), dim=-1)

@@ -25,7 +25,14 @@ from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task.config import TerminationConfig
 from xreset.task.terminations import out_of_bounds
 
-REASONS = ("out of bounds", "object linear velocity", "object angular velocity", "joint velocity", "not finite", "overflow")
+REASONS = (
+    "out of bounds",
+    "object linear velocity",
+    "object angular velocity",
+    "joint velocity",
+    "not finite",
+    "overflow",
+)
 """Why a candidate is rejected; the first that applies, from the right: a state that is not finite is nothing else."""
 
 
@@ -144,7 +151,9 @@ def make_bank(
     used = tuple(o for o in objects if o.name in set(names.tolist()))
     object_index = np.array([[o.name for o in used].index(name) for name in names])
     scene = SceneSpec(robot=robot, objects=used)
-    fingers = fingers_of(robot, used, object_index, tried.joint_pos[frames], tried.object_pos[frames], tried.object_quat_wxyz[frames])
+    fingers = fingers_of(
+        robot, used, object_index, tried.joint_pos[frames], tried.object_pos[frames], tried.object_quat_wxyz[frames]
+    )
     target = tried.joint_pos[frames].astype(np.float32)
 
     def accepted(rows: np.ndarray, report: Callable[[int], None]) -> np.ndarray:
@@ -160,7 +169,15 @@ def make_bank(
             def begun(done: int, before: int = number * len(rows)) -> None:
                 report(before + done)
 
-            rounds = spawn(name, scene, object_index[chosen], (*states, target[chosen]), num_envs=num_envs, device=device, progress=begun)
+            rounds = spawn(
+                name,
+                scene,
+                object_index[chosen],
+                (*states, target[chosen]),
+                num_envs=num_envs,
+                device=device,
+                progress=begun,
+            )
             for backend, start, items, fresh in rounds:
                 reason[left[items[fresh]]] = try_states(backend, start, config).cpu().numpy()[fresh]
         return reason
@@ -176,7 +193,15 @@ def make_bank(
         target[rows[refused]] = still[refused]
     progress(work, work)
     return _bank(
-        dense, retargeted, robot, objects, tuple(backends), frames, reason, fingers.nearest.numpy(), target if squeeze.force > 0 else None
+        dense,
+        retargeted,
+        robot,
+        objects,
+        tuple(backends),
+        frames,
+        reason,
+        fingers.nearest.numpy(),
+        target if squeeze.force > 0 else None,
     )
 
 

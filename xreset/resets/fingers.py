@@ -75,20 +75,26 @@ def fingers_of(
     gap = q.new_zeros(len(q), len(links))
     point, inward = q.new_zeros(len(q), len(links), 3), q.new_zeros(len(q), len(links), 3)
     for g, link in enumerate(links):
-        balls = [shape_balls(shape) for shape in kinematics.tree.link(link).collisions] or [(np.zeros((1, 3)), np.zeros(1))]
+        balls = [shape_balls(shape) for shape in kinematics.tree.link(link).collisions] or [
+            (np.zeros((1, 3)), np.zeros(1))
+        ]
         centers, radii = (torch.as_tensor(np.concatenate(part)) for part in zip(*balls, strict=True))
         R, p = poses[:, g, :3, :3], poses[:, g, :3, 3]
         for number, surface in surfaces.items():
             mine = torch.as_tensor(object_index == number)
             world = centers @ R[mine].transpose(-1, -2) + p[mine, None]
             turn = quat[mine, None].expand(-1, len(centers), 4)
-            distance, gradient = surface.signed_distance(quat_rotate_inverse(turn, world - pos[mine, None]).flatten(0, 1))
+            distance, gradient = surface.signed_distance(
+                quat_rotate_inverse(turn, world - pos[mine, None]).flatten(0, 1)
+            )
             distance, best = (distance.view(-1, len(centers)) - radii).min(dim=-1)
             gradient = gradient.view(-1, len(centers), 3)[torch.arange(len(best)), best]
             into = -quat_rotate(quat[mine], torch.nn.functional.normalize(gradient, dim=-1))
             gap[mine, g], inward[mine, g] = distance, into
             point[mine, g] = centers[best] + radii[best, None] * (R[mine].transpose(-1, -2) @ into[..., None])[..., 0]
-    return Fingers(links=links, finger=torch.tensor([number for number, _ in owned]), gap=gap, point=point, inward=inward)
+    return Fingers(
+        links=links, finger=torch.tensor([number for number, _ in owned]), gap=gap, point=point, inward=inward
+    )
 
 
 def squeeze_targets(robot: RobotSpec, fingers: Fingers, joint_pos: np.ndarray, config: SqueezeConfig) -> np.ndarray:
@@ -107,7 +113,9 @@ def squeeze_targets(robot: RobotSpec, fingers: Fingers, joint_pos: np.ndarray, c
     pressing = fingers.leading & (fingers.gap < config.reach)
     torque = torch.einsum("mgi,mgij->mj", config.force * pressing[..., None] * fingers.inward, jacobian)
     drives = [joint.drive for joint in robot.joints]
-    effort, kp = (torch.tensor([getattr(drive, name) for drive in drives], dtype=torch.float64) for name in ("effort", "kp"))
+    effort, kp = (
+        torch.tensor([getattr(drive, name) for drive in drives], dtype=torch.float64) for name in ("effort", "kp")
+    )
     is_hand = torch.tensor([joint.group == "hand" and joint.drive.kp > 0 for joint in robot.joints])
     beyond = torch.where(is_hand, torque.clamp(-effort, effort) / kp.clamp_min(1e-9), 0.0)
     return torch.where(beyond != 0, kinematics.clamp(q + beyond), q).numpy()

@@ -51,13 +51,18 @@ def hold_bank(
         For each engine one entry per object, in the order of their names, and their sum.
     """
     config = config or HoldConfig()
-    lifted = np.flatnonzero(bank.post_contact & (bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2] > config.lift))
+    lifted = np.flatnonzero(
+        bank.post_contact & (bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2] > config.lift)
+    )
     names = bank.object_name[lifted]
     used = tuple(o for o in objects if o.name in set(names.tolist()))
     held = {name: np.zeros(len(lifted), dtype=bool) for name in backends}
     for number, name in enumerate(backends):
         if len(lifted):
-            scene, index = SceneSpec(robot=robot, objects=used), np.array([[o.name for o in used].index(n) for n in names])
+            scene, index = (
+                SceneSpec(robot=robot, objects=used),
+                np.array([[o.name for o in used].index(n) for n in names]),
+            )
             states = [array[lifted] for array in (bank.joint_pos, bank.object_pos, bank.object_quat_wxyz, bank.targets)]
 
             def report(done: int, before: int = number * len(lifted)) -> None:
@@ -71,7 +76,11 @@ def hold_bank(
                     backend.step()
                 state, health = backend.state(), backend.health()
                 stays = (state.object_pos - start.object_pos).norm(dim=-1) < config.distance
-                stays &= (quat_angle(state.object_quat, start.object_quat) < config.angle) & ~health.nonfinite & ~health.overflow
+                stays &= (
+                    (quat_angle(state.object_quat, start.object_quat) < config.angle)
+                    & ~health.nonfinite
+                    & ~health.overflow
+                )
                 held[name][items[fresh]] = stays.cpu().numpy()[fresh]
     groups = [*((name, names == name) for name in np.unique(names).tolist()), ("all", np.ones(len(lifted), dtype=bool))]
     return [

@@ -13,7 +13,9 @@ from xreset.retarget.validity import REASONS, Thresholds
 from xreset.spec import RobotSpec
 
 
-def colliding_links(result: Retargeted, robot: RobotSpec, thresholds: Thresholds | None = None) -> dict[tuple[str, str], int]:
+def colliding_links(
+    result: Retargeted, robot: RobotSpec, thresholds: Thresholds | None = None
+) -> dict[tuple[str, str], int]:
     """Pair of links -> number of frames lost to ``self collision`` in which it is too deep; the most frequent first.
 
     A frame in which several pairs meet counts for each of them.
@@ -33,7 +35,12 @@ def colliding_links(result: Retargeted, robot: RobotSpec, thresholds: Thresholds
         (whole, SelfCollision(robot, whole, moved_by_arm=True)),
         (hand, SelfCollision(robot, hand, only=robot.self_collision_links)),
     ):
-        near = collision.near(kinematics.link_poses(joints[:, torch.as_tensor(kinematics.joint_indices)]).numpy(), -depth)
+        near = collision.near(
+            kinematics.link_poses(joints[:, torch.as_tensor(kinematics.joint_indices)]).numpy(), -depth
+        )
         names = kinematics.link_names
-        found |= {(int(frame), (names[a], names[b])) for frame, (a, b) in zip(near.configuration, near.links.tolist(), strict=True)}
+        found |= {
+            (int(frame), (names[a], names[b]))
+            for frame, (a, b) in zip(near.configuration, near.links.tolist(), strict=True)
+        }
     return dict(Counter(pair for _, pair in found).most_common())

@@ -77,7 +77,9 @@ class Retargeted(ObjectMotions):
         return accounts(np.asarray(self.object_name)[self.sequence_of_frame], self.post_contact, reason)
 
 
-def write_retargeted(path: str | Path, retargeted: Retargeted, *, config: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
+def write_retargeted(
+    path: str | Path, retargeted: Retargeted, *, config: Mapping[str, Any], inputs: Mapping[str, str]
+) -> None:
     """Write trajectories; see :func:`xreset.records.write_record` for ``config`` and ``inputs``."""
     write_record(path, SCHEMA, retargeted, config=config, inputs=inputs)
 

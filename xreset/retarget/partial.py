@@ -79,7 +79,9 @@ def discard(folder: Path) -> None:
         folder.rmdir()
 
 
-def run_key(demos: Demos, robot: RobotSpec, objects: Sequence[ObjectSpec], config: Any, sequences_per_batch: int, device: str) -> str:
+def run_key(
+    demos: Demos, robot: RobotSpec, objects: Sequence[ObjectSpec], config: Any, sequences_per_batch: int, device: str
+) -> str:
     """SHA-256 over everything that a run's result depends on.
 
     Args:
@@ -94,7 +96,9 @@ def run_key(demos: Demos, robot: RobotSpec, objects: Sequence[ObjectSpec], confi
     arrays = {f.name: getattr(demos, f.name) for f in fields(demos)}
     for spec in sorted(objects, key=lambda o: o.name):
         for number, piece in enumerate(spec.pieces):
-            shape = {"pose": piece.T_body_shape} | {name: np.asarray(v) for name, v in vars(piece.geometry).items() if v is not None}
+            shape = {"pose": piece.T_body_shape} | {
+                name: np.asarray(v) for name, v in vars(piece.geometry).items() if v is not None
+            }
             arrays |= {f"{spec.name} piece {number} {name}": value for name, value in shape.items()}
     for name, value in arrays.items():
         if value is not None:

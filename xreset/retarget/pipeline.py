@@ -27,7 +27,15 @@ from xreset.retarget.validity import REASONS, Thresholds, classify
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.tensors import one_thread
 
-__all__ = ["SCHEMA", "RetargetConfig", "Retargeted", "read_retargeted", "rest_on_table", "retarget_demos", "write_retargeted"]
+__all__ = [
+    "SCHEMA",
+    "RetargetConfig",
+    "Retargeted",
+    "read_retargeted",
+    "rest_on_table",
+    "retarget_demos",
+    "write_retargeted",
+]
 
 _SEQUENCES_PER_BATCH = 24
 """Enough to make batching pay; few enough to keep memory below about 1 GB and progress visible."""
@@ -97,7 +105,9 @@ def retarget_demos(
     demos, hand, arm = work.demos, HandModel(robot, device=device), ArmModel(robot)
     kept = None
     if partial is not None:
-        kept = Partial(partial, run_key(demos, robot, list(work.objects.values()), config, _SEQUENCES_PER_BATCH, device))
+        kept = Partial(
+            partial, run_key(demos, robot, list(work.objects.values()), config, _SEQUENCES_PER_BATCH, device)
+        )
     joint_pos = np.tile(robot.home, (demos.num_frames, 1))
     reason = np.full(demos.num_frames, REASONS.index("not annotated"), dtype=np.int32)
     hand_error, wrist_error = np.full(demos.num_frames, np.inf), np.full(demos.num_frames, np.inf)
@@ -181,7 +191,9 @@ def wrist_paths(
 def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpec]:
     by_name = {spec.name: spec for spec in objects}
     if missing := sorted(set(demos.object_name.tolist()) - set(by_name)):
-        raise DemoError(f"the demonstrations hold objects that were not given: {', '.join(missing)}; given were {', '.join(by_name)}.")
+        raise DemoError(
+            f"the demonstrations hold objects that were not given: {', '.join(missing)}; given were {', '.join(by_name)}."
+        )
     return {name: by_name[name] for name in sorted(set(demos.object_name.tolist()))}
 
 
@@ -196,7 +208,9 @@ class _Work:
         """Contact points [F, 21, 3] and contact [F, 21] of all human keypoints."""
         for i, name in enumerate(demos.object_name.tolist()):
             rows = demos.frames(i)
-            keypoints = np.where(demos.hand_valid[rows, None, None], demos.hand_keypoints[rows].astype(np.float64), np.nan)
+            keypoints = np.where(
+                demos.hand_valid[rows, None, None], demos.hand_keypoints[rows].astype(np.float64), np.nan
+            )
             pos, quat = demos.object_pos[rows].astype(np.float64), demos.object_quat_wxyz[rows].astype(np.float64)
             contacts = keypoint_contacts(self._surfaces[name], keypoints, pos, quat, config.contact_distance)
             self._touched[rows], self.touches[rows] = contacts
@@ -219,7 +233,9 @@ class _Work:
 
         def padded(values: np.ndarray) -> Tensor:
             rows = [demos.frames(i) for i in sequences]
-            out = np.zeros((len(rows), max(row.stop - row.start for row in rows), *values.shape[1:]), dtype=values.dtype)
+            out = np.zeros(
+                (len(rows), max(row.stop - row.start for row in rows), *values.shape[1:]), dtype=values.dtype
+            )
             for s, row in enumerate(rows):
                 out[s, : row.stop - row.start] = values[row]
             return torch.as_tensor(out)
@@ -229,10 +245,14 @@ class _Work:
             annotated=padded(demos.hand_valid),
             contact_points=padded(self._touched[:, hand.keypoint_indices]),
             in_contact=padded(self.touches[:, hand.keypoint_indices]),
-            held=padded(np.asarray(self.touches[:, 1:5].any(axis=1) & self.touches[:, 5:].any(axis=1))),  # keypoints of the thumb: 1 to 4
+            held=padded(
+                np.asarray(self.touches[:, 1:5].any(axis=1) & self.touches[:, 5:].any(axis=1))
+            ),  # keypoints of the thumb: 1 to 4
             object_pos=padded(demos.object_pos.astype(np.float64)),
             object_quat=padded(demos.object_quat_wxyz.astype(np.float64)),
-            object_index=torch.tensor([list(self._surfaces).index(name) for name in demos.object_name[list(sequences)].tolist()]),
+            object_index=torch.tensor(
+                [list(self._surfaces).index(name) for name in demos.object_name[list(sequences)].tolist()]
+            ),
             fields=DistanceFields.join([surface.field for surface in self._surfaces.values()]),
         )
 

@@ -73,9 +73,19 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
         return None, [*found, Finding("error", "URDF", str(error))]
     shapes = sum(len(link.collisions) for link in tree.links)
     mass = sum(link.mass for link in tree.links)
-    found.append(Finding("ok", "URDF", f"{len(tree.links)} links, {len(tree.joints)} joints, {shapes} collision shapes, {mass:.1f} kg"))
+    found.append(
+        Finding(
+            "ok",
+            "URDF",
+            f"{len(tree.links)} links, {len(tree.joints)} joints, {shapes} collision shapes, {mass:.1f} kg",
+        )
+    )
 
-    found += _topic("joints", _joints(spec, tree), f"{len(spec.joints)} actuated joints exist, have limits, and are at home within them")
+    found += _topic(
+        "joints",
+        _joints(spec, tree),
+        f"{len(spec.joints)} actuated joints exist, have limits, and are at home within them",
+    )
     found += _topic("mimic joints", _mimics(spec, tree), f"{len(spec.mimics)} follow an actuated joint")
     found += _topic("links", _links(spec, tree), "palm, fingertips, keypoints and collision links exist")
     found += _topic("inertias", _inertias(tree), "masses are positive, inertias are those of solid bodies")
@@ -107,7 +117,9 @@ def check_engine(spec: RobotSpec, backend: str) -> Finding:
     return Finding("ok", topic, f"link poses agree within {_POSE_TOLERANCE * 1e3:g} mm; home is held")
 
 
-def check(name_or_folder: str | Path, *, report: Callable[[Finding], None] = lambda _: None, engines: bool = True) -> list[Finding]:
+def check(
+    name_or_folder: str | Path, *, report: Callable[[Finding], None] = lambda _: None, engines: bool = True
+) -> list[Finding]:
     """Check a robot.
 
     Args:
@@ -143,7 +155,9 @@ def _topic(topic: str, problems: Iterator[tuple[Level, str]], otherwise: str) ->
 
 
 def _summary(spec: RobotSpec) -> str:
-    return f"{len(spec.arm_indices)} arm joints, {len(spec.hand_indices)} hand joints, {len(spec.fingertips)} fingertips"
+    return (
+        f"{len(spec.arm_indices)} arm joints, {len(spec.hand_indices)} hand joints, {len(spec.fingertips)} fingertips"
+    )
 
 
 # Description against URDF ----------------------------------------------------------------------------------------------------------------
@@ -168,21 +182,36 @@ def _joints(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
     below = _below(tree, spec.hand_root)
     for joint in spec.joints:
         if joint.name not in known:
-            yield "error", f"{joint.name!r} is not in the URDF, which has {_listed(n for n, j in known.items() if j.type != 'fixed')}."
+            yield (
+                "error",
+                f"{joint.name!r} is not in the URDF, which has {_listed(n for n, j in known.items() if j.type != 'fixed')}.",
+            )
             continue
         found = known[joint.name]
         if found.type == "fixed":
             yield "error", f"{joint.name!r} is fixed in the URDF; an actuated joint must move."
         elif not np.isfinite((found.lower, found.upper)).all() or found.lower >= found.upper:
-            yield "error", f"{joint.name!r} has the limits {found.lower:g}..{found.upper:g}; expected finite ones, the lower one first."
+            yield (
+                "error",
+                f"{joint.name!r} has the limits {found.lower:g}..{found.upper:g}; expected finite ones, the lower one first.",
+            )
         elif not found.lower <= joint.home <= found.upper:
-            yield "error", f"{joint.name!r} is at home at {joint.home:g}, outside its limits {found.lower:g}..{found.upper:g}."
+            yield (
+                "error",
+                f"{joint.name!r} is at home at {joint.home:g}, outside its limits {found.lower:g}..{found.upper:g}.",
+            )
         elif (found.child in below) != (joint.group == "hand"):
             where = "below" if found.child in below else "not below"
-            yield "warning", f"{joint.name!r} is of group {joint.group!r} but lies {where} the hand's root {spec.hand_root!r}."
+            yield (
+                "warning",
+                f"{joint.name!r} is of group {joint.group!r} but lies {where} the hand's root {spec.hand_root!r}.",
+            )
     moved = {*spec.joint_names, *(mimic.joint for mimic in spec.mimics)}
     for name in (name for name, joint in known.items() if joint.type != "fixed" and name not in moved):
-        yield "error", f"the URDF's {name!r} moves but is neither actuated nor a mimic joint; add it to either, or make it fixed."
+        yield (
+            "error",
+            f"the URDF's {name!r} moves but is neither actuated nor a mimic joint; add it to either, or make it fixed.",
+        )
 
 
 def _mimics(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
@@ -205,7 +234,10 @@ def _mimics(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
                     f"{own.lower:.4g}..{own.upper:.4g}: the two would hold each other up. Widen its limits, or narrow those of the source.",
                 )
     for name in stated.keys() - {mimic.joint for mimic in spec.mimics}:
-        yield "error", f"the URDF lets {name!r} mimic {stated[name][0]!r}, but the description has no such entry in mimics."
+        yield (
+            "error",
+            f"the URDF lets {name!r} mimic {stated[name][0]!r}, but the description has no such entry in mimics.",
+        )
 
 
 def _mimic_tags(urdf: Path) -> dict[str, tuple[str, float, float]]:
@@ -213,7 +245,11 @@ def _mimic_tags(urdf: Path) -> dict[str, tuple[str, float, float]]:
     for joint in parse_xml(urdf).findall("joint"):
         tag = joint.find("mimic")
         if tag is not None:
-            found[joint.get("name", "")] = (tag.get("joint", ""), float(tag.get("multiplier", 1)), float(tag.get("offset", 0)))
+            found[joint.get("name", "")] = (
+                tag.get("joint", ""),
+                float(tag.get("multiplier", 1)),
+                float(tag.get("offset", 0)),
+            )
     return found
 
 
@@ -235,16 +271,26 @@ def _links(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
     below = _below(tree, spec.hand_root)
     for tip in spec.fingertips:
         if not any(known[link].collisions for link in tip.contact_links):
-            yield "error", f"fingertip {tip.name!r}: none of {_listed(tip.contact_links)} has a collision shape, so it can touch nothing."
+            yield (
+                "error",
+                f"fingertip {tip.name!r}: none of {_listed(tip.contact_links)} has a collision shape, so it can touch nothing.",
+            )
         if tip.link not in below:
-            yield "error", f"fingertip {tip.name!r}: {tip.link!r} does not lie below the hand's root {spec.hand_root!r}."
+            yield (
+                "error",
+                f"fingertip {tip.name!r}: {tip.link!r} does not lie below the hand's root {spec.hand_root!r}.",
+            )
     for link in spec.self_collision_links:
         if not known[link].collisions:
             yield "warning", f"collision.self: {link!r} has no collision shape."
 
 
 def _inertias(tree: RobotTree) -> Iterator[tuple[Level, str]]:
-    at_joints = [link.name for link in tree.links if link.mass > 0 and link.collisions and not link.com.any() and _off_middle(link) > _OFF]
+    at_joints = [
+        link.name
+        for link in tree.links
+        if link.mass > 0 and link.collisions and not link.com.any() and _off_middle(link) > _OFF
+    ]
     if at_joints:
         yield (
             "warning",
@@ -255,11 +301,17 @@ def _inertias(tree: RobotTree) -> Iterator[tuple[Level, str]]:
     for link in tree.links:
         if link.mass <= 0:
             if link.name not in fixed and link.name != tree.root:
-                yield "error", f"{link.name!r} moves but has the mass {link.mass:g} kg; every moving link needs a mass and an inertia."
+                yield (
+                    "error",
+                    f"{link.name!r} moves but has the mass {link.mass:g} kg; every moving link needs a mass and an inertia.",
+                )
             continue
         moments = np.linalg.eigvalsh(link.inertia)
         if moments[0] <= 0:
-            yield "error", f"{link.name!r} has the principal moments {_numbers(moments)} kg m^2; expected positive ones."
+            yield (
+                "error",
+                f"{link.name!r} has the principal moments {_numbers(moments)} kg m^2; expected positive ones.",
+            )
         elif moments[2] > (moments[0] + moments[1]) * (1 + _ROUNDING):
             yield (
                 "error",
@@ -287,14 +339,25 @@ def _drives(spec: RobotSpec) -> Iterator[tuple[Level, str]]:
     for joint in spec.joints:
         drive = joint.drive
         if drive.kp <= 0 or drive.effort <= 0 or min(drive.kd, drive.armature, drive.friction_loss) < 0:
-            yield "error", f"{joint.name!r}: kp and effort must be positive; kd, armature and friction_loss must not be negative."
+            yield (
+                "error",
+                f"{joint.name!r}: kp and effort must be positive; kd, armature and friction_loss must not be negative.",
+            )
             return
     step = SceneSpec.timestep
-    for joint, ratio, inertia in zip(spec.joints, damping_ratio(spec, spec.home), drive_inertia(spec, spec.home), strict=True):
+    for joint, ratio, inertia in zip(
+        spec.joints, damping_ratio(spec, spec.home), drive_inertia(spec, spec.home), strict=True
+    ):
         if ratio < 0.5:
-            yield "warning", f"{joint.name!r} has the damping ratio {ratio:.2f} at home and will swing; 0.7 to 1.5 is usual: raise kd."
+            yield (
+                "warning",
+                f"{joint.name!r} has the damping ratio {ratio:.2f} at home and will swing; 0.7 to 1.5 is usual: raise kd.",
+            )
         if ratio > 5:
-            yield "warning", f"{joint.name!r} has the damping ratio {ratio:.1f} at home and will creep; 0.7 to 1.5 is usual: lower kd."
+            yield (
+                "warning",
+                f"{joint.name!r} has the damping ratio {ratio:.1f} at home and will creep; 0.7 to 1.5 is usual: lower kd.",
+            )
         if joint.drive.kd * step > inertia:
             yield (
                 "warning",
@@ -321,7 +384,10 @@ def _frames(spec: RobotSpec) -> Iterator[tuple[Level, str]]:
             f"the fingers lie along {axis} of the palm {spec.palm!r}: its x should point towards them, z out of its inner side.",
         )
     elif ahead <= 0:
-        yield "warning", f"the fingertips lie {-ahead:.3f} m behind the palm {spec.palm!r}: its x should point towards the fingers."
+        yield (
+            "warning",
+            f"the fingertips lie {-ahead:.3f} m behind the palm {spec.palm!r}: its x should point towards the fingers.",
+        )
 
 
 def _home(spec: RobotSpec) -> list[Finding]:
@@ -351,7 +417,11 @@ def _home(spec: RobotSpec) -> list[Finding]:
     names = np.array(kinematics.link_names)
     for pair in collision.overlapping_at_home:
         found.append(
-            Finding("error", "home and self", f"{' and '.join(pair)} overlap at home: move home, or add the pair to collision.exclude.")
+            Finding(
+                "error",
+                "home and self",
+                f"{' and '.join(pair)} overlap at home: move home, or add the pair to collision.exclude.",
+            )
         )
     near = collision.near(poses, 0.0)
     share = 100 * len(np.unique(near.configuration)) / len(q)
@@ -361,9 +431,17 @@ def _home(spec: RobotSpec) -> list[Finding]:
         often = _listed(f"{pair} ({100 * count / len(q):.0f} %)" for pair, count in pairs[:_LISTED])
         more = f" and {len(pairs) - _LISTED} more pairs" if len(pairs) > _LISTED else ""
         text = f"{share:.0f} % of the spread around home touches itself: {often}{more}; episodes that start so are pushed apart."
-        found.append(Finding("warning", "home and self", f"{text} Move home away, spread less (home_std), or exclude what always meets."))
+        found.append(
+            Finding(
+                "warning",
+                "home and self",
+                f"{text} Move home away, spread less (home_std), or exclude what always meets.",
+            )
+        )
     elif not collision.overlapping_at_home:
-        found.append(Finding("ok", "home and self", f"free at home; {share:.0f} % of the spread around it touches itself"))
+        found.append(
+            Finding("ok", "home and self", f"free at home; {share:.0f} % of the spread around it touches itself")
+        )
     return found
 
 

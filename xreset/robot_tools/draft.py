@@ -70,7 +70,9 @@ def draft_spec(
         fingertips=tuple(tips),
         keypoints=tuple(keypoints),
         self_collision_links=tuple(n for n in below(tree, hand_root) if tree.link(n).collisions),
-        table_exclude=tuple(n for n in tree.link_names if tree.moving_ancestor(n) == tree.root and tree.link(n).collisions),
+        table_exclude=tuple(
+            n for n in tree.link_names if tree.moving_ancestor(n) == tree.root and tree.link(n).collisions
+        ),
     )
 
 
@@ -86,6 +88,8 @@ def link_places(spec: RobotSpec, positions: dict[str, float]) -> dict[str, np.nd
 def description_text(spec: RobotSpec, notes: Sequence[str]) -> str:
     """The robot's ``robot.toml``, every part explained; ``notes`` say what was guessed."""
     loader = jinja2.FileSystemLoader(Path(__file__).with_name("templates"))
-    pages = jinja2.Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False)
+    pages = jinja2.Environment(
+        loader=loader, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False
+    )
     pages.filters["toml"] = lambda value: json.dumps(value, ensure_ascii=False)
     return pages.get_template("robot.toml").render(spec=spec, notes=notes, schema=SCHEMA)

@@ -56,11 +56,17 @@ def find_fingers(
                 links.insert(0, link)
             link = by_child[link].parent
         rest = tuple(name for name in inside if name != end and tree.moving_ancestor(name) == end)
-        chains.append(Finger(name="", links=tuple(links), joints=tuple(by_child[name].name for name in links), rest=rest))
+        chains.append(
+            Finger(name="", links=tuple(links), joints=tuple(by_child[name].name for name in links), rest=rest)
+        )
     if len(chains) < 2:
-        raise RobotError(f"below {hand_root!r} there are {len(chains)} chains of moving links, expected a thumb and at least one finger.")
+        raise RobotError(
+            f"below {hand_root!r} there are {len(chains)} chains of moving links, expected a thumb and at least one finger."
+        )
 
-    words = [" ".join((*c.links, *c.joints, *c.rest, *(by_child[name].name for name in c.rest))).lower() for c in chains]
+    words = [
+        " ".join((*c.links, *c.joints, *c.rest, *(by_child[name].name for name in c.rest))).lower() for c in chains
+    ]
     spec = draft_spec(tree, mimics, hand_root, folder)
     at = link_places(spec, {})
     bases = np.array([at[chain.links[0]][:3, 3] for chain in chains])
@@ -77,23 +83,36 @@ def find_fingers(
         first = marked[0]
     else:
         directions = (ends - bases) / np.linalg.norm(ends - bases, axis=1, keepdims=True)
-        first = int(np.argmin([np.delete(directions, i, axis=0).sum(axis=0) @ directions[i] for i in range(len(chains))]))
+        first = int(
+            np.argmin([np.delete(directions, i, axis=0).sum(axis=0) @ directions[i] for i in range(len(chains))])
+        )
         if len(chains) > 2:
             ahead = [np.delete(directions, i, axis=0).mean(axis=0) for i in range(len(chains))]
-            behind = [float((bases[i] - np.delete(bases, i, axis=0).mean(axis=0)) @ ahead[i]) for i in range(len(chains))]
+            behind = [
+                float((bases[i] - np.delete(bases, i, axis=0).mean(axis=0)) @ ahead[i]) for i in range(len(chains))
+            ]
             first = int(np.argmin(behind))
-        notes.append(f"the thumb is the finger of {', '.join(chains[first].links)}: its base is farthest back (--thumb says another)")
+        notes.append(
+            f"the thumb is the finger of {', '.join(chains[first].links)}: its base is farthest back (--thumb says another)"
+        )
     others = [i for i in range(len(chains)) if i != first]
     alias = {"index": ("index", "fore"), "middle": ("middle",), "ring": ("ring",), "little": ("little", "pinky")}
-    named = {i: next((finger for finger in _FINGERS if any(word in words[i] for word in alias[finger])), "") for i in others}
+    named = {
+        i: next((finger for finger in _FINGERS if any(word in words[i] for word in alias[finger])), "") for i in others
+    }
     if sorted(named.values()) != sorted(set(named.values()) - {""}):
         across = np.linalg.svd(bases[others] - bases[others].mean(axis=0))[2][0]
         across *= np.sign((ends[first] - bases[others].mean(axis=0)) @ across) or 1.0
         others.sort(key=lambda i: -float(bases[i] @ across))
         if len(others) > len(_FINGERS):
-            raise RobotError(f"the hand has {len(others)} fingers beside the thumb; xreset knows {', '.join(_FINGERS)}.")
+            raise RobotError(
+                f"the hand has {len(others)} fingers beside the thumb; xreset knows {', '.join(_FINGERS)}."
+            )
         named = dict(zip(others, _FINGERS, strict=False))
-        notes.append("fingers are named from the thumb's side on: " + "; ".join(f"{named[i]} is {chains[i].links[-1]}" for i in others))
+        notes.append(
+            "fingers are named from the thumb's side on: "
+            + "; ".join(f"{named[i]} is {chains[i].links[-1]}" for i in others)
+        )
     others.sort(key=lambda i: _FINGERS.index(named[i]))
     return [replace(chains[first], name="thumb"), *(replace(chains[i], name=named[i]) for i in others)]
 
@@ -125,7 +144,9 @@ def find_palm(
                     moved += _end(tree, finger, at) - _end(tree, finger, straight)
     z = moved - (moved @ x) * x
     if np.linalg.norm(z) < 0.01:
-        raise RobotError("the fingers do not bend to one side when their joints move, so the palm's inner side cannot be told.")
+        raise RobotError(
+            "the fingers do not bend to one side when their joints move, so the palm's inner side cannot be told."
+        )
     z /= np.linalg.norm(z)
     T = np.eye(4)
     T[:3, :3] = np.stack((x, np.cross(z, x), z), axis=1)
@@ -166,7 +187,11 @@ def with_frames(
         share = along[:-1] / along[-1]
         taken: set[int] = set()
         for number, human in enumerate(_HUMAN, start=1):
-            near = min((i for i in range(len(share)) if i not in taken), key=lambda i: (round(abs(share[i] - human), 2), -i), default=None)
+            near = min(
+                (i for i in range(len(share)) if i not in taken),
+                key=lambda i: (round(abs(share[i] - human), 2), -i),
+                default=None,
+            )
             if near is not None and abs(share[near] - human) < 0.2:
                 taken |= set(range(near + 1))
                 link, keypoint = finger.links[near], f"{finger.name}{number}"

@@ -115,17 +115,31 @@ def _stand_off(hand: RobotTree, rpy: tuple[float, float, float]) -> float:
     for joint in hand.joints:  # parents come before children
         if joint.type == "fixed" and joint.parent in poses:
             poses[joint.child] = poses[joint.parent] @ joint.T_parent_joint
-    height = [surface_of(hand.link(name).collisions)[0] @ T[2, :3] + T[2, 3] for name, T in poses.items() if hand.link(name).collisions]
+    height = [
+        surface_of(hand.link(name).collisions)[0] @ T[2, :3] + T[2, 3]
+        for name, T in poses.items()
+        if hand.link(name).collisions
+    ]
     return max(0.0, round(-float(np.concatenate(height).min()), 3)) if height else 0.0
 
 
-def _write(source: Source, flange: str, hand_root: str, folder: Path, *, thumb: str | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _write(
+    source: Source, flange: str, hand_root: str, folder: Path, *, thumb: str | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     notes = list(source.notes)
     tree = _with_rotors(source, hand_root, notes)
     fingers = find_fingers(tree, source.mimics, hand_root, folder, thumb, notes)
     palm_axes, straight, bent = find_palm(tree, source.mimics, hand_root, fingers, folder)
     tree, tips, keypoints = with_frames(tree, hand_root, fingers, palm_axes, folder, source.mimics, straight)
-    spec = draft_spec(tree, source.mimics, hand_root, folder, tips=tips, keypoints=keypoints, home=_hand_home(tree, source.mimics, bent))
+    spec = draft_spec(
+        tree,
+        source.mimics,
+        hand_root,
+        folder,
+        tips=tips,
+        keypoints=keypoints,
+        home=_hand_home(tree, source.mimics, bent),
+    )
     spec = _arm_home(spec, notes)
     spec = _with_drives(spec, source, notes)
     spec = _with_exclusions(spec, notes)
@@ -150,9 +164,13 @@ def _with_rotors(source: Source, hand_root: str, notes: list[str]) -> RobotTree:
     for link in source.tree.links:
         if link.name in moved_by and link.name in inside:
             drive = source.drives.get(moved_by[link.name])
-            link = replace(link, inertia=link.inertia + (drive.armature if drive and drive.armature else _ROTOR) * np.eye(3))
+            link = replace(
+                link, inertia=link.inertia + (drive.armature if drive and drive.armature else _ROTOR) * np.eye(3)
+            )
         links.append(link)
-    notes.append(f"moving links of the hand carry {_ROTOR:g} kg m^2 of rotor inertia, or what the MJCF states as armature")
+    notes.append(
+        f"moving links of the hand carry {_ROTOR:g} kg m^2 of rotor inertia, or what the MJCF states as armature"
+    )
     return replace(source.tree, links=tuple(links))
 
 
@@ -174,28 +192,39 @@ def _arm_home(spec: RobotSpec, notes: list[str]) -> RobotSpec:
     q = torch.tensor(spec.home).repeat(_IK_STARTS, 1)
     q[:, arm] = low + draw * (high - low)
     goal = torch.tensor(_HOME_PALM, dtype=torch.float64)
-    goal_rot = torch.tensor([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]], dtype=torch.float64)  # x to -y, z down; columns are the axes
+    goal_rot = torch.tensor(
+        [[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]], dtype=torch.float64
+    )  # x to -y, z down; columns are the axes
     for _ in range(_IK_STEPS):
         at = kinematics.jacobian(q, (spec.palm,))
         turn = goal_rot @ at.rot[:, 0].mT
         angle = torch.as_tensor(Rotation.from_matrix(turn.numpy()).as_rotvec())
         error = torch.cat(((goal - at.pos[:, 0]) / 0.1, angle), dim=1)
         J = torch.cat((at.linear[:, 0][..., arm] / 0.1, at.angular[:, 0][..., arm]), dim=1)
-        step = torch.linalg.solve(J.mT @ J + 1e-2 * torch.eye(len(arm), dtype=J.dtype), (J.mT @ error[..., None]))[..., 0]
+        step = torch.linalg.solve(J.mT @ J + 1e-2 * torch.eye(len(arm), dtype=J.dtype), (J.mT @ error[..., None]))[
+            ..., 0
+        ]
         q[:, arm] = torch.minimum(torch.maximum(q[:, arm] + step.clamp(-0.3, 0.3), low), high)
     reached = (error[:, :3].norm(dim=1) * 0.1 < 0.01) & (error[:, 3:].norm(dim=1) < 0.05)
     support = table_points(spec, kinematics)
-    height = height_above_table(kinematics.points(q, support.links, torch.tensor(support.points)), torch.tensor(support.radii), TableSpec())
+    height = height_above_table(
+        kinematics.points(q, support.links, torch.tensor(support.points)), torch.tensor(support.radii), TableSpec()
+    )
     collision = SelfCollision(spec, kinematics, moved_by_arm=True)
     apart = torch.as_tensor(collision.clearance(kinematics.link_poses(q).numpy(), 0.02))
     room = torch.minimum(q[:, arm] - lower, upper - q[:, arm]).amin(dim=1).clamp_max(0.5)
     score = room + 10 * reached + 5 * (height.amin(dim=1) > 0.01) + 5 * (apart > 0)
     best = int(score.argmax())
     if not bool(reached[best]):
-        notes.append("the arm does not reach over the table from where it stands: `xreset robots place` finds a better place and home")
+        notes.append(
+            "the arm does not reach over the table from where it stands: `xreset robots place` finds a better place and home"
+        )
     values = q[best].tolist()
     notes.append("home: the palm over the table, looking down; fingers bent a little")
-    return replace(spec, joints=tuple(replace(joint, home=round(value, 4)) for joint, value in zip(spec.joints, values, strict=True)))
+    return replace(
+        spec,
+        joints=tuple(replace(joint, home=round(value, 4)) for joint, value in zip(spec.joints, values, strict=True)),
+    )
 
 
 def _with_drives(spec: RobotSpec, source: Source, notes: list[str]) -> RobotSpec:
@@ -214,18 +243,29 @@ def _with_drives(spec: RobotSpec, source: Source, notes: list[str]) -> RobotSpec
         joints.append(replace(joint, drive=drive))
     spec = replace(spec, joints=tuple(joints))
     factor = [2.0 if joint.group == "arm" else 1.8 for joint in spec.joints]
-    kd = [f * np.sqrt(j.drive.kp * inertia) for f, j, inertia in zip(factor, spec.joints, drive_inertia(spec, spec.home), strict=True)]
+    kd = [
+        f * np.sqrt(j.drive.kp * inertia)
+        for f, j, inertia in zip(factor, spec.joints, drive_inertia(spec, spec.home), strict=True)
+    ]
     if without:
-        notes.append(f"no effort is stated for {', '.join(without)}; they get {_ARM_EFFORT:g} (arm) or {_HAND_EFFORT:g} N m (hand)")
-    notes.append("drives: kd = 1.8 sqrt(kp I) in the hand, critical in the arm, with the inertia I about the joint at home")
+        notes.append(
+            f"no effort is stated for {', '.join(without)}; they get {_ARM_EFFORT:g} (arm) or {_HAND_EFFORT:g} N m (hand)"
+        )
+    notes.append(
+        "drives: kd = 1.8 sqrt(kp I) in the hand, critical in the arm, with the inertia I about the joint at home"
+    )
     drives = [replace(joint.drive, kd=float(f"{value:.3g}")) for joint, value in zip(spec.joints, kd, strict=True)]
-    return replace(spec, joints=tuple(replace(joint, drive=drive) for joint, drive in zip(spec.joints, drives, strict=True)))
+    return replace(
+        spec, joints=tuple(replace(joint, drive=drive) for joint, drive in zip(spec.joints, drives, strict=True))
+    )
 
 
 def _with_exclusions(spec: RobotSpec, notes: list[str]) -> RobotSpec:
     pairs = always_meeting(spec)
     if pairs:
-        notes.append("never collide, because they meet: " + "; ".join(f"{a} and {b} ({why})" for (a, b), why in pairs.items()))
+        notes.append(
+            "never collide, because they meet: " + "; ".join(f"{a} and {b} ({why})" for (a, b), why in pairs.items())
+        )
     return replace(spec, collision_exclude=tuple(pairs))
 
 

@@ -67,7 +67,9 @@ def place(
     config = config or PlaceConfig()
     wrists = single_frames(paths, Thresholds().hand_error)
     if not len(wrists.annotated):
-        raise RobotError(f"robot {robot.name!r}: there is no frame to reach; hand retargeting followed none within its threshold.")
+        raise RobotError(
+            f"robot {robot.name!r}: there is no frame to reach; hand retargeting followed none within its threshold."
+        )
     random = np.random.default_rng(config.seed)
     order = torch.as_tensor(random.permutation(len(wrists.annotated)))
     tried, kept = wrists[order[: config.frames]], wrists[order[config.frames :][: config.final_frames]]
@@ -76,7 +78,9 @@ def place(
     own = Placement(pos=robot.base_pos, quat=robot.base_quat)
     trial = _Trial(robot=robot, config=config, tried=tried, kept=kept, paths=paths)
     found = [(own, trial.reach(own, 0))]
-    effort = config.rounds * config.candidates + 10 * (1 + config.elite)  # a finalist takes as long as ten candidates or so
+    effort = config.rounds * config.candidates + 10 * (
+        1 + config.elite
+    )  # a finalist takes as long as ten candidates or so
     with _tried_by(trial, processes) as each:
         for number, drawn in enumerate(_rounds(robot, avoid, config, random, found)):
             for begin in range(0, len(drawn), _WAVE):
@@ -86,7 +90,9 @@ def place(
                 found.sort(key=lambda pair: pair[1].rank, reverse=True)
                 progress((number * config.candidates + begin + len(wave)) / effort, found[0][1])
         finalists: list[Finalist] = []
-        chosen = list(dict.fromkeys([own, *(placement for placement, _ in found[: config.elite if config.rounds else 0])]))
+        chosen = list(
+            dict.fromkeys([own, *(placement for placement, _ in found[: config.elite if config.rounds else 0])])
+        )
         for finalist in each(_Trial.finalist, chosen):
             finalists.append(finalist)
             progress(1.0 - 10 * (1 + config.elite - len(finalists)) / effort, found[0][1])
@@ -139,7 +145,9 @@ def _tried_by(trial: _Trial, processes: int) -> Iterator[Callable[..., Iterable[
     try:
         yield lambda method, *args: pool.map(partial(_call, method), *args)
     except BrokenProcessPool as error:
-        raise RobotError("a process that tried placements was killed; is there memory for all of them? Try fewer (--processes).") from error
+        raise RobotError(
+            "a process that tried placements was killed; is there memory for all of them? Try fewer (--processes)."
+        ) from error
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -150,7 +158,9 @@ def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: Pl
     It is given up as soon as the first number of its rank must stay below ``least``; then all frames that were not tried count as reached.
     """
     model = ArmModel(replace(robot, base_pos=placement.pos, base_quat=placement.quat))
-    thresholds = Thresholds(hand_error=np.inf, wrist_position=config.position, wrist_orientation=np.radians(config.orientation))
+    thresholds = Thresholds(
+        hand_error=np.inf, wrist_position=config.position, wrist_orientation=np.radians(config.orientation)
+    )
     effort = ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0)
     frames, begin, end = len(wrists.annotated), 0, _FIRST if least else len(wrists.annotated)
     possible, dexterity = frames, torch.zeros(0, dtype=torch.float64)
@@ -159,7 +169,9 @@ def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: Pl
         joints, measures = track(model, part, thresholds, effort)
         reached = (classify(measures, thresholds) == 0)[:, 0]
         possible -= int((~reached).sum())
-        jacobian = model.kinematics.jacobian(model.full(joints[reached, 0], part.hand_joints[reached, 0]), [robot.hand_root])
+        jacobian = model.kinematics.jacobian(
+            model.full(joints[reached, 0], part.hand_joints[reached, 0]), [robot.hand_root]
+        )
         rows = torch.cat((jacobian.linear[:, 0] / _LENGTH, jacobian.angular[:, 0]), dim=1)[..., model.arm]
         dexterity = torch.cat((dexterity, torch.linalg.svdvals(rows)[:, -1]))
         begin, end = end, 4 * end
@@ -170,7 +182,9 @@ def single_frames(paths: list[ArmTargets], hand_error: float) -> ArmTargets:
     """[F, 1, ...] the annotated frames of paths, each on its own, that hand retargeting follows within ``hand_error`` [m]."""
 
     def flat(name: str) -> torch.Tensor:
-        return torch.cat([getattr(path, name)[path.annotated & (path.hand_error <= hand_error)] for path in paths])[:, None]
+        return torch.cat([getattr(path, name)[path.annotated & (path.hand_error <= hand_error)] for path in paths])[
+            :, None
+        ]
 
     return ArmTargets(**{name: flat(name) for name in vars(paths[0])})
 
@@ -183,10 +197,16 @@ def _followed(robot: RobotSpec, placement: Placement, paths: list[ArmTargets]) -
 
 
 def _rounds(
-    robot: RobotSpec, avoid: np.ndarray, config: PlaceConfig, random: np.random.Generator, found: list[tuple[Placement, Reach]]
+    robot: RobotSpec,
+    avoid: np.ndarray,
+    config: PlaceConfig,
+    random: np.random.Generator,
+    found: list[tuple[Placement, Reach]],
 ) -> Iterator[list[Placement]]:
     """The candidates of each round: first evenly over the ranges, then around the best that ``found`` holds by then."""
-    own_tilt = float(np.degrees(np.arccos(np.clip(Rotation.from_quat(robot.base_quat, scalar_first=True).as_matrix()[2, 2], -1, 1))))
+    own_tilt = float(
+        np.degrees(np.arccos(np.clip(Rotation.from_quat(robot.base_quat, scalar_first=True).as_matrix()[2, 2], -1, 1)))
+    )
     tilt = config.tilt or (own_tilt, own_tilt)
     low = np.array([config.x[0], config.y[0], config.z[0], -180.0, tilt[0], -180.0])
     high = np.array([config.x[1], config.y[1], config.z[1], 180.0, tilt[1], 180.0])

@@ -106,10 +106,14 @@ def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) 
     text = path.read_text()
     text = re.sub(r"^placement *=.*\n", "", text, flags=re.MULTILINE)
     quoted = command.replace("\\", "\\\\").replace('"', '\\"')
-    figures = f"reached = {search.best.reach.reached:.3f}, followed = {search.best.followed:.3f}, frames = {search.frames}"
+    figures = (
+        f"reached = {search.best.reach.reached:.3f}, followed = {search.best.followed:.3f}, frames = {search.frames}"
+    )
     edits = [(r"^(quat *=.*)$", rf'\g<1>\nplacement = {{ {figures}, command = "{_literal(quoted)}" }}')]
     if search.best.placement != search.own.placement:  # else not a digit may change: it would be another robot
-        pos, quat = (", ".join(f"{v:.8g}" for v in values) for values in (search.best.placement.pos, search.best.placement.quat))
+        pos, quat = (
+            ", ".join(f"{v:.8g}" for v in values) for values in (search.best.placement.pos, search.best.placement.quat)
+        )
         edits = [(r"^pos *=.*$", f"pos = [{pos}]"), (r"^quat *=.*$", f"quat = [{quat}]"), *edits]
         for name, value in zip((robot.joint_names[i] for i in robot.arm_indices), search.home, strict=True):
             edits.append((rf'(name *= *"{re.escape(name)}".*?\bhome *= *)[-+.\deE]+', rf"\g<1>{value:.3f}"))

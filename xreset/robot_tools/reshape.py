@@ -49,14 +49,21 @@ def reshape(robot: str, shapes: Path, out: Path) -> tuple[str, ...]:
         raise RobotError(
             f"{shapes} is of another robot than {spec.name!r}: {'; '.join(apart)}. To make a robot of it: xreset robots import."
         )
-    tree = replace(tree, links=tuple(replace(link, collisions=found.get(link.name, link.collisions)) for link in tree.links))
+    tree = replace(
+        tree, links=tuple(replace(link, collisions=found.get(link.name, link.collisions)) for link in tree.links)
+    )
     with atomic_folder(out) as work:
         comment = f"{spec.name} with the collision shapes of {shapes.name}. Written by xreset robots reshape."
-        (work / "robot.urdf").write_text(urdf_text(tree, read_source(spec.urdf).effort, mimics=spec.mimics, comment=comment))
+        (work / "robot.urdf").write_text(
+            urdf_text(tree, read_source(spec.urdf).effort, mimics=spec.mimics, comment=comment)
+        )
         write_meshes(tree, work)
         met = always_meeting(replace(spec, urdf=work / "robot.urdf"))
         edits = [
-            (r"^name *=.*$", f'name = "{out.name}"\nlike = "{spec.fingerprint}"  # {spec.name}, from which only shapes differ'),
+            (
+                r"^name *=.*$",
+                f'name = "{out.name}"\nlike = "{spec.fingerprint}"  # {spec.name}, from which only shapes differ',
+            ),
             (r"^urdf *=.*$", 'urdf = "robot.urdf"'),
         ]
         if met:
@@ -80,7 +87,9 @@ def _shapes(tree: RobotTree, other: RobotTree, path: Path) -> dict[str, tuple[Sh
         if not link.collisions:
             continue
         if owner not in tree.link_names:
-            raise RobotError(f"{path}: {link.name!r} has shapes, and neither it nor what it is fixed to is a link of {tree.name!r}.")
+            raise RobotError(
+                f"{path}: {link.name!r} has shapes, and neither it nor what it is fixed to is a link of {tree.name!r}."
+            )
         moved = (replace(shape, T_body_shape=T @ shape.T_body_shape) for shape in link.collisions)
         found[owner] = (*found.get(owner, ()), *moved)
     if not found:

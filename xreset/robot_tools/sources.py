@@ -52,8 +52,12 @@ def read_source(path: str | Path) -> Source:
     root = parse_xml(path)
     source = _read_mjcf(path) if root.tag == "mujoco" else _read_urdf(path, root)
     check_tree(source.tree, path)
-    drives = [number for drive in source.drives.values() for number in (drive.kp, drive.kd, drive.effort, drive.armature)]
-    if not np.isfinite([*drives, *(number for mimic in source.mimics for number in (mimic.multiplier, mimic.offset))]).all():
+    drives = [
+        number for drive in source.drives.values() for number in (drive.kp, drive.kd, drive.effort, drive.armature)
+    ]
+    if not np.isfinite(
+        [*drives, *(number for mimic in source.mimics for number in (mimic.multiplier, mimic.offset))]
+    ).all():
         raise RobotError(f"{path} has a drive or a mimicking joint with a number that is not finite.")
     return _with_masses(_with_limits(source))
 
@@ -137,9 +141,14 @@ def _renamed(source: Source, links: Iterable[str], joints: Iterable[str]) -> Sou
         name=source.tree.name,
         root=link[source.tree.root],
         links=tuple(replace(item, name=link[item.name]) for item in source.tree.links),
-        joints=tuple(replace(j, name=joint[j.name], parent=link[j.parent], child=link[j.child]) for j in source.tree.joints),
+        joints=tuple(
+            replace(j, name=joint[j.name], parent=link[j.parent], child=link[j.child]) for j in source.tree.joints
+        ),
     )
-    mimics = tuple(replace(mimic, joint=joint[mimic.joint], source=joint.get(mimic.source, mimic.source)) for mimic in source.mimics)
+    mimics = tuple(
+        replace(mimic, joint=joint[mimic.joint], source=joint.get(mimic.source, mimic.source))
+        for mimic in source.mimics
+    )
     effort, drives = ({joint[name]: value for name, value in part.items()} for part in (source.effort, source.drives))
     return replace(source, tree=tree, mimics=mimics, effort=effort, drives=drives)
 
@@ -161,7 +170,9 @@ def _with_limits(source: Source) -> Source:
         row = next(i for i, joint in enumerate(joints) if joint.name == mimic.joint)
         if low < joints[row].lower or high > joints[row].upper:
             stated = f"{joints[row].lower:.4g}..{joints[row].upper:.4g}"
-            notes.append(f"{mimic.joint!r} has the limits {low:.4g}..{high:.4g} that {mimic.source!r} gives it, in place of {stated}")
+            notes.append(
+                f"{mimic.joint!r} has the limits {low:.4g}..{high:.4g} that {mimic.source!r} gives it, in place of {stated}"
+            )
             joints[row] = replace(joints[row], lower=low, upper=high)
     return replace(source, tree=replace(source.tree, joints=tuple(joints)), notes=tuple(notes))
 
@@ -178,7 +189,9 @@ def _with_masses(source: Source) -> Source:
             continue
         if link.mass <= 0 or not plausible(link):
             vertices, faces = surface_of(link.collisions)
-            volume = float(np.einsum("ij,ij->", vertices[faces[:, 0]], np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]])) / 6)
+            volume = float(
+                np.einsum("ij,ij->", vertices[faces[:, 0]], np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]])) / 6
+            )
             mass = link.mass if link.mass > 0 else _DENSITY * volume
             com, inertia = mass_properties(vertices, faces, mass)
             why = "have no mass" if link.mass <= 0 else "have an inertia that their mass and size do not allow"
@@ -219,7 +232,9 @@ def _mjcf_model(path: Path) -> tuple[Any, Any]:
     except ValueError as error:
         raise RobotError(f"{path} is not valid MJCF: {error}") from error
     if problems := _unsupported(model, mujoco):
-        raise RobotError(f"{path} uses what xreset does not have:" + "".join(f"\n  - {problem}" for problem in problems))
+        raise RobotError(
+            f"{path} uses what xreset does not have:" + "".join(f"\n  - {problem}" for problem in problems)
+        )
     return model, mujoco
 
 
@@ -229,7 +244,9 @@ def _read_mjcf(path: Path) -> Source:
     names = [model.body(i).name or f"body{i}" for i in range(model.nbody)]
     tops = [i for i in range(1, model.nbody) if model.body_parentid[i] == 0]
     if len(tops) != 1:
-        raise RobotError(f"{path}: expected one body in the world, found {', '.join(names[i] for i in tops) or 'none'}.")
+        raise RobotError(
+            f"{path}: expected one body in the world, found {', '.join(names[i] for i in tops) or 'none'}."
+        )
     shift = np.zeros((model.nbody, 3))  # a joint may lie beside its body's origin: the link's frame is put onto it
     links, joints, joint_name = [], [], {}
     for body in range(1, model.nbody):
@@ -266,7 +283,9 @@ def _read_mjcf(path: Path) -> Source:
             if not own:
                 joints.append(fixed(above, names[body], T))
         elif own:
-            raise RobotError(f"{path}: the first body {names[body]!r} has joints; put it into a body that does not move.")
+            raise RobotError(
+                f"{path}: the first body {names[body]!r} has joints; put it into a body that does not move."
+            )
         links.append(link)
     mimics = []
     for i in range(model.neq):
@@ -276,7 +295,10 @@ def _read_mjcf(path: Path) -> Source:
             mimics.append(MimicSpec(joint=ends[0], source=ends[1], multiplier=factor, offset=offset))
     order = {link.name: link for link in links}
     tree = RobotTree(
-        name=Path(path).stem, root=names[tops[0]], links=(order[names[tops[0]]], *(order[j.child] for j in joints)), joints=tuple(joints)
+        name=Path(path).stem,
+        root=names[tops[0]],
+        links=(order[names[tops[0]]], *(order[j.child] for j in joints)),
+        joints=tuple(joints),
     )
     drives, effort = _mjcf_drives(model, joint_name)
     return Source(tree=tree, mimics=tuple(mimics), effort=effort, drives=drives, notes=tuple(notes))
@@ -304,21 +326,33 @@ def _mjcf_drives(model, joint_name: dict[int, str]) -> tuple[dict[str, DriveSpec
 def _unsupported(model, mujoco) -> list[str]:
     """Every feature of a model that a robot of xreset cannot have."""
     kinds, geoms = mujoco.mjtJoint, mujoco.mjtGeom
-    problems = [f"the ball joint {model.joint(j).name!r}" for j in range(model.njnt) if int(model.jnt_type[j]) == int(kinds.mjJNT_BALL)]
+    problems = [
+        f"the ball joint {model.joint(j).name!r}"
+        for j in range(model.njnt)
+        if int(model.jnt_type[j]) == int(kinds.mjJNT_BALL)
+    ]
     for i in range(model.ngeom):
         solid = model.geom_contype[i] or model.geom_conaffinity[i]
-        known = {int(getattr(geoms, f"mjGEOM_{kind}")) for kind in ("BOX", "SPHERE", "CAPSULE", "CYLINDER", "MESH", "PLANE")}
+        known = {
+            int(getattr(geoms, f"mjGEOM_{kind}")) for kind in ("BOX", "SPHERE", "CAPSULE", "CYLINDER", "MESH", "PLANE")
+        }
         if solid and int(model.geom_type[i]) not in known:
             kind = geoms(int(model.geom_type[i])).name.removeprefix("mjGEOM_").lower()
-            problems.append(f"the {kind} {model.geom(i).name or i!r} of body {model.body(int(model.geom_bodyid[i])).name!r}")
+            problems.append(
+                f"the {kind} {model.geom(i).name or i!r} of body {model.body(int(model.geom_bodyid[i])).name!r}"
+            )
     for i in range(model.nu):
         if int(model.actuator_trntype[i]) != int(mujoco.mjtTrn.mjTRN_JOINT):
             problems.append(f"the actuator {model.actuator(i).name!r}, which does not drive a single joint")
     for i in range(model.neq):
         if int(model.eq_type[i]) != int(mujoco.mjtEq.mjEQ_JOINT):
-            problems.append(f"the equality {model.equality(i).name or i!r} of type {mujoco.mjtEq(int(model.eq_type[i])).name[5:].lower()}")
+            problems.append(
+                f"the equality {model.equality(i).name or i!r} of type {mujoco.mjtEq(int(model.eq_type[i])).name[5:].lower()}"
+            )
         elif np.abs(model.eq_data[i, 2:5]).max() > 0:
-            problems.append(f"the equality {model.equality(i).name or i!r}, which couples joints by a curve that is not straight")
+            problems.append(
+                f"the equality {model.equality(i).name or i!r}, which couples joints by a curve that is not straight"
+            )
     problems += [f"the tendon {model.tendon(i).name or i!r}" for i in range(model.ntendon)]
     problems += ["flexible bodies"] * bool(model.nflex)
     return problems
@@ -343,7 +377,9 @@ def _geoms(model, mujoco, body: int, shift: np.ndarray) -> Iterable[Shape]:
     """The collision shapes of a body."""
     kinds = mujoco.mjtGeom
     for i in range(int(model.body_geomadr[body]), int(model.body_geomadr[body]) + int(model.body_geomnum[body])):
-        if not (model.geom_contype[i] or model.geom_conaffinity[i]) or int(model.geom_type[i]) == int(kinds.mjGEOM_PLANE):
+        if not (model.geom_contype[i] or model.geom_conaffinity[i]) or int(model.geom_type[i]) == int(
+            kinds.mjGEOM_PLANE
+        ):
             continue
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = _matrix(model.geom_quat[i]), model.geom_pos[i] - shift
@@ -356,13 +392,17 @@ def _geoms(model, mujoco, body: int, shift: np.ndarray) -> Iterable[Shape]:
             try:
                 geometry = hull(vertices, HULL_TOLERANCE).geometry
             except ObjectError as error:
-                raise RobotError(f"the mesh {model.mesh(mesh).name!r} of body {model.body(body).name!r}: {error}") from error
+                raise RobotError(
+                    f"the mesh {model.mesh(mesh).name!r} of body {model.body(body).name!r}: {error}"
+                ) from error
         elif kind == int(kinds.mjGEOM_BOX):
             geometry = Geometry(kind="box", size=tuple(size))
         elif kind == int(kinds.mjGEOM_SPHERE):
             geometry = Geometry(kind="sphere", size=(size[0],))
         else:
-            geometry = Geometry(kind="capsule" if kind == int(kinds.mjGEOM_CAPSULE) else "cylinder", size=(size[0], size[1]))
+            geometry = Geometry(
+                kind="capsule" if kind == int(kinds.mjGEOM_CAPSULE) else "cylinder", size=(size[0], size[1])
+            )
         yield Shape(geometry=geometry, T_body_shape=T)
 
 

@@ -59,8 +59,20 @@ class ActionSpace:
         step = torch.where(is_arm, config.arm_step, unit * (config.hand_step if config.hand == "relative" else 0.0))
         lead = torch.where(is_arm, config.arm_lead, unit * config.hand_lead)
         # Continuous arm joints have infinite limits; where() must not see inf * 0 from them.
-        zero, below, above = (torch.where(is_arm, other, value) for value, other in ((zero, 0.0), (below, 1.0), (above, 1.0)))
-        return cls(lower=lower, upper=upper, is_arm=is_arm, step=step, lead=lead, zero=zero, below=below, above=above, config=config)
+        zero, below, above = (
+            torch.where(is_arm, other, value) for value, other in ((zero, 0.0), (below, 1.0), (above, 1.0))
+        )
+        return cls(
+            lower=lower,
+            upper=upper,
+            is_arm=is_arm,
+            step=step,
+            lead=lead,
+            zero=zero,
+            below=below,
+            above=above,
+            config=config,
+        )
 
     def targets(self, action: Tensor, target: Tensor, joint_pos: Tensor) -> Tensor:
         """[N, J] new joint targets.
@@ -80,7 +92,9 @@ class ActionSpace:
         """[N, J] the action whose targets come nearest to ``wanted`` [N, J], given the present targets."""
         action = (wanted - target) / self.step.clamp_min(1e-9)
         if self.config.hand == "absolute":
-            action = torch.where(self.is_arm, action, self.within_limits(target + (wanted - target) / self.config.hand_smoothing))
+            action = torch.where(
+                self.is_arm, action, self.within_limits(target + (wanted - target) / self.config.hand_smoothing)
+            )
         return action.clamp(-1.0, 1.0)
 
     def within_limits(self, joint_pos: Tensor) -> Tensor:

@@ -134,7 +134,9 @@ class RewardConfig(Checked):
         super().__post_init__()
         for name, weight in self.own.items():
             if not all(name.partition(":")[::2]) or not isfinite(weight):
-                raise ValueError(f"own holds {name!r} with weight {weight}, expected module:function and a finite number")
+                raise ValueError(
+                    f"own holds {name!r} with weight {weight}, expected module:function and a finite number"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +155,9 @@ class TerminationConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.object_low < self.object_high:
-            raise ValueError(f"object_low is {self.object_low}, expected less than object_high, which is {self.object_high}")
+            raise ValueError(
+                f"object_low is {self.object_low}, expected less than object_high, which is {self.object_high}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,7 +277,9 @@ class TaskConfig(Checked):
         steps = self.termination.episode_seconds / (self.timestep * self.substeps)
         for name in ("action_latency", "observation_latency"):
             if (longest := getattr(self.randomization, name)[1]) >= steps:
-                raise ValueError(f"{name} goes up to {longest:g} control steps, expected fewer than an episode has, which are {steps:.0f}")
+                raise ValueError(
+                    f"{name} goes up to {longest:g} control steps, expected fewer than an episode has, which are {steps:.0f}"
+                )
 
 
 EVALUATION_TIMESTEP = 1.0 / 240.0

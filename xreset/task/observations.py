@@ -12,7 +12,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.geometry.rotations import quat_conjugate, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_axis_angle, quat_to_matrix
+from xreset.geometry.rotations import (
+    quat_conjugate,
+    quat_from_axis_angle,
+    quat_multiply,
+    quat_rotate,
+    quat_to_axis_angle,
+    quat_to_matrix,
+)
 from xreset.physics import Links, State
 from xreset.task.config import ObservationConfig
 
@@ -126,7 +133,9 @@ def privileged_group(x: ObservationInput) -> Tensor:
     )
 
 
-def cloud_frame(points: Tensor, object_pos: Tensor, object_quat: Tensor, c: ObservationConfig, generator: torch.Generator) -> Tensor:
+def cloud_frame(
+    points: Tensor, object_pos: Tensor, object_quat: Tensor, c: ObservationConfig, generator: torch.Generator
+) -> Tensor:
     """[N, P, 3] the object's points [N, P, 3] (object frame) in the world frame, with noise, times ``cloud_scale``."""
     cloud = quat_rotate(object_quat[:, None], points) + object_pos[:, None]
     return c.cloud_scale * (cloud + c.noise.cloud * _normal(cloud, generator))

@@ -165,5 +165,7 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
 def _checked(name: str, value: Tensor, like: Tensor) -> Tensor:
     if not isinstance(value, Tensor) or value.shape != like.shape:
         found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-        raise RunError(f"the reward term {name!r} gave {found}, expected a tensor of one value for each world, {tuple(like.shape)}.")
+        raise RunError(
+            f"the reward term {name!r} gave {found}, expected a tensor of one value for each world, {tuple(like.shape)}."
+        )
     return value.to(like.dtype)

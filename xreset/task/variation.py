@@ -11,7 +11,14 @@ from xreset.errors import CapabilityError
 from xreset.physics import Backend, State
 from xreset.task.config import RandomizationConfig
 from xreset.task.latency import DelayLine
-from xreset.task.randomization import own_friction, sample_drives, sample_friction, sample_mass_scale, sample_offset, sample_range
+from xreset.task.randomization import (
+    own_friction,
+    sample_drives,
+    sample_friction,
+    sample_mass_scale,
+    sample_offset,
+    sample_range,
+)
 
 
 class Variation:
@@ -51,7 +58,9 @@ class Variation:
                 "those ranges of task.randomization as they are by default, or use another backend."
             )
         self.force_gain = torch.ones(n, 1, 1, device=device) if config.draws("force_gain") else None
-        late_actions, late_poses = (limits[1] if config.enabled else 0.0 for limits in (config.action_latency, config.observation_latency))
+        late_actions, late_poses = (
+            limits[1] if config.enabled else 0.0 for limits in (config.action_latency, config.observation_latency)
+        )
         self._commands = DelayLine(zeros(joints), late_actions) if late_actions else None
         self._poses = DelayLine(zeros(7), late_poses) if late_poses else None
 
@@ -69,10 +78,14 @@ class Variation:
         """Draw all anew, for every world: pairs of what was drawn [N, ...] and the buffer that it belongs into."""
         c, n = self._config, self._backend.num_worlds
         samples: dict[str, Callable[[], Tensor]] = {
-            "friction": lambda: (sample_friction(n, c, generator) + self._own_friction).clamp(min=0.05),  # slippery, not negative
+            "friction": lambda: (sample_friction(n, c, generator) + self._own_friction).clamp(
+                min=0.05
+            ),  # slippery, not negative
             "object_mass": lambda: self._nominal_mass * sample_mass_scale(n, c, generator),
             "drives": lambda: sample_drives(self._is_arm, n, c, generator),
-            "torsional_friction": lambda: self._backend.scene.friction.torsional * sample_range(n, c.torsional_friction, generator),
+            "torsional_friction": lambda: (
+                self._backend.scene.friction.torsional * sample_range(n, c.torsional_friction, generator)
+            ),
             "object_inertia": lambda: sample_range(n, c.object_inertia, generator),
             "object_com": lambda: sample_offset(n, c.object_com, generator),
         }
@@ -102,7 +115,9 @@ class Variation:
         if self._poses is None:
             return state.object_pos, state.object_quat
         last = self._poses.values[:, 0, 3:]
-        facing = (state.object_quat * last).sum(dim=-1, keepdim=True) < 0  # of a rotation's two quaternions, the one near the last
+        facing = (state.object_quat * last).sum(
+            dim=-1, keepdim=True
+        ) < 0  # of a rotation's two quaternions, the one near the last
         pose = torch.cat((state.object_pos, torch.where(facing, -state.object_quat, state.object_quat)), dim=-1)
         self._poses.fill(fresh, pose)
         pos, quat = self._poses.push(pose).split((3, 4), dim=-1)

@@ -36,7 +36,14 @@ try:
 except ImportError as error:
     raise unavailable("pydrake", "drake", error) from error
 
-from xreset_drake.model import OBJECT_FRICTION, DrakeModel, DrakeSettings, build_model, friction_of_other, spatial_inertia
+from xreset_drake.model import (
+    OBJECT_FRICTION,
+    DrakeModel,
+    DrakeSettings,
+    build_model,
+    friction_of_other,
+    spatial_inertia,
+)
 
 _DEFAULTS = DrakeSettings()
 
@@ -123,8 +130,12 @@ class DrakeWorld(World):
         at = self._at
         load = ExternallyAppliedSpatialForce()
         load.body_index, load.p_BoBq_B = at.object.index(), self._inertia.com
-        load.F_Bq_W = SpatialForce(self.torque, self.force - np.array([0.0, 0.0, self._inertia.mass * GRAVITY * self.gravity_fraction]))
-        at.plant.get_applied_spatial_force_input_port().FixValue(self._context, Value[list[ExternallyAppliedSpatialForce]]([load]))
+        load.F_Bq_W = SpatialForce(
+            self.torque, self.force - np.array([0.0, 0.0, self._inertia.mass * GRAVITY * self.gravity_fraction])
+        )
+        at.plant.get_applied_spatial_force_input_port().FixValue(
+            self._context, Value[list[ExternallyAppliedSpatialForce]]([load])
+        )
         for count in [1] * (n * self._internal_steps) if self._brake.needed else [n * self._internal_steps]:
             if self._brake.needed:
                 self._brake.apply(at, self._context, self._target, self._dt)
@@ -132,7 +143,9 @@ class DrakeWorld(World):
             try:
                 self._simulator.AdvanceTo(self._steps * self._dt)
             except RuntimeError as error:  # its way to say that numbers have grown beyond all bounds
-                warnings.warn(f"Drake gives up on a world, which counts as not finite from now on: {error}", stacklevel=2)
+                warnings.warn(
+                    f"Drake gives up on a world, which counts as not finite from now on: {error}", stacklevel=2
+                )
                 self._lost = np.full(sum(self._sizes), np.nan)
                 return
 
@@ -157,7 +170,10 @@ class DrakeWorld(World):
             return tip_force, tip_touch, table_force
         results = self._at.plant.get_contact_results_output_port().Eval(self._context)
         for contact in map(results.hydroelastic_contact_info, range(results.num_hydroelastic_contacts())):
-            patch, force = contact.contact_surface(), contact.F_Ac_W().translational()  # on the first of the two geometries
+            patch, force = (
+                contact.contact_surface(),
+                contact.F_Ac_W().translational(),
+            )  # on the first of the two geometries
             first, second = self._at.surfaces[patch.id_M()], self._at.surfaces[patch.id_N()]
             if second.role == "object":
                 first, second, force = second, first, -force
@@ -187,7 +203,9 @@ class DrakeWorld(World):
 
     def set_friction(self, friction: np.ndarray) -> None:
         """See :meth:`World.set_friction`."""
-        self._set_friction({role: friction_of_other(float(mu)) for role, mu in zip(("tip", "link", "table"), friction, strict=True)})
+        self._set_friction(
+            {role: friction_of_other(float(mu)) for role, mu in zip(("tip", "link", "table"), friction, strict=True)}
+        )
 
     def _set_friction(self, coefficients: Mapping[str, float]) -> None:
         """Give the geometries of some roles a coefficient of their own. Drake rebuilds what has changed, so only that is touched."""
@@ -199,12 +217,16 @@ class DrakeWorld(World):
                 properties = ProximityProperties(at.properties[geometry])
                 mu = self._friction[surface.role]
                 AddContactMaterial(properties, friction=CoulombFriction(mu, mu))
-                at.scene_graph.AssignRole(self._geometry, at.plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
+                at.scene_graph.AssignRole(
+                    self._geometry, at.plant.get_source_id(), geometry, properties, RoleAssign.kReplace
+                )
 
 
 _DAMPED = "drives are integrated by implicit Euler steps, which damp: the difference shrinks with the step"
 _ROCKING = "a brick that is laid on its edge rocks for a second, because contacts dissipate little; then the force is right to 0.1 %"
-_PITCHING = "friction tilts an object on the compliant table and lags behind its normal force, so that a fast one chatters"
+_PITCHING = (
+    "friction tilts an object on the compliant table and lags behind its normal force, so that a fast one chatters"
+)
 
 _KNOWN_DIFFERENCES = (
     KnownDifference(check="joint_tracking", measure="arm, sine, rms", bound=0.003, reason=_DAMPED),
@@ -212,7 +234,12 @@ _KNOWN_DIFFERENCES = (
     KnownDifference(check="effort_limit", measure="hand, weak step, peak", bound=0.014, reason=_DAMPED),
     KnownDifference(check="resting_on_a_side", measure="vertical force", bound=0.15, reason=_ROCKING),
     KnownDifference(check="resting_on_a_side", measure="horizontal force", bound=0.3, reason=_ROCKING),
-    KnownDifference(check="rest_and_bounce", measure="bounce", bound=0.004, reason="more dissipation would stop sliding objects too early"),
+    KnownDifference(
+        check="rest_and_bounce",
+        measure="bounce",
+        bound=0.004,
+        reason="more dissipation would stop sliding objects too early",
+    ),
     *(
         KnownDifference(check="sliding_distance", measure=f"mu {mu}, {degrees} degrees", bound=bound, reason=_PITCHING)
         for mu, bound in ((0.5, 0.15), (0.8, 0.3), (1.2, 0.8))

@@ -114,7 +114,9 @@ def friction_of_other(pair: float) -> float:
     return OBJECT_FRICTION * pair / (2.0 * OBJECT_FRICTION - pair)
 
 
-def build_model(scene: SceneSpec, robot: Mechanism, thing: ObjectSpec, inertia: Inertia, settings: DrakeSettings) -> DrakeModel:
+def build_model(
+    scene: SceneSpec, robot: Mechanism, thing: ObjectSpec, inertia: Inertia, settings: DrakeSettings
+) -> DrakeModel:
     """Build the diagram of one world."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(
@@ -149,7 +151,9 @@ def build_model(scene: SceneSpec, robot: Mechanism, thing: ObjectSpec, inertia: 
         robot=instance,
         joint_position=np.array([joint.position_start() for joint in joints], dtype=int),
         joint_velocity=np.array([joint.velocity_start() for joint in joints], dtype=int),
-        joint_actuator=np.array([actuators.index(plant.GetJointActuatorByName(joint.name(), instance).index()) for joint in joints]),
+        joint_actuator=np.array(
+            [actuators.index(plant.GetJointActuatorByName(joint.name(), instance).index()) for joint in joints]
+        ),
         mimic_position=np.array([joint.position_start() for joint in mimics], dtype=int),
         mimic_velocity=np.array([joint.velocity_start() for joint in mimics], dtype=int),
         links=[plant.GetFrameByName(_frame_name(link), instance) for link in scene.robot.tracked_links],
@@ -169,7 +173,9 @@ class _Parts:
         self.properties: dict[GeometryId, ProximityProperties] = {}
         self.links: dict[str, list[GeometryId]] = {}
 
-    def attach(self, body: RigidBody, shape: Shape, surface: Surface, *, placed: RigidTransform | None = None, link: str = "") -> None:
+    def attach(
+        self, body: RigidBody, shape: Shape, surface: Surface, *, placed: RigidTransform | None = None, link: str = ""
+    ) -> None:
         """Add a collision shape to a body."""
         properties = ProximityProperties()
         settings = self.settings
@@ -184,7 +190,11 @@ class _Parts:
         AddContactMaterial(with_friction, friction=CoulombFriction(1.0, 1.0))
         pose = _transform(shape.T_body_shape)
         geometry = self.plant.RegisterCollisionGeometry(
-            body, pose if placed is None else placed @ pose, _shape(shape.geometry), f"shape{len(self.surfaces)}", with_friction
+            body,
+            pose if placed is None else placed @ pose,
+            _shape(shape.geometry),
+            f"shape{len(self.surfaces)}",
+            with_friction,
         )
         self.surfaces[geometry], self.properties[geometry] = surface, properties
         if link:
@@ -195,7 +205,9 @@ def _add_robot(parts: _Parts, robot: Mechanism, instance: ModelInstanceIndex) ->
     plant, spec = parts.plant, robot.robot
     bodies: list[RigidBody] = []
     for item in robot.bodies:
-        body = plant.AddRigidBody(item.name, instance, spatial_inertia(item.inertia) if item.inertia else SpatialInertia.Zero())
+        body = plant.AddRigidBody(
+            item.name, instance, spatial_inertia(item.inertia) if item.inertia else SpatialInertia.Zero()
+        )
         bodies.append(body)
         for part in item.shapes:
             tip = robot.tip_of.get(part.link)
@@ -204,7 +216,9 @@ def _add_robot(parts: _Parts, robot: Mechanism, instance: ModelInstanceIndex) ->
             base = RigidTransform(Quaternion(_unit(spec.base_quat)), spec.base_pos)
             plant.WeldFrames(plant.world_frame(), body.body_frame(), base)
             continue
-        place = FixedOffsetFrame(f"joint:{item.joint.name}", bodies[item.parent].body_frame(), _transform(item.T_parent_body), instance)
+        place = FixedOffsetFrame(
+            f"joint:{item.joint.name}", bodies[item.parent].body_frame(), _transform(item.T_parent_body), instance
+        )
         kind = PrismaticJoint if item.joint.type == "prismatic" else RevoluteJoint
         plant.AddJoint(
             kind(
@@ -245,7 +259,9 @@ def _add_object(parts: _Parts, thing: ObjectSpec, inertia: Inertia) -> RigidBody
 def _filter_collisions(scene_graph: SceneGraph, parts: _Parts, robot: Mechanism) -> None:
     """Let only those pairs collide that the scene says: everything is excluded first, then the wanted pairs are allowed."""
     spec = robot.robot
-    of_role = {role: [g for g, surface in parts.surfaces.items() if surface.role == role] for role in ("object", "table")}
+    of_role = {
+        role: [g for g, surface in parts.surfaces.items() if surface.role == role] for role in ("object", "table")
+    }
     on_links = [g for geometries in parts.links.values() for g in geometries]
     above_table = [g for link, geometries in parts.links.items() if link not in spec.table_exclude for g in geometries]
     rule = CollisionFilterDeclaration().ExcludeWithin(GeometrySet(list(parts.surfaces)))

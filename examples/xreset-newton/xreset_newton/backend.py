@@ -18,7 +18,17 @@ from typing import get_args
 import numpy as np
 
 from xreset.backends.pool import PoolBackend, World, is_finite
-from xreset.backends.rigid import Inertia, MovingJoints, TrackedFrames, cross, mechanism, nearer, object_inertia, principal, rotate
+from xreset.backends.rigid import (
+    Inertia,
+    MovingJoints,
+    TrackedFrames,
+    cross,
+    mechanism,
+    nearer,
+    object_inertia,
+    principal,
+    rotate,
+)
 from xreset.errors import XResetError
 from xreset.physics import Capability, KnownDifference, unavailable
 from xreset.spec import GRAVITY, SceneSpec
@@ -48,7 +58,10 @@ class NewtonWorld(World):
         self._tips = len(scene.robot.fingertips)
         self._joints, self._frames = MovingJoints(scene.robot, robot.joint_names), TrackedFrames(robot)
         self._pipeline = newton.CollisionPipeline(
-            model, broad_phase="explicit", shape_pairs_filtered=wp.array(at.pairs, dtype=wp.vec2i, device="cpu"), deterministic=True
+            model,
+            broad_phase="explicit",
+            shape_pairs_filtered=wp.array(at.pairs, dtype=wp.vec2i, device="cpu"),
+            deterministic=True,
         )
         self._contacts = self._pipeline.contacts()
         self._solver = newton.solvers.SolverSteel(
@@ -65,7 +78,9 @@ class NewtonWorld(World):
         )
         self.forces = self._solver.observables({_FORCE}, contacts=self._contacts)
         self._states, self._control = [model.state(), model.state()], model.control()
-        self._roles = {role: np.array([s.role == role for s in at.surfaces]) for role in ("tip", "link", "table", "object")}
+        self._roles = {
+            role: np.array([s.role == role for s in at.surfaces]) for role in ("tip", "link", "table", "object")
+        }
         self._tip_of_shape = np.array([surface.tip for surface in at.surfaces])
         self._base = np.array([*scene.robot.base_pos, *np.roll(scene.robot.base_quat, -1)])
         masses = np.array([body.inertia.mass for body in robot.bodies if body.inertia is not None])
@@ -146,7 +161,10 @@ class NewtonWorld(World):
         """See :meth:`World.contacts`: of the last internal step."""
         tip_force, tip_touch, table_force = np.zeros((self._tips, 3)), np.zeros(self._tips, dtype=bool), np.zeros(3)
         count = int(self._contacts.rigid_contact_count.numpy()[0]) if self._stepped else 0
-        first, second = (shape.numpy()[:count] for shape in (self._contacts.rigid_contact_shape0, self._contacts.rigid_contact_shape1))
+        first, second = (
+            shape.numpy()[:count]
+            for shape in (self._contacts.rigid_contact_shape0, self._contacts.rigid_contact_shape1)
+        )
         force = self.forces.contact_f.numpy()[:count, :3].astype(float)  # on the first shape's body
         mine = self._roles["object"]
         for other, forces in ((second, force), (first, -force)):
@@ -165,8 +183,13 @@ class NewtonWorld(World):
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`."""
         model = self._model
-        values = zip(model.body_mass.numpy(), model.body_com.numpy(), model.body_inertia.numpy(), model.body_label, strict=True)
-        return [principal(float(m), c.astype(float), i.astype(float), XResetError, f"Newton's {name!r}") for m, c, i, name in values]
+        values = zip(
+            model.body_mass.numpy(), model.body_com.numpy(), model.body_inertia.numpy(), model.body_label, strict=True
+        )
+        return [
+            principal(float(m), c.astype(float), i.astype(float), XResetError, f"Newton's {name!r}")
+            for m, c, i, name in values
+        ]
 
     def set_object_inertia(self, inertia: Inertia) -> None:
         """See :meth:`World.set_object_inertia`."""
@@ -195,7 +218,12 @@ _DAMPED = "drives are integrated by implicit Euler steps, which damp: the differ
 _KNOWN_DIFFERENCES = (
     KnownDifference(check="joint_tracking", measure="hand, sine, rms", bound=0.003, reason=_DAMPED),
     KnownDifference(check="effort_limit", measure="hand, weak step, peak", bound=0.014, reason=_DAMPED),
-    KnownDifference(check="torsional_friction", measure="spin lost", bound=1.01, reason="the solver has torsional friction on CUDA only"),
+    KnownDifference(
+        check="torsional_friction",
+        measure="spin lost",
+        bound=1.01,
+        reason="the solver has torsional friction on CUDA only",
+    ),
 )
 
 

@@ -56,21 +56,27 @@ class NewtonModel:
     """Of each shape."""
 
 
-def build_model(scene: SceneSpec, robot: Mechanism, thing: ObjectSpec, inertia: Inertia, settings: NewtonSettings) -> NewtonModel:
+def build_model(
+    scene: SceneSpec, robot: Mechanism, thing: ObjectSpec, inertia: Inertia, settings: NewtonSettings
+) -> NewtonModel:
     """Build the model of one world.
 
     Raises:
         CapabilityError: a joint of the robot has dry friction.
     """
     if any(joint.drive.friction_loss for joint in scene.robot.joints):
-        raise CapabilityError("Newton has no dry friction of joints on the CPU: give the robot's drives a friction_loss of 0.")
+        raise CapabilityError(
+            "Newton has no dry friction of joints on the CPU: give the robot's drives a friction_loss of 0."
+        )
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     newton.solvers.SolverSteel.register_custom_attributes(builder)
     builder.balance_inertia = False
     shapes = _Shapes(builder, settings)
     corner = np.eye(4)
     corner[:3, 3] = *scene.table.center, -scene.table.half_size[2]
-    shapes.add(-1, Shape(geometry=Geometry(kind="box", size=scene.table.half_size), T_body_shape=corner), Surface("table"))
+    shapes.add(
+        -1, Shape(geometry=Geometry(kind="box", size=scene.table.half_size), T_body_shape=corner), Surface("table")
+    )
     _add_robot(builder, shapes, robot)
     body = builder.add_body(**_mass(inertia), label="object")
     for piece in thing.pieces:
@@ -108,7 +114,9 @@ class _Shapes:
 
     def colliding(self, robot: Mechanism) -> np.ndarray:
         """[P, 2] pairs of shapes that the scene lets collide."""
-        return np.array([pair for pair in combinations(range(len(self.surfaces)), 2) if self._collide(robot, *pair)], dtype=np.int32)
+        return np.array(
+            [pair for pair in combinations(range(len(self.surfaces)), 2) if self._collide(robot, *pair)], dtype=np.int32
+        )
 
     def _collide(self, robot: Mechanism, a: int, b: int) -> bool:
         roles = {self.surfaces[a].role, self.surfaces[b].role}
@@ -147,7 +155,11 @@ def _add_robot(builder: newton.ModelBuilder, shapes: _Shapes, robot: Mechanism) 
             )
         for part in item.shapes:
             tip = robot.tip_of.get(part.link, -1)
-            placed = Shape(geometry=part.shape.geometry, T_body_shape=matrix(base) @ part.shape.T_body_shape) if body < 0 else part.shape
+            placed = (
+                Shape(geometry=part.shape.geometry, T_body_shape=matrix(base) @ part.shape.T_body_shape)
+                if body < 0
+                else part.shape
+            )
             shapes.add(body, placed, Surface("link" if tip < 0 else "tip", tip), part.link)
     for mimic in spec.mimics:
         builder.set_joint_mimic(joints[mimic.joint], joints[mimic.source], coeffs=(mimic.offset, mimic.multiplier))
@@ -156,7 +168,12 @@ def _add_robot(builder: newton.ModelBuilder, shapes: _Shapes, robot: Mechanism) 
 
 def _mass(inertia: Inertia) -> dict[str, object]:
     """What a Newton body is told of its mass."""
-    return {"mass": inertia.mass, "com": wp.vec3(*inertia.com), "inertia": wp.mat33(*inertia.matrix.flatten()), "lock_inertia": True}
+    return {
+        "mass": inertia.mass,
+        "com": wp.vec3(*inertia.com),
+        "inertia": wp.mat33(*inertia.matrix.flatten()),
+        "lock_inertia": True,
+    }
 
 
 def xyzw(quat: np.ndarray) -> wp.quat:

@@ -49,7 +49,9 @@ def check(
         used = device if device.split(":")[0] in status.device else "cpu"
         what = f" {status.version}, {spec.name}, {used}: verdict, check, and what came nearest to its tolerance"
         console.print(Text.assemble((name, "bold"), what))
-        results = conformance.run(_maker(name, used), robot=spec, only=only or None, report=lambda r: _print(console, r, verbose))
+        results = conformance.run(
+            _maker(name, used), robot=spec, only=only or None, report=lambda r: _print(console, r, verbose)
+        )
         runs.append(
             {
                 "engine": name,
@@ -62,10 +64,14 @@ def check(
             }
         )
     if json is not None:
-        write_json(json, {"schema": conformance.SCHEMA, "xreset_version": __version__, "command": this_command(), "runs": runs})
+        write_json(
+            json, {"schema": conformance.SCHEMA, "xreset_version": __version__, "command": this_command(), "runs": runs}
+        )
         console.print(f"wrote {json}")
     failed = sum(result["verdict"] == "failed" for record in runs for result in record["checks"])
-    console.print(f"{failed} checks failed" if failed else "no check failed", style="bold red" if failed else "bold green")
+    console.print(
+        f"{failed} checks failed" if failed else "no check failed", style="bold red" if failed else "bold green"
+    )
     if failed:
         raise SystemExit(1)
 
@@ -82,7 +88,13 @@ def _maker(name: str, device: str) -> conformance.MakeBackend:
     return make
 
 
-_STYLE = {"passed": "green", "known difference": "cyan", "failed": "bold red", "unsupported": "yellow", "skipped": "dim"}
+_STYLE = {
+    "passed": "green",
+    "known difference": "cyan",
+    "failed": "bold red",
+    "unsupported": "yellow",
+    "skipped": "dim",
+}
 
 
 def _print(console: Console, result: conformance.CheckResult, verbose: bool) -> None:

@@ -62,12 +62,23 @@ def compare(
     console.print(_table(result))
     for tested in (result.reference, result.floor, *result.engines):
         if tested.broken:
-            console.print(f"{tested.engine.name}: {tested.broken} worlds were not finite or dropped contacts", style="bold red")
+            console.print(
+                f"{tested.engine.name}: {tested.broken} worlds were not finite or dropped contacts", style="bold red"
+            )
     if json is not None:
-        write_json(json, result.as_dict() | {"xreset_version": __version__, "command": this_command(), "inputs": inputs})
+        write_json(
+            json, result.as_dict() | {"xreset_version": __version__, "command": this_command(), "inputs": inputs}
+        )
         console.print(f"wrote {json}")
-    missed = [f"{tested.engine.name}: {metric.name}" for tested in result.engines for metric in tested.metrics if not metric.ok]
-    console.print(f"missed: {'; '.join(missed)}" if missed else "all targets met", style="bold red" if missed else "bold green")
+    missed = [
+        f"{tested.engine.name}: {metric.name}"
+        for tested in result.engines
+        for metric in tested.metrics
+        if not metric.ok
+    ]
+    console.print(
+        f"missed: {'; '.join(missed)}" if missed else "all targets met", style="bold red" if missed else "bold green"
+    )
     if missed:
         raise SystemExit(1)
 

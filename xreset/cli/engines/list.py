@@ -13,7 +13,9 @@ def engines() -> None:
     table = Table("backend", "engine version", "device", "available")
     for name in backend_names():
         status = backend_status(name)
-        table.add_row(name, status.version or "-", status.device, "yes" if status.reason is None else f"no: {status.reason}")
+        table.add_row(
+            name, status.version or "-", status.device, "yes" if status.reason is None else f"no: {status.reason}"
+        )
     Console().print(table)
 
 

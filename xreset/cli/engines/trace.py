@@ -39,7 +39,13 @@ class Limits(Options):
     """By how much they differ, each joint [rad, m] and each coordinate of the object [m]."""
 
     def __post_init__(self) -> None:
-        limits = (self.joint_threshold, self.position_threshold, self.angle_threshold, self.force_threshold, self.contact_time)
+        limits = (
+            self.joint_threshold,
+            self.position_threshold,
+            self.angle_threshold,
+            self.force_threshold,
+            self.contact_time,
+        )
         if min(limits) <= 0:
             raise XResetError(f"thresholds must be above 0, found {', '.join(map(str, limits))}.")
 

@@ -15,7 +15,11 @@ from xreset.errors import XResetError
 from xreset.spec import ObjectSpec, RobotSpec
 
 Kind = Literal["demonstrations", "robot trajectories", "reset states"]
-GOOD: dict[Kind, str] = {"demonstrations": "annotated", "robot trajectories": "valid", "reset states": "stable in physics"}
+GOOD: dict[Kind, str] = {
+    "demonstrations": "annotated",
+    "robot trajectories": "valid",
+    "reset states": "stable in physics",
+}
 """What a row is called that has no reason against it."""
 _BAD: dict[Kind, str] = {"demonstrations": "", "robot trajectories": "not valid: ", "reset states": "rejected: "}
 Phase = Literal["before contact", "after contact"]
@@ -81,7 +85,12 @@ class View:
     human: Human | None = None
 
     def choose(
-        self, *, sequence: int | None = None, object_name: str | None = None, phase: Phase | None = None, reason: str | None = None
+        self,
+        *,
+        sequence: int | None = None,
+        object_name: str | None = None,
+        phase: Phase | None = None,
+        reason: str | None = None,
     ) -> np.ndarray:
         """Indices of the rows that meet every condition given, in order; may be empty.
 
@@ -94,7 +103,9 @@ class View:
         keep = np.ones(len(self.frame), dtype=bool)
         if sequence is not None:
             if not 0 <= sequence < len(self.sequence_name):
-                raise XResetError(f"there is no sequence {sequence}; the file has {len(self.sequence_name)}, counted from 0.")
+                raise XResetError(
+                    f"there is no sequence {sequence}; the file has {len(self.sequence_name)}, counted from 0."
+                )
             keep &= self.sequence == sequence
         if object_name is not None:
             names = [spec.name for spec in self.objects]
@@ -135,4 +146,7 @@ class View:
         )
         if self.hand_error is None or self.wrist_error is None or not np.isfinite(self.hand_error[row]):
             return lines
-        return (*lines, f"off by {1e3 * self.hand_error[row]:.0f} mm (fingertips), {1e3 * self.wrist_error[row]:.0f} mm (wrist)")
+        return (
+            *lines,
+            f"off by {1e3 * self.hand_error[row]:.0f} mm (fingertips), {1e3 * self.wrist_error[row]:.0f} mm (wrist)",
+        )

@@ -26,7 +26,12 @@ _BANK_RATE = 5.0
 
 
 def load_view(
-    path: Path, *, demos: Path | None = None, retargeted: Path | None = None, robot: str | None = None, objects: Path | None = None
+    path: Path,
+    *,
+    demos: Path | None = None,
+    retargeted: Path | None = None,
+    robot: str | None = None,
+    objects: Path | None = None,
 ) -> View:
     """Read a file of any of the three kinds.
 
@@ -43,16 +48,22 @@ def load_view(
     schema = npz_schema(path)
     name = schema.rpartition("/")[0]
     if retargeted is not None and name != "xreset-resets":
-        raise XResetError(f"{path} is no reset bank: leave out --retargeted, which shows what physics rejected of a bank.")
+        raise XResetError(
+            f"{path} is no reset bank: leave out --retargeted, which shows what physics rejected of a bank."
+        )
     if name == "xreset-demos":
         if demos is not None or robot is not None:
-            raise XResetError(f"{path} holds demonstrations only: leave out --demos and --robot, or give a retargeted file.")
+            raise XResetError(
+                f"{path} holds demonstrations only: leave out --demos and --robot, or give a retargeted file."
+            )
         return _demos_view(path, objects)
     if name == "xreset-retargeted":
         return _retargeted_view(path, objects, robot, demos)
     if name == "xreset-resets":
         return _bank_view(path, objects, robot, demos, retargeted)
-    raise FileFormatError(f"{path} states schema {schema!r}; what can be shown is xreset-demos, xreset-retargeted and xreset-resets.")
+    raise FileFormatError(
+        f"{path} states schema {schema!r}; what can be shown is xreset-demos, xreset-retargeted and xreset-resets."
+    )
 
 
 def _demos_view(path: Path, folder: Path | None) -> View:
@@ -108,7 +119,9 @@ def _retargeted_view(path: Path, folder: Path | None, robot: str | None, demos: 
         fingertips=data.fingertip_pos,
         hand_error=data.hand_error,
         wrist_error=data.wrist_error,
-        human=None if demos is None else _human_of(path, demos, objects, data.sequence_name[shown["sequence"]], shown["frame"]),
+        human=None
+        if demos is None
+        else _human_of(path, demos, objects, data.sequence_name[shown["sequence"]], shown["frame"]),
     )
 
 
@@ -119,7 +132,9 @@ def _bank_view(path: Path, folder: Path | None, robot: str | None, demos: Path |
     objects = load_objects(bank.object_names, folder)
     check_objects(path, bank, objects)
     if bank.num_states == 0 and retargeted is None:
-        raise XResetError(f"{path} holds no state: physics rejected all of them. With --retargeted they can be looked at.")
+        raise XResetError(
+            f"{path} holds no state: physics rejected all of them. With --retargeted they can be looked at."
+        )
     view = View(
         kind="reset states",
         robot=spec,
@@ -142,7 +157,9 @@ def _bank_view(path: Path, folder: Path | None, robot: str | None, demos: Path |
     if retargeted is not None:
         view = _with_rejected(path, view, bank, retargeted)
     if demos is not None:
-        view = replace(view, human=_human_of(path, demos, objects, np.array(view.sequence_name)[view.sequence], view.frame))
+        view = replace(
+            view, human=_human_of(path, demos, objects, np.array(view.sequence_name)[view.sequence], view.frame)
+        )
     return view
 
 
@@ -156,7 +173,11 @@ def _with_rejected(path: Path, view: View, bank: ResetBank, retargeted: Path) ->
     sequence = np.concatenate((bank.sequence_index[whole], bank.rejected_sequence_index[whole_rejected]))
     frame = np.concatenate((bank.frame_index[whole], bank.rejected_frame_index[whole_rejected]))
     kept = bank.joint_pos[whole]
-    rows = data.frame_offsets[:-1][sequence] + frame if data.sequence_name.tolist() == bank.sequence_name.tolist() else np.zeros(0, int)
+    rows = (
+        data.frame_offsets[:-1][sequence] + frame
+        if data.sequence_name.tolist() == bank.sequence_name.tolist()
+        else np.zeros(0, int)
+    )
     tried = bool(len(rows)) and rows.max() < len(data.valid) and data.joint_names == bank.joint_names
     if not tried or not np.allclose(data.joint_pos[rows[: len(kept)]], kept, atol=1e-6):
         raise XResetError(f"{path} was not made from {retargeted}: sequences or states differ.")
@@ -192,12 +213,16 @@ def _human(demos: Demos, objects: tuple[ObjectSpec, ...]) -> tuple[Demos, Human]
         rows = (demos.object_name == spec.name)[demos.sequence_of_frame]
         if rows.any():
             pos, quat = demos.object_pos[rows].astype(np.float64), demos.object_quat_wxyz[rows].astype(np.float64)
-            points, touching[rows] = keypoint_contacts(Surface(spec), keypoints[rows], pos, quat, RetargetConfig().contact_distance)
+            points, touching[rows] = keypoint_contacts(
+                Surface(spec), keypoints[rows], pos, quat, RetargetConfig().contact_distance
+            )
             contacts[rows] = np.where(touching[rows][..., None], points, np.nan)
     return demos, Human(keypoints=keypoints, touching=touching, contacts=contacts)
 
 
-def _human_of(path: Path, demos_path: Path, objects: tuple[ObjectSpec, ...], sequence: np.ndarray, frame: np.ndarray) -> Human:
+def _human_of(
+    path: Path, demos_path: Path, objects: tuple[ObjectSpec, ...], sequence: np.ndarray, frame: np.ndarray
+) -> Human:
     """The hands of some frames, found by the name [N] of their sequence and the frame [N] within it."""
     demos = read_demos(demos_path)
     wanted = set(sequence.tolist())

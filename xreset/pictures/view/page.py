@@ -32,7 +32,9 @@ _IDLE = 0.1
 class Page:
     """A page at :attr:`url` until :meth:`close`. Everyone who opens it sees, and turns, the same controls."""
 
-    def __init__(self, view: View, *, host: str = "127.0.0.1", port: int = 8080, sequence: int | None = None, frame: int = 0) -> None:
+    def __init__(
+        self, view: View, *, host: str = "127.0.0.1", port: int = 8080, sequence: int | None = None, frame: int = 0
+    ) -> None:
         """Start the server.
 
         Args:
@@ -56,7 +58,9 @@ class Page:
             with _own_page_only(host):
                 self._server = viser.ViserServer(host=host, port=port, label="xreset view", verbose=False)
         except OSError as error:
-            raise XResetError(f"the page cannot be served at {host}:{port}: {error}. Choose others with --host and --port.") from error
+            raise XResetError(
+                f"the page cannot be served at {host}:{port}: {error}. Choose others with --host and --port."
+            ) from error
         self._scene = _Scene(view, self._server)
         self._make_controls(sequence)
         self._show_choice()
@@ -84,7 +88,9 @@ class Page:
                 self._text.content = "nothing meets this choice"
                 return
             first, *others = self.view.text(row)
-            self._text.content = "\n\n".join((f"**{first}**", *others, f"{int(self._frame.value) + 1} of {len(self._rows)}"))
+            self._text.content = "\n\n".join(
+                (f"**{first}**", *others, f"{int(self._frame.value) + 1} of {len(self._rows)}")
+            )
 
     def serve(self) -> None:
         """Play what is to be played, until interrupted."""
@@ -94,7 +100,9 @@ class Page:
                 continue
             time.sleep(1.0 / (self.view.rate * self._speed.value))
             with self._lock:
-                self._frame.value = (int(self._frame.value) + 1) % len(self._rows)  # calls show, as if the user had moved it
+                self._frame.value = (int(self._frame.value) + 1) % len(
+                    self._rows
+                )  # calls show, as if the user had moved it
 
     def close(self) -> None:
         """Stop the server."""
@@ -102,14 +110,22 @@ class Page:
 
     def _make_controls(self, sequence: int | None) -> None:
         gui, view = self._server.gui, self.view
-        self._reason_of = {f"{reason or GOOD[view.kind]} ({count})": reason for reason, count in view.counts().items() if count}
+        self._reason_of = {
+            f"{reason or GOOD[view.kind]} ({count})": reason for reason, count in view.counts().items() if count
+        }
         names = [f"{s}: {name}" for s, name in enumerate(view.sequence_name)]
         first = _ALL if sequence is None else names[sequence]
         self._sequence: Any = gui.add_dropdown("sequence", [_ALL, *names], initial_value=first)
-        self._object: Any = gui.add_dropdown("object", [_ALL, *(spec.name for spec in view.objects)], initial_value=_ALL)
+        self._object: Any = gui.add_dropdown(
+            "object", [_ALL, *(spec.name for spec in view.objects)], initial_value=_ALL
+        )
         self._phase: Any = gui.add_dropdown("phase", [_ALL, *PHASES], initial_value=_ALL)
-        self._reason: Any = gui.add_dropdown("state", [_ALL, *self._reason_of], initial_value=_ALL, visible=bool(view.reasons))
-        self._frame: Any = gui.add_slider("number" if view.kind == "reset states" else "frame", 0, max(len(self._rows) - 1, 1), 1, 0)
+        self._reason: Any = gui.add_dropdown(
+            "state", [_ALL, *self._reason_of], initial_value=_ALL, visible=bool(view.reasons)
+        )
+        self._frame: Any = gui.add_slider(
+            "number" if view.kind == "reset states" else "frame", 0, max(len(self._rows) - 1, 1), 1, 0
+        )
         back, on = gui.add_button("previous"), gui.add_button("next")
         self._play: Any = gui.add_checkbox("play", False)
         self._speed: Any = gui.add_slider("speed", 0.1, 2.0, 0.1, 1.0)
@@ -156,10 +172,20 @@ class _Scene:
         server.initial_camera.position, server.initial_camera.look_at = camera.eye, camera.target
         server.initial_camera.fov = camera.fov
         scene.set_up_direction("+z")
-        scene.add_box("/table", _rgb(TABLE_COLORS[0]), tuple(2 * h for h in table.half_size), position=(*table.center, -table.half_size[2]))
-        self._objects = [scene.add_mesh_simple(f"/object/{o.name}", o.vertices, o.faces, color=_rgb(OBJECT_COLOR)) for o in view.objects]
+        scene.add_box(
+            "/table",
+            _rgb(TABLE_COLORS[0]),
+            tuple(2 * h for h in table.half_size),
+            position=(*table.center, -table.half_size[2]),
+        )
+        self._objects = [
+            scene.add_mesh_simple(f"/object/{o.name}", o.vertices, o.faces, color=_rgb(OBJECT_COLOR))
+            for o in view.objects
+        ]
         self._goals = [
-            scene.add_mesh_simple(f"/goal/{o.name}", o.vertices, o.faces, color=_rgb(GOAL_COLOR), opacity=0.35, cast_shadow=False)
+            scene.add_mesh_simple(
+                f"/goal/{o.name}", o.vertices, o.faces, color=_rgb(GOAL_COLOR), opacity=0.35, cast_shadow=False
+            )
             for o in view.objects
         ]
         self._links: dict[int, Any] = {}
@@ -175,17 +201,29 @@ class _Scene:
                     )
         nowhere = np.zeros((1, 3), dtype=np.float32)
         points = {"point_shape": "circle", "precision": "float32"}
-        self._keypoints = scene.add_point_cloud("/human/keypoints", nowhere, _rgb(HUMAN_COLOR), point_size=0.012, **points)
-        self._bones = scene.add_line_segments("/human/bones", np.zeros((20, 2, 3), np.float32), _rgb(HUMAN_COLOR), thickness=0.003)
-        self._contacts = scene.add_point_cloud("/human/contacts", nowhere, _rgb(CONTACT_COLOR), point_size=0.006, **points)
-        self._tips = scene.add_point_cloud("/robot/fingertips", nowhere, _rgb(REACHED_COLOR), point_size=0.008, **points)
+        self._keypoints = scene.add_point_cloud(
+            "/human/keypoints", nowhere, _rgb(HUMAN_COLOR), point_size=0.012, **points
+        )
+        self._bones = scene.add_line_segments(
+            "/human/bones", np.zeros((20, 2, 3), np.float32), _rgb(HUMAN_COLOR), thickness=0.003
+        )
+        self._contacts = scene.add_point_cloud(
+            "/human/contacts", nowhere, _rgb(CONTACT_COLOR), point_size=0.006, **points
+        )
+        self._tips = scene.add_point_cloud(
+            "/robot/fingertips", nowhere, _rgb(REACHED_COLOR), point_size=0.008, **points
+        )
 
     def show(self, row: int | None) -> None:
         """Place everything as in a row; None hides what moves."""
         view = self._view
         for i, (body, goal) in enumerate(zip(self._objects, self._goals, strict=True)):
             body.visible = goal.visible = row is not None and i == view.object_index[row]
-        human = view.human if row is not None and view.human is not None and np.isfinite(view.human.keypoints[row]).all() else None
+        human = (
+            view.human
+            if row is not None and view.human is not None and np.isfinite(view.human.keypoints[row]).all()
+            else None
+        )
         self._keypoints.visible = self._bones.visible = human is not None
         self._contacts.visible = human is not None and bool(human.touching[row].any())
         self._tips.visible = row is not None and view.fingertips is not None
@@ -198,7 +236,9 @@ class _Scene:
         self._goals[i].position, self._goals[i].wxyz = view.goal_pos[sequence], view.goal_quat[sequence]
         if human is not None:
             self._keypoints.points = human.keypoints[row].astype(np.float32)
-            self._keypoints.colors = np.where(human.touching[row][:, None], _rgb(TOUCH_COLOR), _rgb(HUMAN_COLOR)).astype(np.uint8)
+            self._keypoints.colors = np.where(
+                human.touching[row][:, None], _rgb(TOUCH_COLOR), _rgb(HUMAN_COLOR)
+            ).astype(np.uint8)
             self._bones.points = human.keypoints[row][BONES].astype(np.float32)
             if self._contacts.visible:
                 self._contacts.points = human.contacts[row][human.touching[row]].astype(np.float32)

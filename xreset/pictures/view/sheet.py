@@ -39,8 +39,14 @@ def moment_tiles(view: View) -> list[Tile]:
     for index, spec in enumerate(view.objects):
         sequences = np.unique(view.sequence[view.object_index == index]).tolist()
         found = [rows for s in sequences if (rows := _moments(view, view.choose(sequence=s))) is not None]
-        rows = next((rows for rows in found if not any(view.reason[row] for row in rows)), found[0] if found else (None,) * len(MOMENTS))
-        tiles += [Tile(caption=_caption(f"{spec.name}: {name}", view, row), row=row) for name, row in zip(MOMENTS, rows, strict=True)]
+        rows = next(
+            (rows for rows in found if not any(view.reason[row] for row in rows)),
+            found[0] if found else (None,) * len(MOMENTS),
+        )
+        tiles += [
+            Tile(caption=_caption(f"{spec.name}: {name}", view, row), row=row)
+            for name, row in zip(MOMENTS, rows, strict=True)
+        ]
     return tiles
 
 
@@ -61,7 +67,9 @@ def reason_tiles(view: View) -> list[Tile]:
         XResetError: the view knows no reasons.
     """
     if not view.reasons:
-        raise XResetError("a reset bank holds only states that were accepted: give the robot trajectories it was made from (--retargeted).")
+        raise XResetError(
+            "a reset bank holds only states that were accepted: give the robot trajectories it was made from (--retargeted)."
+        )
     tiles = []
     for reason, count in list(view.counts().items())[1:]:
         rows = view.choose(reason=reason)
@@ -70,7 +78,9 @@ def reason_tiles(view: View) -> list[Tile]:
     return tiles
 
 
-def draw_sheet(view: View, tiles: Sequence[Tile], *, progress: Callable[[int, int], None] = lambda done, total: None) -> np.ndarray:
+def draw_sheet(
+    view: View, tiles: Sequence[Tile], *, progress: Callable[[int, int], None] = lambda done, total: None
+) -> np.ndarray:
     """Draw tiles beside and below one another, each near to hand and object, captions under them.
 
     Args:
@@ -92,7 +102,11 @@ def draw_sheet(view: View, tiles: Sequence[Tile], *, progress: Callable[[int, in
         picture = np.full((height, width, 3), 240, np.uint8) if tile.row is None else drawer.draw(tile.row, near=True)
         sheet[top : top + height, left : left + width] = picture
         progress(i + 1, len(tiles))
-    return written(sheet, face, [(i % columns * width + 6, i // columns * full + height, tile.caption) for i, tile in enumerate(tiles)])
+    return written(
+        sheet,
+        face,
+        [(i % columns * width + 6, i // columns * full + height, tile.caption) for i, tile in enumerate(tiles)],
+    )
 
 
 def _caption(first: str, view: View, row: int | None) -> tuple[str, ...]:

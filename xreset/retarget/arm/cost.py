@@ -53,7 +53,9 @@ class System(Tensors):
     """[B, n] half the gradient."""
 
 
-def solve(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, iterations: int, *, self_collision: bool) -> Tensor:
+def solve(
+    model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, iterations: int, *, self_collision: bool
+) -> Tensor:
     """[B, n] minimiser of one frame's cost, from ``q``: Levenberg-Marquardt, each element of the batch with its own damping.
 
     A joint at a limit stays there while the cost pulls it outwards; steps beyond a limit are cut off there.
@@ -88,13 +90,18 @@ def system(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, *, self_
         residuals.append(scale * (q - frame.previous))
         jacobians.append(scale * torch.eye(q.shape[1], dtype=q.dtype).expand(len(q), -1, -1))
     low = model.lowest(carriers.pos, carriers.rot, frame.hand_poses, config.table_margin)
-    lift = linear[low.frame, low.carrier, 2] + torch.linalg.cross(angular[low.frame, low.carrier], low.lever[..., None], dim=1)[:, 2]
+    lift = (
+        linear[low.frame, low.carrier, 2]
+        + torch.linalg.cross(angular[low.frame, low.carrier], low.lever[..., None], dim=1)[:, 2]
+    )
     value, slope = _intrusion(low.height, config.table_margin, config.collision_weight)
     residuals.append(q.new_zeros(linear.shape[:2]).index_put((low.frame, low.carrier), value))
     jacobians.append(q.new_zeros(linear[:, :, 0].shape).index_put((low.frame, low.carrier), slope[:, None] * lift))
     r, J = torch.cat(residuals, dim=1), torch.cat(jacobians, dim=1)
     system = System(cost=r.square().sum(1), hessian=J.mT @ J, gradient=(J.mT @ r[..., None])[..., 0])
-    return _with_self_collision(system, model, full, carriers.pos, linear, angular, config) if self_collision else system
+    return (
+        _with_self_collision(system, model, full, carriers.pos, linear, angular, config) if self_collision else system
+    )
 
 
 def _intrusion(distance: Tensor, margin: float, weight: float) -> tuple[Tensor, Tensor]:

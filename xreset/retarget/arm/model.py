@@ -84,10 +84,15 @@ class ArmModel:
         self.hand = hand
         in_hand = set(hand.link_names)
 
-        self.carriers: tuple[str, ...] = (robot.hand_root, *(link for link in self.kinematics.link_names if link not in in_hand))
+        self.carriers: tuple[str, ...] = (
+            robot.hand_root,
+            *(link for link in self.kinematics.link_names if link not in in_hand),
+        )
         """Links whose motion the arm's joints determine: the hand root, which carries the hand, then the arm's links."""
         self._hang(table_points(robot, self.kinematics), in_hand)
-        self.carrier_of = torch.tensor([0 if name in in_hand else self.carriers.index(name) for name in self.kinematics.link_names])
+        self.carrier_of = torch.tensor(
+            [0 if name in in_hand else self.carriers.index(name) for name in self.kinematics.link_names]
+        )
         """[L] index of the carrier of every link."""
         self.arm_collision = SelfCollision(robot, self.kinematics, moved_by_arm=True)
         """Distances that the arm's joints change."""
@@ -99,7 +104,9 @@ class ArmModel:
         self._links = [link for link in links if link in in_hand] + [link for link in links if link not in in_hand]
         """Links with support points (length G), those of the hand first."""
         self._in_hand = [link for link in self._links if link in in_hand]
-        self._carrier = torch.tensor([0 if link in in_hand else self.carriers.index(link) for link in self._links], dtype=torch.long)
+        self._carrier = torch.tensor(
+            [0 if link in in_hand else self.carriers.index(link) for link in self._links], dtype=torch.long
+        )
         rows = [[i for i, name in enumerate(support.links) if name == link] for link in self._links]
         self._spans = Spans.of(rows)
         order = [i for part in rows for i in part]
@@ -135,7 +142,9 @@ class ArmModel:
             carrier = self._carrier[of]
             local = shift[row, of] + (turn[row, of] @ self._points[point][..., None])[..., 0]
             lever = (rot[row, carrier] @ local[..., None])[..., 0]
-            heights = height_above_table(lever[:, None] + pos[row, carrier][:, None], self._radii[point][:, None], self.table)[:, 0]
+            heights = height_above_table(
+                lever[:, None] + pos[row, carrier][:, None], self._radii[point][:, None], self.table
+            )[:, 0]
             found.append(Lowest(frame=row, carrier=carrier, height=heights, lever=lever)[heights < below])
         if not found:
             none = frame.new_zeros(0)
@@ -168,7 +177,9 @@ def measure(model: ArmModel, targets: ArmTargets, joints: Tensor) -> Measures:
     carriers = poses[:, [model.kinematics.link_index(link) for link in model.carriers]]
     root = carriers[:, 0]
     quat = matrix_to_quat(root[:, :3, :3])
-    low = model.lowest(carriers[..., :3, 3], carriers[..., :3, :3], model.hand_poses(targets.hand_joints).flatten(0, 1), _SEARCH)
+    low = model.lowest(
+        carriers[..., :3, 3], carriers[..., :3, :3], model.hand_poses(targets.hand_joints).flatten(0, 1), _SEARCH
+    )
     height = torch.full((len(poses),), _SEARCH, dtype=poses.dtype).scatter_reduce(0, low.frame, low.height, "amin")
     apart = torch.as_tensor(model.arm_collision.clearance(poses.numpy(), _SEARCH)).view(sequences, frames)
     return Measures(

@@ -113,7 +113,9 @@ def mend(problem: ArmProblem, known: Paths, missed: Tensor, progress: Progress) 
     owner, paths = _reseeded(problem, missed, progress)
     count = torch.bincount(owner, minlength=len(missed))
     column = torch.arange(len(owner)) - (count.cumsum(0) - count)[owner]
-    new = known.joints[:, :1].repeat(1, int(count.max()), 1, 1)  # sequences with fewer new paths than others repeat a known one
+    new = known.joints[:, :1].repeat(
+        1, int(count.max()), 1, 1
+    )  # sequences with fewer new paths than others repeat a known one
     new[owner, column] = paths
     known = Paths.cat((known, problem.examined(new)), dim=1)
 
@@ -145,7 +147,9 @@ def _reseeded(problem: ArmProblem, missed: Tensor, progress: Progress) -> tuple[
     if not len(seed):
         return owner, start.new_zeros(0, frames, start.shape[1])
     steps = torch.arange(int(torch.maximum(seed, frames - 1 - seed).max()) + 1)
-    both = torch.cat((seed[:, None] + steps, seed[:, None] - steps)).clamp(0, frames - 1)  # [2B, N] frames in the order of following
+    both = torch.cat((seed[:, None] + steps, seed[:, None] - steps)).clamp(
+        0, frames - 1
+    )  # [2B, N] frames in the order of following
     followed = follow(problem.select(owner.repeat(2)[:, None], both), start.repeat(2, 1), progress)
     paths = start.new_zeros(len(owner), frames, start.shape[1])
     row = torch.arange(len(owner)).repeat(2)
@@ -159,7 +163,9 @@ def _first_frames(problem: ArmProblem) -> Tensor:
     model, config = problem.model, problem.config
     sequences, restarts, home = len(problem.hand_poses), config.restarts, model.home
     generator = torch.Generator().manual_seed(config.seed)
-    spread = torch.rand(restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0  # every sequence gets the same
+    spread = (
+        torch.rand(restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0
+    )  # every sequence gets the same
     spread[0] = 0.0
     lower, upper = torch.maximum(model.lower, home - torch.pi), torch.minimum(model.upper, home + torch.pi)
     start = torch.where(spread < 0, home + spread * (home - lower), home + spread * (upper - home))

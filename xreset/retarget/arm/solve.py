@@ -47,7 +47,9 @@ def track(
         [S, T, n] arm joints, and what was measured of every frame ([S, T] each).
     """
     poses = model.hand_poses(targets.hand_joints)
-    problem = ArmProblem(model=model, targets=targets, hand_poses=poses, thresholds=thresholds, config=config or ArmConfig())
+    problem = ArmProblem(
+        model=model, targets=targets, hand_poses=poses, thresholds=thresholds, config=config or ArmConfig()
+    )
     report = progress or (lambda _: None)
 
     forwards = branches(problem, lambda done: report(0.3 * done))
@@ -89,7 +91,9 @@ def _rescued(problem: ArmProblem, forwards: Paths, joints: Tensor, worth: Tensor
     return joints
 
 
-def _improve(problem: ArmProblem, joints: Tensor, reasons: Sequence[str], again: Callable[[ArmProblem, Tensor, Tensor], Tensor]) -> None:
+def _improve(
+    problem: ArmProblem, joints: Tensor, reasons: Sequence[str], again: Callable[[ArmProblem, Tensor, Tensor], Tensor]
+) -> None:
     """Find new paths for sequences with a frame that is invalid for one of the reasons; where more frames are valid then, replace the old.
 
     Args:

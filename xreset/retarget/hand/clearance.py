@@ -79,7 +79,10 @@ def too_near(
         object_clearance: [m]
         self_depth: [m]
     """
-    bounds = bodies.pos[:, model.group_body] + (bodies.rot[:, model.group_body] @ model.balls.bound_centers[..., None])[..., 0]  # [B, G, 3]
+    bounds = (
+        bodies.pos[:, model.group_body]
+        + (bodies.rot[:, model.group_body] @ model.balls.bound_centers[..., None])[..., 0]
+    )  # [B, G, 3]
     found = (
         *_below_table(model, bodies, bounds, considered),
         *_in_object(model, bodies, bounds, objects, considered, object_clearance),
@@ -95,7 +98,9 @@ def too_near(
 
 def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Iterator[Distances]:
     candidate, group = ((bounds[..., 2] < model.balls.bound_radii) & considered[:, None]).nonzero(as_tuple=True)
-    for frame, ball in _near_balls(model, bodies, candidate, group, lambda centers, _, than: (centers[:, 2] < than).nonzero()[:, 0], 0.0):
+    for frame, ball in _near_balls(
+        model, bodies, candidate, group, lambda centers, _, than: (centers[:, 2] < than).nonzero()[:, 0], 0.0
+    ):
         centers = model.ball_centers(bodies, frame, ball)
         value = height_above_table(centers, model.balls.radii[ball], model.table)
         low = value < 0
@@ -109,9 +114,13 @@ def _in_object(
 ) -> Iterator[Distances]:
     every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
     beside = objects.fields.beside(objects.local(bounds, every), objects.index[every])
-    candidate, group = ((beside < model.balls.bound_radii + object_clearance) & considered[:, None]).nonzero(as_tuple=True)
+    candidate, group = ((beside < model.balls.bound_radii + object_clearance) & considered[:, None]).nonzero(
+        as_tuple=True
+    )
     margin = object_clearance + objects.fields.spacing
-    for frame, ball in _near_balls(model, bodies, candidate, group, lambda *cluster: objects.nearer(*cluster)[0], margin):
+    for frame, ball in _near_balls(
+        model, bodies, candidate, group, lambda *cluster: objects.nearer(*cluster)[0], margin
+    ):
         centers = model.ball_centers(bodies, frame, ball)
         near, distance, direction = objects.nearer(centers, frame, model.balls.radii[ball] + object_clearance)
         frame, ball, centers = frame[near], ball[near], centers[near]
@@ -121,7 +130,12 @@ def _in_object(
 
 
 def _near_balls(
-    model: HandModel, bodies: Bodies, frame: Tensor, group: Tensor, nearer: Callable[[Tensor, Tensor, Tensor], Tensor], margin: float
+    model: HandModel,
+    bodies: Bodies,
+    frame: Tensor,
+    group: Tensor,
+    nearer: Callable[[Tensor, Tensor, Tensor], Tensor],
+    margin: float,
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Frames [A] and balls [A] of links [C] in frames [C] whose cluster is nearer to something than ``margin`` [m].
 
@@ -140,7 +154,9 @@ def _near_balls(
             yield row[near][within], ball
 
 
-def _in_each_other(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor, self_depth: float) -> Iterator[Distances]:
+def _in_each_other(
+    model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor, self_depth: float
+) -> Iterator[Distances]:
     balls, fields, clusters = model.balls, model.balls.fields, model.balls.guard_clusters
     a, b = balls.link_pairs.unbind(1)
     first, second, reach = model.group_body[a], model.group_body[b], balls.bound_radii + STAND_IN - self_depth

@@ -44,7 +44,9 @@ def system(model: HandModel, targets: HandTargets, config: HandConfig, state: Ha
     """Cost of every sequence and its Gauss-Newton approximation."""
     sequences, frames, count = state.joints.shape
     n = count + 6
-    cost, gradient, diagonal = (state.joints.new_zeros(sequences, *shape) for shape in ((frames,), (frames, n), (frames, n, n)))
+    cost, gradient, diagonal = (
+        state.joints.new_zeros(sequences, *shape) for shape in ((frames,), (frames, n), (frames, n, n))
+    )
     size = max(1, _FRAMES_PER_CHUNK[state.joints.device.type] // frames)
     for begin in range(0, sequences, size):
         part = slice(begin, begin + size)
@@ -77,7 +79,9 @@ def _change_weights(model: HandModel, config: HandConfig) -> tuple[Tensor, Tenso
     return weight, limit, config.jump_weight
 
 
-def _frames(model: HandModel, targets: HandTargets, config: HandConfig, state: HandState) -> tuple[Tensor, Tensor, Tensor]:
+def _frames(
+    model: HandModel, targets: HandTargets, config: HandConfig, state: HandState
+) -> tuple[Tensor, Tensor, Tensor]:
     """Cost [B], half the gradient [B, n] and half the Gauss-Newton Hessian [B, n, n] of all terms of single frames."""
     scale = config.length_scale
     bodies = model.bodies(*(value.flatten(0, 1) for value in vars(state).values()))

@@ -60,7 +60,9 @@ class HandModel:
         """Link of each mapped keypoint."""
         for name, link in zip(self.names, self.links, strict=True):
             if name not in KEYPOINTS:
-                raise RobotError(f"robot {robot.name!r}: there is no human keypoint {name!r}; there are {', '.join(KEYPOINTS)}.")
+                raise RobotError(
+                    f"robot {robot.name!r}: there is no human keypoint {name!r}; there are {', '.join(KEYPOINTS)}."
+                )
             self.kinematics.link_index(link)
         if len(set(self.links)) < 3:
             raise RobotError(
@@ -80,7 +82,9 @@ class HandModel:
         """[P, 3] keypoints at home, in the root's frame."""
         self.table = TableSpec()
 
-        on_cpu = self.kinematics if self.device.type == "cpu" else Kinematics(robot, root=robot.hand_root)  # as coal wants it
+        on_cpu = (
+            self.kinematics if self.device.type == "cpu" else Kinematics(robot, root=robot.hand_root)
+        )  # as coal wants it
         collision = SelfCollision(robot, on_cpu, only=robot.self_collision_links)
         self.balls = hand_balls(robot, on_cpu, collision).to(self.device)
         """What keeps the hand out of the object, the table and itself."""
@@ -88,7 +92,9 @@ class HandModel:
         """Those of a jaw; empty for any other hand."""
         self._bodies = tuple(dict.fromkeys((*self.links, *self.balls.links)))
         self._keypoint_bodies = torch.tensor([self._bodies.index(link) for link in self.links], device=self.device)
-        self.group_body = torch.tensor([self._bodies.index(link) for link in self.balls.links], dtype=torch.long, device=self.device)
+        self.group_body = torch.tensor(
+            [self._bodies.index(link) for link in self.balls.links], dtype=torch.long, device=self.device
+        )
         """[G] index among the bodies of each link with balls."""
 
     def keypoints(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Tensor:
@@ -145,7 +151,9 @@ def keypoint_pairs(names: Sequence[str], links: Sequence[str]) -> list[tuple[int
     Works for any subset of the 21 keypoints; pairs on one and the same link say nothing and are left out.
     """
     wrist = [i for i, name in enumerate(names) if name == "wrist"]
-    fingers = [sorted((i for i, name in enumerate(names) if name.startswith(f)), key=lambda i: names[i]) for f in FINGERS]  # base to tip
+    fingers = [
+        sorted((i for i, name in enumerate(names) if name.startswith(f)), key=lambda i: names[i]) for f in FINGERS
+    ]  # base to tip
     pairs = [pair for finger in fingers for pair in pairwise(wrist + finger)]
     thumb, others = fingers[0], [finger for finger in fingers[1:] if finger]
     for left, right in pairwise(others):

@@ -64,7 +64,9 @@ def pads_of(fingertips: Sequence[FingertipSpec], hand: Kinematics, balls: Balls,
                 pads.append(torch.cat(rows)[foremost > foremost.max() - _FRONT])
     if len(pads) < 2:
         pads = [torch.zeros(0, dtype=torch.long, device=home.device)]
-    return Pads(ball=torch.cat(pads), share=torch.cat([home.new_full((len(pad),), 1.0 / max(len(pad), 1)) for pad in pads]))
+    return Pads(
+        ball=torch.cat(pads), share=torch.cat([home.new_full((len(pad),), 1.0 / max(len(pad), 1)) for pad in pads])
+    )
 
 
 def off_object(model: HandModel, bodies: Bodies, objects: Objects, frame: Tensor) -> tuple[Tensor, Tensor]:

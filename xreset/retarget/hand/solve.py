@@ -43,7 +43,10 @@ class HandMotion(Tensors):
 
 
 def retarget_hand(
-    model: HandModel, targets: HandTargets, config: HandConfig | None = None, progress: Callable[[float], None] = lambda share: None
+    model: HandModel,
+    targets: HandTargets,
+    config: HandConfig | None = None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> HandMotion:
     """Hand motions that minimise the cost; sequences are independent of one another.
 
@@ -61,14 +64,19 @@ def retarget_hand(
     root_pos, root_quat = _align_root(model, targets)
     state = HandState(model.kinematics.clamp(model.home).expand(sequences, frames, -1), root_pos, root_quat)
     shares = config.clearance_growth if config.clearance_weight else ()
-    stages = [replace(config, clearance_weight=share * config.clearance_weight, iterations=config.growth_iterations) for share in shares]
+    stages = [
+        replace(config, clearance_weight=share * config.clearance_weight, iterations=config.growth_iterations)
+        for share in shares
+    ]
     stages.append(config)
     steps, cost = sum(stage.iterations for stage in stages), targets.keypoints.new_zeros(sequences)
     for number, stage in enumerate(stages):
         before = sum(earlier.iterations for earlier in stages[:number])
         state, cost = _minimise(model, targets, stage, state, lambda n, before=before: progress((before + n) / steps))
     keypoints = model.keypoints(state.joints, state.root_pos, state.root_quat)
-    return HandMotion(joints=state.joints, root_pos=state.root_pos, root_quat=state.root_quat, keypoints=keypoints, cost=cost).to(home)
+    return HandMotion(
+        joints=state.joints, root_pos=state.root_pos, root_quat=state.root_quat, keypoints=keypoints, cost=cost
+    ).to(home)
 
 
 def _minimise(
@@ -131,7 +139,9 @@ def _limited_step(model: HandModel, state: HandState, here: System, damping: Ten
     free = torch.ones_like(here.gradient)
     free[..., :count] = free_to_move(joints, here.gradient[..., :count], model.kinematics.lower, model.kinematics.upper)
     size = here.diagonal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6)
-    root = size[..., count:].unflatten(-1, (2, 3)).mean(-1, keepdim=True).expand(-1, -1, -1, 3).flatten(-2)  # the same in all directions
+    root = (
+        size[..., count:].unflatten(-1, (2, 3)).mean(-1, keepdim=True).expand(-1, -1, -1, 3).flatten(-2)
+    )  # the same in all directions
     ridge = damping[:, None, None] * torch.cat((size[..., :count], root), dim=-1) * free + (1.0 - free)
     H = here.diagonal * free[..., :, None] * free[..., None, :] + torch.diag_embed(ridge)
     return solve_chain(H, here.coupling * free[:, 1:] * free[:, :-1], -here.gradient * free)

@@ -286,6 +286,42 @@ class TrainingTest(unittest.TestCase):
                 parsed(*arguments)
             self.assertRegex(said.getvalue(), problem)
 
+    def test_a_run_folder_does_not_decide_which_code_is_imported(self):
+        """Reward terms of one's own are taken from the command line only."""
+        code = self.folder / "code"
+        code.mkdir()
+        (code / "strangers_term.py").write_text("def zero(x):\n    return x.tip_distance[:, 0] * 0\n")
+        sys.path.insert(0, str(code))
+        self.addCleanup(sys.path.remove, str(code))
+        stranger = self.folder / "stranger"
+        shutil.copytree(self.out, stranger)
+        data = json.loads((stranger / "run.json").read_text())
+        data["config"]["task"]["reward"]["own"] = {"strangers_term:zero": 1.0}
+        (stranger / "run.json").write_text(json.dumps(data))
+        like = ["--like", str(stranger), "--robot", "openarm", "--resets", str(self.bank), "--backend", "mujoco"]
+        like += ["--device", "cpu", "--num-envs", "4", "--iterations", "1"]
+        resume = ["--resume", "--out", str(stranger), "--iterations", "3"]
+        naming = ["--config.task.reward.own", "strangers_term:zero", "1"]
+
+        def said(*arguments: str) -> str:
+            in_this_process = mock.patch("xreset.env.make_backend", partial(make_backend, workers=0))
+            no_export = mock.patch("xreset.learning.train.export_onnx")
+            text = io.StringIO()
+            with in_this_process, no_export, redirect_stdout(io.StringIO()), redirect_stderr(text):
+                main(["train", *arguments])
+            return text.getvalue()
+
+        self.assertIn("add " + " ".join(naming), said(*like, "--out", str(self.folder / "without")))
+        self.assertEqual(read_run(self.folder / "without").config.task.reward.own, {})
+        with redirect_stderr(io.StringIO()) as text, self.assertRaises(SystemExit):
+            main(["train", *resume])
+        self.assertIn("add " + " ".join(naming), text.getvalue())
+        self.assertNotIn("strangers_term", sys.modules)
+        for arguments in (resume, [*like, "--out", str(self.folder / "with")]):
+            self.assertNotIn("reward terms", said(*arguments, *naming))
+        self.assertIn("strangers_term", sys.modules)
+        self.assertEqual(read_run(self.folder / "with").config.task.reward.own, {"strangers_term:zero": 1.0})
+
     def test_a_run_begins_with_the_networks_of_another(self):
         out, still = (
             self.folder / "onwards",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from argparse import ArgumentParser
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +14,7 @@ from xreset.checks import without_effect
 from xreset.errors import RunError
 from xreset.learning import train as training
 from xreset.learning.config import TrainConfig
-from xreset.learning.recipes import starting_config
+from xreset.learning.recipes import dropped_terms, own_terms_flag, starting_config
 
 
 def train(
@@ -47,8 +48,9 @@ def train(
         minutes: Most time to train now, on a machine that is lent for so long: then the run stops as with Ctrl-C, and --resume goes on.
             Compiling kernels is not counted.
         seed: Seed of every random number.
-        resume: Continue the run in --out from its newest checkpoint.
+        resume: Continue the run in --out from its newest checkpoint. Reward terms of your own must be named again.
         like: Where the configuration starts from: a recipe (paper, minutes, robust) or another run's folder. Flags change what they name.
+            Reward terms of your own are not taken from a run; name them again.
         weights: Another run's folder: begin with the networks of its newest checkpoint, and not with new ones; with their standard
             deviation and, where it adapts, their learning rate.
         config: Task, model and algorithm. The defaults shown are those of --like.
@@ -62,12 +64,19 @@ def train(
             "--resume continues with the run's own networks; leave out --weights, or start another run with it."
         )
     if resume:
-        training.train(out, training.resumed(out, iterations=iterations), resume=True, seconds=60 * minutes)
+        info = training.resumed(out, iterations=iterations, own=config.task.reward.own)
+        training.train(out, info, resume=True, seconds=60 * minutes)
         return
     if robot is None or resets is None:
         raise RunError("a new run needs --robot and --resets; --resume continues the run in --out.")
     if sentences := without_effect(config, starting_config(like)):
         raise RunError(f"--config.{'; --config.'.join(sentences)}. Leave it out, or change the other one.")
+    if (dropped := dropped_terms(like)) and not config.task.reward.own:
+        print(
+            f"{like} was trained with reward terms of your own. They are off here, because a run folder must not decide which code is imported. "
+            f"If you trust this code, add {own_terms_flag(dropped)}.",
+            file=sys.stderr,
+        )
     if iterations is not None:
         config = replace(config, iterations=iterations)
     inputs = training.load_inputs(robot, resets, objects)

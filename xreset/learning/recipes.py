@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from xreset.errors import RunError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.run import read_run
 from xreset.task.config import ActionConfig, ObservationConfig, RandomizationConfig, RewardConfig, TaskConfig
+from xreset.text import plain
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +80,9 @@ RECIPES: dict[str, Recipe] = {
 
 
 def starting_config(like: str) -> TrainConfig:
-    """The configuration of a recipe, or of a run.
+    """Return the configuration of a recipe, or of a run without the reward terms that its user added.
+
+    Such a term names code to import. A file must not decide that, so the terms have to be named again (:func:`dropped_terms`).
 
     Args:
         like: name of a recipe, or a run folder.
@@ -91,4 +95,17 @@ def starting_config(like: str) -> TrainConfig:
     if not Path(like).exists():
         recipes = "; ".join(f"{name}, {recipe.about}" for name, recipe in RECIPES.items())
         raise RunError(f"there is no recipe and no run folder {like!r}. Recipes: {recipes}.")
-    return read_run(like).config
+    config = read_run(like).config
+    reward = replace(config.task.reward, own={})
+    return replace(config, task=replace(config.task, reward=reward))
+
+
+def dropped_terms(like: str) -> dict[str, float]:
+    """Return the user's own reward terms of a run, which :func:`starting_config` leaves out: ``module:function`` -> weight."""
+    return {} if like in RECIPES else read_run(like).config.task.reward.own
+
+
+def own_terms_flag(own: dict[str, float]) -> str:
+    """Return the option of ``xreset train`` that names reward terms of the user's own."""
+    terms = [f"{shlex.quote(plain(name))} {weight:g}" for name, weight in own.items()]
+    return " ".join(["--config.task.reward.own", *terms])

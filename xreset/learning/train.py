@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from xreset.learning.config import TrainConfig, rsl_rl_config
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel
+from xreset.learning.recipes import own_terms_flag
 from xreset.learning.run import RunInfo, checkpoints, latest_checkpoint, read_run, write_run
 from xreset.learning.runner import TrainingRunner, read_checkpoint
 from xreset.objects.catalogue import load_objects
@@ -209,9 +211,25 @@ def default_device(backend: str) -> str:
     return device_for(backend, "cuda" if torch.cuda.is_available() else "cpu")
 
 
-def resumed(out: Path, *, iterations: int | None) -> RunInfo:
-    """The run of a folder, with another total number of iterations if given."""
+def resumed(out: Path, *, iterations: int | None, own: Mapping[str, float] | None = None) -> RunInfo:
+    """Return the run of a folder, with another total number of iterations if given.
+
+    Args:
+        out: the run's folder.
+        iterations: iterations in all; None: as many as ``run.json`` says.
+        own: the user's own reward terms with which the run was started. They name code to import, which a file must not decide.
+
+    Raises:
+        RunError: the run has other reward terms of the user's own.
+    """
     info = read_run(out)
+    expected = info.config.task.reward.own
+    if expected != dict(own or {}):
+        fix = f"add {own_terms_flag(expected)}" if expected else "omit --config.task.reward.own"
+        raise RunError(
+            f"{out} was trained with {len(expected)} reward terms of your own, but {len(own or {})} were named. A run folder must not decide "
+            f"which code is imported. If you trust this code, {fix}."
+        )
     if iterations is not None and iterations != info.config.iterations:
         info = replace(info, config=replace(info.config, iterations=iterations))
     return info

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import tracemalloc
 import unittest
 import zipfile
@@ -20,7 +21,7 @@ import numpy as np
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import atomic_folder, atomic_write, claim, read_json, read_toml, write_json
+from xreset.files import atomic_folder, atomic_write, claim, is_claimed, read_json, read_toml, write_json
 from xreset.records import Field, read_npz, write_npz
 from xreset.resets.bank import check_objects, read_bank, write_bank
 from xreset.spec import ObjectSpec
@@ -86,10 +87,15 @@ class AtomicWriteTest(InFolder):
         self.assertEqual([f.name for f in path.parent.iterdir()], ["a.txt"])
 
     def test_the_file_has_the_usual_permissions(self):
-        before = os.umask(0o022)
-        self.addCleanup(os.umask, before)
-        write_json(self.folder / "a.json", {})
-        self.assertEqual((self.folder / "a.json").stat().st_mode & 0o777, 0o644)
+        self.addCleanup(os.umask, os.umask(0o022))
+        for umask in (0o022, 0o077):
+            os.umask(umask)
+            write_json(self.folder / "a.json", {})
+            with atomic_folder(self.folder / f"made-{umask}"):
+                pass
+            with self.subTest(oct(umask)):
+                self.assertEqual((self.folder / "a.json").stat().st_mode & 0o777, 0o666 & ~umask)
+                self.assertEqual((self.folder / f"made-{umask}").stat().st_mode & 0o777, 0o777 & ~umask)
 
     def test_a_disk_that_is_full_at_the_last_moment(self):
         path = self.folder / "a.json"
@@ -162,13 +168,50 @@ class ClaimTest(InFolder):
         self.assert_only()
 
     def test_what_a_killed_writer_left_is_removed(self):
-        for name in (".file.npz.abc.part", ".other.npz.abc.part"):
-            (self.folder / name).write_bytes(b"half")
-        (self.folder / ".file.npz.abd.part" / "meshes").mkdir(parents=True)
+        def leave():
+            (self.folder / ".xreset-abc.part").write_bytes(b"half")
+            (self.folder / ".xreset-abd.part" / "meshes").mkdir(parents=True)
+
+        leave()
         with claim(self.file):
-            self.assert_only(".file.npz.lock", ".other.npz.abc.part")
+            self.assert_only(".file.npz.lock")
+        leave()
         with claim(self.folder):
             self.assert_only()
+        leave()
+        with atomic_folder(self.folder / "made"):
+            self.assertEqual(len(list(self.folder.iterdir())), 1)
+
+    def test_files_of_others_are_not_removed(self):
+        (self.folder / ".download.part").write_text("precious")
+        (self.folder / ".album.part").mkdir()
+        for path in (self.file, self.folder):
+            with claim(path):
+                pass
+        self.assert_only(".album.part", ".download.part")
+
+    def test_what_another_command_is_writing_is_not_removed(self):
+        with atomic_write(self.folder / "a") as file, atomic_folder(self.folder / "b") as made:
+            for path in (self.file, self.folder):
+                with claim(path):
+                    pass
+            file.write(b"whole")
+            (made / "c").touch()
+        self.assert_only("a", "b")
+        self.assertEqual((self.folder / "a").read_bytes(), b"whole")
+        self.assertTrue((self.folder / "b" / "c").exists())
+
+    def test_a_claim_outlasts_a_look(self):
+        """Whoever asks whether a folder is claimed locks it for a moment."""
+        looking = claim(self.folder)
+        looking.__enter__()
+        end = threading.Timer(0.05, looking.__exit__, (None, None, None))
+        end.start()
+        self.addCleanup(end.join)
+        with claim(self.folder):
+            self.assertTrue(is_claimed(self.folder))
+        self.assertFalse(is_claimed(self.folder))
+        self.assertFalse(is_claimed(self.folder / "missing"))
 
 
 class JsonTest(InFolder):

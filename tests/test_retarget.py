@@ -939,7 +939,7 @@ class StopAndContinueTest(unittest.TestCase):
 
     def test_discard_removes_its_own_files_only(self):
         self.folder.mkdir()
-        for name in ("batch_0000.npz", ".batch_0001.npz.abc.part", "notes.txt"):
+        for name in ("batch_0000.npz", ".xreset-abc.part", "notes.txt"):
             (self.folder / name).touch()
         discard(self.folder)
         self.assertEqual([path.name for path in self.folder.iterdir()], ["notes.txt"])

@@ -416,8 +416,8 @@ class TrainingTest(unittest.TestCase):
                 ):
                     train_only(out, info)
                 (out / "events.out.tfevents.old").write_bytes(b"half")
-                (out / ".worlds.pt.abc.part").write_bytes(b"half")
-                (out / "checkpoints" / ".000001.pt.abc.part").write_bytes(b"half")
+                (out / ".xreset-abc.part").write_bytes(b"half")
+                (out / "checkpoints" / ".xreset-abd.part").write_bytes(b"half")
                 said = io.StringIO()
                 with redirect_stdout(said):
                     train_only(out, resumed(out, iterations=None) if resume else self.start(out, seed=5), resume=resume)

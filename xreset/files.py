@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import glob
 import hashlib
 import json
 import os
+import secrets
 import shutil
 import stat
-import tempfile
+import time
 import tomllib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -35,33 +35,23 @@ def max_bytes() -> int:
 
 @contextmanager
 def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
-    """Open a temporary file that becomes ``path`` when the block ends, and vanishes if the block raises.
+    """Open a temporary file that replaces ``path`` when the block ends, and is removed if the block raises.
 
     Raises:
-        XResetError: if the file cannot be written (no such folder, no permission, disk full); ``path`` is then as it was before.
+        XResetError: the file cannot be written (no such folder, no permission, disk full); ``path`` is then as it was before.
     """
     path = Path(path)
-    temporary: Path | None = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        temporary = Path(name)
-        with os.fdopen(descriptor, mode) as file:
+        with _temporary(path.parent, Path.touch) as temporary, open(temporary, mode) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        temporary.replace(path)
+            temporary.replace(path)
     except OSError as error:
         reason = error.strerror or str(error)
         raise XResetError(
             f"cannot write {path}: {reason}. Nothing was changed; free some space or choose another place."
         ) from error
-    finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
 
 
 def write_whole(path: str | Path, content: bytes | memoryview | str) -> None:
@@ -72,34 +62,74 @@ def write_whole(path: str | Path, content: bytes | memoryview | str) -> None:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """A new folder that becomes ``path``, which is not there or is empty, when the block ends, and vanishes if the block raises."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part"))
+    """Make a temporary folder that becomes ``path`` when the block ends, and is removed if the block raises.
+
+    ``path`` must not exist, or be an empty folder. What killed processes have left next to it is removed.
+    """
+    with _temporary(path.parent, Path.mkdir) as temporary:
+        remove_leftovers(path.parent)
+        yield temporary
+        temporary.replace(path)
+
+
+@contextmanager
+def _temporary(folder: Path, make: Callable[[Path], None]) -> Iterator[Path]:
+    """Make a temporary file or folder, and remove it at the end if it is still there.
+
+    It is locked while the block runs: this tells other processes that it is not a leftover.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = None
+    while descriptor is None:  # again if another process took it for a leftover before it was locked
+        temporary = folder / f".xreset-{secrets.token_hex(4)}.part"
+        make(temporary)
+        with suppress(FileNotFoundError):
+            descriptor = _lock(temporary)
     try:
         yield temporary
-        temporary.chmod(0o755)
-        temporary.replace(path)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        _remove(temporary)
+        os.close(descriptor)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files and folders that killed processes have left in a folder."""
+    for leftover in folder.glob(".xreset-*.part"):
+        with suppress(OSError):
+            descriptor = _lock(leftover, required=True)
+            if descriptor is not None:
+                _remove(leftover)
+                os.close(descriptor)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 @contextmanager
 def claim(path: str | Path) -> Iterator[None]:
-    """Keep a file, or a folder that is there, to this process while the block runs, and remove what killed writers have left of it.
+    """Reserve a file, or an existing folder, for this process while the block runs, and remove what killed processes have left there.
 
     Raises:
         XResetError: another command is writing it.
     """
     path = Path(path)
-    lock = path if path.is_dir() else path.with_name(f".{path.name}.lock")
-    descriptor = _locked(path, lock)
+    if path.is_dir():
+        folder = lock = path
+    else:
+        folder = path.parent
+        lock = folder / f".{path.name}.lock"
     try:
-        folder, pattern = (path, ".*.part") if lock == path else (path.parent, f".{glob.escape(path.name)}.*.part")
-        for leftover in folder.glob(pattern):
-            if leftover.is_dir():
-                shutil.rmtree(leftover, ignore_errors=True)
-            else:
-                leftover.unlink(missing_ok=True)
+        descriptor = _patient_lock(lock)
+    except OSError as error:
+        raise XResetError(f"cannot write {path}: {error.strerror or error}. Choose another place.") from error
+    if descriptor is None:
+        raise XResetError(f"another command is writing {path}. Wait for its end, or choose another --out.")
+    try:
+        remove_leftovers(folder)
         yield
     finally:
         if lock != path:
@@ -109,10 +139,10 @@ def claim(path: str | Path) -> Iterator[None]:
 
 @contextmanager
 def claim_folder(path: str | Path) -> Iterator[None]:
-    """Make a folder, if it is not there, and :func:`claim` it.
+    """Make a folder unless it exists, and :func:`claim` it.
 
     Raises:
-        XResetError: another command is writing into it, or it cannot be made.
+        XResetError: another command is writing into the folder, or it cannot be made.
     """
     path = Path(path)
     try:
@@ -123,30 +153,55 @@ def claim_folder(path: str | Path) -> Iterator[None]:
         yield
 
 
-def _locked(path: Path, lock: Path) -> int:
+def is_claimed(folder: Path) -> bool:
+    """Return whether a command is writing into a folder."""
     try:
-        while True:
-            lock.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(lock, os.O_RDONLY if lock.is_dir() else os.O_RDWR | os.O_CREAT, 0o666)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if os.path.samestat(os.fstat(descriptor), os.stat(lock)):
-                    return descriptor
-            except BlockingIOError:
-                os.close(descriptor)
-                raise XResetError(
-                    f"another command is writing {path}. Wait for its end, or choose another --out."
-                ) from None
-            except FileNotFoundError:  # the owner has just finished and removed it
-                pass
-            except OSError as error:
-                if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
-                    os.close(descriptor)
-                    raise
-                return descriptor  # a file system without locks
-            os.close(descriptor)
+        descriptor = _lock(folder)
+    except FileNotFoundError:
+        return False
+    if descriptor is None:
+        return True
+    os.close(descriptor)
+    return False
+
+
+def _patient_lock(path: Path) -> int | None:
+    """Lock a folder, or a file that is made for this; try for a quarter of a second, because :func:`is_claimed` locks for a moment."""
+    for _ in range(5):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.is_dir():
+            path.touch()
+        with suppress(FileNotFoundError):  # the process that held the lock has just removed the file
+            descriptor = _lock(path)
+            if descriptor is not None:
+                return descriptor
+        time.sleep(0.05)
+    return None
+
+
+def _lock(path: Path, *, required: bool = False) -> int | None:
+    """Lock a file or folder, until the descriptor that is returned is closed or this process ends.
+
+    Args:
+        required: whether a file system without locks is an error (``OSError``).
+
+    Returns:
+        The descriptor, or None if another process has locked the path, or replaced it meanwhile.
+    """
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+            return descriptor
+    except BlockingIOError:
+        pass
     except OSError as error:
-        raise XResetError(f"cannot write {path}: {error.strerror or error}. Choose another place.") from error
+        if error.errno in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS) and not required:
+            return descriptor
+        os.close(descriptor)
+        raise
+    os.close(descriptor)
+    return None
 
 
 def write_json(path: str | Path, data: Any) -> None:

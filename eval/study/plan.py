@@ -20,7 +20,7 @@ from xreset.demos.archive import read_demos
 from xreset.errors import DemoError, FileFormatError, RunError, XResetError
 from xreset.eval.study.file import Data, Evaluation, Runs, Study, merged
 from xreset.eval.study.subset import Subset, refuse_other
-from xreset.files import claim, file_hash
+from xreset.files import file_hash, is_claimed
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import starting_config
@@ -127,14 +127,8 @@ class Step:
         raise NotImplementedError
 
     def busy(self) -> bool:
-        """Whether a command is at it, started by whom ever."""
-        if not self.writes.is_dir():
-            return False
-        try:
-            with claim(self.writes):
-                return False
-        except XResetError:
-            return True
+        """Return whether another process is writing this step's folder."""
+        return is_claimed(self.writes)
 
 
 @dataclass(frozen=True, kw_only=True)

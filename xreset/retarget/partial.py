@@ -18,6 +18,7 @@ import numpy as np
 from xreset import __version__
 from xreset.demos.archive import Demos
 from xreset.errors import FileFormatError
+from xreset.files import remove_leftovers
 from xreset.records import JOINT, Field, read_npz, schema_of, write_npz
 from xreset.retarget.validity import REASONS
 from xreset.spec import ObjectSpec, RobotSpec
@@ -72,9 +73,9 @@ def discard(folder: Path) -> None:
     """Remove the batches in a folder, and the folder unless it holds files that are not xreset's."""
     if not folder.is_dir():
         return
-    for pattern in ("batch_*.npz", ".batch_*.npz.*.part"):  # the second: what a killed run was writing
-        for path in folder.glob(pattern):
-            path.unlink(missing_ok=True)
+    remove_leftovers(folder)
+    for path in folder.glob("batch_*.npz"):
+        path.unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()
 

@@ -49,8 +49,8 @@ def motion(robot: RobotSpec, folder: Path) -> ResetBank:
     """Starts and goals of one synthetic demonstration."""
     from xreset.demos.archive import write_demos
     from xreset.demos.synth import synthesize
-    from xreset.eval.evaluate import load_motion
+    from xreset.inputs import load_inputs
 
     file = folder / "demos.npz"
     write_demos(file, synthesize([OBJECT], 1, seed=0))
-    return load_motion(file, robot, None, trajectories=False)[0]
+    return load_inputs(file, robot=robot).bank

@@ -7,25 +7,22 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from xreset.demos.archive import SCHEMA_NAME as DEMOS
-from xreset.demos.archive import demo_objects, read_demos
 from xreset.description import load_robot
-from xreset.errors import FileFormatError, PolicyError
+from xreset.errors import PolicyError
 from xreset.eval.baselines import KinematicRetargeting
 from xreset.eval.results import EvalResult, mesh_folder, summarize, write_results
 from xreset.eval.rollout import roll_out
 from xreset.eval.setting import Setting
 from xreset.eval.trial import Engine, Trial
 from xreset.files import claim_folder, file_hash
+from xreset.inputs import load_inputs
 from xreset.learning.choice import read_choice
 from xreset.learning.run import read_run
 from xreset.objects.catalogue import load_objects
 from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
-from xreset.records import npz_schema
-from xreset.resets.bank import ResetBank, check_retargeted, starts_and_goals
-from xreset.retarget.pipeline import SCHEMA as RETARGETED
-from xreset.retarget.pipeline import Retargeted, read_retargeted, rest_on_table, retarget_demos
+from xreset.resets.bank import ResetBank
+from xreset.retarget.file import Retargeted
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
 from xreset.typed import from_dict
@@ -70,10 +67,9 @@ class Subject:
 
     def episodes(self, demos: Path, setting: Setting) -> tuple[Trial, Retargeted | None]:
         """The episodes of a file of demonstrations, and the trajectories that the ik baseline follows."""
-        bank, trajectories = load_motion(
-            demos, self.robot, self.meshes(setting.objects), trajectories=self.label == "ik"
-        )
-        return self.trial(bank, setting), trajectories
+        inputs = load_inputs(demos, robot=self.robot, objects=self.meshes(setting.objects), accept=("demos", "motion"))
+        motion = inputs.motion() if self.label == "ik" else None
+        return self.trial(inputs.bank, setting), motion
 
 
 def resolve(policy: str, robot: str | None, seed: int) -> Subject:
@@ -134,34 +130,6 @@ def resolve(policy: str, robot: str | None, seed: int) -> Subject:
         inputs={"policy": file_hash(file)},
         trained_on=tuple(contract["objects"]),
     )
-
-
-def load_motion(
-    path: Path, robot: RobotSpec, objects_folder: Path | None, *, trajectories: bool
-) -> tuple[ResetBank, Retargeted | None]:
-    """Starts and goals of demonstrations, and the robot's trajectories if asked for.
-
-    Args:
-        path: demonstrations (``xreset demos``) or retargeted trajectories (``xreset retarget``).
-        objects_folder: folder of meshes; None: stand-ins.
-        trajectories: whether robot trajectories are needed; demonstrations are then retargeted here.
-    """
-    schema = npz_schema(path)
-    if schema == RETARGETED:
-        data = read_retargeted(path)
-        check_retargeted(path, data, robot)
-    elif schema == DEMOS:
-        demos = read_demos(path)
-        objects = tuple(demo_objects(demos, objects_folder).values())
-        if trajectories:
-            data = retarget_demos(demos, robot, objects)
-        else:
-            return starts_and_goals(rest_on_table(demos, objects), robot), None
-    else:
-        raise FileFormatError(
-            f"{path} states schema {schema!r}, expected {DEMOS!r} (xreset demos) or {RETARGETED!r} (xreset retarget)."
-        )
-    return starts_and_goals(data, robot), data
 
 
 def evaluate(

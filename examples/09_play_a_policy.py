@@ -12,7 +12,7 @@ import onnxruntime
 import torch
 
 import xreset
-from xreset.eval.evaluate import load_motion
+from xreset.inputs import load_inputs
 from xreset.policies import shipped
 from xreset.task.config import TaskConfig, evaluation_task
 from xreset.typed import from_dict
@@ -30,9 +30,8 @@ def main(demos: Path, policy: Path | None = None) -> None:
 
     robot = xreset.load_robot(contract["robot"])
     task = evaluation_task(from_dict(TaskConfig, contract["task"]))
-    goals, _ = load_motion(demos, robot, None, trajectories=False)
-    objects = [xreset.load_object(name) for name in goals.object_names]
-    with xreset.make_env(robot, objects, goals, task, num_envs=1) as env:
+    inputs = load_inputs(demos, robot=robot)
+    with xreset.make_env(robot, inputs.objects, inputs.bank, task, num_envs=1) as env:
         lstm = [np.zeros((1, env.num_envs, given.shape[2]), np.float32) for given in session.get_inputs()[2:]]
         for _ in range(env.max_episode_length - 1):
             seen = {name: value.numpy() for name, value in env.get_observations().items()}

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from xreset.demos.archive import SCHEMA_NAME as DEMOS
-from xreset.demos.archive import read_demos
 from xreset.description import load_robot
 from xreset.errors import DemoError, FileFormatError
 from xreset.eval.engines.actions import SCHEMA as ACTIONS
@@ -18,13 +18,12 @@ from xreset.eval.evaluate import resolve
 from xreset.eval.results import TRACE_SCHEMA, mesh_folder, read_result, read_traces
 from xreset.eval.setting import Place, Sequence, Setting
 from xreset.eval.trial import Engine
-from xreset.objects.catalogue import canonical_name, load_object, load_objects
+from xreset.inputs import load_inputs
+from xreset.objects.catalogue import load_object
 from xreset.records import npz_schema
 from xreset.resets.bank import SCHEMA as BANK
-from xreset.resets.bank import ResetBank, check_objects, check_retargeted, check_robot, read_bank
+from xreset.resets.bank import ResetBank
 from xreset.retarget.file import SCHEMA as RETARGETED
-from xreset.retarget.file import read_retargeted
-from xreset.retarget.pipeline import retarget_demos
 from xreset.spec import ObjectSpec, RobotSpec
 
 
@@ -36,46 +35,24 @@ def load_frames(
     only: Iterable[str] = (),
     progress: Callable[[str, float, int], None] = lambda doing, done, total: None,
 ) -> tuple[RobotSpec, tuple[ObjectSpec, ...], Frames]:
-    """Robot, objects and frames of retargeted trajectories, a reset bank, or demonstrations, which are retargeted here.
+    """Load robot, objects and frames of motion, of a reset bank, or of demonstrations, which are retargeted here.
 
     Args:
-        robot: name or folder; default: the file's. Demonstrations need it.
-        objects_folder: folder of real meshes; None for the stand-ins.
-        only: names of the objects to use; default: all of the file.
+        path: file of any of the three kinds.
+        robot: name or folder; default: the robot that the file names. Demonstrations need it.
+        objects_folder: folder of object meshes; None: the stand-ins.
+        only: names of the objects to use; default: all objects of the file.
         progress: called with (what is being done, sequences retargeted, sequences in all).
 
     Raises:
         XResetError: the file, the robot or an object cannot be used, or they do not belong together.
     """
-
-    def wanted(there: Iterable[str]) -> tuple[ObjectSpec, ...]:
-        names = sorted(set(there))
-        return load_objects(dict.fromkeys([canonical_name(name, names) for name in only] or names), objects_folder)
-
-    schema = npz_schema(path)
-    if schema == DEMOS:
-        if robot is None:
-            raise DemoError(f"{path} holds human demonstrations, which are for no robot yet: give --robot.")
-        demos, spec = read_demos(path), load_robot(robot)
-        objects = wanted(demos.object_name.tolist())
-        demos = demos.select(objects=[o.name for o in objects])
-        data = retarget_demos(demos, spec, objects, progress=lambda done, total: progress("retargeting", done, total))
-        return spec, objects, Frames.of_retargeted(data)
-    if schema not in (RETARGETED, BANK):
-        raise FileFormatError(
-            f"{path} states schema {schema!r}; grasps come from {RETARGETED!r}, {BANK!r} or {DEMOS!r}."
-        )
-    data = read_retargeted(path) if schema == RETARGETED else read_bank(path)
-    spec = load_robot(robot or data.robot)
-    if not isinstance(data, ResetBank):
-        check_retargeted(path, data, spec)
-        return spec, wanted(np.asarray(data.object_name).tolist()), Frames.of_retargeted(data)
-    check_robot(
-        path, "reset bank", spec, name=data.robot, joint_names=data.joint_names, fingerprint=data.robot_fingerprint
-    )
-    objects = wanted(data.object_names)
-    check_objects(path, data, objects)
-    return spec, objects, Frames.of_bank(data)
+    inputs = load_inputs(path, robot=robot, objects=objects_folder, only=only)
+    if isinstance(inputs.data, ResetBank):
+        frames = Frames.of_bank(inputs.data)
+    else:
+        frames = Frames.of_retargeted(inputs.motion(partial(progress, "retargeting")))
+    return inputs.robot, inputs.objects, frames
 
 
 def from_file(source: Path, sequence: Sequence, place: Place) -> Actions:

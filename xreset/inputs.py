@@ -1,0 +1,172 @@
+"""Load what commands work on: demonstrations, retargeted motion or a reset bank, with the robot and the objects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from xreset.demos.archive import SCHEMA_NAME as DEMOS
+from xreset.demos.archive import Demos, demo_objects, read_demos
+from xreset.description import load_robot
+from xreset.errors import DemoError, FileFormatError
+from xreset.files import file_hash
+from xreset.objects.catalogue import canonical_name, load_objects
+from xreset.records import npz_schema
+from xreset.resets.bank import SCHEMA as BANK
+from xreset.resets.bank import ResetBank, check_objects, check_retargeted, check_robot, read_bank, starts_and_goals
+from xreset.retarget.file import SCHEMA as MOTION
+from xreset.retarget.file import Retargeted, read_retargeted
+from xreset.retarget.pipeline import rest_on_table, retarget_demos
+from xreset.spec import ObjectSpec, RobotSpec
+
+Kind = Literal["demos", "motion", "bank"]
+Data = Demos | Retargeted | ResetBank
+
+_SCHEMAS: dict[Kind, str] = {"demos": DEMOS, "motion": MOTION, "bank": BANK}
+_COMMANDS: dict[Kind, str] = {"demos": "xreset demos", "motion": "xreset retarget", "bank": "xreset resets"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """Demonstrations, motion or a bank, with robot and objects; all checked against one another."""
+
+    data: Data
+    objects: tuple[ObjectSpec, ...]
+    """Sorted by name; for a bank in the bank's order."""
+    path: Path | None = None
+    """File of the data; None: the data never were in a file."""
+    hash: str | None = None
+    """SHA-256 of the file when it was read."""
+    objects_folder: Path | None = None
+    """Folder of object meshes; None: the built-in stand-ins."""
+    robot_name: str | None = None
+    """Name or folder of the robot, as given or as the file states it; None: demonstrations, and no robot was given."""
+    loaded_robot: RobotSpec | None = None
+    """The robot, if there is one; see :attr:`robot`."""
+
+    @property
+    def robot(self) -> RobotSpec:
+        """The robot.
+
+        Raises:
+            DemoError: the data are demonstrations, and no robot was given.
+        """
+        if self.loaded_robot is None:
+            raise DemoError(f"{self.name} holds human demonstrations, which are for no robot yet. Give --robot.")
+        return self.loaded_robot
+
+    @property
+    def name(self) -> str:
+        """What messages call the data."""
+        return "the data" if self.path is None else str(self.path)
+
+    @cached_property
+    def bank(self) -> ResetBank:
+        """The reset bank; for demonstrations and motion a bank without states, which holds their starts and goals."""
+        if isinstance(self.data, ResetBank):
+            return self.data
+        if isinstance(self.data, Demos):
+            return starts_and_goals(rest_on_table(self.data, self.objects), self.robot)
+        return starts_and_goals(self.data, self.robot)
+
+    def motion(self, progress: Callable[[float, int], None] = lambda done, total: None) -> Retargeted:
+        """Return the robot's motion; demonstrations are retargeted here, which takes about a second for each.
+
+        Args:
+            progress: called with (sequences retargeted, sequences in all).
+
+        Raises:
+            DemoError: the data are a reset bank, or demonstrations and no robot was given.
+        """
+        if isinstance(self.data, Retargeted):
+            return self.data
+        if isinstance(self.data, ResetBank):
+            raise DemoError(f"{self.name} is a reset bank, which holds no motion. Give the file of xreset retarget.")
+        return retarget_demos(self.data, self.robot, self.objects, progress=progress)
+
+
+def load_inputs(
+    source: str | Path | Data,
+    *,
+    robot: str | Path | RobotSpec | None = None,
+    objects: str | Path | None = None,
+    only: Iterable[str] = (),
+    accept: tuple[Kind, ...] = ("demos", "motion", "bank"),
+) -> Inputs:
+    """Load a file, or take data that are loaded already, with the robot and the objects.
+
+    Args:
+        source: file of ``xreset demos``, ``xreset retarget`` or ``xreset resets``, or its content.
+        robot: the robot, its name or its folder; default: the robot that the file names. Demonstrations name none.
+        objects: folder of object meshes; default: the built-in stand-ins.
+        only: names of the objects to load; demonstrations of other objects are left out. Default: all objects.
+        accept: the kinds of data that the caller can use.
+
+    Raises:
+        FileFormatError: the file is damaged, of another kind, or for another robot or object geometry.
+        DemoError: the demonstrations need an object that is unknown.
+        XResetError: the robot or an object cannot be used.
+    """
+    path = None
+    data = source
+    if isinstance(data, str | Path):
+        path = Path(data)
+        data = _read(path, accept)
+    folder = Path(objects) if objects else None
+    names = _object_names(data)
+    if only:
+        names = tuple(dict.fromkeys(canonical_name(name, names) for name in only))
+    if only and isinstance(data, Demos):
+        data = data.select(objects=names)
+    if isinstance(data, Demos):
+        by_name = demo_objects(data, folder)
+        loaded = tuple(by_name[name] for name in names)
+    else:
+        loaded = load_objects(names, folder)
+        robot = robot or data.robot
+    spec = load_robot(robot) if isinstance(robot, str | Path) else robot
+    inputs = Inputs(
+        data=data,
+        objects=loaded,
+        path=path,
+        hash=file_hash(path) if path else None,
+        objects_folder=folder,
+        robot_name=robot.name if isinstance(robot, RobotSpec) else robot and str(robot),
+        loaded_robot=spec,
+    )
+    _check(inputs)
+    return inputs
+
+
+def _read(path: Path, accept: tuple[Kind, ...]) -> Data:
+    schema = npz_schema(path)
+    if schema == DEMOS and "demos" in accept:
+        return read_demos(path)
+    if schema == MOTION and "motion" in accept:
+        return read_retargeted(path)
+    if schema == BANK and "bank" in accept:
+        return read_bank(path)
+    expected = " or ".join(f"{_SCHEMAS[kind]!r} ({_COMMANDS[kind]})" for kind in accept)
+    raise FileFormatError(f"{path} states schema {schema!r}, expected {expected}.")
+
+
+def _object_names(data: Data) -> tuple[str, ...]:
+    if isinstance(data, ResetBank):
+        return data.object_names
+    return tuple(sorted(set(np.asarray(data.object_name).tolist())))
+
+
+def _check(inputs: Inputs) -> None:
+    """Refuse motion and banks that were made for another robot, and banks that were made with other objects."""
+    data = inputs.data
+    if isinstance(data, Retargeted):
+        check_retargeted(inputs.name, data, inputs.robot)
+    if isinstance(data, ResetBank):
+        robot = {"name": data.robot, "joint_names": data.joint_names, "fingerprint": data.robot_fingerprint}
+        check_robot(inputs.name, "reset bank", inputs.robot, **robot)
+        check_objects(inputs.name, data, inputs.objects)

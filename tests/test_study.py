@@ -1,7 +1,9 @@
 """Studies: the file, the plan, the launcher, and the tables; and one whole study of seconds."""
 
 import io
+import json
 import os
+import re
 import signal
 import tempfile
 import threading
@@ -13,14 +15,18 @@ from importlib.util import find_spec
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
+
 from tests.test_cli import run
 from tests.toy_bank import SOUP
 from tests.toy_results import toy_rollouts, toy_summary
 from tests.toy_study import ShellStep
 from xreset.cli import main
+from xreset.demos.archive import write_demos
+from xreset.demos.synth import synthesize
 from xreset.errors import DemoError, FileFormatError, RunError, XResetError
 from xreset.eval.results import write_results
-from xreset.eval.study.file import SHIPPED, read_study, study_path
+from xreset.eval.study.file import COMMAND_FLAGS, SHIPPED, read_study, study_path
 from xreset.eval.study.launch import Places, launch
 from xreset.eval.study.paper import ALL, paper_tables
 from xreset.eval.study.plan import EvalStep, Plan, TrainStep, flags, make_plan
@@ -60,11 +66,21 @@ class FileTest(InFolder):
                 HEAD + DATA + RUN + run + "minuets = 3\n",
                 r"runs\.a does not fit Runs \(unknown: minuets \(minutes\?\)\)",
             ),
-            (HEAD + DATA + RUN + "[runs.a]\nseeds = [0, 0]\n", r"runs\.a: seeds is \[0, 0\]"),
+            (HEAD + DATA + RUN + "[runs.a]\nseeds = [0, 0]\n", r"runs\.a: seeds is \(0, 0\), expected one or more"),
             (HEAD + DATA + RUN + "[runs.a]\nminutes = 0\n", r"runs\.a: minutes is 0"),
             (HEAD + DATA + RUN + "[runs.a]\npolicy = 'best'\n", r"runs\.a\.policy is 'best'"),
             (HEAD + DATA + RUN + "[runs.a]\ndata = 'real'\n", r"runs\.a\.data is 'real', expected one of 'toy'"),
             (HEAD + DATA + RUN + "[runs.a]\nweights = 'a'\n", r"runs\.a\.weights is 'a', expected one of none"),
+            (HEAD + DATA + RUN + "[runs.a]\nminutes = inf\n", r"runs\.a: minutes is inf"),
+            (HEAD + DATA + RUN + "[runs.a]\ngpus = -1\n", r"runs\.a: gpus is -1"),
+            (HEAD + DATA + RUN + "[runs.a]\nnum_envs = 0\n", r"runs\.a: num_envs is 0"),
+            (HEAD + DATA + RUN + "[runs.a]\nseeds = [99999999999999]\n", r"runs\.a: seeds is \(99999999999999,\)"),
+            (HEAD + DATA + RUN + "[runs.a]\nrobot = '..'\n", r"runs\.a: robot is '\.\.', expected the name"),
+            (HEAD + DATA + RUN + run + "[evaluations.eval]\nper_object = -1\n", r"evaluations\.eval: per_object is -1"),
+            (
+                HEAD + DATA + RUN + "[runs.a]\nweights = 'b'\n[runs.b]\nweights = 'a'\n",
+                r"runs\.a\.weights lead back to themselves: a -> b -> a",
+            ),
             (HEAD + DATA + RUN + "[runs.'../a']\n", "'../a' is no name for a folder"),
             (HEAD + DATA + RUN + run + "[evaluations.checkpoints]\n", "would be a folder of that name"),
             (
@@ -84,6 +100,43 @@ class FileTest(InFolder):
                 read_study(self.file(text))
         with self.assertRaisesRegex(RunError, "no study 'nothing'.*first_grasp.*seconds"):
             study_path("nothing")
+
+    def test_options_that_name_files_are_refused(self):
+        for command, options in (
+            ("retarget", ["--picture", "/tmp/victim.png"]),
+            ("retarget", ["--hand.iterations", "4", "--out=/tmp/victim.npz"]),
+            ("retarget", ["--restart"]),
+            ("retarget", ["--objects", "/tmp"]),
+            ("retarget", ["--pict", "/tmp/victim.png"]),
+            ("retarget", ["-h"]),
+            ("resets", ["--hold", "--out", "/tmp/victim.npz"]),
+            ("resets", ["--robot", "/tmp"]),
+        ):
+            text = HEAD + DATA + f"{command} = {json.dumps(options)}\n" + RUN + "[runs.a]\n"
+            message = rf"data\.toy: {command} holds the option .*, which a study file may not give\. Choose from: --"
+            with self.subTest(options), self.assertRaisesRegex(FileFormatError, message):
+                read_study(self.file(text))
+
+    def test_options_of_the_configuration_are_passed_on(self):
+        for command, options in (
+            ("retarget", ["--hand.object-clearance", "-0.001", "--arm.restarts=8", "--hand.jump_limit", "0.2"]),
+            ("resets", ["--closing.spacing", "0.005", "--squeeze.force", "5", "--hold", "--backend", "mujoco"]),
+        ):
+            text = HEAD + DATA + f"{command} = {json.dumps(options)}\n" + RUN + "[runs.a]\n"
+            with self.subTest(command):
+                self.assertEqual(list(getattr(read_study(self.file(text)).data["toy"], command)), options)
+
+    def test_every_flag_of_a_study_is_one_of_the_command(self):
+        for command, allowed in COMMAND_FLAGS.items():
+            with self.subTest(command), redirect_stdout(io.StringIO()) as said, self.assertRaises(SystemExit):
+                main([command, "--help"])
+            shown = set(re.findall(r"--[a-z][a-z.-]*", said.getvalue()))
+            self.assertEqual(allowed - shown, set())
+
+    def test_a_study_names_no_code(self):
+        text = HEAD + DATA + RUN + "[runs.a.config.task.reward]\nown = { 'module:term' = 1.0 }\n"
+        with self.assertRaisesRegex(FileFormatError, r"runs\.a: config\.task\.reward\.own names code"):
+            read_study(self.file(text))
 
     def test_every_study_that_ships_can_be_read(self):
         files = sorted(SHIPPED.glob("*.toml"))
@@ -184,6 +237,10 @@ class PlanTest(InFolder):
         ):
             with self.subTest(message), self.assertRaisesRegex(error, message):
                 self.plan(text)
+        demos = synthesize(["soup"], 1, 0)
+        write_demos(self.folder / "climbs.npz", replace(demos, object_name=np.array(["../../elsewhere"])), config={})
+        with self.assertRaisesRegex(FileFormatError, r"has the object '\.\./\.\./elsewhere': a name with a slash"):
+            self.plan(HEAD + "[data.toy]\ndemos = 'climbs.npz'\n[runs.a]\ndata = 'toy'\n")
         with self.assertRaisesRegex(RunError, "has no runs b; it has a"):
             self.plan(HEAD + DATA + RUN + "[runs.a]\n", only=("b",))
 

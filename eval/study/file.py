@@ -30,14 +30,19 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from math import isfinite
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from xreset.checks import Checked, NotNegative, Positive
+from xreset.checks import Checked, Finite, Positive, Rule
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.paper import METRICS, paper_tables
 from xreset.files import read_toml
+from xreset.resets.config import ClosingConfig, SqueezeConfig
+from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.hand.config import HandConfig
+from xreset.text import shown
 from xreset.typed import from_dict
 
 SCHEMA = "xreset-study/1"
@@ -45,7 +50,29 @@ SHIPPED = Path(__file__).parent.parent / "studies"
 """Studies that ship with xreset, known by name."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
+_LARGEST_SEED = 2**32 - 1
+"""numpy, torch and the engines take seeds up to this one."""
+Seed = Annotated[int, Rule(f"a whole number from 0 to {_LARGEST_SEED}", lambda x: 0 <= x <= _LARGEST_SEED)]
+
+
+def _are_seeds(seeds: tuple[int, ...]) -> bool:
+    return len(seeds) > 0 and len(set(seeds)) == len(seeds) and min(seeds) >= 0 and max(seeds) <= _LARGEST_SEED
+
+
 Axis = Literal["run", "object", "metric"]
+
+
+def _config_flags(**configs: type) -> set[str]:
+    """Return the command-line flags of configuration classes, such as ``--hand.jump-limit``."""
+    return {f"--{group}.{f.name}".replace("_", "-") for group, config in configs.items() for f in fields(config)}
+
+
+COMMAND_FLAGS = {
+    "retarget": _config_flags(hand=HandConfig, arm=ArmConfig) | {"--device"},
+    "resets": _config_flags(closing=ClosingConfig, squeeze=SqueezeConfig)
+    | {"--backend", "--device", "--num-envs", "--hold", "--no-hold"},
+}
+"""Flags that a study file may give to a command. Flags that name files are not among them: a study writes only into ``--out``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,13 +82,31 @@ class Data(Checked):
     demos: str | None = None
     """An archive (``xreset demos``), relative to ``--data``. None: synthetic ones of the stand-ins."""
     synthetic_per_object: Positive[int] = 4
-    synthetic_seed: NotNegative[int] = 0
+    synthetic_seed: Seed = 0
     meshes: str | None = None
     """Folder of meshes, relative to ``--data``; None: the stand-ins."""
     retarget: tuple[str, ...] = ()
-    """Further options of ``xreset retarget``."""
+    """Further options of ``xreset retarget``: those of :data:`COMMAND_FLAGS`."""
     resets: tuple[str, ...] = ()
-    """Further options of ``xreset resets``."""
+    """Further options of ``xreset resets``: those of :data:`COMMAND_FLAGS`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for command, allowed in COMMAND_FLAGS.items():
+            for text in getattr(self, command):
+                flag = text.partition("=")[0].replace("_", "-")
+                if text.startswith("-") and not _is_number(text) and flag not in allowed:
+                    raise ValueError(
+                        f"{command} holds the option {shown(text)}, which a study file may not give. "
+                        f"Choose from: {', '.join(sorted(allowed))}"
+                    )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return isfinite(float(text))
+    except ValueError:
+        return False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,11 +117,11 @@ class Evaluation(Checked):
     """Of whose demonstrations starts and goals are; None: those that the policy was trained with."""
     objects: tuple[str, ...] = ()
     """Only these, where a run has them; empty: all of the run's."""
-    per_object: int | None = None
+    per_object: Positive[int] | None = None
     """Only the first so many demonstrations of each; None: all (of the run's own data: as many as it was trained with)."""
     episodes: Positive[int] = 5
     """Perturbed starts of each demonstration."""
-    seed: NotNegative[int] = 0
+    seed: Seed = 0
     engines: tuple[str, ...] = ("mujoco", "mujoco-warp", "pybullet", "sapien")
     """Those that are not there are left out, and that is said."""
     num_envs: Positive[int] = 64
@@ -99,26 +144,33 @@ class Runs(Checked):
     recipe: str = "minutes"
     config: dict[str, Any] = field(default_factory=dict)
     """Changes of the recipe, nested as the configuration is."""
-    seeds: tuple[int, ...] = (0,)
-    minutes: Positive[float] | None = None
+    seeds: Annotated[tuple[int, ...], Rule(f"one or more numbers from 0 to {_LARGEST_SEED}, each once", _are_seeds)] = (
+        0,
+    )
+    minutes: Positive[Finite[float]] | None = None
     """Minutes of training, without compiling."""
-    steps: Positive[float] | None = None
+    steps: Positive[Finite[float]] | None = None
     """Environment steps of all worlds; of both the one that is reached first. Neither: the recipe's iterations."""
     weights: str | None = None
     """Other runs of the study, whose networks these begin with: those of the same seed, and of the same object if they are alone, too."""
     backend: str = "mujoco-warp"
     device: Literal["cuda", "cpu"] = "cuda"
-    gpus: int = 1
+    gpus: Positive[int] = 1
     """Processes, each with a GPU and ``num_envs`` worlds of its own."""
-    num_envs: int = 4096
+    num_envs: Positive[int] = 4096
     """Worlds of each process."""
     evaluations: tuple[str, ...] = ()
     """Names of those that are done; none: all."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.seeds or len(set(self.seeds)) < len(self.seeds) or min(self.seeds) < 0:
-            raise ValueError(f"seeds is {list(self.seeds)}, expected one or more, each once and 0 or more")
+        if not _NAME.fullmatch(Path(self.robot).name):
+            raise ValueError(f"robot is {shown(self.robot)}, expected the name of a robot or the folder of one")
+        reward: Any = self.config
+        for key in ("task", "reward"):
+            reward = reward.get(key) if isinstance(reward, dict) else None
+        if isinstance(reward, dict) and "own" in reward:
+            raise ValueError("config.task.reward.own names code to run, which a study file may not. Use xreset train")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,6 +272,13 @@ def _problem(study: Study) -> str | None:
         )
         if found := next(filter(None, problems), None):
             return found
+        chain = [name]
+        while (weights := study.runs[chain[-1]].weights) is not None:
+            if weights in chain:
+                return f"runs.{name}.weights lead back to themselves: {' -> '.join([*chain, weights])}."
+            chain.append(weights)
+            if weights not in study.runs:
+                break
     for i, table in enumerate(study.tables):
         papers = paper_tables()
         problems = (

@@ -27,7 +27,7 @@ from xreset.learning.recipes import starting_config
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.objects.catalogue import canonical_name, object_names
 from xreset.plugins import backend_status
-from xreset.text import short_name
+from xreset.text import short_name, shown
 from xreset.typed import from_dict
 
 if TYPE_CHECKING:
@@ -408,7 +408,14 @@ def _objects_of(name: str, data: Data, given: Path) -> tuple[str, ...]:
             raise FileFormatError(
                 f"there is no {given / file} (data.{name}.{what}). Put it there, or say with --data where it is."
             )
-    return tuple(sorted(set(read_demos(given / data.demos).object_name.tolist())))
+    names = tuple(sorted(set(read_demos(given / data.demos).object_name.tolist())))
+    for object_name in names:
+        if "/" in object_name:
+            raise FileFormatError(
+                f"{given / data.demos} (data.{name}.demos) has the object {shown(object_name)}: "
+                "a name with a slash cannot become the name of a folder. Rename the object."
+            )
+    return names
 
 
 def _named(where: str, objects: tuple[str, ...], there: tuple[str, ...]) -> tuple[str, ...]:

@@ -143,6 +143,11 @@ class PlaceTest(unittest.TestCase):
         with self.assertRaisesRegex(RobotError, "no frame to reach"):
             placing.place(self.robot, [none], np.zeros((0, 3)), CONFIG)
 
+    def test_a_search_without_room_ends(self):
+        avoid = self.wrists.root_pos.numpy().reshape(-1, 3)
+        with self.assertRaisesRegex(RobotError, "no place in the searched ranges is 9 m away.*Lower --search.clear"):
+            placing.place(self.robot, [self.wrists], avoid, dataclasses.replace(CONFIG, clear=9.0))
+
     def test_parameters_of_a_placement_come_back(self):
         rng = np.random.default_rng(0)
         for _ in range(20):

@@ -3,6 +3,7 @@ import shutil
 import tempfile
 import unittest
 from contextlib import redirect_stdout
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,6 +11,7 @@ from unittest import mock
 
 import numpy as np
 import torch
+import trimesh
 
 from xreset import plugins
 from xreset.cli import main
@@ -131,6 +133,34 @@ class BuiltIn(unittest.TestCase):
             spread = np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints])
             margin = np.minimum(robot.home - kinematics.lower.numpy(), kinematics.upper.numpy() - robot.home)
             self.assertGreater((margin / spread).min(), 1.2, name)
+
+
+class Fingerprint(unittest.TestCase):
+    def test_files_of_before_know_the_built_in_robots(self):
+        """These are in reset banks and policies, those of 0.1.0 too."""
+        for name, fingerprint in (
+            ("ur7e-sharpa", "503f290c651dbc9d645a3113d96b9f9c51eecfe382a87fadbeaec8c8896e08d2"),
+            ("openarm", "116fba4a3550b6d513fc9a9969e9721697cf89b4b22531e97b45bb9812ddc8dc"),
+            ("panda-allegro", "4c90fbf5c62c42bd8197697c9331762e171cc0bc31a68497313c1a51fdee8293"),
+            ("xarm7-leap", "04b05e0bf4c1a894947de4d2158377814dc3564cc7c3b140c7c77546e5311f08"),
+        ):
+            self.assertEqual(load(name).fingerprint, fingerprint, name)
+
+    def test_a_changed_mesh_makes_another_robot(self):
+        folder = Path(self.enterContext(tempfile.TemporaryDirectory())) / "robot"
+        shutil.copytree(openarm.URDF.parent, folder)
+        urdf = folder / "robot.urdf"
+        urdf.write_text(urdf.read_text().replace('<box size="0.05 0.14 0.04" />', '<mesh filename="body.stl" />', 1))
+        trimesh.creation.box((0.05, 0.14, 0.04)).export(folder / "body.stl")
+        before = load(folder)
+        self.assertEqual([mesh.name for mesh in before.meshes], ["body.stl"])
+        stated = before.fingerprint
+        of_0_1_0 = replace(before, meshes=()).fingerprint
+        trimesh.creation.box((0.06, 0.14, 0.04)).export(folder / "body.stl")
+        after = load(folder)
+        self.assertFalse(after.has_fingerprint(stated))
+        self.assertTrue(after.has_fingerprint(after.fingerprint))
+        self.assertTrue(after.has_fingerprint(of_0_1_0))
 
 
 class Dynamics(unittest.TestCase):

@@ -15,6 +15,7 @@ from typing import Literal
 from xreset.checks import Number, Text
 from xreset.errors import RobotError
 from xreset.files import read_toml
+from xreset.geometry.urdf import find_mesh, parse_xml
 from xreset.plugins import robot_folder
 from xreset.spec import (
     KEYPOINTS,
@@ -138,9 +139,11 @@ class Description:
 
 
 def _robot(given: Description, folder: Path) -> RobotSpec:
+    urdf = (folder / given.urdf).resolve()
     return RobotSpec(
         name=given.name,
-        urdf=(folder / given.urdf).resolve(),
+        urdf=urdf,
+        meshes=_meshes(urdf),
         joints=tuple(joint.spec() for joint in given.joints),
         mimics=given.mimics,
         base_pos=given.base.pos,
@@ -157,6 +160,17 @@ def _robot(given: Description, folder: Path) -> RobotSpec:
         like=given.like,
         home_std=(given.home_std.arm, given.home_std.hand),
     )
+
+
+def _meshes(urdf: Path) -> tuple[Path, ...]:
+    """Mesh files of the collision shapes, as far as they exist: a wrong URDF is reported by whoever reads it."""
+    try:
+        collisions = list(parse_xml(urdf).iter("collision"))
+    except RobotError:
+        return ()
+    meshes = [mesh for collision in collisions for mesh in collision.iter("mesh")]  # noqa: XR002
+    files = [find_mesh(mesh.get("filename", ""), urdf) for mesh in meshes]
+    return tuple(file for file in files if file is not None)
 
 
 def _contradictions(spec: RobotSpec) -> list[str]:

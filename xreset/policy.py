@@ -81,7 +81,8 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
             raise PolicyError(
                 f"{source} was trained with another {what}: {contract[key]}, here it is {here[key]}. Use --robot {contract['robot']}."
             )
-    if contract["robot_fingerprint"] != here["robot_fingerprint"]:
+    fingerprint = contract["robot_fingerprint"]
+    if fingerprint != robot.like and not robot.has_fingerprint(fingerprint):
         raise PolicyError(
             f"{source} was trained on another version of {robot.name!r}: its URDF or description has changed. Train again."
         )

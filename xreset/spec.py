@@ -161,6 +161,8 @@ class RobotSpec:
     """Spread of the home configuration: standard deviation of arm and hand joints [rad], the paper's Table IX."""
     placement: PlacementSpec | None = field(default=None, repr=False)
     """Where ``base_pos`` and ``base_quat`` come from, if a search found them; no part of the :attr:`fingerprint`."""
+    meshes: tuple[Path, ...] = field(default=(), repr=False, compare=False)
+    """Mesh files of the URDF's collision shapes."""
     like: str = field(default="", repr=False)
     """Fingerprint of the robot that this one differs from in nothing but shapes, so that its policies play here; no part of its own."""
 
@@ -196,9 +198,20 @@ class RobotSpec:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 over the description and the URDF's bytes: equal where the robot is the same, wherever its files lie."""
+        """SHA-256 over the description, the URDF and its meshes: equal where the robot is the same, wherever its files are.
+
+        Files hold it, so the text that is hashed must not change: a new field of a spec gets ``repr=False``, and enters the hash only
+        where it differs from its default.
+        """
         description = repr(replace(self, urdf=Path(self.urdf.name)))
-        return hashlib.sha256(description.encode() + self.urdf.read_bytes()).hexdigest()
+        digest = hashlib.sha256(description.encode() + self.urdf.read_bytes())
+        for mesh in self.meshes:
+            digest.update(mesh.read_bytes())
+        return digest.hexdigest()
+
+    def has_fingerprint(self, fingerprint: str) -> bool:
+        """Return whether a file's fingerprint is this robot's. Files of xreset 0.1.0 do not know its meshes."""
+        return fingerprint in (self.fingerprint, replace(self, meshes=()).fingerprint)
 
 
 @dataclass(frozen=True, kw_only=True)

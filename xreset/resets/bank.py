@@ -217,9 +217,9 @@ def check_robot(
             f"{path} is a {what} for the robot {name!r} with {len(joint_names)} joints; "
             f"{robot.name!r} has {len(robot.joints)}. Make it again with --robot {robot.name}, or use --robot {name}."
         )
-    if fingerprint != robot.fingerprint:
+    if not robot.has_fingerprint(fingerprint):
         raise FileFormatError(
-            f"{path} is a {what} for another version of {name!r}: its URDF or robot.toml has changed. Make it again."
+            f"{path} is a {what} for another version of {name!r}: its URDF, meshes or robot.toml have changed. Make it again."
         )
 
 

@@ -38,6 +38,8 @@ _FIRST = 12
 """Frames that a candidate is tried on before all others: most fail on enough of them."""
 _WAVE = 8
 """Candidates that are given up by the same standard: what had been found before all of them."""
+_DRAWS = 1000
+"""Times that a candidate is drawn until it is clear of wrists and objects; then the round goes without it."""
 _SHRINK = 0.6
 """Factor by which the spread of candidates about the best shrinks from round to round."""
 
@@ -214,16 +216,22 @@ def _rounds(
         centres = [_parameters(placement) for placement, _ in found[: config.elite]]
         candidates = []
         for _ in range(config.candidates):
-            while True:
+            for _ in range(_DRAWS):
                 if number == 0:
                     drawn = random.uniform(low, high)
                 else:
                     spread = (high - low) / 4 * _SHRINK**number
                     drawn = centres[random.integers(len(centres))] + spread * random.standard_normal(6)
-                drawn[:3], drawn[4] = np.clip(drawn[:3], low[:3], high[:3]), np.clip(drawn[4], tilt[0], tilt[1])
+                drawn[:3] = np.clip(drawn[:3], low[:3], high[:3])
+                drawn[4] = np.clip(drawn[4], tilt[0], tilt[1])
                 if not len(avoid) or np.linalg.norm(avoid - drawn[:3], axis=1).min() >= config.clear:
+                    candidates.append(_placement(drawn))
                     break
-            candidates.append(_placement(drawn))
+        if number == 0 and not candidates:
+            raise RobotError(
+                f"robot {robot.name!r}: no place in the searched ranges is {config.clear:g} m away from all wrists and objects. "
+                "Lower --search.clear, or widen --search.x, --search.y or --search.z."
+            )
         yield candidates
 
 

@@ -267,38 +267,6 @@ class ResetTest(WithEnv):
         state = self.make(replace(task, reset=ResetConfig(demo_probability=0.0))).backend.state()
         self.assertTrue(torch.equal(state.joint_target, state.joint_pos))
 
-    def test_what_became_of_episodes_moves_the_frontier(self):
-        env = self.make(replace(TASK, reset=ResetConfig(demo_probability=1.0, frontier=0.5)))
-        began, before = env.bank_state.clone(), env.resets.reached_from_bank.clone()
-        for step in range(env.max_episode_length):
-            if step == 3:
-                env._reached[0] = True  # an object is at its goal once, and then no more
-            *_, extras = env.step(torch.zeros(N, 7))
-        expected = before.clone()
-        for world in range(N):  # (two soup worlds may have begun with the same state)
-            same = began == began[world]
-            hits = (same & (torch.arange(N) == 0)).sum()
-            expected[began[world]] = 0.5 + (1 - 0.9 ** int(same.sum())) * (hits / same.sum() - 0.5)
-        torch.testing.assert_close(env.resets.reached_from_bank, expected)
-        self.assertEqual(env.resets.reached_from_home.tolist(), [0.5] * 3)
-        self.assertAlmostEqual(float(extras["log"]["task/reached_from_bank"]), float(expected.mean()), places=6)
-        self.assertFalse(bool(env._reached.any()), "a new episode has reached nothing yet")
-        other = self.make(replace(TASK, reset=ResetConfig(demo_probability=1.0, frontier=0.5)), seed=1)
-        self.assertTrue(other.restore(env.snapshot()))
-        self.assertTrue(
-            torch.equal(other.resets.reached_from_bank, expected) and torch.equal(other.bank_state, env.bank_state)
-        )
-
-    def test_what_became_of_episodes_from_home_moves_the_frontier_of_everything(self):
-        env = self.make(replace(TASK, reset=ResetConfig(demo_probability=0.0, frontier=1.0, frontier_over="all")))
-        began = env.sequence.clone()
-        for _ in range(env.max_episode_length):
-            *_, extras = env.step(torch.zeros(N, 7))
-        expected = torch.tensor([0.5 * 0.9 ** int((began == demo).sum()) for demo in (0, 2, 1)])
-        torch.testing.assert_close(env.resets.reached_from_home, expected)
-        self.assertAlmostEqual(float(extras["log"]["task/reached_from_home"]), float(expected.mean()), places=6)
-        self.assertEqual(float(extras["log"]["task/from_bank"]), 0.0)
-
     def test_mass_friction_and_gravity_are_drawn_anew_for_the_worlds_that_begin(self):
         env = self.make()
         with (

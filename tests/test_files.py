@@ -451,6 +451,16 @@ class TypedTest(unittest.TestCase):
         del data["timestep"], data["reset"]
         self.assertEqual(from_dict(TaskConfig, data), TaskConfig())
 
+    def test_a_removed_option_is_ignored_where_it_was_off(self):
+        data = asdict(TaskConfig(timestep=0.01))
+        data["reset"] |= {"frontier": 0.0, "frontier_over": "bank", "frontier_power": 1.0, "frontier_rate": 0.1}
+        self.assertEqual(from_dict(TaskConfig, data), TaskConfig(timestep=0.01))
+        data["reset"]["frontier"] = 0.75
+        with self.assertRaisesRegex(
+            FileFormatError, r"^configuration.reset.frontier is 0.75. This option was removed;"
+        ):
+            from_dict(TaskConfig, data)
+
     def test_refusals_name_the_entry(self):
         good = asdict(self.GOOD)
         for words, data in (

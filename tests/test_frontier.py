@@ -22,7 +22,7 @@ from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
 from xreset.policy import ZeroPolicy
 from xreset.resets.bank import read_bank, write_bank
-from xreset.task.config import ObservationConfig, ResetConfig, TaskConfig, TerminationConfig
+from xreset.task.config import ObservationConfig, TaskConfig, TerminationConfig
 
 try:
     import mujoco  # noqa: F401
@@ -78,7 +78,6 @@ class FrontierTest(unittest.TestCase):
         write_bank(cls.resets, cls.bank, config={}, inputs={})
         cls.task = TaskConfig(
             termination=TerminationConfig(episode_seconds=0.5), observation=ObservationConfig(cloud_points=16), distance_points=64,
-            reset=ResetConfig(frontier=0.5),
         )  # fmt: skip
 
     def subject(self) -> Subject:

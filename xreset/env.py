@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _LASTING = (
     "goal_pos", "goal_quat", "gravity_fraction", "sequence", "bank_state", "_episode_length", "_target", "_previous_action", "_best_reach",
-    "_reached", "_reward", "_cloud",
+    "_reward", "_cloud",
 )  # fmt: skip
 """What an environment keeps of each world from step to step, besides the engine's state."""
 
@@ -150,7 +150,6 @@ class ManipulationEnv:
         self._action, self._previous_action = zeros(self.num_actions), zeros(self.num_actions)
         self._target = zeros(self.num_actions)
         self._best_reach, self._reward, self._time_out = zeros(), zeros(), zeros(dtype=torch.bool)
-        self._reached = zeros(dtype=torch.bool)
         self._cloud = zeros(task.observation.cloud_history, task.observation.cloud_points, 3)
         # What a step puts down for the next part of it: which worlds are reset, to what, and which are over and wait for it.
         self._reset_mask, self._over = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
@@ -281,7 +280,6 @@ class ManipulationEnv:
         values = {f"state.{f.name}": getattr(state, f.name) for f in fields(state)}
         values |= {f"env.{name}": value for name, value in self._lasting.items()}
         values |= {f"observed.{name}": self._observations[name] for name in set(self._observations.keys())}
-        values["resets.reached"] = self.resets.reached
         return {name: value.to("cpu", copy=True) for name, value in values.items()}
 
     def restore(self, snapshot: dict[str, Tensor]) -> bool:
@@ -297,7 +295,6 @@ class ManipulationEnv:
         self._reset_mask.zero_()
         for name in set(self._observations.keys()):
             self._observations[name].copy_(snapshot[f"observed.{name}"])
-        self.resets.reached.copy_(snapshot["resets.reached"])
         return True
 
     @property
@@ -363,13 +360,7 @@ class ManipulationEnv:
         time_out = (self._episode_length >= self.max_episode_length) | self._faulty
         self._time_out.copy_(time_out & ~lost)
         self._reset_mask.copy_((lost | time_out) & live)
-        self._reached |= reward.success
         totals = {"health/nonfinite_total": self.nonfinite_count, "health/overflow_total": self.overflow_count}
-        if self.resets.config.frontier > 0:
-            self.resets.learn(self.bank_state, self.sequence, self._reset_mask & ~self._faulty, self._reached)
-            totals["task/reached_from_bank"] = self.resets.reached_from_bank.mean()
-            totals["task/reached_from_home"] = self.resets.reached_from_home.mean()
-            totals["task/from_bank"] = self.from_bank.float().mean()
         names, values = step_log(reward, self._reset_mask, sound=~broken, from_home=~self.from_bank, totals=totals)
         if not self._log_names:
             self._log_names, self._log_values = names, torch.zeros_like(values)
@@ -407,7 +398,7 @@ class ManipulationEnv:
             (start.joint_target, self._target),
         ):
             old.copy_(torch.where(fresh.view(-1, *[1] * (old.ndim - 1)), new, old))
-        for cleared in (self._episode_length, self._previous_action, self._reward, self._reached, self._over):
+        for cleared in (self._episode_length, self._previous_action, self._reward, self._over):
             cleared.masked_fill_(fresh.view(-1, *[1] * (cleared.ndim - 1)), 0)
 
     def _write_resets(self) -> None:

@@ -19,6 +19,8 @@ def from_dict(cls: type[T], data: Any, where: str = "configuration") -> T:
     """Build a dataclass from nested dictionaries as :func:`dataclasses.asdict` and JSON make them.
 
     What is missing takes its default, so that files stay readable when a field is added: its default must be what was done before.
+    A class may list the fields that it no longer has, with the values that mean what is done now: ``REMOVED: ClassVar[dict[str, Any]]``.
+    Entries with these values are ignored.
 
     Raises:
         FileFormatError: names every entry that is unknown, missing, of the wrong type or out of range.
@@ -41,6 +43,14 @@ def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
         problems.append(f"{where} is {shown(data)}, expected an object with the entries of {cls.__name__}.")
         return None
     before = len(problems)
+    removed = getattr(cls, "REMOVED", {})
+    for name in sorted(data.keys() & removed.keys()):
+        if data[name] != removed[name]:
+            problems.append(
+                f"{where}.{name} is {shown(data[name])}. This option was removed; only {removed[name]!r} can be read. "
+                "Use an earlier version of xreset."
+            )
+    data = {name: value for name, value in data.items() if name not in removed}
     hints = typing.get_type_hints(cls, include_extras=not issubclass(cls, Checked))  # which looks at its rules itself
     needed = {f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(cls)}
     unknown, missing = (

@@ -75,12 +75,7 @@ class ResetDistribution:
 
     Attributes:
         joint_pos: [L, J] robot states of the bank.
-        reached: [S + L] share of recent episodes from each start that reached the goal, 0.5 before the first (:meth:`learn`): home with
-            each of the bank's demonstrations, then its states, numbered as they are kept here, sorted by object.
     """
-
-    FLOOR = 0.01
-    """Least s (1 - s) of a start at the frontier, so that there is one while every start fails, or none does."""
 
     def __init__(
         self,
@@ -136,8 +131,6 @@ class ResetDistribution:
         tree = robot_tree(robot)
         limits = np.array([(tree.joint(name).lower, tree.joint(name).upper) for name in robot.joint_names])
         self._lower, self._upper = tensor(limits[:, 0]), tensor(limits[:, 1])
-        self._num_sequences = len(bank.sequence_name)
-        self.reached = torch.full((self._num_sequences + len(state_rows),), 0.5, device=device)
         self._home = tensor(robot.home)
         self._home_std = tensor(np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints]))
 
@@ -153,20 +146,13 @@ class ResetDistribution:
             generator: random numbers, on this distribution's device.
         """
         m, c = len(object_index), self.config
-        uniform = torch.rand(m, 6, generator=generator, device=generator.device)
+        uniform = torch.rand(m, 6, generator=generator, device=generator.device)  # six, so that seeds keep their draws
         states, sequences = (
             (first[object_index], count[object_index])
             for first, count in ((self._state_first, self._state_count), (self._sequence_first, self._sequence_count))
         )
-        row, pick, share = _evenly(*states, uniform[:, 1]), _evenly(*sequences, uniform[:, 2]), c.demo_probability
-        if c.frontier > 0:
-            at_frontier = uniform[:, 4] < c.frontier
-            home_weight, bank_weight = self._weights()
-            row = torch.where(at_frontier, _weighted(bank_weight, *states, uniform[:, 1]), row)
-            if c.frontier_over == "all":
-                pick = torch.where(at_frontier, _weighted(home_weight, *sequences, uniform[:, 2]), pick)
-                share = torch.where(at_frontier, self._bank_share(home_weight, bank_weight)[object_index], share)
-        from_bank = (uniform[:, 0] < share) & (states[1] > 0)
+        row, pick = _evenly(*states, uniform[:, 1]), _evenly(*sequences, uniform[:, 2])
+        from_bank = (uniform[:, 0] < c.demo_probability) & (states[1] > 0)
         row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
         home = self.home(self._sequence_rows[pick], generator)
         if not len(self.joint_pos):
@@ -213,66 +199,7 @@ class ResetDistribution:
             sequence=sequence,
         )
 
-    def learn(self, state: Tensor, sequence: Tensor, ended: Tensor, reached: Tensor) -> None:
-        """Take note of episodes that have ended; ``reached`` changes in place.
-
-        Args:
-            state: [M] the bank state that each episode began with, -1 for home.
-            sequence: [M] its demonstration.
-            ended: [M] bool, whether it has ended; the others are left out.
-            reached: [M] bool, whether it reached the goal.
-        """
-        row = torch.where(state >= 0, self._num_sequences + state, sequence)
-        none = torch.zeros_like(self.reached)
-        episodes, hits = (none.index_add(0, row, what.to(none.dtype)) for what in (ended, ended & reached))
-        fresh = 1.0 - (1.0 - self.config.frontier_rate) ** episodes
-        self.reached += fresh * (hits / episodes.clamp_min(1.0) - self.reached)
-
-    @property
-    def reached_from_home(self) -> Tensor:
-        """The part of :attr:`reached` that is about home: one entry for each demonstration of the scene's objects, sorted by object."""
-        return self.reached[self._sequence_rows]
-
-    @property
-    def reached_from_bank(self) -> Tensor:
-        """[L] the part of :attr:`reached` that is about bank states."""
-        return self.reached[self._num_sequences :]
-
-    def _weights(self) -> tuple[Tensor, Tensor]:
-        """Weights at the frontier, in the order of :attr:`reached_from_home` and of :attr:`reached_from_bank`."""
-
-        def weight(s: Tensor) -> Tensor:
-            return (s * (1.0 - s)).clamp_min(self.FLOOR) ** self.config.frontier_power
-
-        return weight(self.reached_from_home), weight(self.reached_from_bank)
-
-    def _bank_share(self, home_weight: Tensor, bank_weight: Tensor) -> Tensor:
-        """[O] share of the bank in resets at the frontier of everything: its share in the even mixture, by the mean weights of both."""
-        p = self.config.demo_probability
-        bank = p * _mean(bank_weight, self._state_first, self._state_count)
-        home = (1.0 - p) * _mean(home_weight, self._sequence_first, self._sequence_count)
-        return bank / (bank + home).clamp_min(1e-12)
-
 
 def _evenly(first: Tensor, count: Tensor, uniform: Tensor) -> Tensor:
     """[M] indices drawn from ``first : first + count`` by uniform numbers in [0, 1)."""
     return first + torch.minimum((uniform * count).long(), (count - 1).clamp_min(0))
-
-
-def _weighted(weight: Tensor, first: Tensor, count: Tensor, uniform: Tensor) -> Tensor:
-    """[M] indices drawn from ``first : first + count`` in proportion to ``weight`` there, by uniform numbers in [0, 1)."""
-    total = _sums(weight)
-    low, high = total[first], total[first + count]
-    row = torch.searchsorted(total, low + uniform * (high - low), right=True) - 1
-    return torch.minimum(torch.maximum(row, first), first + (count - 1).clamp_min(0))
-
-
-def _mean(weight: Tensor, first: Tensor, count: Tensor) -> Tensor:
-    """[O] mean of ``weight`` in ``first : first + count``; 0 where there is nothing."""
-    total = _sums(weight)
-    return ((total[first + count] - total[first]) / count.clamp_min(1)).to(weight.dtype)
-
-
-def _sums(weight: Tensor) -> Tensor:
-    """[L + 1] sums of the first 0, 1, ... L weights, in double precision."""
-    return torch.cat((weight.new_zeros(1), weight.double().cumsum(0)))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import isfinite
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from xreset.checks import Checked, Finite, NotNegative, Only, Positive, Range, Share
 
@@ -164,20 +164,15 @@ class TerminationConfig(Checked):
 class ResetConfig(Checked):
     """The reset mixture (sections IV-B, appendix D.c, D.e, Table IX)."""
 
+    REMOVED: ClassVar[dict[str, Any]] = {
+        "frontier": 0.0,
+        "frontier_over": "bank",
+        "frontier_power": 1.0,
+        "frontier_rate": 0.1,
+    }
+
     demo_probability: Share[float] = 0.5
     """p: share of resets from the bank; 0 is X-Sim."""
-    frontier: Share[float] = 0.0
-    """Share of resets drawn where the policy sometimes reaches the goal and sometimes does not: in proportion to (s (1 - s)) ^
-    ``frontier_power``, s being the share of recent episodes from a start that reached it. The others are drawn evenly, as in the paper."""
-    frontier_over: Literal["bank", "all"] = "bank"
-    """``bank``: only bank states are drawn so, and ``demo_probability`` stays their share of all resets. ``all``: bank states and home
-    starts, one of each demonstration, are one table; a start's weight is its chance in the even mixture times the one above, so
-    that resets come from the bank until home is where there is something to learn, and then from home."""
-    frontier_power: Positive[Finite[float]] = 1.0
-    """Of 1, the weight is the learnability of Tzannetos et al. 2023 (Proximal Curriculum) and Rutherford et al. 2024 (No Regrets): a start
-    solved in 1 % of episodes has 4 % of the greatest weight. Flatter: with 0.5 it has 20 %, with 0.25 it has 45 %."""
-    frontier_rate: Positive[Share[float]] = 0.1
-    """Weight of an episode in s."""
     pre_contact_only: bool = False
     """Use only bank states before first contact."""
     random_gravity: bool = True
@@ -300,6 +295,6 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
         task,
         observation=replace(task.observation, noise=zero),
         reward=replace(task.reward, own={}),
-        reset=replace(task.reset, demo_probability=0.0, frontier=0.0, home_gravity_std=0.0),
+        reset=replace(task.reset, demo_probability=0.0, home_gravity_std=0.0),
         randomization=replace(task.randomization, enabled=False),
     )

@@ -623,10 +623,8 @@ class Harness(unittest.TestCase):
             self.assertEqual(data["command"], "xreset engines check --backend mujoco --check free_fall")
             self.assertEqual([c["verdict"] for c in data["runs"][0]["checks"]], ["passed"])
             broken = Measure(what="x", measured=float("nan"), tolerance=1.0)
-            check = next(check for check in CHECKS if check.name == "free_fall")
-            red = CheckResult(check=check, verdict="failed", measures=(broken,))
             with (
-                mock.patch("xreset.backends.conformance._run_one", lambda check, bench: red),
+                mock.patch("xreset.backends.conformance._run_one", lambda check, bench: ("failed", "", (broken,))),
                 contextlib.redirect_stdout(io.StringIO()),
                 self.assertRaises(SystemExit) as raised,
             ):

@@ -1,42 +1,112 @@
-"""The worlds that the checks run in, and how they are compared."""
+"""The worlds that the checks run in, and how states are compared."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.conformance.results import Measure, Skipped
+from xreset.backends.conformance.results import Skipped
 from xreset.backends.conformance.scene import gripper
 from xreset.geometry.collision import height_above_table, table_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_normalize
-from xreset.physics import Backend, Parameter, State
+from xreset.physics import Backend, Contacts, Links, Parameter, Parameters, State
 from xreset.plugins import backend_status, make_backend
-from xreset.spec import SceneSpec
+from xreset.spec import ObjectSpec, SceneSpec
 
-_NEARER = 6
-"""Times that a random configuration is brought half the way home, while it reaches into the table."""
-
-
-class MakeBackend(Protocol):
-    """Builds the backend under test."""
-
-    def __call__(self, scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None) -> Backend:
-        """Build ``num_worlds`` worlds."""
-        ...
-
+MakeBackend = Callable[..., Backend]
+"""Builds the backend under test: ``make(scene, num_worlds, object_index=...)``."""
 
 REFERENCE = "mujoco"
 """Backend that others are compared with."""
 REFINEMENT = 8
-"""How much finer the steps are of the reference that the reference is compared with."""
+"""How much finer the steps are of the reference that the reference itself is compared with."""
+_HALVINGS = 6
+"""How often a random configuration is moved half the way home while the robot reaches into the table."""
+
+
+class Worlds:
+    """A backend seen from the CPU.
+
+    Inputs are moved to the backend's device, and rows without a world dimension are repeated for every world; readings
+    are copies on the CPU, which later steps do not change.
+    """
+
+    def __init__(self, backend: Backend, finer: int = 1) -> None:
+        """Wrap a backend whose steps are ``finer`` times smaller than those of the scene."""
+        self.backend = backend
+        self._finer = finer
+        self.altered = False
+        """Whether a physical parameter has been set."""
+
+    def set(self, state: State, worlds: Sequence[int] | None = None) -> None:
+        """Set the state of all worlds, or of the given ones from their rows."""
+        if worlds is not None:
+            state = state[list(worlds)]
+        self.backend.set_state(state.to(self.backend.device), self._index(worlds))
+
+    def set_targets(self, targets: Tensor) -> None:
+        """Set the drive targets, [J] or [N, J]."""
+        self.backend.set_joint_targets(self._for_all(targets))
+
+    def push(self, force: Tensor, torque: Tensor) -> None:
+        """Set force and torque on the object, [3] or [N, 3]."""
+        self.backend.set_object_wrench(self._for_all(force), self._for_all(torque))
+
+    def set_parameter(self, name: Parameter, value: Tensor, worlds: Sequence[int] | None = None) -> None:
+        """Set a physical parameter [N, ...] of all worlds, or of the given ones from their rows."""
+        self.altered = True
+        if worlds is not None:
+            value = value[list(worlds)]
+        getattr(self.backend, f"set_{name}")(value.float().to(self.backend.device), self._index(worlds))
+
+    def set_where(self, worlds: Sequence[int], state: State, parameters: dict[Parameter, Tensor]) -> None:
+        """Set state and parameters through a mask."""
+        self.altered = True
+        device = self.backend.device
+        mask = torch.zeros(self.backend.num_worlds, dtype=torch.bool, device=device)
+        mask[list(worlds)] = True
+        values = {name: value.float().to(device) for name, value in parameters.items()}
+        self.backend.set_where(mask, state.to(device), Parameters(**values))
+
+    def step(self, steps: int) -> None:
+        """Advance by some physics steps of the scene."""
+        self.backend.step(steps * self._finer)
+
+    def advance(self, start: State, steps: int) -> State:
+        """Return what becomes of a state [N, ...] in some physics steps of the scene."""
+        self.set(start)
+        self.step(steps)
+        return self.state()
+
+    def state(self) -> State:
+        """Return the state."""
+        return snapshot(self.backend.state())
+
+    def links(self) -> Links:
+        """Return the tracked links."""
+        return self.backend.links().to("cpu").clone()
+
+    def contacts(self) -> Contacts:
+        """Return the contact forces."""
+        return self.backend.contacts().to("cpu").clone()
+
+    def nonfinite(self) -> Tensor:
+        """Return which worlds are not finite."""
+        return self.backend.health().nonfinite.cpu().clone()
+
+    def _index(self, worlds: Sequence[int] | None) -> Tensor | None:
+        return None if worlds is None else torch.tensor(worlds, device=self.backend.device)
+
+    def _for_all(self, value: Tensor) -> Tensor:
+        rows = value.float().expand(self.backend.num_worlds, value.shape[-1])
+        return rows.contiguous().to(self.backend.device)
 
 
 class Bench:
@@ -53,62 +123,71 @@ class Bench:
         self.own_robot = scene.robot.name == gripper().name
         self.kinematics = Kinematics(scene.robot)
         self.object_index = torch.arange(self.NUM_WORLDS) % len(scene.objects)
-        self._shared: Backend | None = None
-        self._altered = False
+        self._shared: Worlds | None = None
 
     @property
-    def objects(self) -> list:
+    def objects(self) -> list[ObjectSpec]:
         """The object of each shared world."""
         return [self.scene.objects[i] for i in self.object_index.tolist()]
 
-    def backend(self) -> Backend:
-        """The shared worlds in their initial state, with nominal parameters."""
-        if self._shared is None:
-            self._shared = self._make(self.scene, self.NUM_WORLDS, object_index=self.object_index)
-        backend = self._shared
-        if self._altered:
-            _set_nominal(backend, self.objects, self.scene)
-            self._altered = False
-        backend.set_state(self.start(backend.device))
-        return backend
+    @property
+    def masses(self) -> Tensor:
+        """[N] mass of each shared world's object."""
+        return torch.tensor([thing.mass for thing in self.objects])
 
-    def altered(self) -> Backend:
-        """The same, for a check that changes physical parameters: they are put back before the next check."""
-        backend = self.backend()
-        self._altered = True
-        return backend
+    @property
+    def twins(self) -> list[int]:
+        """The two shared worlds that hold the first object."""
+        return [0, len(self.scene.objects)]
+
+    @property
+    def backend(self) -> Backend:
+        """The backend of the shared worlds."""
+        if self._shared is None:
+            self._shared = Worlds(self._make(self.scene, self.NUM_WORLDS, object_index=self.object_index))
+        return self._shared.backend
+
+    def worlds(self) -> Worlds:
+        """Return the shared worlds in their initial state, with nominal parameters."""
+        device = self.backend.device
+        worlds = self._shared
+        assert worlds is not None
+        if worlds.altered:
+            self._set_nominal(worlds)
+            worlds.altered = False
+        worlds.backend.set_state(self.start().to(device))
+        return worlds
 
     @contextmanager
-    def other(self, scene: SceneSpec, num_worlds: int, object_index: Tensor | None = None) -> Iterator[Backend]:
+    def other(self, scene: SceneSpec, num_worlds: int, object_index: Tensor | None = None) -> Iterator[Worlds]:
         """Worlds of another scene, closed at the end of the block."""
         backend = self._make(scene, num_worlds, object_index=object_index)
         try:
-            yield backend
+            yield Worlds(backend)
         finally:
             backend.close()
 
     @contextmanager
-    def reference(
-        self, scene: SceneSpec, num_worlds: int, object_index: Tensor | None = None
-    ) -> Iterator[tuple[Backend, int]]:
-        """The same worlds in the reference engine, and how many of its steps make one step of the scene.
-
-        The reference itself, if it is what is tested, is compared with finer steps of its own.
-        """
+    def reference(self, scene: SceneSpec, num_worlds: int, object_index: Tensor | None = None) -> Iterator[Worlds]:
+        """The same worlds in the reference engine; finer steps of its own if the reference is what is tested."""
         status = backend_status(REFERENCE)
         if status.reason is not None:
             raise Skipped(f"it compares with the reference engine: {status.reason}")
-        finer = REFINEMENT if self.backend().name == REFERENCE else 1
+        finer = REFINEMENT if self.backend.name == REFERENCE else 1
         scene = replace(scene, timestep=scene.timestep / finer)
         with make_backend(REFERENCE, scene, num_worlds, object_index=object_index, workers=0) as backend:
-            yield backend, finer
+            yield Worlds(backend, finer)
 
-    def start(self, device: torch.device | str = "cpu") -> State:
-        """[N] initial states, the object resting where the robot is not."""
-        return self.placed(State.initial(self.scene, self.object_index)).to(device)
+    def start(self) -> State:
+        """Return [N] initial states, the object resting where the robot is not."""
+        return self.placed(State.initial(self.scene, self.object_index))
+
+    def in_the_air(self) -> State:
+        """Return [N] initial states with the object high above everything."""
+        return replace_fields(self.start(), object_pos=torch.tensor([*self.place, 1.5]))
 
     def placed(self, state: State) -> State:
-        """The same states with the object moved to where the robot is not, at the same height."""
+        """Return the states with the object moved to where the robot is not, at the same height."""
         place = torch.tensor(self.place).expand(len(state.object_pos), 2)
         return replace_fields(state, object_pos=torch.cat((place, state.object_pos[:, 2:]), dim=1))
 
@@ -120,65 +199,69 @@ class Bench:
     def close(self) -> None:
         """Close the shared worlds."""
         if self._shared is not None:
-            self._shared.close()
+            self._shared.backend.close()
+
+    def _set_nominal(self, worlds: Worlds) -> None:
+        friction = self.scene.friction
+        one = torch.ones(self.NUM_WORLDS)
+        nominal: dict[Parameter, Tensor] = {
+            "friction": torch.tensor([friction.tip, friction.link, friction.table]).repeat(self.NUM_WORLDS, 1),
+            "torsional_friction": friction.torsional * one,
+            "object_mass": self.masses,
+            "object_inertia": one,
+            "object_com": torch.zeros(self.NUM_WORLDS, 3),
+            "object_gravity": one,
+            "drives": torch.ones(self.NUM_WORLDS, 3, len(self.scene.robot.joints)),
+        }
+        for name, value in nominal.items():
+            if name in worlds.backend.capabilities:
+                worlds.set_parameter(name, value)
 
 
 def free_place(scene: SceneSpec) -> tuple[float, float]:
-    """A place on the table, far from the robot's base and from its hand at home, from which an object can slide."""
-    robot, (x, y), (hx, hy, _) = scene.robot, scene.table.center, scene.table.half_size
-    corners = [(x + sx * (hx - 0.25), y + sy * (hy - 0.2)) for sx in (-1, 1) for sy in (-1, 1)]
+    """Return a place on the table from which an object can slide, far from the robot's base and its hand at home."""
+    robot = scene.robot
+    x, y = scene.table.center
+    half_x, half_y, _ = scene.table.half_size
     palm = Kinematics(robot).link_poses(torch.as_tensor(robot.home), [robot.palm])[0, :2, 3].numpy()
     avoid = np.stack((palm, np.array(robot.base_pos[:2])))
-    return max(corners, key=lambda c: float(np.linalg.norm(avoid - np.array(c), axis=1).min()))
+    corners = []
+    for side_x in (-1, 1):
+        for side_y in (-1, 1):
+            corners.append((x + side_x * (half_x - 0.25), y + side_y * (half_y - 0.2)))
+    return max(corners, key=lambda corner: float(np.linalg.norm(avoid - np.array(corner), axis=1).min()))
 
 
 def replace_fields(state: State, **changes: Tensor) -> State:
-    """The state with some fields replaced; values broadcast over the worlds."""
-    values = {f.name: getattr(state, f.name) for f in fields(State)}
+    """Return the state with some fields replaced; values broadcast over the worlds."""
+    new = {}
     for name, value in changes.items():
-        values[name] = (
-            torch.as_tensor(value, dtype=torch.float32, device=values[name].device).expand_as(values[name]).clone()
-        )
-    return State(**values)
+        present = getattr(state, name)
+        new[name] = torch.as_tensor(value, dtype=torch.float32, device=present.device).expand_as(present)
+    return replace(state, **new).clone()
 
 
 def snapshot(state: State) -> State:
-    """A copy that later steps do not change, on the CPU."""
+    """Return a copy on the CPU that later steps do not change."""
     return state.to("cpu").clone()
 
 
-def advanced(backend: Backend, start: State, steps: int) -> State:
-    """What becomes of a state [N, ...] in some physics steps, on the CPU."""
-    backend.set_state(start.to(backend.device))
-    backend.step(steps)
-    return snapshot(backend.state())
-
-
-def worst_of(what: str, values: Tensor | Sequence[float], tolerance: float, unit: str, names: Sequence[str]) -> Measure:
-    """The largest of some values [N], a NaN before all, and whose it is."""
-    worst = int(np.nan_to_num(np.asarray(values), nan=np.inf).argmax())
-    return Measure(what, float(values[worst]), tolerance, unit, names[worst])
-
-
-def largest(difference: Tensor) -> float:
-    """The largest absolute value; NaN if there is one."""
-    return float(difference.detach().abs().double().max()) if difference.numel() else 0.0
-
-
 def rotation_angle(a: Tensor, b: Tensor) -> Tensor:
-    """[...] angle between the orientations of unit quaternions [..., 4]: precise for small ones, where the arc cosine is not."""
-    (aw, av), (bw, bv) = (q.split((1, 3), dim=-1) for q in (a.double(), b.double()))
+    """[...] angle between the orientations of unit quaternions [..., 4].
+
+    Precise for small angles, where the arc cosine is not.
+    """
+    aw, av = a.double().split((1, 3), dim=-1)
+    bw, bv = b.double().split((1, 3), dim=-1)
     vector = aw * bv - bw * av - torch.linalg.cross(av, bv)  # of conjugate(a) b
     return 2.0 * torch.atan2(vector.norm(dim=-1), (a.double() * b.double()).sum(-1).abs())
 
 
-def random_state(
-    bench: Bench, scene: SceneSpec, num_worlds: int, seed: int, device: torch.device | str = "cpu"
-) -> State:
-    """[N] states with every field away from its default: joints well within their limits, the object in the air, spinning.
+def random_state(bench: Bench, scene: SceneSpec, num_worlds: int, seed: int) -> State:
+    """[N] states with every field away from its default: joints within their limits, the object spinning in the air.
 
-    A robot that would reach into the table is brought nearer to home until it does not: an arm deep inside it is thrown out, and no two
-    engines, nor the same one in two scenes, need do that alike.
+    A robot that would reach into the table is moved towards home until it does not: an arm deep inside the table is
+    thrown out, and no two engines need do that alike.
     """
     random = torch.Generator().manual_seed(seed)
 
@@ -187,16 +270,16 @@ def random_state(
 
     joints = Kinematics(scene.robot)
     home = torch.as_tensor(scene.robot.home, dtype=torch.float64)
-    lower, upper = joints.lower.clamp_min(-3.0), joints.upper.clamp_max(3.0)
+    lower, upper = finite_limits(joints)
     reach = 0.3 * (upper - lower)
     count = len(home)
     pos = (home + reach * uniform(num_worlds, count)).clamp(lower + 0.1 * reach, upper - 0.1 * reach)
     support = table_points(scene.robot, joints)
-    points, radii = torch.tensor(support.points), torch.tensor(support.radii)
-    for _ in range(_NEARER):
-        inside = (height_above_table(joints.points(pos, support.links, points), radii, scene.table) < 0).any(dim=1)
-        if not inside.any():
-            break
+    points = torch.tensor(support.points)
+    radii = torch.tensor(support.radii)
+    for _ in range(_HALVINGS):
+        heights = height_above_table(joints.points(pos, support.links, points), radii, scene.table)
+        inside = (heights < 0).any(dim=1)
         pos = torch.where(inside[:, None], (home + pos) / 2, pos)
     return State(
         joint_pos=pos.float(),
@@ -206,54 +289,29 @@ def random_state(
         object_quat=quat_normalize(uniform(num_worlds, 4)),
         object_linvel=uniform(num_worlds, 3),
         object_angvel=4.0 * uniform(num_worlds, 3),
-    ).to(device)
+    )
+
+
+def finite_limits(kinematics: Kinematics, most: float = 3.0) -> tuple[Tensor, Tensor]:
+    """Lower and upper joint limits [J], cut to at most ``most``."""
+    return kinematics.lower.clamp_min(-most), kinematics.upper.clamp_max(most)
 
 
 def small_motion(kinematics: Kinematics) -> Tensor:
-    """[J] a small way for each joint, towards the middle of its range."""
+    """[J] a small distance for each joint, towards the middle of its range."""
     home = torch.as_tensor(kinematics.robot.home, dtype=torch.float64)
-    lower, upper = kinematics.lower.clamp_min(-3.0), kinematics.upper.clamp_max(3.0)
+    lower, upper = finite_limits(kinematics)
     step = 0.05 * (upper - lower)
     return torch.where(home > (lower + upper) / 2, -step, step).float()
 
 
-def compare_states(
-    found: State, expected: State, tolerances: Mapping[str, tuple[float, str]], of: str = ""
-) -> list[Measure]:
-    """A measure for each field, named after what it is a state ``of``; quaternions are the same with the opposite sign."""
-    measures = []
-    for name, (tolerance, unit) in tolerances.items():
-        a, b = getattr(found, name).cpu(), getattr(expected, name).cpu()
-        if name == "object_quat":
+def state_errors(found: State, expected: State, words: str = "") -> dict[str, Tensor]:
+    """Return the difference of each field, named with ``words`` before it; quaternions are the same with either sign."""
+    errors = {}
+    for field in fields(State):
+        a = getattr(found, field.name)
+        b = getattr(expected, field.name)
+        if field.name == "object_quat":
             a = torch.where((a * b).sum(-1, keepdim=True) < 0, -a, a)
-        measures.append(Measure(what=f"{of} {name}".strip(), measured=largest(a - b), tolerance=tolerance, unit=unit))
-    return measures
-
-
-ROUND_TRIP: dict[str, tuple[float, str]] = {
-    "joint_pos": (2e-6, "rad, m"),
-    "joint_vel": (2e-5, "rad/s, m/s"),
-    "joint_target": (2e-6, "rad, m"),
-    "object_pos": (2e-6, "m"),
-    "object_quat": (2e-6, ""),
-    "object_linvel": (2e-5, "m/s"),
-    "object_angvel": (2e-5, "rad/s"),
-}
-"""Tolerance of a state that is read back: the rounding of float32, and of a change of frame."""
-
-
-def _set_nominal(backend: Backend, objects: list, scene: SceneSpec) -> None:
-    n, device = backend.num_worlds, backend.device
-    friction, one = scene.friction, torch.ones(n)
-    nominal: dict[Parameter, Tensor] = {
-        "friction": torch.tensor([friction.tip, friction.link, friction.table]).repeat(n, 1),
-        "torsional_friction": friction.torsional * one,
-        "object_mass": torch.tensor([o.mass for o in objects]),
-        "object_inertia": one,
-        "object_com": torch.zeros(n, 3),
-        "object_gravity": one,
-        "drives": torch.ones(n, 3, len(scene.robot.joints)),
-    }
-    for name, value in nominal.items():
-        if name in backend.capabilities:
-            getattr(backend, f"set_{name}")(value.float().to(device))
+        errors[f"{words} {field.name}".strip()] = a - b
+    return errors

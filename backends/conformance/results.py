@@ -1,23 +1,29 @@
-"""What a check is, and what it yields: measures, and a result with a verdict.
+"""What a check is and what it yields: measures, and a result with a verdict.
 
 The file that ``xreset engines check --json`` writes (schema :data:`SCHEMA`)::
 
     {"schema": ..., "xreset_version": ..., "command": ...,
      "runs": [{"engine", "engine_version", "robot", "device", "capabilities": [...], "seconds",
                "checks": [{"check", "group", "statement", "cause", "verdict", "problem", "seconds",
-                           "measures": [{"what", "measured", "tolerance", "unit", "where", "verdict", "bound", "reason"}]}]}]}
+                           "measures": [{"what", "measured", "tolerance", "unit", "where",
+                                         "verdict", "bound", "reason"}]}]}]}
 
-A check's verdict is passed, known difference, failed, unsupported (the backend states that it lacks the capability, and refuses as the
-contract asks) or skipped (it cannot be done here: ``problem`` says why). A measure's is one of the first three; ``bound`` and ``reason``
-are those of the known difference, else null and empty. A number that is not finite is written as text.
+A check's verdict is passed, known difference, failed, unsupported (the backend states that it lacks the capability and
+refuses as the contract asks) or skipped (the check cannot be done here; ``problem`` says why). A measure's verdict is
+one of the first three; ``bound`` and ``reason`` are those of the known difference, otherwise null and empty. A number
+that is not finite is written as text.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from torch import Tensor
 
 from xreset.physics import Capability, KnownDifference
 
@@ -32,33 +38,37 @@ Verdict = Literal["passed", "known difference", "failed", "unsupported", "skippe
 Group = Literal["state", "worlds", "robot", "object", "contact"]
 """Part of the contract that a check belongs to."""
 
+Errors = Tensor | float | Iterable[tuple[str, float]]
+"""What a check found: errors, of which the largest absolute value counts; or pairs of a name and an error, of which the
+largest counts and its name is shown."""
+
 
 @dataclass(frozen=True)
 class Measure:
     """One number of a check: how far something is from what it should be."""
 
     what: str
-    """Such as ``joint_pos``; no two of a check are called the same."""
+    """Such as ``joint_pos``; unique within a check."""
     measured: float
     """Distance from what it should be."""
     tolerance: float
     unit: str = ""
     where: str = ""
-    """Such as the joint or the object that came out worst."""
+    """Such as the joint or the object with the largest error."""
     known: KnownDifference | None = None
-    """What the backend declares about it."""
+    """What the backend declares about this measure."""
 
     @property
     def verdict(self) -> MeasureVerdict:
-        """A number that is not finite fails."""
-        if math.isfinite(self.measured) and self.measured <= self.tolerance:
+        """Whether the measured value is accepted; a number that is not finite fails."""
+        if self.measured <= self.tolerance:
             return "passed"
-        if self.known is not None and math.isfinite(self.measured) and self.measured <= self.known.bound:
+        if self.known is not None and self.measured <= self.known.bound:
             return "known difference"
         return "failed"
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-able content."""
+        """Return the content of the results file."""
         return {
             "what": self.what,
             "measured": self.measured if math.isfinite(self.measured) else str(self.measured),
@@ -66,40 +76,40 @@ class Measure:
             "unit": self.unit,
             "where": self.where,
             "verdict": self.verdict,
-            "bound": None if self.known is None else self.known.bound,
-            "reason": "" if self.known is None else self.known.reason,
+            "bound": self.known and self.known.bound,
+            "reason": self.known.reason if self.known else "",
         }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """A contract and how to test it."""
+    """A contract and how to test it; the fields are explained in ``checks.toml``."""
 
     name: str
     group: Group
     statement: str
-    """What is asserted."""
     cause: str
-    """What usually causes a failure."""
-    run: Callable[[Bench], list[Measure]]
-    """Measures it; :class:`Skipped` where that cannot be done."""
+    run: Callable[[Bench], Mapping[str, Errors]]
+    """Makes the measurements, by name; raises :class:`Skipped` where that is impossible."""
     capabilities: tuple[Capability, ...] = ()
-    """Capabilities that it needs and that a backend may lack."""
     own_robot_only: bool = False
-    """Whether it needs the suite's own robot."""
-    last: bool = False
-    """Whether it comes after all others, for it may take the process with it."""
+    tolerance: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    states: Mapping[str, str] = field(default_factory=dict)
 
-
-def checks_of(group: Group) -> Callable[..., Callable[[Callable[[Bench], list[Measure]]], Check]]:
-    """The decorator ``(statement, cause, **options)`` that makes a :class:`Check` of a function, under its name."""
-    return lambda statement, cause, **options: (
-        lambda run: Check(name=run.__name__, group=group, statement=statement, cause=cause, run=run, **options)
-    )
+    def limit(self, what: str, device: str, state_limits: Mapping[str, Mapping[str, Any]]) -> tuple[float, str]:
+        """Return tolerance and unit of a measure on a device, ``cpu`` or ``cuda``."""
+        for pattern, limit in self.tolerance.items():
+            if fnmatchcase(what, pattern):
+                return limit[0], limit[1]
+        words, _, name = what.rpartition(" ")
+        kind = self.states[words]
+        if kind == "exact" and device == "cpu":
+            return 0.0, state_limits[name]["unit"]
+        return state_limits[name]["same" if kind == "exact" else kind], state_limits[name]["unit"]
 
 
 class Skipped(Exception):
-    """A check cannot be done with this robot, on this device or on this machine; says why."""
+    """A check cannot be done with this robot, on this device or on this machine. The message says why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,12 +120,12 @@ class CheckResult:
     verdict: Verdict
     measures: tuple[Measure, ...] = ()
     problem: str = ""
-    """What was raised, if something was, or why it was skipped."""
+    """The exception, if there was one, or why the check was skipped."""
     seconds: float = 0.0
 
     @property
     def name(self) -> str:
-        """The check's."""
+        """Name of the check."""
         return self.check.name
 
     @property
@@ -125,12 +135,14 @@ class CheckResult:
         def share(measure: Measure) -> float:
             if not math.isfinite(measure.measured):
                 return math.inf
-            return measure.measured / measure.tolerance if measure.tolerance else measure.measured and math.inf
+            if measure.tolerance:
+                return measure.measured / measure.tolerance
+            return math.inf if measure.measured else 0.0
 
         return max(self.measures, key=share, default=None)
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-able content."""
+        """Return the content of the results file."""
         return {
             "check": self.check.name,
             "group": self.check.group,
@@ -143,7 +155,18 @@ class CheckResult:
         }
 
 
-def judge(measures: tuple[Measure, ...]) -> Verdict:
-    """The verdict of a check by its measures: the worst of theirs."""
+def largest(errors: Errors) -> tuple[float, str]:
+    """Return the largest error and its name; NaN if there is one."""
+    if not isinstance(errors, Tensor | float | np.ndarray):
+        name, error = max(errors, key=lambda pair: math.inf if math.isnan(pair[1]) else float(pair[1]))
+        return float(error), name
+    return float(np.abs(np.asarray(errors, dtype=np.float64)).max(initial=0.0)), ""
+
+
+def judge(measures: Iterable[Measure]) -> Verdict:
+    """Return the verdict of a check: the worst verdict of its measures."""
     verdicts = {measure.verdict for measure in measures}
-    return "failed" if "failed" in verdicts else "known difference" if "known difference" in verdicts else "passed"
+    for verdict in ("failed", "known difference"):
+        if verdict in verdicts:
+            return verdict
+    return "passed"

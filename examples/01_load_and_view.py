@@ -5,7 +5,7 @@ from pathlib import Path
 
 import xreset
 from xreset.demos.archive import write_demos
-from xreset.pictures.raster import write_png
+from xreset.pictures.render import write_png
 from xreset.pictures.view.load import load_view
 from xreset.pictures.view.picture import Drawer
 from xreset.robot_tools.picture import robot_picture

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import xreset
-from xreset.pictures.raster import write_png
+from xreset.pictures.render import write_png
 from xreset.plugins import robot_folder
 from xreset.robot_tools.check import check
 from xreset.robot_tools.picture import robot_picture

@@ -23,8 +23,8 @@ from xreset.cli import main
 from xreset.demos.archive import Demos, write_demos
 from xreset.errors import FileFormatError, XResetError
 from xreset.geometry.kinematics import Kinematics
-from xreset.pictures.meshes import tinted
-from xreset.pictures.raster import write_png
+from xreset.pictures.meshes import rgb, tint
+from xreset.pictures.render import write_png
 from xreset.pictures.view.colors import reason_color
 from xreset.pictures.view.load import load_view
 from xreset.pictures.view.picture import Drawer
@@ -199,7 +199,7 @@ class Data(WithFiles):
         self.assertEqual(view.counts(), {"": 6, "joint limit": 2, "arm jump": 0})
         np.testing.assert_array_equal(view.choose(reason="joint limit"), [1, 5])
         np.testing.assert_array_equal(view.choose(sequence=1, reason=""), [4, 6, 7])
-        with self.assertRaisesRegex(XResetError, "no reason 'cold'; there are joint limit, arm jump"):
+        with self.assertRaisesRegex(XResetError, "Unknown reason 'cold'. Choose from: joint limit, arm jump"):
             view.choose(reason="cold")
 
     def test_states_that_physics_rejected(self):
@@ -385,11 +385,11 @@ class Served(WithFiles):
         where = kinematics.link_poses(kinematics.base.new_tensor(self.robot.home))[:, :3, 3].numpy()
         for i, link in scene._links.items():
             np.testing.assert_allclose(link.position, where[i], atol=1e-6)
-            np.testing.assert_allclose(link.color, 255 * tinted(scene._colors[i], reason_color("joint limit")), atol=1)
+            np.testing.assert_array_equal(link.color, rgb(tint(scene._colors[i], reason_color("joint limit"))))
         page._frame.value = 2
         page.show()
         for i, link in scene._links.items():
-            np.testing.assert_allclose(link.color, 255 * np.array(scene._colors[i]), atol=1)
+            np.testing.assert_array_equal(link.color, rgb(scene._colors[i]))
 
     def test_frames_of_one_reason_are_picked(self):
         page = self.page(self.retargeted)

@@ -11,7 +11,7 @@ from xreset.eval.engines.replay import EngineTrace, TraceResult
 from xreset.eval.plots import COLORS, figure_style, picture
 from xreset.eval.report.clips import camera_at, encode_mp4
 from xreset.files import write_whole
-from xreset.pictures.raster import Renderer, pose_matrix
+from xreset.pictures.render import Renderer, pose_matrix
 
 SIZE = (320, 300)
 """Width and height of one engine's picture [pixels]; even, as video encoders ask."""

@@ -19,7 +19,7 @@ from xreset.eval.export.recorded import Recorded, Recording
 from xreset.eval.report.clips import encode_mp4
 from xreset.files import atomic_folder, write_json
 from xreset.objects.catalogue import load_object
-from xreset.pictures.raster import Renderer, pose_matrix
+from xreset.pictures.render import Renderer, pose_matrix
 from xreset.spec import SceneSpec
 
 VERSION = "v3.0"

@@ -11,7 +11,7 @@ import numpy as np
 
 from xreset.errors import XResetError, needs
 from xreset.eval.rollout import Episode, Trace
-from xreset.pictures.raster import Camera, Renderer, pose_matrix
+from xreset.pictures.render import Camera, Renderer, pose_matrix
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
 SIZE = (400, 300)

@@ -15,7 +15,7 @@ from xreset.eval.report.clips import Clip, Strip, count_failures, encode_mp4
 from xreset.eval.report.read import ReportData
 from xreset.eval.rollout import Episode
 from xreset.eval.table import FIGURES
-from xreset.pictures.raster import encode_png
+from xreset.pictures.render import encode_png
 from xreset.text import short_name
 
 

@@ -12,7 +12,7 @@ from xreset.cli._terminal import Console
 from xreset.errors import ObjectError
 from xreset.objects import catalogue, meshes, sampling
 from xreset.objects.properties import Properties
-from xreset.pictures import pieces, raster
+from xreset.pictures import pieces, render
 from xreset.spec import ObjectSpec
 
 
@@ -95,7 +95,7 @@ def import_(
             f"{r.obj.name}: {len(r.obj.pieces)} pieces, at most {1e3 * r.deviation:.1f} mm off the surface"
             for r in found
         ]
-        raster.write_png(png, pieces.draw_pieces([r.obj for r in found], captions))
+        render.write_png(png, pieces.draw_pieces([r.obj for r in found], captions))
         console.print(f"{png}: meshes and their pieces", soft_wrap=True, highlight=False)
 
 

@@ -15,7 +15,7 @@ from xreset.cli._terminal import Console, Progress
 from xreset.demos import align, archive, plausible
 from xreset.description import load_robot
 from xreset.files import file_hash
-from xreset.pictures import raster
+from xreset.pictures import render
 from xreset.pictures.view import load, sheet
 from xreset.retarget import collisions, file, partial, pipeline
 from xreset.retarget.arm.config import ArmConfig
@@ -87,7 +87,7 @@ def retarget(
 
     if picture is not None:
         shown = load.load_view(out, demos=demos, robot=robot, objects=objects)
-        raster.write_png(picture, sheet.draw_sheet(shown, sheet.moment_tiles(shown)))
+        render.write_png(picture, sheet.draw_sheet(shown, sheet.moment_tiles(shown)))
 
     colliding = collisions.colliding_links(result, spec, config.thresholds)
     write_accounts(

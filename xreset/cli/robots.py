@@ -17,7 +17,7 @@ from xreset.cli._terminal import Console, Progress
 from xreset.demos import archive
 from xreset.description import DESCRIPTION, load_robot, robot_folder
 from xreset.errors import RobotError
-from xreset.pictures import raster
+from xreset.pictures import render
 from xreset.plugins import robot_names
 from xreset.retarget import pipeline
 from xreset.robot_tools import check as checks
@@ -66,7 +66,7 @@ def check(
     findings = checks.check(robot, report=report, engines=engines)
     counts = {level: sum(finding.level == level for finding in findings) for level in ("error", "warning")}
     if picture is not None and findings[0].level == "ok":
-        raster.write_png(picture, pictures.robot_picture(load_robot(robot)))
+        render.write_png(picture, pictures.robot_picture(load_robot(robot)))
         console.print(f"wrote {picture}", highlight=False)
     console.print(f"{counts['error']} errors, {counts['warning']} warnings", highlight=False)
     if counts["error"]:
@@ -100,7 +100,7 @@ def import_(
         thumb: A link or joint of the thumb, where names and geometry do not tell.
     """
     made = importer.import_robot(arm, hand, out, name=name, flange=flange, offset=offset, rpy=rpy, thumb=thumb)
-    raster.write_png(out / "robot.png", pictures.robot_picture(load_robot(out)))
+    render.write_png(out / "robot.png", pictures.robot_picture(load_robot(out)))
     console = Console()
     for title, lines in (("guessed", made.guessed), ("for you to say", made.to_say)):
         console.print(f"{title}:", highlight=False)

@@ -13,7 +13,7 @@ from xreset.cli._terminal import Console, Progress
 from xreset.errors import XResetError
 from xreset.eval.report import clips
 from xreset.files import write_whole
-from xreset.pictures import raster
+from xreset.pictures import render
 from xreset.pictures.view import data, load, page, picture, sheet
 
 
@@ -89,7 +89,7 @@ def _write_png(path: Path, shown: data.View, rows: np.ndarray, frame: int | None
     chosen = len(rows) // 2 if frame is None else frame
     if not 0 <= chosen < len(rows):
         raise XResetError(f"there is no frame {chosen}; the choice has {len(rows)}, counted from 0.")
-    raster.write_png(path, picture.Drawer(shown, size=(960, 720), smooth=True).draw(int(rows[chosen])))
+    render.write_png(path, picture.Drawer(shown, size=(960, 720), smooth=True).draw(int(rows[chosen])))
     print("\n".join((*shown.text(int(rows[chosen])), f"picture in {path}")))
 
 
@@ -98,7 +98,7 @@ def _write_sheet(path: Path, shown: data.View, *, moments: bool) -> None:
     console = Console()
     with Progress(console) as bar:
         drawn = sheet.draw_sheet(shown, tiles, progress=bar.count("drawing"))
-    raster.write_png(path, drawn)
+    render.write_png(path, drawn)
     for tile in tiles:
         print("; ".join(tile.caption))
     print(f"{sum(tile.row is not None for tile in tiles)} pictures in {path}")

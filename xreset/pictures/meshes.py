@@ -1,22 +1,22 @@
-"""What pictures are made of: meshes of a scene's shapes, with a colour for each part and normals for light.
+"""Triangles of a scene: meshes of its shapes, a color for each part, and normals for light.
 
-Shape letters: F triangles, V vertices, B bodies (the robot's links, then the object).
+Shape letters: F triangles. Colors are red, green, blue in 0..1.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 
 from xreset.geometry.shapes import shape_mesh
 from xreset.geometry.urdf import robot_tree
-from xreset.spec import Geometry, RobotSpec, Shape, TableSpec
+from xreset.spec import ObjectSpec, RobotSpec, TableSpec
 
 Color = tuple[float, float, float]
-"""Red, green, blue in 0..1."""
 
 ARM_COLOR: Color = (0.74, 0.77, 0.82)
 HAND_COLOR: Color = (0.45, 0.53, 0.68)
@@ -26,161 +26,109 @@ OBJECT_COLOR: Color = (0.95, 0.58, 0.22)
 INVALID_COLOR: Color = (0.86, 0.13, 0.13)
 GOAL_COLOR: Color = (0.35, 0.78, 0.35)
 TABLE_COLORS: tuple[Color, Color] = ((0.84, 0.80, 0.74), (0.80, 0.76, 0.70))
-SKY_COLORS: tuple[Color, Color] = ((0.90, 0.93, 0.97), (0.98, 0.98, 0.98))
-AXIS_COLORS: tuple[Color, Color, Color] = ((0.90, 0.15, 0.15), (0.15, 0.70, 0.20), (0.15, 0.35, 0.95))
 
-_CREASE = math.cos(math.radians(40.0))
-"""Faces that meet at a smaller angle than this are shaded as one round surface."""
+_CREASE = math.radians(40.0)
+"""Faces that meet at a smaller angle are shaded as one round surface."""
 _TABLE_CELL = 0.1
+"""Side of a square of the table's chequerboard [m]."""
 
 
 @dataclass(frozen=True)
-class Mesh:
-    """Triangles of one body."""
-
-    vertices: np.ndarray
-    """[V, 3]"""
-    faces: np.ndarray
-    """[F, 3] outward"""
-    normals: np.ndarray = field(repr=False)
-    """[F, 3, 3] unit normal at each corner of each face"""
-
-
-def tinted(color: np.ndarray, tint: Color) -> np.ndarray:
-    """Colours [..., 3] with more than half of another one mixed in: parts can still be told apart."""
-    return 0.4 * np.asarray(color, dtype=float) + 0.6 * np.asarray(tint)
-
-
-def link_meshes(robot: RobotSpec) -> list[Mesh | None]:
-    """The collision shapes of each link of the robot's URDF as one mesh in the link's frame; None for a link without shape."""
-    tree = robot_tree(robot)
-    return [_merge([_shape_mesh(shape) for shape in tree.link(name).collisions]) for name in tree.link_names]
-
-
-def link_colors(robot: RobotSpec) -> list[Color]:
-    """The colour of each link of the robot's URDF: arm, palm, fingers and fingertips are told apart."""
-    tree = robot_tree(robot)
-    parent = {joint.child: joint.parent for joint in tree.joints}
-    tips = {link for tip in robot.fingertips for link in tip.contact_links}
-    body = tree.moving_ancestor(robot.hand_root)
-    colors = []
-    for name in tree.link_names:
-        below, ancestor = False, name
-        while ancestor in parent and not below:
-            ancestor = parent[ancestor]
-            below = ancestor == robot.hand_root
-        palm = name == robot.hand_root or (tree.moving_ancestor(name) == body and below)
-        colors.append(TIP_COLOR if name in tips else PALM_COLOR if palm else HAND_COLOR if below else ARM_COLOR)
-    return colors
-
-
-@dataclass(frozen=True)
-class Placed:
-    """Triangles in the world."""
+class Triangles:
+    """Triangles in the world, ready to be drawn: arrays of float32."""
 
     corners: np.ndarray
-    """[F, 3, 3]"""
+    """[F, 3, 3] counter-clockwise seen from outside [m]."""
     normals: np.ndarray
-    """[F, 3, 3]"""
+    """[F, 3, 3] unit normal at each corner."""
     colors: np.ndarray
     """[F, 3]"""
 
 
-class Bodies:
-    """Rigid meshes that are placed together."""
-
-    def __init__(self, meshes: Sequence[Mesh | None], colors: Sequence[Color]) -> None:
-        drawn = [(index, mesh) for index, mesh in enumerate(meshes) if mesh is not None]
-        self._body = np.concatenate([np.full(len(mesh.faces), index) for index, mesh in drawn])
-        self._corners = np.concatenate([mesh.vertices[mesh.faces] for _, mesh in drawn])
-        self._normals = np.concatenate([mesh.normals for _, mesh in drawn])
-        self._colors = np.array(colors, dtype=float)[self._body]
-
-    def placed(self, poses: np.ndarray, color: Color | None = None) -> Placed:
-        """The triangles with body i at ``poses[i]``."""
-        T = poses[self._body]
-        turned = T[:, None, :3, :3].swapaxes(-1, -2)
-        corners = (self._corners[:, :, None, :] @ turned)[:, :, 0] + T[:, None, :3, 3]
-        normals = (self._normals[:, :, None, :] @ turned)[:, :, 0]
-        colors = self._colors if color is None else np.broadcast_to(np.array(color), self._colors.shape)
-        return Placed(corners, normals, colors)
+def place(mesh: trimesh.Trimesh, color: Color, pose: np.ndarray) -> Triangles:
+    """Return the triangles of a mesh at a pose [4, 4], in one color."""
+    vertices = np.float32(mesh.vertices @ pose[:3, :3].T + pose[:3, 3])
+    normals = np.float32(mesh.vertex_normals @ pose[:3, :3].T)
+    return Triangles(vertices[mesh.faces], normals[mesh.faces], np.tile(np.float32(color), (len(mesh.faces), 1)))
 
 
-def joined(parts: Sequence[Placed]) -> Placed:
-    """All triangles of several."""
-    return Placed(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("corners", "normals", "colors"))
+def join(parts: Sequence[Triangles]) -> Triangles:
+    """Return all triangles of several sets as one set."""
+    return Triangles(
+        np.concatenate([part.corners for part in parts]),
+        np.concatenate([part.normals for part in parts]),
+        np.concatenate([part.colors for part in parts]),
     )
 
 
-def shaded_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """A mesh with a normal at each corner: the mean over the faces around the vertex that meet this one at less than the crease angle."""
-    vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces, dtype=np.int64)
-    edges = vertices[faces]
-    cross = np.cross(
-        edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0]
-    )  # its length is twice the area: the weight in the mean
-    length = np.linalg.norm(cross, axis=1)
-    keep = length > 0
-    faces, cross, length = faces[keep], cross[keep], length[keep]
-    unit = cross / length[:, None]
-
-    corner_vertex = faces.ravel()
-    order = np.argsort(corner_vertex, kind="stable")
-    start = np.searchsorted(corner_vertex[order], np.arange(len(vertices)))
-    count = np.bincount(corner_vertex, minlength=len(vertices))
-    repeats = count[corner_vertex]
-    corner, step = spread(repeats)
-    other = order[start[corner_vertex[corner]] + step] // 3
-    together = np.einsum("ij,ij->i", unit[corner // 3], unit[other]) >= _CREASE
-    total = np.zeros((len(corner_vertex), 3))
-    np.add.at(total, corner[together], cross[other[together]])
-    total /= np.linalg.norm(total, axis=1, keepdims=True)
-    return Mesh(vertices, faces, total.reshape(-1, 3, 3))
+def shade_smoothly(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the mesh with its faces separated along sharp edges, so that its vertex normals suit round and flat parts."""
+    return trimesh.graph.smooth_shade(mesh, angle=_CREASE, facet_minarea=None)
 
 
-def _merge(meshes: Sequence[Mesh]) -> Mesh | None:
-    if not meshes:
-        return None
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    return Mesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]),
-        np.concatenate([mesh.normals for mesh in meshes]),
-    )
+def object_mesh(obj: ObjectSpec) -> trimesh.Trimesh:
+    """Return the surface of an object in its own frame."""
+    return trimesh.Trimesh(obj.vertices, obj.faces, process=False)
 
 
-def _shape_mesh(shape: Shape) -> Mesh:
-    mesh = shape_mesh(shape, coarse=True)
-    return shaded_mesh(mesh.vertices, mesh.faces)
+def link_meshes(robot: RobotSpec) -> list[trimesh.Trimesh | None]:
+    """Return the collision shapes of each link of the robot's URDF as one mesh in the link's frame; None for no shape."""
+    meshes = []
+    tree = robot_tree(robot)
+    for name in tree.link_names:
+        shapes = [shape_mesh(shape, coarse=True) for shape in tree.link(name).collisions]
+        meshes.append(trimesh.util.concatenate(shapes) if shapes else None)
+    return meshes
 
 
-def table_top(table: TableSpec) -> Placed:
-    """The table's top as a chequerboard of 0.1 m, and its sides. Small cells can be dropped one by one where they lie behind the camera."""
-    (cx, cy), (hx, hy, hz) = table.center, table.half_size
-    nx, ny = max(1, round(2 * hx / _TABLE_CELL)), max(1, round(2 * hy / _TABLE_CELL))
-    x, y = np.linspace(cx - hx, cx + hx, nx + 1), np.linspace(cy - hy, cy + hy, ny + 1)
-    i, j = (index.ravel() for index in np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"))
+def link_colors(robot: RobotSpec) -> list[Color]:
+    """Return the color of each link of the robot's URDF: arm, palm, fingers and fingertips differ."""
+    tree = robot_tree(robot)
+    parent = {joint.child: joint.parent for joint in tree.joints}
+    tips: set[str] = set()
+    for tip in robot.fingertips:
+        tips.update(tip.contact_links)
+    palm_body = tree.moving_ancestor(robot.hand_root)
+    colors = []
+    for name in tree.link_names:
+        ancestor: str | None = name
+        while ancestor is not None and ancestor != robot.hand_root:
+            ancestor = parent.get(ancestor)
+        if name in tips:
+            colors.append(TIP_COLOR)
+        elif ancestor is None:
+            colors.append(ARM_COLOR)
+        elif tree.moving_ancestor(name) == palm_body:
+            colors.append(PALM_COLOR)
+        else:
+            colors.append(HAND_COLOR)
+    return colors
 
-    def at(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.stack((x[a], y[b], np.zeros(len(a))), axis=1)
 
-    a, b, c, d = at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)
-    top = np.concatenate((np.stack((a, b, c), axis=1), np.stack((a, c, d), axis=1)))
-    colors = np.array(TABLE_COLORS)[np.tile((i + j) % 2, 2)]
-    T = np.eye(4)
-    T[:3, 3] = (cx, cy, -hz)
-    body = _shape_mesh(Shape(geometry=Geometry(kind="box", size=table.half_size), T_body_shape=T))
-    sides = ~(body.normals[:, 0, 2] > 0.5)
-    return Placed(
-        np.concatenate((top, body.vertices[body.faces[sides]])),
-        np.concatenate((np.broadcast_to(np.array([0, 0, 1.0]), top.shape), body.normals[sides])),
-        np.concatenate((colors, np.broadcast_to(np.array(TABLE_COLORS[1]) * 0.8, (int(sides.sum()), 3)))),
-    )
+def tint(color: Color, other: Color) -> Color:
+    """Mix more than half of another color into a color: parts of different colors still differ."""
+    red, green, blue = 0.4 * np.array(color) + 0.6 * np.array(other)
+    return red, green, blue
 
 
-def spread(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For counts (2, 3): owners (0, 0, 1, 1, 1) and steps (0, 1, 0, 1, 2)."""
-    owner = np.repeat(np.arange(len(counts)), counts)
-    first = np.cumsum(counts) - counts
-    return owner, np.arange(len(owner)) - first[owner]
+def rgb(color: Color) -> tuple[int, int, int]:
+    """Return red, green, blue in 0..255."""
+    red, green, blue = (round(255 * part) for part in color)
+    return red, green, blue
+
+
+def table_top(table: TableSpec) -> Triangles:
+    """Return the table as a chequerboard of boxes with sides of about 0.1 m."""
+    size = 2 * np.array(table.half_size)
+    cells = np.maximum(1, np.round(size[:2] / _TABLE_CELL)).astype(int)
+    cell = np.append(size[:2] / cells, size[2])
+    overlap = (1e-4, 1e-4, 0.0)  # no ray passes between two squares
+    square = shade_smoothly(trimesh.creation.box(cell + overlap))
+    pose = np.eye(4)
+    pose[2, 3] = -size[2] / 2
+    squares = []
+    for index in np.ndindex(*cells):
+        corner = np.array(table.center) - size[:2] / 2
+        pose[:2, 3] = corner + (np.array(index) + 0.5) * cell[:2]
+        squares.append(place(square, TABLE_COLORS[sum(index) % 2], pose))
+    return join(squares)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from xreset.geometry.kinematics import Kinematics
-from xreset.pictures.raster import Camera, Renderer
+from xreset.pictures.render import Camera, Renderer
 from xreset.spec import RobotSpec, SceneSpec
 
 _SIDES = ((0.9, -1.0, 0.7), (-0.5, -0.9, -0.9))

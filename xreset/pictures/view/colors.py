@@ -1,4 +1,4 @@
-"""What each colour on the page and in the pictures means."""
+"""Meaning of each color on the page and in the pictures."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from xreset.pictures.meshes import INVALID_COLOR, Color
 
 HUMAN_COLOR: Color = (0.85, 0.10, 0.45)
 TOUCH_COLOR: Color = (1.00, 0.80, 0.00)
-"""Of keypoints in contact with the object."""
+"""Keypoints in contact with the object."""
 CONTACT_COLOR: Color = (0.05, 0.05, 0.05)
-"""Of the points of the object's surface that they touch."""
+"""Points of the object's surface that keypoints touch."""
 REACHED_COLOR: Color = (0.10, 0.55, 0.90)
-"""Of the robot's fingertips."""
+"""The robot's fingertips."""
 GOOD_COLOR: Color = (0.30, 0.70, 0.35)
-"""Of valid frames on the time line."""
+"""Valid frames on the time line."""
 
 REASON_COLORS: dict[str, Color] = {
-    # of retargeting
+    # retargeting
     "not annotated": (0.55, 0.55, 0.55),
     "hand error": (0.58, 0.20, 0.75),
     "joint limit": (0.50, 0.30, 0.12),
@@ -24,7 +24,7 @@ REASON_COLORS: dict[str, Color] = {
     "arm jump": (0.90, 0.75, 0.05),
     "table collision": (0.86, 0.13, 0.13),
     "self collision": (0.95, 0.35, 0.60),
-    # of the physics filter
+    # physics filter
     "out of bounds": (0.35, 0.35, 0.35),
     "object linear velocity": (0.12, 0.30, 0.85),
     "object angular velocity": (0.58, 0.20, 0.75),
@@ -32,9 +32,11 @@ REASON_COLORS: dict[str, Color] = {
     "not finite": (0.05, 0.05, 0.05),
     "overflow": (0.50, 0.30, 0.12),
 }
-"""Reason -> colour of its frames on the time line, and of the robot in them."""
+"""Reason -> color of its frames on the time line, and of the robot in these frames."""
 
 
 def reason_color(reason: str) -> Color:
-    """The colour of a reason; red for one that is not known here."""
+    """Return the color of a reason; green for none (empty text), red for an unknown one."""
+    if not reason:
+        return GOOD_COLOR
     return REASON_COLORS.get(reason, INVALID_COLOR)

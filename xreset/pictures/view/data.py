@@ -1,4 +1,4 @@
-"""What there is to see, the same for demonstrations, robot trajectories and reset banks: rows of states, and their choice.
+"""Rows of states, the same for demonstrations, robot trajectories and reset banks, and how to choose among them.
 
 Shape letters: N rows (frames of trajectories, or states of a bank), S sequences, J joints, E fingertips, 21 keypoints.
 """
@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from xreset.demos.hand import PARENTS
 from xreset.errors import XResetError
 from xreset.spec import ObjectSpec, RobotSpec
 
@@ -20,12 +21,12 @@ GOOD: dict[Kind, str] = {
     "robot trajectories": "valid",
     "reset states": "stable in physics",
 }
-"""What a row is called that has no reason against it."""
+"""Name of a row without a reason against it."""
 _BAD: dict[Kind, str] = {"demonstrations": "", "robot trajectories": "not valid: ", "reset states": "rejected: "}
 Phase = Literal["before contact", "after contact"]
 PHASES: tuple[Phase, ...] = ("before contact", "after contact")
-BONES = np.array([(0 if i % 4 == 1 else i - 1, i) for i in range(1, 21)])
-"""[20, 2] keypoints that a bone of the human hand joins."""
+BONES = np.column_stack((PARENTS, np.arange(1, 21)))
+"""[20, 2] keypoints at the ends of each bone of the human hand."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +38,11 @@ class Human:
     touching: np.ndarray
     """[N, 21] bool: keypoints in contact with the object."""
     contacts: np.ndarray
-    """[N, 21, 3] the point of the object's surface that each of those touches; NaN for the others."""
+    """[N, 21, 3] point of the object's surface that each keypoint touches; NaN without contact."""
+
+    def select(self, rows: np.ndarray) -> Human:
+        """Return the hands of some rows."""
+        return Human(keypoints=self.keypoints[rows], touching=self.touching[rows], contacts=self.contacts[rows])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,13 +72,13 @@ class View:
     goal_quat: np.ndarray
     """[S, 4]"""
     contact: np.ndarray
-    """[N] bool: the human touches the object in this row; for a bank: has touched it by then."""
+    """[N] bool: the human touches the object in this row; of a bank: has touched it by then."""
     post_contact: np.ndarray
     """[N] bool: at or after the sequence's first contact."""
     reason: tuple[str, ...]
-    """[N] why a row is not valid (not stable, not annotated); empty text where it is."""
+    """[N] why a row is not valid (not stable, not annotated); empty text for a good row."""
     reasons: tuple[str, ...]
-    """Every reason that there could have been, in the order in which they are tested."""
+    """Every possible reason, in the order of the tests."""
     joint_pos: np.ndarray | None = None
     """[N, J]"""
     fingertips: np.ndarray | None = None
@@ -81,7 +86,7 @@ class View:
     hand_error: np.ndarray | None = None
     """[N] mean distance of the robot's fingertips from the human's [m]."""
     wrist_error: np.ndarray | None = None
-    """[N] distance of the hand from where it ought to be [m]."""
+    """[N] distance of the hand from its target [m]."""
     human: Human | None = None
 
     def choose(
@@ -92,61 +97,56 @@ class View:
         phase: Phase | None = None,
         reason: str | None = None,
     ) -> np.ndarray:
-        """Indices of the rows that meet every condition given, in order; may be empty.
+        """Return the indices of the rows that meet every given condition, in order; may be empty.
 
         Args:
-            reason: one of :attr:`reasons`; empty text for the rows without any.
+            reason: one of :attr:`reasons`; empty text for good rows.
 
         Raises:
-            XResetError: there is no such sequence, object or reason.
+            XResetError: unknown sequence, object or reason.
         """
         keep = np.ones(len(self.frame), dtype=bool)
         if sequence is not None:
-            if not 0 <= sequence < len(self.sequence_name):
-                raise XResetError(
-                    f"there is no sequence {sequence}; the file has {len(self.sequence_name)}, counted from 0."
-                )
+            count = len(self.sequence_name)
+            if not 0 <= sequence < count:
+                raise XResetError(f"There is no sequence {sequence}: the file has {count}. Choose 0 to {count - 1}.")
             keep &= self.sequence == sequence
         if object_name is not None:
             names = [spec.name for spec in self.objects]
             if object_name not in names:
-                raise XResetError(f"the file has no object {object_name!r}; it has {', '.join(names)}.")
+                raise XResetError(f"The file has no object {object_name!r}. Choose from: {', '.join(names)}.")
             keep &= self.object_index == names.index(object_name)
         if phase is not None:
             keep &= self.post_contact == (phase == "after contact")
         if reason is not None:
-            if reason and reason not in self.reasons:
-                raise XResetError(f"there is no reason {reason!r}; there are {', '.join(self.reasons) or 'none'}.")
+            if reason not in ("", *self.reasons):
+                raise XResetError(f"Unknown reason {reason!r}. Choose from: {', '.join(self.reasons) or 'none'}.")
             keep &= np.array(self.reason) == reason
         return np.flatnonzero(keep)
 
     def counts(self) -> dict[str, int]:
-        """Number of rows with each reason, those without any under the empty text; reasons that no row has count 0."""
+        """Return the number of rows with each reason, also 0; the number of good rows is under the empty text."""
         found = Counter(self.reason)
         return {reason: found[reason] for reason in ("", *self.reasons)}
 
-    def state(self, row: int) -> str:
-        """Whether a row is good, or why not, in words."""
-        reason = self.reason[row]
-        return f"{_BAD[self.kind]}{reason}" if reason else GOOD[self.kind]
-
     def text(self, row: int) -> tuple[str, ...]:
-        """Lines that say what a row is, the most important one first."""
+        """Return lines that describe a row, the most important one first."""
         sequence = int(self.sequence[row])
-        phase = PHASES[int(self.post_contact[row])]
+        reason = self.reason[row]
+        phase: str = PHASES[int(self.post_contact[row])]
         if self.contact[row] and self.kind != "reset states":
-            count = f" ({int(self.human.touching[row].sum())} keypoints)" if self.human is not None else ""
-            phase += f", human touches{count}"
-        lines = (
-            self.state(row),
+            phase += ", human touches"
+            if self.human is not None:
+                phase += f" ({self.human.touching[row].sum()} keypoints)"
+        lines = [
+            _BAD[self.kind] + reason if reason else GOOD[self.kind],
             self.objects[self.object_index[row]].name,
             f"sequence {sequence}: {self.sequence_name[sequence]}",
             f"frame {int(self.frame[row])}",
             phase,
-        )
-        if self.hand_error is None or self.wrist_error is None or not np.isfinite(self.hand_error[row]):
-            return lines
-        return (
-            *lines,
-            f"off by {1e3 * self.hand_error[row]:.0f} mm (fingertips), {1e3 * self.wrist_error[row]:.0f} mm (wrist)",
-        )
+        ]
+        if self.hand_error is not None and self.wrist_error is not None and np.isfinite(self.hand_error[row]):
+            tips = 1e3 * self.hand_error[row]
+            wrist = 1e3 * self.wrist_error[row]
+            lines.append(f"off by {tips:.0f} mm (fingertips), {wrist:.0f} mm (wrist)")
+        return tuple(lines)

@@ -1,47 +1,45 @@
-"""The coloured bar of the page: one slot for each row, green where it is good, in the reason's colour where not."""
+"""The colored bar of the page: one slot for each row, green where it is good, else in the color of its reason."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from html import escape
 from itertools import groupby
 
-from xreset.pictures.meshes import Color
-from xreset.pictures.view.colors import GOOD_COLOR, reason_color
+from xreset.pictures.view.colors import reason_color
 
 
 def bar(reasons: Sequence[str]) -> str:
-    """HTML of a bar over rows with these reasons; empty text where a row is good."""
-    slots = "".join(
-        f'<div title="{escape(reason)}" style="flex:{len(list(group))};background:{_css(_color(reason))}"></div>'
-        for reason, group in groupby(reasons)
-    )
+    """Return the HTML of a bar over rows with these reasons; the reason of a good row is an empty text."""
+    slots = ""
+    for reason, group in groupby(reasons):
+        width = len(list(group))
+        slots += f'<div title="{escape(reason)}" style="flex:{width};background:{_css_color(reason)}"></div>'
     return f'<div style="display:flex;height:12px;margin:0.6em 1em 0">{slots}</div>'
 
 
 def mark(at: int, count: int) -> str:
-    """HTML of a pointer that stands under slot ``at`` of a bar with ``count`` slots."""
+    """Return the HTML of a pointer under slot ``at`` of a bar with ``count`` slots."""
     left = 100 * (at + 0.5) / count
     return (
         '<div style="position:relative;height:11px;margin:0 1em">'
-        f'<div style="position:absolute;left:{left:.2f}%;transform:translateX(-50%);font-size:9px;line-height:11px">&#9650;</div></div>'
+        f'<div style="position:absolute;left:{left:.2f}%;transform:translateX(-50%);font-size:9px;line-height:11px">'
+        "&#9650;</div></div>"
     )
 
 
 def legend(reasons: Sequence[str], good: str) -> str:
-    """HTML that says which colour is which, of those on the bar, and how often it is there; ``good`` is what good rows are called."""
-    counts = {reason: sum(r == reason for r in reasons) for reason in dict.fromkeys(sorted(reasons))}
-    items = "".join(
-        f'<span style="margin-right:1em;white-space:nowrap"><span style="color:{_css(_color(reason))}">&#9632;</span> '
-        f"{escape(reason or good)} {count}</span>"
-        for reason, count in counts.items()
-    )
+    """Return the HTML of the colors on the bar with their numbers of rows; ``good`` is the name of good rows."""
+    items = ""
+    for reason, count in sorted(Counter(reasons).items()):
+        items += (
+            '<span style="margin-right:1em;white-space:nowrap">'
+            f'<span style="color:{_css_color(reason)}">&#9632;</span> {escape(reason or good)} {count}</span>'
+        )
     return f'<div style="margin:0 1em;font-size:0.8em">{items}</div>'
 
 
-def _color(reason: str) -> Color:
-    return reason_color(reason) if reason else GOOD_COLOR
-
-
-def _css(color: Color) -> str:
-    return f"#{''.join(f'{round(255 * part):02x}' for part in color)}"
+def _css_color(reason: str) -> str:
+    red, green, blue = (round(255 * part) for part in reason_color(reason))
+    return f"#{red:02x}{green:02x}{blue:02x}"

@@ -1,0 +1,310 @@
+"""Pictures of a scene without any engine, display or GPU: rays are cast with Embree.
+
+A picture shows what collides: the robot's collision shapes and the object's surface, lit, with their shadows.
+Shape letters: F triangles, P points, H x W pixels, N rays.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from PIL import Image, ImageDraw
+from scipy.spatial.transform import Rotation
+
+from xreset.errors import XResetError
+from xreset.files import write_whole
+from xreset.geometry.kinematics import Kinematics
+from xreset.pictures.meshes import (
+    GOAL_COLOR,
+    OBJECT_COLOR,
+    Color,
+    Triangles,
+    join,
+    link_colors,
+    link_meshes,
+    object_mesh,
+    place,
+    rgb,
+    shade_smoothly,
+    table_top,
+    tint,
+)
+from xreset.spec import SceneSpec
+
+SKY_COLORS: tuple[Color, Color] = ((0.90, 0.93, 0.97), (0.98, 0.98, 0.98))
+"""Background at the upper and lower edge of a picture."""
+AXIS_COLORS: tuple[Color, Color, Color] = ((0.90, 0.15, 0.15), (0.15, 0.70, 0.20), (0.15, 0.35, 0.95))
+
+_LIGHT = np.float32([0.15, -0.35, 0.92]) / np.linalg.norm(np.float32([0.15, -0.35, 0.92]))
+"""Direction to the light, world frame."""
+_SHADOW_BIAS = 0.0015
+"""Distance from a surface at which a ray to the light starts, so that a surface does not shade itself [m]."""
+_NEAR = 0.02
+"""Overlays nearer to the camera are not drawn [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A pinhole camera. Pixel (0, 0) is the picture's top left; its center is at (0.5, 0.5)."""
+
+    eye: tuple[float, float, float] = (1.28, -0.50, 0.90)
+    """Position, world frame [m]."""
+    target: tuple[float, float, float] = (0.55, 0.42, 0.24)
+    """Point in the middle of the picture; z is up."""
+    fov: float = math.radians(42.0)
+    """Vertical field of view [rad]."""
+
+    def axes(self) -> np.ndarray:
+        """[3, 3] unit vectors to the right, down and forward, as rows."""
+        forward = np.array(self.target) - self.eye
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        if np.linalg.norm(right) < 1e-6:  # straight up or down
+            right = np.array([1.0, 0.0, 0.0])
+        right /= np.linalg.norm(right)
+        return np.stack((right, np.cross(forward, right), forward))
+
+    def focal_length(self, height: int) -> float:
+        """Focal length in pixels of a picture of this height."""
+        return height / 2 / math.tan(self.fov / 2)
+
+    def rays(self, size: tuple[int, int]) -> np.ndarray:
+        """[H * W, 3] float32 directions of the pixels' rays, row by row; their length along the view axis is 1."""
+        width, height = size
+        y, x = np.mgrid[:height, :width].astype(np.float32) + 0.5
+        right = (x - width / 2) / self.focal_length(height)
+        down = (y - height / 2) / self.focal_length(height)
+        return np.stack((right, down, np.ones_like(x)), axis=-1).reshape(-1, 3) @ np.float32(self.axes())
+
+    def project(self, points: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return pixels [P, 2] and distances along the view axis [P] of world points [P, 3] that are before the camera."""
+        local = (points - self.eye) @ self.axes().T
+        local = local[local[:, 2] > _NEAR]
+        pixels = self.focal_length(size[1]) * local[:, :2] / local[:, 2:] + np.array(size) / 2
+        return pixels, local[:, 2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Points:
+    """Dots drawn over the picture, visible through everything."""
+
+    pos: np.ndarray
+    """[P, 3] world frame; rows that are not finite are ignored."""
+    color: Color = (0.85, 0.10, 0.45)
+    radius: float = 0.004
+    """[m]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frames:
+    """Coordinate axes drawn over the picture (x red, y green, z blue)."""
+
+    poses: np.ndarray
+    """[P, 4, 4] world frame."""
+    length: float = 0.03
+    """[m]"""
+
+
+class Renderer:
+    """Draws one scene again and again. The meshes are prepared once."""
+
+    def __init__(
+        self,
+        scene: SceneSpec,
+        *,
+        size: tuple[int, int] = (480, 360),
+        camera: Camera | None = None,
+        smooth: bool = False,
+    ) -> None:
+        """Prepare the meshes.
+
+        Args:
+            scene: robot, objects and table; an empty tuple of objects is allowed.
+            size: width and height in pixels.
+            camera: default: from the front right, over the table.
+            smooth: cast four rays a pixel: better edges, four times the work.
+        """
+        self.scene = scene
+        self.size = size
+        self.camera = camera or Camera()
+        self._smooth = smooth
+        self._kinematics = Kinematics(scene.robot)
+        self._links = [mesh and shade_smoothly(mesh) for mesh in link_meshes(scene.robot)]
+        self._colors = link_colors(scene.robot)
+        self._objects = [shade_smoothly(object_mesh(obj)) for obj in scene.objects]
+        self._table = table_top(scene.table)
+
+    def draw(
+        self,
+        joint_pos: np.ndarray | None,
+        object_pose: np.ndarray | None = None,
+        *,
+        goal_pose: np.ndarray | None = None,
+        object_index: int = 0,
+        robot_tint: Color | None = None,
+        points: Sequence[Points] = (),
+        frames: Sequence[Frames] = (),
+        camera: Camera | None = None,
+    ) -> np.ndarray:
+        """Draw one state.
+
+        Args:
+            joint_pos: [J] rad (m), in the robot's joint order; None omits the robot.
+            object_pose: [4, 4] pose of the object in the world; None omits the object.
+            goal_pose: [4, 4] pose at which a translucent copy of the object is drawn.
+            object_index: index into the scene's objects.
+            robot_tint: color to mix into the robot's own (:func:`tint`).
+            points: dots on top.
+            frames: axes on top.
+            camera: for this picture instead of the renderer's.
+
+        Returns:
+            [H, W, 3] uint8 picture.
+        """
+        camera = camera or self.camera
+        parts = [self._table]
+        if joint_pos is not None:
+            parts += self._robot(joint_pos, robot_tint)
+        if object_pose is not None:
+            parts.append(place(self._objects[object_index], OBJECT_COLOR, np.asarray(object_pose)))
+        goal = None
+        if goal_pose is not None:
+            goal = place(self._objects[object_index], GOAL_COLOR, np.asarray(goal_pose))
+        image = _image(join(parts), goal, camera, self.size, self._smooth)
+        _draw_overlays(image, camera, points, frames)
+        return np.asarray(image.reduce(2))
+
+    def link_frames(self, joint_pos: np.ndarray, links: Sequence[str], *, length: float = 0.03) -> Frames:
+        """Return the axes of links, for :meth:`draw`; ``RobotError`` for an unknown link."""
+        return Frames(poses=self._link_poses(joint_pos, links), length=length)
+
+    def _link_poses(self, joint_pos: np.ndarray, links: Sequence[str] | None = None) -> np.ndarray:
+        joints = torch.as_tensor(np.asarray(joint_pos), dtype=torch.float64)
+        return self._kinematics.link_poses(joints, links).numpy()
+
+    def _robot(self, joint_pos: np.ndarray, robot_tint: Color | None) -> list[Triangles]:
+        parts = []
+        for mesh, color, pose in zip(self._links, self._colors, self._link_poses(joint_pos), strict=True):
+            if mesh is not None:
+                parts.append(place(mesh, tint(color, robot_tint) if robot_tint else color, pose))
+        return parts
+
+
+def draw_bodies(
+    meshes: Sequence[trimesh.Trimesh], colors: Sequence[Color], camera: Camera, size: tuple[int, int]
+) -> np.ndarray:
+    """Return a [H, W, 3] uint8 picture of meshes, each in its color, without a table."""
+    bodies = []
+    for mesh, color in zip(meshes, colors, strict=True):
+        bodies.append(place(shade_smoothly(mesh), color, np.eye(4)))
+    return np.asarray(_image(join(bodies), None, camera, size, smooth=True).reduce(2))
+
+
+def pose_matrix(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """[4, 4] pose from a position [3] and a quaternion [4] (w, x, y, z)."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(np.asarray(quat, dtype=float), scalar_first=True).as_matrix()
+    T[:3, 3] = pos
+    return T
+
+
+def write_png(path: str | Path, picture: np.ndarray) -> None:
+    """Write an [H, W, 3] uint8 picture as PNG; ``XResetError`` if it cannot be written."""
+    write_whole(path, encode_png(picture))
+
+
+def encode_png(picture: np.ndarray) -> bytes:
+    """Return an [H, W, 3] uint8 picture as PNG."""
+    content = io.BytesIO()
+    Image.fromarray(picture).save(content, "PNG")
+    return content.getvalue()
+
+
+def _image(
+    scene: Triangles, goal: Triangles | None, camera: Camera, size: tuple[int, int], smooth: bool
+) -> Image.Image:
+    """Draw at twice the size; without ``smooth``, from one ray for each 2 x 2 pixels."""
+    width, height = size
+    rays_size = (2 * width, 2 * height) if smooth else size
+    rays = camera.rays(rays_size)
+    sky = np.linspace(*SKY_COLORS, rays_size[1], dtype=np.float32)
+    picture = np.repeat(sky, rays_size[0], axis=0)
+    depth = _shade(picture, scene, camera, rays, shadows=True)
+    if goal is not None:
+        over = picture.copy()
+        before = _shade(over, goal, camera, rays, shadows=False) < depth
+        picture[before] = (picture[before] + over[before]) / 2
+    pixels = (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+    image = Image.fromarray(pixels.reshape(rays_size[1], rays_size[0], 3))
+    return image.resize((2 * width, 2 * height), Image.Resampling.NEAREST)
+
+
+def _shade(picture: np.ndarray, scene: Triangles, camera: Camera, rays: np.ndarray, *, shadows: bool) -> np.ndarray:
+    """Paint what the rays [N, 3] hit into the picture [N, 3]; return the depths [N], infinite where nothing is hit."""
+    tree = _ray_tree(scene)
+    eye = np.float32(camera.eye)
+    found = tree.run(np.full_like(rays, eye), rays, query="INTERSECT", output=True)
+    hit = found["primID"] >= 0
+    triangle = found["primID"][hit]
+    first, second, third = scene.normals[triangle].swapaxes(0, 1)
+    u = found["u"][hit, None]
+    v = found["v"][hit, None]
+    normal = _unit((1 - u - v) * first + u * second + v * third)
+    depth = np.where(hit, found["tfar"], np.inf)
+    point = eye + depth[hit, None] * rays[hit]
+    to_eye = _unit(eye - point)
+    lit: Any = 1.0
+    if shadows:
+        start = point + _SHADOW_BIAS * normal
+        lit = tree.run(start, np.full_like(start, _LIGHT), query="OCCLUDED") < 0
+    diffuse = (normal @ _LIGHT).clip(0) * lit
+    gloss = (normal * _unit(to_eye + _LIGHT)).sum(axis=1).clip(0) ** 32 * lit
+    fill = (normal * to_eye).sum(axis=1).clip(0)
+    brightness = 0.40 + 0.06 * normal[:, 2] + 0.48 * diffuse + 0.14 * fill
+    picture[hit] = scene.colors[triangle] * brightness[:, None] + 0.10 * gloss[:, None]
+    return depth
+
+
+def _ray_tree(scene: Triangles) -> Any:
+    try:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+    except ImportError as error:
+        raise XResetError(
+            f"Pictures need embreex, which cannot be imported: {error}. Install it with: pip install embreex"
+            " (it is not available for Linux on ARM)."
+        ) from error
+    tree = EmbreeScene()
+    TriangleMesh(tree, scene.corners)
+    return tree
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def _draw_overlays(image: Image.Image, camera: Camera, points: Sequence[Points], frames: Sequence[Frames]) -> None:
+    pen = ImageDraw.Draw(image)
+    for some in points:
+        pos = np.asarray(some.pos, dtype=float).reshape(-1, 3)
+        pixels, depth = camera.project(pos[np.isfinite(pos).all(axis=1)], image.size)
+        radii = camera.focal_length(image.height) * some.radius / depth
+        for center, radius in zip(pixels, radii.clip(3.0), strict=True):
+            pen.circle(center.tolist(), radius + 2, fill=(13, 13, 13))
+            pen.circle(center.tolist(), radius, fill=rgb(some.color))
+    for some in frames:
+        for pose in np.asarray(some.poses, dtype=float):
+            tips = pose[:3, 3] + some.length * pose[:3, :3].T
+            farthest_first = np.argsort(-(tips @ camera.axes()[2]))
+            for axis in farthest_first:
+                line, _ = camera.project(np.stack((pose[:3, 3], tips[axis])), image.size)
+                if len(line) == 2:
+                    pen.line(line.ravel().tolist(), fill=rgb(AXIS_COLORS[axis]), width=5)

@@ -229,7 +229,7 @@ class Data(WithFiles):
         self.assertEqual(view.reason, ("", "joint velocity", "", ""))
         with self.assertRaisesRegex(XResetError, "was not made from"):
             load_view(self.bank, retargeted=made_from)
-        with self.assertRaisesRegex(XResetError, "no reset bank"):
+        with self.assertRaisesRegex(XResetError, "not a reset bank"):
             load_view(made_from, retargeted=made_from)
 
     def test_bank(self):

@@ -43,7 +43,7 @@ SKY_COLORS: tuple[Color, Color] = ((0.90, 0.93, 0.97), (0.98, 0.98, 0.98))
 """Background at the upper and lower edge of a picture."""
 AXIS_COLORS: tuple[Color, Color, Color] = ((0.90, 0.15, 0.15), (0.15, 0.70, 0.20), (0.15, 0.35, 0.95))
 
-_LIGHT = np.float32([0.15, -0.35, 0.92]) / np.linalg.norm(np.float32([0.15, -0.35, 0.92]))
+_LIGHT = np.array([0.1506, -0.3515, 0.9240], np.float32)
 """Direction to the light, world frame."""
 _SHADOW_BIAS = 0.0015
 """Distance from a surface at which a ray to the light starts, so that a surface does not shade itself [m]."""
@@ -250,7 +250,7 @@ def _image(
 def _shade(picture: np.ndarray, scene: Triangles, camera: Camera, rays: np.ndarray, *, shadows: bool) -> np.ndarray:
     """Paint what the rays [N, 3] hit into the picture [N, 3]; return the depths [N], infinite where nothing is hit."""
     tree = _ray_tree(scene)
-    eye = np.float32(camera.eye)
+    eye = np.array(camera.eye, np.float32)
     found = tree.run(np.full_like(rays, eye), rays, query="INTERSECT", output=True)
     hit = found["primID"] >= 0
     triangle = found["primID"][hit]

@@ -233,7 +233,7 @@ class _Scene:
     def show(self, row: int | None) -> None:
         """Place everything as in a row; None hides what moves."""
         view = self._view
-        shown = None if row is None else int(view.object_index[row])
+        shown = -1 if row is None else int(view.object_index[row])
         for i, (body, goal) in enumerate(zip(self._objects, self._goals, strict=True)):
             body.visible = i == shown
             goal.visible = i == shown

@@ -15,7 +15,7 @@ sys.path.insert(0, os.getcwd())
 
 
 QUICK = (
-    "accounts", "engines_page", "eval", "files", "kinematics", "mirror", "render", "retarget_terms", "robots", "schedule", "synergies",
+    "accounts", "engines_page", "eval", "files", "kinematics", "mirror", "render", "retarget_terms", "robots", "schedule",
     "task",
 )  # fmt: skip
 """Modules of tests that a change of code is first tried with."""

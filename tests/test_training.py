@@ -385,17 +385,6 @@ class TrainingTest(unittest.TestCase):
         train_only(out, resumed(out, iterations=done + 1), resume=True)
         self.assertEqual(read_checkpoint(latest_checkpoint(out))["iteration"], done + 1)
 
-    def test_hand_and_arm_start_with_their_own_deviations(self):
-        out = self.folder / "deviations"
-        model = replace(CONFIG.model, initial_std=0.3, initial_hand_std=0.1)
-        train_only(out, self.start(out, config=replace(CONFIG, model=model, iterations=1)))
-        state = read_checkpoint(latest_checkpoint(out))["actor_state_dict"]
-        (log_std,) = (value for name, value in state.items() if name.endswith("log_std_param"))
-        is_arm = torch.tensor([joint.group == "arm" for joint in robots.load("openarm").joints])
-        torch.testing.assert_close(
-            log_std.exp(), torch.where(is_arm, 0.3, 0.1), rtol=0.05, atol=0.0
-        )  # one iteration moves them a little
-
     def test_a_policy_that_is_missing_is_exported_from_the_checkpoint(self):
         out = self.folder / "exported"
         train(out, self.start(out))

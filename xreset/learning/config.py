@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from xreset.checks import Checked, NotNegative, Only, Positive, Rule, Share
 from xreset.task.config import TaskConfig
@@ -15,6 +15,8 @@ Widths = Annotated[tuple[int, ...], Rule("one width or more, each above 0", lamb
 class ModelConfig(Checked):
     """Actor and critic: PointNet per cloud frame, LSTM with layer norm on its output, MLP."""
 
+    REMOVED: ClassVar[dict[str, Any]] = {"initial_hand_std": None, "synergy_std": None}
+
     pointnet: Widths = (64, 128, 64)
     """Widths of the per-point MLP 3 -> 64 -> 128 -> 64; the maximum over points is the frame's embedding."""
     lstm: Positive[int] = 512
@@ -23,12 +25,6 @@ class ModelConfig(Checked):
     activation: str = "elu"
     initial_std: Positive[float] = 1.0
     """Initial standard deviation of the Gaussian policy. Its logarithm does not depend on the state and is learned. Not in the paper."""
-    initial_hand_std: Positive[float] | None = None
-    """The same for the hand's joints, whose actions are absolute: 0.3 shakes each by a third of half its range, and grasps fall apart.
-    None: ``initial_std``."""
-    synergy_std: Positive[float] | None = None
-    """Initial standard deviation of the exploration along the hand's synergies, in units of the demonstrated spread; beside it, each joint
-    keeps its own. None: no such noise (:mod:`xreset.learning.synergies`)."""
     normalize_returns: bool = False
     """Whether the critic learns returns in units of their running standard deviation (:class:`xreset.learning.model.ReturnCritic`), as the
     paper's library does if told so. Trained policies' returns lie between 0 and 20, so the clip of values means something else without."""
@@ -39,12 +35,14 @@ class ModelConfig(Checked):
     def layers(self) -> dict[str, Any]:
         """What networks must share for one to take over the weights of the other."""
         names = ("pointnet", "lstm", "mlp", "activation", "normalize_observations", "normalize_returns")
-        return {name: getattr(self, name) for name in names} | {"synergies": self.synergy_std is not None}
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
 class PpoConfig(Checked):
     """Proximal policy optimisation."""
+
+    REMOVED: ClassVar[dict[str, Any]] = {"critic_learning_rate": None}
 
     horizon: Positive[int] = 16
     """Control steps per world and iteration."""
@@ -56,9 +54,7 @@ class PpoConfig(Checked):
     discount: Share[float] = 0.99
     gae_lambda: Share[float] = 0.95
     learning_rate: Positive[float] = 1e-3
-    """Of the actor, and of the critic if that has none of its own."""
-    critic_learning_rate: Positive[float] | None = None
-    """A fixed rate of the critic's own. None: the actor's, which adapts to how far the *policy* moves."""
+    """Learning rate of actor and critic; with an adaptive schedule the initial one."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """``adaptive``: the rate is divided (multiplied) by 1.5 where the policy moved more than twice (less than half) ``desired_kl``."""
     desired_kl: Annotated[Positive[float], Only("schedule", "adaptive")] = 0.01
@@ -99,14 +95,8 @@ class TrainConfig(Checked):
     """Start the first episodes at random times, so that worlds do not end in step."""
 
 
-def rsl_rl_config(config: TrainConfig, num_envs: int, synergies: Any = None) -> dict[str, Any]:
-    """The nested dictionary that rsl-rl's runner takes.
-
-    Args:
-        config: model and algorithm.
-        num_envs: worlds of one process.
-        synergies: [J, K] directions of :class:`xreset.learning.synergies.SynergyGaussian`; None or no column: independent noise.
-    """
+def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
+    """Return the nested dictionary that rsl-rl's runner takes; ``num_envs`` counts the worlds of one process."""
     m, p = config.model, config.ppo
     network: dict[str, Any] = {
         "class_name": "xreset.learning.model:PointNetLstmModel",
@@ -123,10 +113,6 @@ def rsl_rl_config(config: TrainConfig, num_envs: int, synergies: Any = None) -> 
         "std_type": "log",
         "learn_std": True,
     }
-    if m.synergy_std is not None and synergies is not None and synergies.shape[1]:
-        gaussian |= {
-            "class_name": "xreset.learning.synergies:SynergyGaussian", "directions": synergies.tolist(), "synergy_std": m.synergy_std,
-        }  # fmt: skip
     return {
         "num_steps_per_env": p.horizon,
         "save_interval": config.save_interval,
@@ -141,7 +127,6 @@ def rsl_rl_config(config: TrainConfig, num_envs: int, synergies: Any = None) -> 
         "algorithm": {
             "class_name": "xreset.learning.ppo:SequencePpo",
             "sequence_length": p.sequence_length,
-            "critic_learning_rate": p.critic_learning_rate,
             "bounds_loss": p.bounds_loss,
             "num_learning_epochs": p.mini_epochs,
             "num_mini_batches": max(1, min(num_envs * p.horizon // p.minibatch_size, num_envs // 2)),

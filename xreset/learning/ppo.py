@@ -69,27 +69,18 @@ SLOWEST, FASTEST = 1e-5, 1e-2
 
 
 class SequencePpo(PPO):
-    """rsl-rl's PPO with :class:`SequenceStorage`, an update that never waits for a GPU, and a critic that may learn at its own rate."""
+    """rsl-rl's PPO with :class:`SequenceStorage` and an update that never waits for a GPU."""
 
-    def __init__(
-        self, *args: Any, critic_learning_rate: float | None = None, bounds_loss: float = 0.0, **options: Any
-    ) -> None:
+    def __init__(self, *args: Any, bounds_loss: float = 0.0, **options: Any) -> None:
         """Set up as rsl-rl does.
 
         Args:
             args: rsl-rl's.
-            critic_learning_rate: a rate of the critic's own; None: the actor's.
             bounds_loss: weight of the squared excess of the actions' means over :data:`BOUND`.
             options: rsl-rl's.
         """
         super().__init__(*args, **options)
-        self.critic_learning_rate, self.bounds_loss = critic_learning_rate, bounds_loss
-        if critic_learning_rate is not None:
-            groups = [
-                {"params": list(self.actor.parameters())},
-                {"params": list(self.critic.parameters()), "lr": critic_learning_rate},
-            ]
-            self.optimizer = type(self.optimizer)(groups, lr=self.learning_rate)
+        self.bounds_loss = bounds_loss
         device, count = torch.device(self.device), self.storage.num_envs
         self._rate = torch.tensor(
             self.learning_rate, device=device, dtype=torch.float32 if device.type == "cuda" else torch.float64
@@ -178,7 +169,7 @@ class SequencePpo(PPO):
     def _use_rate(self) -> None:
         """Give the rate to the optimiser: on a GPU as the tensor itself, which it reads there; for that it has to be the fused one."""
         groups, on_gpu = self.optimizer.param_groups, self._rate.is_cuda
-        for group in groups[:1] if self.critic_learning_rate is not None else groups:
+        for group in groups:
             group["lr"] = self._rate if on_gpu else float(self._rate)
         if groups[0]["capturable"] != on_gpu:  # new, or from a checkpoint of another kind of device
             for group in groups:

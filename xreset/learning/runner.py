@@ -26,7 +26,6 @@ from xreset.learning.config import TrainConfig, rsl_rl_config
 from xreset.learning.curves import CurveFile
 from xreset.learning.distributed import Processes
 from xreset.learning.faults import FaultBudget, FaultCounts, dump_faults, too_many_faults
-from xreset.learning.synergies import hand_synergies
 from xreset.text import shown
 
 
@@ -38,11 +37,7 @@ class TrainingRunner(OnPolicyRunner):
         self.folder = folder
         self.train_config = config
         torch.set_float32_matmul_precision("highest" if config.ppo.precision == "float32" else "high")
-        synergies = None if config.model.synergy_std is None else hand_synergies(env.resets.joint_pos, env.actions)
-        super().__init__(env, rsl_rl_config(config, env.num_envs, synergies), log_dir=None, device=str(env.device))  # pyright: ignore[reportArgumentType]
-        if config.model.initial_hand_std is not None:
-            log_std = cast(torch.nn.Parameter, self.alg.get_policy().distribution.log_std_param)  # pyright: ignore[reportOptionalMemberAccess]
-            log_std.data[~env.actions.is_arm] = math.log(config.model.initial_hand_std)
+        super().__init__(env, rsl_rl_config(config, env.num_envs), log_dir=None, device=str(env.device))  # pyright: ignore[reportArgumentType]
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0

@@ -264,7 +264,7 @@ def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
 
     info = read_run(out)
     weights = read_checkpoint(checkpoint)["actor_state_dict"]
-    cfg = rsl_rl_config(info.config, info.num_envs, weights.get("distribution.directions"))
+    cfg = rsl_rl_config(info.config, info.num_envs)
     actor_cfg = {k: v for k, v in cfg["actor"].items() if k != "class_name"}
     widths = {group: sum(terms.values()) for group, terms in info.contract["observation_layout"].items()}
     o = info.config.task.observation

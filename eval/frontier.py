@@ -1,7 +1,7 @@
-"""From which demonstrated states a policy reaches the goal: what it can do already, and where its training is stuck.
+"""From which demonstrated states a policy reaches the goal: what it can do, and where its training is stuck.
 
 Demonstrated states are the stages of the task from its end backwards: held at the goal, lifted, touched, approached. A policy learns them
-in about that order, so the first stage from which it fails is what training has to discover next.
+in about that order, so training has to discover the first stage from which the policy fails.
 """
 
 from __future__ import annotations
@@ -13,27 +13,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
+from xreset.env import ManipulationEnv
 from xreset.errors import DemoError
-from xreset.eval.evaluate import Subject
-from xreset.eval.metrics import MetricsConfig
-from xreset.eval.rollout import play
-from xreset.eval.setting import Setting
+from xreset.eval.policy_spec import PolicySpec
+from xreset.eval.rollout import Progress, Run, play_all
 from xreset.eval.trial import Engine, Trial
-from xreset.files import file_hash, write_json
+from xreset.files import write_json
 from xreset.policy import Policy
-from xreset.resets.bank import check_objects, read_bank
 from xreset.resets.distribution import bank_starts
-from xreset.schedule import schedule
-from xreset.task.reading import Reading
 
 SCHEMA = "xreset-frontier/1"
 
 NEAR = (0.20, 0.05, 0.02)
 """Distances of the nearest fingertip from the object's surface that divide the approach [m]."""
-LIFT, HIGH = 0.01, 0.10
-"""Heights of the object's origin above the demonstration's start from which it counts as lifted, and as lifted high [m]."""
+LIFT = 0.01
+"""Height of the object's origin above the demonstration's start from which the object counts as lifted [m]."""
+HIGH = 0.10
+"""Height from which it counts as lifted high [m]."""
 STAGES = (
     "hand over 20 cm away",
     "hand 5 to 20 cm away",
@@ -46,10 +43,10 @@ STAGES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Tried:
-    """What became of one demonstrated state."""
+    """Outcome of one demonstrated state."""
 
     state: int
-    """Its row in the bank."""
+    """Row of the state in the bank."""
     sequence_name: str
     frame: int
     object: str
@@ -58,80 +55,74 @@ class Tried:
     reached: bool
     """Whether the object was at the goal at any time."""
     stayed: bool
-    """Whether it was there at the episode's end."""
+    """Whether the object was at the goal at the episode's end."""
 
 
 def stage_of(tip_distance: np.ndarray, lift: np.ndarray) -> np.ndarray:
-    """[M] index into :data:`STAGES`.
+    """Return indices [M] into :data:`STAGES`.
 
     Args:
         tip_distance: [M] distance of the nearest fingertip from the object's surface [m].
-        lift: [M] height of the object's origin above where the demonstration began [m].
+        lift: [M] height of the object's origin above the demonstration's start [m].
     """
     on_table = sum((tip_distance <= edge).astype(int) for edge in NEAR)
-    return np.where(lift < LIFT, on_table, np.where(lift < HIGH, 4, 5))
+    lifted = np.where(lift < HIGH, 4, 5)
+    return np.where(lift < LIFT, on_table, lifted)
 
 
 def try_policy(
-    policy: Policy,
-    engine: Engine,
-    trial: Trial,
-    rows: np.ndarray,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    policy: Policy, engine: Engine, trial: Trial, rows: np.ndarray, progress: Progress = lambda done, total: None
 ) -> list[Tried]:
-    """Let a policy go on from states of a bank, at rest and at full gravity, for one episode each.
+    """Let a policy continue from states of a bank, at rest and at full gravity, for one episode each.
 
     Args:
+        policy: what acts.
+        engine: where it acts.
+        trial: the bank, and how it is played.
         rows: [M] states to try.
         progress: called with (control steps done, control steps in all).
     """
     bank = trial.bank
-    plan = schedule(np.array([trial.names.index(name) for name in bank.object_name[rows]]), trial.num_envs)
     found: dict[int, Tried] = {}
-    with trial.worlds(engine, torch.as_tensor(plan.object_index)) as (env, points):
-        for number, (items, fresh) in enumerate(plan):
-            chosen = rows[items]
-            env.reset(start=bank_starts(bank, chosen).to(env.device))
-            lift = bank.object_pos[chosen, 2] - bank.start_pos[bank.sequence_index[chosen], 2]
-            stage = stage_of(env.reading().tip_distance.amin(dim=-1).cpu().numpy(), lift)
 
-            def look(step: int, _: Reading, number: int = number) -> None:
-                if step:
-                    progress(number * env.max_episode_length + step, len(plan.rounds) * env.max_episode_length)
+    def visit(env: ManipulationEnv, items: np.ndarray, fresh: np.ndarray, run: Run) -> None:
+        chosen = rows[items]
+        lift = bank.object_pos[chosen, 2] - bank.start_pos[bank.sequence_index[chosen], 2]
+        stage = stage_of(env.reading().tip_distance.amin(dim=-1).cpu().numpy(), lift)
+        result, _ = run(lambda step, reading: None)
+        for world in fresh.tolist():
+            row = int(chosen[world])
+            found[row] = Tried(
+                state=row,
+                sequence_name=str(bank.sequence_name[bank.sequence_index[row]]),
+                frame=int(bank.frame_index[row]),
+                object=str(bank.object_name[row]),
+                stage=STAGES[stage[world]],
+                reached=bool(result.reorient_once[world]),
+                stayed=bool(result.reorient[world]),
+            )
 
-            result, _ = play(policy, env, points, MetricsConfig(), look)
-            for world in np.flatnonzero(fresh):
-                row = int(chosen[world])
-                found[row] = Tried(
-                    state=row,
-                    sequence_name=str(bank.sequence_name[bank.sequence_index[row]]),
-                    frame=int(bank.frame_index[row]),
-                    object=str(bank.object_name[row]),
-                    stage=STAGES[stage[world]],
-                    reached=bool(result.reorient_once[world]),
-                    stayed=bool(result.reorient[world]),
-                )
+    objects = [trial.names.index(name) for name in bank.object_name[rows]]
+    play_all(policy, engine, trial, objects, lambda items: bank_starts(bank, rows[items]), visit, progress)
     return [found[row] for row in sorted(found)]
 
 
 def by_stage(tried: list[Tried]) -> list[dict[str, Any]]:
-    """One entry per stage that has states: its name, how many were tried, and the shares that reached the goal and stayed there."""
+    """Return one entry for each stage that has states: its name, their number, and the shares that reached the goal and stayed there."""
     out = []
     for stage in STAGES:
         mine = [t for t in tried if t.stage == stage]
         if mine:
-            reached, stayed = (
-                round(float(np.mean([getattr(t, what) for t in mine])), 6) for what in ("reached", "stayed")
-            )
+            reached = round(float(np.mean([t.reached for t in mine])), 6)
+            stayed = round(float(np.mean([t.stayed for t in mine])), 6)
             out.append({"stage": stage, "states": len(mine), "reached": reached, "stayed": stayed})
     return out
 
 
 def frontier(
-    subject: Subject,
+    policy: PolicySpec,
+    trial: Trial,
     engines: Sequence[Engine],
-    resets: Path,
-    setting: Setting,
     out: Path,
     *,
     states: int,
@@ -140,36 +131,38 @@ def frontier(
     """Try states of a bank in each engine and write ``OUT/BACKEND.json``.
 
     Args:
-        setting: meshes, seed of the draw, worlds at a time.
-        states: how many to draw from the bank, without repetition; all if it has fewer.
+        policy: what is tried.
+        trial: the bank, from :func:`~xreset.eval.trial.load_trial`; its seed draws the states.
+        engines: where it is tried.
+        out: folder for the results.
+        states: how many states to draw from the bank, without repetition; all if the bank has fewer.
         progress: called with (engine, control steps done, control steps in all).
 
     Returns:
-        What was written, in the order of the engines.
+        The contents of the files, in the order of the engines.
 
     Raises:
         DemoError: the bank holds no state.
+        PolicyError: the seed chose this checkpoint.
     """
-    bank = read_bank(resets, robot=subject.robot)
+    policy.check_seed(trial.seed)
+    bank = trial.bank
     if not bank.num_states:
         raise DemoError(
-            f"{resets} holds no state to try: every candidate was rejected. Look at its reasons (xreset resets)."
+            "The bank holds no state to try: every candidate was rejected. xreset resets shows the reasons."
         )
-    trial = subject.trial(bank, setting)
-    check_objects(resets, bank, trial.objects)
-    rows = np.sort(np.random.default_rng(setting.seed).permutation(bank.num_states)[:states])
-    inputs = subject.inputs | {"resets": file_hash(resets)}
+    rows = np.sort(np.random.default_rng(trial.seed).permutation(bank.num_states)[:states])
     written = []
     for engine in engines:
-        tried = try_policy(subject.policy(subject.robot, None), engine, trial, rows, partial(progress, engine.name))
+        tried = try_policy(policy.start(None), engine, trial, rows, partial(progress, engine.name))
         content = {
             "schema": SCHEMA,
             "backend": engine.name,
             "backend_version": engine.version,
-            "robot": subject.robot.name,
-            "policy": subject.label,
-            "seed": setting.seed,
-            "inputs": inputs,
+            "robot": trial.robot.name,
+            "policy": policy.name,
+            "seed": trial.seed,
+            "inputs": trial.inputs,
             "stages": by_stage(tried),
             "tried": [asdict(t) for t in tried],
         }

@@ -1,11 +1,13 @@
-"""Rollouts of a policy in one engine: the same episodes, from the same states, in every engine."""
+"""Rollouts of a policy in one engine: the same episodes, from the same states, in every engine.
+
+Shape letters: N worlds, T recorded states, C control steps, J joints.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +22,14 @@ from xreset.schedule import schedule
 from xreset.task.reading import Reading
 from xreset.task.terminations import out_of_bounds
 
+TRACE_INTERVAL = 0.05
+"""Time between the states of a trace [s]."""
+
+Look = Callable[[int, Reading], None]
+"""Called with (control steps done, reading) at the start of an episode and after every control step."""
+Progress = Callable[[int, int], None]
+"""Called with (control steps done, control steps in all)."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
@@ -30,7 +40,7 @@ class Episode:
     sequence_name: str
     object: str
     repetition: int
-    """Which perturbation of the demonstration's start."""
+    """Number of the perturbation of the demonstration's start."""
     approach: bool
     grasp: bool
     reorient: bool
@@ -46,7 +56,7 @@ class Episode:
 
 @dataclass(frozen=True, kw_only=True)
 class Trace:
-    """States of one episode, for pictures, and what the drives were told, for replays."""
+    """States of one episode, for pictures, and the drives' targets, for replays."""
 
     sequence: int
     object: str
@@ -57,9 +67,11 @@ class Trace:
     joint_pos: np.ndarray
     """[T, J]"""
     object_pos: np.ndarray
+    """[T, 3]"""
     object_quat: np.ndarray
+    """[T, 4]"""
     joint_target: np.ndarray | None = None
-    """[C, J] of every control step; None in files that are older than this."""
+    """[C, J] of every control step; None in files of older versions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,110 +92,146 @@ def roll_out(
     *,
     repetitions: int,
     only: np.ndarray | None = None,
-    trace_interval: float = 0.05,
-    metrics: MetricsConfig | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda done, total: None,
 ) -> Rollouts:
-    """Run demonstrations ``repetitions`` times each.
+    """Play demonstrations ``repetitions`` times each.
 
     Args:
-        repetitions: episodes per demonstration, each with its own perturbation of robot and object.
-        only: indices of the demonstrations to run; None: all.
-        trace_interval: time between the states of a trace [s].
+        policy: what acts.
+        engine: where it acts.
+        trial: what it plays.
+        repetitions: episodes of each demonstration, each with another perturbation of robot and object.
+        only: indices of the demonstrations to play; None: all.
         progress: called with (control steps done, control steps in all).
     """
-    demos, names = trial.bank, trial.names
-    chosen = np.arange(len(demos.sequence_name)) if only is None else np.asarray(only)
+    bank = trial.bank
+    chosen = np.arange(len(bank.sequence_name)) if only is None else np.asarray(only)
     sequences = np.repeat(chosen, repetitions)
     repetition = np.tile(np.arange(repetitions), len(chosen))
-    plan = schedule(np.array([names.index(name) for name in demos.sequence_object[sequences]]), trial.num_envs)
-    recorded = np.flatnonzero(repetition == 0)
+    starts = trial.starts()
     found: dict[int, Episode] = {}
     traces: list[Trace] = []
-    steps, spent, starts = 0, 0.0, trial.starts()
-    with trial.worlds(engine, torch.as_tensor(plan.object_index)) as (env, points):
-        dt = env.backend.scene.control_dt
-        every = max(1, round(trace_interval / dt))
-        for number, (items, fresh) in enumerate(plan):
-            env.reset(start=episode_starts(starts, sequences[items], repetition[items], trial.seed).to(env.device))
-            recorder = _Recorder([int(w) for w in np.flatnonzero(fresh & np.isin(items, recorded))])
+    steps = 0
+    seconds = 0.0
 
-            def look(step: int, reading: Reading, number: int = number, recorder: _Recorder = recorder) -> None:
-                if step % every == 0:
-                    recorder.add(step * dt, reading)
-                if step:
-                    recorder.add_targets(env.joint_target)
-                    progress(number * env.max_episode_length + step, len(plan.rounds) * env.max_episode_length)
+    def visit(env: ManipulationEnv, items: np.ndarray, fresh: np.ndarray, run: Run) -> None:
+        nonlocal steps, seconds
+        recorder = _Recorder(env, [world for world in fresh.tolist() if repetition[items[world]] == 0])
+        result, spent = run(recorder.look)
+        steps += env.max_episode_length * env.num_envs
+        seconds += spent
+        traces.extend(recorder.traces(trial.names))
+        for world in fresh.tolist():
+            item = int(items[world])
+            found[item] = _episode(result, world, bank, int(sequences[item]), int(repetition[item]))
 
-            result, seconds = play(policy, env, points, metrics or MetricsConfig(), look)
-            spent += seconds
-            steps += env.max_episode_length * env.backend.num_worlds
-            traces += recorder.traces(env, names)
-            for world in np.flatnonzero(fresh):
-                found[int(items[world])] = _episode(
-                    result, int(world), int(sequences[items[world]]), int(repetition[items[world]]), demos
-                )
-    episodes = tuple(found[i] for i in sorted(found))
+    play_all(
+        policy,
+        engine,
+        trial,
+        [trial.names.index(name) for name in bank.sequence_object[sequences]],
+        lambda items: episode_starts(starts, sequences[items], repetition[items], trial.seed),
+        visit,
+        progress,
+    )
     return Rollouts(
-        episodes=episodes,
+        episodes=tuple(found[i] for i in sorted(found)),
         traces=tuple(sorted(traces, key=lambda t: t.sequence)),
-        control_steps_per_second=steps / spent,
+        control_steps_per_second=steps / seconds,
     )
 
 
-def play(
+Run = Callable[[Look], tuple[EpisodeMetrics, float]]
+"""Plays one episode in every world; see :func:`play`."""
+
+
+def play_all(
     policy: Policy,
-    env: ManipulationEnv,
-    points: torch.Tensor,
-    metrics: MetricsConfig,
-    look: Callable[[int, Reading], None],
-) -> tuple[EpisodeMetrics, float]:
-    """One episode in every world, from where it is now.
+    engine: Engine,
+    trial: Trial,
+    object_index: list[int],
+    start: Callable[[np.ndarray], Reset],
+    visit: Callable[[ManipulationEnv, np.ndarray, np.ndarray, Run], None],
+    progress: Progress,
+) -> None:
+    """Play one episode for each of some items, in as many rounds as the worlds need.
 
     Args:
-        policy: what acts; it begins anew.
+        policy: what acts.
+        engine: where it acts.
+        trial: what it plays.
+        object_index: index of each item's object.
+        start: makes the starts [N] of items [N].
+        visit: called in every round with the environment, which was just reset, the item [N] of each world, the worlds whose item no
+            earlier world has played, and the function that plays the episodes.
+        progress: called with (control steps done, control steps in all).
+    """
+    plan = schedule(np.array(object_index), trial.num_envs)
+    with trial.worlds(engine, torch.as_tensor(plan.object_index)) as (env, points):
+        total = len(plan.rounds) * env.max_episode_length
+        for number, (items, fresh) in enumerate(plan):
+            before = number * env.max_episode_length
+
+            def run(look: Look, before: int = before) -> tuple[EpisodeMetrics, float]:
+                def watch(step: int, reading: Reading) -> None:
+                    look(step, reading)
+                    if step:
+                        progress(before + step, total)
+
+                return play(policy, env, points, watch)
+
+            env.reset(start=start(items).to(env.device))
+            visit(env, items, np.flatnonzero(fresh), run)
+
+
+def play(policy: Policy, env: ManipulationEnv, points: torch.Tensor, look: Look) -> tuple[EpisodeMetrics, float]:
+    """Play one episode in every world, from its present state.
+
+    Args:
+        policy: what acts; it starts fresh.
         env: the worlds, just reset.
-        points: [N, 4, 3] of the objects, in their frames.
-        look: called with (steps done, reading), first at the start and then after every control step.
+        points: [N, 4, 3] keypoints of the objects, in their frames.
+        look: called at the start and after every control step.
 
     Returns:
-        What was reached, and the seconds that it took without ``look``.
+        The metrics of the episodes, and the seconds that they took without ``look``.
     """
     policy.begin(env)
-    reading, spent = env.reading(), 0.0
-    result = EpisodeMetrics(reading, env.goal_pos, env.goal_quat, points, metrics)
+    reading = env.reading()
+    result = EpisodeMetrics(reading, env.goal_pos, env.goal_quat, points, MetricsConfig())
     look(0, reading)
+    seconds = 0.0
     for step in range(1, env.max_episode_length + 1):
         before = time.perf_counter()
         reading, _ = env.advance(policy.act(env.get_observations()))
         result.update(reading, out_of_bounds(reading.state.object_pos, env.backend.scene.table, env.task.termination))
-        spent += time.perf_counter() - before
+        seconds += time.perf_counter() - before
         look(step, reading)
-    return result, spent
+    return result, seconds
 
 
 def episode_starts(distribution: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int) -> Reset:
-    """One start per world. Each has random numbers of its own, drawn on the CPU, so engine and number of worlds change nothing."""
+    """Return one start for each world. Each has its own random numbers, so the engine and the number of worlds change nothing."""
     parts = []
     for s, r in zip(sequence.tolist(), repetition.tolist(), strict=True):
-        generator = torch.Generator().manual_seed(int(np.random.SeedSequence([seed, s, r]).generate_state(1)[0]))
+        state = np.random.SeedSequence([seed, s, r]).generate_state(1)
+        generator = torch.Generator().manual_seed(int(state[0]))
         parts.append(distribution.home(torch.tensor([s]), generator))
     return Reset.cat(parts)
 
 
-_REACHED = ("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow")
-_PROGRESS = ("reorientation_progress", "task_progress")
+_FLAGS = ("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow")
 
 
-def _episode(result: EpisodeMetrics, world: int, sequence: int, repetition: int, demos: ResetBank) -> Episode:
-    outcome: dict[str, Any] = {name: bool(getattr(result, name)[world]) for name in _REACHED}
-    outcome |= {name: round(float(getattr(result, name)[world]), 6) for name in _PROGRESS}
+def _episode(result: EpisodeMetrics, world: int, bank: ResetBank, sequence: int, repetition: int) -> Episode:
     return Episode(
         sequence=sequence,
-        sequence_name=str(demos.sequence_name[sequence]),
-        object=str(demos.sequence_object[sequence]),
+        sequence_name=str(bank.sequence_name[sequence]),
+        object=str(bank.sequence_object[sequence]),
         repetition=repetition,
-        **outcome,
+        reorientation_progress=round(float(result.reorientation_progress[world]), 6),
+        task_progress=round(float(result.task_progress[world]), 6),
+        **{name: bool(getattr(result, name)[world]) for name in _FLAGS},
     )
 
 
@@ -191,35 +239,47 @@ _STATES = ("joint_pos", "object_pos", "object_quat")
 
 
 class _Recorder:
-    """States of some worlds over an episode."""
+    """Records the states of some worlds over an episode."""
 
-    def __init__(self, worlds: list[int]) -> None:
-        self._worlds, self._time, self._frames, self._targets = worlds, [], [], []
+    def __init__(self, env: ManipulationEnv, worlds: list[int]) -> None:
+        self._env = env
+        self._worlds = worlds
+        self._dt = env.backend.scene.control_dt
+        self._every = max(1, round(TRACE_INTERVAL / self._dt))
+        self._time: list[float] = []
+        self._frames: dict[str, list[np.ndarray]] = {name: [] for name in _STATES}
+        self._targets: list[np.ndarray] = []
 
-    def add(self, time: float, reading: Reading) -> None:
-        if self._worlds:
-            self._time.append(time)
-            self._frames.append(
-                {name: getattr(reading.state, name)[self._worlds].cpu().numpy().copy() for name in _STATES}
-            )
+    def look(self, step: int, reading: Reading) -> None:
+        """Record a state every few steps, and the targets of every step."""
+        if not self._worlds:
+            return
+        if step % self._every == 0:
+            self._time.append(step * self._dt)
+            for name, frames in self._frames.items():
+                frames.append(self._rows(getattr(reading.state, name)))
+        if step:
+            self._targets.append(self._rows(self._env.joint_target))
 
-    def add_targets(self, targets: torch.Tensor) -> None:
-        if self._worlds:
-            self._targets.append(targets[self._worlds].cpu().numpy().copy())
+    def _rows(self, values: torch.Tensor) -> np.ndarray:
+        """A copy, because the environment writes the next values in place."""
+        return values[self._worlds].cpu().numpy().copy()
 
-    def traces(self, env: ManipulationEnv, names: tuple[str, ...]) -> list[Trace]:
-        return [
-            Trace(
+    def traces(self, names: tuple[str, ...]) -> list[Trace]:
+        """One trace of each recorded world; ``names``: of the objects."""
+        env = self._env
+        goal_pos = self._rows(env.goal_pos)
+        goal_quat = self._rows(env.goal_quat)
+        out = []
+        for i, world in enumerate(self._worlds):
+            trace = Trace(
                 sequence=int(env.sequence[world]),
                 object=names[int(env.backend.object_index[world])],
-                goal_pos=env.goal_pos[world]
-                .cpu()
-                .numpy()
-                .copy(),  # the environment writes the next round's goals in place
-                goal_quat=env.goal_quat[world].cpu().numpy().copy(),
+                goal_pos=goal_pos[i],
+                goal_quat=goal_quat[i],
                 time=np.array(self._time),
                 joint_target=np.stack([targets[i] for targets in self._targets]),
-                **{name: np.stack([frame[name][i] for frame in self._frames]) for name in _STATES},
+                **{name: np.stack([frame[i] for frame in frames]) for name, frames in self._frames.items()},  # noqa: XR002
             )
-            for i, world in enumerate(self._worlds)
-        ]
+            out.append(trace)
+        return out

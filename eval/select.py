@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from xreset.errors import RunError
-from xreset.eval.evaluate import resolve
+from xreset.eval.policy_spec import load_policy
 from xreset.eval.results import mesh_folder
 from xreset.eval.rollout import roll_out
 from xreset.eval.setting import Setting
-from xreset.eval.trial import Engine
+from xreset.eval.trial import Engine, load_trial
 from xreset.files import atomic_write, file_hash
 from xreset.learning.choice import Candidate, Choice, write_choice
 from xreset.learning.run import checkpoints, read_run
@@ -84,14 +84,14 @@ def select(
                 from xreset.learning.train import export_checkpoint  # rsl-rl, which exported policies do not need
 
                 export_checkpoint(folder, path, file)
-            subject = resolve(str(file), setting.robot, setting.seed)
-            trial, _ = subject.episodes(demos, setting)
+            policy = load_policy(file, robot=setting.robot)
+            trial = load_trial(policy, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs)
             scores: dict[str, float] = {}
             bar = best.worst if best else -1.0
             order = engines if best is None else sorted(engines, key=lambda e, b=best: b.task_progress[e.name])
             for engine in order:
                 progress(path.name, engine.name, None)
-                rollouts = roll_out(subject.policy(subject.robot, None), engine, trial, repetitions=episodes)
+                rollouts = roll_out(policy.start(None), engine, trial, repetitions=episodes)
                 scores[engine.name] = float(np.mean([e.task_progress for e in rollouts.episodes]))
                 progress(path.name, engine.name, scores[engine.name])
                 if scores[engine.name] <= bar:  # of two that are equal, the newer one

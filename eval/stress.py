@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 
 from xreset.errors import XResetError
-from xreset.eval.evaluate import Subject
 from xreset.eval.plots import COLORS, picture
+from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.rollout import Episode, roll_out
-from xreset.eval.setting import Setting
 from xreset.eval.stats import bootstrap_ci95
-from xreset.eval.trial import Engine
-from xreset.files import file_hash, read_json, write_json
+from xreset.eval.trial import Engine, Trial
+from xreset.files import read_json, write_json
 from xreset.physics import Capability
 from xreset.plugins import backend_class
 from xreset.task.config import RandomizationConfig, TaskConfig
@@ -232,10 +231,9 @@ def stressed(task: TaskConfig, prop: Property | None = None, value: float = 1.0)
 
 
 def stress(
-    subject: Subject,
+    policy: PolicySpec,
+    trial: Trial,
     engines: Sequence[Engine],
-    demos: Path,
-    setting: Setting,
     out: Path,
     *,
     properties: Sequence[Property] = PROPERTIES,
@@ -245,24 +243,23 @@ def stress(
     """Sweep properties in each engine and write ``OUT/BACKEND.json``, after each property anew: one that is stopped keeps what it has.
 
     Args:
-        demos: demonstrations or retargeted trajectories.
-        setting: meshes, seed and worlds at a time.
+        trial: what is played, from :func:`~xreset.eval.trial.load_trial`.
         repetitions: episodes per demonstration, the same for every value.
         progress: called with (engine, runs done, runs in all).
 
     Returns:
         What was written, in the order of the engines.
     """
-    trial, trajectories = subject.episodes(demos, setting)
+    policy.check_seed(trial.seed)
     tasks = {
         (p.name, v): stressed(trial.task, p, v) for p in properties for v in p.values
     }  # all are checked before the first is played
     about: dict[str, Any] = {
         "schema": SCHEMA,
-        "policy": subject.label,
-        "robot": subject.robot.name,
-        "seed": setting.seed,
-        "inputs": subject.inputs | {"demos": file_hash(demos)},
+        "policy": policy.name,
+        "robot": trial.robot.name,
+        "seed": trial.seed,
+        "inputs": trial.inputs,
     }
 
     def keep(card: Stress) -> None:
@@ -275,8 +272,9 @@ def stress(
         total = 1 + sum(len(p.values) for p in usable)
 
         def run(task: TaskConfig, engine: Engine = engine) -> tuple[Episode, ...]:
-            policy = subject.policy(subject.robot, trajectories)
-            return roll_out(policy, engine, replace(trial, task=task), repetitions=repetitions).episodes
+            return roll_out(
+                policy.start(trial.motion), engine, replace(trial, task=task), repetitions=repetitions
+            ).episodes
 
         nominal = run(stressed(trial.task))
         progress(engine.name, 1, total)

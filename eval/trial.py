@@ -1,33 +1,37 @@
-"""What is played when a policy is judged: one setting for every evaluation, and the engine that it is played in.
+"""What an evaluation plays: robot, objects, starts, goals and task in a trial, and the engine to play in.
 
-Shape letters: N worlds, M episodes.
+Shape letters: N worlds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from xreset.env import ManipulationEnv, make_scene
+from xreset.eval.policy_spec import PolicySpec
+from xreset.inputs import Data, Kind, load_inputs
 from xreset.objects.sampling import keypoints
 from xreset.physics import Backend
 from xreset.plugins import backend_class, device_for, make_backend
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import ResetDistribution
+from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
-from xreset.task.config import TaskConfig
+from xreset.task.config import TaskConfig, evaluation_task
 from xreset.task.randomization import sample_friction
 
 MakeBackend = Callable[[SceneSpec, int, Tensor], Backend]
-"""Builds worlds of a scene: how many, and which object each holds [N]."""
+"""Makes the worlds of a scene, given their number and the index of the object in each world [N]."""
 
 SAME_EQUATIONS = frozenset({"mujoco-warp"})
-"""Backends that solve the equations of ``mujoco``, in other arithmetic."""
+"""Backends that solve the equations of ``mujoco`` in another precision."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,21 +43,23 @@ class Engine:
     version: str
     device: str = "cpu"
     grasps: bool = True
-    """Whether press, closing and hold are measured in a comparison of engines."""
+    """Whether a comparison of engines measures press, closing and hold."""
     path: bool = False
-    """Whether paths are compared."""
+    """Whether a comparison of engines measures paths."""
 
 
 def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
-    """An installed backend.
+    """Return an installed backend.
 
-    If it solves the reference's equations, its paths are compared; and on the CPU nothing else is, for a GPU engine is slow there.
+    A backend that solves the equations of the reference is compared path by path; on the CPU in no other way, because it is slow there.
 
     Args:
-        device: where it runs if it can run there; else the CPU.
+        name: name of the backend.
+        device: where the backend runs if it can run there; else it runs on the CPU.
+        options: keywords of the backend.
 
     Raises:
-        BackendUnavailableError: it cannot be used here.
+        BackendUnavailableError: the backend cannot be used here.
     """
     version = backend_class(name).engine_version()
     used = device_for(name, device)
@@ -67,53 +73,102 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """Everything that decides how an episode goes, but for policy and engine."""
+    """Everything that decides how an episode goes, except the policy and the engine."""
 
     robot: RobotSpec
     objects: tuple[ObjectSpec, ...]
-    """Objects of the demonstrations."""
     bank: ResetBank
-    """Starts and goals; its states, if episodes begin with them."""
+    """Starts and goals; and states, for episodes that begin with them."""
     task: TaskConfig
-    """Usually :func:`xreset.task.config.evaluation_task` of the policy's own."""
+    """Usually :func:`xreset.task.config.evaluation_task` of the policy's own task."""
     seed: int = 0
-    """Of the perturbations of robot and object: the same in every engine and for every number of worlds."""
+    """Seed of the perturbations of robot and object, which are the same in every engine and for every number of worlds."""
     num_envs: int = 64
-    """Worlds at a time."""
+    """Worlds that run at the same time."""
+    motion: Retargeted | None = None
+    """Motion for the baseline ``ik``; None for other policies."""
+    objects_folder: Path | None = None
+    """Folder of the object meshes; None: the stand-ins."""
+    inputs: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the files of policy and data, by what they are."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the objects."""
+        """Names of the objects."""
         return tuple(o.name for o in self.objects)
 
     @property
     def scene(self) -> SceneSpec:
-        """Without randomisation: the environment sets friction itself."""
+        """The scene of the task. Its friction is a placeholder, because the environment sets friction itself."""
         return make_scene(self.robot, self.objects, self.task)
 
     @property
     def nominal_scene(self) -> SceneSpec:
-        """With the pair friction of an evaluation, which draws none at random."""
+        """The scene with the pair friction of an evaluation, which draws none at random."""
         return nominal_scene(self.robot, self.objects, self.task)
 
-    def starts(self) -> ResetDistribution:
-        """What starts are drawn from, on the CPU: neither the engine nor its device changes them."""
-        return ResetDistribution(self.bank, self.robot, self.names, self.task.reset)
+    def starts(self, device: str | torch.device = "cpu") -> ResetDistribution:
+        """Return the distribution of starts. Drawn on the CPU, they are the same in every engine."""
+        return ResetDistribution(self.bank, self.robot, self.names, self.task.reset, device)
 
     @contextmanager
     def worlds(self, engine: Engine, object_index: Tensor) -> Iterator[tuple[ManipulationEnv, Tensor]]:
-        """An environment in an engine, whose worlds hold given objects [N], and the keypoints [N, 4, 3] of those in their frames."""
+        """Open an environment in an engine.
+
+        Args:
+            engine: where to play.
+            object_index: [N] index of the object in each world.
+
+        Yields:
+            The environment, and the keypoints [N, 4, 3] of each world's object in the object's frame.
+        """
         with engine.make(self.scene, len(object_index), object_index) as backend:
-            resets = ResetDistribution(self.bank, self.robot, self.names, self.task.reset, backend.device)
+            env = ManipulationEnv(backend, self.task, self.starts(backend.device), seed=self.seed)
             points = torch.stack([torch.as_tensor(keypoints(o), dtype=torch.float32) for o in self.objects])
-            yield (
-                ManipulationEnv(backend, self.task, resets, seed=self.seed),
-                points.to(backend.device)[backend.object_index],
-            )
+            yield env, points.to(backend.device)[backend.object_index]
+
+
+def load_trial(
+    policy: PolicySpec,
+    source: str | Path | Data,
+    *,
+    objects: str | Path | None = None,
+    seed: int = 0,
+    num_envs: int = 64,
+    accept: tuple[Kind, ...] = ("demos", "motion"),
+) -> Trial:
+    """Load what a policy is to play. For the baseline ``ik``, demonstrations are retargeted here.
+
+    Args:
+        policy: the policy, whose robot and task are taken.
+        source: demonstrations, motion or a bank, or a file of them.
+        objects: folder of object meshes; default: the folder of the policy's training.
+        seed: seed of the perturbations.
+        num_envs: worlds that run at the same time.
+        accept: the kinds of data that the caller can use.
+    """
+    folder = Path(objects) if objects else policy.objects_folder
+    inputs = load_inputs(source, robot=policy.robot, objects=folder, accept=accept)
+    hashes = {} if policy.hash is None else {"policy": policy.hash}
+    if inputs.hash is not None:
+        hashes["resets" if isinstance(inputs.data, ResetBank) else "demos"] = inputs.hash
+    used = [o for o in inputs.objects if o.name in inputs.bank.sequence_object]
+    return Trial(
+        robot=policy.robot,
+        objects=tuple(sorted(used, key=lambda o: o.name)),
+        bank=inputs.bank,
+        task=evaluation_task(policy.task),
+        seed=seed,
+        num_envs=num_envs,
+        motion=inputs.motion() if policy.follows_motion else None,
+        objects_folder=folder,
+        inputs=hashes,
+    )
 
 
 def nominal_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
-    """See :attr:`Trial.nominal_scene`."""
+    """Return the scene of :attr:`Trial.nominal_scene`."""
     scene = make_scene(robot, objects, task)
-    tip, link, table = sample_friction(1, replace(task.randomization, enabled=False), torch.Generator())[0].tolist()
+    nominal = replace(task.randomization, enabled=False)
+    tip, link, table = sample_friction(1, nominal, torch.Generator())[0].tolist()
     return replace(scene, friction=replace(scene.friction, tip=tip, link=link, table=table))

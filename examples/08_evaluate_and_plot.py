@@ -5,9 +5,6 @@ from pathlib import Path
 
 import xreset
 from xreset.demos.archive import write_demos
-from xreset.eval.evaluate import resolve
-from xreset.eval.setting import Setting
-from xreset.eval.trial import engine
 
 
 def main(out: Path, engines: tuple[str, ...] = ("mujoco", "sapien")) -> None:
@@ -18,10 +15,13 @@ def main(out: Path, engines: tuple[str, ...] = ("mujoco", "sapien")) -> None:
     from matplotlib import pyplot
 
     write_demos(out / "unseen.npz", xreset.synthesize(["005_tomato_soup_can"], 1, seed=1))
-    subject = resolve("soup-can", None, 0)  # a policy that ships with xreset; a run folder or a .onnx file will do
-    setting = Setting(num_envs=1)
     results = xreset.evaluate(
-        subject, [engine(name) for name in engines], out / "unseen.npz", setting, out / "eval", episodes=1
+        "soup-can",  # a policy that ships with xreset; a run folder or a .onnx file will do
+        out / "unseen.npz",
+        engines,
+        episodes=1,
+        num_envs=1,
+        out=out / "eval",
     )
 
     figure, axes = pyplot.subplots(figsize=(5, 3), layout="constrained")

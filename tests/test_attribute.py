@@ -359,7 +359,7 @@ class CommandTest(unittest.TestCase):
         )
         self.assertIn("there is no backend 'havok'", self.refuse("zero", *rest, "--towards", "havok"))
         self.assertIn("there is no none.npz", self.refuse("zero", *rest, "--towards", "sapien"))
-        self.assertIn("there is no policy", self.refuse("none", *rest, "--towards", "sapien"))
+        self.assertIn("Unknown policy", self.refuse("none", *rest, "--towards", "sapien"))
 
 
 if __name__ == "__main__":

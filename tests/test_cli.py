@@ -184,12 +184,12 @@ class UsageTest(unittest.TestCase):
             ]
             with mock.patch("xreset.eval.evaluate.evaluate", side_effect=KeyboardInterrupt) as evaluate:
                 self.assertEqual(run(*argv)[0], 130)
-            self.assertEqual([engine.name for engine in evaluate.call_args.args[1]], expected)
+            self.assertEqual(list(evaluate.call_args.args[2]), expected)
 
     def test_a_policy_that_does_not_exist(self):
         code, _, err = run("eval", "nonsense", "--demos", "x.npz")
         self.assertEqual(code, 1)
-        self.assertIn("expected a run folder, a .onnx file, or one of zero, random, ik", err)
+        self.assertIn("Give a run folder, a .onnx file, or one of: zero, random, ik", err)
 
 
 if __name__ == "__main__":

@@ -16,14 +16,15 @@ from tests.toy_results import OBJECTS, toy_rollouts, toy_summary
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.evaluate import evaluate
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
+from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import EvalResult, read_results, read_traces, write_results
 from xreset.eval.rollout import Episode
-from xreset.eval.setting import Setting
 from xreset.eval.stats import bootstrap_ci95
 from xreset.eval.table import result_rows
 from xreset.files import claim_folder
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import Contacts, Health, Links, State
+from xreset.task.config import TaskConfig
 from xreset.task.reading import Reading
 from xreset.task.rewards import keypoint_distance
 from xreset.typed import from_dict
@@ -312,14 +313,11 @@ class ResultsTest(unittest.TestCase):
             read_results(self.folder)
 
     def test_two_evaluations_are_not_written_into_one_folder(self):
-        subject = mock.Mock(inputs={})
-        subject.episodes.return_value = mock.Mock(), None
-        demos = self.folder / "demos.npz"
-        demos.write_bytes(b"")
-        out = self.folder / "eval"
-        with claim_folder(out), self.assertRaisesRegex(XResetError, "another command is writing .*eval"):
-            evaluate(subject, [], demos, Setting(), out, episodes=1)
-        self.assertEqual(evaluate(subject, [], demos, Setting(), out, episodes=1), [])
+        policy = PolicySpec(name="zero", start=mock.Mock(), robot=mock.Mock(), task=TaskConfig(), folder=self.folder)
+        with mock.patch("xreset.eval.evaluate.load_trial"):
+            with claim_folder(self.folder), self.assertRaisesRegex(XResetError, "writing"):
+                evaluate(policy, "demos.npz", [])
+            self.assertEqual(evaluate(policy, "demos.npz", []), [])
 
     def test_a_result_that_is_not_a_number_is_not_written(self):
         rollouts = toy_rollouts()

@@ -14,10 +14,9 @@ from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.cli import main
 from xreset.errors import DemoError
-from xreset.eval.evaluate import Subject
 from xreset.eval.frontier import STAGES, Tried, by_stage, frontier, stage_of
-from xreset.eval.setting import Setting
-from xreset.eval.trial import engine
+from xreset.eval.policy_spec import PolicySpec
+from xreset.eval.trial import engine, load_trial
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
 from xreset.policy import ZeroPolicy
@@ -80,16 +79,16 @@ class FrontierTest(unittest.TestCase):
             termination=TerminationConfig(episode_seconds=0.5), observation=ObservationConfig(cloud_points=16), distance_points=64,
         )  # fmt: skip
 
-    def subject(self) -> Subject:
-        return Subject(
-            policy=lambda robot, _: ZeroPolicy(len(robot.joints)), label="zero", robot=self.robot, task=self.task,
-            folder=self.folder / "eval", objects_folder=None, inputs={},
-        )  # fmt: skip
-
     def run_frontier(self, resets: Path, states: int = 100, num_envs: int = 4) -> list[dict]:
-        return frontier(
-            self.subject(), [engine("mujoco")], resets, Setting(num_envs=num_envs), self.folder / "out", states=states
+        policy = PolicySpec(
+            name="zero",
+            start=lambda motion: ZeroPolicy(len(self.robot.joints)),
+            robot=self.robot,
+            task=self.task,
+            folder=self.folder / "eval",
         )
+        trial = load_trial(policy, resets, num_envs=num_envs, accept=("bank",))
+        return frontier(policy, trial, [engine("mujoco")], self.folder / "out", states=states)
 
     def test_every_state_is_tried_once_and_what_became_of_it_is_written(self):
         (result,) = self.run_frontier(self.resets)
@@ -119,7 +118,7 @@ class FrontierTest(unittest.TestCase):
         empty = self.folder / "empty.npz"
         write_bank(empty, self.bank.select(sequences=np.zeros(3, dtype=bool)), config={}, inputs={})
         self.assertEqual(read_bank(empty).num_states, 0)
-        with self.assertRaisesRegex(DemoError, "empty.npz holds no state to try"):
+        with self.assertRaisesRegex(DemoError, "bank holds no state to try"):
             self.run_frontier(empty)
 
     def test_the_command_refuses_what_cannot_go_on_from_a_state(self):

@@ -23,7 +23,7 @@ from xreset.demos.archive import write_demos
 from xreset.demos.synth import synthesize
 from xreset.errors import PolicyError
 from xreset.eval.engines.sources import from_policy
-from xreset.eval.evaluate import resolve
+from xreset.eval.policy_spec import load_policy
 from xreset.eval.setting import Place, Sequence
 from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel
@@ -218,12 +218,12 @@ class ShippedTest(WithPolicy):
 
     def test_a_name_means_the_shipped_file(self):
         self.assertEqual(list(policies.shipped()), ["skilled"])
-        subject = resolve("skilled", None, 0)
+        subject = load_policy("skilled")
         self.assertEqual(
-            (subject.label, subject.robot.name, subject.folder), ("skilled", "openarm", Path("runs/skilled/eval"))
+            (subject.name, subject.robot.name, subject.folder), ("skilled", "openarm", Path("runs/skilled/eval"))
         )
         self.assertEqual(subject.task, TASK)
-        self.assertEqual(subject.inputs, resolve(str(self.file), None, 0).inputs)
+        self.assertEqual(subject.hash, load_policy(self.file).hash)
 
     def test_the_list_is_of_cards(self):
         code, _, err = run("policies", "list")
@@ -259,23 +259,23 @@ class ShippedTest(WithPolicy):
             self.assertIn(problem, run("policies", "list")[2])
 
     def test_it_knows_which_objects_it_was_not_trained_with(self):
-        self.assertEqual(resolve("skilled", None, 0).unseen((SOUP, "mug", "bowl")), ("bowl", "mug"))
-        self.assertEqual(resolve("zero", "openarm", 0).unseen((SOUP, "mug")), ())
+        self.assertEqual(load_policy("skilled").unseen((SOUP, "mug", "bowl")), ("bowl", "mug"))
+        self.assertEqual(load_policy("zero", robot="openarm").unseen((SOUP, "mug")), ())
 
     def test_what_lies_at_a_path_wins(self):
         Path("skilled").write_text("mine")
         with self.assertRaisesRegex(PolicyError, "skilled cannot be read as an ONNX policy"):
-            resolve("skilled", None, 0)
+            load_policy("skilled")
 
     def test_an_unknown_name_lists_those_that_ship(self):
-        expected = "no policy 'skiled': expected a run folder, a .onnx file, or one of zero, random, ik"
+        expected = "Unknown policy 'skiled'. Give a run folder, a .onnx file, or one of: zero, random, ik"
         for command, options in ((("eval",), ()), (("engines", "attribute"), ("--towards", "pybullet"))):
             code, _, err = run(*command, "skiled", "--demos", "x.npz", *options)
             self.assertEqual(code, 1)
-            self.assertIn(f"{expected}, or a policy that ships with xreset: skilled. Check the name or path.", err)
+            self.assertIn(f"{expected}, skilled.", err)
         next(policies.FOLDER.iterdir()).unlink()
-        with self.assertRaisesRegex(PolicyError, f"{expected}. Check"):
-            resolve("skiled", None, 0)
+        with self.assertRaisesRegex(PolicyError, f"{expected}[.]"):
+            load_policy("skiled")
 
     @unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
     def test_it_is_evaluated_traced_and_reported_by_name(self):

@@ -7,6 +7,7 @@ import json
 import tempfile
 import unittest
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
@@ -14,10 +15,14 @@ from unittest import mock
 from tests.test_stress import episodes
 from xreset.cli import main
 from xreset.errors import FileFormatError, PolicyError, RunError
-from xreset.eval import evaluate as evaluating
+from xreset.eval.evaluate import evaluate
+from xreset.eval.frontier import frontier
+from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.select import SEED, candidates_in, select
 from xreset.eval.setting import Setting
+from xreset.eval.stress import stress
 from xreset.learning.choice import Choice, read_choice
+from xreset.task.config import TaskConfig
 
 SCORES = {
     "300.onnx": {"a": 0.90, "b": 0.60, "c": 0.80},
@@ -37,17 +42,19 @@ class SelectTest(unittest.TestCase):
         self.played: list[tuple[str, str, int]] = []
 
     def choose(self, **options) -> Choice:
-        def resolved(path: str, robot: str | None, seed: int):
-            name = Path(path).name
-            trial = SimpleNamespace(name=name, seed=seed)
-            return SimpleNamespace(robot=None, policy=lambda *_: name, episodes=lambda demos, setting: (trial, None))
+        def load_policy(path: Path, robot: str | None):
+            return SimpleNamespace(start=lambda motion: path.name)
+
+        def load_trial(policy, demos, seed: int, **_):
+            return SimpleNamespace(seed=seed)
 
         def rolled(policy, engine, trial, *, repetitions):
             self.played.append((policy, engine.name, trial.seed))
             return SimpleNamespace(episodes=episodes([SCORES[policy][engine.name]] * repetitions))
 
         engines = [SimpleNamespace(name=name, version="1") for name in "abc"]
-        with mock.patch("xreset.eval.select.resolve", resolved), mock.patch("xreset.eval.select.roll_out", rolled):
+        patches = {"load_policy": load_policy, "load_trial": load_trial, "roll_out": rolled}
+        with mock.patch.multiple("xreset.eval.select", **patches):
             return select(self.folder, engines, self.demos, Setting(seed=SEED), **options)  # pyright: ignore[reportArgumentType]
 
     def test_the_best_worst_engine_decides(self):
@@ -81,18 +88,24 @@ class SelectTest(unittest.TestCase):
 
     def test_the_starts_that_decided_are_not_reported(self):
         choice = self.choose()
-        inputs = {"policy": choice.policy_hash}
-        subject = SimpleNamespace(
-            folder=self.folder / "eval", inputs=inputs, episodes=mock.Mock(side_effect=InterruptedError)
+        policy = PolicySpec(
+            name="p",
+            start=mock.Mock(),
+            robot=mock.Mock(),
+            task=TaskConfig(),
+            folder=self.folder / "eval",
+            hash=choice.policy_hash,
         )
-        with self.assertRaisesRegex(
-            PolicyError, f"the starts of seed {SEED} are those by which this policy was chosen"
+        trial = mock.Mock(seed=SEED)
+        for measure in (
+            lambda: evaluate(policy, self.demos, [], seed=SEED),
+            lambda: stress(policy, trial, [], self.folder),
+            lambda: frontier(policy, trial, [], self.folder, states=1),
         ):
-            evaluating.evaluate(subject, [], self.demos, Setting(seed=SEED), self.folder, episodes=1)  # pyright: ignore[reportArgumentType]
-        for seed, policy in ((0, choice.policy_hash), (SEED, "another")):
-            subject.inputs = {"policy": policy}
-            with self.assertRaises(InterruptedError):
-                evaluating.evaluate(subject, [], self.demos, Setting(seed=seed), self.folder, episodes=1)  # pyright: ignore[reportArgumentType]
+            with self.assertRaisesRegex(PolicyError, f"Seed {SEED} chose this checkpoint"):
+                measure()
+        policy.check_seed(0)
+        replace(policy, hash="another").check_seed(SEED)
 
     def test_a_damaged_choice_is_refused(self):
         self.choose()

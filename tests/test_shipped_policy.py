@@ -10,9 +10,8 @@ from pathlib import Path
 
 from xreset.demos.archive import write_demos
 from xreset.demos.synth import synthesize
-from xreset.eval.evaluate import BASELINES, evaluate, resolve
-from xreset.eval.setting import Setting
-from xreset.eval.trial import engine
+from xreset.eval.evaluate import evaluate
+from xreset.eval.policy_spec import BASELINES, load_policy
 from xreset.objects.catalogue import object_names
 from xreset.policies import card, shipped
 from xreset.policy import OnnxPolicy
@@ -63,7 +62,7 @@ class ShippedPolicyTest(unittest.TestCase):
     def test_it_fits_its_robot_and_what_its_task_observes_today(self):
         for name in shipped():
             with self.subTest(name):
-                resolve(name, None, 0)
+                load_policy(name)
 
     def test_the_file_is_small_and_tells_nothing_of_where_it_was_made(self):
         for name, file in shipped().items():
@@ -95,9 +94,7 @@ class ShippedPolicyTest(unittest.TestCase):
                 with tempfile.TemporaryDirectory() as folder:
                     demos = Path(folder) / "demos.npz"
                     write_demos(demos, synthesize(OnnxPolicy(file).contract["objects"][:1], 2))
-                    (result,) = evaluate(
-                        resolve(name, None, 0), [engine("mujoco")], demos, Setting(num_envs=2), Path(folder), episodes=1
-                    )
+                    (result,) = evaluate(name, demos, num_envs=2, out=folder, episodes=1)
                 self.assertEqual(result.episodes, 2)
                 self.assertGreaterEqual(result.task_progress.mean, FLOOR)
 

@@ -16,7 +16,6 @@ import torch
 from xreset.errors import FileFormatError
 from xreset.eval.engines.episodes import Motion, closing_episode
 from xreset.eval.engines.grasps import Grasps
-from xreset.eval.metrics import MetricsConfig
 from xreset.eval.rollout import Trace, episode_starts, play
 from xreset.eval.trial import Engine, Trial, nominal_scene
 from xreset.physics import State
@@ -135,7 +134,7 @@ def play_policy(
                 targets.append(env.joint_target[0].cpu().clone())
                 progress(step, env.max_episode_length)
 
-        play(policy, env, points, MetricsConfig(), look)
+        play(policy, env, points, look)
     return Actions(
         scene=replace(trial.nominal_scene, objects=(trial.objects[thing],)),
         label=f"{policy.name} in {engine.name}, {trial.bank.sequence_name[sequence]} (perturbation {repetition}, seed {trial.seed})",
@@ -166,7 +165,7 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
 
 
 def write_actions(path: str | Path, actions: Actions) -> None:
-    """Write an action sequence; see :func:`xreset.files.write_npz`."""
+    """Write an action sequence; see :func:`xreset.records.write_npz`."""
     scene, friction = actions.scene, actions.scene.friction
     write_npz(
         path,

@@ -14,10 +14,10 @@ from xreset.errors import DemoError, FileFormatError
 from xreset.eval.engines.actions import SCHEMA as ACTIONS
 from xreset.eval.engines.actions import Actions, grasp_and_lift, play_policy, read_actions, recorded_actions, robot_of
 from xreset.eval.engines.grasps import Frames, find_grasps
-from xreset.eval.evaluate import resolve
+from xreset.eval.policy_spec import load_policy
 from xreset.eval.results import TRACE_SCHEMA, mesh_folder, read_result, read_traces
-from xreset.eval.setting import Place, Sequence, Setting
-from xreset.eval.trial import Engine
+from xreset.eval.setting import Place, Sequence
+from xreset.eval.trial import Engine, load_trial
 from xreset.inputs import load_inputs
 from xreset.objects.catalogue import load_object
 from xreset.records import npz_schema
@@ -100,14 +100,20 @@ def from_policy(
         progress: called with (control steps done, control steps in all).
     """
     assert sequence.policy is not None, "no policy"
-    subject = resolve(sequence.policy, place.robot, place.seed)
-    trial, trajectories = subject.episodes(source, Setting(**vars(place)))
+    policy = load_policy(sequence.policy, robot=place.robot, seed=place.seed)
+    trial = load_trial(policy, source, objects=place.objects, seed=place.seed)
     name = _object(source, sequence.object, trial.bank.sequence_object.tolist())
     mine = np.flatnonzero(trial.bank.sequence_object == name)
     if sequence.episode >= len(mine):
         raise DemoError(f"{source} has {len(mine)} demonstrations of {name}, so --episode is at most {len(mine) - 1}.")
-    policy, chosen = subject.policy(subject.robot, trajectories), int(mine[sequence.episode])
-    return play_policy(policy, engine, trial, sequence=chosen, repetition=sequence.repetition, progress=progress)
+    return play_policy(
+        policy.start(trial.motion),
+        engine,
+        trial,
+        sequence=int(mine[sequence.episode]),
+        repetition=sequence.repetition,
+        progress=progress,
+    )
 
 
 def _from_evaluation(source: Path, sequence: Sequence, place: Place) -> Actions:

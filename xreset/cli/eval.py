@@ -10,7 +10,7 @@ import tyro
 from xreset.cli._common import engine_bars
 from xreset.cli._terminal import Console
 from xreset.eval import evaluate as evaluation
-from xreset.eval import table, trial
+from xreset.eval import policy_spec, table
 from xreset.eval.setting import Setting
 
 
@@ -35,16 +35,17 @@ def evaluate(
         out: Folder for the results; default: eval/ in the run folder or beside the policy; runs/NAME/eval for a policy that ships with
             xreset, runs/BASELINE-ROBOT/eval for a baseline.
     """
-    engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
+    engines = tuple(dict.fromkeys(backend or ("mujoco",)))
     console = Console()
-    subject = evaluation.resolve(policy, setting.robot, setting.seed)
-    folder = out or subject.folder
-    with engine_bars(console, [e.name for e in engines]) as progress:
-        summaries = evaluation.evaluate(subject, engines, demos, setting, folder, episodes=episodes, progress=progress)
+    spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
+    with engine_bars(console, engines) as progress:
+        summaries = evaluation.evaluate(
+            spec, demos, engines, episodes=episodes, out=out, progress=progress, **vars(setting)
+        )
     console.print(table.results_table(summaries))
     if unseen := summaries[0].unseen:
         console.print(f"not in the policy's training: {', '.join(unseen)}", highlight=False, soft_wrap=True)
-    console.print(f"results in {folder}")
+    console.print(f"results in {out or spec.folder}")
 
 
 COMMAND = evaluate

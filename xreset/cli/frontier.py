@@ -11,8 +11,8 @@ from rich.table import Table
 from xreset.cli._common import engine_bars
 from xreset.cli._terminal import Console
 from xreset.errors import PolicyError
-from xreset.eval import evaluate, trial
 from xreset.eval import frontier as frontiers
+from xreset.eval import policy_spec, trial
 from xreset.eval.setting import Setting
 
 
@@ -42,11 +42,14 @@ def frontier(
         )
     engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
     console = Console()
-    subject = evaluate.resolve(policy, setting.robot, setting.seed)
-    folder = out or subject.folder.parent / "frontier"
+    spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
+    folder = out or spec.folder.parent / "frontier"
+    played = trial.load_trial(
+        spec, resets, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs, accept=("bank",)
+    )
     with engine_bars(console, [e.name for e in engines]) as progress:
-        results = frontiers.frontier(subject, engines, resets, setting, folder, states=states, progress=progress)
-    title = f"{subject.label} on {subject.robot.name} goes on from {len(results[0]['tried'])} demonstrated states:"
+        results = frontiers.frontier(spec, played, engines, folder, states=states, progress=progress)
+    title = f"{spec.name} on {spec.robot.name} goes on from {len(results[0]['tried'])} demonstrated states:"
     table = Table(
         "the episode begins with", title=f"{title}\nof them, at the goal at any time / at the end", title_justify="left"
     )

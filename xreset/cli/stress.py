@@ -10,7 +10,7 @@ from rich.table import Table
 
 from xreset.cli._common import engine_bars
 from xreset.cli._terminal import Console
-from xreset.eval import evaluate, trial
+from xreset.eval import policy_spec, trial
 from xreset.eval import stress as sweeps
 from xreset.eval.setting import Setting
 
@@ -40,14 +40,15 @@ def stress(
     properties = sweeps.chosen(property)
     engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
     console = Console()
-    subject = evaluate.resolve(policy, setting.robot, setting.seed)
-    folder = out or subject.folder.parent / "stress"
+    spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
+    folder = out or spec.folder.parent / "stress"
+    played = trial.load_trial(spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs)
     with engine_bars(console, [e.name for e in engines]) as progress:
         found = sweeps.stress(
-            subject, engines, demos, setting, folder, properties=properties, repetitions=episodes, progress=progress
+            spec, played, engines, folder, properties=properties, repetitions=episodes, progress=progress
         )
-    sweeps.write_plot(folder / "stress.png", found, f"{subject.label}: what it bears")
-    table = Table("property", title=f"{subject.label}: task progress, and its difference to the same episodes (95 %)")
+    sweeps.write_plot(folder / "stress.png", found, f"{spec.name}: what it bears")
+    table = Table("property", title=f"{spec.name}: task progress, and its difference to the same episodes (95 %)")
     table.add_column("value", justify="right")
     for result in found:
         table.add_column(result.backend, justify="right", no_wrap=True)

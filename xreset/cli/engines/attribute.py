@@ -12,10 +12,10 @@ import tyro
 from xreset.checks import Options
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import DemoError, XResetError
-from xreset.eval import evaluate, trial
+from xreset.eval import policy_spec, trial
 from xreset.eval.engines import attribution, attribution_view
 from xreset.eval.setting import Setting
-from xreset.files import file_hash, write_json
+from xreset.files import write_json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,9 +63,10 @@ def attribute(
     if backend == towards:
         raise XResetError(f"--backend and --towards are both {backend!r}; an engine does not differ from itself.")
     console, demos = Console(), played.demos
-    subject = evaluate.resolve(policy, setting.robot, setting.seed)
+    spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
+    spec.check_seed(setting.seed)
     a, b = (trial.engine(name, device=setting.device) for name in (backend, towards))
-    played_trial, trajectories = subject.episodes(demos, setting)
+    played_trial = trial.load_trial(spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs)
     if unknown := sorted(set(played.object) - set(played_trial.names)):
         raise DemoError(f"{demos} has no {', '.join(unknown)}; it has {', '.join(played_trial.names)}.")
     objects = tuple(o for o in played_trial.objects if o.name in (played.object or played_trial.names))
@@ -73,24 +74,25 @@ def attribute(
     if played.max_demos is not None and played.max_demos < len(chosen):
         chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, played.max_demos).round().astype(int))]
     objects = tuple(o for o in objects if o.name in played_trial.bank.sequence_object[chosen])
-    out, folder = out or subject.folder.parent / "attribute", subject.meshes(setting.objects)
+    out = out or spec.folder.parent / "attribute"
+    folder = played_trial.objects_folder
     with Progress(console) as bar:
         task = bar.add_task("", total=None)
         found = attribution.attribute(
-            lambda: subject.policy(subject.robot, trajectories), a, b, replace(played_trial, objects=objects),
+            lambda: spec.start(played_trial.motion), a, b, replace(played_trial, objects=objects),
             episodes=played.episodes, sequences=chosen, only=only, what_if=what_if,
             progress=lambda run, done, total: bar.update(task, description=run, completed=done, total=total or None),
         )  # fmt: skip
     count = f"{len(found.rows[0].episodes)} episodes of {len(chosen)} demonstrations, seed {setting.seed}"
-    title = f"{subject.label} on {subject.robot.name}: what costs the skill between {backend} and {towards}\n{count}"
+    title = f"{spec.name} on {spec.robot.name}: what costs the skill between {backend} and {towards}\n{count}"
     content = found.as_dict() | {
-        "policy": subject.label,
-        "robot": subject.robot.name,
+        "policy": spec.name,
+        "robot": spec.robot.name,
         "seed": setting.seed,
         "demonstrations": len(chosen),
         "versions": {a.name: a.version, b.name: b.version},
         "objects_folder": str(folder) if folder else None,
-        "inputs": subject.inputs | {"demos": file_hash(demos)},
+        "inputs": played_trial.inputs,
     }
     write_json(out / "attribution.json", content)
     attribution_view.write_plot(out / "attribution.png", found, title)

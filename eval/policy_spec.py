@@ -1,0 +1,130 @@
+"""What a policy's name means: a run folder, an exported file, a policy that ships with xreset, or a baseline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from xreset.description import load_robot
+from xreset.errors import PolicyError
+from xreset.eval.baselines import KinematicRetargeting
+from xreset.files import file_hash
+from xreset.learning.choice import read_choice
+from xreset.learning.run import read_run
+from xreset.policies import results_folder, shipped
+from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
+from xreset.retarget.file import Retargeted
+from xreset.spec import RobotSpec
+from xreset.task.config import TaskConfig
+from xreset.typed import from_dict
+
+BASELINES = ("zero", "random", "ik")
+"""Names of the policies that need no training."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicySpec:
+    """A policy, the robot and the task that it was trained for, and where its results go."""
+
+    name: str
+    start: Callable[[Retargeted | None], Policy]
+    """Makes a fresh policy, one for each engine. Only the baseline ``ik`` needs motion, and follows it."""
+    robot: RobotSpec
+    task: TaskConfig
+    """The task of the training."""
+    folder: Path
+    """Default folder of evaluations; what else is measured of the policy goes next to it."""
+    objects_folder: Path | None = None
+    """Folder of object meshes of the training; None: the stand-ins."""
+    objects: tuple[str, ...] | None = None
+    """Names of the objects of the training; None: a baseline, which was not trained."""
+    hash: str | None = None
+    """SHA-256 of the policy's file; None: a baseline."""
+
+    @property
+    def follows_motion(self) -> bool:
+        """Whether the policy needs the robot's motion."""
+        return self.name == "ik"
+
+    def unseen(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Return the names of objects that the training did not have, sorted; none for a baseline."""
+        return () if self.objects is None else tuple(sorted(set(names) - set(self.objects)))
+
+    def check_seed(self, seed: int) -> None:
+        """Refuse the seed whose starts chose this checkpoint, because a result on them is biased.
+
+        Raises:
+            PolicyError: ``xreset select`` used the seed.
+        """
+        choice = read_choice(self.folder.parent) if self.hash else None
+        if choice is not None and choice.policy_hash == self.hash and choice.seed == seed:
+            raise PolicyError(f"Seed {seed} chose this checkpoint (xreset select). Use another --seed.")
+
+
+def load_policy(policy: str | Path, *, robot: str | Path | None = None, seed: int = 0) -> PolicySpec:
+    """Find the policy that a name means. A file or folder comes before a shipped policy of the same name.
+
+    Args:
+        policy: run folder, exported policy (.onnx), name of a policy that ships with xreset, or one of :data:`BASELINES`.
+        robot: name or folder of the robot; default: the policy's own. Baselines need it.
+        seed: seed of the baseline ``random``.
+
+    Raises:
+        PolicyError: the policy is unknown, or does not fit the robot.
+    """
+    name = str(policy)
+    if name in BASELINES:
+        return _baseline(name, robot, seed)
+    path = Path(policy)
+    objects_folder = None
+    if path.is_dir():
+        from xreset.learning.train import ensure_policy
+
+        run = read_run(path)
+        file = ensure_policy(path)
+        folder = path
+        objects_folder = Path(run.objects) if run.objects else None
+        robot = robot or run.robot
+        name = path.name
+    elif path.suffix == ".onnx" or path.exists():
+        file = path
+        folder = path.parent
+        name = path.stem
+    elif name in shipped():
+        file = shipped()[name]
+        folder = results_folder(name)
+    else:
+        known = ", ".join((*BASELINES, *shipped()))
+        raise PolicyError(f"Unknown policy {name!r}. Give a run folder, a .onnx file, or one of: {known}.")
+    contract = OnnxPolicy(file).contract
+    spec = load_robot(robot or contract["robot"])
+    task = from_dict(TaskConfig, contract["task"], f"{file}: task")
+    check_contract(str(file), contract, spec, task)
+    return PolicySpec(
+        name=name,
+        start=lambda motion: OnnxPolicy(file),
+        robot=spec,
+        task=task,
+        folder=folder / "eval",
+        objects_folder=objects_folder,
+        objects=tuple(contract["objects"]),
+        hash=file_hash(file),
+    )
+
+
+def _baseline(name: str, robot: str | Path | None, seed: int) -> PolicySpec:
+    if robot is None:
+        raise PolicyError(f"The baseline {name!r} needs a robot. Add --robot.")
+    spec = load_robot(robot)
+
+    def start(motion: Retargeted | None) -> Policy:
+        if name == "zero":
+            return ZeroPolicy(len(spec.joints))
+        if name == "random":
+            return RandomPolicy(len(spec.joints), seed)
+        assert motion is not None, "the baseline ik needs motion"
+        return KinematicRetargeting(motion)
+
+    folder = Path("runs") / f"{name}-{spec.name}" / "eval"
+    return PolicySpec(name=name, start=start, robot=spec, task=TaskConfig(), folder=folder)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
 from xreset.checks import Checked, NotNegative, Only, Positive, Rule, Share
+from xreset.learning.schedules import ScheduleConfig
 from xreset.task.config import TaskConfig
 
 Widths = Annotated[tuple[int, ...], Rule("one width or more, each above 0", lambda widths: min(widths, default=0) >= 1)]
@@ -88,6 +89,7 @@ class TrainConfig(Checked):
     task: TaskConfig = field(default_factory=TaskConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     ppo: PpoConfig = field(default_factory=PpoConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     iterations: Positive[int] = 10000
     save_interval: Positive[int] = 50
     """Iterations between checkpoints."""

@@ -26,6 +26,7 @@ from xreset.learning.config import TrainConfig, rsl_rl_config
 from xreset.learning.curves import CurveFile
 from xreset.learning.distributed import Processes
 from xreset.learning.faults import FaultBudget, FaultCounts, dump_faults, too_many_faults
+from xreset.learning.schedules import value_at
 from xreset.text import shown
 
 
@@ -90,12 +91,14 @@ class TrainingRunner(OnPolicyRunner):
                 log.restore(self._log_state)
         saved_at = self.iteration
         budget = FaultBudget(horizon * env.num_envs * self.gpu_world_size)
-        end = time.perf_counter() + seconds
+        begin = time.perf_counter()
+        end = begin + seconds
         with _stop_on_interrupt() as stop:
             while self.iteration < num_learning_iterations and not self._agreed(
                 bool(stop) or time.perf_counter() > end
             ):
                 start = time.perf_counter()
+                self._follow_schedule(max(self.iteration / num_learning_iterations, (start - begin) / seconds))
                 with torch.no_grad():
                     for _ in range(horizon):
                         obs, reward, done, extras = env.step(alg.act(obs))
@@ -120,6 +123,11 @@ class TrainingRunner(OnPolicyRunner):
             self.save_checkpoint(log)
         if log is not None:
             log.close(stopped=self.iteration < num_learning_iterations)
+
+    def _follow_schedule(self, progress: float) -> None:
+        """Set what changes during a run to its values at a share of the run."""
+        if points := self.train_config.schedule.demo_probability:
+            cast(ManipulationEnv, self.env).resets.demo_probability.fill_(value_at(points, progress))
 
     def _agreed(self, stop: bool) -> bool:
         """Whether any process is to stop: then all do, after the same iteration."""

@@ -93,7 +93,7 @@ def start_run(
             f"the engine {backend!r} does not run on {device!r}. Leave out --device, or choose another --backend."
         )
     version = backend_class(backend).engine_version()
-    if config.task.reset.demo_probability > 0 and not inputs.bank.num_states:
+    if uses_bank(config) and not inputs.bank.num_states:
         raise RunError(
             f"{inputs.resets} holds no state to reset to: every candidate was rejected. Look at its reasons (xreset resets), "
             "or train without it: --config.task.reset.demo-probability 0"
@@ -123,6 +123,14 @@ def start_run(
         weights=str(checkpoint) if checkpoint else None,
         weights_hash=file_hash(checkpoint) if checkpoint else None,
     )
+
+
+def uses_bank(config: TrainConfig) -> bool:
+    """Whether a training ever begins episodes with states of the bank."""
+    points = config.schedule.demo_probability
+    if points:
+        return any(value > 0 for _, value in points)
+    return config.task.reset.demo_probability > 0
 
 
 def train(
@@ -272,7 +280,7 @@ def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
         {
             "policy": torch.zeros(1, widths["policy"]),
             "proprio": torch.zeros(1, widths["proprio"]),
-            "perception": torch.zeros(1, o.cloud_history, o.cloud_points, 3),
+            "perception": torch.zeros(1, *o.cloud_shape),
         },
         batch_size=[1],
     )

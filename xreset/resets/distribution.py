@@ -75,6 +75,7 @@ class ResetDistribution:
 
     Attributes:
         joint_pos: [L, J] robot states of the bank.
+        demo_probability: [] share of resets from the bank; a training's schedule writes into it.
     """
 
     def __init__(
@@ -95,6 +96,7 @@ class ResetDistribution:
             DemoError: an object of the scene has no demonstration in the bank.
         """
         self.config = config
+        self.demo_probability = torch.tensor(float(config.demo_probability), device=device)
         if config.pre_contact_only:
             bank = bank.select(pre_contact_only=True)
         missing = [name for name in object_names if name not in bank.sequence_object]
@@ -152,7 +154,7 @@ class ResetDistribution:
             for first, count in ((self._state_first, self._state_count), (self._sequence_first, self._sequence_count))
         )
         row, pick = _evenly(*states, uniform[:, 1]), _evenly(*sequences, uniform[:, 2])
-        from_bank = (uniform[:, 0] < c.demo_probability) & (states[1] > 0)
+        from_bank = (uniform[:, 0] < self.demo_probability) & (states[1] > 0)
         row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
         home = self.home(self._sequence_rows[pick], generator)
         if not len(self.joint_pos):

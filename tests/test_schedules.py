@@ -1,0 +1,48 @@
+"""Settings that change during a run."""
+
+import unittest
+from types import SimpleNamespace
+
+import torch
+
+from xreset.learning.config import TrainConfig
+from xreset.learning.runner import TrainingRunner
+from xreset.learning.schedules import ScheduleConfig, value_at
+from xreset.learning.train import uses_bank
+from xreset.task.config import ResetConfig, TaskConfig
+
+
+class ScheduleTest(unittest.TestCase):
+    def test_values_lie_on_straight_lines_between_the_points(self):
+        points = ((0.2, 0.9), (0.6, 0.5), (1.0, 0.1))
+        for progress, value in ((0.0, 0.9), (0.2, 0.9), (0.4, 0.7), (0.8, 0.3), (1.0, 0.1), (1.5, 0.1)):
+            with self.subTest(progress=progress):
+                self.assertAlmostEqual(value_at(points, progress), value)
+
+    def test_a_schedule_that_ends_before_it_begins_is_refused(self):
+        for points in (((0.5, 0.9), (0.2, 0.1)), ((0.0, 0.9), (0.0, 0.1)), ((0.0, 1.2),), ((-0.1, 0.5),)):
+            with (
+                self.subTest(points=points),
+                self.assertRaisesRegex(ValueError, "each share greater than the one before"),
+            ):
+                ScheduleConfig(demo_probability=points)
+
+    def test_a_training_moves_the_share_of_demonstrated_states(self):
+        resets = SimpleNamespace(demo_probability=torch.tensor(0.5))
+        runner = SimpleNamespace(env=SimpleNamespace(resets=resets), train_config=TrainConfig())
+        TrainingRunner._follow_schedule(runner, 0.5)
+        self.assertEqual(float(resets.demo_probability), 0.5)
+        runner.train_config = TrainConfig(schedule=ScheduleConfig(demo_probability=((0.0, 1.0), (1.0, 0.0))))
+        TrainingRunner._follow_schedule(runner, 0.75)
+        self.assertEqual(float(resets.demo_probability), 0.25)
+
+    def test_a_bank_is_needed_where_its_states_are_used(self):
+        home = TaskConfig(reset=ResetConfig(demo_probability=0.0))
+        later = ScheduleConfig(demo_probability=((0.0, 0.0), (1.0, 0.5)))
+        self.assertTrue(uses_bank(TrainConfig()))
+        self.assertFalse(uses_bank(TrainConfig(task=home)))
+        self.assertTrue(uses_bank(TrainConfig(task=home, schedule=later)))
+
+
+if __name__ == "__main__":
+    unittest.main()

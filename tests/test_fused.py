@@ -29,13 +29,12 @@ class FusedPointNetTest(unittest.TestCase):
         cls.fused = fused
         cls.device = "cuda" if ON_GPU else "cpu"
 
-    def compare(self, clouds: int, dims: list[int], points: int) -> dict[str, float]:
+    def compare(self, clouds: int, dims: list[int], points: int, width: int = 3) -> dict[str, float]:
         """Relative differences of the embeddings and of every gradient."""
         torch.manual_seed(clouds)
-        net = PointNet(dims).to(self.device)
-        cloud = 0.05 * torch.randn(clouds, points, 3, device=self.device) + torch.tensor(
-            [0.5, 0.1, 0.05], device=self.device
-        )
+        net = PointNet(dims, point_width=width).to(self.device)
+        center = torch.linspace(0.5, 0.05, width, device=self.device)
+        cloud = 0.05 * torch.randn(clouds, points, width, device=self.device) + center
         weight = torch.randn(clouds, dims[-1], device=self.device)
         parameters = list(net.parameters())
         with mock.patch.object(self.fused, "FACTORS", torch.bfloat16 if ON_GPU else torch.float32):
@@ -52,12 +51,13 @@ class FusedPointNetTest(unittest.TestCase):
     def test_it_computes_what_the_plain_layers_compute(self):
         # bfloat16 factors move some maxima to another point, and some gradient with them: plain layers in bfloat16 differ as much.
         forward, backward = (6e-3, 8e-2) if ON_GPU else (1e-6, 1e-5)
-        for clouds, dims, points in (
-            (5, [64, 128, 64], 64),
-            (3, [16, 32, 16], 16),
-            (300 if ON_GPU else 2, [32, 32, 64], 32),
+        for clouds, dims, points, width in (
+            (5, [64, 128, 64], 64, 3),
+            (5, [64, 128, 64], 64, 9),
+            (3, [16, 32, 16], 16, 3),
+            (300 if ON_GPU else 2, [32, 32, 64], 32, 3),
         ):
-            for name, difference in self.compare(clouds, dims, points).items():
+            for name, difference in self.compare(clouds, dims, points, width).items():
                 with self.subTest(clouds=clouds, dims=dims, what=name):
                     self.assertLess(difference, forward if name == "embedding" else backward)
 

@@ -389,6 +389,22 @@ class ExportTest(unittest.TestCase):
                 obs = observations(4, seed=t)
                 torch.testing.assert_close(policy.act(obs), self.model(obs).clamp(-1, 1), atol=1e-5, rtol=0)
 
+    def test_paired_points_are_exported_with_their_nine_numbers(self):
+        obs = observations(4)
+        obs["perception"] = torch.randn(4, 1, 10, 9, generator=torch.Generator().manual_seed(1))
+        gaussian = {"class_name": "GaussianDistribution", "std_type": "log"}
+        model = PointNetLstmModel(obs, GROUPS, "actor", A, distribution_cfg=gaussian, **SMALL)
+        task = TaskConfig(observation=ObservationConfig(cloud="paired", cloud_points=10))
+        widths = {"policy": {"all": 7}, "proprio": {"all": 9}, "perception": {"paired_cloud": 10 * 9}}
+        contract = policy_contract(robots.load("openarm"), task, ()) | {
+            "observation_layout": widths,
+            "joint_names": list("abcde"),
+        }
+        file = self.file.with_name("paired.onnx")
+        export_onnx(model, file, contract)
+        with torch.no_grad():
+            torch.testing.assert_close(OnnxPolicy(file).act(obs), model(obs).clamp(-1, 1), atol=1e-5, rtol=0)
+
     def test_begin_forgets(self):
         policy = OnnxPolicy(self.file)
         obs = observations(2)

@@ -132,6 +132,23 @@ class RewardTest(unittest.TestCase):
         position, rotation = 4 * (1 - math.tanh(0.1 / 0.2)), 4 * (1 - math.tanh(math.pi / 3 / 1.5))
         self.assert_terms(reward, grasp=1, position=position, rotation=rotation)
 
+    def test_a_linear_rotation_reward_has_the_same_slope_everywhere(self):
+        config = RewardConfig(rotation_shape="linear", rotation_near=2.0, rotation_near_width=0.3)
+        for degrees in (10, 90, 170):
+            reward = self.reward(
+                config, best_reach=torch.tensor(1e3), tip_force=self.PRESS, object_quat=turned(degrees)
+            )
+            near = 2 * (1 - math.tanh(math.radians(degrees) / 0.3))
+            with self.subTest(degrees=degrees):
+                self.assert_terms(
+                    reward,
+                    grasp=1,
+                    position=4,
+                    rotation=4 * (1 - degrees / 180),
+                    rotation_near=near,
+                    success=10 if degrees < 15 else 0,
+                )
+
     def test_progress_is_paid_in_place_of_presence(self):
         """A press that moves nothing earns nothing, the goal everything, half the way what the formula says, and losing ground costs."""
         config, far, start = RewardConfig(tracking="progress"), torch.tensor(1e3), torch.tensor([0.5, 0.3, -0.2])
@@ -416,6 +433,11 @@ class ResetTest(WithRobot):
             reset = self.distribution(demo_probability=p).sample(self.SOUPS, generator())
             self.assertAlmostEqual(float(reset.from_bank.float().mean()), p, delta=0.03 * (0 < p < 1))
 
+    def test_the_share_of_bank_resets_may_change_between_draws(self):
+        resets = self.distribution(demo_probability=0.0)
+        resets.demo_probability.fill_(1.0)
+        self.assertTrue(bool(resets.sample(self.SOUPS, generator()).from_bank.all()))
+
     def test_bank_resets_are_states_of_the_bank(self):
         bank = toy_bank(self.robot)
         index = torch.tensor([0, 1] * 500)
@@ -623,20 +645,25 @@ class ObservationTest(unittest.TestCase):
             found[:, 12:], torch.stack((self.x.tip_distance.amin(1), self.x.gravity_fraction, self.x.reward), 1)
         )
 
+    def test_paired_cloud(self):
+        config = replace(self.config, cloud="paired", cloud_scale=5.0)
+        points = torch.randn(self.N, 10, 3, generator=generator(1))
+        cloud = obs.cloud_frame(points, self.x, config, generator())
+        self.assertEqual(tuple(cloud.shape), (self.N, 10, 9))
+        now = quat_rotate(self.x.seen_quat[2], points[2, 7]) + self.x.seen_pos[2]
+        goal = quat_rotate(self.x.goal_quat[2], points[2, 7]) + self.x.goal_pos[2]
+        torch.testing.assert_close(cloud[2, 7], 5.0 * torch.cat((now, goal, goal - now)))
+        widths = obs.layout(self.J, self.E, config)["perception"]
+        self.assertEqual(widths, {"paired_cloud": config.cloud_points * 9})
+
     def test_cloud(self):
         points = torch.randn(self.N, 10, 3, generator=generator(1))
-        cloud = obs.cloud_frame(points, self.x.state.object_pos, self.x.state.object_quat, self.config, generator())
+        cloud = obs.cloud_frame(points, self.x, self.config, generator())
         self.assertEqual(tuple(cloud.shape), (self.N, 10, 3))
-        expected = quat_rotate(self.x.state.object_quat[2], points[2, 7]) + self.x.state.object_pos[2]
+        expected = quat_rotate(self.x.seen_quat[2], points[2, 7]) + self.x.seen_pos[2]
         torch.testing.assert_close(cloud[2, 7], expected)
 
-        scaled = obs.cloud_frame(
-            points,
-            self.x.state.object_pos,
-            self.x.state.object_quat,
-            replace(self.config, cloud_scale=5.0),
-            generator(),
-        )
+        scaled = obs.cloud_frame(points, self.x, replace(self.config, cloud_scale=5.0), generator())
         torch.testing.assert_close(scaled, 5.0 * cloud)
 
     def test_rotations_as_columns_of_the_matrix(self):
@@ -672,7 +699,8 @@ class ObservationTest(unittest.TestCase):
         self.assertAlmostEqual(float(proprio[:, self.J : 2 * self.J].std()), 0.1 * 0.2, delta=1e-3)
         self.assertEqual(float(proprio[:, 2 * self.J :].abs().max()), 0.0)
         origin = torch.zeros(1, many, 3)
-        cloud = obs.cloud_frame(origin, torch.zeros(1, 3), IDENTITY[None], c, generator())
+        x = replace(self.x, seen_pos=torch.zeros(1, 3), seen_quat=IDENTITY[None])
+        cloud = obs.cloud_frame(origin, x, c, generator())
         self.assertAlmostEqual(float(cloud.std()), 0.03, delta=0.001)
 
 

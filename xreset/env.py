@@ -150,7 +150,7 @@ class ManipulationEnv:
         self._action, self._previous_action = zeros(self.num_actions), zeros(self.num_actions)
         self._target = zeros(self.num_actions)
         self._best_reach, self._reward, self._time_out = zeros(), zeros(), zeros(dtype=torch.bool)
-        self._cloud = zeros(task.observation.cloud_history, task.observation.cloud_points, 3)
+        self._cloud = zeros(*task.observation.cloud_shape)
         # What a step puts down for the next part of it: which worlds are reset, to what, and which are over and wait for it.
         self._reset_mask, self._over = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self._bad_action = zeros(dtype=torch.bool)
@@ -435,7 +435,7 @@ class ManipulationEnv:
             tip_distance=reading.tip_distance,
             reward=self._reward,
         )
-        frame = obs.cloud_frame(self._cloud_points, seen_pos, seen_quat, c, self.generator)[:, None]
+        frame = obs.cloud_frame(self._cloud_points, x, c, self.generator)[:, None]
         history = torch.cat((self._cloud[:, 1:], frame), dim=1)
         self._cloud.copy_(torch.where(self._reset_mask.view(-1, 1, 1, 1), frame, history))
         groups = {

@@ -215,7 +215,7 @@ class OnnxPolicy:
         layout_, worlds = self.contract["observation_layout"], 2
         shapes = {
             "flat": (worlds, sum(sum(layout_[group].values()) for group in ("policy", "proprio"))),
-            "cloud": (worlds, task.cloud_history, task.cloud_points, 3),
+            "cloud": (worlds, *task.cloud_shape),
             "h_in": (1, worlds, width),
             "c_in": (1, worlds, width),
         }

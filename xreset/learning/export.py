@@ -17,6 +17,8 @@ from xreset.files import atomic_write
 from xreset.learning.model import PointNetLstmModel
 from xreset.learning.shrink import drop_exporter_notes
 from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS
+from xreset.task.config import ObservationConfig
+from xreset.typed import from_dict
 
 
 def export_onnx(actor: PointNetLstmModel, path: str | Path, contract: dict[str, Any]) -> None:
@@ -30,10 +32,12 @@ def export_onnx(actor: PointNetLstmModel, path: str | Path, contract: dict[str, 
     import onnx
 
     policy = actor.as_onnx()
-    history, points = contract["task"]["observation"]["cloud_history"], contract["task"]["observation"]["cloud_points"]
+    observation = from_dict(
+        ObservationConfig, contract["task"]["observation"], "the policy's contract: task.observation"
+    )
     n = 2  # an example batch that is not 1, so that the exporter keeps the world dimension free
     state = torch.zeros(1, n, policy.lstm_dim)  # pyright: ignore[reportArgumentType, reportCallIssue]
-    example = (torch.zeros(n, policy.flat_dim), torch.zeros(n, history, points, 3), state, state.clone())  # pyright: ignore[reportArgumentType, reportCallIssue]
+    example = (torch.zeros(n, policy.flat_dim), torch.zeros(n, *observation.cloud_shape), state, state.clone())  # pyright: ignore[reportArgumentType, reportCallIssue]
     worlds = torch.export.Dim("worlds", min=1, max=65536)
     shapes = ({0: worlds}, {0: worlds}, {1: worlds}, {1: worlds})
     with tempfile.TemporaryDirectory() as folder:

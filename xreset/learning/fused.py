@@ -4,7 +4,7 @@ The plain layers write some 500 values per point to memory and read them back, f
 Here one program takes a cloud through all three layers and the maximum. The backward kernel computes the activations anew and starts from
 the points that were the maximum of a channel: no other point has a gradient.
 
-Letters: F clouds, P points, A, B, C widths of the three layers. :class:`xreset.learning.model.PointNet` is the reference.
+Letters: F clouds, P points, K numbers per point, A, B, C widths of the three layers. :class:`xreset.learning.model.PointNet` is the reference.
 """
 
 # Triton takes plain numbers for its constants; a type checker sees the kernels' own declarations.
@@ -40,35 +40,44 @@ def _elu_slope(activated):
 
 
 @triton.jit
-def _first_layer(cloud, frame, w1, b1, P: tl.constexpr, A: tl.constexpr):
-    """The first layer before its activation [P, A]: three multiplications, no matrix product."""
-    p, a = tl.arange(0, P), tl.arange(0, A)
-    at = cloud + frame * (3 * P) + p * 3
-    x, y, z = tl.load(at), tl.load(at + 1), tl.load(at + 2)
-    wx, wy, wz = tl.load(w1 + a * 3), tl.load(w1 + a * 3 + 1), tl.load(w1 + a * 3 + 2)
-    return x[:, None] * wx[None, :] + y[:, None] * wy[None, :] + z[:, None] * wz[None, :] + tl.load(b1 + a)[None, :]
+def _first_layer(cloud, frame, w1, b1, P: tl.constexpr, K: tl.constexpr, A: tl.constexpr):
+    """The first layer before its activation [P, A]: K multiplications, no matrix product."""
+    p = tl.arange(0, P)
+    a = tl.arange(0, A)
+    point = cloud + frame * (K * P) + p * K
+    total = tl.load(point)[:, None] * tl.load(w1 + a * K)[None, :]
+    for k in tl.static_range(1, K):
+        total += tl.load(point + k)[:, None] * tl.load(w1 + a * K + k)[None, :]
+    return total + tl.load(b1 + a)[None, :]
 
 
 @triton.jit
-def _points(cloud, frame, low, P: tl.constexpr):
-    """[P, 16] x, y, z, 1, then what rounding took from x, y, z. With it sums over points, too, are products of the matrix units."""
-    p, k = tl.arange(0, P), tl.arange(0, 16)
-    exact = tl.load(cloud + frame * (3 * P) + p[:, None] * 3 + (k % 4)[None, :], mask=(k % 4 < 3)[None, :], other=1.0)
+def _points(cloud, frame, low, P: tl.constexpr, K: tl.constexpr, W: tl.constexpr):
+    """[P, W] a point's K numbers, 1, then what rounding took from the numbers, then zeros.
+
+    With these columns, sums over points are products of the matrix units, too.
+    """
+    p = tl.arange(0, P)
+    column = tl.arange(0, W)
+    number = column % (K + 1)
+    at = cloud + frame * (K * P) + p[:, None] * K + number[None, :]
+    exact = tl.load(at, mask=(number < K)[None, :], other=1.0)
     rounded = exact.to(low)
-    rest = tl.where((k < 7)[None, :], exact - rounded.to(tl.float32), 0.0).to(low)
-    return tl.where((k < 4)[None, :], rounded, rest)
+    rest = tl.where((column < 2 * K + 1)[None, :], exact - rounded.to(tl.float32), 0.0).to(low)
+    return tl.where((column < K + 1)[None, :], rounded, rest)
 
 
 @triton.jit
 def _forward(
-    cloud, w1, b1, w2, b2, w3, b3, out, winner, frames, P: tl.constexpr, A: tl.constexpr, B: tl.constexpr, C: tl.constexpr,
+    cloud, w1, b1, w2, b2, w3, b3, out, winner, frames,
+    P: tl.constexpr, K: tl.constexpr, A: tl.constexpr, B: tl.constexpr, C: tl.constexpr,
 ):  # fmt: skip
     a, b, c = tl.arange(0, A), tl.arange(0, B), tl.arange(0, C)
     second = tl.load(w2 + b[None, :] * A + a[:, None])  # [A, B], in the factors' precision
     third = tl.load(w3 + c[None, :] * B + b[:, None])  # [B, C]
     bias2, bias3 = tl.load(b2 + b), tl.load(b3 + c)
     for frame in range(tl.program_id(0), frames, tl.num_programs(0)):
-        z2 = tl.dot(_elu(_first_layer(cloud, frame, w1, b1, P, A)).to(second.dtype), second) + bias2[None, :]
+        z2 = tl.dot(_elu(_first_layer(cloud, frame, w1, b1, P, K, A)).to(second.dtype), second) + bias2[None, :]
         z3 = tl.dot(_elu(z2).to(second.dtype), third)
         best, point = tl.max(z3, axis=0, return_indices=True)
         at = frame * C + c
@@ -79,21 +88,22 @@ def _forward(
 @triton.jit
 def _backward(
     cloud, w1, b1, w2, b2, w3, gradient, winner, d1, d2, db2, d3, frames,
-    P: tl.constexpr, A: tl.constexpr, B: tl.constexpr, C: tl.constexpr, LOWER: tl.constexpr,
+    P: tl.constexpr, K: tl.constexpr, A: tl.constexpr, B: tl.constexpr, C: tl.constexpr,
+    W: tl.constexpr, LOWER: tl.constexpr,
 ):  # fmt: skip
-    """One partial sum per program: of d1 [16, A], d2 [A, B] and db2 [16, B] if LOWER, else of d3 [B, C].
+    """One partial sum per program: of d1 [W, A], d2 [A, B] and db2 [W, B] if LOWER, else of d3 [B, C].
 
     The rows of d1 and db2 are the columns of :func:`_points`. Together the sums would not fit into the registers.
     """
-    a, b, c, p, k = tl.arange(0, A), tl.arange(0, B), tl.arange(0, C), tl.arange(0, P), tl.arange(0, 16)
+    a, b, c, p, k = tl.arange(0, A), tl.arange(0, B), tl.arange(0, C), tl.arange(0, P), tl.arange(0, W)
     second = tl.load(w2 + b[None, :] * A + a[:, None])  # [A, B]
     second_t = tl.load(w2 + b[:, None] * A + a[None, :])  # [B, A]
     third_t = tl.load(w3 + c[:, None] * B + b[None, :])  # [C, B]
     bias2 = tl.load(b2 + b)
-    sum_1, sum_2, sum_b2 = tl.zeros([16, A], tl.float32), tl.zeros([A, B], tl.float32), tl.zeros([16, B], tl.float32)
+    sum_1, sum_2, sum_b2 = tl.zeros([W, A], tl.float32), tl.zeros([A, B], tl.float32), tl.zeros([W, B], tl.float32)
     sum_3 = tl.zeros([B, C], tl.float32)
     for frame in range(tl.program_id(0), frames, tl.num_programs(0)):
-        a1 = _elu(_first_layer(cloud, frame, w1, b1, P, A))
+        a1 = _elu(_first_layer(cloud, frame, w1, b1, P, K, A))
         a1_low = a1.to(second.dtype)
         a2 = _elu(tl.dot(a1_low, second) + bias2[None, :])
         at = frame * C + c
@@ -101,7 +111,7 @@ def _backward(
             tl.load(winner + at).to(tl.int32)[None, :] == p[:, None], tl.load(gradient + at)[None, :], 0.0
         ).to(second.dtype)
         if LOWER:
-            points = tl.trans(_points(cloud, frame, second.dtype, P))
+            points = tl.trans(_points(cloud, frame, second.dtype, P, K, W))
             g2 = (tl.dot(g3, third_t) * _elu_slope(a2)).to(second.dtype)
             sum_b2 = tl.dot(points, g2, sum_b2)
             sum_2 = tl.dot(tl.trans(a1_low), g2, sum_2)
@@ -111,22 +121,22 @@ def _backward(
             sum_3 = tl.dot(tl.trans(a2.to(second.dtype)), g3, sum_3)
     program = tl.program_id(0)
     if LOWER:
-        tl.store(d1 + program * 16 * A + k[:, None] * A + a[None, :], sum_1)
+        tl.store(d1 + program * W * A + k[:, None] * A + a[None, :], sum_1)
         tl.store(d2 + program * A * B + a[:, None] * B + b[None, :], sum_2)
-        tl.store(db2 + program * 16 * B + k[:, None] * B + b[None, :], sum_b2)
+        tl.store(db2 + program * W * B + k[:, None] * B + b[None, :], sum_b2)
     else:
         tl.store(d3 + program * B * C + b[:, None] * C + c[None, :], sum_3)
 
 
 class _FusedPointNet(torch.autograd.Function):
-    """(cloud [F, P, 3], weights and biases of three layers) -> [F, C]. Clouds are observations: they get no gradient."""
+    """(cloud [F, P, K], weights and biases of three layers) -> [F, C]. Clouds are observations: they get no gradient."""
 
     @staticmethod
     def forward(
         ctx: Any, cloud: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor
     ) -> Tensor:
-        frames, points, _ = cloud.shape
-        sizes = {"P": points, "A": len(w1), "B": len(w2), "C": len(w3)}
+        frames, points, width = cloud.shape
+        sizes = {"P": points, "K": width, "A": len(w1), "B": len(w2), "C": len(w3)}
         if cloud.numel() >= 2**31:
             raise ValueError(
                 f"{frames} clouds of {points} points are more than the kernels can address at once; pass fewer"
@@ -150,22 +160,29 @@ class _FusedPointNet(torch.autograd.Function):
         def partial(*shape: int) -> Tensor:
             return torch.empty(programs, *shape, device=cloud.device)
 
-        d1, d2, db2, d3 = partial(16, a), partial(a, b), partial(16, b), partial(b, c)
+        width = ctx.sizes["K"]
+        columns = _columns(width)
+        d1, d2, db2, d3 = partial(columns, a), partial(a, b), partial(columns, b), partial(b, c)
         for lower in (False, True):
             _backward[(programs,)](
                 cloud, w1, b1, low2, b2, low3, gradient, winner, d1, d2, db2, d3, len(cloud),
-                **ctx.sizes, LOWER=lower, **_BACKWARD,
+                **ctx.sizes, W=columns, LOWER=lower, **_BACKWARD,
             )  # fmt: skip
         first = d1.sum(dim=0)
         return (
             None,
-            (first[:3] + first[4:7]).T,
-            first[3],
+            (first[:width] + first[width + 1 : 2 * width + 1]).T,
+            first[width],
             d2.sum(dim=0).T,
-            db2[:, 3].sum(dim=0),
+            db2[:, width].sum(dim=0),
             d3.sum(dim=0).T,
             gradient.sum(dim=0),
         )
+
+
+def _columns(width: int) -> int:
+    """Columns of :func:`_points` for points of ``width`` numbers: the least power of two that holds them, 16 or more."""
+    return max(16, 1 << (2 * width).bit_length())
 
 
 @functools.cache
@@ -185,7 +202,7 @@ def supports(points: int, widths: tuple[int, ...]) -> bool:
 
 
 def fused_pointnet(cloud: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor) -> Tensor:
-    """Embed clouds [..., P, 3] as [..., C]: layers 3 -> A -> B -> C (weights as of ``nn.Linear``) with ELU between, maximum over points.
+    """Embed clouds [..., P, K] as [..., C]: layers K -> A -> B -> C (weights as of ``nn.Linear``) with ELU between, maximum over points.
 
     Matrix products take bfloat16 factors: against the plain layers in float32 the result differs by some 1e-3 of its size.
     """

@@ -1,7 +1,7 @@
 """The paper's network (appendix C, Table VIII): PointNet per cloud frame, LSTM with layer norm, MLP.
 
-Observation groups with two dimensions are flat; groups with four, [N, H, P, 3], are cloud histories. Shape letters: N worlds (or
-sequences), T steps of a rollout, L steps of a sequence, H history (or the LSTM's width), P points, D flat width.
+Observation groups with two dimensions are flat; groups with four, [N, H, P, K], are cloud histories. Shape letters: N worlds (or
+sequences), T steps of a rollout, L steps of a sequence, H history (or the LSTM's width), P points, K numbers per point, D flat width.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ LstmState = tuple[Tensor, Tensor]
 
 
 class PointNet(nn.Module):
-    """Embeds clouds [..., P, 3] as [..., dims[-1]]: the same MLP for every point, then the maximum over points."""
+    """Embeds clouds [..., P, K] as [..., dims[-1]]: the same MLP for every point, then the maximum over points."""
 
-    def __init__(self, dims: list[int], activation: str = "elu") -> None:
-        """Build the per-point MLP 3 -> dims[0] -> ...; no activation after the last layer."""
+    def __init__(self, dims: list[int], activation: str = "elu", point_width: int = 3) -> None:
+        """Build the per-point MLP K -> dims[0] -> ..., K being ``point_width``; no activation after the last layer."""
         super().__init__()
         act = {"elu": nn.ELU, "relu": nn.ReLU}[activation]
         layers: list[nn.Module] = []
-        for i, (width_in, width_out) in enumerate(zip([3, *dims[:-1]], dims, strict=True)):
+        for i, (width_in, width_out) in enumerate(zip([point_width, *dims[:-1]], dims, strict=True)):
             layers += [act()] * (i > 0) + [nn.Linear(width_in, width_out)]
         self.mlp = nn.Sequential(*layers)
         self.use_bfloat16 = False
@@ -36,7 +36,7 @@ class PointNet(nn.Module):
         self._fusible = activation == "elu" and len(dims) == 3
 
     def forward(self, cloud: Tensor) -> Tensor:
-        """[..., P, 3] -> [..., dims[-1]]."""
+        """[..., P, K] -> [..., dims[-1]]."""
         if not (self.use_bfloat16 and cloud.is_cuda):
             return self.mlp(cloud).amax(dim=-2)
         linear = [layer for layer in self.mlp if isinstance(layer, nn.Linear)]
@@ -52,7 +52,7 @@ class PointNet(nn.Module):
 
 
 def embed_sequences(pointnet: PointNet, cloud: Tensor, first: Tensor) -> Tensor:
-    """[L, N, H, embedding] embeddings of cloud histories [L, N, H, P, 3], every distinct frame embedded once.
+    """[L, N, H, embedding] embeddings of cloud histories [L, N, H, P, K], every distinct frame embedded once.
 
     Step t's history is step t-1's, shifted by one, with the newest frame at the end; where an episode begins (``first`` [L, N]) it is H
     copies of the newest. So L steps hold H - 1 + L distinct frames and not L * H: with a horizon of 16 and a history of 5, 20 and not 80.
@@ -115,16 +115,17 @@ class Trunk(nn.Module):
     def __init__(
         self,
         flat_dim: int,
-        history: int,
+        cloud_shape: tuple[int, int, int],
         pointnet_dims: list[int],
         lstm_dim: int,
         activation: str,
         normalizer: nn.Module,
     ) -> None:
-        """Build normaliser, PointNet, LSTM and layer norm."""
+        """Build normaliser, PointNet, LSTM and layer norm for clouds of shape (H, P, K)."""
         super().__init__()
+        history, _, point_width = cloud_shape
         self.normalizer = normalizer
-        self.pointnet = PointNet(pointnet_dims, activation)
+        self.pointnet = PointNet(pointnet_dims, activation, point_width)
         self.lstm = nn.LSTM(flat_dim + history * pointnet_dims[-1], lstm_dim)
         self.norm = nn.LayerNorm(lstm_dim)
 
@@ -137,7 +138,7 @@ class Trunk(nn.Module):
         return torch.cat((self.normalizer(flat).to(dtype), embeddings.flatten(-2).to(dtype)), dim=-1)
 
     def forward(self, flat: Tensor, cloud: Tensor, state: LstmState) -> tuple[Tensor, LstmState]:
-        """One step for N worlds: [N, D], [N, H, P, 3], LSTM state of [1, N, lstm] each -> [N, lstm], new state."""
+        """One step for N worlds: [N, D], [N, H, P, K], LSTM state of [1, N, lstm] each -> [N, lstm], new state."""
         out, state = self.lstm(self.join(flat, self.pointnet(cloud))[None], state)
         return self.norm(out[0]), state
 
@@ -179,9 +180,8 @@ class PointNetLstmModel(MLPModel):
         self.cloud_group = next(group for group in obs_groups[obs_set] if obs[group].ndim == 4)
         super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims, activation, False, distribution_cfg)
         normalizer = EmpiricalNormalization(self.obs_dim) if obs_normalization else nn.Identity()
-        self.trunk = Trunk(
-            self.obs_dim, obs[self.cloud_group].shape[1], list(pointnet_dims), lstm_dim, activation, normalizer
-        )
+        cloud_shape = tuple(obs[self.cloud_group].shape[1:])
+        self.trunk = Trunk(self.obs_dim, cloud_shape, list(pointnet_dims), lstm_dim, activation, normalizer)
         self.trunk.pointnet.use_bfloat16 = bfloat16_clouds
         self.state: LstmState | None = None
         self.reuse_embeddings = False
@@ -218,7 +218,7 @@ class PointNetLstmModel(MLPModel):
         return trunk.norm(out).unflatten(1, (pieces, -1)).transpose(0, 1).flatten(0, 1)
 
     def _embed(self, cloud: Tensor) -> Tensor:
-        """[N, H, embedding] embeddings of the histories [N, H, P, 3] that an environment shows in a rollout."""
+        """[N, H, embedding] embeddings of the histories [N, H, P, K] that an environment shows in a rollout."""
         known, began = self._embeddings, self._began
         if known is None or not self.reuse_embeddings:
             embeddings = self.trunk.pointnet(cloud)
@@ -317,7 +317,7 @@ class ReturnCritic(PointNetLstmModel):
 
 
 class ExportedPolicy(nn.Module):
-    """The deterministic policy: ``(flat [N, D], cloud [N, H, P, 3], h_in, c_in [1, N, lstm]) -> (actions [N, J], h_out, c_out)``."""
+    """The deterministic policy: ``(flat [N, D], cloud [N, H, P, K], h_in, c_in [1, N, lstm]) -> (actions [N, J], h_out, c_out)``."""
 
     def __init__(self, model: PointNetLstmModel) -> None:
         """Copy the parts of a trained model; the copy is on the CPU and in evaluation mode."""

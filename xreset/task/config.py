@@ -61,8 +61,12 @@ class ObservationConfig(Checked):
 
     cloud_points: Positive[int] = 64
     """Points per cloud (P)."""
-    cloud_history: Positive[int] = 5
-    """Frames of cloud history (H), oldest first."""
+    cloud: Literal["history", "paired"] = "history"
+    """What the policy sees of the object's surface points. ``history``: their positions in the last ``cloud_history`` frames (the draft of
+    the paper). ``paired``: for every point its position, its position at the goal, and the goal's minus the present one, in this frame
+    only (the published paper): the error of the pose, point by point."""
+    cloud_history: Annotated[Positive[int], Only("cloud", "history")] = 5
+    """Frames of cloud history, oldest first."""
     rotation: Literal["quaternion", "matrix"] = "quaternion"
     """How orientations are shown: a quaternion with w >= 0, which jumps where w is 0, or the first two columns of the rotation matrix,
     which never do (Zhou et al. 2019, On the Continuity of Rotation Representations)."""
@@ -76,6 +80,13 @@ class ObservationConfig(Checked):
     joint_vel_scale: NotNegative[float] = 0.1
     """Factor on joint velocities [s/rad]."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
+
+    @property
+    def cloud_shape(self) -> tuple[int, int, int]:
+        """Shape of one world's cloud: frames (H), points (P), numbers per point (K)."""
+        if self.cloud == "paired":
+            return 1, self.cloud_points, 9
+        return self.cloud_history, self.cloud_points, 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +113,14 @@ class RewardConfig(Checked):
     position_width: Annotated[Positive[float], Only("tracking", "presence")] = 0.2
     """[m]"""
     rotation: Annotated[Finite[float], Only("tracking", "presence")] = 4.0
-    rotation_width: Annotated[Positive[float], Only("tracking", "presence")] = 1.5
+    rotation_shape: Annotated[Literal["tanh", "linear"], Only("tracking", "presence")] = "tanh"
+    """How ``rotation`` falls with the angle to the goal. ``tanh``: 1 - tanh(angle / ``rotation_width``) (the paper), which is flat beyond a
+    right angle. ``linear``: 1 - angle / pi, which has the same slope everywhere."""
+    rotation_width: Annotated[Positive[float], Only("rotation_shape", "tanh")] = 1.5
+    """[rad]"""
+    rotation_near: Annotated[Finite[float], Only("tracking", "presence")] = 0.0
+    """Weight of a second rotation term, 1 - tanh(angle / ``rotation_near_width``), which pays for the last degrees."""
+    rotation_near_width: Positive[float] = 0.3
     """[rad]"""
     progress: Annotated[Finite[float], Only("tracking", "progress")] = 8.0
     """Paid in full at the goal, nothing at the start, and less than nothing farther away."""

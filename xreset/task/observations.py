@@ -2,12 +2,13 @@
 
 Groups: ``policy`` (object pose, goal pose, gravity fraction, previous action), ``proprio`` (joints, palm, fingertips, contact forces),
 ``perception`` (cloud history) and, for the critic only, ``privileged``.
-Shape letters: N worlds, J joints, E fingertips, P points, H history.
+Shape letters: N worlds, J joints, E fingertips, P points, K numbers per point, H history.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import prod
 
 import torch
 from torch import Tensor
@@ -56,7 +57,7 @@ class ObservationInput:
 def layout(num_joints: int, num_tips: int, c: ObservationConfig) -> dict[str, dict[str, int]]:
     """Width of every term of the flat groups, in order; a policy fits a task only if this is equal.
 
-    ``perception`` is listed with its number of values H * P * 3.
+    ``perception`` is listed with its number of values H * P * K.
     """
     turn, width = ("quat", 4) if c.rotation == "quaternion" else ("rotation", 6)
     return {
@@ -79,7 +80,7 @@ def layout(num_joints: int, num_tips: int, c: ObservationConfig) -> dict[str, di
             "tip_force": 3 * num_tips,
             **({"joint_target": num_joints} if c.joint_target else {}),
         },
-        "perception": {"cloud": c.cloud_history * c.cloud_points * 3},
+        "perception": {"cloud" if c.cloud == "history" else "paired_cloud": prod(c.cloud_shape)},
     }
 
 
@@ -133,12 +134,17 @@ def privileged_group(x: ObservationInput) -> Tensor:
     )
 
 
-def cloud_frame(
-    points: Tensor, object_pos: Tensor, object_quat: Tensor, c: ObservationConfig, generator: torch.Generator
-) -> Tensor:
-    """[N, P, 3] the object's points [N, P, 3] (object frame) in the world frame, with noise, times ``cloud_scale``."""
-    cloud = quat_rotate(object_quat[:, None], points) + object_pos[:, None]
-    return c.cloud_scale * (cloud + c.noise.cloud * _normal(cloud, generator))
+def cloud_frame(points: Tensor, x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
+    """[N, P, K] one frame of the object's points [N, P, 3] (object frame) in the world frame, times ``cloud_scale``.
+
+    The present positions are noisy. With ``cloud="paired"`` the goal positions and the differences follow them.
+    """
+    cloud = quat_rotate(x.seen_quat[:, None], points) + x.seen_pos[:, None]
+    cloud = cloud + c.noise.cloud * _normal(cloud, generator)
+    if c.cloud == "history":
+        return c.cloud_scale * cloud
+    goal = quat_rotate(x.goal_quat[:, None], points) + x.goal_pos[:, None]
+    return c.cloud_scale * torch.cat((cloud, goal, goal - cloud), dim=-1)
 
 
 def _normal(like: Tensor, generator: torch.Generator) -> Tensor:

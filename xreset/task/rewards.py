@@ -130,6 +130,13 @@ def progress(x: RewardInput, c: RewardConfig) -> Tensor:
     return (farthest - far) / farthest
 
 
+def rotation_closeness(angle: Tensor, c: RewardConfig) -> Tensor:
+    """[N] 1 at the goal, falling with the angle to it [rad]."""
+    if c.rotation_shape == "linear":
+        return 1.0 - angle / torch.pi
+    return 1.0 - torch.tanh(angle / c.rotation_width)
+
+
 def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     """The reward of one control step."""
     grasped = contact_gate(x.tip_force, c.contact_threshold)
@@ -144,7 +151,8 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     else:
         tracking = {
             "position": c.position * gate_f * (1.0 - torch.tanh(position_error / c.position_width)),
-            "rotation": c.rotation * gate_f * (1.0 - torch.tanh(rotation_error / c.rotation_width)),
+            "rotation": c.rotation * gate_f * rotation_closeness(rotation_error, c),
+            "rotation_near": c.rotation_near * gate_f * (1.0 - torch.tanh(rotation_error / c.rotation_near_width)),
         }
     terms = {
         "reach": c.reach * (1.0 - torch.tanh(reach / c.reach_width)),

@@ -1,10 +1,12 @@
 import dataclasses
+import os
 import tempfile
 import unittest
 from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
 
 from tests.toy_robot import toy_hand_arm, write_urdf
 from xreset import robots
@@ -12,7 +14,10 @@ from xreset.backends.conformance.scene import gripper
 from xreset.errors import RobotError
 from xreset.geometry.dynamics import drive_shares, mass_matrix
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.urdf import load_urdf
 from xreset.spec import DriveSpec, JointSpec
+
+FIXED = '<joint name="{name}" type="fixed"><parent link="base"/><child link="{child}"/><!----></joint>'
 
 
 class DriveSharesTest(unittest.TestCase):
@@ -33,6 +38,66 @@ class DriveSharesTest(unittest.TestCase):
     def test_without_mimic_joints_a_drive_is_its_joints_own(self):
         robot = robots.load("ur7e-sharpa")
         np.testing.assert_array_equal(drive_shares(robot), np.eye(len(robot.joints)))
+
+
+class UrdfTest(unittest.TestCase):
+    def setUp(self):
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+
+    def urdf(self, *parts: str) -> Path:
+        path = self.folder / "robot.urdf"
+        path.write_text(f'<robot name="toy"><link name="base"/>{"".join(parts)}</robot>')
+        return path
+
+    def test_a_changed_mesh_is_read_again(self):
+        mesh = self.folder / "box.stl"
+        trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)
+        shape = '<collision><geometry><mesh filename="box.stl"/></geometry></collision>'
+        path = self.urdf(f'<link name="end">{shape}</link>', FIXED.format(name="j", child="end"))
+        self.assertIs(load_urdf(path), load_urdf(path))
+        trimesh.creation.box((0.3, 0.1, 0.1)).export(mesh)
+        os.utime(mesh, ns=(1, 1))
+        vertices = np.asarray(load_urdf(path).link("end").collisions[0].geometry.vertices)
+        self.assertAlmostEqual(np.ptp(vertices[:, 0]), 0.3)
+
+    def test_shapes_and_defaults(self):
+        shapes = '<box size="2 4 6"/>', '<sphere radius="1"/>', '<cylinder radius="1" length="4"/>'
+        collisions = "".join(
+            f'<collision><origin xyz="1 2 3" rpy="0 0 {np.pi / 2}"/><geometry>{shape}</geometry></collision>'
+            for shape in (*shapes, '<capsule radius="1" length="4"/>')
+        )
+        joint = FIXED.format(name="j", child="end").replace("fixed", "continuous")
+        tree = load_urdf(self.urdf(f'<link name="end">{collisions}</link>', joint))
+        found = [(shape.geometry.kind, shape.geometry.size) for shape in tree.link("end").collisions]
+        kinds = [("box", (1, 2, 3)), ("sphere", (1,)), ("cylinder", (1, 2)), ("capsule", (1, 2))]
+        self.assertEqual(found, kinds)
+        turned = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+        np.testing.assert_allclose(tree.link("end").collisions[0].T_body_shape, turned, atol=1e-12)
+        joint = tree.joint("j")
+        self.assertEqual((joint.type, joint.lower, joint.upper), ("revolute", -np.inf, np.inf))
+        np.testing.assert_array_equal(joint.axis, (1, 0, 0))
+        self.assertEqual(tree.link("end").mass, 0)
+
+    def test_what_is_no_tree_of_links_is_refused(self):
+        link = '<link name="end"/>'
+        joint = FIXED.format(name="j", child="end")
+        for parts, message in (
+            ((link, link, joint), "occurs twice"),
+            ((link,), "expected one root link, found 2"),
+            ((joint,), "names link 'end'"),
+            ((link, joint, joint), "child of two joints"),
+            ((link, joint.replace("fixed", "floating")), "type 'floating'"),
+            ((link, '<joint name="j" type="fixed"/>'), "no parent link"),
+            ((link, joint.replace('name="j"', "")), "KeyError"),
+            ((link.replace("end", "e&#155;d"),), "control characters"),
+            ((link, joint.replace("fixed", "revolute").replace("<!---->", '<axis xyz="1 0"/>')), "expected 3 numbers"),
+            (
+                (link, joint.replace("fixed", "revolute").replace("<!---->", '<axis xyz="0 0 0"/>')),
+                "expected a direction",
+            ),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(RobotError, message):
+                load_urdf(self.urdf(*parts))
 
 
 class KinematicsTest(unittest.TestCase):

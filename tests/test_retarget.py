@@ -26,7 +26,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_multiply, quat_rotate, quat_to_matrix
 from xreset.geometry.shapes import box, half_spaces, hull, shape_mesh, surface_of
 from xreset.geometry.solids import link_field, signed_distance
-from xreset.geometry.surface import Surface, keypoint_contacts, solid_nodes
+from xreset.geometry.surface import Surface, keypoint_contacts
 from xreset.retarget import pipeline as pipeline_module
 from xreset.retarget.arm import cost as arm_cost
 from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, track
@@ -117,16 +117,6 @@ class SurfaceTest(unittest.TestCase):
         self.assertAlmostEqual(
             distance.item(), -0.03, delta=2.1e-3
         )  # to the outer faces, not to the ends of the boxes at x = +-0.02
-
-    def test_solid_nodes_survive_a_missing_triangle(self):
-        whole = box_object(((0, 0, 0), (0.1, 0.1, 0.1)))
-        triangles = whole.vertices[whole.faces]
-        axes = [np.linspace(-0.08, 0.08, 33)] * 3
-        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        expected = (np.abs(nodes) < 0.05 - 1e-9).all(axis=-1)
-        edge = (np.abs(np.abs(nodes) - 0.05) < 1e-6).any(axis=-1)  # nodes in a face belong to either side
-        for mesh in (triangles, triangles[1:]):
-            self.assertTrue((solid_nodes(mesh, axes) == expected)[~edge].all())
 
     def test_contacts_need_annotation_and_nearness(self):
         quat = np.array([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])  # x of the object is y of the world

@@ -302,7 +302,7 @@ class Registry(unittest.TestCase):
             _, found = check_description("openarm")
         mimics = [(f.level, f.message) for f in found if f.topic == "mimic joints"]
         self.assertEqual(mimics[0], ("warning", "first"))
-        self.assertRegex(mimics[1][1], "has no joint 'nowhere'; it has joint1")
+        self.assertRegex(mimics[1][1], "has no joint 'nowhere'. Choose from: joint1")
         self.assertEqual([f.level for f in found if f.topic in ("links", "inertias")], ["ok", "ok"])
 
     def test_check_finds_an_indefinite_inertia_and_a_missing_mass(self):

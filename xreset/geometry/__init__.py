@@ -1,1 +1,2 @@
-"""Rotations, kinematic trees, shapes, surfaces and distances: what lies beneath objects, robots, retargeting and engines."""
+"""Rotations, kinematic trees, shapes, surfaces and distances: what lies beneath objects, robots, retargeting and
+engines."""

@@ -1,13 +1,15 @@
-"""A hand as balls: what keeps it out of the object, the table and itself while it is being retargeted.
+"""A hand as balls, which keep it out of the object, the table and itself while it is retargeted.
 
-Balls make distances and their derivatives cheap over whole trajectories. They are exact for capsules and spheres, and inscribed in other
-shapes; smaller ones lie under the surface that those do not reach, and balls of radius 0 stand for edges and corners. What they miss is
-for the exact checks that follow (coal, then physics).
+Balls make distances and their derivatives cheap over whole trajectories. They are exact for capsules and spheres, and
+inscribed in other shapes. Smaller balls lie under the surface that those do not reach, and balls of radius 0 stand for
+edges and corners. What the balls miss, the exact checks that follow find (coal, then physics).
+
+Shape letters: Q balls, G links with balls, R guards, K clusters, H pairs of links.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence, Sized
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from itertools import product
 
@@ -25,29 +27,29 @@ from xreset.spec import Geometry, RobotSpec, Shape
 from xreset.tensors import Tensors
 
 SPACING = 4e-3
-"""[m] Balls need not be closer to each other than this, however thin the shape: from 2.8 mm on they leave no hole, and thinner ones lack no
-more than their own thickness."""
+"""Balls need not be closer than this, however thin the shape [m]. From a radius of 2.8 mm on they leave no hole;
+thinner shapes lack no more than their own thickness."""
 BARE = 2.5e-3
-"""[m] Where a shape's surface is farther than this from the balls that fill it, smaller ones lie under it. A box of 5 x 14 x 4 cm is bare
-up to 8 mm deep near its edges: enough for a banana."""
+"""Smaller balls are added where the surface of a shape is farther than this from the balls that fill it [m]. Without
+them a box of 5 x 14 x 4 cm would be bare up to 8 mm deep near its edges, enough for a banana to sink in."""
 APART = 6e-3
-"""[m] Balls of one link that keep out of others are no nearer to each other."""
+"""Smallest distance between the balls of one link that keep out of other links [m]."""
 STAND_IN = 3.5e-3
-"""[m] Such a ball is that much larger where others are left out for it. Edges that cross between two balls are deeper in each other than
-any ball, and the exact test takes how far two shapes must be moved to part: with this the LEAP hand loses 1 % of its frames to that test,
-without it 90 %."""
+"""Such a ball is larger by this where it stands for others nearby [m]. Where edges cross between two balls they are
+deeper in each other than any ball, and the exact test measures how far two shapes must move to separate. With this
+value the LEAP hand loses 1 % of its frames to that test, without it 90 %."""
 
 _CLUSTER = 16
-"""Most balls that are ruled out together, by a ball about them."""
-_INWARD = 8
-"""Steps by which a point of a surface moves inwards from one face after the other."""
+"""Most balls in a cluster."""
+_INWARD_STEPS = 8
+"""Steps that move a point of a surface inwards from one face after the other."""
 _ROWS = {"cpu": 200_000, "cuda": 8_000_000}
-"""Balls looked at in one go: on a CPU what fits its caches."""
+"""Rows that are processed at once: on a CPU as many as fit its caches."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Spans(Tensors):
-    """Groups of consecutive rows of a table (G in number)."""
+    """Groups of consecutive rows of a table (G groups)."""
 
     start: Tensor
     """[G] first row of each group."""
@@ -55,30 +57,32 @@ class Spans(Tensors):
     """[G] number of its rows."""
 
     @staticmethod
-    def of(parts: Sequence[Sized]) -> Spans:
-        """Of groups whose members follow one another."""
-        counts = torch.tensor([len(part) for part in parts], dtype=torch.long)
+    def of(groups: Iterable[Sized]) -> Spans:
+        """Return the spans of groups whose members follow one another."""
+        counts = torch.tensor([len(group) for group in groups], dtype=torch.long)
         return Spans(start=counts.cumsum(0) - counts, count=counts)
 
     def members(self, groups: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """All rows of some groups [C], in pieces that bound the memory: for each row, the place [A] in ``groups`` that asks for it,
-        ascending, and the row [A] itself."""
+        """Iterate over all rows of some groups [C], in pieces that bound the memory.
+
+        Each piece has, for A rows, the positions [A] in ``groups``, ascending, and the rows [A].
+        """
+        device = groups.device
         counts = self.count[groups]
         ends = counts.cumsum(0)
-        piece = (ends - 1).div(_ROWS[groups.device.type], rounding_mode="floor")
-        for places in torch.arange(len(groups), device=groups.device).split(
-            torch.unique_consecutive(piece, return_counts=True)[1].tolist()
-        ):
-            asking = torch.repeat_interleave(places, counts[places])
-            within = (
-                torch.arange(len(asking), device=groups.device) - (ends - counts)[asking] + (ends - counts)[places[0]]
-            )
-            yield asking, self.start[groups][asking] + within
+        piece = (ends - 1).div(_ROWS[device.type], rounding_mode="floor")
+        _, sizes = torch.unique_consecutive(piece, return_counts=True)
+        for positions in torch.arange(len(groups), device=device).split(sizes.tolist()):
+            position = torch.repeat_interleave(positions, counts[positions])
+            begin = ends - counts
+            within = torch.arange(len(position), device=device) - begin[position] + begin[positions[0]]
+            yield position, self.start[groups][position] + within
 
 
 @dataclass(frozen=True, kw_only=True)
 class Clusters(Tensors):
-    """Rows of a table that lie near each other, with a ball about each such cluster (K in number): what is far from it is far from all."""
+    """Rows of a table that are near each other, each cluster with a ball around it: what is far from that ball is far
+    from all."""
 
     centers: Tensor
     """[K, 3] in the link's frame."""
@@ -87,127 +91,160 @@ class Clusters(Tensors):
     of_link: Spans
     """[G] the clusters of each link."""
     spans: Spans
-    """[K] the places of each cluster's rows in ``rows``."""
+    """[K] the part of ``rows`` that belongs to each cluster."""
     rows: Tensor
     """Rows of the table, cluster after cluster."""
 
     @staticmethod
     def of(centers: Sequence[np.ndarray], radii: Sequence[np.ndarray]) -> Clusters:
-        """Clusters of balls, given by link: centres [n, 3] in its frame and radii [n] of rows that follow one another."""
-        parts = [_halved(own) for own in centers]
-        first = np.cumsum([0, *map(len, radii)])
-        rows = [part + start for own, start in zip(parts, first, strict=False) for part in own]
-        balls = [
-            bounding_ball(c[part], r[part]) for c, r, own in zip(centers, radii, parts, strict=True) for part in own
-        ]
+        """Cluster balls that are given by link: centers [n, 3] in its frame and radii [n] of rows that follow one
+        another."""
+        own_centers = []
+        own_radii = []
+        rows = []
+        of_link = []
+        first = 0
+        for link_centers, link_radii in zip(centers, radii, strict=True):
+            parts = _halved(link_centers, np.arange(len(link_centers)))
+            of_link.append(parts)
+            for part in parts:
+                rows.append(part + first)
+                own_centers.append(link_centers[part])
+                own_radii.append(link_radii[part])
+            first += len(link_radii)
+        bound_centers, bound_radii = bounding_balls(own_centers, own_radii)
         return Clusters(
-            centers=torch.as_tensor(np.array([middle for middle, _ in balls]).reshape(-1, 3)),
-            radii=torch.as_tensor(np.array([radius for _, radius in balls])),
-            of_link=Spans.of(parts),
+            centers=bound_centers,
+            radii=bound_radii,
+            of_link=Spans.of(of_link),
             spans=Spans.of(rows),
-            rows=torch.as_tensor(np.concatenate([np.zeros(0, dtype=np.int64), *rows])),
+            rows=_joined(rows).long(),
         )
 
     def members(self, clusters: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """All rows of some clusters [C], as :meth:`Spans.members` has them."""
-        for asking, place in self.spans.members(clusters):
-            yield asking, self.rows[place]
+        """Iterate over all rows of some clusters [C]: see :meth:`Spans.members`."""
+        for position, place in self.spans.members(clusters):
+            yield position, self.rows[place]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Balls(Tensors):
-    """Balls fixed to the links of a hand, and those links as solids that the balls of others stay out of: Q balls on G links."""
+    """Balls fixed to the links of a hand, and those links as solids that the balls of other links stay out of."""
 
     links: tuple[str, ...]
-    """The links that carry balls (length G)."""
+    """Links that carry balls (length G)."""
     clusters: Clusters
-    """Of the balls."""
+    """Clusters of the balls."""
     link: Tensor
-    """[Q] each ball's link, as an index of ``links``: ascending."""
+    """[Q] link of each ball, as an index of ``links``: ascending."""
     centers: Tensor
     """[Q, 3] in the link's frame."""
     radii: Tensor
     """[Q]"""
     bound_centers: Tensor
-    """[G, 3] centre, in the link's frame, of a ball about all of the link's balls."""
+    """[G, 3] center, in the link's frame, of a ball around all balls of the link."""
     bound_radii: Tensor
     """[G]"""
     guards: Tensor
-    """[R] the balls that keep out of other links, none nearer than :data:`APART` to another of its link."""
+    """[R] balls that keep out of other links; two of one link are at least :data:`APART` apart."""
     guard_radii: Tensor
-    """[R] their radii there: larger where they stand for others."""
+    """[R] their radii against other links: larger where they stand for other balls."""
     guard_clusters: Clusters
-    """Of the guards."""
+    """Clusters of the guards."""
     fields: DistanceFields
     """Signed distances to the G links, in their frames."""
     link_pairs: Tensor
-    """[H, 2] pairs of links, as indices of ``links``: the guards of the first keep out of the second. Each pair is there both ways."""
+    """[H, 2] pairs of links, as indices of ``links``: the guards of the first keep out of the second. Each pair occurs
+    both ways."""
 
 
 def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> Balls:
-    """The balls of a hand.
+    """Fill a hand with balls.
 
     Args:
         robot: the robot.
         hand: kinematics of its hand.
         collision: decides which links must not overlap.
     """
-    links = [name for name in hand.link_names if hand.tree.link(name).collisions]
-    balls = [
-        [np.concatenate(part) for part in zip(*map(shape_balls, hand.tree.link(name).collisions), strict=True)]
-        for name in links
-    ]
-    centers, radii = [part[0] for part in balls], [part[1] for part in balls]
-    guards = [_apart(c, r, APART) for c, r in zip(centers, radii, strict=True)]
-    stand_in = [_near_others(c, g) for c, g in zip(centers, guards, strict=True)]
-    guard_radii = [r[g] + STAND_IN * s for r, g, s in zip(radii, guards, stand_in, strict=True)]
-    first = np.cumsum([0, *map(len, radii)])
-    bounds = [bounding_ball(c, r) for c, r in zip(centers, radii, strict=True)]
-    named = [(hand.link_names[a], hand.link_names[b]) for a, b in collision.link_pairs]
-    link_pairs = [(links.index(a), links.index(b)) for a, b in named if {a, b} <= set(links)]
+    links: list[str] = []
+    centers = []
+    radii = []
+    fields = []
+    guards = []
+    guard_centers = []
+    guard_radii = []
+    first = 0
+    for name in hand.link_names:
+        shapes = hand.tree.link(name).collisions
+        if not shapes:
+            continue
+        balls = [shape_balls(shape) for shape in shapes]
+        own_centers = np.concatenate([ball_centers for ball_centers, _ in balls])
+        own_radii = np.concatenate([ball_radii for _, ball_radii in balls])
+        chosen = _apart(own_centers, own_radii, APART)
+        gaps = np.linalg.norm(own_centers[chosen][:, None] - own_centers, axis=-1)
+        has_neighbor = (gaps <= APART).sum(axis=1) > 1
+        links.append(name)
+        centers.append(own_centers)
+        radii.append(own_radii)
+        guards.append(chosen + first)
+        guard_centers.append(own_centers[chosen])
+        guard_radii.append(own_radii[chosen] + STAND_IN * has_neighbor)
+        fields.append(link_field(shapes))
+        first += len(own_radii)
+    pairs = []
+    for pair in collision.link_pairs:
+        names = [hand.link_names[index] for index in pair]
+        if set(names) <= set(links):
+            pairs.append([links.index(name) for name in names])
+    both_ways = np.array([*pairs, *(pair[::-1] for pair in pairs)], dtype=np.int64)
+    bound_centers, bound_radii = bounding_balls(centers, radii)
     return Balls(
         links=tuple(links),
         clusters=Clusters.of(centers, radii),
-        link=torch.repeat_interleave(
-            torch.arange(len(links)), torch.tensor([len(part) for part in radii], dtype=torch.long)
-        ),
-        centers=torch.as_tensor(np.concatenate([np.zeros((0, 3)), *centers])),
-        radii=torch.as_tensor(np.concatenate([np.zeros(0), *radii])),
-        bound_centers=torch.as_tensor(np.array([middle for middle, _ in bounds]).reshape(-1, 3)),
-        bound_radii=torch.as_tensor(np.array([radius for _, radius in bounds])),
-        guards=torch.as_tensor(
-            np.concatenate([np.zeros(0, dtype=np.int64), *(g + f for g, f in zip(guards, first, strict=False))])
-        ),
-        guard_radii=torch.as_tensor(np.concatenate([np.zeros(0), *guard_radii])),
-        guard_clusters=Clusters.of([c[g] for c, g in zip(centers, guards, strict=True)], guard_radii),
-        fields=DistanceFields.join([link_field(hand.tree.link(name).collisions) for name in links]),
-        link_pairs=torch.as_tensor(
-            np.array([*link_pairs, *((b, a) for a, b in link_pairs)], dtype=np.int64).reshape(-1, 2)
-        ),
+        link=torch.as_tensor(np.repeat(np.arange(len(links)), [len(own) for own in radii])),
+        centers=_joined(centers, 3),
+        radii=_joined(radii),
+        bound_centers=bound_centers,
+        bound_radii=bound_radii,
+        guards=_joined(guards).long(),
+        guard_radii=_joined(guard_radii),
+        guard_clusters=Clusters.of(guard_centers, guard_radii),
+        fields=DistanceFields.join(fields),
+        link_pairs=torch.as_tensor(both_ways.reshape(-1, 2)),
     )
 
 
-def bounding_ball(centers: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, float]:
-    """A ball about balls at centres [n, 3] of radii [n]: its centre, the middle of the box about theirs, and its radius."""
-    middle = (centers.max(axis=0) + centers.min(axis=0)) / 2
-    return middle, float((np.linalg.norm(centers - middle, axis=1) + radii).max())
+def _joined(parts: Sequence[np.ndarray], *shape: int) -> Tensor:
+    """[n, *shape] all parts in one tensor, even if there is none."""
+    return torch.as_tensor(np.concatenate([np.zeros((0, *shape)), *parts]))
 
 
-def _halved(centers: np.ndarray) -> list[np.ndarray]:
-    """Some points [n, 3], halved across their longest side until no part has more than :data:`_CLUSTER`: those of each part, ascending."""
-    parts, todo = [], [np.arange(len(centers))] if len(centers) else []
-    while todo:
-        part = todo.pop()
-        if len(part) <= _CLUSTER:
-            parts.append(part)
-            continue
-        along = centers[part][:, np.ptp(centers[part], axis=0).argmax()].argsort(kind="stable")
-        todo += [np.sort(part[along[len(part) // 2 :]]), np.sort(part[along[: len(part) // 2]])]
-    return parts
+def bounding_balls(centers: Sequence[np.ndarray], radii: Sequence[np.ndarray]) -> tuple[Tensor, Tensor]:
+    """Return centers [G, 3] and radii [G] of one ball around each of G groups of balls, centers [n, 3] and radii
+    [n]."""
+    middles = []
+    reaches = []
+    for own_centers, own_radii in zip(centers, radii, strict=True):
+        middle = (own_centers.max(axis=0) + own_centers.min(axis=0)) / 2
+        middles.append(middle)
+        reaches.append((np.linalg.norm(own_centers - middle, axis=1) + own_radii).max())
+    return torch.as_tensor(np.array(middles).reshape(-1, 3)), torch.tensor(reaches, dtype=torch.float64)
+
+
+def _halved(centers: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
+    """Halve some rows of points [n, 3] across their longest side until no part has more than :data:`_CLUSTER`."""
+    if len(rows) <= _CLUSTER:
+        return [rows]
+    axis = np.ptp(centers[rows], axis=0).argmax()
+    ordered = rows[centers[rows, axis].argsort(kind="stable")]
+    half = len(rows) // 2
+    return _halved(centers, np.sort(ordered[:half])) + _halved(centers, np.sort(ordered[half:]))
 
 
 def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray:
-    """Which of some balls, the largest first, are farther from each other than ``spacing``; ascending."""
+    """Choose balls that are farther from each other than ``spacing``, larger ones first; return their rows,
+    ascending."""
     kept: list[int] = []
     for ball in np.argsort(-radii, kind="stable").tolist():
         if not kept or np.linalg.norm(centers[kept] - centers[ball], axis=1).min() > spacing:
@@ -215,43 +252,46 @@ def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray
     return np.sort(np.array(kept, dtype=np.int64))
 
 
-def _near_others(centers: np.ndarray, guards: np.ndarray) -> np.ndarray:
-    """[R] whether another of the balls at centres [n, 3] is nearer than :data:`APART` to each of some of them."""
-    return np.array(
-        [(np.linalg.norm(centers - centers[ball], axis=1) <= APART).sum() > 1 for ball in guards], dtype=bool
-    )
-
-
 def inscribed_balls(geometry: Geometry) -> tuple[np.ndarray, float]:
-    """Balls inside a shape that fill it well: centres [n, 3] in the shape's frame and their radius.
+    """Fill a shape with balls: centers [n, 3] in the shape's frame and their radius.
 
-    A capsule or a long cylinder gets a row along its axis, a sphere itself. A box gets layers of balls as thick as its thinnest side, as
-    far apart as their radius or :data:`SPACING`; so does a flat cylinder, through the square in its rim, and a hull, through the box about
-    it shrunk to the hull's volume.
+    A capsule or a long cylinder gets a row along its axis, a sphere itself. A box gets layers of balls as thick as its
+    thinnest side, at distances of their radius or :data:`SPACING`. A flat cylinder is filled like the box through the
+    square in its rim, a hull like the box around it, shrunk to the hull's volume.
     """
+    size = np.array(geometry.size)
+    center = np.zeros(3)
     if geometry.kind == "sphere":
-        return np.zeros((1, 3)), geometry.size[0]
-    if geometry.kind == "capsule" or (geometry.kind == "cylinder" and geometry.size[1] >= geometry.size[0]):
-        radius, half = geometry.size
-        return _grid((0.0, 0.0, half if geometry.kind == "capsule" else half - radius), radius), radius
-    if geometry.kind == "cylinder":
-        radius, half = geometry.size
-        center, sides = np.zeros(3), np.array((radius * 0.5**0.5, radius * 0.5**0.5, half))
-    elif geometry.kind == "box":
-        center, sides = np.zeros(3), np.array(geometry.size)
-    else:
+        return center[None], geometry.size[0]
+    if geometry.kind == "hull":
         points, _ = support_points(geometry)
-        low, high = points.min(axis=0), points.max(axis=0)
-        center, sides = (
-            (low + high) / 2,
-            (high - low) / 2 * (ConvexHull(points).volume / np.prod(high - low)) ** (1 / 3),
-        )
+        low = points.min(axis=0)
+        high = points.max(axis=0)
+        center = (low + high) / 2
+        sides = (high - low) / 2 * (ConvexHull(points).volume / np.prod(high - low)) ** (1 / 3)
+    elif geometry.kind == "box":
+        sides = size
+    else:
+        radius, half = geometry.size
+        if geometry.kind == "capsule":
+            return _grid((0.0, 0.0, half), radius), radius
+        if half >= radius:
+            return _grid((0.0, 0.0, half - radius), radius), radius
+        sides = np.array((radius * 0.5**0.5, radius * 0.5**0.5, half))
     radius = float(sides.min())
-    return center + _grid(tuple(sides - radius), radius), radius
+    return center + _grid(sides - radius, radius), radius
+
+
+def _grid(half: Iterable[float], radius: float) -> np.ndarray:
+    """[n, 3] an even grid over [-half, half] with steps of at most the radius or :data:`SPACING`."""
+    step = max(radius, SPACING)
+    rows = [np.linspace(-h, h, int(np.ceil(2 * h / step - 1e-9)) + 1) if h > 0 else [0.0] for h in half]
+    return np.array(list(product(*rows)))
 
 
 def sharp_points(geometry: Geometry, spacing: float) -> np.ndarray:
-    """[n, 3] points where a shape stands out of balls in it: a box's edges, a cylinder's rims, a hull's vertices; none for round shapes."""
+    """[n, 3] points where a shape stands out of the balls in it: a box's edges, a cylinder's rims, a hull's
+    vertices."""
     points, radius = support_points(geometry)
     if radius > 0:
         return np.zeros((0, 3))
@@ -259,47 +299,47 @@ def sharp_points(geometry: Geometry, spacing: float) -> np.ndarray:
         return points
     edges = []
     for axis, half in enumerate(geometry.size):
-        along = np.linspace(-half, half, int(np.ceil(2 * half / spacing)) + 1)
-        for corner in points[points[:, axis] > 0]:
-            edge = np.repeat(corner[None], len(along), axis=0)
-            edge[:, axis] = along
-            edges.append(edge)
-    return np.unique(np.concatenate(edges), axis=0)
+        sides = [np.array((-end, end)) for end in geometry.size]
+        sides[axis] = np.linspace(-half, half, int(np.ceil(2 * half / spacing)) + 1)
+        edges += product(*sides)
+    return np.unique(np.array(edges), axis=0)
 
 
 def shell_balls(geometry: Geometry, centers: np.ndarray, radius: float) -> tuple[np.ndarray, float]:
-    """Balls under the surface of a shape where it is farther than :data:`BARE` from those of a radius about given centres [m, 3]: centres
-    [n, 3] and their radius, with which they come that near to a right-angled edge."""
+    """Add small balls under the surface of a shape where it is farther than :data:`BARE` from the balls that fill it.
+
+    Args:
+        geometry: the shape.
+        centers: [m, 3] centers of the balls that fill the shape.
+        radius: radius of the balls that fill the shape.
+
+    Returns:
+        Centers [n, 3] of the small balls and their radius, with which they come within :data:`BARE` of a right-angled
+        edge.
+    """
     from trimesh.remesh import subdivide_to_size
 
     small = BARE / (2**0.5 - 1)
     if geometry.kind in ("sphere", "capsule") or radius <= small:
         return np.zeros((0, 3)), small
     shape = Shape(geometry=geometry)
-    mesh, planes = shape_mesh(shape), half_spaces(shape)
-    surface = np.unique(subdivide_to_size(mesh.vertices, mesh.faces, SPACING)[0].round(9), axis=0)
+    mesh = shape_mesh(shape)
+    planes = half_spaces(shape)
+    vertices = subdivide_to_size(mesh.vertices, mesh.faces, SPACING)[0]
+    surface = np.unique(vertices.round(9), axis=0)
     bare = surface[np.linalg.norm(surface[:, None] - centers, axis=-1).min(axis=-1) > radius + BARE]
-    for _ in range(_INWARD):  # from the surface to where the ball lies inside
+    for _ in range(_INWARD_STEPS):
         beyond = np.maximum(bare @ planes[:, :3].T + planes[:, 3] + small, 0.0)
-        worst = beyond.argmax(axis=1)
-        bare = bare - beyond.max(axis=1)[:, None] * planes[worst, :3]
-    bare = np.unique(bare[(bare @ planes[:, :3].T + planes[:, 3]).max(axis=1) < -0.9 * small].round(6), axis=0)
+        bare = bare - beyond.max(axis=1)[:, None] * planes[beyond.argmax(axis=1), :3]
+    inside = (bare @ planes[:, :3].T + planes[:, 3]).max(axis=1) < -0.9 * small
+    bare = np.unique(bare[inside].round(6), axis=0)
     return bare[_apart(bare, np.zeros(len(bare)), small)], small
 
 
 def shape_balls(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """Balls of one shape: centres [n, 3] in the link's frame and radii [n]."""
+    """Fill one shape with balls: centers [n, 3] in the link's frame and radii [n]."""
     inner, radius = inscribed_balls(shape.geometry)
     shell, small = shell_balls(shape.geometry, inner, radius)
     sharp = sharp_points(shape.geometry, max(min(radius, small), SPACING))
     points = np.concatenate((inner, shell, sharp)) @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
-    return points, np.concatenate(
-        [np.full(len(part), r) for part, r in ((inner, radius), (shell, small), (sharp, 0.0))]
-    )
-
-
-def _grid(half: tuple[float, ...], radius: float) -> np.ndarray:
-    """[n, 3] an even grid over [-half, half] with steps of at most the radius or :data:`SPACING`."""
-    step = max(radius, SPACING)
-    rows = [np.linspace(-h, h, int(np.ceil(2 * h / step - 1e-9)) + 1) if h > 0 else np.zeros(1) for h in half]
-    return np.array(list(product(*rows)))
+    return points, np.repeat([radius, small, 0.0], [len(inner), len(shell), len(sharp)])

@@ -1,9 +1,10 @@
 """How far a robot is from the table and from itself.
 
-The table needs no collision library: a convex shape's lowest point is one of a few support points, less a radius. Self-collision asks coal
-(signed distance, nearest points), but only for the pairs of shapes whose bounding spheres are near.
+The table needs no collision library: the lowest point of a convex shape is one of a few support points, less a radius.
+Self-collision asks coal (signed distance, nearest points), but only for pairs of shapes whose bounding spheres are
+near.
 
-Shape letters: B configurations, L links, G shapes, H support points.
+Shape letters: B configurations, L links, G shapes, H support points, A pairs of shapes that are near each other.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -20,35 +22,36 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import RobotTree
 from xreset.spec import Geometry, RobotSpec, TableSpec
 
-_RIM = 16
+_RIM_POINTS = 16
 """Support points on each rim of a cylinder."""
 _POSES_PER_CHUNK = 4096
 
 
 def support_points(geometry: Geometry) -> tuple[np.ndarray, float]:
-    """Points [H, 3] and a radius such that the shape is the convex hull of balls of that radius around the points.
+    """Return points [H, 3] and a radius such that the shape is the convex hull of balls of that radius around the
+    points.
 
     Exact for boxes, spheres, capsules and hulls; a cylinder's rims are regular polygons whose corners lie on the rim.
     """
+    size = geometry.size
     if geometry.kind == "box":
-        return np.array(np.meshgrid(*([-s, s] for s in geometry.size))).reshape(3, -1).T, 0.0
+        return np.array(np.meshgrid(*([-half, half] for half in size))).reshape(3, -1).T, 0.0
     if geometry.kind == "sphere":
-        return np.zeros((1, 3)), geometry.size[0]
+        return np.zeros((1, 3)), size[0]
     if geometry.kind == "capsule":
-        radius, half = geometry.size
+        radius, half = size
         return np.array([[0, 0, -half], [0, 0, half]]), radius
     if geometry.kind == "cylinder":
-        radius, half = geometry.size
-        angle = np.arange(_RIM) * (2 * np.pi / _RIM)
+        radius, half = size
+        angle = np.arange(_RIM_POINTS) * (2 * np.pi / _RIM_POINTS)
         rim = np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=1)
-        return np.concatenate([np.column_stack((rim, np.full(_RIM, z))) for z in (-half, half)]), 0.0
+        return np.concatenate([np.column_stack((rim, np.full(_RIM_POINTS, z))) for z in (-half, half)]), 0.0
     assert geometry.vertices is not None
     return np.asarray(geometry.vertices, dtype=float), 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class SupportPoints:
-    """The support points of a robot's shapes."""
+class SupportPoints(NamedTuple):
+    """Support points of a robot's shapes."""
 
     links: tuple[str, ...]
     """Link of each point (length H)."""
@@ -59,9 +62,9 @@ class SupportPoints:
 
 
 def table_points(robot: RobotSpec, kinematics: Kinematics) -> SupportPoints:
-    """The support points of every link that may not touch the table."""
+    """Return the support points of every link that may not touch the table."""
     links: list[str] = []
-    points: list[np.ndarray] = []
+    points = [np.zeros((0, 3))]
     radii: list[float] = []
     for name in kinematics.link_names:
         if name in robot.table_exclude:
@@ -71,17 +74,16 @@ def table_points(robot: RobotSpec, kinematics: Kinematics) -> SupportPoints:
             points.append(local @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3])
             links += [name] * len(local)
             radii += [radius] * len(local)
-    return SupportPoints(
-        links=tuple(links), points=np.concatenate(points) if points else np.zeros((0, 3)), radii=np.array(radii)
-    )
+    return SupportPoints(links=tuple(links), points=np.concatenate(points), radii=np.array(radii))
 
 
 def height_above_table(points: Tensor, radii: Tensor, table: TableSpec) -> Tensor:
-    """[..., H] height of balls above the table's top; infinite for balls centred beside it. Points are [..., H, 3]."""
-    beside = ((points[..., 0] - table.center[0]).abs() > table.half_size[0]) | (
-        (points[..., 1] - table.center[1]).abs() > table.half_size[1]
-    )
-    return (points[..., 2] - radii).masked_fill(beside, float("inf"))
+    """[..., H] height of balls at points [..., H, 3] above the table's top; infinite for balls centered next to the
+    table."""
+    x, y, z = points.unbind(-1)
+    off_x = (x - table.center[0]).abs() > table.half_size[0]
+    off_y = (y - table.center[1]).abs() > table.half_size[1]
+    return (z - radii).masked_fill(off_x | off_y, float("inf"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,15 +91,15 @@ class Approaches:
     """Pairs of shapes that are near each other (length A)."""
 
     configuration: np.ndarray
-    """[A] which configuration."""
+    """[A] index of the configuration."""
     links: np.ndarray
     """[A, 2] indices of the two links in the kinematics' order."""
     distance: np.ndarray
     """[A] signed distance [m], negative where they overlap."""
     points: np.ndarray
-    """[A, 2, 3] nearest points on either shape, world frame."""
+    """[A, 2, 3] nearest points on the two shapes, world frame."""
     normal: np.ndarray
-    """[A, 3] unit vector from the first shape to the second: moving the second along it parts them."""
+    """[A, 3] unit vector from the first shape to the second: moving the second along it separates them."""
 
 
 class SelfCollision:
@@ -111,11 +113,13 @@ class SelfCollision:
         moved_by_arm: bool = False,
         only: Collection[str] | None = None,
     ) -> None:
-        """Choose the pairs of links that count: never neighbours, excluded pairs, or pairs that overlap at home (a matter of modelling).
+        """Choose the pairs of links that count.
+
+        Neighbors, excluded pairs and pairs that overlap at home (a matter of modeling) never count.
 
         Args:
             robot: the robot.
-            kinematics: of the whole robot, or of its hand.
+            kinematics: kinematics of the whole robot, or of its hand.
             moved_by_arm: only pairs whose relative pose depends on an arm joint.
             only: only pairs among these links.
 
@@ -126,43 +130,47 @@ class SelfCollision:
             import coal
         except ImportError as error:
             raise XResetError(
-                f"self-collision needs coal, which cannot be imported ({error}). Run: pip install 'xreset[retarget]'"
+                f"Self-collision needs coal, which cannot be imported ({error}). Run: pip install 'xreset[retarget]'"
             ) from error
         self._coal = coal
-        tree = kinematics.tree
+        names = kinematics.link_names
         self._link: list[int] = []
         self._geometry: list = []
-        local, centers, radii = [], [], []
-        for index, name in enumerate(kinematics.link_names):
+        local = []
+        centers = []
+        radii = []
+        for index, name in enumerate(names):
             if only is not None and name not in only:
                 continue
-            for shape in tree.link(name).collisions:
+            for shape in kinematics.tree.link(name).collisions:
+                points, radius = support_points(shape.geometry)
+                center = (points.max(axis=0) + points.min(axis=0)) / 2
                 self._link.append(index)
                 self._geometry.append(coal_geometry(coal, shape.geometry))
-                points, radius = support_points(shape.geometry)
-                centre = (points.max(axis=0) + points.min(axis=0)) / 2
                 local.append(shape.T_body_shape)
-                centers.append(shape.T_body_shape[:3, :3] @ centre + shape.T_body_shape[:3, 3])
-                radii.append(radius + float(np.linalg.norm(points - centre, axis=1).max()))
+                centers.append(shape.T_body_shape[:3, :3] @ center + shape.T_body_shape[:3, 3])
+                radii.append(radius + float(np.linalg.norm(points - center, axis=1).max()))
         self._T_link_shape = np.array(local).reshape(-1, 4, 4)
-        self._center, self._radius = np.array(centers).reshape(-1, 3), np.array(radii)
+        self._center = np.array(centers).reshape(-1, 3)
+        self._radius = np.array(radii)
 
-        names = kinematics.link_names
-        linked = combinations(dict.fromkeys(self._link), 2)
-        count = {(a, b) for a, b in linked if _may_collide(robot, tree, names[a], names[b], moved_by_arm)}
-        pairs = [(i, j) for i, j in combinations(range(len(self._link)), 2) if (self._link[i], self._link[j]) in count]
-        self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-        home = kinematics.link_poses(
-            kinematics.clamp(kinematics.lower.new_tensor(robot.home[kinematics.joint_indices]))
-        )[None].numpy()
-        overlapping = self.near(home, 0.0)
-        never = {tuple(sorted(pair)) for pair in overlapping.links.tolist()}
-        self.overlapping_at_home: tuple[tuple[str, str], ...] = tuple(
-            (kinematics.link_names[int(i)], kinematics.link_names[int(j)]) for i, j in sorted(never)
-        )
-        """Pairs of links that were left out because they overlap at home."""
-        keep = [tuple(sorted((self._link[i], self._link[j]))) not in never for i, j in self._pairs]
-        self._pairs = self._pairs[np.array(keep, dtype=bool)]
+        counted = set()
+        for a, b in combinations(dict.fromkeys(self._link), 2):
+            if _may_collide(robot, kinematics.tree, names[a], names[b], moved_by_arm):
+                counted.add((a, b))
+        self._pairs = self._shape_pairs(counted)
+        home = kinematics.lower.new_tensor(robot.home[kinematics.joint_indices])
+        overlapping = self.near(kinematics.link_poses(kinematics.clamp(home))[None].numpy(), 0.0)
+        at_home = {(a, b) for a, b in overlapping.links.tolist()}
+        self.overlapping_at_home: tuple[tuple[str, str], ...] = tuple((names[a], names[b]) for a, b in sorted(at_home))
+        """Pairs of links that do not count because they overlap at home."""
+        self._pairs = self._shape_pairs(counted - at_home)
+
+    def _shape_pairs(self, links: set[tuple[int, int]]) -> np.ndarray:
+        """[A, 2] pairs of shapes of pairs of links."""
+        shapes = combinations(range(len(self._link)), 2)
+        pairs = [(i, j) for i, j in shapes if (self._link[i], self._link[j]) in links]
+        return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
     @property
     def link_pairs(self) -> list[tuple[int, int]]:
@@ -170,38 +178,31 @@ class SelfCollision:
         return list(dict.fromkeys((self._link[i], self._link[j]) for i, j in self._pairs))
 
     def near(self, link_poses: np.ndarray, margin: float) -> Approaches:
-        """Every pair of shapes nearer than ``margin`` [m].
-
-        Args:
-            link_poses: [B, L, 4, 4] of all links of the kinematics, in its order.
-            margin: [m]
-        """
-        coal = self._coal
-        request, result = coal.DistanceRequest(), coal.DistanceResult()
+        """Find every pair of shapes nearer than ``margin`` [m], in link poses [B, L, 4, 4] of all links of the
+        kinematics."""
+        request = self._coal.DistanceRequest()
         request.enable_signed_distance = True
-        rows: list[tuple[int, int, int, float]] = []
-        points: list[tuple[np.ndarray, np.ndarray]] = []
-        normals: list[np.ndarray] = []
+        result = self._coal.DistanceResult()
+        rows = []
+        points = []
+        normals = []
+        first, second = self._pairs.T
+        reach = self._radius[first] + self._radius[second] + margin
         for begin in range(0, len(link_poses) if len(self._pairs) else 0, _POSES_PER_CHUNK):
-            part = link_poses[begin : begin + _POSES_PER_CHUNK]
-            T = part[:, self._link]  # [B, G, 4, 4]
+            T = link_poses[begin : begin + _POSES_PER_CHUNK, self._link]  # [B, G, 4, 4]
             centers = np.einsum("bgij,gj->bgi", T[..., :3, :3], self._center) + T[..., :3, 3]
-            first, second = self._pairs.T
-            reach = self._radius[first] + self._radius[second] + margin
-            gap = np.zeros((len(part), len(self._pairs)))
-            for axis in range(3):  # one axis at a time, to keep the temporary arrays small
+            gap = np.zeros((len(T), len(self._pairs)))
+            for axis in range(3):  # one axis at a time keeps the temporary arrays small
                 gap += (centers[:, first, axis] - centers[:, second, axis]) ** 2
             for b, pair in np.argwhere(gap < reach**2):
-                transforms = []
-                for g in self._pairs[pair]:
-                    pose = T[b, g] @ self._T_link_shape[g]
-                    transforms.append(coal.Transform3s(pose[:3, :3], pose[:3, 3]))
-                i, j = self._pairs[pair]
+                arguments = []
+                for shape in self._pairs[pair]:
+                    pose = T[b, shape] @ self._T_link_shape[shape]
+                    arguments += [self._geometry[shape], self._coal.Transform3s(pose[:3, :3], pose[:3, 3])]
                 result.clear()
-                distance = coal.distance(
-                    self._geometry[i], transforms[0], self._geometry[j], transforms[1], request, result
-                )
+                distance = self._coal.distance(*arguments, request, result)
                 if distance < margin:
+                    i, j = self._pairs[pair]
                     rows.append((begin + b, self._link[i], self._link[j], distance))
                     points.append((np.array(result.getNearestPoint1()), np.array(result.getNearestPoint2())))
                     normals.append(np.array(result.normal))
@@ -215,7 +216,7 @@ class SelfCollision:
         )
 
     def clearance(self, link_poses: np.ndarray, margin: float) -> np.ndarray:
-        """[B] smallest signed distance between two shapes, at most ``margin``."""
+        """[B] smallest signed distance between two shapes, at most ``margin``; arguments as in :meth:`near`."""
         near = self.near(link_poses, margin)
         clearance = np.full(len(link_poses), margin)
         np.minimum.at(clearance, near.configuration, near.distance)
@@ -223,45 +224,45 @@ class SelfCollision:
 
 
 def _may_collide(robot: RobotSpec, tree: RobotTree, a: str, b: str, moved_by_arm: bool) -> bool:
-    """Whether a pair of links counts: see :class:`SelfCollision`."""
-    parents = {joint.child: joint for joint in tree.joints}
-    body_a, body_b = tree.moving_ancestor(a), tree.moving_ancestor(b)
-
-    def parent_body(body: str) -> str | None:
-        return tree.moving_ancestor(parents[body].parent) if body in parents else None
-
-    if body_a == body_b or parent_body(body_a) == body_b or parent_body(body_b) == body_a:
+    """Return whether a pair of links counts: see :class:`SelfCollision`."""
+    joint_above = {joint.child: joint for joint in tree.joints}
+    bodies = {tree.moving_ancestor(a), tree.moving_ancestor(b)}
+    parents = {tree.moving_ancestor(joint_above[body].parent) for body in bodies if body in joint_above}
+    if len(bodies) == 1 or bodies & parents:
         return False
-    if any({tree.moving_ancestor(name) for name in pair} == {body_a, body_b} for pair in robot.collision_exclude):
-        return False
+    for pair in robot.collision_exclude:
+        if {tree.moving_ancestor(name) for name in pair} == bodies:
+            return False
     if not moved_by_arm:
         return True
     arm = {joint.name for joint in robot.joints if joint.group == "arm"}
 
     def arm_joints(link: str) -> set[str]:
-        found = set()
-        while link in parents:
-            found |= {parents[link].name} & arm
-            link = parents[link].parent
-        return found
+        above = set()
+        while link in joint_above:
+            above.add(joint_above[link].name)
+            link = joint_above[link].parent
+        return above & arm
 
     return arm_joints(a) != arm_joints(b)
 
 
 def coal_geometry(coal, geometry: Geometry):
-    """A shape as coal knows it."""
+    """Convert a shape to coal's type; ``coal`` is the module."""
+    size = geometry.size
     if geometry.kind == "box":
-        return coal.Box(*(2 * s for s in geometry.size))
+        return coal.Box(*(2 * half for half in size))
     if geometry.kind == "sphere":
-        return coal.Sphere(geometry.size[0])
+        return coal.Sphere(size[0])
     if geometry.kind == "capsule":
-        return coal.Capsule(geometry.size[0], 2 * geometry.size[1])
+        return coal.Capsule(size[0], 2 * size[1])
     if geometry.kind == "cylinder":
-        return coal.Cylinder(geometry.size[0], 2 * geometry.size[1])
-    points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+        return coal.Cylinder(size[0], 2 * size[1])
     assert geometry.vertices is not None and geometry.faces is not None
+    points = coal.StdVec_Vec3s()
     for vertex in geometry.vertices:
         points.append(np.asarray(vertex, dtype=float))
-    for face in geometry.faces:
-        triangles.append(coal.Triangle(*(int(i) for i in face)))
+    triangles = coal.StdVec_Triangle()
+    for face in geometry.faces.tolist():
+        triangles.append(coal.Triangle(*face))
     return coal.Convex(points, triangles)

@@ -1,4 +1,4 @@
-"""The inertia that a joint's drive feels: what drive gains are chosen by."""
+"""The inertia that a joint's drive must accelerate, which drive gains are chosen by."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from xreset.spec import DriveSpec, JointSpec, RobotSpec
 def mass_matrix(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
     """[J, J] mass matrix of the robot without armature [kg m^2, kg for a prismatic joint].
 
-    M(q) = sum over links of m Jv^T Jv + Jw^T I Jw, with Jv and Jw the Jacobians of the link's centre of mass and of its orientation, and I
-    its inertia about the centre of mass; mimic joints count through the joint that they follow.
+    M(q) = sum over links of m Jv^T Jv + Jw^T I Jw, with Jv and Jw the Jacobians of the link's center of mass and of its
+    orientation, and I its inertia about the center of mass. A mimic joint counts through the joint that it follows.
 
     Args:
         robot: the robot.
@@ -24,47 +24,49 @@ def mass_matrix(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
     kinematics = Kinematics(robot)
     links = [kinematics.tree.link(name) for name in kinematics.link_names]
     com = torch.tensor(np.stack([link.com for link in links]))
-    jacobian = kinematics.jacobian(torch.as_tensor(joint_pos, dtype=torch.float64), kinematics.link_names, com)
-    linear, angular, rot = jacobian.linear.numpy(), jacobian.angular.numpy(), jacobian.rot.numpy()
+    q = torch.as_tensor(joint_pos, dtype=torch.float64)
+    _, rot, linear, angular = (x.numpy() for x in kinematics.jacobian(q, kinematics.link_names, com))
     mass = np.array([link.mass for link in links])
     inertia = rot @ np.stack([link.inertia for link in links]) @ rot.transpose(0, 2, 1)
     return np.einsum("l,lai,laj->ij", mass, linear, linear) + np.einsum("lai,lab,lbj->ij", angular, inertia, angular)
 
 
 def drive_shares(robot: RobotSpec) -> np.ndarray:
-    """[J, J + Q] how the torque of each drive is shared by its joint and the Q mimic joints, those that follow it.
+    """[J, J + Q] how each drive's torque is shared by its joint and the Q mimic joints that follow it.
 
-    A drive on one joint of several that move as one would have to push the others through their coupling, which then gives way; and what
-    an engine integrates implicitly in the drive's damping would slow that joint alone. With U [J + Q, J] the rates of all joints by those
-    of the actuated ones and M their mass matrix at home, armature included, the shares W = (U^T M U)^-1 U^T M accelerate all joints as they
-    are coupled, so that the coupling has nothing to do; and W U = 1: along coupled motion a drive is what its figures say.
+    A drive on only one of several coupled joints would push the others through their coupling, which then gives way.
+    Also, the damping of the drive that an engine integrates implicitly would slow that joint alone.
+
+    U [J + Q, J] are the rates of all joints per rate of the actuated ones, M is their mass matrix at home, armature
+    included. The shares W = (U^T M U)^-1 U^T M accelerate all joints as they are coupled, so the coupling has nothing
+    to do. Because W U = 1, the drive keeps its stated figures for coupled motion.
     """
-    joints, mimics = robot.joints, robot.mimics
-    U = np.eye(len(joints) + len(mimics), len(joints))
-    if not mimics:
+    joints = len(robot.joints)
+    U = np.eye(joints + len(robot.mimics), joints)
+    if not robot.mimics:
         return U
     idle = DriveSpec(kp=0.0, kd=0.0, effort=0.0)
-    free = []
-    for row, mimic in zip(U[len(joints) :], mimics, strict=True):
+    followers = []
+    for row, mimic in zip(U[joints:], robot.mimics, strict=True):
         source = robot.joint_names.index(mimic.source)
         row[source] = mimic.multiplier
-        free.append(
-            JointSpec(
-                name=mimic.joint, group="hand", drive=idle, home=mimic.multiplier * robot.home[source] + mimic.offset
-            )
-        )
-    uncoupled = replace(robot, joints=(*joints, *free), mimics=())
-    M = mass_matrix(uncoupled, uncoupled.home) + np.diag([joint.drive.armature for joint in uncoupled.joints])
+        home = mimic.multiplier * robot.home[source] + mimic.offset
+        followers.append(JointSpec(name=mimic.joint, group="hand", drive=idle, home=home))
+    uncoupled = replace(robot, joints=(*robot.joints, *followers), mimics=())
+    M = mass_matrix(uncoupled, uncoupled.home) + np.diag(_drive_values(uncoupled, "armature"))
     return np.linalg.solve(U.T @ M @ U, U.T @ M)
 
 
 def drive_inertia(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
-    """[J] inertia that each drive feels when it alone moves, armature included: the diagonal of the mass matrix [kg m^2 or kg]."""
-    return np.diag(mass_matrix(robot, joint_pos)) + np.array([joint.drive.armature for joint in robot.joints])
+    """[J] inertia of each joint when it moves alone, armature included: the mass matrix' diagonal [kg m^2 or kg]."""
+    return np.diag(mass_matrix(robot, joint_pos)) + _drive_values(robot, "armature")
 
 
 def damping_ratio(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
     """[J] kd / (2 sqrt(kp I)) of each drive, 1 being critical damping, with I from :func:`drive_inertia`."""
-    kp = np.array([joint.drive.kp for joint in robot.joints])
-    kd = np.array([joint.drive.kd for joint in robot.joints])
-    return kd / (2 * np.sqrt(kp * drive_inertia(robot, joint_pos)))
+    stiffness = _drive_values(robot, "kp") * drive_inertia(robot, joint_pos)
+    return _drive_values(robot, "kd") / (2 * np.sqrt(stiffness))
+
+
+def _drive_values(robot: RobotSpec, name: str) -> np.ndarray:
+    return np.array([getattr(joint.drive, name) for joint in robot.joints])

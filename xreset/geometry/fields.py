@@ -1,10 +1,14 @@
-"""Signed distances to several objects, on a grid each, looked up in one go on any device."""
+"""Signed distances to several objects on one grid each, looked up in one batch on any device.
+
+Shape letters: M objects, N points, A points that are near.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,47 +17,75 @@ from xreset.tensors import Tensors
 
 @dataclass(frozen=True, kw_only=True)
 class DistanceFields(Tensors):
-    """Signed distances to M objects' surfaces at the nodes of one grid per object, in the objects' mesh frames [m]."""
+    """Signed distances to M objects at the nodes of one grid per object, in the objects' mesh frames [m]."""
 
     values: Tensor
-    """All grids' nodes behind one another, z fastest; negative inside."""
+    """Nodes of all grids, grid after grid, z fastest; negative inside."""
     start: Tensor
-    """[M] index of each grid's first node."""
+    """[M] index of the first node of each grid."""
     counts: Tensor
-    """[M, 3] nodes of each grid along x, y and z."""
+    """[M, 3] number of nodes of each grid along x, y and z."""
     origin: Tensor
     """[M, 3] corner of each grid."""
     low: Tensor
     """[M, 3] lower corner of the object's bounding box."""
     high: Tensor
-    """[M, 3] upper corner."""
+    """[M, 3] upper corner of the object's bounding box."""
     spacing: float
-    """Between neighbouring nodes [m]."""
+    """Distance of neighboring nodes [m]."""
+
+    @staticmethod
+    def on_grid(
+        values: np.ndarray, origin: np.ndarray, spacing: float, low: np.ndarray, high: np.ndarray
+    ) -> DistanceFields:
+        """Return the field of one object from its values [X, Y, Z] and the corners [3] of grid and bounding box."""
+        return DistanceFields(
+            values=torch.as_tensor(values.reshape(-1)),
+            start=torch.zeros(1, dtype=torch.long),
+            counts=torch.tensor([values.shape]),
+            origin=torch.as_tensor(origin)[None],
+            low=torch.as_tensor(low)[None],
+            high=torch.as_tensor(high)[None],
+            spacing=spacing,
+        )
 
     @staticmethod
     def join(parts: Sequence[DistanceFields]) -> DistanceFields:
-        """Those of several objects, behind one another; all must have one spacing and lie on one device."""
-        if len({part.spacing for part in parts}) != 1:
-            raise ValueError(f"grids must have one spacing, found {sorted({part.spacing for part in parts})}")
-        sizes = torch.tensor([len(part.values) for part in parts], device=parts[0].start.device)
-        shift = sizes.cumsum(0) - sizes
-        return replace(
-            DistanceFields.cat(parts), start=torch.cat([part.start + shift[i] for i, part in enumerate(parts)])
-        )
+        """Join the fields of several objects; all must have the same spacing and device."""
+        spacings = {part.spacing for part in parts}
+        if len(spacings) != 1:
+            raise ValueError(f"The grids have different spacings: {sorted(spacings)}. Sample all with the same one.")
+        start = []
+        nodes = 0
+        for part in parts:
+            start.append(part.start + nodes)
+            nodes += len(part.values)
+        return replace(DistanceFields.cat(parts), start=torch.cat(start))
 
-    def beside(self, points: Tensor, which: Tensor) -> Tensor:
+    def box_distance(self, points: Tensor, which: Tensor) -> Tensor:
         """[...] distance of points [..., 3] from the bounding box of their object [...]; 0 inside."""
-        return (points - torch.minimum(torch.maximum(points, self.low[which]), self.high[which])).norm(dim=-1)
+        nearest = torch.minimum(torch.maximum(points, self.low[which]), self.high[which])
+        return (points - nearest).norm(dim=-1)
 
-    def nearer(self, points: Tensor, which: Tensor, than: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Which of some points [N, 3] are nearer than [N] to their object [N]: indices [A], signed distances [A], gradients [A, 3].
+    def nearer(self, points: Tensor, which: Tensor, limit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Find the points that are nearer to their object than a limit.
 
-        Most are ruled out by the bounding box; one step of the grid more is as far as distances from it may be wrong beside an edge.
+        The bounding box rules most points out. One grid step is added, because beside an edge interpolated distances
+        may be too small by that much.
+
+        Args:
+            points: [N, 3] in the mesh frame of their object.
+            which: [N] index of the object.
+            limit: [N] distance [m].
+
+        Returns:
+            Indices [A] of the near points, their signed distances [A] and gradients [A, 3].
         """
-        some = (self.beside(points, which) <= (than + self.spacing).clamp_min(0.0)).nonzero()[:, 0]
-        distance, gradient = self.signed_distance(points[some], which[some])
-        near = distance < than[some]
-        return some[near], distance[near], gradient[near]
+        reachable = self.box_distance(points, which) <= (limit + self.spacing).clamp_min(0.0)
+        candidates = reachable.nonzero()[:, 0]
+        distance, gradient = self.signed_distance(points[candidates], which[candidates])
+        near = distance < limit[candidates]
+        return candidates[near], distance[near], gradient[near]
 
     def signed_distance(self, points: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance [N] and its gradient [N, 3] by trilinear interpolation.
@@ -70,25 +102,22 @@ class DistanceFields(Tensors):
         beyond = unclamped - x
         excess = beyond.norm(dim=-1)
         cell = x.floor().long()
-        f = x - cell
-        step_x, step_y = counts[:, 1] * counts[:, 2], counts[:, 2]
+        step_y = counts[:, 2]
+        step_x = counts[:, 1] * step_y
         node = self.start[which] + cell[:, 0] * step_x + cell[:, 1] * step_y + cell[:, 2]
         corner = torch.stack((node, node + step_y, node + step_x, node + step_x + step_y), dim=-1)
         v = self.values[torch.stack((corner, corner + 1), dim=-1)].view(-1, 2, 2, 2)
-        fx, fy, fz = (f[:, i].view(-1, *[1] * (2 - i)) for i in range(3))
+        fx, fy, fz = (x - cell).unbind(1)
+        fy_rows = fy[:, None]
         slope_x = v[:, 1] - v[:, 0]
-        along_x = v[:, 0] + fx * slope_x  # [N, 2, 2]
+        along_x = v[:, 0] + fx[:, None, None] * slope_x  # [N, 2, 2]
         slope_y = along_x[:, 1] - along_x[:, 0]
-        along_y = along_x[:, 0] + fy * slope_y  # [N, 2]
+        along_y = along_x[:, 0] + fy_rows * slope_y  # [N, 2]
         slope_z = along_y[:, 1] - along_y[:, 0]
-        slope_x = slope_x[:, 0] + fy * (slope_x[:, 1] - slope_x[:, 0])
-        gradient = torch.stack(
-            (
-                slope_x[:, 0] + fz * (slope_x[:, 1] - slope_x[:, 0]),
-                slope_y[:, 0] + fz * (slope_y[:, 1] - slope_y[:, 0]),
-                slope_z,
-            ),
-            dim=-1,
-        )
-        gradient = torch.where(beyond == 0, gradient / self.spacing, beyond / excess[:, None].clamp_min(1e-12))
+        slope_x = slope_x[:, 0] + fy_rows * (slope_x[:, 1] - slope_x[:, 0])
+        slope_xy = torch.stack((slope_x, slope_y), dim=1)  # [N, 2, 2]
+        slope_xy = slope_xy[..., 0] + fz[:, None] * (slope_xy[..., 1] - slope_xy[..., 0])
+        gradient = torch.cat((slope_xy, slope_z[:, None]), dim=1)
+        outward = beyond / excess[:, None].clamp_min(1e-12)
+        gradient = torch.where(beyond == 0, gradient / self.spacing, outward)
         return along_y[:, 0] + fz * slope_z + excess * self.spacing, gradient

@@ -1,4 +1,5 @@
-"""Quaternions and rotations over batched torch tensors: pure functions, (w, x, y, z), last dimension first come.
+"""Quaternions and rotations over batched torch tensors: pure functions. Quaternions are (w, x, y, z) in the last
+dimension.
 
 For numpy arrays use ``scipy.spatial.transform.Rotation`` with ``scalar_first=True``.
 """
@@ -11,27 +12,29 @@ from torch import Tensor
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
     """[..., 4] Hamilton product: rotation b first, then a; both broadcast."""
-    aw, u, bw, v = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
-    product = a * b
-    w = product[..., :1] - product[..., 1:].sum(dim=-1, keepdim=True)
-    return torch.cat((w, torch.addcmul(torch.addcmul(torch.linalg.cross(u, v), aw, v), bw, u)), dim=-1)
+    aw, u = a.split((1, 3), dim=-1)
+    bw, v = b.split((1, 3), dim=-1)
+    pw, products = (a * b).split((1, 3), dim=-1)
+    w = pw - products.sum(dim=-1, keepdim=True)
+    xyz = torch.addcmul(torch.addcmul(torch.linalg.cross(u, v), aw, v), bw, u)
+    return torch.cat((w, xyz), dim=-1)
 
 
 def quat_conjugate(q: Tensor) -> Tensor:
-    """[..., 4] the inverse of a unit quaternion."""
+    """[..., 4] inverse of a unit quaternion."""
     return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
 
 
 def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
-    """[..., 3] vector v turned by the unit quaternion q [..., 4]; both broadcast."""
-    w, u = q[..., :1], q[..., 1:]
+    """[..., 3] vector v rotated by the unit quaternion q [..., 4]; both broadcast."""
+    w, u = q.split((1, 3), dim=-1)
     u, v = torch.broadcast_tensors(u, v)
     t = 2.0 * torch.linalg.cross(u, v)
     return torch.addcmul(v, w, t) + torch.linalg.cross(u, t)
 
 
 def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
-    """[..., 3] vector v turned by the inverse of the unit quaternion q."""
+    """[..., 3] vector v rotated by the inverse of the unit quaternion q."""
     return quat_rotate(quat_conjugate(q), v)
 
 
@@ -63,37 +66,33 @@ def quat_to_axis_angle(q: Tensor) -> Tensor:
 
 def quat_to_matrix(q: Tensor) -> Tensor:
     """[..., 3, 3] rotation matrix of a unit quaternion [..., 4]."""
-    turned = quat_rotate(
-        q[..., None, :], torch.eye(3, dtype=q.dtype, device=q.device)
-    )  # the unit vectors: the matrix's columns
-    return turned.mT
+    unit_vectors = torch.eye(3, dtype=q.dtype, device=q.device)
+    columns = quat_rotate(q[..., None, :], unit_vectors)
+    return columns.mT
 
 
 def matrix_to_quat(R: Tensor) -> Tensor:
     """[..., 4] unit quaternion (w >= 0) of a rotation matrix [..., 3, 3].
 
-    The largest of the four candidates is used (Shepperd's method), so there is no loss of precision near half turns.
+    Shepperd's method: of the four candidates, the one with the largest divisor is used, so half turns lose no
+    precision.
     """
-    m = R
-    t = torch.stack(
-        (
-            1 + m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2],
-            1 + m[..., 0, 0] - m[..., 1, 1] - m[..., 2, 2],
-            1 - m[..., 0, 0] + m[..., 1, 1] - m[..., 2, 2],
-            1 - m[..., 0, 0] - m[..., 1, 1] + m[..., 2, 2],
-        ),
-        dim=-1,
-    )
-    a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
-    d, e, f = m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] + m[..., 1, 2]
-    candidates = torch.stack(
-        (
-            torch.stack((t[..., 0], a, b, c), dim=-1),
-            torch.stack((a, t[..., 1], d, e), dim=-1),
-            torch.stack((b, d, t[..., 2], f), dim=-1),
-            torch.stack((c, e, f, t[..., 3]), dim=-1),
-        ),
-        dim=-2,
-    )
+    x, y, z = R.diagonal(dim1=-2, dim2=-1).unbind(-1)
+    antisymmetric = R - R.mT
+    symmetric = R + R.mT
+    a = antisymmetric[..., 2, 1]
+    b = antisymmetric[..., 0, 2]
+    c = antisymmetric[..., 1, 0]
+    d = symmetric[..., 1, 0]
+    e = symmetric[..., 0, 2]
+    f = symmetric[..., 2, 1]
+    t = torch.stack((1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z), dim=-1)
+    t0, t1, t2, t3 = t.unbind(-1)
+    candidates = torch.stack((t0, a, b, c, a, t1, d, e, b, d, t2, f, c, e, f, t3), dim=-1).unflatten(-1, (4, 4))
     best = t.argmax(dim=-1)[..., None, None].expand(*t.shape[:-1], 1, 4)
     return quat_normalize(candidates.gather(-2, best).squeeze(-2))
+
+
+def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
+    """[..., n] product of matrices [..., n, m] and vectors [..., m]; both broadcast."""
+    return (matrix @ vector[..., None])[..., 0]

@@ -1,6 +1,6 @@
-"""Convex shapes: how to make them, their meshes, and the mass properties of triangle meshes.
+"""Convex shapes: constructors, meshes, half spaces, and the mass properties of triangle meshes.
 
-Lengths in metres, coordinates in the object's mesh frame.
+Lengths in meters, coordinates in the object's mesh frame.
 """
 
 from __future__ import annotations
@@ -17,49 +17,52 @@ from xreset.spec import Geometry, Shape
 
 if TYPE_CHECKING:
     import trimesh
-_FEW = 300
-"""Points that every engine bears in a hull."""
+
+_MOST_HULL_POINTS = 300
+"""Number of points in a hull that every engine accepts."""
 CYLINDER_SECTIONS = 48
 """Sides of the prism that stands for a cylinder in a surface mesh."""
 
 
 def box(center: ArrayLike, size: Sequence[float]) -> Shape:
-    """An axis-aligned box of edge lengths ``size``."""
-    return Shape(
-        geometry=Geometry(kind="box", size=tuple(float(s) / 2 for s in size)), T_body_shape=_translation(center)
-    )
+    """Make an axis-aligned box of edge lengths ``size``."""
+    half = tuple(float(edge) / 2 for edge in size)
+    return _placed(Geometry(kind="box", size=half), center)
 
 
 def cylinder(center: ArrayLike, radius: float, height: float) -> Shape:
-    """A cylinder along z."""
-    return Shape(
-        geometry=Geometry(kind="cylinder", size=(float(radius), float(height) / 2)), T_body_shape=_translation(center)
-    )
+    """Make a cylinder along z."""
+    return _placed(Geometry(kind="cylinder", size=(float(radius), float(height) / 2)), center)
+
+
+def _placed(geometry: Geometry, center: ArrayLike) -> Shape:
+    T = np.eye(4)
+    T[:3, 3] = center
+    return Shape(geometry=geometry, T_body_shape=T)
 
 
 def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
-    """The convex hull of points [V, 3].
+    """Make the convex hull of points.
 
     Args:
         points: [V, 3]
-        tolerance: if there are more than 300 points: the hull of a few of them, no face of which another lies beyond by more than
-            this [m]; 0: of all.
+        tolerance: with more than 300 points, a hull of fewer is made; other points lie at most this far beyond it [m].
+            0 keeps all points.
 
     Raises:
         ObjectError: the points span no volume.
     """
     points = np.asarray(points, dtype=float)
     try:
-        points = _outermost(points, tolerance) if tolerance > 0 and len(points) > _FEW else points
+        if tolerance > 0 and len(points) > _MOST_HULL_POINTS:
+            points = _outermost(points, tolerance)
         convex = ConvexHull(points)
     except (QhullError, ValueError) as error:
-        raise ObjectError(
-            f"{len(points)} points span no volume, so they have no convex hull: {str(error).splitlines()[0]}"
-        ) from error
+        reason = str(error).splitlines()[0]
+        raise ObjectError(f"{len(points)} points span no volume, so they have no convex hull: {reason}") from error
     index = np.full(len(points), -1)
     index[convex.vertices] = np.arange(len(convex.vertices))
-    corners = points[convex.simplices]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = _triangle_normals(points[convex.simplices])
     inward = (normals * convex.equations[:, :3]).sum(axis=1) < 0  # qhull's triangles have no consistent winding
     faces = convex.simplices.copy()
     faces[inward] = faces[inward][:, ::-1]
@@ -67,7 +70,10 @@ def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
 
 
 def _outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
-    """Points [n, 3] whose hull lacks less than the tolerance: those farthest beyond the hull of the points so far, face by face."""
+    """Select points [n, 3] of a hull that no other point exceeds by more than the tolerance.
+
+    The points farthest beyond the faces of the hull so far are added until the hull is good enough.
+    """
     points = points[ConvexHull(points).vertices]
     directions = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
     chosen = np.unique((points @ directions.T).argmax(axis=0))
@@ -75,7 +81,7 @@ def _outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
         planes = ConvexHull(points[chosen]).equations
         beyond = points @ planes[:, :3].T + planes[:, 3]
         farthest = beyond.argmax(axis=0)
-        worst = beyond[farthest, np.arange(len(planes))]
+        worst = beyond.max(axis=0)
         missing = np.unique(farthest[worst > max(tolerance, worst.max() / 2)])
         if not len(missing):
             return points[chosen]
@@ -83,7 +89,7 @@ def _outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
 
 
 def loft(sections: Iterable[np.ndarray]) -> Shape:
-    """The convex hull of cross sections, each [n, 3]."""
+    """Make the convex hull of cross sections, each [n, 3]."""
     return hull(np.concatenate(list(sections)))
 
 
@@ -95,43 +101,42 @@ def section(
     A power of 2 is an ellipse; larger ones approach a rectangle.
     """
     angle = (np.arange(count) + 0.5) * 2 * np.pi / count
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     radius = (np.abs(c) ** power + np.abs(s) ** power) ** (-1 / power)
-    center, half_u, half_v = (np.asarray(vector, dtype=float) for vector in (center, half_u, half_v))
-    return center + np.outer(radius * c, half_u) + np.outer(radius * s, half_v)
+    along_u = np.outer(radius * c, np.asarray(half_u, dtype=float))
+    along_v = np.outer(radius * s, np.asarray(half_v, dtype=float))
+    return np.asarray(center, dtype=float) + along_u + along_v
 
 
 def prism(outline: Sequence[tuple[float, float]], bottom: float, top: float) -> Shape:
-    """The convex hull of a polygon in x and y between two heights."""
+    """Make the convex hull of a polygon in x and y between two heights."""
     xy = np.asarray(outline, dtype=float)
     return loft([np.column_stack([xy, np.full(len(xy), z)]) for z in (bottom, top)])
 
 
 def shape_mesh(shape: Shape, *, coarse: bool = False) -> trimesh.Trimesh:
-    """The closed triangle mesh of a convex shape, in its body's frame.
+    """Make the closed triangle mesh of a convex shape, in its body's frame.
 
     Args:
         shape: the shape.
-        coarse: round shapes with few triangles: enough for a picture, not for a distance.
+        coarse: use few triangles for round shapes; enough for a picture, not for a distance.
     """
     import trimesh
 
     geometry = shape.geometry
+    size = geometry.size
     if geometry.kind == "box":
-        mesh = trimesh.creation.box(2 * np.array(geometry.size))
+        mesh = trimesh.creation.box(2 * np.array(size))
     elif geometry.kind == "sphere":
-        mesh = trimesh.creation.icosphere(2 if coarse else 3, geometry.size[0])
+        mesh = trimesh.creation.icosphere(2 if coarse else 3, size[0])
     elif geometry.kind == "cylinder":
-        mesh = trimesh.creation.cylinder(
-            geometry.size[0], 2 * geometry.size[1], sections=24 if coarse else CYLINDER_SECTIONS
-        )
+        mesh = trimesh.creation.cylinder(size[0], 2 * size[1], sections=24 if coarse else CYLINDER_SECTIONS)
     elif geometry.kind == "capsule":
-        mesh = trimesh.creation.capsule(
-            radius=geometry.size[0], height=2 * geometry.size[1], count=(10, 14) if coarse else (32, 32)
-        )
-        mesh.apply_translation(
-            [0, 0, -mesh.bounds.mean(axis=0)[2]]
-        )  # trimesh has had its origin at one end or in the middle
+        count = (10, 14) if coarse else (32, 32)
+        mesh = trimesh.creation.capsule(radius=size[0], height=2 * size[1], count=count)
+        # The origin is at one end or in the middle, depending on trimesh's version.
+        mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
     else:
         mesh = trimesh.Trimesh(geometry.vertices, geometry.faces, process=False)
     mesh.apply_transform(shape.T_body_shape)
@@ -139,17 +144,25 @@ def shape_mesh(shape: Shape, *, coarse: bool = False) -> trimesh.Trimesh:
 
 
 def surface_of(pieces: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and triangles [F, 3] of all pieces together; where pieces overlap, triangles lie inside the solid."""
+    """Return vertices [V, 3] and triangles [F, 3] of all pieces; where pieces overlap, triangles lie inside the
+    solid."""
     import trimesh
 
     mesh = trimesh.util.concatenate([shape_mesh(piece) for piece in pieces])
     return np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
 
 
-def mass_properties(vertices: np.ndarray, faces: np.ndarray, mass: float) -> tuple[np.ndarray, np.ndarray]:
-    """Centre of mass [3] and inertia [3, 3] about it of a closed mesh with uniform density and that mass.
+def half_spaces(shape: Shape) -> np.ndarray:
+    """[P, 4] planes of a convex shape, (outward unit normal, offset): x is inside where normal . x + offset <= 0 for
+    all."""
+    vertices = np.asarray(shape_mesh(shape).vertices, dtype=float)
+    return np.unique(ConvexHull(vertices).equations.round(9), axis=0)  # coplanar triangles share a plane
 
-    For a mesh of several closed parts each part counts in full, so a volume where two parts overlap counts twice.
+
+def mass_properties(vertices: np.ndarray, faces: np.ndarray, mass: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return center of mass [3] and inertia [3, 3] about it of a closed mesh of uniform density and the given mass.
+
+    In a mesh of several closed parts each part counts in full, so a volume where two parts overlap counts twice.
     """
     import trimesh
 
@@ -158,25 +171,21 @@ def mass_properties(vertices: np.ndarray, faces: np.ndarray, mass: float) -> tup
 
 
 def shell_properties(vertices: np.ndarray, faces: np.ndarray, mass: float) -> tuple[np.ndarray, np.ndarray]:
-    """Centre of mass [3] and inertia [3, 3] about it of a thin wall along the triangles, of the same thickness everywhere."""
+    """Return center of mass [3] and inertia [3, 3] about it of a thin wall of constant thickness along the triangles.
+
+    The second moment of a triangle, the mean of x x^T, is (the sum over its corners + that of the corners' sum) / 12.
+    """
     corners = vertices[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = np.linalg.norm(_triangle_normals(corners), axis=1)
     weight = mass * area / area.sum()
     com = np.einsum("f,fi->i", weight, corners.mean(axis=1)) / mass
     local = corners - com
     total = local.sum(axis=1)
     second = np.einsum("f,fki,fkj->ij", weight, local, local) + np.einsum("f,fi,fj->ij", weight, total, total)
-    second /= 12  # of x x^T over a triangle: (the corners' + that of their sum) / 12
+    second /= 12
     return com, np.trace(second) * np.eye(3) - second
 
 
-def _translation(center: ArrayLike) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, 3] = center
-    return T
-
-
-def half_spaces(shape: Shape) -> np.ndarray:
-    """[P, 4] the planes of a convex shape, (outward unit normal, offset): a point x is inside where normal . x + offset <= 0 for all."""
-    vertices = np.asarray(shape_mesh(shape).vertices, dtype=float)
-    return np.unique(ConvexHull(vertices).equations.round(9), axis=0)  # coplanar triangles share a plane
+def _triangle_normals(corners: np.ndarray) -> np.ndarray:
+    """[F, 3] normals of triangles [F, 3, 3], twice as long as the area."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

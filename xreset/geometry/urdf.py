@@ -1,12 +1,11 @@
 """A URDF as plain data: the kinematic tree that every part of xreset builds from.
 
-Each engine's own URDF reader has habits of its own (invented masses, fused fixed links, joint order, effort as a force range). So a URDF is
-read once, here, and the backends build their models from a :class:`RobotTree`.
+Every engine's own URDF reader has habits (invented masses, fused fixed links, joint order, effort as a force range). So
+a URDF is read once, here, and the backends build their models from a :class:`RobotTree`.
 """
 
 from __future__ import annotations
 
-import io
 import math
 import os
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -26,8 +26,13 @@ from xreset.text import is_plain, shown
 JointType = Literal["revolute", "prismatic", "fixed"]
 
 HULL_TOLERANCE = 5e-4
-"""[m] How far the hull of a mesh with many points may stand back behind them: makers' meshes have thousands, engines bear hundreds."""
-_MASSLESS = 1e-9
+"""How far points of a mesh may stand out of its hull [m]: makers' meshes have thousands of points, engines accept
+hundreds."""
+_LARGEST = 1e6
+"""Largest number in a URDF, limits excepted: masses [kg], positions [m], inertias [kg m^2]. No robot comes near."""
+_SHORTEST_AXIS = 1e-9
+_FOLDERS_ABOVE = 3
+"""Folders above the URDF's own in which meshes may lie: those of a ROS package and of its workspace, never the root."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,9 +43,9 @@ class Link:
     mass: float
     """[kg]; 0 where the URDF gives none."""
     com: np.ndarray
-    """[3] centre of mass in the link frame [m]."""
+    """[3] center of mass in the link frame [m]."""
     inertia: np.ndarray
-    """[3, 3] about the centre of mass, along the link frame's axes [kg m^2]."""
+    """[3, 3] about the center of mass, along the link frame's axes [kg m^2]."""
     collisions: tuple[Shape, ...]
     """Convex collision shapes in the link frame; a mesh is its convex hull, within :data:`HULL_TOLERANCE`."""
 
@@ -60,6 +65,7 @@ class Joint:
     lower: float
     """Lower position limit [rad or m]; -inf for a continuous joint."""
     upper: float
+    """Upper position limit [rad or m]; inf for a continuous joint."""
     velocity: float
     """Largest speed [rad/s or m/s]; inf where the URDF gives none."""
 
@@ -80,21 +86,23 @@ class RobotTree:
         return tuple(link.name for link in self.links)
 
     def link(self, name: str) -> Link:
-        """The link of that name; ``RobotError`` if there is none."""
-        for link in self.links:
-            if link.name == name:
-                return link
-        raise RobotError(f"robot {self.name!r} has no link {name!r}; it has {', '.join(self.link_names)}.")
+        """Return the link of that name, or raise ``RobotError``."""
+        return self._named("link", self.links, name)
 
     def joint(self, name: str) -> Joint:
-        """The joint of that name; ``RobotError`` if there is none."""
-        for joint in self.joints:
-            if joint.name == name:
-                return joint
-        raise RobotError(f"robot {self.name!r} has no joint {name!r}; it has {', '.join(j.name for j in self.joints)}.")
+        """Return the joint of that name, or raise ``RobotError``."""
+        return self._named("joint", self.joints, name)
+
+    def _named(self, kind: str, parts, name: str):
+        for part in parts:
+            if part.name == name:
+                return part
+        known = ", ".join(part.name for part in parts)
+        raise RobotError(f"robot {self.name!r} has no {kind} {name!r}. Choose from: {known}.")
 
     def moving_ancestor(self, name: str) -> str:
-        """The link of the rigid body that ``name`` belongs to: itself, or the nearest ancestor that a joint moves (or the root)."""
+        """Return the link of the rigid body of a link: itself, or the nearest ancestor that a joint moves (or the
+        root)."""
         by_child = {joint.child: joint for joint in self.joints}
         while name in by_child and by_child[name].type == "fixed":
             name = by_child[name].parent
@@ -102,32 +110,38 @@ class RobotTree:
 
 
 def robot_tree(robot: RobotSpec) -> RobotTree:
-    """The tree of a robot's URDF (read once per file and modification)."""
+    """Return the tree of a robot's URDF; the file is read again only after a change."""
     return load_urdf(robot.urdf)
 
 
 def load_urdf(path: str | Path) -> RobotTree:
     """Read a URDF.
 
-    ``<capsule radius length/>`` is understood in addition to the standard shapes. Mesh files are looked for beside the URDF
-    (``package://NAME/`` is tried there and in the three folders above it).
+    ``<capsule radius length/>`` is accepted in addition to the standard shapes. Mesh files are searched next to the
+    URDF (``package://NAME/`` also in the three folders above it).
 
     Raises:
-        RobotError: the file is missing or damaged, a mesh is missing, the links form no tree, or a joint type is not supported.
+        RobotError: the file is missing or damaged, a mesh is missing, the links form no tree, or a joint type is not
+            supported.
     """
     path = Path(path).resolve()
     if not path.is_file():
-        raise RobotError(f"there is no URDF at {path}.")
-    if path.stat().st_size > max_bytes() // 16:
-        raise RobotError(f"{path} has {path.stat().st_size >> 20} MB, too many for a URDF.")
-    return _load(path, path.stat().st_mtime_ns)
+        raise RobotError(f"{path} is not a file. Expected a URDF there.")
+    status = path.stat()
+    if status.st_size > max_bytes() // 16:
+        raise RobotError(f"{path} has {status.st_size >> 20} MB, which is too large for a URDF.")
+    tree, meshes = _load(path, status.st_mtime_ns)
+    if any(_modified(mesh) != time for mesh, time in meshes):
+        _load.cache_clear()
+        tree, _ = _load(path, status.st_mtime_ns)
+    return tree
 
 
-def parse_xml(path: Path) -> ElementTree.Element:
-    """The root of a file.
+def parse_xml(path: Path) -> Element:
+    """Return the root element of a file.
 
     Raises:
-        RobotError: it cannot be read.
+        RobotError: the file cannot be read.
     """
     try:
         return ElementTree.parse(path).getroot()
@@ -135,83 +149,81 @@ def parse_xml(path: Path) -> ElementTree.Element:
         raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
 
 
-@lru_cache(maxsize=16)
-def _load(path: Path, _modified: int) -> RobotTree:
-    import yourdfpy
-
-    xml = parse_xml(path)
+def _modified(mesh: Path) -> int:
+    """Return the time of a mesh's last change [ns]; -1 if the file is gone."""
     try:
-        if xml.tag == "mujoco":
-            raise RobotError(f"{path} is MJCF, not URDF; `xreset robots import` makes a robot of it.")
-        for element in xml.iter("geometry"):  # yourdfpy knows no capsules: they travel as negative cylinders
-            for capsule in element.findall("capsule"):
-                capsule.tag = "cylinder"
-                capsule.set("radius", f"-{capsule.get('radius')}")
-        with np.errstate(invalid="ignore"):
-            robot = yourdfpy.URDF.load(
-                io.BytesIO(ElementTree.tostring(xml)),
-                build_scene_graph=False,
-                load_meshes=False,
-                filename_handler=lambda name: name,
-            ).robot
-    except RobotError:
-        raise
-    except Exception as error:  # yourdfpy raises whatever its parsing meets
-        raise RobotError(f"{path} cannot be read as a URDF: {shown(str(error))}") from error
+        return mesh.stat().st_mtime_ns
+    except OSError:
+        return -1
 
-    joints = {joint.child: joint for joint in robot.joints}
-    names = [link.name for link in robot.links]
-    if len(set(names)) != len(names):
-        raise RobotError(f"{path}: a link name occurs twice.")
-    roots = [name for name in names if name not in joints]
+
+@lru_cache(maxsize=16)
+def _load(path: Path, _modified_ns: int) -> tuple[RobotTree, list[tuple[Path, int]]]:
+    """Read a URDF; return its tree, and its mesh files with the times of their last change."""
+    xml = parse_xml(path)
+    if xml.tag == "mujoco":
+        raise RobotError(f"{path} is MJCF, not URDF; `xreset robots import` makes a robot of it.")
+    meshes: list[tuple[Path, int]] = []
+    try:
+        with np.errstate(invalid="ignore"):  # check_tree refuses what is not finite
+            links = {}
+            for element in xml.findall("link"):
+                link = _link(element, path, meshes)
+                if link.name in links:
+                    raise RobotError(f"{path}: the link name {shown(link.name)} occurs twice.")
+                links[link.name] = link
+            joints = {}
+            for element in xml.findall("joint"):
+                joint = _joint(element, path)
+                if joint.child in joints:
+                    raise RobotError(f"{path}: link {joint.child!r} is the child of two joints, expected one.")
+                joints[joint.child] = joint
+            tree = _ordered(xml.get("name") or path.stem, links, joints, path)
+    except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
+        raise RobotError(f"{path} cannot be read as a URDF: {shown(f'{type(error).__name__}: {error}')}") from error
+    check_tree(tree, path)
+    return tree, meshes
+
+
+def _ordered(name: str, links: dict[str, Link], joints: dict[str, Joint], path: Path) -> RobotTree:
+    """Return the tree of links by name and joints by child, parents before children."""
+    for joint in joints.values():
+        for end in (joint.parent, joint.child):
+            if end not in links:
+                raise RobotError(f"{path}: joint {joint.name!r} names link {end!r}, which the file does not define.")
+    roots = [link for link in links if link not in joints]
     if len(roots) != 1:
         raise RobotError(f"{path}: expected one root link, found {len(roots)} ({', '.join(roots) or 'none'}).")
-    children: dict[str, list[str]] = {}
-    for joint in robot.joints:
-        for end in (joint.parent, joint.child):
-            if end not in names:
-                raise RobotError(f"{path}: joint {joint.name!r} names link {end!r}, which the file does not define.")
-        children.setdefault(joint.parent, []).append(joint.child)
     order: list[str] = []
-    stack = [roots[0]]
+    stack = list(roots)
     while stack:
-        name = stack.pop()
-        order.append(name)
-        stack.extend(reversed(children.get(name, [])))
-    if len(order) != len(names):
-        raise RobotError(f"{path}: links {sorted(set(names) - set(order))} are not connected to the root {roots[0]!r}.")
-
-    by_name = {link.name: link for link in robot.links}
-    for name in (*names, *(joint.name for joint in robot.joints)):
-        if not isinstance(name, str) or not is_plain(name):
-            raise RobotError(f"{path}: the name {shown(name)} holds characters that control a terminal, or is none.")
-    try:
-        with np.errstate(invalid="ignore"):  # what is not finite is refused below
-            tree = RobotTree(
-                name=robot.name or path.stem,
-                root=roots[0],
-                links=tuple(_link(by_name[name], path) for name in order),
-                joints=tuple(_joint(joints[name], path) for name in order[1:]),
-            )
-    except (ValueError, TypeError, IndexError) as error:  # vectors of two numbers, texts for numbers
-        raise RobotError(f"{path} has numbers that make no sense: {shown(str(error))}") from error
-    check_tree(tree, path)
-    return tree
-
-
-_LARGEST = 1e6
-"""Of any number of a URDF but limits: masses [kg], positions [m], inertias [kg m^2]. No robot comes near."""
+        parent = stack.pop()
+        order.append(parent)
+        children = [joint.child for joint in joints.values() if joint.parent == parent]
+        stack.extend(reversed(children))
+    if len(order) != len(links):
+        raise RobotError(f"{path}: links {sorted(set(links) - set(order))} are not connected to the root {roots[0]!r}.")
+    return RobotTree(
+        name=name,
+        root=roots[0],
+        links=tuple(links[link] for link in order),
+        joints=tuple(joints[link] for link in order[1:]),
+    )
 
 
 def check_tree(tree: RobotTree, path: Path) -> None:
-    """Refuse numbers that are not finite or beyond anything real (``RobotError``); continuous joints' limits are infinite on purpose."""
+    """Raise ``RobotError`` for numbers that are not finite or too large; limits of continuous joints may be
+    infinite."""
     for link in tree.links:
         parts = [link.com, link.inertia, np.array([link.mass])]
         for shape in link.collisions:
             parts += [shape.T_body_shape, np.asarray(shape.geometry.size or 0.0)]
-            parts += [] if shape.geometry.vertices is None else [shape.geometry.vertices]
+            if shape.geometry.vertices is not None:
+                parts.append(shape.geometry.vertices)
         if not all((np.abs(part) < _LARGEST).all() for part in parts):
             raise RobotError(f"{path}: link {link.name!r} has a number that is not finite, or far too large.")
+        if any(min(shape.geometry.size, default=0.0) < 0 for shape in link.collisions):
+            raise RobotError(f"{path}: link {link.name!r} has a shape of negative size.")
         if link.mass < 0:
             raise RobotError(f"{path}: link {link.name!r} has the mass {link.mass} kg, expected 0 or more.")
     for joint in tree.joints:
@@ -219,104 +231,159 @@ def check_tree(tree: RobotTree, path: Path) -> None:
             raise RobotError(f"{path}: joint {joint.name!r} has a number that is not finite, or far too large.")
         if math.isnan(joint.velocity) or not joint.lower <= joint.upper:
             raise RobotError(
-                f"{path}: joint {joint.name!r} has the limits {joint.lower} to {joint.upper}, expected the lower one first."
+                f"{path}: joint {joint.name!r} has the limits {joint.lower} to {joint.upper}. "
+                "Expected the lower one first."
             )
 
 
-def _link(link, path: Path) -> Link:
-    inertial = link.inertial
-    if inertial is None or not inertial.mass:
-        mass, com, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
-    else:
-        origin = np.eye(4) if inertial.origin is None else np.asarray(inertial.origin, dtype=float)
-        about = np.zeros((3, 3)) if inertial.inertia is None else np.asarray(inertial.inertia, dtype=float)
-        mass, com, inertia = float(inertial.mass), origin[:3, 3], origin[:3, :3] @ about @ origin[:3, :3].T
+def _name(element: Element, path: Path) -> str:
+    name = element.attrib["name"]
+    if not name or not is_plain(name):
+        raise RobotError(f"{path}: the name {shown(name)} is empty or contains control characters.")
+    return name
+
+
+def _vector(text: str, length: int) -> np.ndarray:
+    """[length] numbers that a text holds."""
+    values = np.array(text.replace(",", " ").split(), dtype=float)
+    if len(values) != length:
+        raise ValueError(f"expected {length} numbers, found {shown(text)}")
+    return values
+
+
+def _origin(element: Element) -> np.ndarray:
+    """[4, 4] pose that the element's ``origin`` gives."""
+    from trimesh.transformations import compose_matrix
+
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(4)
+    xyz = _vector(origin.get("xyz", "0 0 0"), 3)
+    rpy = _vector(origin.get("rpy", "0 0 0"), 3)
+    return compose_matrix(translate=xyz, angles=rpy)
+
+
+def _link(element: Element, path: Path, meshes: list[tuple[Path, int]]) -> Link:
+    name = _name(element, path)
+    mass = 0.0
+    com = np.zeros(3)
+    matrix = np.zeros((3, 3))
+    inertial = element.find("inertial")
+    if inertial is not None:
+        given = inertial.find("mass")
+        mass = 0.0 if given is None else float(given.get("value", 0.0))
+    if inertial is not None and mass:
+        origin = _origin(inertial)
+        com = origin[:3, 3]
+        about = inertial.find("inertia")
+        if about is not None:
+            for row, key in enumerate("xyz"):
+                for column, other in enumerate("xyz"):
+                    default = 1.0 if row == column else 0.0
+                    matrix[row, column] = float(about.get("i" + "".join(sorted(key + other)), default))
+        matrix = origin[:3, :3] @ matrix @ origin[:3, :3].T
     shapes = []
-    for collision in link.collisions:
-        T = np.eye(4) if collision.origin is None else np.asarray(collision.origin, dtype=float)
-        geometry = collision.geometry
-        if geometry.box is not None:
-            size = tuple(float(s) / 2 for s in geometry.box.size)
-            if len(size) != 3:
-                raise ValueError(f"link {link.name!r} has a box of {len(size)} numbers")
-            shape = Geometry(kind="box", size=size)
-        elif geometry.sphere is not None:
-            shape = Geometry(kind="sphere", size=(float(geometry.sphere.radius),))
-        elif geometry.cylinder is not None:
-            radius, half = float(geometry.cylinder.radius), float(geometry.cylinder.length) / 2
-            shape = Geometry(kind="capsule" if radius < 0 else "cylinder", size=(abs(radius), half))
-        elif geometry.mesh is not None:
-            shape = _hull(geometry.mesh, link.name, path)
-        else:
-            raise RobotError(f"{path}: link {link.name!r} has a collision without a geometry.")
-        shapes.append(Shape(geometry=shape, T_body_shape=T))
-    return Link(name=link.name, mass=mass, com=com, inertia=inertia, collisions=tuple(shapes))
+    for collision in element.findall("collision"):
+        geometry = collision.find("geometry")
+        if geometry is None or not len(geometry):
+            raise RobotError(f"{path}: link {name!r} has a collision without a geometry.")
+        shapes.append(Shape(geometry=_geometry(geometry[0], name, path, meshes), T_body_shape=_origin(collision)))
+    return Link(name=name, mass=mass, com=com, inertia=matrix, collisions=tuple(shapes))
 
 
-def _hull(mesh, link: str, path: Path) -> Geometry:
+def _geometry(shape: Element, link: str, path: Path, meshes: list[tuple[Path, int]]) -> Geometry:
+    if shape.tag == "box":
+        size = _vector(shape.attrib["size"], 3) / 2
+        return Geometry(kind="box", size=tuple(size.tolist()))
+    if shape.tag == "sphere":
+        return Geometry(kind="sphere", size=(float(shape.attrib["radius"]),))
+    if shape.tag == "mesh":
+        return _mesh_hull(shape, link, path, meshes)
+    if shape.tag not in ("cylinder", "capsule"):
+        raise RobotError(f"{path}: link {link!r} has a collision shape {shown(shape.tag)}, which is not supported.")
+    size = (float(shape.attrib["radius"]), float(shape.attrib["length"]) / 2)
+    return Geometry(kind="capsule" if shape.tag == "capsule" else "cylinder", size=size)
+
+
+def _mesh_hull(mesh: Element, link: str, path: Path, meshes: list[tuple[Path, int]]) -> Geometry:
+    """Return the hull of a mesh file, and add the file to ``meshes``."""
     import trimesh
 
-    file = find_mesh(mesh.filename, path)
+    name = mesh.attrib["filename"]
+    file = find_mesh(name, path)
     if file is None:
         raise RobotError(
-            f"{path}: link {link!r} uses the mesh {shown(mesh.filename)}, which is not in its folders. Put it there."
+            f"{path}: link {link!r} uses the mesh {shown(name)}, which is not in its folders. Put it there."
         )
     try:
+        meshes.append((file, _modified(file)))
         if file.stat().st_size > max_bytes():
             raise ValueError(f"it has {file.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows")
         loaded = trimesh.load(file, force="mesh", process=False)
         if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.vertices):
-            raise ValueError("it holds no triangles")
+            raise ValueError("it contains no triangles")
         if not (np.abs(loaded.vertices) < _LARGEST).all():
-            raise ValueError("it has a vertex that is not finite, or far away")
-        scale = np.ones(3) if mesh.scale is None else np.broadcast_to(np.asarray(mesh.scale, dtype=float), 3)
-        return hull(np.asarray(loaded.vertices) * scale, HULL_TOLERANCE).geometry
-    except Exception as error:  # trimesh and qhull raise whatever they meet
+            raise ValueError("a vertex is not finite, or too far away")
+        scale = np.array(mesh.get("scale", "1").replace(",", " ").split(), dtype=float)
+        return hull(np.asarray(loaded.vertices) * np.broadcast_to(scale, 3), HULL_TOLERANCE).geometry
+    except Exception as error:  # trimesh and qhull raise many kinds of errors
         raise RobotError(
-            f"{path}: link {link!r} uses the mesh {mesh.filename!r}, which cannot be read: {shown(str(error))}"
+            f"{path}: link {link!r} uses the mesh {name!r}, which cannot be read: {shown(str(error))}"
         ) from error
 
 
-_ABOVE = 3
-"""Folders above a URDF's own in which its meshes may lie: those of a ROS package and of its workspace, never the root."""
-
-
 def find_mesh(name: str, urdf: Path) -> Path | None:
-    """The file that a URDF's mesh name means, or None: a name cannot lead out of the robot's folders."""
-    relative = Path(name.split("://", 1)[1]) if "://" in name else Path(name)
-    folders = [folder for folder in urdf.parents[: _ABOVE + 1] if folder != folder.parent]
-    names = (
-        [relative, Path(*relative.parts[1:])] if name.startswith("package://") else [relative]
-    )  # a package's own folder may be above
-    candidates = (Path(os.path.normpath(folder / each)) for each in names for folder in folders)
+    """Return the file that a URDF's mesh name means, or None; a name cannot lead out of the robot's folders."""
+    relative = Path(name.split("://", 1)[-1])
+    folders = [folder for folder in urdf.parents[: _FOLDERS_ABOVE + 1] if folder != folder.parent]
+    names = [relative]
+    if name.startswith("package://"):  # the package's own folder may be above
+        names.append(Path(*relative.parts[1:]))
     try:
-        return next((file for file in candidates if file.is_relative_to(folders[-1]) and file.is_file()), None)
-    except (OSError, ValueError):  # a name too long, or with a zero in it
-        return None
+        for each in names:
+            for folder in folders:
+                file = Path(os.path.normpath(folder / each))
+                if file.is_relative_to(folders[-1]) and file.is_file():
+                    return file
+    except (OSError, ValueError):  # a name that is too long, or contains a zero
+        pass
+    return None
 
 
-def _joint(joint, path: Path) -> Joint:
-    if joint.type not in ("revolute", "continuous", "prismatic", "fixed"):
+def _joint(element: Element, path: Path) -> Joint:
+    name = _name(element, path)
+    kind = element.get("type")
+    if kind not in ("revolute", "continuous", "prismatic", "fixed"):
         raise RobotError(
-            f"{path}: joint {joint.name!r} has type {joint.type!r}; supported are revolute, continuous, prismatic and fixed."
+            f"{path}: joint {name!r} has type {kind!r}; supported are revolute, continuous, prismatic and fixed."
         )
-    axis = np.array([1.0, 0, 0]) if joint.axis is None else np.asarray(joint.axis, dtype=float)
-    if joint.type != "fixed" and not np.linalg.norm(axis) > _MASSLESS:
-        raise RobotError(f"{path}: joint {joint.name!r} has the axis {axis}, expected a direction.")
-    lower, upper, velocity = -math.inf, math.inf, math.inf
-    if joint.limit is not None:
-        if joint.type != "continuous":
-            lower = 0.0 if joint.limit.lower is None else float(joint.limit.lower)
-            upper = 0.0 if joint.limit.upper is None else float(joint.limit.upper)
-        velocity = math.inf if joint.limit.velocity is None else float(joint.limit.velocity)
+    given = element.find("axis")
+    axis = _vector("1 0 0" if given is None else given.get("xyz", "1 0 0"), 3)
+    length = float(np.linalg.norm(axis))
+    if kind != "fixed" and not length > _SHORTEST_AXIS:
+        raise RobotError(f"{path}: joint {name!r} has the axis {axis}, expected a direction.")
+    lower = -math.inf
+    upper = math.inf
+    velocity = math.inf
+    limit = element.find("limit")
+    if limit is not None:
+        velocity = float(limit.get("velocity", math.inf))
+        if kind != "continuous":
+            lower = float(limit.get("lower", 0.0))
+            upper = float(limit.get("upper", 0.0))
+    ends = {}
+    for end in ("parent", "child"):
+        link = element.find(end)
+        if link is None:
+            raise RobotError(f"{path}: joint {name!r} has no {end} link.")
+        ends[end] = link.attrib["link"]
     return Joint(
-        name=joint.name,
-        type="revolute" if joint.type == "continuous" else joint.type,
-        parent=joint.parent,
-        child=joint.child,
-        T_parent_joint=np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=float),
-        axis=axis / max(float(np.linalg.norm(axis)), _MASSLESS),
+        name=name,
+        type="revolute" if kind == "continuous" else kind,
+        T_parent_joint=_origin(element),
+        axis=axis / max(length, _SHORTEST_AXIS),
         lower=lower,
         upper=upper,
         velocity=velocity,
+        **ends,
     )

@@ -1,7 +1,7 @@
-"""Writing URDFs: of the built-in robots from published figures, and of imported ones.
+"""Writes URDFs: those of the built-in robots, from published figures, and those of imported robots.
 
-Both become a :class:`~xreset.geometry.urdf.RobotTree`, the same plain data that a URDF is read into, so writing and reading
-are inverse.
+Both become a :class:`~xreset.geometry.urdf.RobotTree`, the same plain data that a URDF is read into, so writing and
+reading are inverse.
 """
 
 from __future__ import annotations
@@ -15,26 +15,28 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from xreset.geometry import shapes
 from xreset.geometry.urdf import Joint, Link, RobotTree
 from xreset.spec import Geometry, MimicSpec, Shape
 
 FRAME_MASS = 1e-4
-"""Mass [kg] of a link that is only a frame: some engines invent a mass (1 kg) for a link that has none."""
+"""Mass of a link that is only a frame [kg]; some engines invent a mass of 1 kg for a link that has none."""
 FRAME_INERTIA = 1e-7
-"""Its moment of inertia about every axis [kg m^2]."""
+"""Moment of inertia of such a link about every axis [kg m^2]."""
 
 
 def pose(
     xyz: Sequence[float] = (0, 0, 0), *, rpy: Sequence[float] = (0, 0, 0), quat: Sequence[float] | None = None
 ) -> np.ndarray:
-    """[4, 4] pose from a position [m] and roll, pitch, yaw about fixed axes [rad], or a quaternion (w, x, y, z) of any length."""
-    rotation = (
-        Rotation.from_euler("xyz", rpy)
-        if quat is None
-        else Rotation.from_quat(np.array(quat, dtype=float), scalar_first=True)
-    )
+    """[4, 4] pose from a position [m] and roll, pitch, yaw about fixed axes [rad], or a quaternion (w, x, y, z) of any
+    length."""
+    if quat is None:
+        rotation = Rotation.from_euler("xyz", rpy)
+    else:
+        rotation = Rotation.from_quat(np.array(quat, dtype=float), scalar_first=True)
     T = np.eye(4)
     T[:3, :3] = rotation.as_matrix()
     T[:3, 3] = xyz
@@ -54,27 +56,43 @@ def inertia_matrix(ixx: float, ixy: float, ixz: float, iyy: float, iyz: float, i
 
 
 def box(size: Sequence[float], center: Sequence[float] = (0, 0, 0)) -> Shape:
-    """A box of full edge lengths ``size`` [m]."""
-    return Shape(geometry=Geometry(kind="box", size=tuple(s / 2 for s in size)), T_body_shape=pose(center))
+    """Make a box of full edge lengths ``size`` [m]."""
+    return shapes.box(center, size)
 
 
 def capsule(start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
-    """A capsule whose axis runs from ``start`` to ``end`` [m]; the round ends lie beyond them."""
+    """Make a capsule whose axis runs from ``start`` to ``end`` [m]; the round ends lie beyond them."""
     return _between("capsule", start, end, radius)
 
 
 def cylinder(start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
-    """A cylinder whose axis runs from ``start`` to ``end`` [m]."""
+    """Make a cylinder whose axis runs from ``start`` to ``end`` [m]."""
     return _between("cylinder", start, end, radius)
 
 
+def _between(
+    kind: Literal["capsule", "cylinder"], start: Sequence[float], end: Sequence[float], radius: float
+) -> Shape:
+    a = np.array(start, dtype=float)
+    b = np.array(end, dtype=float)
+    length = float(np.linalg.norm(b - a))
+    direction = (b - a) / length
+    turn = np.cross([0.0, 0, 1], direction)
+    sine = float(np.linalg.norm(turn))
+    T = np.eye(4)
+    T[:3, 3] = (a + b) / 2
+    if sine > 1e-9:
+        T[:3, :3] = Rotation.from_rotvec(turn / sine * math.atan2(sine, direction[2])).as_matrix()
+    return Shape(geometry=Geometry(kind=kind, size=(radius, length / 2)), T_body_shape=T)
+
+
 def frame(name: str) -> Link:
-    """A link that is only a frame: no shape, and a mass too small to matter."""
+    """Make a link that is only a frame: no shape, and a mass too small to matter."""
     return Link(name=name, mass=FRAME_MASS, com=np.zeros(3), inertia=np.eye(3) * FRAME_INERTIA, collisions=())
 
 
 def fixed(parent: str, child: str, T_parent_child: np.ndarray) -> Joint:
-    """A fixed joint."""
+    """Make a fixed joint."""
     return Joint(
         name=f"{child}_fixed",
         type="fixed",
@@ -111,61 +129,66 @@ class ArmLink:
     com: Sequence[float]
     """[m]"""
     inertia: Sequence[float]
-    """ixx ixy ixz iyy iyz izz about the centre of mass [kg m^2], along axes turned by ``inertia_roll``."""
+    """ixx ixy ixz iyy iyz izz about the center of mass [kg m^2], along axes rotated by ``inertia_roll``."""
     inertia_roll: float = 0.0
-    """Turn of those axes about x [rad]."""
+    """Rotation of those axes about x [rad]."""
     shapes: tuple[Shape, ...]
 
     def below(self, parent: str) -> tuple[Joint, Link]:
-        """The joint that hangs it below another link, and the link."""
+        """Return the joint that attaches the link to a parent link, and the link."""
         R = pose(rpy=(self.inertia_roll, 0, 0))[:3, :3]
-        inertia = R @ inertia_matrix(*self.inertia) @ R.T
         joint = Joint(
-            name=self.joint, type=self.type, parent=parent, child=self.name, T_parent_joint=pose(self.xyz, rpy=self.rpy),
-            axis=np.array(self.axis, dtype=float), lower=self.range[0], upper=self.range[1], velocity=self.velocity,
-        )  # fmt: skip
-        return joint, Link(
-            name=self.name, mass=self.mass, com=np.array(self.com), inertia=inertia, collisions=self.shapes
+            name=self.joint,
+            type=self.type,
+            parent=parent,
+            child=self.name,
+            T_parent_joint=pose(self.xyz, rpy=self.rpy),
+            axis=np.array(self.axis, dtype=float),
+            lower=self.range[0],
+            upper=self.range[1],
+            velocity=self.velocity,
         )
+        link = Link(
+            name=self.name,
+            mass=self.mass,
+            com=np.array(self.com),
+            inertia=R @ inertia_matrix(*self.inertia) @ R.T,
+            collisions=self.shapes,
+        )
+        return joint, link
 
 
 def urdf_text(
     tree: RobotTree, effort: Mapping[str, float], *, mimics: Sequence[MimicSpec] = (), comment: str = ""
 ) -> str:
-    """The URDF of a tree.
+    """Return the text of a tree's URDF.
 
     Args:
         tree: links and joints.
-        effort: largest torque [N m] or force [N] of each moving joint that has a drive; 0 is written for the others (mimic joints).
+        effort: largest torque [N m] or force [N] of each moving joint that has a drive; the others (mimic joints) get
+            0.
         mimics: joints that follow another.
-        comment: where the figures come from; stands at the top.
+        comment: source of the figures, written at the top.
 
     Returns:
         The file's text. Numbers have nine significant digits, so the same figures give the same text.
     """
     robot = Element("robot", name=tree.name)
     for link in tree.links:
-        _write_link(robot, link)
+        _add_link(robot, link)
     by_joint = {mimic.joint: mimic for mimic in mimics}
     for joint in tree.joints:
         element = SubElement(robot, "joint", name=joint.name, type=joint.type)
-        _write_origin(element, joint.T_parent_joint)
-        SubElement(element, "parent", link=joint.parent)
-        SubElement(element, "child", link=joint.child)
+        _add_origin(element, joint.T_parent_joint)
+        _add(element, "parent", link=joint.parent)
+        _add(element, "child", link=joint.child)
         if joint.type == "fixed":
             continue
-        SubElement(element, "axis", xyz=_numbers(joint.axis))
-        limit = {
-            "lower": joint.lower,
-            "upper": joint.upper,
-            "effort": effort.get(joint.name, 0.0),
-            "velocity": joint.velocity,
-        }
-        SubElement(element, "limit", {key: _number(value) for key, value in limit.items()})
+        _add(element, "axis", xyz=joint.axis)
+        drive = effort.get(joint.name, 0.0)
+        _add(element, "limit", lower=joint.lower, upper=joint.upper, effort=drive, velocity=joint.velocity)
         if mimic := by_joint.get(joint.name):
-            SubElement(
-                element, "mimic", joint=mimic.source, multiplier=_number(mimic.multiplier), offset=_number(mimic.offset)
-            )
+            _add(element, "mimic", joint=mimic.source, multiplier=mimic.multiplier, offset=mimic.offset)
     ElementTree.indent(robot)
     head = "".join(f"  {line}\n" for line in comment.splitlines())
     return f'<?xml version="1.0"?>\n<!--\n{head}-->\n{ElementTree.tostring(robot, encoding="unicode")}\n'
@@ -178,11 +201,10 @@ def write_meshes(tree: RobotTree, folder: Path) -> None:
             geometry = shape.geometry
             if geometry.vertices is None or geometry.faces is None:
                 continue
+            lines = [f"v {_text(vertex)}" for vertex in geometry.vertices]
+            lines += [f"f {a} {b} {c}" for a, b, c in geometry.faces + 1]
             file = folder / _mesh_name(link.name, number)
             file.parent.mkdir(parents=True, exist_ok=True)
-            lines = [f"v {_numbers(vertex)}" for vertex in geometry.vertices] + [
-                f"f {a} {b} {c}" for a, b, c in geometry.faces + 1
-            ]
             file.write_text("\n".join(lines) + "\n")
 
 
@@ -190,48 +212,46 @@ def _mesh_name(link: str, number: int) -> str:
     return f"meshes/{link.replace('/', '_')}_{number}.obj"
 
 
-def _between(
-    kind: Literal["capsule", "cylinder"], start: Sequence[float], end: Sequence[float], radius: float
-) -> Shape:
-    a, b = np.array(start, dtype=float), np.array(end, dtype=float)
-    length = float(np.linalg.norm(b - a))
-    direction = (b - a) / length
-    T = np.eye(4)
-    T[:3, 3] = (a + b) / 2
-    turn = np.cross([0.0, 0, 1], direction)
-    sine = float(np.linalg.norm(turn))
-    if sine > 1e-9:
-        T[:3, :3] = Rotation.from_rotvec(turn / sine * math.atan2(sine, direction[2])).as_matrix()
-    return Shape(geometry=Geometry(kind=kind, size=(radius, length / 2)), T_body_shape=T)
-
-
-def _write_link(robot: Element, link: Link) -> None:
+def _add_link(robot: Element, link: Link) -> None:
     element = SubElement(robot, "link", name=link.name)
     inertial = SubElement(element, "inertial")
-    SubElement(inertial, "origin", xyz=_numbers(link.com))
-    SubElement(inertial, "mass", value=_number(link.mass))
-    names = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-    SubElement(inertial, "inertia", {name: _number(link.inertia[at]) for name, at in names.items()})
+    _add(inertial, "origin", xyz=link.com)
+    _add(inertial, "mass", value=link.mass)
+    (ixx, ixy, ixz), (_, iyy, iyz), (_, _, izz) = link.inertia
+    _add(inertial, "inertia", ixx=ixx, ixy=ixy, ixz=ixz, iyy=iyy, iyz=iyz, izz=izz)
     for number, shape in enumerate(link.collisions):
         collision = SubElement(element, "collision")
-        _write_origin(collision, shape.T_body_shape)
-        geometry, size = SubElement(collision, "geometry"), shape.geometry.size
-        if shape.geometry.kind == "box":
-            SubElement(geometry, "box", size=_numbers(2 * s for s in size))
-        elif shape.geometry.kind == "sphere":
-            SubElement(geometry, "sphere", radius=_number(size[0]))
-        elif shape.geometry.kind == "hull":
-            SubElement(geometry, "mesh", filename=_mesh_name(link.name, number))
+        _add_origin(collision, shape.T_body_shape)
+        geometry = SubElement(collision, "geometry")
+        kind = shape.geometry.kind
+        size = shape.geometry.size
+        if kind == "box":
+            _add(geometry, "box", size=2 * np.array(size))
+        elif kind == "sphere":
+            _add(geometry, "sphere", radius=size[0])
+        elif kind == "hull":
+            _add(geometry, "mesh", filename=_mesh_name(link.name, number))
         else:
-            SubElement(geometry, shape.geometry.kind, radius=_number(size[0]), length=_number(2 * size[1]))
+            _add(geometry, kind, radius=size[0], length=2 * size[1])
 
 
-def _write_origin(element: Element, T: np.ndarray) -> None:
-    SubElement(element, "origin", xyz=_numbers(T[:3, 3]), rpy=_numbers(_roll_pitch_yaw(T[:3, :3])))
+def _add_origin(element: Element, T: np.ndarray) -> None:
+    _add(element, "origin", xyz=T[:3, 3], rpy=_roll_pitch_yaw(T[:3, :3]))
+
+
+def _add(parent: Element, tag: str, **attributes: str | ArrayLike) -> None:
+    """Add an element whose attributes are texts, numbers or vectors."""
+    texts = {}
+    for name, value in attributes.items():
+        texts[name] = value if isinstance(value, str) else _text(value)
+    SubElement(parent, tag, texts)
 
 
 def _roll_pitch_yaw(R: np.ndarray) -> tuple[float, float, float]:
-    """Angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad]; yaw is 0 where pitch is +-90 degrees and only the sum of the two is defined."""
+    """Return the angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad].
+
+    Where pitch is +-90 degrees, only the sum of roll and yaw is defined; yaw is 0 there.
+    """
     level = math.hypot(R[0, 0], R[1, 0])
     pitch = math.atan2(-R[2, 0], level)
     if level < 1e-5:
@@ -239,10 +259,7 @@ def _roll_pitch_yaw(R: np.ndarray) -> tuple[float, float, float]:
     return math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])
 
 
-def _numbers(values) -> str:
-    return " ".join(_number(value) for value in values)
-
-
-def _number(value: float) -> str:
-    text = f"{round(float(value), 12):.9g}"
-    return "0" if text == "-0" else text
+def _text(values: ArrayLike) -> str:
+    """Return numbers, separated by spaces, with nine significant digits."""
+    numbers = [f"{round(float(value), 12):.9g}" for value in np.ravel(values)]
+    return " ".join("0" if number == "-0" else number for number in numbers)

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from xreset.errors import RobotError
-from xreset.geometry.balls import Spans, bounding_ball
+from xreset.geometry.balls import Spans, bounding_balls
 from xreset.geometry.collision import SelfCollision, SupportPoints, height_above_table, table_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
@@ -111,9 +110,8 @@ class ArmModel:
         self._spans = Spans.of(rows)
         order = [i for part in rows for i in part]
         self._points, self._radii = torch.as_tensor(support.points[order]), torch.as_tensor(support.radii[order])
-        balls = [bounding_ball(support.points[part], support.radii[part]) for part in rows]
-        self._middles = torch.as_tensor(np.array([middle for middle, _ in balls]).reshape(-1, 3))
-        self._reach = torch.tensor([radius for _, radius in balls], dtype=self._points.dtype)
+        centers = [support.points[part] for part in rows]
+        self._middles, self._reach = bounding_balls(centers, [support.radii[part] for part in rows])
         """Of a ball about each link's points, in the link's frame."""
 
     def hand_poses(self, hand_joints: Tensor) -> Tensor:

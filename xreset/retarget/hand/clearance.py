@@ -113,7 +113,7 @@ def _in_object(
     model: HandModel, bodies: Bodies, bounds: Tensor, objects: Objects, considered: Tensor, object_clearance: float
 ) -> Iterator[Distances]:
     every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
-    beside = objects.fields.beside(objects.local(bounds, every), objects.index[every])
+    beside = objects.fields.box_distance(objects.local(bounds, every), objects.index[every])
     candidate, group = ((beside < model.balls.bound_radii + object_clearance) & considered[:, None]).nonzero(
         as_tuple=True
     )
@@ -164,7 +164,7 @@ def _in_each_other(
     candidate, pair = (near & considered[:, None]).nonzero(as_tuple=True)
     inverse = bodies.rot[candidate, second[pair]].mT
     middle = (inverse @ (bounds[candidate, a[pair]] - bodies.pos[candidate, second[pair]])[..., None])[..., 0]
-    near = fields.beside(middle, b[pair]) < reach[a[pair]]
+    near = fields.box_distance(middle, b[pair]) < reach[a[pair]]
     candidate, pair, inverse = candidate[near], pair[near], inverse[near]
     turn = inverse @ bodies.rot[candidate, first[pair]]
     shift = (inverse @ (bodies.pos[candidate, first[pair]] - bodies.pos[candidate, second[pair]])[..., None])[..., 0]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from xreset.backends.conformance.harness import Bench, Worlds, random_state, replace_fields, rotation_angle
-from xreset.backends.conformance.results import Errors
+from xreset.backends.conformance.results import Measured
 from xreset.backends.conformance.scene import flat_objects
 from xreset.physics import State
 from xreset.spec import GRAVITY, ObjectSpec, PairFriction, SceneSpec, lowest_point
@@ -21,7 +21,7 @@ Motion = Callable[[Bench, Worlds, Sequence[int]], tuple[State, Tensor]]
 """Moves worlds that hold the objects of some of the bench's worlds. Returns the end and the table's forces [N, 3]."""
 
 
-def resting_weight(bench: Bench) -> dict[str, Errors]:
+def resting_weight(bench: Bench) -> Measured:
     """Put objects on the table: no force right after setting; after half a second the table carries their weight."""
     worlds = bench.worlds()
     start = bench.start()
@@ -41,7 +41,7 @@ def resting_weight(bench: Bench) -> dict[str, Errors]:
     }
 
 
-def resting_on_a_side(bench: Bench) -> dict[str, Errors]:
+def resting_on_a_side(bench: Bench) -> Measured:
     """Lay objects on one of their sides: the table's force is m g along the world's z, not along the object's."""
     turn = torch.tensor([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])  # by 90 degrees about x
     start = replace_fields(bench.start(), object_quat=turn)
@@ -59,7 +59,7 @@ def _height_on_side(thing: ObjectSpec) -> float:
     return -lowest_point(pieces)
 
 
-def rest_and_bounce(bench: Bench) -> dict[str, Errors]:
+def rest_and_bounce(bench: Bench) -> Measured:
     """Put flat objects on the table, then drop them from 30 mm: their height after a second, and how far they bounce."""
     objects = flat_objects()
     names = [thing.name for thing in objects]
@@ -90,7 +90,7 @@ def rest_and_bounce(bench: Bench) -> dict[str, Errors]:
     }
 
 
-def object_mass(bench: Bench) -> dict[str, Errors]:
+def object_mass(bench: Bench) -> Measured:
     """Give the objects other masses, then set a state: the table must carry those masses."""
     worlds = bench.worlds()
     mass = bench.masses * torch.tensor([2.0, 0.5, 1.5, 0.7])
@@ -100,7 +100,7 @@ def object_mass(bench: Bench) -> dict[str, Errors]:
     return {"vertical force": worlds.contacts().table_force[:, 2] / (GRAVITY * mass) - 1.0}
 
 
-def set_as_built(bench: Bench) -> dict[str, Errors]:
+def set_as_built(bench: Bench) -> Measured:
     """Set mass and friction in some worlds and build others with them: sliding objects must do the same in both.
 
     Masses change by powers of two, which every product and every eigenvector carries without rounding. Contacts make
@@ -123,7 +123,7 @@ def set_as_built(bench: Bench) -> dict[str, Errors]:
     return {what: zip(names, values, strict=True) for what, values in errors.items()}
 
 
-def object_inertia_set(bench: Bench) -> dict[str, Errors]:
+def object_inertia_set(bench: Bench) -> Measured:
     """Set the inertia of some worlds' objects and build others so: tumbling and sliding must be the same in both."""
     factors = torch.tensor([2.0, 0.5, 4.0, 0.25])
     worlds = bench.worlds()
@@ -135,7 +135,7 @@ def object_inertia_set(bench: Bench) -> dict[str, Errors]:
     return _tumble_and_slide(bench, worlds, built)
 
 
-def object_com_set(bench: Bench) -> dict[str, Errors]:
+def object_com_set(bench: Bench) -> Measured:
     """Move the centre of mass of some worlds' objects and build others so: both must tumble and slide alike."""
     offsets = torch.tensor(
         [[0.0078125, 0.0, 0.0], [0.0, -0.0078125, 0.00390625], [0.00390625, 0.00390625, -0.00390625], [0.0, 0.0, 0.0]]
@@ -149,7 +149,7 @@ def object_com_set(bench: Bench) -> dict[str, Errors]:
     return _tumble_and_slide(bench, worlds, built)
 
 
-def _tumble_and_slide(bench: Bench, worlds: Worlds, built: Sequence[ObjectSpec]) -> dict[str, Errors]:
+def _tumble_and_slide(bench: Bench, worlds: Worlds, built: Sequence[ObjectSpec]) -> Measured:
     """Compare worlds whose objects were changed with worlds that were built with such objects."""
     scenes = [replace(bench.scene, objects=(thing,)) for thing in built]
     tumbling, sliding = _against_built(bench, worlds, scenes, [_tumble, _slide])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from xreset.backends.conformance.harness import Bench, Worlds, replace_fields
-from xreset.backends.conformance.results import Errors
+from xreset.backends.conformance.results import Measured
 from xreset.backends.conformance.scene import ball, flat_objects
 from xreset.physics import State
 from xreset.spec import GRAVITY
@@ -20,7 +20,7 @@ _CASES = [(mu, degrees) for mu in (0.2, 0.5, 0.8, 1.2) for degrees in (0, 45)]  
 _DISTANCE = 0.2  # m that every object slides
 
 
-def sliding_distance(bench: Bench) -> dict[str, Errors]:
+def sliding_distance(bench: Bench) -> Measured:
     """Push boxes off at the speed v with which Coulomb friction stops them after v^2 / (2 mu g) = 0.2 m."""
     shapes = flat_objects()[:3]
     scene = replace(bench.scene, objects=shapes)
@@ -41,7 +41,7 @@ def sliding_distance(bench: Bench) -> dict[str, Errors]:
     return errors
 
 
-def slope(bench: Bench) -> dict[str, Errors]:
+def slope(bench: Bench) -> Measured:
     """Load a box sideways, as a slope does, with 0.95 and 1.05 of mu m g: it must stay, and slide with 0.05 mu g."""
     box = flat_objects()[0]
     scene = replace(bench.scene, objects=(box,))
@@ -71,7 +71,7 @@ def slope(bench: Bench) -> dict[str, Errors]:
     return errors
 
 
-def torsional_friction(bench: Bench) -> dict[str, Errors]:
+def torsional_friction(bench: Bench) -> Measured:
     """Spin a ball on the table with two sliding frictions: torsional friction brakes it with the same torque in both.
 
     I domega/dt = -t m g, with t the torsional friction, a length.
@@ -82,7 +82,7 @@ def torsional_friction(bench: Bench) -> dict[str, Errors]:
     return {"spin lost": lost - 1.0}
 
 
-def torsional_friction_set(bench: Bench) -> dict[str, Errors]:
+def torsional_friction_set(bench: Bench) -> Measured:
     """Spin balls whose torsional friction was set world by world, then a state: each is braked by its own.
 
     I domega/dt = -t m g, with none, half, all and twice of what the scene says.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from xreset.backends.conformance.harness import Bench, Worlds, rotation_angle
-from xreset.backends.conformance.results import Errors
+from xreset.backends.conformance.results import Measured
 from xreset.geometry.rotations import matrix_to_quat, quat_conjugate, quat_multiply, quat_rotate
 from xreset.physics import State
 from xreset.spec import GRAVITY
@@ -16,7 +16,7 @@ from xreset.spec import GRAVITY
 _SETTLE = 120  # steps
 
 
-def held_object(bench: Bench) -> dict[str, Errors]:
+def held_object(bench: Bench) -> Measured:
     """Hold a brick between two jaws in the air: the fingers push against each other and carry the weight together."""
     worlds = bench.worlds()
     state, closing = grasp(bench)
@@ -37,7 +37,7 @@ def held_object(bench: Bench) -> dict[str, Errors]:
     }
 
 
-def shaken_grasp(bench: Bench) -> dict[str, Errors]:
+def shaken_grasp(bench: Bench) -> Measured:
     """Hold a brick for half a second, then shake it for two, up and down and sideways: it must stay in the palm."""
     worlds = bench.worlds()
     state, _ = grasp(bench)
@@ -66,7 +66,7 @@ def _in_palm(bench: Bench, worlds: Worlds) -> tuple[Tensor, Tensor]:
     return quat_rotate(inverse, now.object_pos - links.pos[:, 0]), quat_multiply(inverse, now.object_quat)
 
 
-def tip_friction(bench: Bench) -> dict[str, Errors]:
+def tip_friction(bench: Bench) -> Measured:
     """Hold two bricks, one of them with slippery fingertips: that one must fall, the other must not."""
     worlds = bench.worlds()
     held, dropped = bench.twins

@@ -8,13 +8,13 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from xreset.backends.conformance.harness import Bench, replace_fields
-from xreset.backends.conformance.results import Errors
+from xreset.backends.conformance.results import Measured
 from xreset.spec import GRAVITY, ObjectSpec
 
 _STEPS = 24
 
 
-def free_fall(bench: Bench) -> dict[str, Errors]:
+def free_fall(bench: Bench) -> Measured:
     """Throw objects without spin for half a second: they keep their horizontal velocity and do not begin to turn.
 
     A semi-implicit step of length h falls g t h / 2 lower than the parabola. The vertical tolerance allows for that
@@ -36,7 +36,7 @@ def free_fall(bench: Bench) -> dict[str, Errors]:
     }
 
 
-def free_spin(bench: Bench) -> dict[str, Errors]:
+def free_spin(bench: Bench) -> Measured:
     """Throw spinning objects: each centre of mass flies a parabola, and the axes turn as Euler's equations say.
 
     The mesh-frame origin is off the centre of mass, so it matters what the linear velocity refers to. The vertical
@@ -73,10 +73,10 @@ def free_spin(bench: Bench) -> dict[str, Errors]:
             "angvel": np.abs(end.object_angvel[i].double().numpy() - omega).max(),
         }
         errors.append(error)
-    return {what: np.array([error[what] for error in errors]) for what in errors[0]}
+    return {what: np.array([error[what] for error in errors]) for what in errors[0]}  # noqa: XR002
 
 
-def object_gravity(bench: Bench) -> dict[str, Errors]:
+def object_gravity(bench: Bench) -> Measured:
     """Let objects fall with different gravity fractions, set before the state."""
     worlds = bench.worlds()
     fraction = torch.tensor([0.0, 0.5, 1.0, 0.25])
@@ -88,7 +88,7 @@ def object_gravity(bench: Bench) -> dict[str, Errors]:
     return {"velocity gained": float(off) / full, "spin gained": end.object_angvel}
 
 
-def object_wrench(bench: Bench) -> dict[str, Errors]:
+def object_wrench(bench: Bench) -> Measured:
     """Push and twist objects in the air, with other masses if those can be set; setting a state ends the wrench."""
     worlds = bench.worlds()
     factor = torch.ones(bench.NUM_WORLDS)

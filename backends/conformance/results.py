@@ -38,9 +38,12 @@ Verdict = Literal["passed", "known difference", "failed", "unsupported", "skippe
 Group = Literal["state", "worlds", "robot", "object", "contact"]
 """Part of the contract that a check belongs to."""
 
-Errors = Tensor | float | Iterable[tuple[str, float]]
-"""What a check found: errors, of which the largest absolute value counts; or pairs of a name and an error, of which the
-largest counts and its name is shown."""
+Errors = Tensor | np.ndarray | float | Iterable[tuple[str, float]]
+"""Errors, of which the largest absolute value counts; or pairs of a name and an error, of which the largest counts and
+its name is shown."""
+
+Measured = Mapping[str, Errors]
+"""What a check found, by the names of its measures."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ class Check:
     group: Group
     statement: str
     cause: str
-    run: Callable[[Bench], Mapping[str, Errors]]
+    run: Callable[[Bench], Measured]
     """Makes the measurements, by name; raises :class:`Skipped` where that is impossible."""
     capabilities: tuple[Capability, ...] = ()
     own_robot_only: bool = False
@@ -157,10 +160,10 @@ class CheckResult:
 
 def largest(errors: Errors) -> tuple[float, str]:
     """Return the largest error and its name; NaN if there is one."""
-    if not isinstance(errors, Tensor | float | np.ndarray):
-        name, error = max(errors, key=lambda pair: math.inf if math.isnan(pair[1]) else float(pair[1]))
-        return float(error), name
-    return float(np.abs(np.asarray(errors, dtype=np.float64)).max(initial=0.0)), ""
+    if isinstance(errors, Tensor | np.ndarray | float | int):
+        return float(np.abs(np.asarray(errors, dtype=np.float64)).max(initial=0.0)), ""
+    name, error = max(errors, key=lambda pair: math.inf if math.isnan(pair[1]) else float(pair[1]))
+    return float(error), name
 
 
 def judge(measures: Iterable[Measure]) -> Verdict:

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, replace_fields, rotation_angle
-from xreset.backends.conformance.results import Errors, Skipped
+from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.conformance.scene import without_collisions
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat
@@ -31,7 +31,7 @@ _DRIVE_SCALES = ((1.0, 1.0, 1.0), (0.7, 1.4, 1.0), (1.3, 0.8, 0.5))  # of stiffn
 # Kinematics -----------------------------------------------------------------------------------------------------------
 
 
-def forward_kinematics(bench: Bench) -> dict[str, Errors]:
+def forward_kinematics(bench: Bench) -> Measured:
     """Set many configurations and compare palm and fingertips with the URDF's kinematics and the reference engine's."""
     random = torch.Generator().manual_seed(7)
     lower, upper = finite_limits(bench.kinematics)
@@ -61,7 +61,7 @@ def forward_kinematics(bench: Bench) -> dict[str, Errors]:
     }
 
 
-def mass_properties(bench: Bench) -> dict[str, Errors]:
+def mass_properties(bench: Bench) -> Measured:
     """Read masses, centres of mass and inertias back from the engine, of every moving body and of the objects."""
     found = bench.worlds().backend.mass_properties().to("cpu")
     bodies = _bodies(bench.scene.robot)
@@ -116,7 +116,7 @@ def _bodies(robot: RobotSpec) -> list[tuple[str, float, np.ndarray, np.ndarray]]
 # Drives ---------------------------------------------------------------------------------------------------------------
 
 
-def joint_tracking(bench: Bench) -> dict[str, Errors]:
+def joint_tracking(bench: Bench) -> Measured:
     """Move every joint by itself, by a step and by a sine, and compare its path with the reference engine's."""
     scene = without_collisions(bench.scene)
     steps = round(_DURATION / scene.control_dt)
@@ -125,7 +125,7 @@ def joint_tracking(bench: Bench) -> dict[str, Errors]:
     return _against_reference(bench, scene, {"step": torch.ones(steps), "sine": sine})
 
 
-def effort_limit(bench: Bench) -> dict[str, Errors]:
+def effort_limit(bench: Bench) -> Measured:
     """Step every joint with an effort limit of 30 % of what its drive asks for, and compare with the reference engine."""
     scene = without_collisions(bench.scene)
     _, way = _alone(bench, scene)
@@ -152,7 +152,7 @@ def _alone(bench: Bench, scene: SceneSpec) -> tuple[State, Tensor]:
     return replace_fields(start, joint_target=start.joint_pos), way.float()
 
 
-def _against_reference(bench: Bench, scene: SceneSpec, signals: dict[str, Tensor]) -> dict[str, Errors]:
+def _against_reference(bench: Bench, scene: SceneSpec, signals: dict[str, Tensor]) -> Measured:
     """Return root mean square and peak of the difference between each joint's path and its path in the reference.
 
     A slide's path counts in proportion to its way, as if that were 0.2 rad.
@@ -192,7 +192,7 @@ def _path(worlds: Worlds, start: State, way: Tensor, signal: Tensor, substeps: i
     return torch.stack(path)
 
 
-def drive_equation(bench: Bench) -> dict[str, Errors]:
+def drive_equation(bench: Bench) -> Measured:
     """Step the target of the vertical slide and compare with the drive's differential equation.
 
     (m + armature) x'' = clip(kp (target - x) - kd x', effort). The robot's weight is compensated, so it is absent.
@@ -225,7 +225,7 @@ def drive_equation(bench: Bench) -> dict[str, Errors]:
     return errors
 
 
-def drive_scale(bench: Bench) -> dict[str, Errors]:
+def drive_scale(bench: Bench) -> Measured:
     """Scale the drives of some worlds, and compare with engines that were built with a robot of such drives.
 
     All joints step at once. Factors set through a mask must do the same, and worlds outside of it must keep theirs.
@@ -281,7 +281,7 @@ def drive_scale(bench: Bench) -> dict[str, Errors]:
 # Limits and weight ----------------------------------------------------------------------------------------------------
 
 
-def joint_limits(bench: Bench) -> dict[str, Errors]:
+def joint_limits(bench: Bench) -> Measured:
     """Send every joint beyond its limits: it must come to rest there."""
     scene = without_collisions(bench.scene)
     kinematics = Kinematics(scene.robot)
@@ -306,7 +306,7 @@ def joint_limits(bench: Bench) -> dict[str, Errors]:
     return errors
 
 
-def gravity_compensation(bench: Bench) -> dict[str, Errors]:
+def gravity_compensation(bench: Bench) -> Measured:
     """Hold several configurations for 2 s: an arm whose weight is compensated does not sag."""
     if not bench.scene.robot.gravity_compensated:
         raise Skipped("this robot's weight is not compensated")
@@ -323,7 +323,7 @@ def gravity_compensation(bench: Bench) -> dict[str, Errors]:
     return {"sag": zip(scene.robot.joint_names, off.tolist(), strict=True)}
 
 
-def own_weight(bench: Bench) -> dict[str, Errors]:
+def own_weight(bench: Bench) -> Measured:
     """Leave the weight to the drives and give the objects gravity fractions: the robot sags by its whole own weight.
 
     At rest kp (target - q) = sum over links of m g dz/dq, in every world.

@@ -1,4 +1,4 @@
-"""The scene of the conformance suite: small, quick to build, and with nothing symmetric, centred or in the engine's likely order."""
+"""The scene of the conformance suite: small, quick to build, with nothing symmetric, centred or in a likely order."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from xreset.spec import Geometry, ObjectSpec, PairFriction, RobotSpec, SceneSpec
 
 @cache
 def gripper() -> RobotSpec:
-    """The suite's own robot, hung above the table: five joints, one of which another one mimics, and two fingertips.
+    """Return the suite's own robot, hung above the table: five joints, one with a mimic joint, and two fingertips.
 
     Its joint order is neither the URDF's nor alphabetical.
     """
@@ -27,77 +27,79 @@ def gripper() -> RobotSpec:
 
 @cache
 def objects() -> tuple[ObjectSpec, ...]:
-    """A brick (a box), a can (a cylinder) and a bracket (two hulls); the centres of mass are off the origin of the mesh frame."""
+    """Return a brick (a box), a can (a cylinder) and a bracket (two hulls), with centres of mass off the mesh origin."""
     brick = shape("box", (0.02, 0.03, 0.025), (0.01, 0.005, -0.004), yaw=0.3)
     can = shape("cylinder", (0.033, 0.05), (0.0, 0.0, 0.01))
-    foot, arm = (
-        shape("hull", (0.05, 0.02, 0.01), (0.0, 0.0, -0.02)),
-        shape("hull", (0.012, 0.02, 0.03), (-0.038, 0.0, 0.02)),
-    )
+    foot = shape("hull", (0.05, 0.02, 0.01), (0.0, 0.0, -0.02))
+    arm = shape("hull", (0.012, 0.02, 0.03), (-0.038, 0.0, 0.02))
     return (
         solid("brick", 0.25, (brick,), shift=(0.004, -0.003, 0.002), twist=0.2),
-        solid("can", 0.35, (can,), shift=(0.002, 0.0, -0.003), twist=0.0),
-        solid("bracket", 0.30, (foot, arm), shift=(0.0, 0.001, 0.0), twist=0.0),
+        solid("can", 0.35, (can,), shift=(0.002, 0.0, -0.003)),
+        solid("bracket", 0.30, (foot, arm), shift=(0.0, 0.001, 0.0)),
     )
 
 
 @cache
 def flat_objects() -> tuple[ObjectSpec, ...]:
-    """A box, a hull of the same shape, two hulls side by side, and a cylinder: all rest 20 mm above the table and are 40 mm high."""
-    half = (0.05, 0.06, 0.02)
-    side = (half[0] / 2, half[1], half[2])
+    """Return a box, the same as a hull, the same as two hulls, and a cylinder: all 40 mm high, with centred frames."""
+    size = (0.05, 0.06, 0.02)
+    half = (0.025, 0.06, 0.02)
+    halves = (shape("hull", half, (0.025, 0, 0)), shape("hull", half, (-0.025, 0, 0)))
     return (
-        solid("box", 0.4, (shape("box", half, (0, 0, 0)),)),
-        solid("hull", 0.4, (shape("hull", half, (0, 0, 0)),)),
-        solid("two hulls", 0.4, tuple(shape("hull", side, (x, 0, 0)) for x in (side[0], -side[0]))),
-        solid("cylinder", 0.4, (shape("cylinder", (0.06, 0.02), (0, 0, 0)),)),
+        solid("box", 0.4, (shape("box", size),)),
+        solid("hull", 0.4, (shape("hull", size),)),
+        solid("two hulls", 0.4, halves),
+        solid("cylinder", 0.4, (shape("cylinder", (0.06, 0.02)),)),
     )
 
 
 @cache
 def ball() -> ObjectSpec:
-    """A ball of 30 mm radius."""
-    return replace(solid("ball", 0.4, (shape("sphere", (0.03,), (0, 0, 0)),)), inertia=8e-4 * np.eye(3))
+    """Return a ball of 30 mm radius."""
+    return replace(solid("ball", 0.4, (shape("sphere", (0.03,)),)), inertia=8e-4 * np.eye(3))
 
 
 def scene(robot: RobotSpec | None = None) -> SceneSpec:
-    """The suite's scene: its own robot or another one, and its three objects."""
-    return SceneSpec(
-        robot=robot or gripper(),
-        objects=objects(),
-        friction=PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002),
-    )
+    """Return the suite's scene: its own robot or another one, and its three objects."""
+    friction = PairFriction(tip=0.9, link=0.5, table=0.6, torsional=0.002)
+    return SceneSpec(robot=robot or gripper(), objects=objects(), friction=friction)
 
 
 def without_collisions(scene: SceneSpec) -> SceneSpec:
-    """The same scene with a robot whose links touch neither one another nor the table."""
+    """Return the scene with a robot whose links touch neither one another nor the table."""
     robot = scene.robot
     return replace(scene, robot=replace(robot, self_collision_links=(), table_exclude=robot_tree(robot).link_names))
 
 
 def reorder_joints(scene: SceneSpec) -> SceneSpec:
-    """The same scene with its joints named in reverse order."""
+    """Return the scene with its joints named in reverse order."""
     return replace(scene, robot=replace(scene.robot, joints=scene.robot.joints[::-1]))
 
 
-def shape(kind: str, size: tuple[float, ...], pos: tuple[float, float, float], yaw: float = 0.0) -> Shape:
-    """A box, a box as a hull (half edges), a cylinder (radius, half height) or a sphere, at a place in the mesh frame [m]."""
+def shape(kind: str, size: Sequence[float], pos: Sequence[float] = (0, 0, 0), yaw: float = 0.0) -> Shape:
+    """Return a shape at a place in the mesh frame [m].
+
+    Sizes [m]: half edges of a box, or of a box that is given as a hull; radius and half height of a cylinder; radius
+    of a sphere.
+    """
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_euler("z", yaw).as_matrix(), pos
-    if kind == "hull":  # a box, given as vertices
+    T[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
+    T[:3, 3] = pos
+    if kind == "hull":
         mesh = trimesh.creation.box(extents=2.0 * np.array(size))
         geometry = Geometry(kind="hull", vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces))
     else:
-        geometry = Geometry(kind=kind, size=size)  # pyright: ignore[reportArgumentType]
+        geometry = Geometry(kind=kind, size=tuple(size))  # pyright: ignore[reportArgumentType]
     return Shape(geometry=geometry, T_body_shape=T)
 
 
 def solid(
     name: str, mass: float, pieces: tuple[Shape, ...], *, shift: Sequence[float] = (0, 0, 0), twist: float = 0.0
 ) -> ObjectSpec:
-    """An object with the inertia of its shape at even density, then its centre of mass shifted and its principal axes turned.
+    """Return an object of even density whose centre of mass is then shifted and whose principal axes are turned.
 
-    Its mass is a number of float32, as the interface to a backend has it: no rounding comes between a mass that is set and one built.
+    The mass is a number of float32, as the interface to a backend has it: a mass that is set and one that is built do
+    not differ by rounding.
     """
     mass = float(np.float32(mass))
     mesh = trimesh.util.concatenate([_mesh(piece) for piece in pieces])
@@ -114,13 +116,14 @@ def solid(
 
 
 def _mesh(shape: Shape) -> trimesh.Trimesh:
-    geometry = shape.geometry
-    if geometry.kind == "box":
-        mesh = trimesh.creation.box(extents=2.0 * np.array(geometry.size))
-    elif geometry.kind == "sphere":
-        mesh = trimesh.creation.icosphere(radius=geometry.size[0])
-    elif geometry.kind == "cylinder":
-        mesh = trimesh.creation.cylinder(radius=geometry.size[0], height=2.0 * geometry.size[1], sections=32)
+    size = shape.geometry.size
+    kind = shape.geometry.kind
+    if kind == "box":
+        mesh = trimesh.creation.box(extents=2.0 * np.array(size))
+    elif kind == "sphere":
+        mesh = trimesh.creation.icosphere(radius=size[0])
+    elif kind == "cylinder":
+        mesh = trimesh.creation.cylinder(radius=size[0], height=2.0 * size[1], sections=32)
     else:
-        mesh = trimesh.Trimesh(geometry.vertices, geometry.faces)
+        mesh = trimesh.Trimesh(shape.geometry.vertices, shape.geometry.faces)
     return mesh.apply_transform(shape.T_body_shape)

@@ -13,7 +13,7 @@ from xreset.backends.conformance.harness import (
     small_motion,
     state_errors,
 )
-from xreset.backends.conformance.results import Errors, Skipped
+from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.conformance.scene import reorder_joints
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat
@@ -22,15 +22,15 @@ from xreset.physics import Links, State
 from xreset.spec import SceneSpec
 
 
-def state_round_trip(bench: Bench) -> dict[str, Errors]:
+def state_round_trip(bench: Bench) -> Measured:
     """Set a random state in every world and read it back."""
     worlds = bench.worlds()
     state = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=1)
     worlds.set(state)
-    return dict(state_errors(worlds.state(), state))
+    return state_errors(worlds.state(), state)
 
 
-def links_after_set(bench: Bench) -> dict[str, Errors]:
+def links_after_set(bench: Bench) -> Measured:
     """Set a random state and compare the tracked links with the URDF's kinematics, without a step."""
     worlds = bench.worlds()
     state = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=2)
@@ -38,13 +38,13 @@ def links_after_set(bench: Bench) -> dict[str, Errors]:
     return _link_errors(bench.kinematics, state, worlds.links())
 
 
-def links_after_steps(bench: Bench) -> dict[str, Errors]:
+def links_after_steps(bench: Bench) -> Measured:
     """Move every joint and compare the tracked links with the kinematics of the joint positions on the way."""
     moved = _moved_by_mimics(bench.scene)
     return _errors_on_the_way(bench, [i for i in range(len(moved)) if not moved[i]])
 
 
-def mimic_joints(bench: Bench) -> dict[str, Errors]:
+def mimic_joints(bench: Bench) -> Measured:
     """Do the same for links that a mimic joint moves: it is set exactly, then follows through a stiff coupling."""
     moved = _moved_by_mimics(bench.scene)
     which = [i for i in range(len(moved)) if moved[i]]
@@ -61,7 +61,7 @@ def mimic_joints(bench: Bench) -> dict[str, Errors]:
     return errors
 
 
-def joint_order(bench: Bench) -> dict[str, Errors]:
+def joint_order(bench: Bench) -> Measured:
     """Name the joints in another order: states still go by name, and a target moves the joint that it names."""
     scene = reorder_joints(bench.scene)
     kinematics = Kinematics(scene.robot)
@@ -118,7 +118,7 @@ def _moved_by_mimics(scene: SceneSpec) -> list[bool]:
     return [moved(link) for link in scene.robot.tracked_links]
 
 
-def _errors_on_the_way(bench: Bench, which: list[int]) -> dict[str, Errors]:
+def _errors_on_the_way(bench: Bench, which: list[int]) -> Measured:
     """Return the errors of some tracked links' poses, [T, N, ...], while every joint moves."""
     worlds = bench.worlds()
     home = torch.as_tensor(bench.scene.robot.home, dtype=torch.float32)

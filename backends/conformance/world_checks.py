@@ -15,11 +15,11 @@ from xreset.backends.conformance.harness import (
     small_motion,
     state_errors,
 )
-from xreset.backends.conformance.results import Errors, Skipped
+from xreset.backends.conformance.results import Measured, Skipped
 from xreset.physics import Parameter, State
 
 
-def nothing_stays(bench: Bench) -> dict[str, Errors]:
+def nothing_stays(bench: Bench) -> Measured:
     """Disturb one world, then set it and a calm one with the same object to the same state: they must continue alike."""
     worlds = bench.worlds()
     disturbed, calm = bench.twins
@@ -33,13 +33,13 @@ def nothing_stays(bench: Bench) -> dict[str, Errors]:
         worlds.push(force, 0.01 * force)
     worlds.step(16)
     state = worlds.advance(start, 16)
-    errors: dict[str, Errors] = dict(state_errors(state[[disturbed]], state[[calm]]))
+    errors = state_errors(state[[disturbed]], state[[calm]])
     if bench.scene.robot.gravity_compensated:
         errors["drift from the target"] = state.joint_pos[disturbed] - start.joint_pos[disturbed]
     return errors
 
 
-def selected_worlds(bench: Bench) -> dict[str, Errors]:
+def selected_worlds(bench: Bench) -> Measured:
     """Set two worlds, in descending order, during a motion: they have the new state, the others continue undisturbed."""
     new = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=4)
     start = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=5)
@@ -64,17 +64,17 @@ def selected_worlds(bench: Bench) -> dict[str, Errors]:
     }
 
 
-def worlds_independent(bench: Bench) -> dict[str, Errors]:
+def worlds_independent(bench: Bench) -> Measured:
     """Run twice, the second time with one world quite different: the others must not notice."""
     state = bench.start()
     wild = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=6)
     others = [0, 2, 3]
     disturbed = bench.worlds().advance(state.with_rows([1], wild), 32)
     calm = bench.worlds().advance(state, 32)
-    return dict(state_errors(disturbed[others], calm[others]))
+    return state_errors(disturbed[others], calm[others])
 
 
-def objects_in_a_batch(bench: Bench) -> dict[str, Errors]:
+def objects_in_a_batch(bench: Bench) -> Measured:
     """Drop different objects in one batch, and each of them alone: the same must happen."""
 
     def drop(worlds: Worlds, start: State) -> tuple[State, Tensor]:
@@ -95,14 +95,14 @@ def objects_in_a_batch(bench: Bench) -> dict[str, Errors]:
     return errors
 
 
-def twins(bench: Bench) -> dict[str, Errors]:
+def twins(bench: Bench) -> Measured:
     """Set two worlds with the same object to the same state and let both move and touch alike: they must stay equal."""
     end = _busy(bench, bench.worlds())
     one, other = bench.twins
-    return dict(state_errors(end[[one]], end[[other]]))
+    return state_errors(end[[one]], end[[other]])
 
 
-def repeatable(bench: Bench) -> dict[str, Errors]:
+def repeatable(bench: Bench) -> Measured:
     """Do the same twice, with something else in between, and once in new worlds: every bit must be the same.
 
     The shared worlds will not do: the masses that another check has put back in them are rounded to single precision.
@@ -118,7 +118,7 @@ def repeatable(bench: Bench) -> dict[str, Errors]:
     return {**state_errors(again, first, "again,"), **state_errors(in_new_worlds, first, "newly built,")}
 
 
-def masked_set(bench: Bench) -> dict[str, Errors]:
+def masked_set(bench: Bench) -> Measured:
     """Set state and parameters of the worlds of a mask during a motion: the same as with the single setters."""
     chosen = [3, 1]
     start = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=12)
@@ -147,10 +147,10 @@ def masked_set(bench: Bench) -> dict[str, Errors]:
         worlds.step(12)
         return worlds.state()
 
-    return dict(state_errors(run(masked=True), run(masked=False)))
+    return state_errors(run(masked=True), run(masked=False))
 
 
-def broken_world(bench: Bench) -> dict[str, Errors]:
+def broken_world(bench: Bench) -> Measured:
     """Give one world a velocity that is not a number: health names it alone, the others continue, setting it heals it.
 
     This check comes last, because an engine may end the process.

@@ -2,7 +2,7 @@
 
 An engine is added by writing a :class:`World` (one world, numpy) and a :class:`PoolBackend` that names it.
 
-Shape letters as in :mod:`xreset.physics`; arrays of one world have no leading N.
+Shape letters are those of :mod:`xreset.physics`; arrays of one world have no leading N.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import math
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,12 +20,14 @@ from torch import Tensor
 
 from xreset.backends.rigid import Inertia
 from xreset.backends.workers import (
+    CONTACT_FIELDS,
     READINGS,
     STATE_FIELDS,
     Job,
     LocalWorlds,
     WorkerTeam,
     WorldFailure,
+    arrays_in,
     layout_of,
     usable_cores,
 )
@@ -34,17 +37,18 @@ from xreset.spec import SceneSpec
 
 
 class World(ABC):
-    """One world of a scene in one process. Arrays are numpy float64; conventions are those of :class:`~xreset.physics.Backend`.
+    """One world of a scene in one process. Arrays are numpy float64; conventions are those of :class:`Backend`.
 
-    The state is undefined until :meth:`set_state`, which the pool calls first. A world that reports a non-finite state is not stepped
-    again before its state is set. :meth:`links` and :meth:`contacts` are called only where somebody wants them, in any order, once or
-    often: they must move nothing, and speak of the last step. No parameter changes between that step and the call.
+    The state is undefined until :meth:`set_state`, which the pool calls first. A world that reports a non-finite state
+    is not stepped again before its state is set. :meth:`links` and :meth:`contacts` are called only where somebody
+    wants them, in any order, once or often: they must move nothing, and describe the last step. No parameter changes
+    between that step and the call.
     """
 
     gravity_fraction = 1.0
-    """Of the object."""
+    """Gravity fraction of the object."""
     force = torque = np.zeros(3)
-    """What acts on the object besides, until the next step: see :meth:`set_object_wrench`."""
+    """External wrench on the object until the next step: see :meth:`set_object_wrench`."""
 
     @abstractmethod
     def __init__(self, scene: SceneSpec, object_index: int) -> None:
@@ -52,18 +56,18 @@ class World(ABC):
 
     @abstractmethod
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Set every field of :class:`~xreset.physics.State`; nothing of the past may remain (but physical parameters do)."""
+        """Set every field of :class:`State`; nothing of the past may remain, except physical parameters."""
 
     @abstractmethod
     def get_state(self) -> dict[str, np.ndarray]:
-        """Every field of :class:`~xreset.physics.State`.
+        """Return every field of :class:`State`.
 
-        They may be views of the engine's memory, which the next call that changes the world overwrites.
+        The arrays may be views of the engine's memory, which the next call that changes the world overwrites.
         """
 
     @abstractmethod
     def set_joint_targets(self, targets: np.ndarray) -> None:
-        """Set the drive targets (J,)."""
+        """Set the drive targets [J]."""
 
     @abstractmethod
     def step(self, n: int) -> None:
@@ -71,44 +75,51 @@ class World(ABC):
 
     @abstractmethod
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Tracked links: position (K, 3), orientation (K, 4), velocity of the origin (K, 3), angular velocity (K, 3).
+        """Return position [K, 3], orientation [K, 4], velocity of the origin [K, 3], angular velocity [K, 3] of links.
 
-        They may be views of the engine's memory, which the next call that changes the world overwrites.
+        The arrays may be views of the engine's memory, which the next call that changes the world overwrites.
         """
 
     @abstractmethod
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """On the object in the last physics step: tip force (E, 3), tip touch (E,) bool, table force (3,). Zero right after set_state."""
+        """Return tip force [E, 3], tip touch [E] bool and table force [3] on the object in the last physics step.
+
+        All are zero right after :meth:`set_state`.
+        """
 
     def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
-        """Whether the state is not finite, and whether contacts overflowed in the last :meth:`step`: never, unless an engine knows better.
+        """Return whether the state is not finite, and whether contacts overflowed in the last :meth:`step`.
 
-        ``state`` is what :meth:`get_state` has just returned: nothing has to be read again. See :func:`is_finite`.
+        ``state`` is what :meth:`get_state` has just returned, so nothing has to be read again.
         """
         return not is_finite(state), False
 
     def mass_properties(self) -> list[Inertia]:
-        """What the engine itself holds: of each moving body of the robot, in the order of the mechanism, then of the object.
+        """Return what the engine itself holds: each moving body of the robot in the mechanism's order, then the object.
 
-        Asked for only where the backend has the capability ``mass_properties``.
+        Called only where the backend has the capability ``mass_properties``.
         """
         raise NotImplementedError
 
     @abstractmethod
     def set_object_inertia(self, inertia: Inertia) -> None:
-        """Set the object's mass properties. Another centre of mass only where the backend has the capability ``object_com``."""
+        """Set the object's mass properties.
+
+        The centre of mass changes only where the backend has the capability ``object_com``.
+        """
 
     @abstractmethod
     def set_friction(self, friction: np.ndarray) -> None:
-        """Set the friction of the pairs object-tip, object-other link, object-table (3,)."""
+        """Set the friction of the pairs object-tip, object-other link, object-table [3]."""
 
     def set_object_gravity(self, fraction: float) -> None:
         """Set the object's gravity fraction."""
         self.gravity_fraction = fraction
 
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
-        """Set the force (3,) at the object's centre of mass and the torque (3,); called before every :meth:`step`."""
-        self.force, self.torque = force, torque
+        """Set the force [3] at the object's centre of mass and the torque [3]; called before every :meth:`step`."""
+        self.force = force
+        self.torque = torque
 
     # The next two are called only where the backend has the capability.
 
@@ -117,7 +128,7 @@ class World(ABC):
         raise NotImplementedError
 
     def set_drives(self, scale: np.ndarray) -> None:
-        """Set factors (3, J) on the drives' stiffness, damping and effort limit."""
+        """Set factors [3, J] on the drives' stiffness, damping and effort limit."""
         raise NotImplementedError
 
     def close(self) -> None:  # noqa: B027 (most engines need nothing)
@@ -125,17 +136,22 @@ class World(ABC):
 
 
 def is_finite(state: Mapping[str, np.ndarray]) -> bool:
-    """Whether all numbers of a state are. One bad number spoils the sum, which costs less than looking at each."""
+    """Return whether all numbers of a state are finite.
+
+    One bad number spoils the sum, which costs less than looking at each.
+    """
     return math.isfinite(sum(x.dot(x) for x in state.values()))
 
 
 class PoolBackend(Backend):
     """N worlds of a CPU engine, spread over worker processes.
 
-    A subclass sets ``name``, ``capabilities`` and ``world_class`` and says its engine's version. Getters return views of shared memory.
+    A subclass sets ``name``, ``capabilities`` and ``world_class`` and returns its engine's version. Getters return
+    views of shared memory; inputs are read at the next step.
 
-    One :meth:`step` is one round trip to each worker, after which state and health are there. Links and contacts cost time to read, so a
-    step brings those that were asked for after the step before; asked for anew, they take a round trip of their own, once.
+    One :meth:`step` is one round trip to each worker, after which state and health are there. Links and contacts cost
+    time to read, so a step brings those that were asked for after the step before. Otherwise, asking for them takes a
+    round trip, once.
     """
 
     world_class: ClassVar[type[World]]
@@ -154,9 +170,12 @@ class PoolBackend(Backend):
         """Build the worlds.
 
         Args:
+            scene: see :class:`Backend`.
+            num_worlds: see :class:`Backend`.
+            object_index: see :class:`Backend`.
             device: ``cpu``.
-            workers: number of processes; 0 runs the worlds in this process. Default: one per usable core, but no more than worlds, and
-                this process if there is one world only.
+            workers: number of processes; 0 runs the worlds in this process. Default: one per usable core, but no more
+                than worlds; this process if there is only one world.
             world_options: further keywords of the world class (picklable).
 
         Raises:
@@ -164,24 +183,21 @@ class PoolBackend(Backend):
         """
         if torch.device(device).type != "cpu":
             raise CapabilityError(
-                f"the backend {self.name!r} runs on the CPU only, found device {device!r}. Use device 'cpu', or the backend 'mujoco-warp'."
+                f"The backend {self.name!r} runs on the CPU only, found device {device!r}. "
+                "Use device 'cpu', or the backend 'mujoco-warp'."
             )
         super().__init__(scene, num_worlds, object_index=object_index, device=device)
         if workers is None:
-            workers = 0 if num_worlds == 1 else min(usable_cores(), num_worlds)
+            workers = 0 if num_worlds == 1 else usable_cores()
         if workers < 0:
             raise ValueError(f"workers is {workers}, expected 0 or more")
-        workers = min(workers, num_worlds)
         layout = layout_of(num_worlds, scene.robot)
-        owned = np.array_split(np.arange(num_worlds), max(workers, 1))
-        jobs = [
-            Job(
-                self.name, self.world_class, dict(world_options), scene, int(w[0]), tuple(self.object_index[w].tolist())
-            )
-            for w in owned
-        ]
+        jobs = []
+        for worlds in np.array_split(np.arange(num_worlds), max(min(workers, num_worlds), 1)):
+            held = tuple(self.object_index[worlds].tolist())
+            jobs.append(Job(self.name, self.world_class, world_options, scene, int(worlds[0]), held))
         if workers == 0:
-            self._arrays = {name: np.zeros(shape, dtype) for name, (shape, dtype) in layout.items()}
+            self._arrays = arrays_in(bytearray(layout.itemsize), layout)
             self._team: LocalWorlds | WorkerTeam = LocalWorlds(jobs[0], self._arrays)
         else:
             self._team = WorkerTeam(jobs, layout)
@@ -194,15 +210,10 @@ class PoolBackend(Backend):
 
         views = {name: torch.from_numpy(array) for name, array in self._arrays.items()}
         self._state = State(**{name: views[name] for name in STATE_FIELDS})
-        self._links = Links(
-            pos=views["link_pos"], quat=views["link_quat"], linvel=views["link_linvel"], angvel=views["link_angvel"]
-        )
-        self._contacts = Contacts(
-            tip_force=views["tip_force"], tip_touch=views["tip_touch"], table_force=views["table_force"]
-        )
+        self._links = Links(**{field.name: views[f"link_{field.name}"] for field in fields(Links)})
+        self._contacts = Contacts(**{name: views[name] for name in CONTACT_FIELDS})
         self._health = Health(nonfinite=views["nonfinite"], overflow=views["overflow"])
-        for name, value in vars(State.initial(scene, self.object_index)).items():
-            self._arrays[name][:] = value
+        self._state.map(Tensor.copy_, State.initial(scene, self.object_index))
         try:
             self._command("build", readings=READINGS)
         except BaseException:
@@ -210,21 +221,18 @@ class PoolBackend(Backend):
             raise
 
     def set_state(self, state: State, worlds: Tensor | None = None) -> None:
-        """See :meth:`Backend.set_state`. The external wrench of those worlds ends."""
         index = self._selected(worlds)
         values = {name: self._checked(name, getattr(state, name), len(index)) for name in STATE_FIELDS}
         for name, value in values.items():
             self._arrays[name][index] = value
         self._arrays["wrench"][index] = 0.0
-        self._move("set_state", index, readings=self._present)
+        self._command("set_state", index, readings=self._present)
 
     def state(self) -> State:
-        """See :meth:`Backend.state`: views of shared memory."""
         self._must_be_open()
         return self._state
 
     def set_joint_targets(self, targets: Tensor) -> None:
-        """See :meth:`Backend.set_joint_targets`; the worlds read them at the next step."""
         self._must_be_open()
         self._arrays["joint_target"][:] = self._checked("joint_target", targets, self.num_worlds)
 
@@ -232,21 +240,19 @@ class PoolBackend(Backend):
         substeps = self.scene.substeps if substeps is None else substeps
         if substeps < 1:
             raise ValueError(f"substeps is {substeps}, expected at least 1")
-        asked, self._asked = self._asked, frozenset[str]()
-        self._move("step", argument=substeps, readings=asked)
+        asked = self._asked
+        self._asked = frozenset()
+        self._command("step", argument=substeps, readings=asked)
 
     def links(self) -> Links:
-        """See :meth:`Backend.links`: views of shared memory."""
-        self._ask(frozenset(("links",)))
+        self._ask("links")
         return self._links
 
     def contacts(self) -> Contacts:
-        """See :meth:`Backend.contacts`: views of shared memory."""
-        self._ask(frozenset(("contacts",)))
+        self._ask("contacts")
         return self._contacts
 
     def health(self) -> Health:
-        """See :meth:`Backend.health`: views of shared memory."""
         self._must_be_open()
         return self._health
 
@@ -254,48 +260,36 @@ class PoolBackend(Backend):
         if "mass_properties" not in self.capabilities:
             return super().mass_properties()
         self._command("mass_properties")
-        mass, com, inertia = (
-            torch.from_numpy(self._arrays[f"body_{name}"].copy()) for name in ("mass", "com", "inertia")
-        )
-        return MassProperties(mass=mass, com=com, inertia=inertia)
+        found = {name: self._arrays[f"body_{name}"].copy() for name in ("mass", "com", "inertia")}
+        return MassProperties(**{name: torch.from_numpy(values) for name, values in found.items()})
 
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
-        """See :meth:`Backend.set_object_wrench`; the worlds read it at the next step."""
         self._require("object_wrench")
         self._must_be_open()
         wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
         self._arrays["wrench"][:] = self._checked("wrench", wrench, self.num_worlds)
 
     def close(self) -> None:
-        """End the workers. Calling it twice does no harm."""
         self._close()
 
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         self._require(name)
         index = self._selected(worlds)
         given = self._checked(name, value, len(index))
-        self._bring(READINGS)  # they are of the last step, and an engine may work them out from its parameters
+        self._bring(READINGS)  # they describe the last step, and an engine may compute them from its parameters
         self._arrays[name][index] = given
         self._command("set_parameter", index, name)
 
-    def _move(
-        self, method: str, worlds: np.ndarray | None = None, argument: Any = None, *, readings: frozenset[str]
-    ) -> None:
-        """Run a command that changes what worlds report; these readings are present afterwards."""
-        self._present = frozenset[str]()
-        self._command(method, worlds, argument, readings)
-        self._present = readings
-
-    def _ask(self, readings: frozenset[str]) -> None:
-        """Have readings present, after the next step too."""
+    def _ask(self, reading: str) -> None:
+        """Have a reading present, after the next step too."""
         self._must_be_open()
-        self._bring(readings)
-        self._asked |= readings
+        self._bring(frozenset((reading,)))
+        self._asked |= {reading}
 
     def _bring(self, readings: frozenset[str]) -> None:
-        if missing := readings - self._present:
+        missing = readings - self._present
+        if missing:
             self._command("read", readings=missing)
-            self._present |= missing
 
     def _selected(self, worlds: Tensor | None) -> np.ndarray:
         if worlds is None:
@@ -319,7 +313,10 @@ class PoolBackend(Backend):
         argument: Any = None,
         readings: frozenset[str] = frozenset(),
     ) -> None:
+        """Run a command in the workers, and bring readings. Commands that move worlds make other readings stale."""
         self._must_be_open()
+        if method in ("step", "set_state"):
+            self._present = frozenset()
         try:
             self._team.command(method, worlds, argument, readings)
         except WorldFailure as failure:
@@ -328,14 +325,13 @@ class PoolBackend(Backend):
             raise RuntimeError(
                 f"backend {self.name!r}, world {failure.world}, {method}: {failure.message}\n{failure.trace}"
             ) from failure
-        except (
-            BaseException
-        ):  # the workers and this process no longer agree on what has been done (Ctrl-C, a dead worker)
+        except BaseException:  # after Ctrl-C or a worker's death, nobody knows what has been done
             self.close()
             raise
+        self._present |= readings
 
     def _must_be_open(self) -> None:
         if not self._close.alive:
             raise XResetError(
-                f"the backend {self.name!r} is closed (by close(), Ctrl-C or the death of a worker). Build a new one."
+                f"The backend {self.name!r} is closed (by close(), Ctrl-C or the death of a worker). Build a new one."
             )

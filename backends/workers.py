@@ -1,14 +1,13 @@
 """The processes behind :mod:`xreset.backends.pool`: shared arrays, the worlds of one process, and worker processes.
 
-Each worker is a fresh interpreter (``python -c``), so it inherits neither torch's threads nor the caller's ``__main__``: scripts need no
-main guard. Numbers travel through one file that every process maps and that the parent then unlinks; commands travel through the worker's
-standard input, and the worker ends with it. So whatever way the parent dies, its workers end and nothing is left behind.
+Each worker is a fresh interpreter, so it inherits neither torch's threads nor the caller's ``__main__``: scripts need
+no main guard. Numbers travel through a file without a name that every process maps, commands through a pipe. The
+system closes both whichever way the parent ends, so its workers end too and nothing is left behind.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import mmap
 import os
 import pickle
@@ -17,98 +16,89 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from xreset.backends.rigid import object_inertia
 from xreset.errors import XResetError
-from xreset.physics import Parameter, State
+from xreset.physics import Contacts, Parameter, State
 from xreset.spec import RobotSpec, SceneSpec
 
 if TYPE_CHECKING:
     from xreset.backends.pool import World
 
-# Shared arrays -------------------------------------------------------------------------------------------------------------------------
+# Shared arrays --------------------------------------------------------------------------------------------------------
 
 STATE_FIELDS = tuple(field.name for field in fields(State))
-Layout = Mapping[str, tuple[tuple[int, ...], type]]
+LINK_FIELDS = ("link_pos", "link_quat", "link_linvel", "link_angvel")
+CONTACT_FIELDS = tuple(field.name for field in fields(Contacts))
 
 
-def layout_of(n: int, robot: RobotSpec) -> Layout:
-    """Name -> shape and type of every shared array. The state is both what a world is set to and what it reports."""
-    joints, tips = len(robot.joints), len(robot.fingertips)
-    links, bodies = 1 + tips, joints + len(robot.mimics) + 1
-    f = np.float32
-    return {
-        "joint_pos": ((n, joints), f),
-        "joint_vel": ((n, joints), f),
-        "joint_target": ((n, joints), f),
-        "object_pos": ((n, 3), f),
-        "object_quat": ((n, 4), f),
-        "object_linvel": ((n, 3), f),
-        "object_angvel": ((n, 3), f),
-        "link_pos": ((n, links, 3), f),
-        "link_quat": ((n, links, 4), f),
-        "link_linvel": ((n, links, 3), f),
-        "link_angvel": ((n, links, 3), f),
-        "tip_force": ((n, tips, 3), f),
-        "tip_touch": ((n, tips), np.bool_),
-        "table_force": ((n, 3), f),
-        "nonfinite": ((n,), np.bool_),
-        "overflow": ((n,), np.bool_),
-        "friction": ((n, 3), f),
-        "torsional_friction": ((n,), f),
-        "object_mass": ((n,), f),
-        "object_inertia": ((n,), f),
-        "object_com": ((n, 3), f),
-        "object_gravity": ((n,), f),
-        "drives": ((n, 3, joints), f),
-        "wrench": ((n, 6), f),
-        "body_mass": ((n, bodies), f),
-        "body_com": ((n, bodies, 3), f),
-        "body_inertia": ((n, bodies, 3, 3), f),
+def layout_of(n: int, robot: RobotSpec) -> np.dtype:
+    """Return the shared arrays of n worlds as the fields of one record.
+
+    The state is both what a world is set to and what it reports.
+    """
+    joints = len(robot.joints)
+    tips = len(robot.fingertips)
+    links = 1 + tips
+    bodies = joints + len(robot.mimics) + 1
+    shapes = {
+        "joint_pos": (joints,),
+        "joint_vel": (joints,),
+        "joint_target": (joints,),
+        "object_pos": (3,),
+        "object_quat": (4,),
+        "object_linvel": (3,),
+        "object_angvel": (3,),
+        "link_pos": (links, 3),
+        "link_quat": (links, 4),
+        "link_linvel": (links, 3),
+        "link_angvel": (links, 3),
+        "tip_force": (tips, 3),
+        "table_force": (3,),
+        "friction": (3,),
+        "torsional_friction": (),
+        "object_mass": (),
+        "object_inertia": (),
+        "object_com": (3,),
+        "object_gravity": (),
+        "drives": (3, joints),
+        "wrench": (6,),
+        "body_mass": (bodies,),
+        "body_com": (bodies, 3),
+        "body_inertia": (bodies, 3, 3),
     }
+    flags = {"tip_touch": (tips,), "nonfinite": (), "overflow": ()}
+    numbers = [(name, np.float32, (n, *shape)) for name, shape in shapes.items()]
+    return np.dtype(numbers + [(name, np.bool_, (n, *shape)) for name, shape in flags.items()])
 
 
-_ALIGNMENT = 64
-
-
-def _size(layout: Layout) -> int:
-    return sum(
-        -(-int(np.prod(shape)) * np.dtype(dtype).itemsize // _ALIGNMENT) * _ALIGNMENT
-        for shape, dtype in layout.values()
-    )
-
-
-def _map(path: str, layout: Layout) -> dict[str, np.ndarray]:
-    """The arrays of a layout over a file that all processes map."""
-    with open(path, "r+b") as file:
-        memory = mmap.mmap(file.fileno(), _size(layout))
-    arrays, offset = {}, 0
-    for name, (shape, dtype) in layout.items():
-        count = int(np.prod(shape))
-        arrays[name] = np.frombuffer(memory, dtype, count, offset).reshape(shape)
-        offset += -(-count * np.dtype(dtype).itemsize // _ALIGNMENT) * _ALIGNMENT
-    return arrays
+def arrays_in(memory: Any, layout: np.dtype) -> dict[str, np.ndarray]:
+    """Return the arrays of a layout in a block of memory."""
+    record = np.frombuffer(memory, layout)
+    return {name: record[name][0] for name in layout.fields or ()}
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Return the number of cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
-# The worlds of one process -------------------------------------------------------------------------------------------------------------
+# The worlds of one process --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Job:
-    """Which worlds a process runs: ``first``, ``first + 1``, ... as many as it has object indices."""
+    """Which worlds a process runs: ``first``, ``first + 1``, ..., one for each object index."""
 
     backend: str
     world_class: type[World]
@@ -119,28 +109,29 @@ class Job:
 
 
 class WorldFailure(Exception):
-    """A world raised. Crosses process boundaries, so it holds text; ``kind`` is set for errors that the user can mend."""
+    """A world raised. The failure crosses process boundaries, so it holds text.
+
+    ``kind`` is set for errors that the user can fix.
+    """
 
     def __init__(self, world: int, kind: type[XResetError] | None, message: str, trace: str) -> None:
         super().__init__(world, kind, message, trace)
-        self.world, self.kind, self.message, self.trace = world, kind, message, trace
+        self.world = world
+        self.kind = kind
+        self.message = message
+        self.trace = trace
 
-
-_MOVING = frozenset(("build", "set_state", "step"))
-"""Commands after which a world reports something else than before."""
 
 READINGS = frozenset(("links", "contacts"))
 """What is read from a world only where somebody wants it."""
 
-_GIVEN = {
-    "build": STATE_FIELDS,
-    "set_state": STATE_FIELDS,
-    "step": ("joint_target", "wrench"),
-}
-"""Arrays that a command's worlds are given, in double precision."""
+_MOVING = ("build", "set_state", "step")
+"""Commands after which a world reports something else than before."""
 
+_GIVEN = {"build": STATE_FIELDS, "set_state": STATE_FIELDS, "step": ("joint_target", "wrench")}
+"""Arrays that a command gives to the worlds, in double precision."""
 
-_OF_INERTIA = {"object_mass": "mass", "object_inertia": "scale", "object_com": "offset"}
+_INERTIA_ARGUMENT = {"object_mass": "mass", "object_inertia": "scale", "object_com": "offset"}
 """Parameters of the object's mass properties -> arguments of :meth:`Inertia.changed`."""
 
 
@@ -151,35 +142,38 @@ class LocalWorlds:
         self._job = job
         mine = slice(job.first, job.first + len(job.object_index))
         self._arrays = {name: array[mine] for name, array in arrays.items()}
-        """Of the worlds of this job."""
         self._given: dict[str, np.ndarray] = {}
         self._worlds: list[World] = []
-        self._changes: list[dict[str, Any]] = [{} for _ in job.object_index]
-        """What has been set of the objects' mass properties."""
+        self._inertia_changes: list[dict[str, Any]] = [{} for _ in job.object_index]
 
     def command(self, method: str, worlds: np.ndarray | None, argument: Any, readings: frozenset[str]) -> None:
-        """Run one of the methods below for the given worlds (all if None), and publish what they then report, and the readings.
+        """Run one of the methods below for the given worlds (all if None), then publish what they report.
 
-        All worlds act before any is published: engine and Python code take turns in the processor's caches once, not once per world.
+        All worlds act before any is published: engine and Python code then take turns in the processor's caches once
+        instead of once per world.
+
+        Raises:
+            WorldFailure: a world raised.
         """
         rows = range(len(self._job.object_index)) if worlds is None else (worlds - self._job.first).tolist()
         self._given = {name: self._arrays[name].astype(np.float64) for name in _GIVEN.get(method, ())}
-        row, action = 0, getattr(self, f"_{method}")
+        action = getattr(self, f"_{method}")
+        row = 0
         try:
             for row in rows:
                 action(row, argument)
             for row in rows:
                 if method in _MOVING:
-                    self._publish(row)
+                    self._publish_state(row)
                 if "links" in readings:
-                    self._publish_links(row)
+                    self._publish(row, LINK_FIELDS, self._worlds[row].links())
                 if "contacts" in readings:
-                    self._publish_contacts(row)
-        except XResetError as error:
-            raise WorldFailure(self._job.first + row, type(error), str(error), traceback.format_exc()) from error
+                    self._publish(row, CONTACT_FIELDS, self._worlds[row].contacts())
         except Exception as error:
-            text = f"{type(error).__name__}: {error}"
-            raise WorldFailure(self._job.first + row, None, text, traceback.format_exc()) from error
+            known = isinstance(error, XResetError)
+            message = str(error) if known else f"{type(error).__name__}: {error}"
+            world = self._job.first + row
+            raise WorldFailure(world, type(error) if known else None, message, traceback.format_exc()) from error
 
     def close(self) -> None:
         """Close the worlds."""
@@ -193,38 +187,44 @@ class LocalWorlds:
 
     def _set_state(self, i: int, _) -> None:
         self._worlds[i].set_state({name: self._given[name][i] for name in STATE_FIELDS})
-        self._arrays["nonfinite"][i] = self._arrays["overflow"][i] = False
+        self._arrays["nonfinite"][i] = False
+        self._arrays["overflow"][i] = False
 
     def _step(self, i: int, n: int) -> None:
         if self._arrays["nonfinite"][i]:
             return
-        world, wrench = self._worlds[i], self._given["wrench"][i]
+        world = self._worlds[i]
+        wrench = self._given["wrench"][i]
         world.set_joint_targets(self._given["joint_target"][i])
         world.set_object_wrench(wrench[:3], wrench[3:])
         world.step(n)
 
     def _read(self, i: int, _) -> None:
-        """Nothing moves: the readings alone are published."""
+        """Do nothing: the readings alone are published."""
 
     def _mass_properties(self, i: int, _) -> None:
         for k, body in enumerate(self._worlds[i].mass_properties()):
-            self._arrays["body_mass"][i, k], self._arrays["body_com"][i, k] = body.mass, body.com
+            self._arrays["body_mass"][i, k] = body.mass
+            self._arrays["body_com"][i, k] = body.com
             self._arrays["body_inertia"][i, k] = body.matrix
 
     def _set_parameter(self, i: int, name: Parameter) -> None:
         value = self._arrays[name][i].astype(np.float64)
-        value = value if value.ndim else float(value)
-        if name in _OF_INERTIA:
-            self._changes[i][_OF_INERTIA[name]] = value
-            nominal = object_inertia(self._job.scene.objects[self._job.object_index[i]])
-            self._worlds[i].set_object_inertia(nominal.changed(**self._changes[i]))
-        else:
+        if not value.ndim:
+            value = float(value)
+        if name not in _INERTIA_ARGUMENT:
             getattr(self._worlds[i], f"set_{name}")(value)
-
-    def _publish(self, i: int) -> None:
-        world, arrays = self._worlds[i], self._arrays
-        if arrays["nonfinite"][i]:  # nothing has moved since that was said
             return
+        changes = self._inertia_changes[i]
+        changes[_INERTIA_ARGUMENT[name]] = value
+        nominal = object_inertia(self._job.scene.objects[self._job.object_index[i]])
+        self._worlds[i].set_object_inertia(nominal.changed(**changes))
+
+    def _publish_state(self, i: int) -> None:
+        arrays = self._arrays
+        if arrays["nonfinite"][i]:  # nothing has moved since that was published
+            return
+        world = self._worlds[i]
         state = world.get_state()
         for name, value in state.items():
             arrays[name][i] = value
@@ -234,64 +234,55 @@ class LocalWorlds:
         if overflow:
             arrays["overflow"][i] = True
 
-    def _publish_links(self, i: int) -> None:
-        arrays = self._arrays
-        arrays["link_pos"][i], arrays["link_quat"][i], arrays["link_linvel"][i], arrays["link_angvel"][i] = (
-            self._worlds[i].links()
-        )
-
-    def _publish_contacts(self, i: int) -> None:
-        arrays = self._arrays
-        arrays["tip_force"][i], arrays["tip_touch"][i], arrays["table_force"][i] = self._worlds[i].contacts()
+    def _publish(self, i: int, names: Sequence[str], values: Sequence[np.ndarray]) -> None:
+        for name, value in zip(names, values, strict=True):
+            self._arrays[name][i] = value
 
 
-# Worker processes ----------------------------------------------------------------------------------------------------------------------
+# Worker processes -----------------------------------------------------------------------------------------------------
 
-_BOOT = "import sys; sys.path[:] = {path!r}; from xreset.backends.workers import serve; serve()"
-_DONE, _FAILED = b"+", b"-"
-"""How a worker's reply begins; an exception follows a failure."""
+_BOOT = "import sys; sys.path[:] = {path!r}; from xreset.backends.workers import serve; serve({pipe}, {memory})"
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 class WorkerTeam:
     """Worker processes, each with one job."""
 
-    def __init__(self, jobs: Sequence[Job], layout: Layout) -> None:
+    def __init__(self, jobs: Sequence[Job], layout: np.dtype) -> None:
         world_class = jobs[0].world_class
         if world_class.__module__ == "__main__" or "<locals>" in world_class.__qualname__:
             raise XResetError(
-                f"{world_class.__qualname__} is defined in {world_class.__module__!r}, where worker processes cannot import it. "
-                "Move it to a module, or pass workers=0."
+                f"{world_class.__qualname__} is defined in {world_class.__module__!r}, where worker processes cannot "
+                "import it. Move it to a module, or pass workers=0."
             )
-        shared = Path("/dev/shm")
-        folder = shared if os.access(shared, os.W_OK) else Path(tempfile.gettempdir())  # memory where there is some
-        _sweep(folder)
-        descriptor, path = tempfile.mkstemp(prefix="xreset-", dir=folder)
+        in_memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
         self._workers: list[_Worker] = []
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_SH)
-            os.truncate(descriptor, _size(layout))
-            self.arrays = _map(path, layout)
-            self._workers += [_Worker(job) for job in jobs]  # they start while others are still being asked
+            with tempfile.TemporaryFile(dir=in_memory) as file:
+                file.truncate(layout.itemsize)
+                self.arrays = arrays_in(mmap.mmap(file.fileno(), layout.itemsize), layout)
+                for job in jobs:
+                    self._workers.append(_Worker(job, file.fileno()))
             for worker in self._workers:
-                worker.send(pickle.dumps((path, layout, worker.job)))
+                worker.send(pickle.dumps((layout, worker.job)))
             for worker in self._workers:
                 worker.receive("start")
         except BaseException:
             self.close()
             raise
-        finally:
-            os.unlink(path)
-            os.close(descriptor)
 
     def command(self, method: str, worlds: np.ndarray | None, argument: Any, readings: frozenset[str]) -> None:
-        """Have all workers concerned run it at the same time, and wait for all of them."""
-        asked, to_all = [], pickle.dumps((method, None, argument, readings))
+        """Have all workers concerned run a command at the same time, and wait for all of them."""
+        asked = []
+        message = pickle.dumps((method, None, argument, readings))
         for worker in self._workers:
-            mine = None if worlds is None else worlds[(worlds >= worker.first) & (worlds < worker.stop)]
-            if mine is None or mine.size:
-                worker.send(to_all if mine is None else pickle.dumps((method, mine, argument, readings)))
-                asked.append(worker)
+            if worlds is not None:
+                mine = worlds[(worlds >= worker.first) & (worlds < worker.stop)]
+                if not mine.size:
+                    continue
+                message = pickle.dumps((method, mine, argument, readings))
+            worker.send(message)
+            asked.append(worker)
         failures = []
         for worker in asked:
             try:
@@ -302,7 +293,7 @@ class WorkerTeam:
             raise failures[0]
 
     def close(self) -> None:
-        """Close the workers' input, which ends them; kill those that do not end in time."""
+        """Close the pipes, which ends the workers; kill those that do not end in time."""
         for worker in self._workers:
             worker.hang_up()
         for worker in self._workers:
@@ -310,115 +301,101 @@ class WorkerTeam:
         self._workers.clear()
 
 
-def _sweep(folder: Path) -> None:
-    """Remove the files of processes that were killed before they could: nobody holds them any more."""
-    for path in folder.glob("xreset-*"):
-        with contextlib.suppress(OSError), open(path, "rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if (
-                time.time() - os.fstat(file.fileno()).st_mtime > 60.0
-            ):  # a young one's owner may not have come to hold it yet
-                path.unlink()
-
-
 class _Worker:
     """One worker process, as its parent sees it."""
 
-    _PATIENCE = 5.0
+    _END_WITHIN = 5.0
     """Seconds that a worker may take to end."""
-    _ANSWER = 600.0
-    """Seconds that it may take to answer: building an engine's worlds takes some, a command far less than one."""
+    _ANSWER_WITHIN = 600.0
+    """Seconds that a worker may take to answer: building worlds takes some, any other command far less than one."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: Job, memory: int) -> None:
         self.job = job
-        self.first, self.stop = job.first, job.first + len(job.object_index)
-        path = [str(Path(entry or ".").absolute()) for entry in sys.path]
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _BOOT.format(path=path)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env={**os.environ, **_ONE_THREAD},
-            start_new_session=True,  # Ctrl-C is for the parent, which then hangs up
-        )
+        self.first = job.first
+        self.stop = job.first + len(job.object_index)
+        self._pipe, pipe_of_worker = Pipe()
+        path = [os.path.abspath(entry) for entry in sys.path]
+        with pipe_of_worker:
+            boot = _BOOT.format(path=path, pipe=pipe_of_worker.fileno(), memory=memory)
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", boot],
+                pass_fds=(pipe_of_worker.fileno(), memory),
+                stdin=subprocess.DEVNULL,
+                stdout=2,  # engines print; the caller's standard output is not theirs
+                env={**os.environ, **_ONE_THREAD},
+                start_new_session=True,  # Ctrl-C is for the parent, which then closes the pipe
+            )
 
     def send(self, message: bytes) -> None:
         """Send a pickled message; a dead worker is noticed at the reply."""
-        assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.write(message)
-            self._process.stdin.flush()
+        with contextlib.suppress(OSError):
+            self._pipe.send_bytes(message)
 
-    def receive(self, doing: str) -> None:
-        """Wait for the reply, and raise what it says has gone wrong."""
-        assert self._process.stdout is not None
-        if not select.select([self._process.stdout], [], [], self._ANSWER)[0]:
+    def receive(self, command: str) -> None:
+        """Wait for the reply, and raise the failure that it holds."""
+        if not select.select([self._pipe], [], [], self._ANSWER_WITHIN)[0]:
             self._process.kill()
             raise XResetError(
-                f"a worker process of the backend {self.job.backend!r} has not answered {doing!r} for {self._ANSWER:.0f} s and was ended; "
-                f"it ran worlds {self.first} to {self.stop - 1}. workers=0 runs the worlds in this process, where a debugger can see them."
+                f"A worker process of the backend {self.job.backend!r} has not answered {command!r} for "
+                f"{self._ANSWER_WITHIN:.0f} s and was ended; it ran worlds {self.first} to {self.stop - 1}. "
+                "workers=0 runs the worlds in this process, where a debugger can see them."
             )
-        if self._process.stdout.read(len(_DONE)) == _DONE:
-            return
         try:
-            failure = pickle.load(self._process.stdout)
-        except (EOFError, pickle.UnpicklingError) as error:
-            raise XResetError(self._obituary(doing)) from error
-        raise failure
+            failure = self._pipe.recv_bytes()
+        except (EOFError, OSError) as error:
+            raise XResetError(self._cause_of_death(command)) from error
+        if failure:
+            raise pickle.loads(failure)
 
     def hang_up(self) -> None:
-        """Close the worker's input."""
-        assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.close()
+        """Close the pipe."""
+        self._pipe.close()
 
     def wait(self) -> None:
         """Wait for the end, and force it if need be."""
-        assert self._process.stdout is not None
         try:
-            self._process.wait(self._PATIENCE)
+            self._process.wait(self._END_WITHIN)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._process.stdout.close()
 
-    def _obituary(self, doing: str) -> str:
+    def _cause_of_death(self, command: str) -> str:
         self.hang_up()
         self.wait()
         code = self._process.returncode
         how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         hint = " It may have run out of memory: use fewer worlds or workers." if code == -signal.SIGKILL else ""
         return (
-            f"a worker process of the backend {self.job.backend!r} {how} during {doing!r}; it ran worlds {self.first} to {self.stop - 1}."
-            f"{hint} What it said is on standard error; workers=0 runs the worlds in this process, where a debugger can see them."
+            f"A worker process of the backend {self.job.backend!r} {how} during {command!r}; it ran worlds "
+            f"{self.first} to {self.stop - 1}.{hint} Its messages are on standard error. "
+            "workers=0 runs the worlds in this process, where a debugger can see them."
         )
 
 
-def serve() -> None:
-    """Main function of a worker process: read a job and then commands from standard input until it ends, reply on standard output.
+def serve(pipe: int, memory: int) -> None:
+    """Run a worker process: receive a job and then commands, and answer each with nothing or a failure, until the end.
 
-    Whatever the engine prints goes to standard error instead.
+    Args:
+        pipe: file descriptor of the pipe to the parent.
+        memory: file descriptor of the shared arrays.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    commands, replies = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
-
-    def attempt(action, *arguments) -> Any:
-        error, result = None, None
-        try:
-            result = action(*arguments)
-        except WorldFailure as failure:
-            error = failure
-        except Exception:
-            error = XResetError(f"a worker process failed:\n{traceback.format_exc()}")
-        replies.write(_DONE if error is None else _FAILED + pickle.dumps(error))
-        replies.flush()
-        return result
-
-    def start() -> LocalWorlds:
-        path, layout, job = pickle.load(commands)
-        return LocalWorlds(job, _map(path, layout))
-
-    with contextlib.suppress(EOFError, pickle.UnpicklingError, BrokenPipeError):  # the parent is gone, or done with us
-        local = attempt(start)
-        while local is not None:
-            attempt(local.command, *pickle.load(commands))
+    connection = Connection(pipe)
+    worlds = None
+    with contextlib.suppress(EOFError, OSError):  # the parent is gone, or done with this worker
+        while True:
+            failure = b""
+            message = connection.recv_bytes()
+            try:
+                if worlds is None:
+                    layout, job = pickle.loads(message)
+                    worlds = LocalWorlds(job, arrays_in(mmap.mmap(memory, layout.itemsize), layout))
+                else:
+                    worlds.command(*pickle.loads(message))
+            except WorldFailure as error:
+                failure = pickle.dumps(error)
+            except Exception:
+                failure = pickle.dumps(XResetError(f"A worker process failed:\n{traceback.format_exc()}"))
+            connection.send_bytes(failure)
+            if worlds is None:
+                return

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from xreset.eval.policy_spec import PolicySpec, load_policy
-from xreset.eval.results import EvalResult, summarize, write_results
+from xreset.eval.results import Evaluation, episode_table, summarize, write_results
 from xreset.eval.rollout import roll_out
 from xreset.eval.trial import Engine, engine, load_trial
 from xreset.files import claim_folder
@@ -27,7 +27,7 @@ def evaluate(
     device: str = "cpu",
     out: str | Path | None = None,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
-) -> list[EvalResult]:
+) -> Evaluation:
     """Play every demonstration in every engine, from the same starts, and write the results.
 
     Args:
@@ -44,7 +44,7 @@ def evaluate(
         progress: called with (engine, control steps done, control steps in all).
 
     Returns:
-        The results that were written, in the order of the engines.
+        The results that were written, in the order of the engines. They print as a table; ``to_frame()`` has a row for each episode.
 
     Raises:
         PolicyError: the policy is unknown, or the seed chose this checkpoint.
@@ -57,6 +57,7 @@ def evaluate(
     trial = load_trial(policy, demos, objects=objects, seed=seed, num_envs=num_envs)
     folder = Path(out) if out else policy.folder
     results = []
+    tables = []
     with claim_folder(folder):
         for e in chosen:
             player = policy.start(trial.motion)
@@ -74,4 +75,5 @@ def evaluate(
             )
             write_results(folder, result, rollouts, trial.robot.joint_names)
             results.append(result)
-    return results
+            tables.append(episode_table(result, rollouts.episodes))
+    return Evaluation(results, tables)

@@ -1,17 +1,22 @@
-"""Evaluation results as files: one JSON per engine, its episodes and traces beside it."""
+"""Results of evaluations: their files, and one table with a row for each episode.
+
+``ENGINE.json`` holds the summary of one engine, ``ENGINE.episodes.json`` its episodes and ``ENGINE.trace.npz`` recorded states.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from xreset.checks import Checked, NotNegative, Positive, Range, Share
 from xreset.errors import FileFormatError
 from xreset.eval.rollout import Episode, Rollouts, Trace
 from xreset.eval.stats import bootstrap_ci95
+from xreset.eval.table import table_text
 from xreset.files import read_json, write_json
 from xreset.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
 from xreset.typed import from_dict
@@ -32,12 +37,16 @@ _TRACE_FIELDS = {
     "sequence_index": Field(("K",), "i", within=(0, 2**31)),
     "joint_target": Field(("K", "C", "J"), "f", required=False, within=None),
 }
-
 _STACKED = {
-    "joint_pos": "joint_pos", "object_pos": "object_pos", "object_quat": "object_quat_wxyz", "goal_pos": "goal_pos",
+    "joint_pos": "joint_pos",
+    "object_pos": "object_pos",
+    "object_quat": "object_quat_wxyz",
+    "goal_pos": "goal_pos",
     "goal_quat": "goal_quat_wxyz",
-}  # fmt: skip
-"""Field of :class:`~xreset.eval.rollout.Trace` -> array."""
+}
+"""Field of :class:`~xreset.eval.rollout.Trace` -> array in the file."""
+_LARGEST_STATE = 1e6
+"""[m, rad] An object may fall for a while and a joint may run away, but not further."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +60,7 @@ class TaskProgress(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class DemoResult(Checked):
-    """The episodes of one demonstration."""
+    """Means over the episodes of one demonstration."""
 
     sequence: str
     object: str
@@ -65,25 +74,25 @@ class DemoResult(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeFaults(Checked):
-    """Episodes that ended early."""
+    """Numbers of episodes with a fault."""
 
     nonfinite: NotNegative[int]
-    """Because a number was not finite: the engine broke down, or the policy's action was none."""
+    """A number was not finite: the engine broke down, or the policy's action was not finite."""
     overflow: NotNegative[int]
-    """In which the engine dropped contacts or constraints."""
+    """The engine dropped contacts or constraints."""
     out_of_bounds: NotNegative[int]
-    """Because the object left the scene."""
+    """The object left the scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvalResult(Checked):
-    """Contents of ``eval/BACKEND.json``: one policy in one engine."""
+    """Contents of ``eval/ENGINE.json``: one policy in one engine."""
 
     backend: str
     backend_version: str
     robot: str
     objects: tuple[str, ...]
-    """Sorted."""
+    """Object names, sorted."""
     objects_folder: str | None
     """Folder of meshes; None: the stand-ins."""
     policy: str
@@ -100,40 +109,103 @@ class EvalResult(Checked):
     health: EpisodeFaults
     control_steps_per_second: Positive[float]
     inputs: dict[str, str]
-    """SHA-256 by name."""
+    """SHA-256 of the policy and the demonstrations."""
     unseen: tuple[str, ...] = ()
-    """Those of the objects that the policy was not trained with, sorted; none of a baseline's."""
+    """Objects that the policy was not trained with, sorted; empty for a baseline."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.objects or not self.per_demo:
-            raise ValueError("it tells of no object or no demonstration")
+            raise ValueError("it names no object or no demonstration")
         if "/" in self.backend or not self.backend:
             raise ValueError(f"backend is {self.backend!r}, expected an engine's name")
 
 
+class Evaluation(list[EvalResult]):
+    """Results of one policy, one for each engine. It prints as a table; :meth:`to_frame` gives every episode."""
+
+    def __init__(self, results: Iterable[EvalResult], episodes: Sequence[pd.DataFrame]) -> None:
+        """Join the tables of the engines."""
+        super().__init__(results)
+        self._episodes = pd.concat(episodes, ignore_index=True) if episodes else pd.DataFrame()
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the table of episodes; see :func:`episode_table`."""
+        return self._episodes
+
+    def __str__(self) -> str:
+        return table_text(self)
+
+
+# Episodes as a table ----------------------------------------------------------------------------------------------------------------------
+
+
+def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = "") -> pd.DataFrame:
+    """Return a table with one row for each episode.
+
+    Columns: run, policy, engine, robot and seed, then the fields of :class:`~xreset.eval.rollout.Episode`: sequence (index of the
+    demonstration), sequence_name, object, repetition, approach, grasp, reorient, reorient_once, reorientation_progress, task_progress,
+    out_of_bounds, nonfinite, overflow.
+    """
+    table = pd.DataFrame([asdict(e) for e in episodes], columns=[f.name for f in fields(Episode)])
+    about = {
+        "run": run or result.policy,
+        "policy": result.policy,
+        "engine": result.backend,
+        "robot": result.robot,
+        "seed": result.seed,
+    }
+    for place, (column, value) in enumerate(about.items()):
+        table.insert(place, column, value)
+    return table
+
+
+def mean(episodes: pd.DataFrame, metric: str) -> float:
+    """Return the mean of one metric over episodes, rounded to six digits."""
+    return round(float(episodes[metric].to_numpy(float).mean()), 6)
+
+
 def summarize(
-    rollouts: Rollouts, *, backend: str, backend_version: str, robot: str, policy: str, seed: int, inputs: dict[str, str],
-    objects_folder: str | None, unseen: tuple[str, ...] = (),
-) -> EvalResult:  # fmt: skip
-    """What the episodes come to."""
-    episodes = rollouts.episodes
-    progress, groups = (np.array([getattr(e, name) for e in episodes]) for name in ("task_progress", "sequence"))
-    low, high = (round(x, 6) for x in bootstrap_ci95(progress, groups))
+    rollouts: Rollouts,
+    *,
+    backend: str,
+    backend_version: str,
+    robot: str,
+    policy: str,
+    seed: int,
+    inputs: dict[str, str],
+    objects_folder: str | None,
+    unseen: tuple[str, ...] = (),
+) -> EvalResult:
+    """Return the means, intervals and faults of the episodes of one engine."""
+    episodes = pd.DataFrame([asdict(e) for e in rollouts.episodes])
+    low, high = bootstrap_ci95(episodes["task_progress"].to_numpy(float), episodes["sequence"].to_numpy())
+    per_demo = []
+    for _, own in episodes.groupby("sequence", sort=False):
+        first = own.iloc[0]
+        per_demo.append(
+            DemoResult(
+                sequence=first["sequence_name"],
+                object=first["object"],
+                episodes=len(own),
+                task_progress=mean(own, "task_progress"),
+                **_rates(own),
+            )
+        )
     return EvalResult(
         backend=backend,
         backend_version=backend_version,
         robot=robot,
-        objects=tuple(sorted({e.object for e in episodes})),
+        objects=tuple(sorted(episodes["object"].unique())),
         objects_folder=objects_folder,
         policy=policy,
         episodes=len(episodes),
-        episodes_per_demo=1 + max(e.repetition for e in episodes),
+        episodes_per_demo=1 + int(episodes["repetition"].max()),
         seed=seed,
-        task_progress=TaskProgress(mean=mean(episodes, "task_progress"), ci95=(low, high)),
+        task_progress=TaskProgress(mean=mean(episodes, "task_progress"), ci95=(round(low, 6), round(high, 6))),
         reorient_once_rate=mean(episodes, "reorient_once"),
-        per_demo=tuple(_per_demo([e for e in episodes if e.sequence == s]) for s in dict.fromkeys(groups.tolist())),
-        health=EpisodeFaults(**{f.name: sum(getattr(e, f.name) for e in episodes) for f in fields(EpisodeFaults)}),
+        per_demo=tuple(per_demo),
+        health=EpisodeFaults(**{f.name: int(episodes[f.name].sum()) for f in fields(EpisodeFaults)}),
         control_steps_per_second=round(rollouts.control_steps_per_second, 1),
         inputs=inputs,
         unseen=unseen,
@@ -141,74 +213,90 @@ def summarize(
     )
 
 
-def mean(episodes: Sequence[Episode], metric: str) -> float:
-    """Of a field of episodes, to six digits."""
-    return round(float(np.mean([getattr(e, metric) for e in episodes])), 6)
-
-
-def _rates(episodes: Sequence[Episode]) -> dict[str, float]:
+def _rates(episodes: pd.DataFrame) -> dict[str, float]:
     rates = {f"{stage}_rate": mean(episodes, stage) for stage in ("approach", "grasp", "reorient")}
-    return rates | {"reorientation_progress": mean(episodes, "reorientation_progress")}
-
-
-def _per_demo(episodes: Sequence[Episode]) -> DemoResult:
-    return DemoResult(
-        sequence=episodes[0].sequence_name,
-        object=episodes[0].object,
-        episodes=len(episodes),
-        task_progress=mean(episodes, "task_progress"),
-        **_rates(episodes),
-    )
+    rates["reorientation_progress"] = mean(episodes, "reorientation_progress")
+    return rates
 
 
 def mesh_folder(given: Path | None, recorded: str | None) -> Path | None:
-    """The folder of meshes to use: the given one, else the one that a run or its results name; None: the stand-ins."""
-    return given or (Path(recorded) if recorded else None)
+    """Return the folder of meshes to use: the given one, else the one that a run or its results name; None: the stand-ins."""
+    if given is not None or recorded is None:
+        return given
+    return Path(recorded)
+
+
+# Files ------------------------------------------------------------------------------------------------------------------------------------
 
 
 def write_results(folder: Path, summary: EvalResult, rollouts: Rollouts, joint_names: tuple[str, ...]) -> Path:
-    """Write ``BACKEND.json``, ``BACKEND.episodes.json`` and ``BACKEND.trace.npz``; returns the first."""
+    """Write ``ENGINE.json``, ``ENGINE.episodes.json`` and ``ENGINE.trace.npz``; return the path of the first."""
     name = summary.backend
-    write_json(
-        folder / f"{name}.episodes.json",
-        {"schema": EPISODES_SCHEMA, "episodes": [asdict(e) for e in rollouts.episodes]},
-    )
+    episodes = [asdict(e) for e in rollouts.episodes]
+    write_json(folder / f"{name}.episodes.json", {"schema": EPISODES_SCHEMA, "episodes": episodes})
     traces = rollouts.traces
-    recorded = [t.joint_target for t in traces if t.joint_target is not None]
-    targets = np.stack(recorded) if len(recorded) == len(traces) else None
-    write_npz(
-        folder / f"{name}.trace.npz",
-        TRACE_SCHEMA,
-        {
-            "time": traces[0].time,
-            "joint_names": np.array(joint_names),
-            **{key: np.stack([getattr(t, name) for t in traces]) for name, key in _STACKED.items()},
-            "object_name": np.array([t.object for t in traces]),
-            "sequence_index": np.array([t.sequence for t in traces]),
-            **({} if targets is None else {"joint_target": targets}),
-        },
-    )
+    arrays = {
+        "time": traces[0].time,
+        "joint_names": np.array(joint_names),
+        "object_name": np.array([t.object for t in traces]),
+        "sequence_index": np.array([t.sequence for t in traces]),
+    }
+    for field, key in _STACKED.items():
+        arrays[key] = np.stack([getattr(t, field) for t in traces])
+    targets = [t.joint_target for t in traces if t.joint_target is not None]
+    if len(targets) == len(traces):
+        arrays["joint_target"] = np.stack(targets)
+    write_npz(folder / f"{name}.trace.npz", TRACE_SCHEMA, arrays)
     write_json(folder / f"{name}.json", {"schema": SCHEMA} | asdict(summary))
     return folder / f"{name}.json"
 
 
+def read_evaluation(folder: Path, run: str = "") -> Evaluation:
+    """Read the results of every engine in an ``eval`` folder, and their episodes.
+
+    Args:
+        run: what the table of episodes calls the run; default: as the results name the policy.
+
+    Raises:
+        FileFormatError: a file is damaged, or the files are of different evaluations.
+    """
+    results = read_results(folder)
+    tables = [_read_table(folder, result, run) for result in results]
+    return Evaluation(results, tables)
+
+
+def _read_table(folder: Path, result: EvalResult, run: str) -> pd.DataFrame:
+    """Read the table of episodes of one engine."""
+    episodes = read_episodes(folder, result.backend)
+    if len(episodes) != result.episodes:
+        raise FileFormatError(
+            f"{folder / result.backend}.json states {result.episodes} episodes, {result.backend}.episodes.json holds "
+            f"{len(episodes)}. The files are of different evaluations; evaluate again."
+        )
+    return episode_table(result, episodes, run)
+
+
 def read_results(folder: Path) -> list[EvalResult]:
-    """Every engine's result in an ``eval`` folder, in order of name."""
+    """Read the result of every engine in an ``eval`` folder, in order of name."""
     files = [f for f in folder.glob("*.json") if not f.name.endswith(".episodes.json")]
     return [read_result(file) for file in sorted(files, key=lambda f: f.stem)]
 
 
 def read_result(path: Path) -> EvalResult:
-    """One engine's result.
+    """Read the result of one engine.
 
     Raises:
-        FileFormatError: it is damaged, or lacks an entry; the message names it.
+        FileFormatError: the file is damaged, or lacks an entry; the message names the entry.
     """
     return from_dict(EvalResult, read_json(path, SCHEMA), str(path))
 
 
 def read_episodes(folder: Path, backend: str) -> tuple[Episode, ...]:
-    """The episodes of one engine."""
+    """Read the episodes of one engine.
+
+    Raises:
+        FileFormatError: the file is damaged, or a value is impossible.
+    """
     path = folder / f"{backend}.episodes.json"
     episodes = read_json(path, EPISODES_SCHEMA).get("episodes")
     if not isinstance(episodes, list):
@@ -217,47 +305,50 @@ def read_episodes(folder: Path, backend: str) -> tuple[Episode, ...]:
 
 
 def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tuple[Trace, ...]:
-    """The traces of one engine.
+    """Read the traces of one engine.
 
     Raises:
         FileFormatError: the file is damaged, or its joints are not ``joint_names`` in that order.
     """
     path = folder / f"{backend}.trace.npz"
-    a = read_npz(path, TRACE_SCHEMA, _TRACE_FIELDS, what="an evaluation trace", check=_check_traces)
-    found = tuple(a["joint_names"].tolist())
+    arrays = read_npz(path, TRACE_SCHEMA, _TRACE_FIELDS, what="an evaluation trace", check=_trace_problem)
+    found = tuple(arrays["joint_names"].tolist())
     if found != joint_names:
         raise FileFormatError(
             f"{path} is a trace of the joints {', '.join(found)}; the robot has {', '.join(joint_names)}. Evaluate again."
         )
-    return tuple(
-        Trace(
-            sequence=int(a["sequence_index"][i]),
-            object=str(a["object_name"][i]),
-            time=a["time"],
-            joint_target=a["joint_target"][i] if "joint_target" in a else None,
-            **{name: a[key][i] for name, key in _STACKED.items()},
+    traces = []
+    for i, name in enumerate(arrays["object_name"]):
+        trace = Trace(
+            sequence=int(arrays["sequence_index"][i]),
+            object=str(name),
+            time=arrays["time"],
+            joint_target=arrays["joint_target"][i] if "joint_target" in arrays else None,
+            **{field: arrays[key][i] for field, key in _STACKED.items()},
         )
-        for i in range(len(a["object_name"]))
-    )
+        traces.append(trace)
+    return tuple(traces)
 
 
-_FAR = 1e6
-"""[m, rad] An object may fall for a while and a joint may run away, but not so far."""
+def _trace_problem(arrays: dict[str, np.ndarray]) -> str | None:
+    """Return what no engine can have written, if there is such a thing.
 
-
-def _check_traces(a: dict[str, np.ndarray]) -> str | None:
-    """What no engine can have given. One that breaks down gives numbers that are not finite, from some frame after the first on."""
-    if len(a["time"]) < 2 or (np.diff(a["time"]) <= 0).any():
+    An engine that breaks down writes numbers that are not finite, from some frame after the first on.
+    """
+    time = arrays["time"]
+    if len(time) < 2 or (np.diff(time) <= 0).any():
         return "the times of its frames do not rise."
-    state = np.concatenate((a["joint_pos"], a["object_pos"], a["object_quat_wxyz"]), axis=2)
-    sound = np.isfinite(state).all(axis=2)
-    if not sound[:, 0].all():
+    state = np.concatenate((arrays["joint_pos"], arrays["object_pos"], arrays["object_quat_wxyz"]), axis=2)
+    finite = np.isfinite(state).all(axis=2)
+    if not finite[:, 0].all():
         return "an episode begins with numbers that are not finite."
-    if (np.abs(state[sound]) > _FAR).any():
-        return f"a state holds {np.abs(state[sound]).max():.3g}, expected at most {_FAR:g}."
-    if (np.abs(np.linalg.norm(a["object_quat_wxyz"][sound].astype(float), axis=-1) - 1) > UNIT_TOLERANCE).any():
+    largest = np.abs(state[finite]).max()
+    if largest > _LARGEST_STATE:
+        return f"a state holds {largest:.3g}, expected at most {_LARGEST_STATE:g}."
+    lengths = np.linalg.norm(arrays["object_quat_wxyz"][finite].astype(float), axis=-1)
+    if (np.abs(lengths - 1) > UNIT_TOLERANCE).any():
         return "array 'object_quat_wxyz' holds quaternions that are not unit."
-    targets = a.get("joint_target")
-    if targets is not None and not (np.abs(targets[sound.min(axis=1)]) <= _FAR).all():
+    targets = arrays.get("joint_target")
+    if targets is not None and not (np.abs(targets[finite.min(axis=1)]) <= _LARGEST_STATE).all():
         return "array 'joint_target' holds numbers that are not finite, or far too large."
     return None

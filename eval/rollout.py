@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from xreset.checks import NotNegative, Share
 from xreset.env import ManipulationEnv
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
 from xreset.eval.trial import Engine, Trial
@@ -35,19 +36,19 @@ Progress = Callable[[int, int], None]
 class Episode:
     """Result of one episode."""
 
-    sequence: int
+    sequence: NotNegative[int]
     """Index of the demonstration."""
     sequence_name: str
     object: str
-    repetition: int
+    repetition: NotNegative[int]
     """Number of the perturbation of the demonstration's start."""
     approach: bool
     grasp: bool
     reorient: bool
     reorient_once: bool
     """Whether the object was at the goal at any time."""
-    reorientation_progress: float
-    task_progress: float
+    reorientation_progress: Share[float]
+    task_progress: Share[float]
     out_of_bounds: bool
     nonfinite: bool
     overflow: bool

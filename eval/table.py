@@ -1,15 +1,18 @@
-"""Tables: for a terminal, and as Markdown like that of ``docs/results.md``."""
+"""Tables: for a terminal, and as Markdown like the tables of ``docs/results.md``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+import rich.console
 from rich.table import Table
 from rich.text import Text
 
-from xreset.eval.results import EvalResult
+if TYPE_CHECKING:
+    from xreset.eval.results import EvalResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,20 +25,25 @@ class Rows:
 
 
 def escape(text: str) -> str:
-    """Text that Markdown shows as it is, in one line."""
+    """Return text that Markdown shows unchanged, in one line."""
     for special in "\\|*_<>`[]":
         text = text.replace(special, f"\\{special}")
     return " ".join(text.split())
 
 
 def markdown(rows: Rows, escape: Callable[[str], str] = escape) -> str:
-    """As a table in Markdown."""
-    lines = [rows.head, ("---",) * len(rows.head), *rows.body]
-    return "\n".join("| " + " | ".join(escape(cell) for cell in line) + " |" for line in lines) + "\n"
+    """Return a table in Markdown."""
+    lines = ""
+    for cells in (rows.head, ("---",) * len(rows.head), *rows.body):
+        lines += "| " + " | ".join(map(escape, cells)) + " |\n"
+    return lines
 
 
 def rich_table(rows: Rows) -> Table:
-    """For a terminal. If two columns describe a row, they become one, so that four engines fit into 80 characters."""
+    """Return a table for a terminal.
+
+    If two columns describe a row, they are joined to one, so that four engines fit into 80 characters.
+    """
     grouped = not any(rows.head[:2])
     table = Table(title=rows.title, title_justify="left")
     for i, name in enumerate(rows.head[grouped:]):
@@ -49,21 +57,21 @@ def rich_table(rows: Rows) -> Table:
 
 
 def _cell(text: str) -> Text:
-    """As it is, without markup; a number stays beside its unit, and three shares on one line."""
+    """Return a cell without markup. A number stays next to its unit, and three shares stay on one line."""
     return Text(text.replace(" / ", "/").replace(" %", "\N{NO-BREAK SPACE}%"))
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of an evaluation: a row of the terminal's table, a column of the report's."""
+    """A figure of an evaluation: a row of the terminal's table, a column of the report's table."""
 
     text: Callable[[EvalResult], str]
     share: Callable[[EvalResult], float] | None = None
-    """Drawn behind it, in [0, 1]."""
+    """Length of the bar behind the text, in [0, 1]."""
     interval: Callable[[EvalResult], tuple[float, float]] | None = None
-    """95 %, in [0, 1]."""
+    """95 % interval, in [0, 1]."""
     fault: bool = False
-    """Whether all but 0 is bad."""
+    """Whether every number but 0 is a fault."""
 
 
 FIGURES = {
@@ -87,24 +95,35 @@ FIGURES = {
 
 
 def result_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
-    """One row of text per figure: its name, then its value in each engine."""
-    found, first = [("version", *(s.backend_version for s in summaries))], summaries[0]
+    """Return one row of text for each figure: its name, then its value in each engine."""
+    rows = [("version", *(s.backend_version for s in summaries))]
     for name, figure in FIGURES.items():
-        found.append((name, *map(figure.text, summaries)))
-        if (interval := figure.interval) is not None:
-            found.append(
-                ("  95 % interval", *("{:.0f}-{:.0f}%".format(*(100 * x for x in interval(s))) for s in summaries))
-            )
-    known = [name for name in first.objects if name not in first.unseen]
-    parts = {"  trained objects": known, "  unseen objects": first.unseen} if known and first.unseen else {}
-    for place, (part, objects) in enumerate(parts.items(), 3):
-        means = [np.mean([d.task_progress for d in s.per_demo if d.object in objects]) for s in summaries]
-        found.insert(place, (part, *(f"{value:.1%}" for value in means)))
-    return found
+        rows.append((name, *map(figure.text, summaries)))
+        if figure.interval is not None:
+            intervals = map(figure.interval, summaries)
+            rows.append(("  95 % interval", *(f"{100 * low:.0f}-{100 * high:.0f}%" for low, high in intervals)))
+        if name == "task progress":
+            rows += _unseen_rows(summaries)
+    return rows
+
+
+def _unseen_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
+    """Return task progress of trained and of unseen objects; nothing if all objects are of one kind."""
+    unseen = summaries[0].unseen
+    trained = [name for name in summaries[0].objects if name not in unseen]
+    rows = []
+    if trained and unseen:
+        for label, objects in (("  trained objects", trained), ("  unseen objects", unseen)):
+            cells = []
+            for s in summaries:
+                value = np.mean([d.task_progress for d in s.per_demo if d.object in objects])
+                cells.append(f"{value:.1%}")
+            rows.append((label, *cells))
+    return rows
 
 
 def results_table(summaries: Sequence[EvalResult]) -> Table:
-    """An evaluation: one column per engine; four of them fit into 80 characters."""
+    """Return the table of an evaluation: one column for each engine; four engines fit into 80 characters."""
     first = summaries[0]
     title = f"{first.policy} on {first.robot}\n{first.episodes} episodes of {len(first.per_demo)} demonstrations, seed {first.seed}"
     table = Table("", title=title, title_justify="left")
@@ -114,3 +133,13 @@ def results_table(summaries: Sequence[EvalResult]) -> Table:
     for row in result_rows(summaries):
         table.add_row(*row, style="bold" if row[0] == "task progress" else None)
     return table
+
+
+def table_text(summaries: Sequence[EvalResult]) -> str:
+    """Return :func:`results_table` as plain text."""
+    if not summaries:
+        return "no results"
+    console = rich.console.Console(width=100, color_system=None)
+    with console.capture() as captured:
+        console.print(results_table(summaries))
+    return captured.get()

@@ -11,7 +11,6 @@ import numpy as np
 
 from xreset.eval.report.progress import processes
 from xreset.eval.report.read import ASPECTS, Training
-from xreset.eval.results import mean
 from xreset.eval.rollout import Episode
 from xreset.eval.stats import crossed_bootstrap_ci95
 
@@ -134,7 +133,7 @@ def score(group: Group, engine: str) -> Score | None:
     return Score(
         task_progress=task_progress,
         ci95=ci95,
-        **{name: mean(episodes, name) for name in stages},
+        **{name: round(float(np.mean([getattr(e, name) for e in episodes])), 6) for name in stages},
         each={m.label: float(np.mean([e.task_progress for e in m.episodes[engine]])) for m in evaluated},
         nonfinite=sum(e.nonfinite for e in episodes),
         overflow=sum(e.overflow for e in episodes),

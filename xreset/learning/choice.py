@@ -24,8 +24,11 @@ class Candidate:
     """Engine -> mean over the episodes; without the engines in which it was not played, because it could not be chosen any more."""
 
     def __post_init__(self) -> None:
-        if not all(0 <= value <= 1 for value in self.task_progress.values()):
-            raise ValueError(f"task_progress is {self.task_progress}, expected numbers from 0 to 1")
+        values = self.task_progress.values()
+        if not values or not all(0 <= value <= 1 for value in values):
+            raise ValueError(
+                f"task_progress is {self.task_progress}, expected an engine at least, and numbers from 0 to 1"
+            )
 
     @property
     def worst(self) -> float:

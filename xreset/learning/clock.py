@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from xreset.checks import NotNegative, Share
 from xreset.files import read_json, write_json
 from xreset.typed import from_dict
 
@@ -23,11 +24,11 @@ SHARES = (0.01, 0.1, 0.5)
 class Passing:
     """The first iteration in which at least ``share`` of the steps of worlds that began at home were at the goal."""
 
-    share: float
-    iteration: int
-    env_steps: int
+    share: Share[float]
+    iteration: NotNegative[int]
+    env_steps: NotNegative[int]
     """Of all worlds, until then."""
-    minutes: float
+    minutes: NotNegative[float]
     """Of training until then, without compiling."""
 
 
@@ -37,11 +38,11 @@ class Lift:
 
     passed: tuple[Passing, ...] = ()
     """In the order of :data:`SHARES`."""
-    iteration: int = 0
+    iteration: NotNegative[int] = 0
     """How far the training has come."""
-    env_steps: int = 0
-    minutes: float = 0.0
-    success_from_home: float = 0.0
+    env_steps: NotNegative[int] = 0
+    minutes: NotNegative[float] = 0.0
+    success_from_home: Share[float] = 0.0
     """In the last iteration."""
 
 

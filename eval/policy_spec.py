@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from xreset.description import load_robot
+from xreset.env import ManipulationEnv, make_env
 from xreset.errors import PolicyError
 from xreset.eval.baselines import KinematicRetargeting
 from xreset.files import file_hash
@@ -14,9 +15,10 @@ from xreset.learning.choice import read_choice
 from xreset.learning.run import read_run
 from xreset.policies import results_folder, shipped
 from xreset.policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
+from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
-from xreset.spec import RobotSpec
-from xreset.task.config import TaskConfig
+from xreset.spec import ObjectSpec, RobotSpec
+from xreset.task.config import TaskConfig, evaluation_task
 from xreset.typed import from_dict
 
 BASELINES = ("zero", "random", "ik")
@@ -50,6 +52,43 @@ class PolicySpec:
     def unseen(self, names: Iterable[str]) -> tuple[str, ...]:
         """Return the names of objects that the training did not have, sorted; none for a baseline."""
         return () if self.objects is None else tuple(sorted(set(names) - set(self.objects)))
+
+    def make_env(
+        self,
+        objects: Sequence[ObjectSpec],
+        bank: ResetBank,
+        *,
+        engine: str = "mujoco",
+        num_envs: int = 1,
+        device: str = "cpu",
+        seed: int = 0,
+    ) -> ManipulationEnv:
+        """Make an environment of the policy's own task, as evaluations play it: from home, at full gravity.
+
+        Args:
+            objects: objects of the bank; the policy need not know them.
+            bank: starts and goals.
+            engine: name of a physics engine.
+            num_envs: number of worlds.
+            device: where the engine runs: cpu or cuda.
+            seed: seed of every random number.
+        """
+        task = evaluation_task(self.task)
+        return make_env(self.robot, objects, bank, task, engine=engine, num_envs=num_envs, device=device, seed=seed)
+
+    def begin(self, env: ManipulationEnv) -> Policy:
+        """Return the policy, ready to act in an environment whose episodes have just begun.
+
+        Raises:
+            PolicyError: its observations or actions would mean something else there.
+        """
+        if self.follows_motion:
+            raise PolicyError("The baseline 'ik' follows recorded motion. Use xreset.evaluate.")
+        policy = self.start(None)
+        if isinstance(policy, OnnxPolicy):
+            check_contract(self.name, policy.contract, env.backend.scene.robot, env.task)
+        policy.begin(env)
+        return policy
 
     def check_seed(self, seed: int) -> None:
         """Refuse the seed whose starts chose this checkpoint, because a result on them is biased.

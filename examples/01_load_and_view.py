@@ -4,7 +4,6 @@ import sys
 from pathlib import Path
 
 import xreset
-from xreset.demos.archive import write_demos
 from xreset.pictures.render import write_png
 from xreset.pictures.view.load import load_view
 from xreset.pictures.view.picture import Drawer
@@ -18,7 +17,7 @@ def main(out: Path) -> None:
 
     can = xreset.load_object("soup")  # a built-in stand-in; a folder of meshes is the second argument
     demos = xreset.synthesize([can.name], 2, seed=0)  # or xreset.read_demos("demos.npz")
-    write_demos(out / "demos.npz", demos)
+    xreset.write_demos(out / "demos.npz", demos)
     view = load_view(out / "demos.npz", demos=None, retargeted=None, robot=None, objects=None)
     write_png(out / "demos.png", Drawer(view, smooth=True).draw(row=60))
 

@@ -7,7 +7,6 @@ import numpy as np
 
 import xreset
 from xreset.demos.keypoints import Convention, read_keypoints
-from xreset.resets.bank import write_bank
 
 
 def record(file: Path) -> None:
@@ -39,7 +38,7 @@ def main(out: Path) -> None:
     robot, can = xreset.load_robot("openarm"), xreset.load_object("soup")
     motion = xreset.retarget_demos(demos, robot, [can])
     bank = xreset.make_bank(motion, robot, [can], ["mujoco"], num_envs=8)
-    write_bank(out / "bank.npz", bank, config={}, inputs={})
+    xreset.write_bank(out / "bank.npz", bank, config={}, inputs={})
     print(f"{int(motion.valid.sum())} of {demos.num_frames} frames can be reached, {bank.num_states} states are stable")
 
 

@@ -4,7 +4,6 @@ import sys
 from pathlib import Path
 
 import xreset
-from xreset.demos.archive import write_demos
 
 
 def main(out: Path, engines: tuple[str, ...] = ("mujoco", "sapien")) -> None:
@@ -14,29 +13,18 @@ def main(out: Path, engines: tuple[str, ...] = ("mujoco", "sapien")) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    write_demos(out / "unseen.npz", xreset.synthesize(["005_tomato_soup_can"], 1, seed=1))
-    results = xreset.evaluate(
-        "soup-can",  # a policy that ships with xreset; a run folder or a .onnx file will do
-        out / "unseen.npz",
-        engines,
-        episodes=1,
-        num_envs=1,
-        out=out / "eval",
-    )
+    unseen = xreset.synthesize(["005_tomato_soup_can"], 1, seed=1)  # or the file of demonstrations
+    policy = "soup-can"  # ships with xreset; a run folder or an .onnx file will do
+    results = xreset.evaluate(policy, unseen, engines, episodes=1, num_envs=1, out=out / "eval")
 
     figure, axes = pyplot.subplots(figsize=(5, 3), layout="constrained")
     parts = ("approach_rate", "grasp_rate", "reorient_rate", "reorientation_progress")
     for number, result in enumerate(results):
         means = [getattr(result, part) for part in parts]
-        axes.bar(
-            [i + 0.4 * number for i in range(len(parts))],
-            means,
-            width=0.38,
-            label=f"{result.backend} {result.backend_version}",
-        )
-        print(
-            f"{result.policy} in {result.backend}: task progress {result.task_progress.mean:.0%} in {result.episodes} episodes"
-        )
+        places = [i + 0.4 * number for i in range(len(parts))]
+        axes.bar(places, means, width=0.38, label=f"{result.backend} {result.backend_version}")
+        progress = f"task progress {result.task_progress.mean:.0%} in {result.episodes} episodes"
+        print(f"{result.policy} in {result.backend}: {progress}")
     axes.set_xticks([i + 0.2 for i in range(len(parts))], [part.replace("_", "\n") for part in parts])
     axes.set(ylim=(0, 1), ylabel="share")
     axes.legend(loc="lower left")

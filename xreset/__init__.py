@@ -2,12 +2,14 @@
 
     import xreset
 
-    robot = xreset.load_robot("ur7e-sharpa")
     can = xreset.load_object("soup")
-    demos = xreset.synthesize([can.name], 4)                       # or xreset.read_demos("demos.npz")
-    motion = xreset.retarget_demos(demos, robot, [can])            # robot states that follow the human's hand
-    bank = xreset.make_bank(motion, robot, [can], ["mujoco"])      # those that a physics engine finds stable
-    env = xreset.make_env(robot, [can], bank, engine="mujoco")     # N worlds that begin there
+    demos = xreset.synthesize([can.name], 4)                               # or xreset.read_demos("demos.npz")
+    policy = xreset.load_policy("nine-objects")                            # or a run folder, or an .onnx file
+
+    motion = xreset.retarget_demos(demos, policy.robot, [can])             # robot states that follow the human hand
+    bank = xreset.make_bank(motion, policy.robot, [can], ["mujoco"])       # those that a physics engine finds stable
+    with policy.make_env([can], bank, engine="mujoco") as env:             # the task that the policy was trained for
+        xreset.film(policy, env, "can.mp4")
 
 Importing this package loads nothing heavy: no torch, no physics engine, no display. A name is imported when it is first used.
 """

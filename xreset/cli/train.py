@@ -6,12 +6,12 @@ import math
 import sys
 from argparse import ArgumentParser
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from xreset.checks import without_effect
 from xreset.errors import RunError
+from xreset.learning import new_run
 from xreset.learning import train as training
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import dropped_terms, own_terms_flag, starting_config
@@ -77,20 +77,20 @@ def train(
             f"If you trust this code, add {own_terms_flag(dropped)}.",
             file=sys.stderr,
         )
-    if iterations is not None:
-        config = replace(config, iterations=iterations)
-    inputs = training.load_inputs(robot, resets, objects)
-    info = training.start_run(
-        inputs,
-        backend=backend,
-        device=device or training.default_device(backend),
-        num_envs=num_envs,
-        seed=seed,
-        config=config,
+    new_run.train(
+        resets,
         out=out,
+        config=config,
+        robot=robot,
+        objects=objects,
+        engine=backend,
+        device=device,
+        num_envs=num_envs,
+        iterations=iterations,
+        minutes=minutes,
+        seed=seed,
         weights=weights,
     )
-    training.train(out, info, inputs, seconds=60 * minutes)
 
 
 def command_for(arguments: list[str]) -> Callable[..., None]:

@@ -1,0 +1,21 @@
+"""A policy that ships with xreset grasps an object that it has never seen, in an engine that it was not trained in."""
+
+import sys
+
+import xreset
+
+
+def main(meshes: str, name: str, out: str) -> None:
+    """Make demonstrations of the mesh ``meshes/NAME.obj`` and a bank from them, and film the policy's first episode."""
+    thing = xreset.load_object(name, meshes)
+    demos = xreset.synthesize([name], 2, meshes=meshes)  # or xreset.read_demos("demos.npz")
+    policy = xreset.load_policy("nine-objects")  # or a run folder, or an .onnx file
+
+    motion = xreset.retarget_demos(demos, policy.robot, [thing])  # robot states that follow the human hand
+    bank = xreset.make_bank(motion, policy.robot, [thing], ["pybullet"])  # those that the engine finds stable
+    with policy.make_env([thing], bank, engine="pybullet") as env:  # the task that the policy was trained for
+        xreset.film(policy, env, out)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -571,9 +571,9 @@ class BankTest(InFolder):
 
         bank = toy_bank(self.robot, object_sources=("stand-in", "ab12"))
         check_objects("bank.npz", bank, (obj(SOUP, "stand-in"), obj(SPAM, "ab12"), obj("011_banana", "ff")))
-        with self.refused(f"built-in stand-in of {SOUP}, but here is an imported mesh", "--objects"):
+        with self.refused(f"built-in stand-in of {SOUP}, but the given one is an imported mesh", "--objects"):
             check_objects("bank.npz", bank, (obj(SOUP, "ab12"),))
-        with self.refused(f"an imported mesh of {SPAM}, but here is an imported mesh", "another one"):
+        with self.refused(f"an imported mesh of {SPAM}, but the given one is an imported mesh", "another mesh"):
             check_objects("bank.npz", bank, (obj(SPAM, "ab13"),))
 
 

@@ -12,7 +12,9 @@ from xreset.errors import DemoError
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
 from xreset.physics import Health, State
-from xreset.resets.filter import REASONS, FilterConfig, make_bank, try_states
+from xreset.resets import filter as filtering
+from xreset.resets.filter import REASONS, make_bank, rejection
+from xreset.resets.probe import settle
 from xreset.retarget.pipeline import Retargeted
 from xreset.spec import SceneSpec
 
@@ -32,13 +34,15 @@ class FilterTest(unittest.TestCase):
         cls.objects = load_objects([SOUP, SPAM])
         cls.height = float(rest_height(cls.objects[0], UPRIGHT))
 
-    def try_one(self, pos, joint_pos=None, backend_class=MujocoBackend, config=None):
+    def try_one(self, pos, joint_pos=None, backend_class=MujocoBackend):
         """The reason (None: accepted) of one state with the soup can at ``pos``."""
         scene = SceneSpec(robot=self.robot, objects=self.objects[:1])
         joint_pos = self.robot.home if joint_pos is None else joint_pos
         rows = [torch.as_tensor(np.asarray(v)[None], dtype=torch.float32) for v in (joint_pos, pos, UPRIGHT)]
         with backend_class(scene, 1, workers=0) as backend:
-            reason = int(try_states(backend, State.at_rest(*rows), config or FilterConfig()))
+            start = State.at_rest(*rows)
+            settle(backend, start, gravity=0.0, steps=filtering.STEPS)
+            reason = int(rejection(backend, start))
         return None if reason < 0 else REASONS[reason]
 
     def test_an_object_at_rest_is_accepted(self):
@@ -55,9 +59,9 @@ class FilterTest(unittest.TestCase):
 
     def test_thresholds_count(self):
         pos = [0.5, 0.3, self.height - 0.02]
-        self.assertIsNone(
-            self.try_one(pos, config=FilterConfig(linear_velocity=1e3, angular_velocity=1e3, joint_velocity=1e3))
-        )
+        limits = {"LINEAR_VELOCITY": 1e3, "ANGULAR_VELOCITY": 1e3, "JOINT_VELOCITY": 1e3}
+        with mock.patch.multiple(filtering, **limits):
+            self.assertIsNone(self.try_one(pos))
 
     def test_broken_and_overflowing_worlds_are_rejected(self):
         for field, reason in (("nonfinite", "not finite"), ("overflow", "overflow")):
@@ -167,8 +171,8 @@ class FilterTest(unittest.TestCase):
             return (Moves if name == "moves" else MujocoBackend)(*args, workers=0, **options)
 
         with (
-            mock.patch("xreset.resets.filter.make_backend", made),
-            mock.patch("xreset.resets.filter.device_for", lambda name, device: device),
+            mock.patch("xreset.resets.probe.make_backend", made),
+            mock.patch("xreset.resets.probe.device_for", lambda name, device: device),
         ):
             bank = make_bank(self.retargeted(), self.robot, self.objects, ["mujoco", "moves"], num_envs=2)
         self.assertEqual(bank.backends, ("mujoco", "moves"))

@@ -74,7 +74,7 @@ def resets(
         accounts_path(out),
         of="states tried in physics",
         rows=bank.accounts(),
-        bands=[asdict(band) for band in bands],
+        bands=bands,
         pressing=bank.num_pressing,
         **({"hold": [asdict(row) for row in held]} if hold else {}),
     )
@@ -124,14 +124,14 @@ def _accepted(data: file.Retargeted, bank: banks.ResetBank, title: str) -> Table
     return table
 
 
-def _closing(bands: Sequence[banks.Band]) -> Table:
+def _closing(bands: Sequence[dict]) -> Table:
     """States by the distance between finger and object."""
     table = Table(
         "finger to object", "frames: tried", "accepted", "added: tried", "accepted", title="where the hand closes in"
     )
     for band in bands:
-        counts = (band.tried, band.kept, band.added, band.added_kept)
-        far, near = ("" if edge is None else f"{100 * edge:g}" for edge in (band.nearer, band.farther))
+        counts = (band["tried"], band["kept"], band["added"], band["added_kept"])
+        far, near = ("" if edge is None else f"{100 * edge:g}" for edge in (band["nearer"], band["farther"]))
         table.add_row(
             f"{far} to {near} cm" if far and near else f"beyond {near} cm" if near else "contact", *map(str, counts)
         )

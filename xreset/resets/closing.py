@@ -1,8 +1,9 @@
 """More states where a hand closes in on an object.
 
-People come in at 0.6 to 0.9 m/s, so at 30 frames a second a demonstration shows a hand two or three times between 10 cm and its grasp,
-which is where a policy learns to grasp or to press. Between two frames of one motion the robot's joints are interpolated, so that
-fingertips move by a stated distance from state to state; physics judges the new states like the others.
+People's hands come in at 0.6 to 0.9 m/s. So at 30 frames a second a demonstration shows a hand two or three times
+between 10 cm and its grasp, where a policy learns whether to grasp or to press. Here the robot's joints are
+interpolated between two frames of one motion, so that fingertips move by a stated distance from state to state. Physics
+judges the new states like the others.
 """
 
 from __future__ import annotations
@@ -22,90 +23,98 @@ from xreset.spec import ObjectSpec, RobotSpec
 TOUCH = 0.002
 """A finger nearer to the object than this touches it [m]; retargeting keeps 0.5 mm between them."""
 MOVED = 0.01
-"""Once its origin is farther than this from where it started [m], an object has been moved."""
+"""An object has been moved once its origin is farther than this from where it started [m]."""
+
+_POSITIONS = ("joint_pos", "palm_pos", "fingertip_pos", "object_pos")
+_ROTATIONS = ("palm_quat_wxyz", "object_quat_wxyz")
+_REPEATED = ("annotated", "valid", "reason", "contact", "hand_error", "wrist_error")
 
 
 class Closing(NamedTuple):
     """Trajectories with states between frames."""
 
     retargeted: Retargeted
-    """With more frames, no longer evenly spaced in time. Those that were there are unchanged and in their order."""
+    """With more frames, no longer evenly spaced in time. The given frames are unchanged and in their order."""
     frame: np.ndarray
-    """[F] the frame that each was, or that comes before it, counted over the trajectories that were given."""
+    """[F] given frame that each frame is or follows, counted over the given trajectories."""
     part: np.ndarray
-    """[F] how far it lies on the way to the next one, in [0, 1); 0 is the frame itself."""
+    """[F] how far each frame is on the way to the next given one, in [0, 1); 0 is the given frame itself."""
 
 
 def with_closing_frames(
     retargeted: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec], config: ClosingConfig
 ) -> Closing:
-    """The same motion with frames added between valid ones where the hand closes in.
+    """Return the same motion with frames added between valid ones where the hand closes in.
 
-    That is where a finger is near the object, until the thumb and another one touch it or it has been moved. It is not until the human's
-    first contact: then the robot's fingers are usually 5 to 10 mm away.
+    That is where a finger is near the object, until the thumb and another finger touch the object or the object has
+    been moved. The human's first contact is not the end: there the robot's fingers are usually 5 to 10 mm away.
     """
     owner = retargeted.sequence_of_frame
     if config.spacing is None:
         return Closing(retargeted, np.arange(len(owner)), np.zeros(len(owner)))
-    fingers = fingers_in(retargeted, robot, objects)
-    gap = fingers.nearest.numpy()
-    touch, thumb = (fingers.gap < TOUCH).numpy(), (fingers.finger == 0).numpy()
-    start = retargeted.frame_offsets[:-1][owner]
-    moved = np.linalg.norm(retargeted.object_pos - retargeted.object_pos[start], axis=-1) > MOVED
-    over = touch[:, thumb].any(axis=1) & touch[:, ~thumb].any(axis=1) | moved
-    past = np.cumsum(over)
-    over = past - (past - over)[start] > 0  # in this frame, or in one before it of the same sequence
-    before = np.flatnonzero(
-        (owner[:-1] == owner[1:])
-        & retargeted.valid[:-1]
-        & retargeted.valid[1:]
-        & ~over[:-1]
-        & (np.minimum(gap[:-1], gap[1:]) < config.within)
-    )
-    travel = np.linalg.norm(retargeted.fingertip_pos[before + 1] - retargeted.fingertip_pos[before], axis=-1).max(
-        axis=-1
-    )
+    before = _frames_to_follow(retargeted, fingers_in(retargeted, robot, objects), config.within)
+    step = retargeted.fingertip_pos[before + 1] - retargeted.fingertip_pos[before]
+    travel = np.linalg.norm(step, axis=-1).max(axis=-1)
     pieces = np.ones(len(owner), dtype=int)
     pieces[before] = np.maximum(np.ceil(travel / config.spacing).astype(int), 1)
-    row = np.repeat(np.arange(len(owner)), pieces)
-    part = (np.arange(len(row)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[row]
-    following = np.minimum(row + 1, len(owner) - 1)
+    frame = np.repeat(np.arange(len(owner)), pieces)
+    first_row = np.cumsum(pieces) - pieces
+    part = (np.arange(len(frame)) - first_row[frame]) / pieces[frame]
 
-    def between(values: np.ndarray) -> np.ndarray:
-        share = part.reshape(-1, *[1] * (values.ndim - 1))
-        return np.where(share > 0, values[row] + share * (values[following] - values[row]), values[row]).astype(
-            values.dtype
-        )
-
-    def turned(quats: np.ndarray) -> np.ndarray:
-        first, second = (Rotation.from_quat(quats[at], scalar_first=True) for at in (row, following))
-        step = Rotation.from_rotvec(part[:, None] * (first.inv() * second).as_rotvec())
-        return np.where(part[:, None] > 0, (first * step).as_quat(scalar_first=True), quats[row]).astype(quats.dtype)
-
-    counts = np.bincount(owner[row], minlength=len(retargeted.sequence_name))
+    arrays = {name: getattr(retargeted, name)[frame] for name in _REPEATED}
+    for name in _POSITIONS:
+        arrays[name] = _positions_between(getattr(retargeted, name), frame, part)
+    for name in _ROTATIONS:
+        arrays[name] = _rotations_between(getattr(retargeted, name), frame, part)
+    counts = np.bincount(owner[frame], minlength=len(retargeted.sequence_name))
     offsets = np.concatenate(([0], np.cumsum(counts)))
-    starts = np.cumsum(pieces) - pieces
-    first = retargeted.first_contact
-    contact_row = starts[np.where(first >= 0, retargeted.frame_offsets[:-1] + first, 0)]
+    contact = retargeted.first_contact
+    contact_row = first_row[np.where(contact >= 0, retargeted.frame_offsets[:-1] + contact, 0)]
     dense = replace(
         retargeted,
         frame_offsets=offsets.astype(retargeted.frame_offsets.dtype),
-        first_contact=np.where(first >= 0, contact_row - offsets[:-1], first).astype(first.dtype),
-        **{
-            name: between(getattr(retargeted, name))
-            for name in ("joint_pos", "palm_pos", "fingertip_pos", "object_pos")
-        },
-        **{name: turned(getattr(retargeted, name)) for name in ("palm_quat_wxyz", "object_quat_wxyz")},
-        **{
-            name: getattr(retargeted, name)[row]
-            for name in ("annotated", "valid", "reason", "contact", "hand_error", "wrist_error")
-        },
+        first_contact=np.where(contact >= 0, contact_row - offsets[:-1], contact).astype(contact.dtype),
+        **arrays,
     )
-    return Closing(dense, row, part)
+    return Closing(dense, frame, part)
+
+
+def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, within: float) -> np.ndarray:
+    """Return the frames between which and their next ones states are added."""
+    owner = retargeted.sequence_of_frame
+    start = retargeted.frame_offsets[:-1][owner]
+    touch = (fingers.gap < TOUCH).numpy()
+    thumb = (fingers.finger == 0).numpy()
+    grasped = touch[:, thumb].any(axis=1) & touch[:, ~thumb].any(axis=1)
+    moved = np.linalg.norm(retargeted.object_pos - retargeted.object_pos[start], axis=-1) > MOVED
+    over = grasped | moved
+    count = np.cumsum(over)
+    over = count - (count - over)[start] > 0  # in this frame, or in an earlier one of the same sequence
+    gap = fingers.nearest.numpy()
+    near = np.minimum(gap[:-1], gap[1:]) < within
+    same_sequence = owner[:-1] == owner[1:]
+    return np.flatnonzero(same_sequence & retargeted.valid[:-1] & retargeted.valid[1:] & ~over[:-1] & near)
+
+
+def _positions_between(values: np.ndarray, frame: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """[F, ...] values on straight lines; given frames stay the same bit for bit."""
+    following = values[np.minimum(frame + 1, len(values) - 1)]
+    share = part.reshape(-1, *[1] * (values.ndim - 1))
+    between = values[frame] + share * (following - values[frame])
+    return np.where(share > 0, between, values[frame]).astype(values.dtype)
+
+
+def _rotations_between(quats: np.ndarray, frame: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """[F, 4] quaternions that turn evenly; given frames stay the same bit for bit."""
+    first = Rotation.from_quat(quats[frame], scalar_first=True)
+    second = Rotation.from_quat(quats[np.minimum(frame + 1, len(quats) - 1)], scalar_first=True)
+    step = Rotation.from_rotvec(part[:, None] * (first.inv() * second).as_rotvec())
+    between = (first * step).as_quat(scalar_first=True)
+    return np.where(part[:, None] > 0, between, quats[frame]).astype(quats.dtype)
 
 
 def fingers_in(retargeted: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec]) -> Fingers:
-    """Where the fingers are in every frame [F]."""
+    """Measure where the fingers are in every frame [F]."""
     names = [o.name for o in objects]
     index = np.array([names.index(str(name)) for name in retargeted.object_name])[retargeted.sequence_of_frame]
     return fingers_of(robot, objects, index, retargeted.joint_pos, retargeted.object_pos, retargeted.object_quat_wxyz)

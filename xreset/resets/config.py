@@ -1,4 +1,4 @@
-"""What a reset bank may be made with beyond the paper's filter; all of it is off by default."""
+"""Options of a reset bank beyond the paper's filter; all are off by default."""
 
 from __future__ import annotations
 
@@ -25,17 +25,3 @@ class SqueezeConfig(Checked):
     """Normal force of each finger that is at the object [N]. 0: targets are the joints' positions."""
     reach: Positive[Finite[float]] = 0.005
     """A finger nearer than this to the object is at it [m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class HoldConfig(Checked):
-    """When a lifted state counts as a grasp that holds (:mod:`xreset.resets.hold`)."""
-
-    seconds: Positive[Finite[float]] = 1.0
-    """Time at full gravity with the targets unchanged [s]."""
-    distance: Positive[Finite[float]] = 0.02
-    """Farthest that the object's origin may then be from where it was [m]."""
-    angle: Positive[Finite[float]] = 0.5235987755982988
-    """Largest angle by which it may then be turned [rad], 30 degrees."""
-    lift: Positive[Finite[float]] = 0.01
-    """Height of the object's origin above the demonstration's start from which a state is lifted [m]."""

@@ -1,13 +1,12 @@
 """The reset distribution: home resets and bank resets, mixed (the paper's sections IV-B and appendix D.c, D.e).
 
-Home: robot near its home configuration, object at a demonstration's first pose, perturbed. Bank: a demonstrated hand-object state.
-The goal is the last object pose of the same demonstration.
+A home reset puts the robot near its home configuration and the object near a demonstration's first pose. A bank reset
+restores a demonstrated hand-object state. The goal is the last object pose of the same demonstration.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from xreset.geometry.urdf import robot_tree
 from xreset.resets.bank import ResetBank
 from xreset.spec import GRAVITY, RobotSpec
 from xreset.task.config import ResetConfig
-from xreset.tensors import Tensors
+from xreset.tensors import Tensors, where
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,14 +47,13 @@ class Reset(Tensors):
 
 
 def _tensor(array: np.ndarray, device: torch.device | str = "cpu") -> Tensor:
-    """Numbers in single precision, or 64-bit integers."""
-    return torch.as_tensor(
-        np.ascontiguousarray(array), dtype=torch.float32 if array.dtype.kind == "f" else torch.long, device=device
-    )
+    """Return a tensor in single precision, or of 64-bit integers."""
+    dtype = torch.float32 if array.dtype.kind == "f" else torch.long
+    return torch.as_tensor(np.ascontiguousarray(array), dtype=dtype, device=device)
 
 
 def bank_starts(bank: ResetBank, rows: np.ndarray) -> Reset:
-    """Given states [M] of a bank, as they are, at full gravity; ``state`` counts the bank's own rows."""
+    """Return starts from given states [M] of a bank at full gravity; ``state`` is the row in the bank."""
     sequence = bank.sequence_index[rows]
     return Reset(
         joint_pos=_tensor(bank.joint_pos[rows]),
@@ -70,11 +68,35 @@ def bank_starts(bank: ResetBank, rows: np.ndarray) -> Reset:
     )
 
 
+class _Grouped:
+    """Rows of a table sorted by the object that each belongs to, to be drawn by object."""
+
+    def __init__(self, owners: np.ndarray, object_names: tuple[str, ...], device: torch.device | str) -> None:
+        """Sort; ``owners`` names each row's object. Rows of objects that are not in ``object_names`` are left out."""
+        number = {name: i for i, name in enumerate(object_names)}
+        index = np.array([number.get(name, -1) for name in owners], dtype=np.int64)
+        known = np.flatnonzero(index >= 0)
+        self.rows = known[np.argsort(index[known], kind="stable")]
+        """Rows of the table, in the sorted order."""
+        count = np.bincount(index[known], minlength=len(object_names))
+        self._count = _tensor(count, device)
+        self._first = _tensor(np.cumsum(count) - count, device)
+
+    def count(self, object_index: Tensor) -> Tensor:
+        """Return the number of rows of given objects [M]."""
+        return self._count[object_index]
+
+    def draw(self, object_index: Tensor, uniform: Tensor) -> Tensor:
+        """Return places in the sorted order, drawn evenly from the rows of given objects [M] by numbers [M] in [0,
+        1)."""
+        count = self._count[object_index]
+        return self._first[object_index] + torch.minimum((uniform * count).long(), (count - 1).clamp_min(0))
+
+
 class ResetDistribution:
-    """Draws resets for worlds of given objects from a bank; all tensors live on one device, nothing is copied per draw.
+    """Draws resets for worlds of given objects from a bank. All tensors live on one device; a draw copies nothing to it.
 
     Attributes:
-        joint_pos: [L, J] robot states of the bank.
         demo_probability: [] share of resets from the bank; a training's schedule writes into it.
     """
 
@@ -89,55 +111,40 @@ class ResetDistribution:
         """Prepare the tables.
 
         Args:
+            bank: states, starts and goals.
             robot: its home configuration and joint limits.
             object_names: objects of the scene, in the scene's order.
+            config: how resets are drawn.
+            device: where the tensors live.
 
         Raises:
             DemoError: an object of the scene has no demonstration in the bank.
         """
         self.config = config
         self.demo_probability = torch.tensor(float(config.demo_probability), device=device)
-        if config.pre_contact_only:
-            bank = bank.select(pre_contact_only=True)
         missing = [name for name in object_names if name not in bank.sequence_object]
         if missing:
             raise DemoError(
-                f"the reset bank has no demonstration of {', '.join(missing)}; it has {', '.join(bank.object_names)}."
+                f"The reset bank has no demonstration of {', '.join(missing)}; it has {', '.join(bank.object_names)}."
             )
-
-        tensor = partial(_tensor, device=device)
-
-        # States and sequences sorted by object: object o owns the rows first[o] : first[o] + count[o].
-        number = {name: i for i, name in enumerate(object_names)}
-        state_object = np.array([number.get(name, -1) for name in bank.object_name], dtype=np.int64)
-        state_rows = np.flatnonzero(state_object >= 0)[np.argsort(state_object[state_object >= 0], kind="stable")]
-        sequence_object = np.array([number.get(name, -1) for name in bank.sequence_object], dtype=np.int64)
-        sequence_rows = np.flatnonzero(sequence_object >= 0)[
-            np.argsort(sequence_object[sequence_object >= 0], kind="stable")
-        ]
-
-        def ranges(owner: np.ndarray) -> tuple[Tensor, Tensor]:
-            count = np.bincount(owner, minlength=len(object_names))
-            return tensor(np.cumsum(count) - count), tensor(count)
-
-        self._state_first, self._state_count = ranges(state_object[state_rows])
-        self._sequence_first, self._sequence_count = ranges(sequence_object[sequence_rows])
-        self.joint_pos = tensor(bank.joint_pos[state_rows])
-        self._joint_target = tensor(bank.targets[state_rows])
-        self._object_pos = tensor(bank.object_pos[state_rows])
-        self._object_quat = tensor(bank.object_quat_wxyz[state_rows])
-        self._state_sequence = tensor(bank.sequence_index[state_rows])
-        self._sequence_rows = tensor(sequence_rows)
-        self._start_pos, self._start_quat = tensor(bank.start_pos), tensor(bank.start_quat_wxyz)
-        self._goal_pos, self._goal_quat = tensor(bank.goal_pos), tensor(bank.goal_quat_wxyz)
-        tree = robot_tree(robot)
-        limits = np.array([(tree.joint(name).lower, tree.joint(name).upper) for name in robot.joint_names])
-        self._lower, self._upper = tensor(limits[:, 0]), tensor(limits[:, 1])
-        self._home = tensor(robot.home)
-        self._home_std = tensor(np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints]))
+        if config.pre_contact_only:
+            bank = bank.select(pre_contact_only=True)
+        self._grouped_states = _Grouped(bank.object_name, object_names, device)
+        self._states = bank_starts(bank, self._grouped_states.rows).to(device)
+        self._grouped_sequences = _Grouped(bank.sequence_object, object_names, device)
+        self._sequences = _tensor(self._grouped_sequences.rows, device)
+        self._start_pos = _tensor(bank.start_pos, device)
+        self._start_quat = _tensor(bank.start_quat_wxyz, device)
+        self._goal_pos = _tensor(bank.goal_pos, device)
+        self._goal_quat = _tensor(bank.goal_quat_wxyz, device)
+        joints = [robot_tree(robot).joint(name) for name in robot.joint_names]
+        self._lower = _tensor(np.array([float(joint.lower) for joint in joints]), device)
+        self._upper = _tensor(np.array([float(joint.upper) for joint in joints]), device)
+        self._home = _tensor(robot.home, device)
+        self._home_std = _tensor(np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints]), device)
 
     def start_pose(self, sequence: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the object is at the start of given demonstrations [M]: position [M, 3] and quaternion [M, 4]."""
+        """Return the object's pose at the start of given demonstrations [M]: position [M, 3] and quaternion [M, 4]."""
         return self._start_pos[sequence], self._start_quat[sequence]
 
     def sample(self, object_index: Tensor, generator: torch.Generator) -> Reset:
@@ -147,42 +154,26 @@ class ResetDistribution:
             object_index: [M] object of each world.
             generator: random numbers, on this distribution's device.
         """
-        m, c = len(object_index), self.config
-        uniform = torch.rand(m, 6, generator=generator, device=generator.device)  # six, so that seeds keep their draws
-        states, sequences = (
-            (first[object_index], count[object_index])
-            for first, count in ((self._state_first, self._state_count), (self._sequence_first, self._sequence_count))
-        )
-        row, pick = _evenly(*states, uniform[:, 1]), _evenly(*sequences, uniform[:, 2])
-        from_bank = (uniform[:, 0] < self.demo_probability) & (states[1] > 0)
-        row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
-        home = self.home(self._sequence_rows[pick], generator)
-        if not len(self.joint_pos):
+        # Two of the six numbers are not used. They are drawn so that a seed gives the episodes that it gave in earlier
+        # versions.
+        uniform = torch.rand(len(object_index), 6, generator=generator, device=generator.device)
+        sequence = self._sequences[self._grouped_sequences.draw(object_index, uniform[:, 2])]
+        home = self.home(sequence, generator)
+        if not len(self._states.state):
             return home
-        sequence = torch.where(from_bank, self._state_sequence[row], home.sequence)
-
-        def mix(bank_value: Tensor, home_value: Tensor) -> Tensor:
-            return torch.where(from_bank.view(-1, *[1] * (home_value.ndim - 1)), bank_value, home_value)
-
-        gravity = uniform[:, 3] if c.random_gravity else torch.ones_like(uniform[:, 3])
-        return Reset(
-            joint_pos=mix(self.joint_pos[row], home.joint_pos),
-            joint_target=mix(self._joint_target[row], home.joint_target),
-            object_pos=mix(self._object_pos[row], home.object_pos),
-            object_quat=mix(self._object_quat[row], home.object_quat),
-            goal_pos=self._goal_pos[sequence],
-            goal_quat=self._goal_quat[sequence],
-            gravity_fraction=mix(gravity, home.gravity_fraction),
-            state=torch.where(from_bank, row, -1),
-            sequence=sequence,
-        )
+        from_bank = (uniform[:, 0] < self.demo_probability) & (self._grouped_states.count(object_index) > 0)
+        row = self._grouped_states.draw(object_index, uniform[:, 1])
+        row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
+        gravity = uniform[:, 3] if self.config.random_gravity else torch.ones_like(uniform[:, 3])
+        return where(from_bank, replace(self._states[row], state=row, gravity_fraction=gravity), home)
 
     def home(self, sequence: Tensor, generator: torch.Generator) -> Reset:
-        """Home resets for given demonstrations [M], perturbed as configured."""
-        m, c, device = len(sequence), self.config, generator.device
-        noise = (
-            torch.randn(m, len(self._home), generator=generator, device=device) * self._home_std * float(c.home_noise)
-        )
+        """Return home resets for given demonstrations [M], perturbed as configured."""
+        m = len(sequence)
+        c = self.config
+        device = generator.device
+        noise = torch.randn(m, len(self._home), generator=generator, device=device)
+        noise = noise * self._home_std * float(c.home_noise)
         joint_pos = torch.minimum(torch.maximum(self._home + noise, self._lower), self._upper)
         shift = 2.0 * torch.rand(m, 3, generator=generator, device=device) - 1.0
         offset = torch.cat((shift[:, :2] * c.spawn_xy, torch.zeros(m, 1, device=device)), dim=-1)
@@ -200,8 +191,3 @@ class ResetDistribution:
             state=torch.full((m,), -1, device=device),
             sequence=sequence,
         )
-
-
-def _evenly(first: Tensor, count: Tensor, uniform: Tensor) -> Tensor:
-    """[M] indices drawn from ``first : first + count`` by uniform numbers in [0, 1)."""
-    return first + torch.minimum((uniform * count).long(), (count - 1).clamp_min(0))

@@ -1,29 +1,38 @@
 """The physics filter: which retargeted states stay put when they are spawned (the paper's appendix D.c).
 
-Each candidate is spawned at rest, the drives hold its joint positions, gravity on the object is off, and eight control steps pass. It is
-rejected if it leaves the scene or still moves: object faster than 0.10 m/s or 1.0 rad/s, or a joint faster than 2.0 rad/s.
+Each candidate is spawned at rest, the drives hold its joint positions, the object has no weight, and eight control
+steps pass. It is rejected if it leaves the scene or still moves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from xreset.errors import DemoError
 from xreset.physics import Backend, State
-from xreset.plugins import device_for, make_backend
 from xreset.resets.bank import ResetBank, starts_and_goals
-from xreset.resets.closing import Closing, with_closing_frames
+from xreset.resets.closing import with_closing_frames
 from xreset.resets.config import ClosingConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
+from xreset.resets.probe import probe
 from xreset.retarget.pipeline import Retargeted
-from xreset.schedule import schedule
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task.config import TerminationConfig
 from xreset.task.terminations import out_of_bounds
+
+STEPS = 8
+"""Control steps with the drives holding."""
+LINEAR_VELOCITY = 0.10
+"""Largest residual speed of the object's origin [m/s]."""
+ANGULAR_VELOCITY = 1.0
+"""Largest residual angular speed of the object [rad/s]."""
+JOINT_VELOCITY = 2.0
+"""Largest residual joint speed [rad/s or m/s]."""
 
 REASONS = (
     "out of bounds",
@@ -33,79 +42,24 @@ REASONS = (
     "not finite",
     "overflow",
 )
-"""Why a candidate is rejected; the first that applies, from the right: a state that is not finite is nothing else."""
+"""Why a candidate is rejected. Where several reasons apply, the last one is stated: a state that is not finite is
+nothing else."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FilterConfig:
-    """The paper's thresholds."""
-
-    steps: int = 8
-    """Control steps with the drives holding."""
-    linear_velocity: float = 0.10
-    """Largest residual speed of the object's origin [m/s]."""
-    angular_velocity: float = 1.0
-    """Largest residual angular speed of the object [rad/s]."""
-    joint_velocity: float = 2.0
-    """Largest residual joint speed [rad/s or m/s]."""
-
-
-def spawn(
-    name: str,
-    scene: SceneSpec,
-    object_index: np.ndarray,
-    states: Sequence[np.ndarray],
-    *,
-    num_envs: int,
-    device: str,
-    progress: Callable[[int], None],
-) -> Iterator[tuple[Backend, State, np.ndarray, np.ndarray]]:
-    """Let an engine have states, as many at a time as there are worlds.
-
-    Args:
-        object_index: [M] which of the scene's objects each state has.
-        states: joint positions [M, J], object positions [M, 3] and orientations [M, 4], drive targets [M, J].
-        num_envs: worlds at a time.
-        device: where the engine runs if it can.
-        progress: called with the number of states done.
-
-    Yields:
-        The engine, one state at rest for each of its N worlds, which states those are [N], and [N] False where one is only repeated.
-    """
-    plan, done = schedule(object_index, num_envs), 0
-    worlds = torch.as_tensor(plan.object_index)
-    with make_backend(name, scene, len(worlds), object_index=worlds, device=device_for(name, device)) as backend:
-        for items, fresh in plan:
-            start = (torch.as_tensor(array[items], dtype=torch.float32, device=backend.device) for array in states)
-            yield backend, State.at_rest(*start), items, fresh
-            done += int(fresh.sum())
-            progress(done)
-
-
-def try_states(backend: Backend, start: State, config: FilterConfig) -> torch.Tensor:
-    """Spawn one state per world, let the steps pass, and look at what moves.
-
-    Args:
-        start: [N, ...] at rest.
-
-    Returns:
-        [N] long: index into :data:`REASONS`, -1 where the state is accepted.
-    """
-    n = backend.num_worlds
-    backend.set_object_gravity(torch.zeros(n, device=backend.device))
-    backend.set_state(start)
-    for _ in range(config.steps):
-        backend.step()
-    state, health = backend.state(), backend.health()
+def rejection(backend: Backend, start: State) -> Tensor:
+    """Return why the present states of an engine's worlds are rejected: [N] index into :data:`REASONS`, -1 where
+    accepted."""
+    state = backend.state()
+    health = backend.health()
     tests = (
         out_of_bounds(state.object_pos, backend.scene.table, TerminationConfig()),
-        state.object_linvel.norm(dim=-1) > config.linear_velocity,
-        state.object_angvel.norm(dim=-1) > config.angular_velocity,
-        state.joint_vel.abs().amax(dim=-1) > config.joint_velocity,
+        state.object_linvel.norm(dim=-1) > LINEAR_VELOCITY,
+        state.object_angvel.norm(dim=-1) > ANGULAR_VELOCITY,
+        state.joint_vel.abs().amax(dim=-1) > JOINT_VELOCITY,
         health.nonfinite,
         health.overflow,
     )
-    reason = torch.full((n,), -1, dtype=torch.long, device=backend.device)
+    reason = torch.full((backend.num_worlds,), -1, dtype=torch.long, device=backend.device)
     for i, test in reversed(list(enumerate(tests))):
         reason[test & (reason < 0)] = i
     return reason
@@ -115,129 +69,110 @@ def make_bank(
     retargeted: Retargeted,
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
-    backends: Sequence[str],
+    engine: str | Sequence[str] = "mujoco",
     *,
     num_envs: int = 64,
     device: str = "cpu",
-    config: FilterConfig | None = None,
     closing: ClosingConfig | None = None,
     squeeze: SqueezeConfig | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ResetBank:
-    """Try every valid frame in every engine and keep those that all accept.
+    """Try every valid frame in every engine and keep those that all engines accept.
 
     Args:
-        backends: engines, tried in this order; a rejection carries the first one's reason.
+        retargeted: robot trajectories.
+        robot: the robot of the trajectories.
+        objects: the objects of the trajectories.
+        engine: one or several engines, tried in this order; a rejection states the first engine's reason.
         num_envs: worlds at a time.
         device: where engines run that can use it; the others run on the CPU.
-        closing: states between frames, which are tried like the others; None: none.
-        squeeze: with which force the targets of states after contact press. Accepted states are tried with them once more, and where an
-            engine does not accept that, the targets stay the joints' positions. None: all do.
+        closing: states to add between frames; None: none.
+        squeeze: with which force the drive targets of states after contact press on the object; None: targets are the
+            joints' positions. Accepted states are tried once more with the targets, and an engine that rejects this
+            leaves the targets where they were.
         progress: called with (candidates tried, candidates in all).
 
     Raises:
         DemoError: no frame is valid.
     """
-    config, closing, squeeze = config or FilterConfig(), closing or ClosingConfig(), squeeze or SqueezeConfig()
+    engines = (engine,) if isinstance(engine, str) else tuple(engine)
+    squeeze = squeeze or SqueezeConfig()
     if not retargeted.valid.any():
         raise DemoError(
-            "no frame of the retargeted trajectories is valid, so there is no state to try; look at the reasons of xreset retarget."
+            "no frame of the retargeted trajectories is valid, so there is no state to try. "
+            "Look at the reasons of xreset retarget."
         )
-    dense = with_closing_frames(retargeted, robot, objects, closing)
-    tried = dense.retargeted
-    frames = np.flatnonzero(tried.valid)
-    sequence = tried.sequence_of_frame[frames]
-    names = np.asarray(tried.object_name)[sequence]
-    used = tuple(o for o in objects if o.name in set(names.tolist()))
-    object_index = np.array([[o.name for o in used].index(name) for name in names])
+    dense = with_closing_frames(retargeted, robot, objects, closing or ClosingConfig())
+    motion = dense.retargeted
+    frames = np.flatnonzero(motion.valid)
+    sequence = motion.sequence_of_frame[frames]
+    object_name = np.asarray(motion.object_name)[sequence]
+    used = tuple(o for o in objects if o.name in set(object_name.tolist()))
+    names = [o.name for o in used]
+    object_index = np.array([names.index(name) for name in object_name])
     scene = SceneSpec(robot=robot, objects=used)
-    fingers = fingers_of(
-        robot, used, object_index, tried.joint_pos[frames], tried.object_pos[frames], tried.object_quat_wxyz[frames]
-    )
-    target = tried.joint_pos[frames].astype(np.float32)
+    joint_pos = motion.joint_pos[frames]
+    object_pos = motion.object_pos[frames]
+    object_quat = motion.object_quat_wxyz[frames]
+    fingers = fingers_of(robot, used, object_index, joint_pos, object_pos, object_quat)
+    target = joint_pos.astype(np.float32)
 
-    def accepted(rows: np.ndarray, report: Callable[[int], None]) -> np.ndarray:
-        """[len(rows)] reason of states, given as rows of ``frames``; -1 where every engine accepts them."""
+    def try_candidates(rows: np.ndarray, report: Callable[[int], None]) -> np.ndarray:
+        """Return the reasons for which candidates [rows] are rejected, -1 where every engine accepts them."""
+        arrays = (joint_pos, object_pos, object_quat, target)
+        states = State.at_rest(*(torch.as_tensor(array[rows], dtype=torch.float32) for array in arrays))
         reason = np.full(len(rows), -1, dtype=np.int64)
-        for number, name in enumerate(backends):
+        for number, name in enumerate(engines):
             left = np.flatnonzero(reason < 0)
             if not len(left):
                 break
-            chosen = rows[left]
-            states = [array[frames[chosen]] for array in (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz)]
-
-            def begun(done: int, before: int = number * len(rows)) -> None:
-                report(before + done)
-
-            rounds = spawn(
+            before = number * len(rows)
+            reason[left] = probe(
                 name,
                 scene,
-                object_index[chosen],
-                (*states, target[chosen]),
+                object_index[rows[left]],
+                states[torch.as_tensor(left)],
+                rejection,
+                gravity=0.0,
+                steps=STEPS,
                 num_envs=num_envs,
                 device=device,
-                progress=begun,
+                progress=lambda done, before=before: report(before + done),
             )
-            for backend, start, items, fresh in rounds:
-                reason[left[items[fresh]]] = try_states(backend, start, config).cpu().numpy()[fresh]
         return reason
 
-    work = len(backends) * len(frames)
-    reason = accepted(np.arange(len(frames)), lambda done: progress(done, work))
+    work = len(engines) * len(frames)
+    reason = try_candidates(np.arange(len(frames)), lambda done: progress(done, work))
     if squeeze.force > 0:
-        rows = np.flatnonzero((reason < 0) & tried.post_contact[frames])
-        still = target[rows]
-        target[rows] = squeeze_targets(robot, fingers, tried.joint_pos[frames], squeeze)[rows]
-        work += len(backends) * len(rows)
-        refused = accepted(rows, lambda done: progress(len(backends) * len(frames) + done, work)) >= 0
-        target[rows[refused]] = still[refused]
+        rows = np.flatnonzero((reason < 0) & motion.post_contact[frames])
+        target[rows] = squeeze_targets(robot, fingers, joint_pos, squeeze)[rows]
+        tried = work
+        work += len(engines) * len(rows)
+        refused = rows[try_candidates(rows, lambda done: progress(tried + done, work)) >= 0]
+        target[refused] = joint_pos[refused]
     progress(work, work)
-    return _bank(
-        dense,
-        retargeted,
-        robot,
-        objects,
-        tuple(backends),
-        frames,
-        reason,
-        fingers.nearest.numpy(),
-        target if squeeze.force > 0 else None,
-    )
 
-
-def _bank(
-    dense: Closing,
-    original: Retargeted,
-    robot: RobotSpec,
-    objects: Sequence[ObjectSpec],
-    backends: tuple[str, ...],
-    frames: np.ndarray,
-    reason: np.ndarray,
-    gap: np.ndarray,
-    target: np.ndarray | None,
-) -> ResetBank:
-    retargeted = dense.retargeted
-    sequence = retargeted.sequence_of_frame[frames]
-    keep, reject = reason < 0, reason >= 0
-    rows, f32 = frames[keep], np.float32
-    of_both = {
+    keep = reason < 0
+    columns = {
         "sequence_index": sequence.astype(np.int32),
-        "frame_index": (dense.frame[frames] - original.frame_offsets[sequence]).astype(np.int32),
-        "post_contact": retargeted.post_contact[frames],
-        "finger_gap": gap.astype(f32),
+        "frame_index": (dense.frame[frames] - retargeted.frame_offsets[sequence]).astype(np.int32),
+        "post_contact": motion.post_contact[frames],
+        "finger_gap": fingers.nearest.numpy().astype(np.float32),
     }
     if dense.part.any():
-        of_both["frame_part"] = dense.part[frames].astype(f32)
+        columns["frame_part"] = dense.part[frames].astype(np.float32)
+    kept = {name: values[keep] for name, values in columns.items()}
+    rejected = {f"rejected_{name}": values[~keep] for name, values in columns.items()}
     return replace(
-        starts_and_goals(retargeted, robot, {o.name: o.source for o in objects}),
-        backends=backends,
-        joint_pos=retargeted.joint_pos[rows].astype(f32),
-        object_pos=retargeted.object_pos[rows].astype(f32),
-        object_quat_wxyz=retargeted.object_quat_wxyz[rows].astype(f32),
-        object_name=np.asarray(retargeted.object_name)[sequence[keep]],
-        rejected_reason=reason[reject].astype(np.int32),
+        starts_and_goals(motion, robot, {o.name: o.source for o in objects}),
+        backends=engines,
+        joint_pos=joint_pos[keep].astype(np.float32),
+        joint_target=target[keep] if squeeze.force > 0 else None,
+        object_pos=object_pos[keep].astype(np.float32),
+        object_quat_wxyz=object_quat[keep].astype(np.float32),
+        object_name=object_name[keep],
+        rejected_reason=reason[~keep].astype(np.int32),
         reason_names=REASONS,
-        joint_target=None if target is None else target[keep],
-        **{name: values[keep] for name, values in of_both.items()},
-        **{f"rejected_{name}": values[reject] for name, values in of_both.items()},
+        **kept,
+        **rejected,
     )

@@ -1,5 +1,4 @@
-"""How near the fingers of a state are to its object: between their collision shapes and the object's, not between frames;
-and drive targets with which they press, and do not only stand where they are.
+"""Distances between the fingers' collision shapes and the object's, and drive targets with which fingers press.
 
 Shape letters: M states, J joints, E fingers, G contact links of all fingers.
 """
@@ -30,9 +29,9 @@ class Fingers:
     finger: Tensor
     """[G] finger of each link, thumb first."""
     gap: Tensor
-    """[M, G] signed distance from a link's shapes to the object's collision pieces [m]; balls stand for the shapes."""
+    """[M, G] signed distance from a link's shapes, approximated by balls, to the object's collision pieces [m]."""
     point: Tensor
-    """[M, G, 3] that point of the link, in its frame."""
+    """[M, G, 3] nearest point of the link, in the link's frame."""
     inward: Tensor
     """[M, G, 3] unit vector into the object there, world frame."""
 
@@ -43,7 +42,7 @@ class Fingers:
 
     @property
     def leading(self) -> Tensor:
-        """[M, G] bool: whether a link is the nearest of its finger; the first of those that are equally near."""
+        """[M, G] bool: whether a link is the nearest one of its finger; the first one if several are equally near."""
         lead = torch.zeros_like(self.gap, dtype=torch.bool)
         for number in self.finger.unique():
             mine = (self.finger == number).nonzero()[:, 0]
@@ -59,63 +58,82 @@ def fingers_of(
     object_pos: np.ndarray,
     object_quat: np.ndarray,
 ) -> Fingers:
-    """Measure states.
+    """Measure how near the fingers of states are to their objects.
 
     Args:
+        robot: the hand, with its fingertips' contact links.
+        objects: objects of the states.
         object_index: [M] which of them each state has.
         joint_pos: [M, J]
         object_pos: [M, 3]
         object_quat: [M, 4]
     """
-    q, pos, quat = (torch.as_tensor(array, dtype=torch.float64) for array in (joint_pos, object_pos, object_quat))
-    owned = [(number, link) for number, tip in enumerate(robot.fingertips) for link in tip.contact_links]
-    links = tuple(link for _, link in owned)
-    kinematics, surfaces = Kinematics(robot), {n: Surface(objects[n]) for n in np.unique(object_index).tolist()}
+    q = torch.as_tensor(joint_pos, dtype=torch.float64)
+    pos = torch.as_tensor(object_pos, dtype=torch.float64)
+    quat = torch.as_tensor(object_quat, dtype=torch.float64)
+    links: list[str] = []
+    finger: list[int] = []
+    for number, tip in enumerate(robot.fingertips):
+        links += tip.contact_links
+        finger += [number] * len(tip.contact_links)
+    kinematics = Kinematics(robot)
     poses = kinematics.link_poses(q, links)
+    surfaces = {number: Surface(objects[number]) for number in np.unique(object_index).tolist()}
     gap = q.new_zeros(len(q), len(links))
-    point, inward = q.new_zeros(len(q), len(links), 3), q.new_zeros(len(q), len(links), 3)
+    point = q.new_zeros(len(q), len(links), 3)
+    inward = q.new_zeros(len(q), len(links), 3)
     for g, link in enumerate(links):
-        balls = [shape_balls(shape) for shape in kinematics.tree.link(link).collisions] or [
-            (np.zeros((1, 3)), np.zeros(1))
-        ]
-        centers, radii = (torch.as_tensor(np.concatenate(part)) for part in zip(*balls, strict=True))
-        R, p = poses[:, g, :3, :3], poses[:, g, :3, 3]
+        centers, radii = _balls(kinematics, link)
+        R = poses[:, g, :3, :3]
+        p = poses[:, g, :3, 3]
         for number, surface in surfaces.items():
             mine = torch.as_tensor(object_index == number)
             world = centers @ R[mine].transpose(-1, -2) + p[mine, None]
             turn = quat[mine, None].expand(-1, len(centers), 4)
-            distance, gradient = surface.signed_distance(
-                quat_rotate_inverse(turn, world - pos[mine, None]).flatten(0, 1)
-            )
-            distance, best = (distance.view(-1, len(centers)) - radii).min(dim=-1)
-            gradient = gradient.view(-1, len(centers), 3)[torch.arange(len(best)), best]
+            local = quat_rotate_inverse(turn, world - pos[mine, None])
+            distance, gradient = surface.signed_distance(local.flatten(0, 1))
+            distance, nearest = (distance.view(-1, len(centers)) - radii).min(dim=-1)
+            gradient = gradient.view(-1, len(centers), 3)[torch.arange(len(nearest)), nearest]
             into = -quat_rotate(quat[mine], torch.nn.functional.normalize(gradient, dim=-1))
-            gap[mine, g], inward[mine, g] = distance, into
-            point[mine, g] = centers[best] + radii[best, None] * (R[mine].transpose(-1, -2) @ into[..., None])[..., 0]
-    return Fingers(
-        links=links, finger=torch.tensor([number for number, _ in owned]), gap=gap, point=point, inward=inward
-    )
+            into_link = (R[mine].transpose(-1, -2) @ into[..., None])[..., 0]
+            gap[mine, g] = distance
+            inward[mine, g] = into
+            point[mine, g] = centers[nearest] + radii[nearest, None] * into_link
+    return Fingers(links=tuple(links), finger=torch.tensor(finger), gap=gap, point=point, inward=inward)
+
+
+def _balls(kinematics: Kinematics, link: str) -> tuple[Tensor, Tensor]:
+    """Return centers [B, 3] and radii [B] of the balls that stand for a link's collision shapes; a point at its origin
+    if it has none."""
+    shapes = kinematics.tree.link(link).collisions
+    if not shapes:
+        return torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+    balls = [shape_balls(shape) for shape in shapes]
+    centers = np.concatenate([center for center, _ in balls])
+    radii = np.concatenate([radius for _, radius in balls])
+    return torch.as_tensor(centers), torch.as_tensor(radii)
 
 
 def squeeze_targets(robot: RobotSpec, fingers: Fingers, joint_pos: np.ndarray, config: SqueezeConfig) -> np.ndarray:
-    """[M, J] targets: the joints' positions, and for hand joints what presses, within joint limits and the drives' largest torques.
+    """Return drive targets [M, J] with which the fingers press, within joint limits and the drives' largest torques.
 
-    A finger that presses on the object with a normal force f needs joint torques J^T f, and a drive gives them where its target lies
-    J^T f / kp beyond the joint. What the other parts of the hand would have to do for balance is left to them: drives are soft, and the
-    object moves by millimetres until what it rests against presses back.
+    A finger that presses on the object with a normal force f needs joint torques J^T f. A drive gives them where its
+    target is J^T f / kp beyond the joint. Balance is left to the drives, which are soft: the object moves by
+    millimetres until what it rests against presses back. Targets of joints that do not press are the joints' positions.
 
     Args:
+        robot: its drives.
+        fingers: of the same states.
         joint_pos: [M, J]
+        config: which fingers press, and how hard.
     """
     q = torch.as_tensor(joint_pos, dtype=torch.float64)
     kinematics = Kinematics(robot)
     jacobian = kinematics.jacobian(q, fingers.links, fingers.point).linear
     pressing = fingers.leading & (fingers.gap < config.reach)
     torque = torch.einsum("mgi,mgij->mj", config.force * pressing[..., None] * fingers.inward, jacobian)
-    drives = [joint.drive for joint in robot.joints]
-    effort, kp = (
-        torch.tensor([getattr(drive, name) for drive in drives], dtype=torch.float64) for name in ("effort", "kp")
-    )
+    effort = torch.tensor([joint.drive.effort for joint in robot.joints], dtype=torch.float64)
+    kp = torch.tensor([joint.drive.kp for joint in robot.joints], dtype=torch.float64)
     is_hand = torch.tensor([joint.group == "hand" and joint.drive.kp > 0 for joint in robot.joints])
     beyond = torch.where(is_hand, torque.clamp(-effort, effort) / kp.clamp_min(1e-9), 0.0)
     return torch.where(beyond != 0, kinematics.clamp(q + beyond), q).numpy()

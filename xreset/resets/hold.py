@@ -7,17 +7,27 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from xreset.geometry.rotations import quat_angle
+from xreset.physics import Backend, State
 from xreset.resets.bank import ResetBank
-from xreset.resets.config import HoldConfig
-from xreset.resets.filter import spawn
+from xreset.resets.probe import probe
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
+
+LIFT = 0.01
+"""Height of the object's origin above the demonstration's start from which a state is lifted [m]."""
+SECONDS = 1.0
+"""Time at full gravity [s]."""
+DISTANCE = 0.02
+"""Largest distance of the object's origin from where it was [m]."""
+ANGLE = float(np.pi / 6)
+"""Largest angle by which the object may be turned [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Held:
-    """How many lifted states hold."""
+    """Number of lifted states that hold, of one object in one engine."""
 
     backend: str
     object_name: str
@@ -25,7 +35,16 @@ class Held:
     lifted: int
     held: int
     alike: dict[str, int]
-    """Other engine -> how many end as they do there: held or not."""
+    """Other engine -> number of states that end there as they do here: held or not."""
+
+
+def stays(backend: Backend, start: State) -> Tensor:
+    """[N] bool: whether the objects of an engine's worlds are still where they started, and the simulation is sound."""
+    state = backend.state()
+    health = backend.health()
+    near = (state.object_pos - start.object_pos).norm(dim=-1) < DISTANCE
+    upright = quat_angle(state.object_quat, start.object_quat) < ANGLE
+    return near & upright & ~health.nonfinite & ~health.overflow
 
 
 def hold_bank(
@@ -36,61 +55,52 @@ def hold_bank(
     *,
     num_envs: int = 64,
     device: str = "cpu",
-    config: HoldConfig | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Held]:
-    """Let the lifted states of a bank hold on in every engine.
+    """Count the lifted states of a bank that hold the object in each engine.
 
     Args:
+        bank: states.
+        robot: the bank's robot.
+        objects: the bank's objects.
+        backends: engines.
         num_envs: worlds at a time.
         device: where engines run that can use it; the others run on the CPU.
-        config: how long, and how far an object may move.
         progress: called with (states done, states in all).
 
     Returns:
         For each engine one entry per object, in the order of their names, and their sum.
     """
-    config = config or HoldConfig()
-    lifted = np.flatnonzero(
-        bank.post_contact & (bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2] > config.lift)
-    )
-    names = bank.object_name[lifted]
-    used = tuple(o for o in objects if o.name in set(names.tolist()))
+    height = bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2]
+    lifted = np.flatnonzero(bank.post_contact & (height > LIFT))
+    object_name = bank.object_name[lifted]
     held = {name: np.zeros(len(lifted), dtype=bool) for name in backends}
-    for number, name in enumerate(backends):
-        if len(lifted):
-            scene, index = (
-                SceneSpec(robot=robot, objects=used),
-                np.array([[o.name for o in used].index(n) for n in names]),
+    if len(lifted):
+        used = tuple(o for o in objects if o.name in set(object_name.tolist()))
+        names = [o.name for o in used]
+        scene = SceneSpec(robot=robot, objects=used)
+        arrays = (bank.joint_pos, bank.object_pos, bank.object_quat_wxyz, bank.targets)
+        states = State.at_rest(*(torch.as_tensor(array[lifted], dtype=torch.float32) for array in arrays))
+        for number, name in enumerate(backends):
+            before = number * len(lifted)
+            held[name] = probe(
+                name,
+                scene,
+                np.array([names.index(n) for n in object_name]),
+                states,
+                stays,
+                gravity=1.0,
+                steps=round(SECONDS / scene.control_dt),
+                num_envs=num_envs,
+                device=device,
+                progress=lambda done, before=before: progress(before + done, len(backends) * len(lifted)),
             )
-            states = [array[lifted] for array in (bank.joint_pos, bank.object_pos, bank.object_quat_wxyz, bank.targets)]
-
-            def report(done: int, before: int = number * len(lifted)) -> None:
-                progress(before + done, len(backends) * len(lifted))
-
-            rounds = spawn(name, scene, index, states, num_envs=num_envs, device=device, progress=report)
-            for backend, start, items, fresh in rounds:
-                backend.set_object_gravity(torch.ones(len(items), device=backend.device))
-                backend.set_state(start)
-                for _ in range(round(config.seconds / scene.control_dt)):
-                    backend.step()
-                state, health = backend.state(), backend.health()
-                stays = (state.object_pos - start.object_pos).norm(dim=-1) < config.distance
-                stays &= (
-                    (quat_angle(state.object_quat, start.object_quat) < config.angle)
-                    & ~health.nonfinite
-                    & ~health.overflow
-                )
-                held[name][items[fresh]] = stays.cpu().numpy()[fresh]
-    groups = [*((name, names == name) for name in np.unique(names).tolist()), ("all", np.ones(len(lifted), dtype=bool))]
-    return [
-        Held(
-            backend=name,
-            object_name=label,
-            lifted=int(mine.sum()),
-            held=int((held[name] & mine).sum()),
-            alike={other: int(((held[name] == held[other]) & mine).sum()) for other in held if other != name},
-        )
-        for name in backends
-        for label, mine in groups
-    ]
+    groups = {name: object_name == name for name in np.unique(object_name).tolist()}
+    groups["all"] = np.ones(len(lifted), dtype=bool)
+    rows = []
+    for name in backends:
+        for label, mine in groups.items():
+            alike = {other: int(((held[name] == held[other]) & mine).sum()) for other in held if other != name}
+            count = int((held[name] & mine).sum())
+            rows.append(Held(backend=name, object_name=label, lifted=int(mine.sum()), held=count, alike=alike))
+    return rows

@@ -1,0 +1,70 @@
+"""Put states into an engine, take control steps, and judge what became of each state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xreset.physics import Backend, State
+from xreset.plugins import device_for, make_backend
+from xreset.schedule import schedule
+from xreset.spec import SceneSpec
+
+Judge = Callable[[Backend, State], Tensor]
+"""Verdicts [N] on the worlds of an engine, which began with the given states."""
+
+
+def probe(
+    engine: str,
+    scene: SceneSpec,
+    object_index: np.ndarray,
+    states: State,
+    judge: Judge,
+    *,
+    gravity: float,
+    steps: int,
+    num_envs: int,
+    device: str,
+    progress: Callable[[int], None],
+) -> np.ndarray:
+    """Return the verdicts [M] on states, of which an engine tries as many at a time as it has worlds.
+
+    Args:
+        engine: name of the engine.
+        scene: robot and objects.
+        object_index: [M] which of the scene's objects each state has.
+        states: [M, ...]
+        judge: called after the last step of each round.
+        gravity: fraction of the objects' weight.
+        steps: control steps.
+        num_envs: worlds at a time.
+        device: where the engine runs if it can.
+        progress: called with the number of states done.
+    """
+    plan = schedule(object_index, num_envs)
+    worlds = torch.as_tensor(plan.object_index)
+    verdicts = None
+    done = 0
+    with make_backend(engine, scene, len(worlds), object_index=worlds, device=device_for(engine, device)) as backend:
+        for items, fresh in plan:
+            start = states[torch.as_tensor(items)].to(backend.device)
+            settle(backend, start, gravity=gravity, steps=steps)
+            found = judge(backend, start).cpu().numpy()
+            if verdicts is None:
+                verdicts = np.empty(len(object_index), dtype=found.dtype)
+            verdicts[items[fresh]] = found[fresh]
+            done += int(fresh.sum())
+            progress(done)
+    assert verdicts is not None, "there is at least one state"
+    return verdicts
+
+
+def settle(backend: Backend, start: State, *, gravity: float, steps: int) -> None:
+    """Put the worlds into states [N], with a fraction of the objects' weight, and take control steps."""
+    backend.set_object_gravity(torch.full((backend.num_worlds,), gravity, device=backend.device))
+    backend.set_state(start)
+    for _ in range(steps):
+        backend.step()

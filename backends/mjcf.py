@@ -1,11 +1,11 @@
 """A scene as a MuJoCo model: what both MuJoCo backends run.
 
-The model is built from :class:`~xreset.backends.rigid.Mechanism`, not by MuJoCo's URDF reader, which turns effort limits into joint force
-ranges. Links that are fixed to another are fused into its body (fewer bodies are faster on a GPU); :class:`SceneModel` says where every
-link, joint and shape of the scene has gone.
+The model is built from :class:`~xreset.backends.rigid.Mechanism`, not by MuJoCo's URDF reader, which turns effort
+limits into joint force ranges. Links that are fixed to another are fused into its body, because fewer bodies are faster
+on a GPU; :class:`SceneModel` states where every link, joint and shape of the scene is.
 
-The settings follow from measurements against other engines: an elliptic friction cone with impratio 10 holds grasps that a pyramidal cone
-loses, contacts are as stiff as the timestep allows (time constant of two timesteps), and condim 4 gives torsional friction.
+The settings follow from measurements against other engines: an elliptic friction cone with impratio 10 holds grasps
+that a pyramidal cone loses, contacts are as stiff as the timestep allows, and condim 4 gives torsional friction.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations, product
 
 import mujoco
 import numpy as np
@@ -33,10 +33,12 @@ from xreset.errors import ObjectError, XResetError
 from xreset.geometry.dynamics import drive_shares
 from xreset.geometry.urdf import Joint
 from xreset.physics import KnownDifference
-from xreset.spec import GRAVITY, Geometry, ObjectSpec, SceneSpec
+from xreset.spec import GRAVITY, Geometry, ObjectSpec, SceneSpec, Shape
 
-# Collision bits: a pair collides if one's contype meets the other's conaffinity.
-_HIT_OBJECT, _HIT_TABLE, _HIT_SELF = 1, 2, 4
+# Collision bits: a pair collides if the contype of one meets the conaffinity of the other.
+_HIT_OBJECT = 1
+_HIT_TABLE = 2
+_HIT_SELF = 4
 
 _IMPRATIO = 10.0
 _SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
@@ -48,7 +50,6 @@ _CONDIM = 4
 _ROLLING = 1e-4  # MuJoCo wants a positive number although condim 4 does not use it
 _ARENA = 16 << 20  # bytes for contacts and constraints of one MjData
 
-_KINDS = ("box", "sphere", "capsule", "cylinder", "hull")
 _GEOM_TYPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -60,18 +61,16 @@ _PARKED_SIZE = 1e-6
 _PARKED_POS = (0.0, 0.0, 1e3)  # in the object's frame: out of everything's reach wherever the object is
 
 
-KNOWN_DIFFERENCES = tuple(
-    KnownDifference(
-        check="slope",
-        measure=f"acceleration, mu {mu}, {degrees} degrees",
-        bound=1.5,
-        reason="the convex contact model lifts what slides, by mu times speed times the contact's time constant, so it patters; an error "
-        "of the drag counts twenty times here, and on average the drag is right",
-    )
-    for mu in (0.5, 0.8, 1.2)
-    for degrees in (0, 45)
+_PATTERS = (
+    "the convex contact model lifts what slides, by mu times speed times the contact's time constant, so it patters; "
+    "an error of the drag counts twenty times here, and on average the drag is right"
 )
-"""What both MuJoCo backends cannot do: at mu = 1.2 and 0.5 m/s, a 40 mm high box was seen to hop by 3.6 mm."""
+_SLOPES = [(mu, degrees) for mu in (0.5, 0.8, 1.2) for degrees in (0, 45)]  # noqa: XR002
+KNOWN_DIFFERENCES = tuple(
+    KnownDifference(check="slope", measure=f"acceleration, mu {mu}, {degrees} degrees", bound=1.5, reason=_PATTERS)
+    for mu, degrees in _SLOPES
+)
+"""Checks that both MuJoCo backends miss: at mu = 1.2 and 0.5 m/s, a 40 mm high box was seen to hop by 3.6 mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,10 +78,10 @@ class MujocoSettings:
     """Dials of both MuJoCo backends."""
 
     time_constant_steps: float = 2.016
-    """Time constant of contacts (``solref``) in timesteps: as stiff as the timestep allows, with a hair's breadth for rounding."""
+    """Time constant of contacts (``solref``) in timesteps: as stiff as the timestep allows, with room for rounding."""
 
     def __post_init__(self) -> None:
-        """Refuse what MuJoCo would silently raise to its minimum."""
+        """Refuse values that MuJoCo would silently raise to its minimum."""
         if not self.time_constant_steps >= MIN_TIME_CONSTANT_STEPS:
             raise ValueError(
                 f"time_constant_steps is {self.time_constant_steps}, expected at least {MIN_TIME_CONSTANT_STEPS}"
@@ -100,14 +99,18 @@ def compile_scene(
     sensors: bool = False,
     settings: MujocoSettings = _DEFAULTS,
 ) -> SceneModel:
-    """The model of a scene that holds ``scene.objects[object_index]``.
+    """Return the model of a scene that holds ``scene.objects[object_index]``.
 
     Args:
-        slots_for: also make room for the shapes of these objects: the models of one scene with the same ``slots_for`` agree in the
-            type and number of all geoms and in all meshes, so one engine model can hold any of the objects. Slots without use are parked.
-        sensors: let the engine itself compute what a backend reports. ``sensordata`` then holds, one behind the other, of the tracked
-            links the positions [K, 3], orientations [K, 4], velocities [K, 3] and angular velocities [K, 3]; then the force of the
-            object on the table [3] and on each fingertip geom [S, 3].
+        scene: the scene.
+        object_index: index of the object.
+        slots_for: also make room for the shapes of these objects. Models of one scene with the same ``slots_for`` agree
+            in the type and number of all geoms and in all meshes, so one engine model can hold any of the objects.
+            Unused slots are parked.
+        sensors: let the engine itself compute what a backend reports. ``sensordata`` then holds, in this order, the
+            tracked links' positions [K, 3], orientations [K, 4], velocities [K, 3] and angular velocities [K, 3]; the
+            force of the object on the table [3] and on each fingertip geom [S, 3].
+        settings: further dials.
 
     Raises:
         RobotError: the robot cannot be simulated.
@@ -138,10 +141,10 @@ def compile_scene(
         ) from error
     _let_com_move(model, model.body("object").id)
     model.body_gravcomp[model.body("object").id] = 0.0
-    return locate(robot, model, roles, parked, sensed)
+    return locate(scene, robot, model, roles, parked, sensed)
 
 
-# Options -------------------------------------------------------------------------------------------------------------------------------
+# Options --------------------------------------------------------------------------------------------------------------
 
 
 def _empty_spec(scene: SceneSpec) -> mujoco.MjSpec:
@@ -174,20 +177,24 @@ def _contact(friction: float, scene: SceneSpec, settings: MujocoSettings) -> dic
     }
 
 
-# Robot ---------------------------------------------------------------------------------------------------------------------------------
+# Robot ----------------------------------------------------------------------------------------------------------------
 
 
 def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, settings: MujocoSettings) -> dict[str, int]:
-    """Add bodies, joints and geoms; returns the role of each geom by name."""
+    """Add bodies, joints and geoms; return geom -> role."""
     description = robot.robot
     added: list[mujoco.MjsBody] = []
     roles: dict[str, int] = {}
-    geoms: list[list[tuple[str, str]]] = []  # of each body: (geom, link)
+    self_geoms: list[dict[str, str]] = []
+    """For each body: geom -> link, of the links that may collide with other links."""
     for body in robot.bodies:
         if body.joint is None:
-            parent, pos, quat = spec.worldbody, np.array(description.base_pos), np.array(description.base_quat)
+            parent = spec.worldbody
+            pos = np.array(description.base_pos)
+            quat = np.array(description.base_quat)
         else:
-            parent, (pos, quat) = added[body.parent], pos_quat(body.T_parent_body)
+            parent = added[body.parent]
+            pos, quat = pos_quat(body.T_parent_body)
         element = parent.add_body(
             name=body_name(body),
             pos=pos,
@@ -200,36 +207,31 @@ def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, settings
         if body.joint is not None:
             _add_joint(element, body.joint, scene)
         added.append(element)
-        geoms.append([])
-        for i, (link, shape) in enumerate((item.link, item.shape) for item in body.shapes):
+        self_geoms.append({})
+        for i, item in enumerate(body.shapes):
             name = f"{body_name(body)}/{i}"
-            roles[name] = role = robot.tip_of.get(link, OTHER_LINK)
-            self_bit = _HIT_SELF if link in description.self_collision_links else 0
-            table_bit = 0 if link in description.table_exclude else _HIT_TABLE
-            pos, quat = pos_quat(shape.T_body_shape)
-            mesh = _add_mesh(spec, name, shape.geometry) if shape.geometry.kind == "hull" else ""
+            roles[name] = role = robot.tip_of.get(item.link, OTHER_LINK)
+            friction = scene.friction.link if role == OTHER_LINK else scene.friction.tip
+            self_bit = _HIT_SELF if item.link in description.self_collision_links else 0
+            table_bit = 0 if item.link in description.table_exclude else _HIT_TABLE
             element.add_geom(
                 name=name,
-                pos=pos,
-                quat=quat,
                 contype=self_bit | table_bit,
                 conaffinity=_HIT_OBJECT | self_bit,
-                **_geometry(shape.geometry, mesh),
-                **_contact(scene.friction.link if role == OTHER_LINK else scene.friction.tip, scene, settings),
+                **_placed(spec, item.shape, name),
+                **_contact(friction, scene, settings),
             )
             if self_bit:
-                geoms[-1].append((name, link))
-    _limit_self_collision(spec, scene, robot, geoms)
+                self_geoms[-1][name] = item.link
+    _limit_self_collision(spec, scene, robot, self_geoms)
     return roles
 
 
 def _set_inertia(element: mujoco.MjsBody, inertia: Inertia) -> None:
-    element.mass, element.ipos, element.inertia, element.iquat = (
-        inertia.mass,
-        inertia.com,
-        inertia.moments,
-        inertia.quat,
-    )
+    element.mass = inertia.mass
+    element.ipos = inertia.com
+    element.inertia = inertia.moments
+    element.iquat = inertia.quat
 
 
 def _add_joint(element: mujoco.MjsBody, joint: Joint, scene: SceneSpec) -> None:
@@ -249,18 +251,18 @@ def _add_joint(element: mujoco.MjsBody, joint: Joint, scene: SceneSpec) -> None:
 
 
 def _limit_self_collision(
-    spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, geoms: list[list[tuple[str, str]]]
+    spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, geoms: Sequence[dict[str, str]]
 ) -> None:
     """Keep the collisions between bodies that :meth:`Mechanism.may_collide` allows.
 
-    MuJoCo excludes whole bodies. Where only some links of two bodies may collide, the bodies are excluded and those links' geoms paired.
+    MuJoCo excludes whole bodies. Where only some links of two bodies may collide, the bodies are excluded and the geoms
+    of those links are paired.
     """
     friction = (scene.friction.link, scene.friction.link, scene.friction.torsional, _ROLLING, _ROLLING)
-    for (i, mine), (j, others) in combinations(enumerate(geoms), 2):
-        if not mine or not others:
-            continue
-        allowed = [(a, b) for a, link_a in mine for b, link_b in others if robot.may_collide(link_a, link_b)]
-        if len(allowed) == len(mine) * len(others):
+    for i, j in combinations(range(len(geoms)), 2):
+        pairs = list(product(geoms[i], geoms[j]))
+        allowed = [(a, b) for a, b in pairs if robot.may_collide(geoms[i][a], geoms[j][b])]
+        if len(allowed) == len(pairs):
             continue
         spec.add_exclude(bodyname1=body_name(robot.bodies[i]), bodyname2=body_name(robot.bodies[j]))
         for a, b in allowed:
@@ -270,13 +272,15 @@ def _limit_self_collision(
 
 
 def _add_drives(spec: mujoco.MjSpec, scene: SceneSpec) -> None:
-    """Drives on joints; on those that others follow, through a tendon along all of them: see :func:`drive_shares`."""
+    """Add the drives: on joints, and on joints that others follow through a tendon: see :func:`drive_shares`."""
     robot = scene.robot
     moving = [*robot.joint_names, *(mimic.joint for mimic in robot.mimics)]
-    offset = np.array([*np.zeros(len(robot.joints)), *(mimic.offset for mimic in robot.mimics)])
+    offset = np.array([0.0] * len(robot.joints) + [mimic.offset for mimic in robot.mimics])
     for joint, shares in zip(robot.joints, drive_shares(robot), strict=True):
-        drive, along = joint.drive, np.flatnonzero(shares)
-        if shared := len(along) > 1:
+        drive = joint.drive
+        along = np.flatnonzero(shares)
+        shared = len(along) > 1
+        if shared:
             tendon = spec.add_tendon(name=joint.name)
             for i in along:
                 tendon.wrap_joint(moving[i], shares[i])
@@ -311,47 +315,40 @@ def _padded(values: Sequence[float], length: int = mujoco.mjNGAIN) -> np.ndarray
     return out
 
 
-# Object --------------------------------------------------------------------------------------------------------------------------------
+# Object ---------------------------------------------------------------------------------------------------------------
 
 
 def _add_object(
     spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Sequence[int], settings: MujocoSettings
 ) -> set[str]:
-    """Add the object and empty slots; returns the names of the geoms that are parked."""
+    """Add the object and empty slots; return the names of the geoms that are parked."""
     thing = scene.objects[index]
-    held = sorted({*slots_for, index})
-    meshes = {i: _add_hulls(spec, scene.objects[i], i) for i in held}
+    hulls: dict[int, list[str]] = {}
     slots: Counter[str] = Counter()
-    for i in held:
+    for i in sorted({*slots_for, index}):
+        hulls[i] = _add_hulls(spec, scene.objects[i], i)
         slots |= Counter(piece.geometry.kind for piece in scene.objects[i].pieces)  # the larger of the two counts
+    spare = next(filter(None, chain.from_iterable(hulls.values())), "")
 
-    body = spec.worldbody.add_body(
-        name="object", gravcomp=1.0, explicitinertial=True
-    )  # MuJoCo ignores it unless it is set while compiling
+    # MuJoCo ignores gravcomp unless it is set while compiling.
+    body = spec.worldbody.add_body(name="object", gravcomp=1.0, explicitinertial=True)
     inertia = object_inertia(thing)
     _set_inertia(body, replace(inertia, com=inertia.com + _ASIDE))
     body.add_joint(name="object", type=mujoco.mjtJoint.mjJNT_FREE, align=mujoco.mjtAlignFree.mjALIGNFREE_FALSE)
     parked = set()
     common = {"contype": _HIT_OBJECT, "conaffinity": 0, **_contact(0.0, scene, settings)}
-    spare = next((name for names in meshes.values() for name in names), "")
-    for kind in _KINDS:
+    for kind, geom_type in _GEOM_TYPES.items():
         pieces = [piece for piece in thing.pieces if piece.geometry.kind == kind]
         for slot in range(slots[kind]):
             name = f"object/{kind}/{slot}"
             if slot < len(pieces):
-                mesh = meshes[index][slot] if kind == "hull" else ""
-                pos, quat = pos_quat(pieces[slot].T_body_shape)
-                body.add_geom(name=name, pos=pos, quat=quat, **_geometry(pieces[slot].geometry, mesh), **common)
+                mesh = hulls[index][slot] if kind == "hull" else ""
+                body.add_geom(name=name, **_geometry(pieces[slot], mesh), **common)
             else:
                 parked.add(name)
-                size = (_PARKED_SIZE,) * 3
+                mesh = spare if kind == "hull" else ""
                 body.add_geom(
-                    name=name,
-                    type=_GEOM_TYPES[kind],
-                    pos=_PARKED_POS,
-                    size=size,
-                    meshname=spare if kind == "hull" else "",
-                    **common,
+                    name=name, type=geom_type, pos=_PARKED_POS, size=(_PARKED_SIZE,) * 3, meshname=mesh, **common
                 )
     return parked
 
@@ -364,26 +361,33 @@ def _add_hulls(spec: mujoco.MjSpec, thing: ObjectSpec, index: int) -> list[str]:
 
 
 _ASIDE = np.full(3, 1e-3)
-"""[m] by which the object's centre of mass is beside its place while MuJoCo compiles."""
+"""[m] by which the object's centre of mass is away from its place while MuJoCo compiles."""
 
 
 def _let_com_move(model: mujoco.MjModel, body: int) -> None:
     """Put the object's centre of mass into its place.
 
-    Where MuJoCo finds it in the body's origin, it makes the mass matrix diagonal for good, and reads its position no more.
+    Where MuJoCo finds it in the body's origin, it makes the mass matrix diagonal for good and ignores the position.
     """
     model.body_ipos[body] -= _ASIDE
     mujoco.mj_setConst(model, mujoco.MjData(model))
     model.body_sameframe[body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
-# Shapes --------------------------------------------------------------------------------------------------------------------------------
+# Shapes ---------------------------------------------------------------------------------------------------------------
 
 
-def _geometry(geometry: Geometry, mesh: str) -> dict:
+def _placed(spec: mujoco.MjSpec, shape: Shape, name: str) -> dict:
+    """Return the attributes of a geom, whose mesh is added if it has one."""
+    mesh = _add_mesh(spec, name, shape.geometry) if shape.geometry.kind == "hull" else ""
+    return _geometry(shape, mesh)
+
+
+def _geometry(shape: Shape, mesh: str) -> dict:
+    pos, quat = pos_quat(shape.T_body_shape)
     size = np.zeros(3)
-    size[: len(geometry.size)] = geometry.size
-    return {"type": _GEOM_TYPES[geometry.kind], "size": size, "meshname": mesh}
+    size[: len(shape.geometry.size)] = shape.geometry.size
+    return {"type": _GEOM_TYPES[shape.geometry.kind], "pos": pos, "quat": quat, "size": size, "meshname": mesh}
 
 
 def _add_mesh(spec: mujoco.MjSpec, name: str, hull: Geometry) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
@@ -10,9 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.backends.rigid import Body, Mechanism
+from xreset.spec import SceneSpec
 
-TABLE, OTHER_LINK, OBJECT = -1, -2, -3
-"""Values of :attr:`SceneModel.geom_role` beside the fingertip indices 0..E-1."""
+TABLE = -1
+OTHER_LINK = -2
+OBJECT = -3
+"""Values of :attr:`SceneModel.geom_role` next to the fingertip indices 0..E-1."""
 
 MIN_FRICTION = 1e-4
 """Sliding friction of the object's own geoms, and the smallest of any pair."""
@@ -25,6 +28,7 @@ class SceneModel:
     Letters: J actuated joints, Q mimic joints, K tracked links, E fingertips, G geoms.
     """
 
+    scene: SceneSpec
     model: mujoco.MjModel
     joint_qpos: np.ndarray
     """[J] addresses in qpos, in joint order."""
@@ -59,17 +63,16 @@ class SceneModel:
     parked: np.ndarray
     """[G] bool: an object's shape slot that this object does not use."""
     sensed_tip: np.ndarray
-    """[S] fingertip of each geom that has a contact sensor; empty without sensors (see :func:`xreset.backends.mjcf.compile_scene`)."""
+    """[S] fingertip of each geom that has a contact sensor; empty without sensors, see ``mjcf.compile_scene``."""
 
     @property
     def friction_column(self) -> np.ndarray:
-        """[G] which of the frictions (object-tip, object-other link, object-table) a geom decides; 3 for the object's own geoms.
+        """[G] which friction (object-tip, object-other link, object-table) a geom decides; 3 for the object's own geoms.
 
         MuJoCo gives a pair the larger friction of its geoms, and the object's own stays at :data:`MIN_FRICTION`.
         """
-        return np.select(
-            [self.geom_role >= 0, self.geom_role == OTHER_LINK, self.geom_role == TABLE], [0, 1, 2], default=3
-        )
+        roles = self.geom_role
+        return np.select([roles >= 0, roles == OTHER_LINK, roles == TABLE], [0, 1, 2], default=3)
 
 
 def body_name(body: Body) -> str:
@@ -82,24 +85,22 @@ def pos_quat(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
 
 
-_NET_FORCE = (
-    1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE),
-    3,
-    1,
-)  # intprm of a contact sensor: what, reduced to the net force, once
+_NET_FORCE = (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1)
+"""Parameters of a contact sensor: the force, reduced to the net force, once."""
 
 
 def add_sensors(spec: mujoco.MjSpec, robot: Mechanism, roles: dict[str, int]) -> list[int]:
-    """Add what :func:`xreset.backends.mjcf.compile_scene` says; returns the fingertip of each geom sensed."""
+    """Add the sensors that ``mjcf.compile_scene`` describes; return the fingertip of each geom that has one."""
     sites = []
     for i, link in enumerate(robot.robot.tracked_links):
         body, T = robot.frames[link]
         pos, quat = pos_quat(T)
-        sites.append(spec.body(body_name(robot.bodies[body])).add_site(name=f"link/{i}", pos=pos, quat=quat).name)
-    kind, site = mujoco.mjtSensor, mujoco.mjtObj.mjOBJ_SITE
+        site = spec.body(body_name(robot.bodies[body])).add_site(name=f"link/{i}", pos=pos, quat=quat)
+        sites.append(site.name)
+    kind = mujoco.mjtSensor
     for quantity in (kind.mjSENS_FRAMEPOS, kind.mjSENS_FRAMEQUAT, kind.mjSENS_FRAMELINVEL, kind.mjSENS_FRAMEANGVEL):
         for name in sites:
-            spec.add_sensor(type=quantity, objtype=site, objname=name)
+            spec.add_sensor(type=quantity, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=name)
     tips = {geom: role for geom, role in roles.items() if role >= 0}
     for geom in ("table", *tips):
         spec.add_sensor(
@@ -114,36 +115,52 @@ def add_sensors(spec: mujoco.MjSpec, robot: Mechanism, roles: dict[str, int]) ->
 
 
 def locate(
-    robot: Mechanism, model: mujoco.MjModel, roles: dict[str, int], parked: set[str], sensed: list[int]
+    scene: SceneSpec,
+    robot: Mechanism,
+    model: mujoco.MjModel,
+    roles: dict[str, int],
+    parked: set[str],
+    sensed: list[int],
 ) -> SceneModel:
-    """Find the parts; ``roles``: geom -> its role, ``sensed``: fingertip of each geom that has a sensor."""
-    joints, mimics = robot.robot.joint_names, robot.robot.mimics
-    names = [model.geom(i).name for i in range(model.ngeom)]
-    frames = [robot.frames[link] for link in robot.robot.tracked_links]
-    poses = [pos_quat(T) for _, T in frames]
-    qpos = {model.joint(i).name: int(model.jnt_qposadr[i]) for i in range(model.njnt)}
-    dof = {model.joint(i).name: int(model.jnt_dofadr[i]) for i in range(model.njnt)}
+    """Find the parts of a scene in its model.
 
-    def addresses(table: dict[str, int], joints: Sequence[str]) -> np.ndarray:
-        return np.array([table[name] for name in joints], dtype=np.int64)
+    Args:
+        scene: what the model was compiled from.
+        robot: its robot.
+        model: the compiled model.
+        roles: geom -> role.
+        parked: geoms that are parked.
+        sensed: fingertip of each geom that has a contact sensor.
+    """
+    names = robot.robot.joint_names
+    mimics = robot.robot.mimics
+    geoms = [model.geom(i).name for i in range(model.ngeom)]
+    bodies, frames = zip(*(robot.frames[link] for link in robot.robot.tracked_links), strict=True)
 
+    def ids(bodies: Iterable[Body]) -> np.ndarray:
+        return np.array([model.body(body_name(body)).id for body in bodies], dtype=np.int64)
+
+    joints = np.array([model.joint(name).id for name in names], dtype=np.int64)
+    followers = np.array([model.joint(mimic.joint).id for mimic in mimics], dtype=np.int64)
+    free = model.joint("object").id
     return SceneModel(
+        scene=scene,
         model=model,
-        joint_qpos=addresses(qpos, joints),
-        joint_dof=addresses(dof, joints),
-        mimic_qpos=addresses(qpos, [mimic.joint for mimic in mimics]),
-        mimic_dof=addresses(dof, [mimic.joint for mimic in mimics]),
-        mimic_source=np.array([joints.index(mimic.source) for mimic in mimics], dtype=np.int64),
+        joint_qpos=model.jnt_qposadr[joints].astype(np.int64),
+        joint_dof=model.jnt_dofadr[joints].astype(np.int64),
+        mimic_qpos=model.jnt_qposadr[followers].astype(np.int64),
+        mimic_dof=model.jnt_dofadr[followers].astype(np.int64),
+        mimic_source=np.array([names.index(mimic.source) for mimic in mimics], dtype=np.int64),
         mimic_multiplier=np.array([mimic.multiplier for mimic in mimics], dtype=np.float64),
         mimic_offset=np.array([mimic.offset for mimic in mimics], dtype=np.float64),
-        link_body=np.array([model.body(body_name(robot.bodies[i])).id for i, _ in frames], dtype=np.int64),
-        link_pos=np.array([pos for pos, _ in poses]),
-        link_quat=np.array([quat for _, quat in poses]),
-        moving_bodies=np.array([model.body(body_name(body)).id for body in robot.bodies[1:]], dtype=np.int64),
+        link_body=ids(robot.bodies[body] for body in bodies),
+        link_pos=np.array([T[:3, 3] for T in frames]),
+        link_quat=np.array([pos_quat(T)[1] for T in frames]),
+        moving_bodies=ids(robot.bodies[1:]),
         object_body=model.body("object").id,
-        object_qpos=qpos["object"],
-        object_dof=dof["object"],
-        geom_role=np.array([roles.get(name, OBJECT) for name in names], dtype=np.int64),
-        parked=np.array([name in parked for name in names]),
+        object_qpos=int(model.jnt_qposadr[free]),
+        object_dof=int(model.jnt_dofadr[free]),
+        geom_role=np.array([roles.get(name, OBJECT) for name in geoms], dtype=np.int64),
+        parked=np.array([name in parked for name in geoms]),
         sensed_tip=np.array(sensed, dtype=np.int64),
     )

@@ -143,7 +143,7 @@ class MujocoWarpBackend(Backend):
                 self._prepare()
         self.set_state(State.initial(scene, self.object_index).to(self.device))
 
-    # Availability ----------------------------------------------------------------------------------------------------------------
+    # Availability -----------------------------------------------------------------------------------------------------
 
     @classmethod
     def engine_version(cls) -> str:
@@ -155,7 +155,7 @@ class MujocoWarpBackend(Backend):
         """Kinds of devices that can be used here."""
         return ["cuda", "cpu"] if torch.cuda.is_available() else ["cpu"]
 
-    # State -----------------------------------------------------------------------------------------------------------------------
+    # State ------------------------------------------------------------------------------------------------------------
 
     def set_state(self, state: State, worlds: Tensor | None = None) -> None:
         """See :meth:`Backend.set_state`. The external wrench of those worlds ends."""
@@ -189,7 +189,7 @@ class MujocoWarpBackend(Backend):
                 self._run("step")
             self._run("read")
 
-    # Readings --------------------------------------------------------------------------------------------------------------------
+    # Readings ---------------------------------------------------------------------------------------------------------
 
     def links(self) -> Links:
         """See :meth:`Backend.links`: views of the engine's memory."""
@@ -230,7 +230,7 @@ class MujocoWarpBackend(Backend):
         axes = quat_to_matrix(quat)
         return MassProperties(mass=mass.clone(), com=com.clone(), inertia=axes @ torch.diag_embed(moments) @ axes.mT)
 
-    # Physical parameters ---------------------------------------------------------------------------------------------------------
+    # Physical parameters ----------------------------------------------------------------------------------------------
 
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         self._must_be_open()
@@ -253,7 +253,7 @@ class MujocoWarpBackend(Backend):
         self._graphs.clear()
         self._model = self._data = None
 
-    # Building --------------------------------------------------------------------------------------------------------------------
+    # Building ---------------------------------------------------------------------------------------------------------
 
     def _allocate(self) -> None:
         """Allocate what the worlds are read into, and name what setters write to."""
@@ -357,7 +357,7 @@ class MujocoWarpBackend(Backend):
                 self._graphs[name] = capture.graph
         wp.synchronize_device(self._warp_device)
 
-    # What the graphs hold -----------------------------------------------------------------------------------------------------------
+    # What the graphs hold ---------------------------------------------------------------------------------------------
 
     def _read_contacts(self) -> None:
         """Read the forces of the last step's contacts; their arrays stay until the next step."""
@@ -432,7 +432,7 @@ class MujocoWarpBackend(Backend):
     def _run(self, name: str) -> None:
         wp.capture_launch(self._graphs[name])
 
-    # Checking ----------------------------------------------------------------------------------------------------------------------
+    # Checking ---------------------------------------------------------------------------------------------------------
 
     def _rows(self, value: Tensor, shape: tuple[int, ...]) -> Tensor:
         value = torch.as_tensor(value, dtype=torch.float32, device=self.device).detach()

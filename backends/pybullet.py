@@ -265,7 +265,7 @@ class PybulletWorld(World):
         if drives is not None:
             self.set_drives(drives)
 
-    # Building ----------------------------------------------------------------------------------------------------------------------------
+    # Building ---------------------------------------------------------------------------------------------------------
 
     def _load_robot(self, robot: Mechanism, folder: Path) -> Model:
         parts = robot_parts(robot)
@@ -399,7 +399,7 @@ class PybulletBackend(PoolBackend):
         return version("pybullet")
 
 
-# Bullet's habits ------------------------------------------------------------------------------------------------------------------------
+# Bullet's habits ------------------------------------------------------------------------------------------------------
 
 
 def _xyzw(q: Sequence[float] | np.ndarray) -> tuple[float, float, float, float]:

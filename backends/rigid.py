@@ -291,7 +291,7 @@ def _fused_inertia(robot: RobotSpec, links: list[Link], frames: dict[str, tuple[
     return principal(mass, com, inertia, RobotError, f"robot {robot.name!r}: the link {links[0].name!r}")
 
 
-# Few quaternions -------------------------------------------------------------------------------------------------------------------------
+# Few quaternions ------------------------------------------------------------------------------------------------------
 # For one or a handful of vectors [3] or [n, 3], where numpy's and scipy's own functions cost more than the arithmetic.
 
 

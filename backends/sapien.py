@@ -186,7 +186,7 @@ class SapienWorld(World):
     def set_drives(self, scale: np.ndarray) -> None:
         self._joints.set_drives(scale.astype(np.float64))
 
-    # Building ----------------------------------------------------------------------------------------------------------------------------
+    # Building ---------------------------------------------------------------------------------------------------------
 
     def _add_table(self, scene: SceneSpec) -> None:
         table = self._sapien.physx.PhysxRigidStaticComponent()
@@ -288,7 +288,7 @@ class SapienWorld(World):
     def _pose(self, T: np.ndarray) -> Any:
         return self._sapien.Pose(T[:3, 3], matrix_to_quat(T[:3, :3]))
 
-    # Contacts ----------------------------------------------------------------------------------------------------------------------------
+    # Contacts ---------------------------------------------------------------------------------------------------------
 
     def _contact_points(self) -> tuple[list[_Surface], np.ndarray, np.ndarray]:
         """What pressed on the object in the last step: surfaces, points [n, 3], normal forces on the object [n, 3]."""
@@ -365,7 +365,7 @@ class _Surface(NamedTuple):
     """Index of its fingertip."""
 
 
-# SAPIEN's habits -----------------------------------------------------------------------------------------------------------------------
+# SAPIEN's habits ------------------------------------------------------------------------------------------------------
 
 _NO_LIMIT = 1e3
 """Speed limit of bodies [m/s, rad/s]: PhysX has lower ones of its own."""

@@ -124,7 +124,7 @@ def _couple(articulation: Any, joints: Mapping[str, Any], mimic: MimicSpec) -> N
     )
 
 
-# Which shapes collide --------------------------------------------------------------------------------------------------------------------
+# Which shapes collide -------------------------------------------------------------------------------------------------
 # Two shapes collide if a bit of one's first group is in the other's second group.
 
 OBJECT_BIT, TABLE_BIT, _FIRST_SELF_BIT, _BITS = 1, 2, 2, 32

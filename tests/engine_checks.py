@@ -96,7 +96,7 @@ class EngineChecks:
         backend.set_state(state)
         return backend, state
 
-    # Objects -----------------------------------------------------------------------------------------------------------------------------
+    # Objects ----------------------------------------------------------------------------------------------------------
 
     def test_objects_rest_at_their_height(self):
         backend = self.make(replace(scene(), objects=FLAT), len(FLAT))
@@ -167,7 +167,7 @@ class EngineChecks:
         found = Rotation.from_quat(state.object_quat[0].double().numpy(), scalar_first=True)
         self.assertLess((found * turn.inv()).magnitude(), 4e-3)
 
-    # Joints ------------------------------------------------------------------------------------------------------------------------------
+    # Joints -----------------------------------------------------------------------------------------------------------
 
     def test_a_drive_pushes_with_its_effort_and_no_more(self):
         robot = with_drive(gripper(), "lift", effort=8.0)
@@ -239,7 +239,7 @@ class EngineChecks:
             fall = before - float(backend.links().linvel[0, 0, 2])
             self.assertAlmostEqual(fall, 0.0 if compensated else GRAVITY * 0.1, delta=0.03)
 
-    # Contacts ----------------------------------------------------------------------------------------------------------------------------
+    # Contacts ---------------------------------------------------------------------------------------------------------
 
     def test_contact_forces_explain_the_objects_motion(self):
         backend, _ = self.grasp(**self.one_step_options)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import tempfile
 import unittest
+import weakref
 from dataclasses import fields, replace
 from pathlib import Path
 from unittest import mock
@@ -433,6 +435,17 @@ class Steps(unittest.TestCase):
 
 
 class Limits(unittest.TestCase):
+    def test_a_closed_backend_keeps_no_scene_alive(self):
+        held = scene()
+        seen = weakref.ref(held)
+        with MujocoBackend(held, 2, workers=0) as backend:
+            first, second = worlds(backend)
+            self.assertIs(first._at, MujocoWorld(held, 0)._at)  # what is in use is compiled once
+            self.assertIsNot(first._at, second._at)
+        del held, backend, first, second
+        gc.collect()
+        self.assertIsNone(seen())
+
     def test_warp_counts_contacts_that_found_no_room(self):
         backend = MujocoWarpBackend(scene(), 4, object_index=torch.zeros(4, dtype=torch.long), contacts_per_world=1)
         backend.step(8)

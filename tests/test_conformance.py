@@ -52,7 +52,7 @@ def outcome(defect: Defect, *checks: str, **attributes) -> dict[str, CheckResult
     return {result.name: result for result in results}
 
 
-# What is set and read --------------------------------------------------------------------------------------------------------------------
+# What is set and read -------------------------------------------------------------------------------------------------
 
 
 @breaks("joint_order")
@@ -134,7 +134,6 @@ class MimicJointThatIsNotSet(MujocoWorld):
     def set_state(self, state):
         super().set_state(state)
         self._data.qpos[self._at.mimic_qpos] = 0.0
-        self._begin_next_step()
 
 
 @breaks("forward_kinematics", "links_after_set")
@@ -145,7 +144,7 @@ class LinksAtTheCentreOfMass(MujocoWorld):
         return self._data.xipos[body], quat, linvel, angvel
 
 
-# Worlds ----------------------------------------------------------------------------------------------------------------------------------
+# Worlds ---------------------------------------------------------------------------------------------------------------
 
 
 @breaks("nothing_stays", "object_wrench")
@@ -226,7 +225,7 @@ class HiddenBrokenWorld(MujocoWorld):
         return False, False
 
 
-# The robot -------------------------------------------------------------------------------------------------------------------------------
+# The robot ------------------------------------------------------------------------------------------------------------
 
 
 class _Remodelled(MujocoWorld):
@@ -313,7 +312,7 @@ class GravityFractionOfTheWholeWorld(MujocoWorld):
         self._model.opt.gravity[2] = -9.81 * fraction
 
 
-# The object ------------------------------------------------------------------------------------------------------------------------------
+# The object -----------------------------------------------------------------------------------------------------------
 
 
 @breaks("free_fall")
@@ -408,7 +407,7 @@ class ShapesMoveWithTheCentreOfMass(MujocoWorld):
         self._model.geom_pos[mine] = self._at.model.geom_pos[mine] + offset
 
 
-# Contact ---------------------------------------------------------------------------------------------------------------------------------
+# Contact --------------------------------------------------------------------------------------------------------------
 
 
 @breaks("resting_weight", "held_object")

@@ -24,7 +24,6 @@ from xreset.resets.bank import read_bank as read_bank
 from xreset.resets.bank import write_bank as write_bank
 from xreset.resets.config import ClosingConfig as ClosingConfig
 from xreset.resets.config import SqueezeConfig as SqueezeConfig
-from xreset.resets.filter import FilterConfig as FilterConfig
 from xreset.resets.filter import make_bank as make_bank
 from xreset.retarget.file import Retargeted as Retargeted
 from xreset.retarget.pipeline import RetargetConfig as RetargetConfig

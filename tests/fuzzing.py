@@ -63,7 +63,7 @@ def readers() -> Iterator[dict[str, Reader]]:
     from torch.utils.tensorboard import SummaryWriter
 
     from xreset.backends.conformance import SCHEMA as CONFORMANCE
-    from xreset.demos.dexycb import _extrinsics, _meta, _npz
+    from xreset.demos.dexycb import _read_extrinsics, _read_meta, _read_npz
     from xreset.demos.keypoints import read_keypoints, read_transform
     from xreset.demos.synth import synthesize
     from xreset.description import load_robot, read_description
@@ -174,7 +174,7 @@ def readers() -> Iterator[dict[str, Reader]]:
         calibration.parent.mkdir(parents=True)
         poses = {"apriltag": np.eye(4)[:3].ravel().tolist(), "837": np.eye(4)[:3].ravel().tolist()}
         calibration.write_text(yaml.safe_dump({"extrinsics": poses, "master": "837"}))
-        found["DexYCB calibration"] = Reader(calibration, lambda p: _extrinsics(folder, "1"), "yaml")
+        found["DexYCB calibration"] = Reader(calibration, lambda p: _read_extrinsics(folder, "1"), "yaml")
         meta = {
             "extrinsics": "1",
             "mano_sides": ["right"],
@@ -183,9 +183,9 @@ def readers() -> Iterator[dict[str, Reader]]:
             "ycb_grasp_ind": 0,
             "ycb_ids": [2],
         }
-        add("DexYCB meta", "meta.yml", _meta, "yaml").write_text(yaml.safe_dump(meta))
+        add("DexYCB meta", "meta.yml", _read_meta, "yaml").write_text(yaml.safe_dump(meta))
         np.savez(
-            add("DexYCB poses", "pose.npz", lambda p: _npz(p, ("pose_y",)), "npz", ("pose_y",)),
+            add("DexYCB poses", "pose.npz", lambda p: _read_npz(p, {"pose_y": (4, 1, 7)}), "npz", ("pose_y",)),
             pose_y=np.zeros((4, 1, 7)),
         )
 

@@ -90,7 +90,7 @@ class Archive(WithFolder):
             ),
             (
                 self.changed("object_quat_wxyz", second.stop - 1, (1, 1, 0, 0)),
-                r"length 1.4142 in frame \d+ of sequence 1 .* unit",
+                r"object_quat_wxyz has length 1.4142 in frame \d+ of sequence 1 .* unit",
             ),
             (self.changed("hand_side", 2, "Right"), r"sequence 2 .* hand_side 'Right', expected 'right' or 'left'"),
             (self.changed("frame_offsets", 2, 0), "frame_offsets must increase"),
@@ -137,11 +137,11 @@ class Archive(WithFolder):
         name = str(self.demos.sequence_name[1])
         self.assertEqual(self.demos.select(names=[name], sides=["right"]).sequence_name.tolist(), [name])
         for options, message in (
-            ({"objects": ["tuna"]}, "'tuna'; there are 005_tomato_soup_can"),
-            ({"sides": ["left"]}, "no hand sides left; there are right"),
-            ({"names": ["x"]}, "no sequences x"),
+            ({"objects": ["tuna"]}, "'tuna'. Choose from: 005_tomato_soup_can"),
+            ({"sides": ["left"]}, "no hand_side left. Choose from: \\['right"),
+            ({"names": ["x"]}, "no sequence_name x"),
             ({"indices": [4]}, "there are 4 sequences"),
-            ({"indices": [0], "objects": ["banana"]}, "no sequence meets"),
+            ({"indices": [0], "objects": ["banana"]}, "No sequence meets"),
         ):
             with self.assertRaisesRegex(DemoError, message):
                 self.demos.select(**options)
@@ -159,7 +159,7 @@ class Archive(WithFolder):
     def test_unknown_object(self):
         demos = self.changed("object_name", 3, "055_baseball")
         write_demos(self.folder / "a.npz", demos)  # the archive may hold any object
-        with self.assertRaisesRegex(DemoError, r"_001' needs the object '055_baseball'.*there are 003_cracker_box"):
+        with self.assertRaisesRegex(DemoError, r"_001' needs the object '055_baseball'.*Choose from: 003_cracker_box"):
             demo_objects(read_demos(self.folder / "a.npz"))
         self.assertEqual(list(demo_objects(self.demos)), ["005_tomato_soup_can", "011_banana"])
 
@@ -295,9 +295,9 @@ class DexYCB(WithFolder):
 
     def test_only_what_is_asked_for(self):
         self.check(read_dexycb(self.folder, objects=["spam"], sides=["right"]))
-        with self.assertRaisesRegex(DemoError, r"none of the 1 sequences.*010_potted_meat_can \(right\)"):
+        with self.assertRaisesRegex(DemoError, r"None of the 1 sequences.*010_potted_meat_can \(right\)"):
             read_dexycb(self.folder, objects=["soup"])
-        with self.assertRaisesRegex(DemoError, "none of the 1 sequences"):
+        with self.assertRaisesRegex(DemoError, "None of the 1 sequences"):
             read_dexycb(self.folder, sides=["left"])
         with self.assertRaises(ObjectError):
             read_dexycb(self.folder, objects=["teapot"])
@@ -544,6 +544,8 @@ class Synthetic(unittest.TestCase):
             synthesize(["teapot"])
         with self.assertRaisesRegex(DemoError, "per_object is 0"):
             synthesize(["soup"], per_object=0)
+        with self.assertRaisesRegex(DemoError, "per_object is 1000000000 .* 1 to 100000"):
+            synthesize(["soup"], per_object=10**9)
         with self.assertRaisesRegex(DemoError, "fps is 1"):
             synthesize(["soup"], fps=1)
 
@@ -588,7 +590,7 @@ class Commands(WithFolder):
         self.assertIn("no DexYCB sequence", err)
         code, _, err = self.run_command("synth", "--out", file, "--objects", "teapot")
         self.assertEqual(code, 1)
-        self.assertIn("there is no object 'teapot'", err)
+        self.assertIn("Unknown object 'teapot'", err)
         self.assertEqual(list(self.folder.iterdir()), [])
 
 
@@ -610,8 +612,8 @@ class Plausible(unittest.TestCase):
             for words, changes in (
                 ("MANO's order", {"hand_keypoints": mano}),
                 (r"\(x, y, z, w\)", {"wrist_quat_wxyz": demos.wrist_quat_wxyz[:, [1, 2, 3, 0]]}),
-                ("1 of 1 sequences begins .* are these coordinates of a camera", {"object_pos": high}),
-                ("1 of 1 sequences ends where it starts", {"object_pos": end, "object_quat_wxyz": turn}),
+                ("1 of 1 sequences begins .* Are these coordinates of a camera", {"object_pos": high}),
+                ("1 of 1 sequences begins .* at its goal already", {"object_pos": end, "object_quat_wxyz": turn}),
             ):
                 with self.subTest(words, side=side):
                     (doubt,) = doubts(replace(demos, **changes))
@@ -631,7 +633,7 @@ class Plausible(unittest.TestCase):
             self.assertEqual(doubts(demos, objects), [])
             for field, words in (
                 ("object_quat_wxyz", "of the objects stand on the table if"),
-                ("wrist_quat_wxyz", "put w first"),
+                ("wrist_quat_wxyz", "ut w first"),
             ):
                 (doubt,) = doubts(replace(demos, **{field: getattr(demos, field)[:, [1, 2, 3, 0]]}), objects)
                 self.assertIn(words, doubt)

@@ -3,6 +3,7 @@
 import os
 import pickle
 import tempfile
+import tracemalloc
 import unittest
 from pathlib import Path
 
@@ -90,13 +91,14 @@ class Ho3d(Case):
 
     def test_refusals(self):
         cases = (
-            ("amid others, first in 0005", {"objTrans": lambda i, v: None if i == 5 else v}),
+            ("between others, first in 0005", {"objTrans": lambda i, v: None if i == 5 else v}),
             ("evaluation split gives the wrist alone", {"handJoints3D": lambda i, v: np.zeros(3)}),
+            ("objName is", {"objName": lambda i, v: ("thing",)}),
             (r"shape \[2\], expected \[3\]", {"objTrans": lambda i, v: np.zeros(2)}),
             ("not finite", {"objTrans": lambda i, v: v * np.nan}),
             ("object changes", {"objName": lambda i, v: f"thing_{i}"}),
             (
-                "Say --order",
+                "Use --order",
                 {
                     "handJoints3D": lambda i, v: (
                         None if v is None else v[[0, 13, 14, 15, 16, *range(1, 13), *range(17, 21)]]
@@ -109,10 +111,18 @@ class Ho3d(Case):
             with self.subTest(words), self.assertRaisesRegex(DemoError, words):
                 self.read()
         self.write()
-        with self.assertRaisesRegex(DemoError, "of no sequence where its camera stands; expected SM2.txt"):
+        with self.assertRaisesRegex(DemoError, "no camera pose for any sequence.*SM2.txt"):
             self.read(cameras=self.folder / "ho3d")
         with self.assertRaisesRegex(DemoError, "no HO-3D sequence"):
             read_ho3d(self.folder, fps=30.0, cameras=self.cameras)
+        far = self.folder / "ho3d/train/SM2/meta" / f"{10**9 - 1}.pkl"
+        far.write_bytes((far.parent / "0000.pkl").read_bytes())
+        with self.assertRaisesRegex(DemoError, "more than 1000000 frames"):
+            self.read()
+        far.rename(far.parent / f"{10**40}.pkl")
+        with self.assertRaisesRegex(DemoError, "not named by a frame's number"):
+            self.read()
+        (far.parent / f"{10**40}.pkl").unlink()
         np.savetxt(self.cameras / "SM2.txt", np.linalg.inv(CAMERA))
         with self.assertRaisesRegex(DemoError, "inverse of what it should be"):
             self.read()
@@ -164,6 +174,14 @@ class Pickles(Case):
             with self.subTest(words), self.assertRaisesRegex(DemoError, words):
                 self.load(content)
         self.assertFalse(target.exists())
+
+    def test_a_number_in_the_file_reserves_no_memory(self):
+        tracemalloc.start()
+        self.addCleanup(tracemalloc.stop)
+        self.load(b"\x80\x02}r\x00\x00\x00\x10.")  # a value that is stored under the number 2^28
+        with self.assertRaisesRegex(DemoError, "cannot be read"):  # a bytearray of 1 TiB
+            self.load(b"\x80\x05\x96" + (1 << 40).to_bytes(8, "little") + b".")
+        self.assertLess(tracemalloc.get_traced_memory()[1], 1 << 20)
 
     def test_a_shape_that_the_data_does_not_have(self):
         content = pickle.dumps({"a": np.zeros(3)}, protocol=2).replace(b"K\x03\x85", b"J\xff\xff\xff\x7f\x85")

@@ -111,7 +111,7 @@ class Synthetic(unittest.TestCase):
         self.same(read_keypoints(self.npz(object_quat_wxyz=None, object_quat_xyzw=xyzw), PLAIN))
         self.same(read_keypoints(self.npz(object_quat_wxyz=None, object_quat=xyzw), replace(PLAIN, quat="xyzw")))
         self.same(read_keypoints(self.npz(object_quat_wxyz=None, object_quat=wxyz), replace(PLAIN, quat="wxyz")))
-        self.refused("say --quat wxyz or xyzw", object_quat_wxyz=None, object_quat=wxyz)
+        self.refused("Add --quat", object_quat_wxyz=None, object_quat=wxyz)
         self.refused("must be given once", object_quat=wxyz)
         self.refused("must be given once, .* found object_pos", object_quat_wxyz=None)
         self.refused("quaternion of frame 0 has length 2", object_quat_wxyz=2 * wxyz)
@@ -129,22 +129,23 @@ class Synthetic(unittest.TestCase):
         )
         self.refused("--table-from-camera FILE", replace(PLAIN, frame="camera"))
         self.refused("--coordinates says .* table frame already", replace(PLAIN, table_from_camera=np.eye(4)))
-        self.refused("say it with --object", object=None)
-        self.refused("say it with --side", side=None)
-        self.refused("with --fps", replace(PLAIN, fps=None))
+        self.refused("Add --object", object=None)
+        self.refused("Add --side", side=None)
+        self.refused("Add --fps", replace(PLAIN, fps=None))
 
     def test_what_contradicts_the_numbers_is_refused(self):
-        self.refused("In --units mm it would", keypoints=1e3 * self.points)
-        self.refused("In --units m it would", replace(PLAIN, units="mm"))
-        self.refused("Say --order mano", keypoints=written(self.points, "mano"))
-        self.refused("Say --order (mediapipe|openpose)", replace(PLAIN, order="mano"))
+        self.refused("With --units mm it would", keypoints=1e3 * self.points)
+        self.refused("With --units m it would", replace(PLAIN, units="mm"))
+        self.refused("Use --order mano", keypoints=written(self.points, "mano"))
+        self.refused("Use --order (mediapipe|openpose)", replace(PLAIN, order="mano"))
         self.refused("It is the other hand .*or the coordinates are left-handed", side=np.array("left"))
         self.refused("file says side 'right', but --side says 'left'", replace(PLAIN, side="left"))
         self.refused("file says 20 frames per second, but --fps says 10", fps=np.array(20.0))
         self.refused("centred on the hand", keypoints=self.points - self.points.mean(axis=1, keepdims=True))
         swelling = np.linspace(0.4, 2.5, len(self.points))[:, None, None]
         self.refused(
-            "are no metric keypoints", keypoints=self.points[:, :1] + swelling * (self.points - self.points[:, :1])
+            "so the keypoints are not metric",
+            keypoints=self.points[:, :1] + swelling * (self.points - self.points[:, :1]),
         )
         points, pos, turn = seen_from(CAMERA, self.demos)
         seen = {"keypoints": points, "object_pos": pos, "object_quat_wxyz": turn.as_quat(scalar_first=True)}
@@ -187,6 +188,16 @@ class Synthetic(unittest.TestCase):
         self.refused("must be in seconds", replace(PLAIN, fps=None), time=1e3 * (time - 5.0))
         self.refused("must increase", time=time[::-1].copy())
 
+    def test_a_long_pause_is_not_resampled_to_frames_without_end(self):
+        time = np.arange(len(self.points)) / 10
+        time[-1] = 2e8
+        self.refused("more than 1000000 frames", replace(PLAIN, fps=30.0), time=time)
+
+    def test_objects_get_their_official_names(self):
+        self.same(read_keypoints(self.npz(object=np.array("soup")), PLAIN))
+        own = read_keypoints(self.npz(object=np.array("my_cup")), PLAIN)
+        self.assertEqual(own.object_name.tolist(), ["my_cup"])
+
     def test_a_csv_of_several_sequences(self):
         path = self.folder / "two.csv"
         turn = Rotation.from_quat(self.demos.object_quat_wxyz, scalar_first=True)
@@ -200,7 +211,7 @@ class Synthetic(unittest.TestCase):
         self.assertEqual(found.sequence_name.tolist(), ["a", "b"])
         self.same(found.select(names=["a"]))
         with (
-            self.assertRaisesRegex(DemoError, "line 2, column x0: 'oops' is no number"),
+            self.assertRaisesRegex(DemoError, "line 2, column x0: 'oops' is not a number"),
             self.assertLogs("xreset.demos.keypoints"),
         ):
             path.write_text(re.sub(r"(?m)(^a,[^,]*,right,0.9,)[^,]*", r"\1oops", first))

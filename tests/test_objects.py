@@ -403,7 +403,7 @@ class MeshImport(unittest.TestCase):
         with self.assertLogs("xreset.objects.meshes", "WARNING") as log:
             self.assertEqual(load_object("banana", self.folder).mass, 0.066)
         self.assertIn("hollow", log.output[0])  # 66 g in a litre
-        with self.assertRaisesRegex(ObjectError, r"'soup'.*011_banana.*looked for meshes in"):
+        with self.assertRaisesRegex(ObjectError, r"'soup'.*011_banana.*the meshes in"):
             load_object("soup", self.folder)
         with self.assertRaisesRegex(ObjectError, "no folder"):
             load_object("soup", self.folder / "nowhere")

@@ -137,6 +137,11 @@ class Data(WithFiles):
         ):
             load_view(file)
 
+    def test_the_papers_names_of_objects_are_understood(self):
+        data, file = toy_retargeted(self.robot), self.folder / "alias.npz"
+        write_retargeted(file, replace(data, object_name=np.array(["soup", "spam"])), config={}, inputs={})
+        self.assertEqual([spec.name for spec in load_view(file).objects], [SOUP, SPAM])
+
     def test_demonstrations(self):
         view = load_view(self.demos)
         self.assertEqual((view.kind, view.robot, view.rate), ("demonstrations", None, 30.0))

@@ -1,4 +1,4 @@
-"""The archive of demonstrations: all sequences behind one another, in one npz file.
+"""The archive of demonstrations: all sequences one after another, in one npz file.
 
 Shape letters: S sequences, F frames of all sequences, 21 keypoints (``xreset.spec.KEYPOINTS``). Metres, quaternions (w, x, y, z). Poses
 are in the table frame: z up, table top at z = 0, the person at +y.
@@ -6,7 +6,7 @@ are in the table frame: z up, table top at z = 0, the person at +y.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,16 +18,19 @@ from xreset.errors import DemoError, ObjectError
 from xreset.objects.catalogue import canonical_name, load_object, object_names
 from xreset.records import POSITION, RATE, UNIT_TOLERANCE, Field, arrays_of, offsets_problem, read_record, write_record
 from xreset.spec import ObjectSpec
+from xreset.text import shown
 
 SCHEMA_NAME = "xreset-demos/1"
 SIDES = ("right", "left")
 
 _HAND = 0.5
-"""[m] No keypoint is so far from its wrist: the longest hand on record has 33 cm."""
+"""Largest distance of a keypoint from its wrist [m]; the longest hand on record has 0.33 m."""
+_PER_SEQUENCE = ("sequence_name", "subject", "object_name", "hand_side")
+_PER_FRAME = ("hand_keypoints", "hand_valid", "wrist_quat_wxyz", "object_pos", "object_quat_wxyz")
 
 
 class ObjectMotions:
-    """Motions of objects behind one another: S sequences, F frames of all of them. Base of what files of frames hold."""
+    """Motions of objects one after another: S sequences, F frames of all of them. Base of records of frames."""
 
     fps: float
     sequence_name: np.ndarray
@@ -37,7 +40,7 @@ class ObjectMotions:
     object_quat_wxyz: np.ndarray
 
     def frames(self, sequence: int) -> slice:
-        """The frames of a sequence."""
+        """Frames of a sequence."""
         return slice(int(self.frame_offsets[sequence]), int(self.frame_offsets[sequence + 1]))
 
     @property
@@ -48,12 +51,14 @@ class ObjectMotions:
     @property
     def start_pose(self) -> tuple[np.ndarray, np.ndarray]:
         """Object pose in each sequence's first frame: [S, 3] and [S, 4]."""
-        return self.object_pos[self.frame_offsets[:-1]], self.object_quat_wxyz[self.frame_offsets[:-1]]
+        first = self.frame_offsets[:-1]
+        return self.object_pos[first], self.object_quat_wxyz[first]
 
     @property
     def goal_pose(self) -> tuple[np.ndarray, np.ndarray]:
         """Object pose in each sequence's last frame, the goal of the task: [S, 3] and [S, 4]."""
-        return self.object_pos[self.frame_offsets[1:] - 1], self.object_quat_wxyz[self.frame_offsets[1:] - 1]
+        last = self.frame_offsets[1:] - 1
+        return self.object_pos[last], self.object_quat_wxyz[last]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +68,7 @@ class Demos(ObjectMotions):
     sequence_name: Annotated[np.ndarray, Field(("S",), "U")]
     """[S] text; unique."""
     subject: Annotated[np.ndarray, Field(("S",), "U")]
-    """[S] text: who demonstrated."""
+    """[S] text: the demonstrating person."""
     object_name: Annotated[np.ndarray, Field(("S",), "U")]
     """[S] text: the grasped object's official name."""
     hand_side: Annotated[np.ndarray, Field(("S",), "U")]
@@ -85,7 +90,7 @@ class Demos(ObjectMotions):
     subjects: Annotated[np.ndarray, Field(("B",), "U")] | None = None
     """[B] the subjects that ``T_level_from_table`` is given for."""
     T_level_from_table: Annotated[np.ndarray, Field(("B", 4, 4), "f", within=POSITION)] | None = None
-    """[B, 4, 4] per subject: takes poses to a frame whose z axis is the true table's normal; see :func:`xreset.demos.levelled`."""
+    """[B, 4, 4] per subject: takes poses to a frame whose z axis is the true table's normal (:func:`xreset.demos.align.levelled`)."""
 
     @property
     def num_sequences(self) -> int:
@@ -110,74 +115,83 @@ class Demos(ObjectMotions):
         max_per_object: int | None = None,
         spread: bool = False,
     ) -> Demos:
-        """The sequences that meet every condition given.
+        """Return the sequences that meet every given condition.
 
         Args:
             indices: sequence indices; the result has their order.
             objects: object names, official or the paper's.
-            max_per_object: keep the first so many of each object.
-            spread: keep so many of each object from all over the archive in place of the first, which in most archives are one person's.
+            max_per_object: keep the first n sequences of each object.
+            spread: keep n of each object from all over the archive instead of the first, which in most archives are one person's.
 
         Raises:
-            DemoError: an index, name, object or side that is not there, or nothing is left.
+            DemoError: unknown index, name, object or side, or nothing is left.
         """
-        chosen = np.arange(self.num_sequences) if indices is None else np.asarray(list(indices), dtype=np.int64)
+        chosen = np.arange(self.num_sequences)
+        if indices is not None:
+            chosen = np.asarray(list(indices), dtype=np.int64)
         if ((chosen < 0) | (chosen >= self.num_sequences)).any():
             raise DemoError(
-                f"sequence indices {chosen.tolist()} asked for; there are {self.num_sequences} sequences, counted from 0."
+                f"Unknown sequence index in {chosen.tolist()}: there are {self.num_sequences} sequences, counted from 0."
             )
         if names is not None:
-            chosen = chosen[np.isin(self.sequence_name[chosen], _all_there("sequences", names, self.sequence_name))]
+            chosen = self._having("sequence_name", names, chosen)
         if objects is not None:
-            there = sorted(set(self.object_name.tolist()))
+            known = sorted(set(self.object_name.tolist()))
             try:
-                wanted = [canonical_name(name, there) for name in objects]
+                objects = [canonical_name(name, known) for name in objects]
             except ObjectError as error:
-                raise DemoError(f"these demonstrations do not have what was asked for: {error}") from None
-            chosen = chosen[np.isin(self.object_name[chosen], wanted)]
+                raise DemoError(f"The demonstrations lack an object: {error}") from None
+            chosen = self._having("object_name", objects, chosen)
         if sides is not None:
-            chosen = chosen[np.isin(self.hand_side[chosen], _all_there("hand sides", sides, self.hand_side))]
+            chosen = self._having("hand_side", sides, chosen)
         if max_per_object is not None:
-            objects_of = self.object_name[chosen]
-            different = np.unique(objects_of)
-            kept = []
-            for number, name in enumerate(different):
-                rows = np.flatnonzero(objects_of == name)
-                picks = np.arange(min(max_per_object, len(rows)))
-                if spread:  # from as many even parts, and from another place in them for every object
-                    picks = ((picks + (number + 0.5) / len(different)) * len(rows) / max(len(picks), 1)).astype(int)
-                kept.append(rows[picks])
-            chosen = chosen[np.sort(np.concatenate(kept))] if kept else chosen
+            chosen = self._few_per_object(chosen, max_per_object, spread)
         if not len(chosen):
-            raise DemoError("no sequence meets all the conditions of the selection; relax one of them.")
-        return self._take(chosen)
+            raise DemoError("No sequence meets all conditions of the selection. Relax one of them.")
+        frames = [np.arange(self.frame_offsets[i], self.frame_offsets[i + 1]) for i in chosen]
+        rows = np.concatenate(frames)
+        changes = {name: getattr(self, name)[chosen] for name in _PER_SEQUENCE}
+        changes |= {name: getattr(self, name)[rows] for name in _PER_FRAME}
+        return replace(self, frame_offsets=_offsets([len(part) for part in frames]), **changes)
 
-    def _take(self, chosen: np.ndarray) -> Demos:
-        lengths = np.diff(self.frame_offsets)[chosen]
-        frames = np.concatenate([np.arange(*self.frames(i).indices(self.num_frames)) for i in chosen])
-        per_sequence = {name: getattr(self, name)[chosen] for name in _PER_SEQUENCE}
-        per_frame = {name: getattr(self, name)[frames] for name in _PER_FRAME}
-        return replace(self, frame_offsets=_offsets(lengths), **per_sequence, **per_frame)
+    def _having(self, field: str, wanted: Iterable[str], chosen: np.ndarray) -> np.ndarray:
+        """Return those of the chosen sequences whose field has one of the wanted values."""
+        values = getattr(self, field)
+        wanted = list(wanted)
+        known = sorted(set(values.tolist()))
+        missing = [name for name in wanted if name not in known]
+        if missing:
+            raise DemoError(f"The demonstrations have no {field} {', '.join(missing)}. Choose from: {shown(known)}.")
+        return chosen[np.isin(values[chosen], wanted)]
 
-
-_PER_SEQUENCE = ("sequence_name", "subject", "object_name", "hand_side")
-_PER_FRAME = ("hand_keypoints", "hand_valid", "wrist_quat_wxyz", "object_pos", "object_quat_wxyz")
+    def _few_per_object(self, chosen: np.ndarray, count: int, spread: bool) -> np.ndarray:
+        names = self.object_name[chosen]
+        objects = np.unique(names)
+        kept = []
+        for number, name in enumerate(objects):
+            rows = np.flatnonzero(names == name)
+            picks = np.arange(min(count, len(rows)))
+            if spread:  # one from each of n even parts, at another place in the parts for every object
+                place = (number + 0.5) / len(objects)
+                picks = ((picks + place) * len(rows) / max(len(picks), 1)).astype(int)
+            kept.extend(rows[picks])
+        return chosen[np.sort(kept)] if kept else chosen[:0]
 
 
 def concatenate(parts: Sequence[Demos]) -> Demos:
-    """Several sets of demonstrations behind one another.
+    """Join several sets of demonstrations.
 
     Raises:
-        DemoError: nothing to concatenate, different frame rates, or one sequence name twice.
+        DemoError: nothing to join, different frame rates, or a sequence name occurs twice.
     """
     if not parts:
-        raise DemoError("there are no demonstrations to concatenate.")
+        raise DemoError("There are no demonstrations to join.")
     rates = sorted({round(float(part.fps), 3) for part in parts})
     if len(rates) > 1:
-        raise DemoError(
-            f"demonstrations with different frame rates ({', '.join(map(str, rates))} per second) cannot share a file."
-        )
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in (*_PER_SEQUENCE, *_PER_FRAME)}
+        raise DemoError(f"Demonstrations in one file must have one frame rate, but these have the frame rates {rates}.")
+    joined = {}
+    for name in _PER_SEQUENCE + _PER_FRAME:
+        joined[name] = np.concatenate([getattr(part, name) for part in parts])
     levels: dict[str, np.ndarray] = {}
     for part in parts:
         if part.subjects is not None and part.T_level_from_table is not None:
@@ -189,8 +203,7 @@ def concatenate(parts: Sequence[Demos]) -> Demos:
         T_level_from_table=np.array(list(levels.values())) if levels else None,
         **joined,
     )
-    if problem := _problem(arrays_of(demos)):
-        raise DemoError(f"the demonstrations do not fit together: {problem}")
+    _check(demos)
     return demos
 
 
@@ -211,16 +224,15 @@ def write_demos(
     Raises:
         DemoError: the demonstrations hold a value that the archive may not hold.
     """
-    if problem := _problem(arrays_of(demos)):
-        raise DemoError(f"these demonstrations cannot be written: {problem}")
+    _check(demos)
     write_record(path, SCHEMA_NAME, demos, config=config, inputs=inputs)
 
 
 def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSpec]:
-    """The objects that the demonstrations need, by name: stand-ins, or the meshes of a folder.
+    """Return the objects of the demonstrations by name: stand-ins, or the meshes of a folder.
 
     Raises:
-        DemoError: an object is unknown; the message names a sequence that needs it, and the objects that there are.
+        DemoError: an object is unknown; the message names a sequence that needs it, and the known objects.
         ObjectError: a mesh cannot be used.
     """
     known = object_names(folder)
@@ -231,81 +243,79 @@ def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSp
         try:
             canonical_name(name, known)
         except ObjectError as error:
-            where = (
-                "among the built-in stand-ins; give a folder of meshes with --objects"
-                if folder is None
-                else f"in {folder}"
-            )
-            raise DemoError(f"sequence {sequence!r} needs the object {name!r}, which is not {where}: {error}") from None
+            hint = "" if folder else " Or give a folder of meshes with --objects."
+            raise DemoError(f"The sequence {sequence!r} needs the object {name!r}. {error}{hint}") from None
         objects[name] = load_object(name, folder)
     return objects
 
 
-def _offsets(lengths: np.ndarray) -> np.ndarray:
+def _offsets(lengths: Sequence[int] | np.ndarray) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
 
 
-def _all_there(what: str, wanted: Iterable[str], there: np.ndarray) -> list[str]:
-    wanted, known = list(wanted), sorted(set(there.tolist()))
-    missing = [name for name in wanted if name not in known]
-    if missing:
-        shown = ", ".join(known[:8]) + (f" and {len(known) - 8} more" if len(known) > 8 else "")
-        raise DemoError(f"these demonstrations have no {what} {', '.join(missing)}; there are {shown}.")
-    return wanted
+def _check(demos: Demos) -> None:
+    problem = _problem(arrays_of(demos))
+    if problem:
+        raise DemoError(f"The demonstrations cannot be used: {problem}")
 
 
 def _problem(arrays: Mapping[str, Any]) -> str | None:
-    """What is wrong with the values, or None. Types and shapes have been checked."""
-    offsets, names = np.asarray(arrays["frame_offsets"]), arrays["sequence_name"]
-    frames = len(arrays["object_pos"])
-    if problem := offsets_problem(arrays, frames):
+    """Return the first thing that is wrong with the values, or None. Types and shapes have been checked."""
+    offsets = np.asarray(arrays["frame_offsets"])
+    names = arrays["sequence_name"]
+    problem = offsets_problem(arrays, len(arrays["object_pos"]))
+    if problem:
         return problem
-    wrong = ~np.isin(arrays["hand_side"], SIDES)
-    if wrong.any():
-        i = int(np.argmax(wrong))
+    wrong_side = ~np.isin(arrays["hand_side"], SIDES)
+    if wrong_side.any():
+        i = int(np.argmax(wrong_side))
         return f"sequence {i} ({names[i]!s}) has hand_side {str(arrays['hand_side'][i])!r}, expected 'right' or 'left'."
     if not RATE[0] <= arrays["fps"] <= RATE[1]:
-        return f"fps is {arrays['fps']}, expected a positive number, from {RATE[0]:g} to {RATE[1]:g}."
-    if (arrays.get("subjects") is None) != (arrays.get("T_level_from_table") is None):
-        return "subjects and T_level_from_table belong together, but one of them is missing."
+        return f"fps is {arrays['fps']}, expected a number from {RATE[0]:g} to {RATE[1]:g}."
     level = arrays.get("T_level_from_table")
-    if level is not None and not (
-        np.isfinite(level).all() and all(is_rigid(T) for T in np.asarray(level, dtype=float))
-    ):
-        return "T_level_from_table has a matrix that is no rotation and translation."
-
-    def first(bad: np.ndarray) -> str:
-        frame = int(np.argmax(bad))
-        sequence = int(np.searchsorted(offsets, frame, side="right")) - 1
-        return f"frame {frame - offsets[sequence]} of sequence {sequence} ({names[sequence]!s})"
-
-    valid = np.asarray(arrays["hand_valid"])
-    for name, where in (
-        ("object_pos", True),
-        ("object_quat_wxyz", True),
-        ("hand_keypoints", valid),
-        ("wrist_quat_wxyz", valid),
-    ):
-        bad = ~np.isfinite(arrays[name]).reshape(frames, -1).all(axis=1) & where
+    if (arrays.get("subjects") is None) != (level is None):
+        return "subjects and T_level_from_table belong together, but one of them is missing."
+    if level is not None and not all(is_rigid(T) for T in np.asarray(level, dtype=float)):
+        return "T_level_from_table has a matrix that is not a rotation and translation."
+    for bad, values, sentence in _frame_checks(arrays):
         if bad.any():
-            hint = "; mark the frame in hand_valid if the hand is not known there" if where is valid else ""
-            return f"{name} is not finite in {first(bad)}{hint}."
-    for name, where in (("object_quat_wxyz", np.ones(frames, dtype=bool)), ("wrist_quat_wxyz", valid)):
-        norm = np.linalg.norm(np.where(where[:, None], arrays[name], [1.0, 0, 0, 0]), axis=1)
-        bad = np.abs(norm - 1) > UNIT_TOLERANCE
-        if bad.any():
-            return f"{name} has length {norm[np.argmax(bad)]:.4f} in {first(bad)}, expected unit quaternions."
-    bad = (np.abs(arrays["object_pos"]) > POSITION[1]).any(axis=1)
-    if bad.any():
-        place = np.round(arrays["object_pos"][np.argmax(bad)], 3).tolist()
-        return f"object_pos is {place} in {first(bad)}, expected metres in the table frame."
-    hand = np.where(valid[:, None, None], arrays["hand_keypoints"], 0.0)
-    bad = np.linalg.norm(hand[:, 1:] - hand[:, :1], axis=2).max(axis=1) > _HAND
-    if bad.any():
-        size = float(np.linalg.norm(hand[:, 1:] - hand[:, :1], axis=2).max(axis=1)[np.argmax(bad)])
-        unit = " Are these millimetres?" if 0.05 < size / 1000 < _HAND else ""
-        return f"hand_keypoints are up to {size:.4g} m from the wrist in {first(bad)}, expected the metres of a hand.{unit}"
-    bad = np.abs(hand).max(axis=(1, 2)) > POSITION[1]
-    if bad.any():
-        return f"hand_keypoints are over {POSITION[1]:g} m away in {first(bad)}, expected metres in the table frame."
+            frame = int(np.argmax(bad))
+            sequence = int(np.searchsorted(offsets, frame, side="right")) - 1
+            place = f"frame {frame - offsets[sequence]} of sequence {sequence} ({names[sequence]!s})"
+            return sentence.format(place=place, value=float(values[frame]))
     return None
+
+
+def _frame_checks(arrays: Mapping[str, Any]) -> Iterator[tuple[np.ndarray, np.ndarray, str]]:
+    """Yield the frames that are wrong [F] bool, a number of each frame [F], and a sentence, one check after another."""
+    valid = np.asarray(arrays["hand_valid"])
+    pos = arrays["object_pos"]
+    quat = arrays["object_quat_wxyz"]
+    # the values of the hand's arrays do not matter in frames without a hand
+    hand = np.where(valid[:, None, None], arrays["hand_keypoints"], 0.0)
+    wrist = np.where(valid[:, None], arrays["wrist_quat_wxyz"], [1.0, 0.0, 0.0, 0.0])
+    hint = " If the hand is unknown there, set hand_valid to False."
+    yield _any(~np.isfinite(pos)), valid, "object_pos is not finite in {place}."
+    yield _any(~np.isfinite(quat)), valid, "object_quat_wxyz is not finite in {place}."
+    yield _any(~np.isfinite(hand)), valid, "hand_keypoints is not finite in {place}." + hint
+    yield _any(~np.isfinite(wrist)), valid, "wrist_quat_wxyz is not finite in {place}." + hint
+    for name, quats in (("object_quat_wxyz", quat), ("wrist_quat_wxyz", wrist)):
+        length = np.linalg.norm(quats, axis=1)
+        sentence = " has length {value:.4f} in {place}, expected unit quaternions."
+        yield np.abs(length - 1) > UNIT_TOLERANCE, length, name + sentence
+    reach = np.abs(pos).max(axis=1)
+    yield reach > POSITION[1], reach, "object_pos is {value:.4g} m away in {place}, expected metres in the table frame."
+    size = np.linalg.norm(hand[:, 1:] - hand[:, :1], axis=2).max(axis=1)
+    sentence = "hand_keypoints are up to {value:.4g} m from the wrist in {place}, expected the metres of a hand."
+    yield size > _HAND, size, sentence + " Are these millimetres?"
+    reach = np.abs(hand).max(axis=(1, 2))
+    yield (
+        reach > POSITION[1],
+        reach,
+        "hand_keypoints are {value:.4g} m away in {place}, expected metres in the table frame.",
+    )
+
+
+def _any(wrong: np.ndarray) -> np.ndarray:
+    """[F] bool: whether anything in a frame is wrong."""
+    return np.asarray(wrong.reshape(len(wrong), -1).any(axis=1))

@@ -1,6 +1,6 @@
 """Reader of the DexYCB data set (Chao et al. 2021) in its official folder layout.
 
-    ROOT/20200709-subject-01/20200709_141754/meta.yml              which object, hand, cameras and calibration
+    ROOT/20200709-subject-01/20200709_141754/meta.yml              object, hand, cameras and calibration
                                              pose.npz              pose_y: objects, pose_m: MANO; both in the world frame
                                              SERIAL/labels_000000.npz   joint_3d: hand joints, in that camera's frame
     ROOT/calibration/extrinsics_ID/extrinsics.yml                  camera poses and the AprilTag's pose in the world frame
@@ -31,8 +31,9 @@ from xreset.text import is_plain, shown
 FPS = 30.0
 _MAX_FRAMES = 100_000
 """An hour of frames; DexYCB's sequences have 72."""
-
-_META = ("extrinsics", "mano_sides", "num_frames", "serials", "ycb_grasp_ind", "ycb_ids")
+_MAX_YAML_BYTES = 1 << 20
+_Poses = Mapping[str, np.ndarray]
+"""Camera serial, or ``apriltag`` -> pose [4, 4] in the world frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,11 +61,12 @@ def read_dexycb(
     sides: Iterable[str] = SIDES,
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> Demos:
-    """Read all sequences below a DexYCB folder, through to the table frame.
+    """Read all sequences below a DexYCB folder, in the table frame.
 
     Args:
         root: the folder that holds the subjects' folders and ``calibration``.
         objects: only sequences that grasp one of these (official names or the paper's).
+        sides: only sequences of these hands.
         progress: called with (sequences done, sequences in all, name) before each sequence is read.
 
     Raises:
@@ -72,141 +74,116 @@ def read_dexycb(
         ObjectError: a name in ``objects`` is not one of DexYCB's.
     """
     root = Path(root)
-    wanted = None if objects is None else {canonical_name(name, NAME_OF_ID.values()) for name in objects}
-    found = [_meta(path) for path in sorted(root.glob("*/*/meta.yml"))]
+    names = NAME_OF_ID.values()
+    wanted = set(names) if objects is None else {canonical_name(name, names) for name in objects}
+    found = [_read_meta(path) for path in sorted(root.glob("*/*/meta.yml"))]
     if not found:
         raise DemoError(
-            f"there is no DexYCB sequence in {root}: expected SUBJECT/SEQUENCE/meta.yml below it, such as"
+            f"There is no DexYCB sequence in {root}: expected SUBJECT/SEQUENCE/meta.yml below it, such as"
             " 20200709-subject-01/20200709_141754/meta.yml. Give the folder that holds the subjects' folders."
         )
-    chosen = [
-        sequence
-        for sequence in found
-        if sequence.side in set(sides) and (wanted is None or sequence.object_name in wanted)
-    ]
+    sides = set(sides)
+    chosen = [sequence for sequence in found if sequence.side in sides and sequence.object_name in wanted]
     if not chosen:
-        there = ", ".join(sorted({f"{sequence.object_name} ({sequence.side})" for sequence in found}))
+        known = ", ".join(sorted({f"{sequence.object_name} ({sequence.side})" for sequence in found}))
         raise DemoError(
-            f"none of the {len(found)} sequences in {root} has the objects and hands asked for; there are {there}."
+            f"None of the {len(found)} sequences in {root} has the requested objects and hands. Choose from: {known}."
         )
-    calibrations: dict[str, Mapping[str, np.ndarray]] = {}
+    calibrations: dict[str, _Poses] = {}
     parts = []
     for done, sequence in enumerate(chosen):
         progress(done, len(chosen), sequence.name)
         if sequence.extrinsics not in calibrations:
-            calibrations[sequence.extrinsics] = _extrinsics(root, sequence.extrinsics)
+            calibrations[sequence.extrinsics] = _read_extrinsics(root, sequence.extrinsics)
         parts.append(_read(sequence, calibrations[sequence.extrinsics]))
     return concatenate(parts)
 
 
-def _read(sequence: _Sequence, extrinsics: Mapping[str, np.ndarray]) -> Demos:
+def _read(sequence: _Sequence, extrinsics: _Poses) -> Demos:
     T_table_world = np.linalg.inv(extrinsics["apriltag"])
     turn = Rotation.from_matrix(T_table_world[:3, :3])
-    poses = _npz(sequence.folder / "pose.npz", ("pose_y", "pose_m"))
+    path = sequence.folder / "pose.npz"
     frames = sequence.num_frames
-    _expect(sequence, "pose.npz: pose_y", poses["pose_y"].shape, (frames, sequence.num_objects, 7))
-    _expect(sequence, "pose.npz: pose_m", poses["pose_m"].shape, (frames, 1, 51))
-    pose_object = poses["pose_y"][:, sequence.object_index].astype(float)
-    pose_hand = poses["pose_m"][:, 0].astype(float)
-    for name, values in (("pose_y", pose_object), ("pose_m", pose_hand)):
-        if not (np.abs(values) < 1e3).all():
-            raise DemoError(
-                f"sequence {sequence.name}: {name} of pose.npz holds numbers that are not finite, or far too large."
-            )
-    if (np.linalg.norm(pose_object[:, :4], axis=1) < 0.5).any():
-        raise DemoError(
-            f"sequence {sequence.name}: frame {np.argmin(np.linalg.norm(pose_object[:, :4], axis=1))} has no object pose."
-        )
+    pose_object, pose_hand = _read_npz(path, {"pose_y": (frames, sequence.num_objects, 7), "pose_m": (frames, 1, 51)})
+    pose_object = pose_object[:, sequence.object_index]
+    pose_hand = pose_hand[:, 0]
+    if not (np.abs(pose_object) < 1e3).all() or not (np.abs(pose_hand) < 1e3).all():
+        raise DemoError(f"{path} holds numbers that are not finite, or far too large. Unpack it again.")
+    unknown = np.linalg.norm(pose_object[:, :4], axis=1) < 0.5
+    if unknown.any():
+        raise DemoError(f"{path}: frame {np.argmax(unknown)} has no object pose.")
 
-    keypoints = np.stack(
-        [_joints(sequence, frame, extrinsics) for frame in range(frames)]
-    )  # world frame, NaN where there is no hand
+    keypoints = np.stack([_read_joints(sequence, frame, extrinsics) for frame in range(frames)])
     valid = np.isfinite(keypoints).all(axis=(1, 2)) & (pose_hand != 0).any(axis=1)
     keypoints[~valid] = np.nan
     wrist = np.full((frames, 4), np.nan)
     wrist[valid] = (turn * Rotation.from_rotvec(pose_hand[valid, :3])).as_quat(canonical=True, scalar_first=True)
-
-    def to_table(points: np.ndarray) -> np.ndarray:
-        return points @ T_table_world[:3, :3].T + T_table_world[:3, 3]
-
+    object_turn = turn * Rotation.from_quat(pose_object[:, :4])
     return Demos(
         sequence_name=np.array([sequence.name]),
         subject=np.array([sequence.folder.parent.name]),
         object_name=np.array([sequence.object_name]),
         hand_side=np.array([sequence.side]),
         frame_offsets=np.array([0, frames], dtype=np.int32),
-        hand_keypoints=to_table(keypoints).astype(np.float32),
+        hand_keypoints=_transform(T_table_world, keypoints).astype(np.float32),
         hand_valid=valid,
         wrist_quat_wxyz=wrist.astype(np.float32),
-        object_pos=to_table(pose_object[:, 4:]).astype(np.float32),
-        object_quat_wxyz=(turn * Rotation.from_quat(pose_object[:, :4]))
-        .as_quat(canonical=True, scalar_first=True)
-        .astype(np.float32),
+        object_pos=_transform(T_table_world, pose_object[:, 4:]).astype(np.float32),
+        object_quat_wxyz=object_turn.as_quat(canonical=True, scalar_first=True).astype(np.float32),
         fps=FPS,
     )
 
 
-def _joints(sequence: _Sequence, frame: int, extrinsics: Mapping[str, np.ndarray]) -> np.ndarray:
+def _transform(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def _read_joints(sequence: _Sequence, frame: int, extrinsics: _Poses) -> np.ndarray:
     """[21, 3] hand joints in the world frame, from the first camera that has this frame's labels; NaN where there is no hand.
 
     DexYCB's joint order is this project's keypoint order. All cameras' labels come from one fit, so one camera is enough.
     """
     calibrated = [serial for serial in sequence.serials if serial in extrinsics]
-    for serial in calibrated:
-        path = sequence.folder / serial / f"labels_{frame:06d}.npz"
-        if path.is_file():
-            joints = _npz(path, ("joint_3d",))["joint_3d"]
-            _expect(sequence, f"{serial}/{path.name}: joint_3d", joints.shape, (1, 21, 3))
-            joints = joints[0].astype(float)
-            if (joints == -1).all():
-                return np.full((21, 3), np.nan)
-            T = extrinsics[serial]
-            return joints @ T[:3, :3].T + T[:3, 3]
     if not calibrated:
         raise DemoError(
             f"sequence {sequence.name}: no camera of meta.yml ({', '.join(sequence.serials)}) is in extrinsics_{sequence.extrinsics}; the"
             " calibration folder does not belong to these sequences. Download DexYCB's calibration archive again."
         )
+    for serial in calibrated:
+        path = sequence.folder / serial / f"labels_{frame:06d}.npz"
+        if path.is_file():
+            (joints,) = _read_npz(path, {"joint_3d": (1, 21, 3)})
+            if (joints == -1).all():
+                return np.full((21, 3), np.nan)
+            return _transform(extrinsics[serial], joints[0])
     raise DemoError(
         f"sequence {sequence.name}: no camera ({', '.join(calibrated)}) has labels_{frame:06d}.npz, but meta.yml says"
         f" {sequence.num_frames} frames. Unpack at least one camera's folder of this sequence completely."
     )
 
 
-def _meta(path: Path) -> _Sequence:
-    meta = _yaml(path)
-    missing = [key for key in _META if key not in meta]
-    if missing:
-        raise DemoError(f"{path} has no {', '.join(missing)}; it is not a DexYCB meta.yml.")
-    ids, index, frames, sides, serials = (
-        meta[key] for key in ("ycb_ids", "ycb_grasp_ind", "num_frames", "mano_sides", "serials")
-    )
-    for key, value, fits in (
-        ("ycb_ids", ids, isinstance(ids, list) and all(type(i) is int for i in ids)),
-        ("ycb_grasp_ind", index, type(index) is int),
-        ("num_frames", frames, type(frames) is int and 0 < frames <= _MAX_FRAMES),
-        ("mano_sides", sides, isinstance(sides, list) and all(isinstance(side, str) for side in sides)),
-        (
-            "serials",
-            serials,
-            isinstance(serials, list) and all(isinstance(s, str | int) and is_plain(str(s)) for s in serials),
-        ),
-        ("extrinsics", meta["extrinsics"], isinstance(meta["extrinsics"], str | int)),
-    ):
-        if not fits:
-            raise DemoError(f"{path}: {key} is {shown(value)}, which is no value of DexYCB's.")
-    if not 0 <= index < len(ids):
-        raise DemoError(f"{path}: ycb_grasp_ind is {index}, but there are {len(ids)} objects in ycb_ids.")
+def _read_meta(path: Path) -> _Sequence:
+    meta = _read_yaml(path)
+
+    def value(key: str, fits: Callable[[Any], bool], expected: str) -> Any:
+        if key not in meta:
+            raise DemoError(f"{path} has no {key}. Is it a DexYCB meta.yml?")
+        if not fits(meta[key]):
+            raise DemoError(f"{path}: {key} is {shown(meta[key])}, expected {expected}.")
+        return meta[key]
+
+    ids = value("ycb_ids", lambda x: isinstance(x, list) and all(type(i) is int for i in x), "a list of numbers")
+    index = value("ycb_grasp_ind", lambda x: type(x) is int and 0 <= x < len(ids), f"0 to {len(ids) - 1}")
+    frames = value("num_frames", lambda x: type(x) is int and 0 < x <= _MAX_FRAMES, f"1 to {_MAX_FRAMES}")
+    (side,) = value("mano_sides", lambda x: x in (["right"], ["left"]), "one of right and left")
+    serials = value("serials", lambda x: isinstance(x, list) and all(map(_is_name, x)), "a list of cameras")
+    extrinsics = value("extrinsics", lambda x: isinstance(x, str | int), "the name of a calibration")
     if ids[index] not in NAME_OF_ID:
-        raise DemoError(
-            f"{path}: the grasped object has YCB id {ids[index]}; DexYCB's ids go from 1 to {len(NAME_OF_ID)}."
-        )
-    if len(sides) != 1 or sides[0] not in SIDES:
-        raise DemoError(f"{path}: mano_sides is {shown(sides)}, expected one of right and left.")
+        raise DemoError(f"{path}: the grasped object has YCB id {ids[index]}, expected 1 to {len(NAME_OF_ID)}.")
     return _Sequence(
         folder=path.parent,
-        extrinsics=str(meta["extrinsics"]),
-        side=sides[0],
+        extrinsics=str(extrinsics),
+        side=side,
         object_name=NAME_OF_ID[ids[index]],
         object_index=index,
         num_objects=len(ids),
@@ -215,23 +192,27 @@ def _meta(path: Path) -> _Sequence:
     )
 
 
-def _extrinsics(root: Path, name: str) -> dict[str, np.ndarray]:
-    """Camera serial, or ``apriltag`` -> pose [4, 4] in the world frame."""
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str | int) and is_plain(str(value))
+
+
+def _read_extrinsics(root: Path, name: str) -> _Poses:
     path = root / "calibration" / f"extrinsics_{name}" / "extrinsics.yml"
-    entries = _yaml(path).get("extrinsics")
+    entries = _read_yaml(path).get("extrinsics")
     if not isinstance(entries, dict) or "apriltag" not in entries:
         raise DemoError(f"{path} has no pose 'apriltag' under 'extrinsics': without it the table frame is unknown.")
     poses = {}
     for key, values in entries.items():
         numbers = isinstance(values, list | tuple) and all(type(x) in (int, float) and abs(x) < 1e6 for x in values)
         if not numbers or len(values) != 12:
-            found = f"{len(values)} numbers" if numbers else shown(values)
-            raise DemoError(f"{path}: the pose {shown(key)} has {found}, expected the 12 numbers of a 3x4 matrix.")
+            raise DemoError(
+                f"{path}: the pose {shown(key)} is {shown(values)}, expected the 12 numbers of a 3x4 matrix."
+            )
         T = np.eye(4)
         T[:3] = np.asarray(values, dtype=float).reshape(3, 4)
         if not is_rigid(T):
             raise DemoError(
-                f"{path}: the pose {shown(key)} is no rotation and translation: it is scaled, mirrored or damaged."
+                f"{path}: the pose {shown(key)} is not a rotation and translation: it is scaled, mirrored or damaged."
             )
         poses[str(key)] = T
     return poses
@@ -241,20 +222,16 @@ class _Loader(yaml.SafeLoader):
     """Plain YAML and ``!!python/tuple``, which DexYCB's calibration uses; every other tag is refused."""
 
 
-def _tuple(loader: yaml.SafeLoader, node: Any) -> tuple[Any, ...]:
-    return tuple(loader.construct_sequence(node))
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _Loader.construct_sequence)
 
 
-_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _tuple)
-
-
-def _yaml(path: Path) -> dict[str, Any]:
+def _read_yaml(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise DemoError(
-            f"there is no {path}; the DexYCB folder is incomplete. Unpack its calibration archive beside the subjects' folders."
+            f"There is no {path}; the DexYCB folder is incomplete. Unpack its calibration archive next to the subjects' folders."
         )
     try:
-        if path.stat().st_size > 1 << 20:
+        if path.stat().st_size > _MAX_YAML_BYTES:
             raise ValueError("it has more than a megabyte")
         data = yaml.load(path.read_text(), Loader=_Loader)
     except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
@@ -264,17 +241,17 @@ def _yaml(path: Path) -> dict[str, Any]:
     return data
 
 
-def _npz(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+def _read_npz(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> list[np.ndarray]:
+    """Return arrays of these names and shapes, as floats."""
     if not path.is_file():
-        raise DemoError(f"there is no {path}; the sequence is incomplete. Unpack it again.")
+        raise DemoError(f"There is no {path}; the sequence is incomplete. Unpack it again.")
     try:
-        return read_arrays(path, names)
+        arrays = read_arrays(path, tuple(shapes))
     except FileFormatError as error:
         raise DemoError(f"{error} It is damaged or not DexYCB's; unpack it again.") from error
-
-
-def _expect(sequence: _Sequence, what: str, found: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    if found != expected:
-        raise DemoError(
-            f"sequence {sequence.name}: {what} has shape {found}, but meta.yml asks for {expected}. Is a file of another sequence there?"
-        )
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            raise DemoError(
+                f"{path}: {name} has shape {arrays[name].shape}, but meta.yml asks for {shape}. Is it a file of another sequence?"
+            )
+    return [arrays[name].astype(float) for name in shapes]

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-PARENTS = np.array([0 if k % 4 == 1 else k - 1 for k in range(1, 21)])
-"""[20] the keypoint before each of those beyond the wrist: with it, it makes a bone."""
+PARENTS = np.array([0, 1, 2, 3, 0, 5, 6, 7, 0, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19])
+"""[20] the keypoint before each of the keypoints 1 to 20: the other end of its bone."""
 FINGER_BASES = np.array([[-90, -4, 22], [-95, -2, 0], [-87, -4, -21], [-77, -9, -40]]) * 1e-3
 """[4, 3] the knuckles of index, middle, ring and little finger [m]."""
 FINGER_LENGTHS = np.array([[38, 23, 23], [42, 26, 24], [38, 25, 24], [29, 19, 21]]) * 1e-3
@@ -23,52 +23,51 @@ THUMB_LENGTHS = np.array([42, 33, 30]) * 1e-3
 DIP_PER_PIP = 0.6
 """Flexion of a finger's last joint per flexion of its middle joint: one tendon bends both."""
 
-FINGER_JOINTS = tuple(
-    f"{finger}_{joint}" for finger in ("index", "middle", "ring", "little") for joint in ("abduction", "mcp", "pip")
-)
-THUMB_JOINTS = ("thumb_radial", "thumb_palmar", "thumb_twist", "thumb_mcp", "thumb_ip")
-JOINTS = FINGER_JOINTS + THUMB_JOINTS
-"""The 17 joint angles [rad] in the order of :func:`keypoints`; flexion is positive."""
-
+# The 17 joint angles [rad]; flexion is positive. Of each finger, index to little: abduction, base joint (MCP), middle joint (PIP).
+# Of the thumb: radial and palmar abduction, twist, MCP, IP.
 LOWER = np.array([-0.3, -0.2, 0.0] * 4 + [-0.3, 0.1, -0.2, 0.0, -0.1])
 UPPER = np.array([0.3, 1.5, 1.75] * 4 + [1.0, 1.1, 1.0, 0.9, 1.2])
 """[17] limits of the joint angles [rad]."""
 RELAXED = np.array([0.0, 0.35, 0.45] * 4 + [0.4, 0.6, 0.3, 0.25, 0.25])
-"""[17] a hand at ease."""
+"""[17] joint angles of a hand at ease [rad]."""
 
 
 def keypoints(angles: np.ndarray, side: str = "right") -> np.ndarray:
     """[..., 21, 3] keypoints in the hand's frame for joint angles [..., 17]."""
     angles = np.asarray(angles, dtype=float)
-    fingers = angles[..., :12].reshape(*angles.shape[:-1], 4, 3)
-    turn = fingers[..., 0] + FINGER_SPLAY
-    flexion = np.stack(
-        (fingers[..., 1], fingers[..., 1] + fingers[..., 2], fingers[..., 1] + (1 + DIP_PER_PIP) * fingers[..., 2]),
-        axis=-1,
-    )
-    cos, sin = np.cos(flexion), np.sin(flexion)
-    bones = (
-        np.stack((-cos * np.cos(turn)[..., None], -sin, cos * np.sin(turn)[..., None]), axis=-1)
-        * FINGER_LENGTHS[..., None]
-    )
-    finger_points = FINGER_BASES[:, None] + np.concatenate(
-        (np.zeros_like(bones[..., :1, :]), np.cumsum(bones, axis=-2)), axis=-2
-    )
+    wrist = np.zeros((*angles.shape[:-1], 1, 3))
+    fingers = _fingers(angles[..., :12]).reshape(*angles.shape[:-1], 16, 3)
+    points = np.concatenate((wrist, _thumb(angles[..., 12:]), fingers), axis=-2)
+    return points * (-1.0, 1.0, 1.0) if side == "left" else points
 
-    radial, palmar, twist, mcp, ip = np.moveaxis(angles[..., 12:], -1, 0)
+
+def _fingers(angles: np.ndarray) -> np.ndarray:
+    """[..., 4, 4, 3] points of the four fingers for their joint angles [..., 12]."""
+    abduction, mcp, pip = np.moveaxis(angles.reshape(*angles.shape[:-1], 4, 3), -1, 0)
+    turn = (abduction + FINGER_SPLAY)[..., None]
+    flexion = np.stack((mcp, mcp + pip, mcp + (1 + DIP_PER_PIP) * pip), axis=-1)
+    cos = np.cos(flexion)
+    directions = np.stack((-cos * np.cos(turn), -np.sin(flexion), cos * np.sin(turn)), axis=-1)
+    return _chain(FINGER_BASES[:, None], directions * FINGER_LENGTHS[..., None])
+
+
+def _thumb(angles: np.ndarray) -> np.ndarray:
+    """[..., 4, 3] points of the thumb for its joint angles [..., 5]."""
+    radial, palmar, twist, mcp, ip = np.moveaxis(angles, -1, 0)
+    zero = np.zeros_like(twist)
     first = np.stack((-np.cos(radial) * np.cos(palmar), -np.sin(palmar), np.sin(radial) * np.cos(palmar)), axis=-1)
-    bend = np.stack(
-        (np.zeros_like(twist), -np.sin(twist), -np.cos(twist)), axis=-1
-    )  # where the thumb's tip goes when it flexes
+    bend = np.stack((zero, -np.sin(twist), -np.cos(twist)), axis=-1)  # where the tip goes when the thumb flexes
     bend = bend - (bend * first).sum(axis=-1, keepdims=True) * first
     bend /= np.linalg.norm(bend, axis=-1, keepdims=True)
-    bent = np.stack((np.zeros_like(mcp), mcp, mcp + ip), axis=-1)[..., None]
-    bones = (np.cos(bent) * first[..., None, :] + np.sin(bent) * bend[..., None, :]) * THUMB_LENGTHS[:, None]
-    thumb_points = THUMB_BASE + np.concatenate((np.zeros_like(bones[..., :1, :]), np.cumsum(bones, axis=-2)), axis=-2)
+    flexion = np.stack((zero, mcp, mcp + ip), axis=-1)[..., None]
+    directions = np.cos(flexion) * first[..., None, :] + np.sin(flexion) * bend[..., None, :]
+    return _chain(THUMB_BASE, directions * THUMB_LENGTHS[:, None])
 
-    wrist = np.zeros((*angles.shape[:-1], 1, 3))
-    points = np.concatenate((wrist, thumb_points, finger_points.reshape(*angles.shape[:-1], 16, 3)), axis=-2)
-    return points * (-1.0, 1.0, 1.0) if side == "left" else points
+
+def _chain(base: np.ndarray, bones: np.ndarray) -> np.ndarray:
+    """[..., 4, 3] joints of a chain of three bones [..., 3, 3] from its base."""
+    start = np.zeros_like(bones[..., :1, :])
+    return base + np.concatenate((start, np.cumsum(bones, axis=-2)), axis=-2)
 
 
 def hand_axes(direction: np.ndarray, palm: np.ndarray, side: str = "right") -> np.ndarray:

@@ -3,13 +3,12 @@
     ROOT/train/SEQUENCE/meta/0000.pkl     handJoints3D (21, 3), objRot (3, 1) axis and angle, objTrans (3,), objName; metres
 
 Each frame's numbers are in the camera's frame with OpenGL's axes: x right, y up, the camera looks along -z. Joints are in MANO's order; all
-hands are right hands. What was not annotated is None. The files say neither the rate nor where the table is.
+hands are right hands. Values that were not annotated are None. The files state neither the rate nor the place of the table.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,8 @@ from xreset.errors import DemoError
 from xreset.text import shown
 
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
-"""To the axes of :class:`xreset.demos.Convention`'s cameras: x right, y down, z where it looks."""
+"""To the axes of the cameras of :class:`xreset.demos.keypoints.Convention`: x right, y down, z forward."""
+_SHAPES = {"handJoints3D": (21, 3), "objRot": (3,), "objTrans": (3,)}
 
 
 def read_ho3d(
@@ -33,110 +33,113 @@ def read_ho3d(
     cameras: str | Path,
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> Demos:
-    """Read the training sequences below an HO-3D folder whose camera's place is known.
+    """Read the training sequences below an HO-3D folder that have a camera pose.
 
     Args:
         root: the folder that holds ``train``.
         fps: frames per second; consecutive numbers are consecutive frames.
-        cameras: a file with the camera's pose in the table frame (:func:`xreset.demos.read_transform`; x right, y down, z where it looks)
-            for all sequences, or a folder with ``SEQUENCE.txt`` or ``.npy``; sequences without one are left out.
+        cameras: a file with the camera's pose in the table frame (:func:`xreset.demos.keypoints.read_transform`; x right, y down, z
+            forward) for all sequences, or a folder with ``SEQUENCE.txt`` or ``.npy``; sequences without one are omitted.
         progress: called with (sequences done, sequences in all, name) before each is read.
 
     Raises:
         DemoError: the folder is not in this layout, or a sequence contradicts itself.
     """
-    root, cameras = Path(root), Path(cameras)
-    folders = {path.parent.name: path for path in sorted((root / "train").glob("*/meta")) if path.is_dir()}
+    cameras = Path(cameras)
+    folders = [path for path in sorted(Path(root, "train").glob("*/meta")) if path.is_dir()]
     if not folders:
-        raise DemoError(f"there is no HO-3D sequence in {root}: expected train/SEQUENCE/meta/0000.pkl below it.")
-    places = {
-        name: [cameras / f"{name}.txt", cameras / f"{name}.npy"] if cameras.is_dir() else [cameras] for name in folders
-    }
-    poses = {
-        name: next(path for path in paths if path.is_file())
-        for name, paths in places.items()
-        if any(map(Path.is_file, paths))
-    }
+        raise DemoError(f"There is no HO-3D sequence in {root}: expected train/SEQUENCE/meta/0000.pkl below it.")
+    poses = {}
+    for folder in folders:
+        name = folder.parent.name
+        for path in (cameras / f"{name}.txt", cameras / f"{name}.npy", cameras):
+            if path.is_file():
+                poses[folder] = read_transform(path)
+                break
     if not poses:
         raise DemoError(
-            f"{cameras} says of no sequence where its camera stands; expected {next(iter(folders))}.txt, or a file for all."
+            f"{cameras} contains no camera pose for any sequence. Give one file for all, or a folder with {folders[0].parent.name}.txt."
         )
     parts = []
-    for done, (name, place) in enumerate(poses.items()):
+    for done, (folder, pose) in enumerate(poses.items()):
+        name = folder.parent.name
         progress(done, len(poses), name)
         convention = Convention(
-            order="mano", units="m", frame="camera", table_from_camera=read_transform(place), fps=fps, side="right"
+            order="mano",
+            units="m",
+            frame="camera",
+            table_from_camera=pose,
+            fps=fps,
+            side="right",
+            subject=name.rstrip("0123456789"),
         )
-        parts.append(_sequence(folders[name], name, convention))
+        arrays = {"sequence": np.array(name), **_read_sequence(folder, fps)}
+        parts.append(sequence_of(arrays, str(folder), convention))
     return concatenate(parts)
 
 
-@dataclass(frozen=True)
-class _Frame:
-    number: int
-    joints: np.ndarray
-    """[21, 3] NaN if not annotated."""
-    pose: np.ndarray | None
-    """[4, 4]"""
-    name: str
-
-
-def _sequence(folder: Path, name: str, convention: Convention) -> Demos:
-    frames = [_frame(path) for path in sorted(folder.glob("*.pkl"))]
-    known = [i for i, frame in enumerate(frames) if frame.pose is not None]
+def _read_sequence(folder: Path, fps: float) -> dict[str, np.ndarray]:
+    """Return the arrays of a sequence (see :func:`xreset.demos.keypoints.sequence_of`), from its first to its last known object pose."""
+    frames = {}
+    for path in sorted(folder.glob("*.pkl")):
+        if not (path.stem.isdecimal() and len(path.stem) < 10):
+            raise DemoError(f"{path} is not named by a frame's number, such as 0000.pkl.")
+        frames[int(path.stem)] = _read_frame(path)
+    known = [number for number, frame in frames.items() if frame["pose"] is not None]
     if not known:
         raise DemoError(f"{folder} has no frame with an object's pose (objRot and objTrans).")
-    frames = frames[known[0] : known[-1] + 1]
-    if missing := [frame.number for frame in frames if frame.pose is None]:
+    frames = {number: frame for number, frame in frames.items() if known[0] <= number <= known[-1]}
+    missing = sorted(set(frames) - set(known))
+    if missing:
         raise DemoError(
-            f"{folder}: the object's pose is not known in {len(missing)} frames amid others, first in {missing[0]:04d}.pkl."
+            f"{folder}: the object's pose is unknown in {len(missing)} frames between others, first in {missing[0]:04d}.pkl."
         )
-    if len(names := {frame.name for frame in frames}) > 1:
-        raise DemoError(f"{folder}: the object changes within the sequence: {shown(sorted(names))}.")
-    numbers = np.array([frame.number for frame in frames])
+    names = sorted({frame["name"] for frame in frames.values()})
+    if len(names) > 1:
+        raise DemoError(f"{folder}: the object changes within the sequence: {shown(names)}.")
     arrays = {
-        "sequence": np.array(name),
-        "object": np.array(frames[0].name),
-        "keypoints": np.stack([frame.joints for frame in frames]),
-        "object_pose": np.stack([frame.pose for frame in frames if frame.pose is not None]),
+        "object": np.array(names[0]),
+        "keypoints": np.stack([frame["joints"] for frame in frames.values()]),
+        "object_pose": np.stack([frame["pose"] for frame in frames.values()]),
     }
-    if (np.diff(numbers) > 1).any():  # frames that were left out are interpolated
-        assert convention.fps is not None
-        arrays["time"] = (numbers - numbers[0]) / convention.fps
-    return sequence_of(arrays, str(folder), replace(convention, subject=name.rstrip("0123456789")))
+    numbers = np.array(list(frames))
+    if (np.diff(numbers) > 1).any():  # missing frames are interpolated
+        arrays["time"] = (numbers - numbers[0]) / fps
+    return arrays
 
 
-def _frame(path: Path) -> _Frame:
-    if not path.stem.isdecimal():
-        raise DemoError(f"{path} is not named by a frame's number, such as 0000.pkl.")
+def _read_frame(path: Path) -> dict[str, Any]:
+    """Return joints [21, 3] (NaN if unknown), object pose [4, 4] (None if unknown) and object name."""
     data = read_pickle(path)
-    if lacking := sorted({"handJoints3D", "objRot", "objTrans", "objName"} - set(data)):
+    lacking = sorted({*_SHAPES, "objName"} - set(data))
+    if lacking:
         raise DemoError(
-            f"{path} lacks {', '.join(lacking)}; is it an annotation of HO-3D? It has {shown(sorted(data))}."
+            f"{path} lacks {', '.join(lacking)}; it has {shown(sorted(data))}. Is it an annotation of HO-3D?"
         )
-    joints = _numbers(path, data, "handJoints3D", (21, 3))
-    rotation, position = _numbers(path, data, "objRot", (3,)), _numbers(path, data, "objTrans", (3,))
+    if not isinstance(data["objName"], str):
+        raise DemoError(f"{path}: objName is {shown(data['objName'])}, expected a text.")
+    joints, rotation, position = (_numbers(path, data, name) for name in _SHAPES)
     pose = None
     if rotation is not None and position is not None:
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = _FROM_OPENGL @ Rotation.from_rotvec(rotation).as_matrix(), _FROM_OPENGL @ position
+        pose[:3, :3] = _FROM_OPENGL @ Rotation.from_rotvec(rotation).as_matrix()
+        pose[:3, 3] = _FROM_OPENGL @ position
     points = np.full((21, 3), np.nan) if joints is None else joints @ _FROM_OPENGL
-    return _Frame(int(path.stem), points, pose, str(data["objName"]))
+    return {"joints": points, "pose": pose, "name": data["objName"]}
 
 
-def _numbers(path: Path, data: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray | None:
+def _numbers(path: Path, data: Mapping[str, Any], name: str) -> np.ndarray | None:
     value = data[name]
+    shape = _SHAPES[name]
     if value is None:
         return None
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fi":
         raise DemoError(f"{path}: {name} is {shown(value)}, expected numbers {list(shape)}.")
     if value.size != np.prod(shape) or (value.ndim > 1 and value.shape[0] != shape[0]):
-        evaluation = (
-            " The evaluation split gives the wrist alone: use train."
-            if name == "handJoints3D" and value.size == 3
-            else ""
-        )
-        raise DemoError(f"{path}: {name} has shape {list(value.shape)}, expected {list(shape)}.{evaluation}")
+        hint = ""
+        if name == "handJoints3D" and value.size == 3:
+            hint = " The evaluation split gives the wrist alone. Use the split train."
+        raise DemoError(f"{path}: {name} has shape {list(value.shape)}, expected {list(shape)}.{hint}")
     if not np.isfinite(value).all():
         raise DemoError(f"{path}: {name} holds numbers that are not finite.")
     return value.astype(float).reshape(shape)

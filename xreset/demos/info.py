@@ -1,4 +1,4 @@
-"""What demonstrations contain, object by object."""
+"""Summary of demonstrations, object by object."""
 
 from __future__ import annotations
 
@@ -29,29 +29,33 @@ class ObjectSummary:
     """From start to goal orientation [rad]."""
 
 
-def summarize(demos: Demos) -> list[ObjectSummary]:
-    """One summary per object, in order of name."""
+def start_to_goal(demos: Demos) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distance [S] in metres and the angle [S] in radians from each object's first to its last pose."""
     start_pos, start_quat = demos.start_pose
     goal_pos, goal_quat = demos.goal_pose
-    lift = np.array([demos.object_pos[demos.frames(i), 2].max() for i in range(demos.num_sequences)]) - start_pos[:, 2]
-    distance = np.linalg.norm(goal_pos - start_pos, axis=1)
     turn = Rotation.from_quat(goal_quat, scalar_first=True) * Rotation.from_quat(start_quat, scalar_first=True).inv()
-    angle = turn.magnitude()
+    return np.linalg.norm(goal_pos - start_pos, axis=1), turn.magnitude()
+
+
+def summarize(demos: Demos) -> list[ObjectSummary]:
+    """Return one summary per object, sorted by name."""
+    starts = demos.frame_offsets[:-1]
+    lift = np.maximum.reduceat(demos.object_pos[:, 2], starts) - demos.object_pos[starts, 2]
+    distance, angle = start_to_goal(demos)
     frames = np.diff(demos.frame_offsets)
-    hand_frames = np.add.reduceat(demos.hand_valid.astype(np.int64), demos.frame_offsets[:-1])
-    out = []
+    hand_frames = np.add.reduceat(demos.hand_valid.astype(np.int64), starts)
+    summaries = []
     for name in sorted(set(demos.object_name.tolist())):
         own = demos.object_name == name
-        out.append(
-            ObjectSummary(
-                object_name=name,
-                sequences=int(own.sum()),
-                right=int((demos.hand_side[own] == "right").sum()),
-                frames=int(frames[own].sum()),
-                hand_frames=int(hand_frames[own].sum()),
-                lift=float(np.median(lift[own])),
-                goal_distance=float(np.median(distance[own])),
-                goal_angle=float(np.median(angle[own])),
-            )
+        summary = ObjectSummary(
+            object_name=name,
+            sequences=int(own.sum()),
+            right=int((demos.hand_side[own] == "right").sum()),
+            frames=int(frames[own].sum()),
+            hand_frames=int(hand_frames[own].sum()),
+            lift=float(np.median(lift[own])),
+            goal_distance=float(np.median(distance[own])),
+            goal_angle=float(np.median(angle[own])),
         )
-    return out
+        summaries.append(summary)
+    return summaries

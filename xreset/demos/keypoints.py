@@ -1,18 +1,20 @@
 """Reader of demonstrations of any tracker: 21 hand keypoints and the object's pose, frame by frame, as npz, CSV or a folder of either.
 
-What the numbers mean (order of the keypoints, unit, frame, quaternions, rate, hand, object) must be in the file or be said: it is never
-guessed. Where the numbers contradict what was said, the reader refuses and names the option that fits. ``docs/demonstrations.md`` has the
-layout of the files.
+The meaning of the numbers (order of the keypoints, unit, frame, quaternions, rate, hand, object) must be in the file or be given: it is
+never guessed. If the numbers contradict what was given, the reader refuses and names the option that fits. ``docs/demonstrations.md``
+has the layout of the files.
 """
 
 from __future__ import annotations
 
 import csv
 import logging
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -22,6 +24,7 @@ from xreset.demos import hand
 from xreset.demos.archive import SIDES, Demos, concatenate
 from xreset.errors import DemoError
 from xreset.files import max_bytes
+from xreset.objects.catalogue import official_name
 from xreset.records import RATE, UNIT_TOLERANCE, Field, read_npz
 from xreset.text import is_plain, shown
 
@@ -29,29 +32,39 @@ Order = Literal["mano", "mediapipe", "openpose"]
 Unit = Literal["m", "mm"]
 Frame = Literal["table", "camera"]
 Quaternion = Literal["wxyz", "xyzw"]
+Motion = tuple[np.ndarray, np.ndarray, Rotation]
+"""Keypoints [F, 21, 3], object positions [F, 3] and F object orientations."""
 
 ORDERS: Mapping[Order, tuple[int, ...]] = {
     "mano": (0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20),
     "mediapipe": tuple(range(21)),
     "openpose": tuple(range(21)),
 }
-"""Where each of :data:`xreset.spec.KEYPOINTS` stands in the order of others. MANO: the 16 joints of the model (wrist, index, middle,
-little, ring, thumb, base to end), then the tips of thumb, index, middle, ring and little finger (Romero et al. 2017; HO3D's order too)."""
+"""Index of each of :data:`xreset.spec.KEYPOINTS` in another order. MANO: the 16 joints of the model (wrist, index, middle, little, ring,
+thumb, base to end), then the tips of thumb, index, middle, ring and little finger (Romero et al. 2017; HO-3D's order too)."""
 
-_KNUCKLES = np.array([0, 5, 9, 13, 17])
-_PALM = (0.06, 0.14)
-"""[m] Range of distances from the wrist to the middle finger's knuckle: 0.09 to 0.10 in DexYCB, with room for children and for trackers."""
+MAX_FRAMES = 1_000_000
+"""Most frames that a sequence may be resampled to: nine hours at 30 per second."""
+
+_KNUCKLES = [0, 5, 9, 13, 17]
+_PALM = (60.0, 140.0)
+"""Range of distances from the wrist to the middle finger's knuckle [mm]: 90 to 100 in DexYCB, with room for children and trackers."""
 _ORDER_RATIO = 1.1
-"""A hand read in a wrong order has bones at least so much longer in sum: 1.29 (MANO's read as MediaPipe's) and 1.50 at the median."""
+"""A hand in a wrong order has longer bones by at least this factor: 1.29 (MANO's read as MediaPipe's) and 1.50 at the median."""
 _BONE_SPREAD = 0.3
 """Largest relative standard deviation of a bone's length over a sequence; a tracker's noise is below, image coordinates are above."""
 _CURL = 0.015
-"""[m] Fingers that bend so far to the back of the hand, at the median of a sequence, are those of the other hand."""
+"""Fingers that bend this far to the back of the hand, at the median of a sequence, are those of the other hand [m]."""
+_CENTERED = 0.05
+"""Keypoints whose mean is always this close to the origin are relative to the hand [m]."""
 _START = (-0.1, 0.7)
-"""[m] Range of heights at which an object's origin may start above the table."""
+"""Range of heights at which an object's origin may start above the table [m]."""
 _UNEVEN = 0.1
-"""Largest deviation of a time step from the median one, as a share of it, for the frames to count as evenly spaced."""
+"""Largest relative deviation of a time step from the median one for frames that count as evenly spaced."""
+_MATRIX_BYTES = 1 << 16
+"""Largest file of a matrix of 4 x 4 numbers."""
 
+_TEXTS = ("sequence", "object", "side", "subject")
 _FILE = {
     "keypoints": Field(("F", 21, 3), "fi", within=None),
     "object_pose": Field(("F", 4, 4), "fi", required=False),
@@ -61,50 +74,42 @@ _FILE = {
     "object_quat_xyzw": Field(("F", 4), "fi", required=False),
     "time": Field(("F",), "fi", required=False),
     "fps": Field((), "fi", required=False, within=RATE),
-    "sequence": Field((), "U", required=False),
-    "object": Field((), "U", required=False),
-    "side": Field((), "U", required=False),
-    "subject": Field((), "U", required=False),
-}
-"""A sequence of F frames. Keypoints are NaN where the hand was not seen; ``time`` [s]."""
+} | {name: Field((), "U", required=False) for name in _TEXTS}
+"""Arrays of a sequence of F frames. Keypoints are NaN where the hand was not seen; ``time`` [s]."""
 
-_TEXTS = ("sequence", "object", "side", "subject")
 _COLUMNS = {
-    "keypoints": tuple(f"{axis}{k}" for k in range(21) for axis in "xyz"),
-    "object_pose": tuple(f"object_{row}{column}" for row in range(3) for column in range(4)),
-    "object_pos": ("object_x", "object_y", "object_z"),
-    "object_quat": tuple(f"object_q{i}" for i in range(4)),
-    "object_quat_wxyz": tuple(f"object_q{axis}" for axis in "wxyz"),
-    "time": ("time",),
+    "keypoints": [f"{'xyz'[axis]}{k}" for k, axis in np.ndindex(21, 3)],
+    "object_pose": [f"object_{row}{column}" for row, column in np.ndindex(3, 4)],
+    "object_pos": ["object_x", "object_y", "object_z"],
+    "object_quat": ["object_q0", "object_q1", "object_q2", "object_q3"],
+    "object_quat_wxyz": ["object_qw", "object_qx", "object_qy", "object_qz"],
+    "time": ["time"],
 }
+"""Columns of a CSV that hold the numbers of an array, row by row of the array."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Convention:
-    """What the numbers of a tracker mean; None: as the file says, or refuse."""
+    """Meaning of a tracker's numbers; None: as the file says, or refuse."""
 
     order: Order | None = None
     """Order of the 21 keypoints."""
     units: Unit | None = None
-    """Of keypoints and object positions."""
+    """Unit of keypoints and object positions."""
     frame: Frame | None = None
-    """``table``: z up, table top at z = 0. ``camera``: of a camera that does not move."""
+    """``table``: z up, table top at z = 0. ``camera``: the frame of a camera that does not move."""
     table_from_camera: np.ndarray | None = None
     """[4, 4] pose of the camera in the table frame [m]; with ``frame="camera"``."""
     quat: Quaternion | None = None
     """Order of the object's quaternions, where their names do not say it."""
     fps: float | None = None
-    """Frames per second of a file without times; or what files with times are resampled to."""
+    """Frames per second of a file without times; files with times are resampled to it."""
     object_name: str | None = None
     """The grasped object."""
     side: Literal["right", "left"] | None = None
     """The hand."""
     subject: str = "unknown"
-    """Who demonstrated."""
-
-
-_MATRIX_BYTES = 1 << 16
-"""Largest file of a matrix of 4 x 4 numbers."""
+    """The demonstrating person."""
 
 
 def read_keypoints(
@@ -123,30 +128,33 @@ def read_keypoints(
         to an average hand: 3.6 degrees from MANO's at most, on DexYCB.
 
     Raises:
-        DemoError: something about the numbers is not known or contradicts itself; the message names the option that says it.
+        DemoError: something about the numbers is unknown or contradicts itself; the message names the option that states it.
         FileFormatError: an npz file is damaged or does not have the arrays.
     """
-    path, convention = Path(path), convention or Convention()
-    _must_be_known(convention)
+    path = Path(path)
+    convention = convention or Convention()
+    _check_convention(convention)
+    folder = path.parent
+    files = [path]
     if path.is_dir():
-        files = sorted(file for file in path.rglob("*") if file.suffix in (".npz", ".csv") and file.is_file())
-        names = [file.relative_to(path).with_suffix("").as_posix() for file in files]
+        folder = path
+        files = [file for file in sorted(path.rglob("*")) if file.suffix in (".npz", ".csv") and file.is_file()]
         if not files:
             raise DemoError(
-                f"there is no .npz and no .csv file below {path}; give a folder with one file for each sequence."
+                f"There is no .npz and no .csv file below {path}. Give a folder with a file for each sequence."
             )
-    else:
-        files, names = [path], [path.stem]
     parts = []
-    for done, (file, name) in enumerate(zip(files, names, strict=True)):
+    for done, file in enumerate(files):
+        name = file.relative_to(folder).with_suffix("").as_posix()
         progress(done, len(files), name)
         sequences = _read_csv(file, name) if file.suffix == ".csv" else [_read_npz(file, name)]
-        parts += [sequence_of(arrays, f"{file}, sequence {arrays['sequence']}", convention) for arrays in sequences]
+        for arrays in sequences:
+            parts.append(sequence_of(arrays, f"{file}, sequence {arrays['sequence']}", convention))
     return concatenate(parts)
 
 
 def read_transform(path: str | Path) -> np.ndarray:
-    """[4, 4] from a text file of four rows, or an npy file.
+    """Read a [4, 4] matrix from a text file of four rows, or an npy file.
 
     Raises:
         DemoError: it cannot be read, or is no rotation and translation in metres.
@@ -156,21 +164,21 @@ def read_transform(path: str | Path) -> np.ndarray:
         if path.stat().st_size > _MATRIX_BYTES:
             raise ValueError(f"it has {path.stat().st_size} bytes")
         T = np.load(path, mmap_mode="r", allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, ndmin=2)
-    except Exception as error:  # numpy's own parsers raise whatever they meet
-        problem = shown(str(error))
+    except Exception as error:  # numpy's parsers raise any kind of error
         raise DemoError(
-            f"{path} cannot be read as a matrix: {problem}. Write its four rows as four lines of four numbers."
+            f"{path} cannot be read as a matrix: {shown(str(error))}. Write its four rows as four lines of four numbers."
         ) from error
     if T.shape != (4, 4) or not is_rigid(T):
         raise DemoError(
-            f"{path} holds no 4x4 matrix of a rotation and a translation (last row 0 0 0 1), but {T.shape}: {shown(T.tolist())}."
+            f"{path} holds {T.shape} numbers {shown(T.tolist())}, expected the 4x4 matrix of a rotation and a translation,"
+            " with the last row 0 0 0 1."
         )
     if np.abs(T[:3, 3]).max() > 20:
         raise DemoError(f"{path} moves by {np.linalg.norm(T[:3, 3]):.0f} m. Its translation must be in metres.")
     return T.astype(float)
 
 
-def _must_be_known(convention: Convention) -> None:
+def _check_convention(convention: Convention) -> None:
     missing = []
     if convention.order is None:
         missing.append("the order of the keypoints: --order mano, mediapipe or openpose")
@@ -180,13 +188,13 @@ def _must_be_known(convention: Convention) -> None:
         missing.append("the frame of the coordinates: --coordinates table or camera")
     if convention.frame == "camera" and convention.table_from_camera is None:
         missing.append(
-            "where the camera stands: --table-from-camera FILE, its pose in the table frame (z up, table top at z = 0), 4x4, metres"
+            "the camera's pose: --table-from-camera FILE, in the table frame (z up, table top at z = 0), 4x4, metres"
         )
     if missing:
-        raise DemoError("the numbers alone do not tell\n  - " + "\n  - ".join(missing))
+        raise DemoError("The file does not state:\n  - " + "\n  - ".join(missing))
     if convention.frame == "table" and convention.table_from_camera is not None:
         raise DemoError(
-            "--table-from-camera was given, but --coordinates says that the coordinates are in the table frame already."
+            "--coordinates says that the coordinates are in the table frame already. Omit --table-from-camera."
         )
 
 
@@ -198,70 +206,86 @@ def _read_npz(path: Path, name: str) -> dict[str, np.ndarray]:
 
 
 def _read_csv(path: Path, name: str) -> list[dict[str, np.ndarray]]:
-    """The sequences of a table with one row for each frame, in their order; frames of one must stand together."""
+    """Read the sequences of a table with one row for each frame; the frames of a sequence stand together."""
     try:
         if path.stat().st_size > max_bytes():
-            raise DemoError(
-                f"{path} has {path.stat().st_size >> 20} MB; set XRESET_MAX_FILE_MB to read it, or split it."
-            )
+            raise DemoError(f"{path} has {path.stat().st_size >> 20} MB. Split it, or set XRESET_MAX_FILE_MB.")
         with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file, strict=True))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+            header, *lines = csv.reader(file, strict=True)
+    except (OSError, ValueError, csv.Error) as error:
         raise DemoError(f"{path} cannot be read as a CSV table: {error}.") from error
-    header = [cell.strip() for cell in rows[0]] if rows else []
-    if twice := sorted({column for column in header if header.count(column) > 1}):
-        raise DemoError(f"{path} has the columns {', '.join(twice)} more than once.")
-    at = {column: i for i, column in enumerate(header)}
-    fields = {field: columns for field, columns in _COLUMNS.items() if any(column in at for column in columns)}
-    for field, columns in {"keypoints": _COLUMNS["keypoints"], **fields}.items():
-        if missing := [column for column in columns if column not in at]:
-            raise DemoError(
-                f"{path} lacks the columns {shown(missing)} of {field}; the first line must name x0, y0, z0 to z20 and the object's pose"
-                " (docs/demonstrations.md). Found: " + shown(header)
-            )
-    known = {column for columns in fields.values() for column in columns} | {*_TEXTS, "frame"}
-    if unknown := sorted(set(header) - known):
-        logging.getLogger(__name__).warning("%s also has the columns %s, which are left aside.", path, shown(unknown))
-    body = [(number, row) for number, row in enumerate(rows[1:], start=2) if any(cell.strip() for cell in row)]
-    for number, row in body:
-        if len(row) != len(header):
-            raise DemoError(f"{path}, line {number}: {len(row)} cells, expected {len(header)} as in the first line.")
-    owners = [row[at["sequence"]].strip() if "sequence" in at else name for _, row in body]
-    starts = [i for i, owner in enumerate(owners) if i == 0 or owner != owners[i - 1]]
-    if not starts:
+    header = [cell.strip() for cell in header]
+    fields = _fields_of(header, path)
+    rows = []
+    for number, cells in enumerate(lines, start=2):
+        if not any(cell.strip() for cell in cells):
+            continue
+        if len(cells) != len(header):
+            raise DemoError(f"{path}, line {number}: {len(cells)} cells, expected {len(header)} as in the first line.")
+        row = dict(zip(header, map(str.strip, cells), strict=True))
+        rows.append({"sequence": name, **row, "line": number})
+    if not rows:
         raise DemoError(f"{path} has no line after the names of its columns.")
     sequences = []
-    for begin, end in zip(starts, [*starts[1:], len(body)], strict=True):
-        part = body[begin:end]
-        arrays: dict[str, np.ndarray] = {"sequence": np.array(owners[begin])}
-        for text in set(_TEXTS[1:]) & set(at):
-            values = {row[at[text]].strip() for _, row in part}
-            if len(values) > 1:
-                raise DemoError(
-                    f"{path}, sequence {owners[begin]}: the column {text} changes within it: {shown(sorted(values))}."
-                )
-            arrays[text] = np.array(values.pop())
-        for field, columns in fields.items():
-            arrays[field] = np.array(
-                [[_number(row[at[column]], path, number, column) for column in columns] for number, row in part]
-            )
-        arrays["keypoints"] = arrays["keypoints"].reshape(-1, 21, 3)
-        if "time" in arrays:
-            arrays["time"] = arrays["time"][:, 0]
-        if "object_pose" in arrays:
-            arrays["object_pose"] = np.concatenate(
-                (arrays["object_pose"].reshape(-1, 3, 4), np.broadcast_to([0.0, 0, 0, 1], (len(part), 1, 4))), axis=1
-            )
-        sequences.append(arrays)
+    for sequence, part in groupby(rows, key=lambda row: row["sequence"]):
+        try:
+            sequences.append(_arrays_of(list(part), fields))
+        except DemoError as error:
+            raise DemoError(f"{path}, sequence {sequence}, {error}") from None
     return sequences
 
 
-def _number(cell: str, path: Path, line: int, column: str) -> float:
+def _fields_of(header: Sequence[str], path: Path) -> list[str]:
+    """Return the arrays that the columns hold."""
+    twice = sorted(column for column, count in Counter(header).items() if count > 1)
+    if twice:
+        raise DemoError(f"{path} has columns more than once: {shown(twice)}. Rename them.")
+    known = {*_TEXTS, "frame"}
+    fields = []
+    for field, columns in _COLUMNS.items():
+        missing = sorted(set(columns) - set(header))
+        if missing and (field == "keypoints" or len(missing) < len(columns)):
+            raise DemoError(
+                f"{path} lacks the columns {shown(missing)} of {field}. The first line must name x0, y0, z0 to z20 and the object's"
+                f" pose (docs/demonstrations.md). Found: {shown(header)}"
+            )
+        if not missing:
+            fields.append(field)
+            known.update(columns)
+    unknown = sorted(set(header) - known)
+    if unknown:
+        logging.getLogger(__name__).warning("%s also has the columns %s, which are ignored.", path, shown(unknown))
+    return fields
+
+
+def _arrays_of(rows: Sequence[Mapping[str, Any]], fields: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the arrays of one sequence, as an npz would hold them."""
+    arrays = {}
+    for text in _TEXTS:
+        values = sorted({row[text] for row in rows if text in row})
+        if len(values) > 1:
+            raise DemoError(f"the column {text} changes: {shown(values)}. Give each sequence its own name.")
+        if values:
+            arrays[text] = np.array(values[0])
+    for field in fields:
+        numbers: list[float] = []
+        for row in rows:
+            numbers.extend(_number(row, column) for column in _COLUMNS[field])
+        shape = (3, 4) if field == "object_pose" else _FILE[field].shape[1:]
+        arrays[field] = np.array(numbers).reshape(-1, *shape)
+    if "object_pose" in arrays:
+        last_row = np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 1))
+        arrays["object_pose"] = np.concatenate((arrays["object_pose"], last_row), axis=1)
+    return arrays
+
+
+def _number(row: Mapping[str, Any], column: str) -> float:
+    cell = row[column]
     try:
-        return float(cell) if cell.strip() else np.nan
+        return float(cell) if cell else np.nan
     except ValueError:
         raise DemoError(
-            f"{path}, line {line}, column {column}: {shown(cell)} is no number; leave a cell empty if it is not known."
+            f"line {row['line']}, column {column}: {shown(cell)} is not a number. Leave a cell empty if it is unknown."
         ) from None
 
 
@@ -269,38 +293,49 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
 
 
 def sequence_of(arrays: Mapping[str, np.ndarray], what: str, convention: Convention) -> Demos:
-    """One sequence from the arrays of a file; see :func:`read_keypoints`, whose errors it raises. ``what`` names it in them."""
+    """Return one sequence from the arrays of a file; see :func:`read_keypoints` for errors, in which ``what`` names the sequence."""
+    try:
+        return _sequence(arrays, convention)
+    except DemoError as error:
+        raise DemoError(f"{what}: {error}") from None
+
+
+def _sequence(arrays: Mapping[str, np.ndarray], convention: Convention) -> Demos:
     assert convention.order is not None
     scale = 1e-3 if convention.units == "mm" else 1.0
     points = np.asarray(arrays["keypoints"], dtype=float) * scale
     valid = np.isfinite(points).all(axis=(1, 2))
     if not valid.any():
-        raise DemoError(f"{what}: no frame has all 21 keypoints.")
-    side = _said(what, "side", arrays, convention.side)
+        raise DemoError("no frame has all 21 keypoints.")
+    side = _text(arrays, "side", convention.side)
     if side not in SIDES:
-        raise DemoError(f"{what}: the side is {shown(side)}, expected right or left.")
-    _check_hand(points[valid], what, convention, side)
+        raise DemoError(f"the side is {shown(side)}, expected right or left.")
+    for problem in _hand_problems(points[valid], convention, side):
+        raise DemoError(problem)
+    points[~valid] = np.nan
     points = points[:, ORDERS[convention.order]]
-    pos, turn = _object(arrays, what, convention, scale)
+    pos, turn = _object_pose(arrays, convention)
+    pos = pos * scale
     if convention.table_from_camera is not None:
-        T = convention.table_from_camera
-        points, pos = points @ T[:3, :3].T + T[:3, 3], pos @ T[:3, :3].T + T[:3, 3]
-        turn = Rotation.from_matrix(T[:3, :3]) * turn
+        R = convention.table_from_camera[:3, :3]
+        camera = convention.table_from_camera[:3, 3]
+        points = points @ R.T + camera
+        pos = pos @ R.T + camera
+        turn = Rotation.from_matrix(R) * turn
     if not _START[0] <= pos[0, 2] <= _START[1]:
         raise DemoError(
-            f"{what}: the object starts at z = {pos[0, 2]:.3f} m, but it must start on a table whose top is at z = 0. Are these the"
+            f"the object starts at z = {pos[0, 2]:.3f} m, but it must start on a table whose top is at z = 0. Are these the"
             " camera's coordinates (--coordinates camera --table-from-camera FILE), or is that matrix the inverse of what it should be?"
         )
-    points[~valid] = np.nan
-    fps, (points, pos, turn) = _evenly(arrays, what, convention, points, pos, turn)
+    fps, (points, pos, turn) = _evenly(arrays, convention, (points, pos, turn))
     valid = np.asarray(np.isfinite(points).all(axis=(1, 2)))
     wrist = np.full((len(points), 4), np.nan)
     if valid.any():
         wrist[valid] = _wrist(points[valid], side).as_quat(canonical=True, scalar_first=True)
     return Demos(
-        sequence_name=np.array([_plain(what, "sequence", str(arrays["sequence"]))]),
-        subject=np.array([_plain(what, "subject", str(arrays.get("subject", convention.subject)))]),
-        object_name=np.array([_said(what, "object", arrays, convention.object_name)]),
+        sequence_name=np.array([_text(arrays, "sequence", None)]),
+        subject=np.array([_text({"subject": np.array(convention.subject), **arrays}, "subject", None)]),
+        object_name=np.array([official_name(_text(arrays, "object", convention.object_name))]),
         hand_side=np.array([side]),
         frame_offsets=np.array([0, len(points)], dtype=np.int32),
         hand_keypoints=points.astype(np.float32),
@@ -312,151 +347,143 @@ def sequence_of(arrays: Mapping[str, np.ndarray], what: str, convention: Convent
     )
 
 
-def _said(what: str, field: str, arrays: Mapping[str, np.ndarray], option: str | None) -> str:
-    """A text of the file or of the command line, which must not contradict each other."""
-    if field not in arrays:
-        if option is None:
-            raise DemoError(f"{what}: the {field} is neither in the file nor given; say it with --{field}.")
-        return _plain(what, field, option)
-    found = str(arrays[field])
-    if option not in (None, found):
-        raise DemoError(f"{what}: the file says {field} {shown(found)}, but --{field} says {shown(option)}.")
-    return _plain(what, field, found)
-
-
-def _plain(what: str, field: str, text: str) -> str:
+def _text(arrays: Mapping[str, np.ndarray], field: str, option: str | None) -> str:
+    """Return a text of the file or of the command line, which must not contradict each other."""
+    if field not in arrays and option is None:
+        raise DemoError(f"the {field} is neither in the file nor given. Add --{field}.")
+    text = str(arrays[field]) if field in arrays else str(option)
+    if option not in (None, text):
+        raise DemoError(f"the file says {field} {shown(text)}, but --{field} says {shown(option)}. Omit the option.")
     if not text or not is_plain(text):
-        raise DemoError(f"{what}: the {field} is {shown(text)}, expected a name of printable characters.")
+        raise DemoError(f"the {field} is {shown(text)}, expected a name of printable characters.")
     return text
 
 
-def _check_hand(points: np.ndarray, what: str, convention: Convention, side: str) -> None:
-    """Refuse keypoints [F, 21, 3] in metres, in their own order, that contradict the convention."""
+def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Iterator[str]:
+    """Yield what in keypoints [F, 21, 3] in metres, in the file's order, contradicts the convention; the likeliest cause first."""
     assert convention.order is not None
-    palm = float(np.median(np.linalg.norm(points[:, ORDERS[convention.order][9]] - points[:, 0], axis=1)))
+    order = ORDERS[convention.order]
+    palm = 1e3 * float(np.median(np.linalg.norm(points[:, order[9]] - points[:, 0], axis=1)))
     if not _PALM[0] <= palm <= _PALM[1]:
-        other = {"m": ("mm", 1e-3), "mm": ("m", 1e3)}[convention.units or "m"]
-        fits = f" In --units {other[0]} it would." if _PALM[0] <= palm * other[1] <= _PALM[1] else ""
-        raise DemoError(
-            f"{what}: from the wrist to the middle finger's knuckle it is {1e3 * palm:.3g} mm; no hand measures other than"
-            f" {1e3 * _PALM[0]:.0f} to {1e3 * _PALM[1]:.0f} mm.{fits} Keypoints must be metric and in space, not those of an image."
+        unit = "mm" if convention.units == "m" else "m"
+        in_unit = palm / 1e3 if convention.units == "m" else palm * 1e3
+        fits = f" With --units {unit} it would." if _PALM[0] <= in_unit <= _PALM[1] else ""
+        yield (
+            f"from the wrist to the middle finger's knuckle it is {palm:.3g} mm, expected {_PALM[0]:.0f} to {_PALM[1]:.0f} mm.{fits}"
+            " Keypoints must be metric and in space, not those of an image."
         )
-    sums = {order: float(np.median(hand.bone_lengths(points[:, ORDERS[order]]).sum(axis=1))) for order in ORDERS}
-    best = min(sums, key=lambda order: sums[order])
-    if sums[convention.order] > _ORDER_RATIO * sums[best]:
-        raise DemoError(
-            f"{what}: in the order {convention.order} the bones of the hand are {sums[convention.order]:.2f} m long together, in the order"
-            f" {best} {sums[best]:.2f} m. Say --order {best}."
+    lengths = {name: np.median(hand.bone_lengths(points[:, ORDERS[name]]).sum(axis=1)) for name in ORDERS}
+    best = min(lengths, key=lambda name: lengths[name])
+    if lengths[convention.order] > _ORDER_RATIO * lengths[best]:
+        yield (
+            f"in the order {convention.order} the bones of the hand are {lengths[convention.order]:.2f} m long together, in the order"
+            f" {best} {lengths[best]:.2f} m. Use --order {best}."
         )
-    ordered = points[:, ORDERS[convention.order]]
-    lengths = hand.bone_lengths(ordered)
-    spread = float(np.median(lengths.std(axis=0) / lengths.mean(axis=0)))
+    points = points[:, order]
+    bones = hand.bone_lengths(points)
+    spread = np.median(bones.std(axis=0) / bones.mean(axis=0))
     if spread > _BONE_SPREAD:
-        raise DemoError(
-            f"{what}: the lengths of the hand's bones change by {spread:.0%} (standard deviation) in the course of the sequence; these are"
-            " no metric keypoints. MediaPipe's normalised landmarks, for one, are coordinates of the image."
+        yield (
+            f"the lengths of the hand's bones change by {spread:.0%} (standard deviation) during the sequence, so the keypoints are"
+            " not metric. MediaPipe's normalised landmarks, for example, are coordinates of the image."
         )
-    if len(points) > 1 and np.linalg.norm(ordered.mean(axis=1), axis=1).max() < 0.05:
-        raise DemoError(
-            f"{what}: the keypoints are centred on the hand in every frame, as MediaPipe's world landmarks are: they do not say where"
-            " the hand is. Add the hand's position in the camera's or the table's frame first."
+    if len(points) > 1 and np.linalg.norm(points.mean(axis=1), axis=1).max() < _CENTERED:
+        yield (
+            "the keypoints are centred on the hand in every frame, like MediaPipe's world landmarks, so the place of the hand is"
+            " unknown. Add the hand's position in the camera's or the table's frame first."
         )
-    palm_normal = np.cross(ordered[:, 5] - ordered[:, 0], ordered[:, 17] - ordered[:, 0]) * (
-        1 if side == "right" else -1
-    )
+    palm_normal = np.cross(points[:, 5] - points[:, 0], points[:, 17] - points[:, 0])
+    if side == "left":
+        palm_normal *= -1
     palm_normal /= np.linalg.norm(palm_normal, axis=1, keepdims=True)
-    bent = ordered[:, [8, 12, 16, 20]] - ordered[:, [5, 9, 13, 17]]
-    curl = float(np.median((bent * palm_normal[:, None]).sum(axis=-1)))
+    fingers = points[:, [8, 12, 16, 20]] - points[:, [5, 9, 13, 17]]
+    curl = np.median((fingers * palm_normal[:, None]).sum(axis=-1))
     if curl < -_CURL:
-        raise DemoError(
-            f"{what}: as a {side} hand its fingers bend {-1e3 * curl:.0f} mm towards the back of the hand. It is the other hand (--side)"
+        yield (
+            f"as a {side} hand its fingers bend {-1e3 * curl:.0f} mm towards the back of the hand. It is the other hand (--side)"
             " or the coordinates are left-handed, as Unity's are: negate one axis of keypoints and poses."
         )
 
 
-def _object(
-    arrays: Mapping[str, np.ndarray], what: str, convention: Convention, scale: float
-) -> tuple[np.ndarray, Rotation]:
-    """Position [F, 3] in metres and orientation of the object, still in the file's frame."""
-    given = [name for name in ("object_pose", "object_quat", "object_quat_wxyz", "object_quat_xyzw") if name in arrays]
-    if len(given) != 1 or ("object_pos" in arrays) != (given[0] != "object_pose"):
+def _object_pose(arrays: Mapping[str, np.ndarray], convention: Convention) -> tuple[np.ndarray, Rotation]:
+    """Return position [F, 3] and orientation of the object, in the file's unit and frame."""
+    given = [name for name in _FILE if name.startswith("object_") and name in arrays]
+    if given != ["object_pose"] and not (len(given) == 2 and given[0] == "object_pos"):
         raise DemoError(
-            f"{what}: the object's pose must be given once, as object_pose (matrices) or as object_pos and object_quat_wxyz or _xyzw;"
-            f" found {', '.join(given + ['object_pos'] * ('object_pos' in arrays)) or 'none'}."
+            "the object's pose must be given once, as object_pose (matrices) or as object_pos and object_quat_wxyz or _xyzw;"
+            f" found {', '.join(given) or 'none'}."
         )
-    values = np.asarray(arrays[given[0]], dtype=float)
-    if not np.isfinite(values).all() or ("object_pos" in arrays and not np.isfinite(arrays["object_pos"]).all()):
+    name = given[-1]
+    values = np.asarray(arrays[name], dtype=float)
+    pos = np.asarray(arrays["object_pos"], dtype=float) if "object_pos" in arrays else values[:, :3, 3]
+    if not np.isfinite(values).all() or not np.isfinite(pos).all():
         raise DemoError(
-            f"{what}: the object's pose is not known in every frame; leave out those at the ends, interpolate the others."
+            "the object's pose is unknown in some frames. Remove such frames at the ends, interpolate the others."
         )
-    if given[0] == "object_pose":
-        bad = ~np.array([is_rigid(T) for T in values])
+    if name == "object_pose":
+        bad = np.array([not is_rigid(T) for T in values])
         if bad.any():
             raise DemoError(
-                f"{what}: object_pose of frame {np.argmax(bad)} is no rotation and translation with the last row 0 0 0 1."
+                f"object_pose of frame {np.argmax(bad)} is not a rotation and translation with the last row 0 0 0 1."
             )
-        return values[:, :3, 3] * scale, Rotation.from_matrix(values[:, :3, :3])
-    order = given[0].removeprefix("object_quat").removeprefix("_") or convention.quat
+        return pos, Rotation.from_matrix(values[:, :3, :3])
+    order = convention.quat if name == "object_quat" else name.removeprefix("object_quat_")
     if order is None:
-        raise DemoError(
-            f"{what}: nothing says whether object_quat is (w, x, y, z) or (x, y, z, w); say --quat wxyz or xyzw."
-        )
-    bad = np.abs(np.linalg.norm(values, axis=1) - 1) > UNIT_TOLERANCE
+        raise DemoError("the file does not state whether object_quat is (w, x, y, z) or (x, y, z, w). Add --quat.")
+    length = np.linalg.norm(values, axis=1)
+    bad = np.abs(length - 1) > UNIT_TOLERANCE
     if bad.any():
         frame = int(np.argmax(bad))
-        raise DemoError(
-            f"{what}: the quaternion of frame {frame} has length {np.linalg.norm(values[frame]):.4f}, expected 1."
-        )
-    return np.asarray(arrays["object_pos"], dtype=float) * scale, Rotation.from_quat(
-        values, scalar_first=order == "wxyz"
-    )
+        raise DemoError(f"the quaternion of frame {frame} has length {length[frame]:.4f}, expected 1.")
+    return pos, Rotation.from_quat(values, scalar_first=order == "wxyz")
 
 
-def _evenly(
-    arrays: Mapping[str, np.ndarray],
-    what: str,
-    convention: Convention,
-    points: np.ndarray,
-    pos: np.ndarray,
-    turn: Rotation,
-) -> tuple[float, tuple[np.ndarray, np.ndarray, Rotation]]:
-    """The rate, and the sequence at that rate: as it is, or interpolated between its own times."""
-    stated = float(arrays["fps"]) if "fps" in arrays else None
+def _evenly(arrays: Mapping[str, np.ndarray], convention: Convention, motion: Motion) -> tuple[float, Motion]:
+    """Return the rate, and the motion at that rate: as it is, or interpolated between its own times."""
     if "time" not in arrays:
-        rate = stated if stated is not None else convention.fps
+        rate = float(arrays["fps"]) if "fps" in arrays else convention.fps
         if rate is None:
-            raise DemoError(f"{what}: it has neither times nor a rate; say how many frames a second has with --fps.")
+            raise DemoError("it has neither times nor a rate. Add --fps, the frames per second.")
         if convention.fps not in (None, rate):
-            raise DemoError(f"{what}: the file says {rate:g} frames per second, but --fps says {convention.fps:g}.")
-        return rate, (points, pos, turn)
+            raise DemoError(f"the file says {rate:g} frames per second, but --fps says {convention.fps:g}.")
+        return rate, motion
     time = np.asarray(arrays["time"], dtype=float)
     steps = np.diff(time)
     if len(time) < 2 or not np.isfinite(time).all() or (steps <= 0).any():
-        raise DemoError(f"{what}: time must increase from frame to frame.")
+        raise DemoError("time must increase from frame to frame.")
     own = 1 / float(np.median(steps))
-    if not RATE[0] <= own <= RATE[1] or (own > 500 and convention.fps is None) or own < 2:
-        raise DemoError(f"{what}: by its times it has {own:.4g} frames per second. Times must be in seconds.")
+    if not 2 <= own <= RATE[1] or (own > 500 and convention.fps is None):
+        raise DemoError(f"by its times it has {own:.4g} frames per second. Times must be in seconds.")
     even = np.abs(steps * own - 1).max() <= _UNEVEN
     if convention.fps is None and not even:
         raise DemoError(
-            f"{what}: frames are {1e3 * steps.min():.1f} to {1e3 * steps.max():.1f} ms apart; say --fps to resample them evenly."
+            f"frames are {1e3 * steps.min():.1f} to {1e3 * steps.max():.1f} ms apart. Add --fps to resample them evenly."
         )
     rate = convention.fps or float(round(own, 3))
     if even and abs(rate / own - 1) < 1e-3:
-        return rate, (points, pos, turn)
-    at = time[0] + np.arange(int((time[-1] - time[0]) * rate + 1e-6) + 1) / rate
+        return rate, motion
+    frames = (time[-1] - time[0]) * rate + 1e-6
+    if frames > MAX_FRAMES:
+        raise DemoError(
+            f"{time[-1] - time[0]:.6g} s at {rate:g} frames per second are more than {MAX_FRAMES} frames."
+            " Are the times in seconds? Split the sequence, or lower --fps."
+        )
+    at = time[0] + np.arange(int(frames) + 1) / rate
     after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
-    share = np.clip((at - time[after - 1]) / steps[after - 1], 0.0, 1.0)
-    points = (
-        points[after - 1] * (1 - share)[:, None, None] + points[after] * share[:, None, None]
-    )  # NaN beside a frame without a hand
-    pos = pos[after - 1] * (1 - share)[:, None] + pos[after] * share[:, None]
+    before = after - 1
+    share = np.clip((at - time[before]) / steps[before], 0.0, 1.0)[:, None]
+    points, pos, turn = motion
+    # NaN next to a frame without a hand
+    points = points[before] * (1 - share)[..., None] + points[after] * share[..., None]
+    pos = pos[before] * (1 - share) + pos[after] * share
     return rate, (points, pos, Slerp(time, turn)(np.clip(at, time[0], time[-1])))
 
 
 def _wrist(points: np.ndarray, side: str) -> Rotation:
-    """Orientation of MANO's root from keypoints [F, 21, 3]: wrist and knuckles laid over those of an average hand (Kabsch's algorithm)."""
-    template = np.concatenate((np.zeros((1, 3)), hand.FINGER_BASES)) * ((1 if side == "right" else -1), 1, 1)
+    """Fit wrist and knuckles of an average hand to keypoints [F, 21, 3] (Kabsch's algorithm); F orientations of MANO's root."""
+    template = np.concatenate((np.zeros((1, 3)), hand.FINGER_BASES))
+    if side == "left":
+        template[:, 0] *= -1
     found = points[:, _KNUCKLES]
     covariance = np.einsum("ki,fkj->fij", template - template.mean(axis=0), found - found.mean(axis=1, keepdims=True))
     U, _, Vt = np.linalg.svd(covariance)

@@ -1,4 +1,4 @@
-"""How hand and object move in a synthetic demonstration: random timing, approach, lift and goal."""
+"""Motion of hand and object in a synthetic demonstration: random timing, approach, lift and goal."""
 
 from __future__ import annotations
 
@@ -11,18 +11,21 @@ from xreset.demos import hand
 from xreset.demos.grasp import Grasp, Solid
 
 LIFT = (0.14, 0.41)
-"""Height that objects are lifted [m]: the 5th and 95th percentile of 180 right-hand DexYCB sequences."""
+"""Range of heights to which objects are lifted [m]: the 5th and 95th percentile of 180 right-hand DexYCB sequences."""
 
 _TRIES = 12
-_CLEAR = 0.001  # [m]: a fingertip in contact is at 2 mm, give or take the fit
+_CLEAR = 0.001
+"""A path is good if no keypoint comes nearer than this to object or table [m]; a fingertip in contact is at about 2 mm."""
+_OPENING = np.array([0.0, 0.4, 0.2] * 4 + [-0.15, -0.1, 0.0, 0.3, 0.3])
+"""[17] joint angles by which a hand opens before a grasp [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """When things happen, in frames."""
+    """Events of a demonstration, as numbers of frames."""
 
     frames: int
-    """T, all of them."""
+    """T, all frames."""
     reach: int
     """The hand has arrived."""
     close: int
@@ -44,31 +47,27 @@ class HandPath:
     angles: np.ndarray
     """[T, 17] joint angles."""
     gap: float
-    """Least distance of a keypoint to object and table until the lift [m]."""
+    """Smallest distance of a keypoint to object and table until the lift [m]."""
 
 
 def random_timing(fps: float, rng: np.random.Generator) -> Timing:
-    """A demonstration of about 2.4 s whose object leaves the table after about 1.15 s."""
-    seconds = np.cumsum(
-        [
-            rng.uniform(0.75, 0.95),
-            rng.uniform(0.15, 0.25),
-            rng.uniform(0.05, 0.1),
-            rng.uniform(0.8, 1.0),
-            rng.uniform(0.25, 0.45),
-        ]
-    )
-    reach, close, lift, end, last = (round(float(s) * fps) for s in seconds)
+    """Draw the timing of a demonstration of about 2.4 s whose object leaves the table after about 1.15 s."""
+    durations = [rng.uniform(*span) for span in ((0.75, 0.95), (0.15, 0.25), (0.05, 0.1), (0.8, 1.0), (0.25, 0.45))]
+    reach, close, lift, end, last = (round(float(seconds) * fps) for seconds in np.cumsum(durations))
     return Timing(frames=last + 1, reach=reach, close=close, lift=lift, end=end)
 
 
 def object_path(
     pos: np.ndarray, rest: Rotation, timing: Timing, rng: np.random.Generator
 ) -> tuple[np.ndarray, Rotation]:
-    """Object position [T, 3] and T orientations: at rest, lifted, turned, at the goal.
+    """Draw the object's motion: at rest, lifted, turned, at the goal.
 
     Args:
-        pos: [3] where it rests.
+        pos: [3] position at rest.
+        rest: orientation at rest.
+
+    Returns:
+        Positions [T, 3] and T orientations.
     """
     goal = pos + np.array([rng.uniform(-0.06, 0.06), rng.uniform(-0.14, 0.0), rng.uniform(*LIFT)])
     heading = rng.uniform(0, 2 * np.pi)
@@ -76,20 +75,19 @@ def object_path(
     turn = Rotation.from_rotvec(tilt) * Rotation.from_euler("z", np.radians(rng.uniform(-45.0, 45.0)))
     frame = np.arange(timing.frames)
     rise = _minimum_jerk(frame, timing.lift, timing.end)
-    late = _minimum_jerk(
-        frame, timing.lift + 0.2 * (timing.end - timing.lift), timing.end
-    )  # turns when it is clear of the table
-    object_rot = Rotation.from_rotvec(late[:, None] * turn.as_rotvec()) * rest
+    clear_of_table = timing.lift + 0.2 * (timing.end - timing.lift)
+    turned = _minimum_jerk(frame, clear_of_table, timing.end)
+    object_rot = Rotation.from_rotvec(turned[:, None] * turn.as_rotvec()) * rest
     return pos + rise[:, None] * (goal - pos), object_rot
 
 
 def clear_approach(
     solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, side: str, rng: np.random.Generator
 ) -> HandPath:
-    """The first of some random approaches in which no keypoint comes too near to object or table, or the best of them.
+    """Return the first of some random approaches that stays clear of object and table, or else the one with the largest gap.
 
     Args:
-        pos: [3] its position.
+        pos: [3] the object's position.
     """
     best: HandPath | None = None
     for _ in range(_TRIES):
@@ -110,18 +108,15 @@ def place_hand(pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: st
 def _approach(
     solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, side: str, rng: np.random.Generator
 ) -> HandPath:
-    """To a place before the object while the hand opens, forward, close; each a minimum-jerk motion, overlapping."""
+    """Move to a place before the object while the hand opens, then forward, then close: minimum-jerk motions that overlap."""
     frame = np.arange(timing.frames)
     mirror = 1.0 if side == "right" else -1.0
-    start = np.array(
-        [
-            pos[0] - mirror * rng.uniform(-0.05, 0.20),
-            rng.uniform(0.60, 0.80),
-            grasp.wrist_pos[2] + rng.uniform(0.02, 0.18),
-        ]
-    )
+    x = pos[0] - mirror * rng.uniform(-0.05, 0.20)
+    y = rng.uniform(0.60, 0.80)
+    z = grasp.wrist_pos[2] + rng.uniform(0.02, 0.18)
+    start = np.array([x, y, z])
     start_rot = Rotation.from_rotvec(rng.normal(0.0, 0.2, 3)) * grasp.wrist_rot
-    fingers = grasp.wrist_rot.apply([-1.0, 0.0, 0.0] if side == "right" else [1.0, 0.0, 0.0])
+    fingers = grasp.wrist_rot.apply([-mirror, 0.0, 0.0])
     palm = grasp.wrist_rot.apply([0.0, -1.0, 0.0])
     inward = fingers + 0.6 * palm
     before = grasp.wrist_pos - rng.uniform(0.07, 0.10) * inward / np.linalg.norm(inward)
@@ -133,8 +128,7 @@ def _approach(
     turning = _minimum_jerk(frame, 0, 0.85 * timing.reach)[:, None]
     wrist_rot = Rotation.from_rotvec((1 - turning) * (start_rot * grasp.wrist_rot.inv()).as_rotvec()) * grasp.wrist_rot
 
-    opened = grasp.angles - np.array([0.0, 0.4, 0.2] * 4 + [-0.15, -0.1, 0.0, 0.3, 0.3])
-    opened = np.clip(opened, hand.LOWER, hand.UPPER)
+    opened = np.clip(grasp.angles - _OPENING, hand.LOWER, hand.UPPER)
     opening = _minimum_jerk(frame, 0.1 * timing.reach, 0.65 * timing.reach)[:, None]
     closing = _minimum_jerk(frame, 0.8 * timing.reach, timing.close)[:, None]
     angles = hand.RELAXED + opening * (opened - hand.RELAXED) + closing * (grasp.angles - opened)
@@ -144,6 +138,6 @@ def _approach(
 
 
 def _minimum_jerk(frame: np.ndarray, start: float, end: float) -> np.ndarray:
-    """0 until ``start``, 1 from ``end``, and between them the smoothest path of human reaching (Flash and Hogan 1985)."""
+    """Return 0 until ``start``, 1 from ``end``, and between them the smoothest path of human reaching (Flash and Hogan 1985)."""
     s = np.clip((frame - start) / (end - start), 0.0, 1.0)
     return s**3 * (10 + s * (6 * s - 15))

@@ -1,4 +1,4 @@
-"""Which objects there are, by any of their names."""
+"""The known objects, by any of their names."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ ALIASES = {
     "powerdrill": "035_power_drill",
     "scissors": "037_scissors",
 }
-"""The paper's names."""
+"""The paper's names -> official names."""
+_ALIAS_OF = {name: alias for alias, name in ALIASES.items()}
 
 
 def object_names(folder: Path | None = None) -> tuple[str, ...]:
@@ -33,27 +34,37 @@ def object_names(folder: Path | None = None) -> tuple[str, ...]:
 
 
 def canonical_name(name: str, known: Iterable[str] = STAND_INS) -> str:
-    """The official name of an object: from itself, its name without the number, or the paper's name for it.
+    """Return the name of a known object: from itself, its name without the number, or the paper's name for it.
 
     Raises:
-        ObjectError: none of the known objects is meant.
+        ObjectError: no known object has this name.
     """
     known = tuple(known)
-    wanted = name.strip().lower().replace(" ", "_")
     if name in known:
         return name
-    if ALIASES.get(wanted) in known:
-        return ALIASES[wanted]
-    matches = [full for full in known if full.lower() == wanted or full.lower().split("_", 1)[-1] == wanted]
+    key = _key(name)
+    matches = [other for other in known if key in (_key(other), _key(other).partition("_")[2])]
     if len(matches) == 1:
         return matches[0]
-    short = {full: alias for alias, full in ALIASES.items()}
-    listing = ", ".join(f"{full} ({short[full]})" if full in short else full for full in known) or "none"
-    raise ObjectError(f"there is no object {name!r}; there are {listing}.")
+    listing = [f"{other} ({_ALIAS_OF[other]})" if other in _ALIAS_OF else other for other in known]
+    raise ObjectError(f"Unknown object {name!r}. Choose from: {', '.join(listing) or 'none'}.")
+
+
+def official_name(name: str) -> str:
+    """Return the official name of a built-in object; another name stays as it is, for it may be that of a mesh."""
+    try:
+        return canonical_name(name)
+    except ObjectError:
+        return name
+
+
+def _key(name: str) -> str:
+    key = name.strip().lower().replace(" ", "_")
+    return ALIASES.get(key, key)
 
 
 def load_object(name: str, folder: Path | None = None) -> ObjectSpec:
-    """An object by any of its names.
+    """Load an object by any of its names.
 
     Args:
         name: official name, name without number, or the paper's name.
@@ -69,13 +80,13 @@ def load_object(name: str, folder: Path | None = None) -> ObjectSpec:
         full = canonical_name(name, files)
     except ObjectError as error:
         raise ObjectError(
-            f"{error} (looked for meshes in {folder}; without that folder the built-in stand-ins are used)"
+            f"{error} These are the meshes in {folder}; omit the folder for the built-in objects."
         ) from None
     return import_mesh(files[full], full)
 
 
 def load_objects(names: Iterable[str], folder: Path | None = None) -> tuple[ObjectSpec, ...]:
-    """Several objects, in that order; see :func:`load_object`."""
+    """Load several objects, in that order; see :func:`load_object`."""
     return tuple(load_object(name, folder) for name in names)
 
 

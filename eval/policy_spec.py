@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from xreset.checks import from_dict
 from xreset.description import load_robot
 from xreset.env import ManipulationEnv, make_env
 from xreset.errors import PolicyError
@@ -19,7 +20,6 @@ from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
-from xreset.typed import from_dict
 
 BASELINES = ("zero", "random", "ik")
 """Names of the policies that need no training."""

@@ -12,14 +12,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from xreset.checks import Checked, NotNegative, Positive, Range, Share
+from xreset.checks import Checked, NotNegative, Positive, Range, Share, from_dict
 from xreset.errors import FileFormatError
 from xreset.eval.rollout import Episode, Rollouts, Trace
 from xreset.eval.stats import bootstrap_ci95
 from xreset.eval.table import table_text
 from xreset.files import read_json, write_json
 from xreset.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
-from xreset.typed import from_dict
 
 SCHEMA = "xreset-eval/1"
 EPISODES_SCHEMA = "xreset-episodes/1"

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from xreset.checks import from_dict
 from xreset.errors import XResetError
 from xreset.eval.plots import COLORS, picture
 from xreset.eval.policy_spec import PolicySpec
@@ -25,7 +26,6 @@ from xreset.files import read_json, write_json
 from xreset.physics import Capability
 from xreset.plugins import backend_class
 from xreset.task.config import RandomizationConfig, TaskConfig
-from xreset.typed import from_dict
 
 SCHEMA = "xreset-stress/1"
 COSTLY = 0.10

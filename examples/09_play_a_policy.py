@@ -12,10 +12,10 @@ import onnxruntime
 import torch
 
 import xreset
+from xreset.checks import from_dict
 from xreset.inputs import load_inputs
 from xreset.policies import shipped
 from xreset.task.config import TaskConfig, evaluation_task
-from xreset.typed import from_dict
 
 
 def main(demos: Path, policy: Path | None = None) -> None:

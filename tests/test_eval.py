@@ -13,6 +13,7 @@ import torch
 
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_results import OBJECTS, toy_rollouts, toy_summary
+from xreset.checks import from_dict
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.evaluate import evaluate
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
@@ -27,7 +28,6 @@ from xreset.physics import Contacts, Health, Links, State
 from xreset.task.config import TaskConfig
 from xreset.task.reading import Reading
 from xreset.task.rewards import keypoint_distance
-from xreset.typed import from_dict
 
 CORNERS = torch.tensor([[-1.0, -1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]]) * 0.05
 IDENTITY = torch.tensor([1.0, 0, 0, 0])
@@ -261,8 +261,8 @@ class ResultsTest(unittest.TestCase):
             ("missing: grasp_rate", {"grasp_rate": None}),
             ("unknown: later", {"later": 1}),
             ("policy is 5, expected str", {"policy": 5}),
-            ("grasp_rate is -5.0, expected a number from 0 to 1", {"grasp_rate": -5}),
-            ("mean is 7.0, expected a number from 0 to 1", {"task_progress": {"mean": 7, "ci95": [0, 1]}}),
+            ("grasp_rate is -5, expected a number from 0 to 1", {"grasp_rate": -5}),
+            ("mean is 7, expected a number from 0 to 1", {"task_progress": {"mean": 7, "ci95": [0, 1]}}),
             ("ci95 has 1 entries", {"task_progress": {"mean": 0.5, "ci95": [0]}}),
             (
                 "nonfinite is '<script>alert",

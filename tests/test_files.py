@@ -20,13 +20,13 @@ import numpy as np
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
+from xreset.checks import from_dict
 from xreset.errors import FileFormatError, XResetError
 from xreset.files import atomic_folder, atomic_write, claim, is_claimed, read_json, read_toml, write_json
 from xreset.records import Field, read_npz, write_npz
 from xreset.resets.bank import check_objects, read_bank, write_bank
 from xreset.spec import ObjectSpec
 from xreset.task.config import TaskConfig
-from xreset.typed import from_dict
 
 SCHEMA = {
     "points": Field(("F", 3), "f"),

@@ -12,6 +12,7 @@ from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 
 from xreset import robots
+from xreset.checks import from_dict
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig, rsl_rl_config
 from xreset.learning.export import export_onnx
@@ -19,7 +20,6 @@ from xreset.learning.model import PointNetLstmModel, ReturnCritic, embed_sequenc
 from xreset.learning.ppo import SequencePpo, SequenceStorage
 from xreset.policy import OnnxPolicy, policy_contract
 from xreset.task.config import ObservationConfig, RandomizationConfig, ResetConfig, TaskConfig, TerminationConfig
-from xreset.typed import from_dict
 
 N, T, L, A = 3, 8, 4, 5
 GROUPS = {"actor": ["policy", "proprio", "perception"], "critic": ["policy", "proprio", "privileged", "perception"]}

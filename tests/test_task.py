@@ -12,6 +12,7 @@ import torch
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
+from xreset.checks import from_dict
 from xreset.errors import DemoError, PolicyError, RunError
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_rotate
 from xreset.physics import Links, State
@@ -35,7 +36,6 @@ from xreset.task.latency import DelayLine
 from xreset.task.randomization import pair_friction, sample_drives, sample_friction, sample_mass_scale
 from xreset.task.rewards import RewardInput, compute_reward, contact_gate
 from xreset.task.terminations import episode_steps, out_of_bounds
-from xreset.typed import from_dict
 
 IDENTITY = torch.tensor([1.0, 0, 0, 0])
 

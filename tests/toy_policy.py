@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
+from xreset.checks import from_dict
 from xreset.task.config import TaskConfig
-from xreset.typed import from_dict
 
 
 def write_policy(

@@ -1,20 +1,29 @@
-"""Numbers of a configuration that make no sense are refused when it is made, not met as NaN some minutes later: rules at the field."""
+"""Typed dataclasses: rules for the values of their fields, and strict reading from JSON and TOML.
+
+A rule is part of a field's annotation, as in ``width: Positive[float] = 0.1``. A number that makes no sense is refused when a
+configuration is made, instead of turning into NaN some minutes later.
+"""
 
 from __future__ import annotations
 
+import types
+import typing
 from collections.abc import Callable
-from dataclasses import dataclass, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from difflib import get_close_matches
 from functools import cache
 from math import inf, isfinite
-from types import UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
+
+from xreset.errors import FileFormatError
+from xreset.text import shown
 
 
 @dataclass(frozen=True)
 class Rule:
-    """What a field's value must be like: metadata of its annotation."""
+    """What the value of a field must be like, in its annotation. None obeys every rule."""
 
     expected: str
     holds: Callable[[Any], bool]
@@ -22,85 +31,209 @@ class Rule:
 
 T = TypeVar("T")
 Positive = Annotated[T, Rule("a number above 0", lambda x: 0 < x <= inf)]
-"""Infinity will do, where it means that there is no limit: else ``Positive[Finite[float]]``."""
+"""Infinity is allowed, and means no limit; otherwise write ``Positive[Finite[float]]``."""
 NotNegative = Annotated[T, Rule("a finite number, 0 or more", lambda x: 0 <= x < inf)]
 Finite = Annotated[T, Rule("a finite number", isfinite)]
 Share = Annotated[T, Rule("a number from 0 to 1", lambda x: 0 <= x <= 1)]
 Range = Annotated[
     tuple[float, float], Rule("two finite numbers, 0 or more, the lower one first", lambda x: 0 <= x[0] <= x[1] < inf)
 ]
-
 Text = Annotated[str, Rule("a text", lambda text: bool(text.strip()) and text.isprintable())]
-Number = Annotated[float, Rule("a finite number, and no huge one", lambda x: abs(x) <= 1e9)]
-"""Of a robot's description: stiffnesses reach 1e5, everything else far less."""
+Number = Annotated[float, Rule("a finite number of at most 1e9", lambda x: abs(x) <= 1e9)]
+"""A number of a robot's description: stiffnesses reach 1e5, everything else is far smaller."""
 
 
 @dataclass(frozen=True)
 class Only:
-    """What another field must be for a field to mean anything: metadata of its annotation."""
+    """The value that another field must have for this field to have an effect, in its annotation."""
 
     field: str
     choice: str
 
 
-def without_effect(settings: Any, defaults: Any, path: tuple[str, ...] = ()) -> list[str]:
-    """What was changed from the defaults and means nothing beside the other settings; a sentence for each field, nested ones with it.
-
-    Args:
-        defaults: another of its kind.
-        path: names of the fields that lead to it.
-    """
-    sentences = []
-    for name, marks in _marks(type(settings)).items():
-        value, default = getattr(settings, name), getattr(defaults, name)
-        if is_dataclass(value) and type(value) is type(default):
-            sentences += without_effect(value, default, (*path, name))
-        for rule in (mark for mark in marks if isinstance(mark, Only)):
-            if value != default and (found := getattr(settings, rule.field)) != rule.choice:
-                where = ".".join((*path, name))
-                sentences.append(
-                    f"{where} is {value}, which means something where {rule.field} is {rule.choice}; it is {found}"
-                )
-    return sentences
-
-
 class Checked:
-    """Base of dataclasses whose fields' annotations hold rules, as in ``width: Positive[float] = 0.1``. None meets every rule.
-
-    Making one raises ``ValueError``, which says of all fields that break a rule what they are and what was expected. NaN is never in range.
-    """
+    """Base of dataclasses that obey the rules of their fields: making one that does not raises ``ValueError``, which names every field."""
 
     def __post_init__(self) -> None:
-        wrong = [
-            f"{name} is {value}, expected {rule.expected}"
-            for name, marks in _marks(type(self)).items()
-            if (value := getattr(self, name)) is not None
-            for rule in marks
-            if isinstance(rule, Rule) and not rule.holds(value)
-        ]
+        wrong = []
+        for name, marks in _marks(type(self)).items():
+            value = getattr(self, name)
+            wrong += [f"{name} is {shown(value)}, expected {rule.expected}" for rule in _broken(marks, value)]
         if wrong:
             raise ValueError("; ".join(wrong))
 
 
+class Options:
+    """Base of dataclasses whose fields are options of a command, shown and checked as if they were its own."""
+
+
+def without_effect(settings: Any, defaults: Any, path: tuple[str, ...] = ()) -> list[str]:
+    """Return a sentence for each changed setting that has no effect with the other settings.
+
+    Args:
+        defaults: settings of the same class.
+        path: names of the fields that lead to the settings.
+    """
+    sentences = []
+    for name, marks in _marks(type(settings)).items():
+        value = getattr(settings, name)
+        default = getattr(defaults, name)
+        if is_dataclass(value) and type(value) is type(default):
+            sentences += without_effect(value, default, (*path, name))
+        for mark in marks:
+            if isinstance(mark, Only) and value != default and getattr(settings, mark.field) != mark.choice:
+                where = ".".join((*path, name))
+                sentences.append(
+                    f"{where} is {value}, which means something where {mark.field} is {mark.choice}; "
+                    f"it is {getattr(settings, mark.field)}"
+                )
+    return sentences
+
+
 @cache
-def _marks(cls: type) -> dict[str, list[Rule | Only]]:
-    """What the annotation of each field says besides its type."""
-    return {name: _marks_in(hint) for name, hint in get_type_hints(cls, include_extras=True).items()}
+def _marks(cls: type) -> dict[str, list[Any]]:
+    """Field name -> what its annotation holds in addition to the type."""
+    marks = {}
+    for name, hint in get_type_hints(cls, include_extras=True).items():
+        parts = get_args(hint) if _is_union(hint) else (hint,)
+        marks[name] = [mark for part in parts for mark in getattr(part, "__metadata__", ())]  # noqa: XR002
+    return marks
 
 
-def _marks_in(hint: Any) -> list[Rule | Only]:
-    inside = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    return [mark for part in inside for mark in getattr(part, "__metadata__", ()) if isinstance(mark, Rule | Only)]
+def _broken(marks: typing.Iterable[Any], value: Any) -> list[Rule]:
+    if value is None:
+        return []
+    return [mark for mark in marks if isinstance(mark, Rule) and not mark.holds(value)]
+
+
+def _is_union(hint: Any) -> bool:
+    return get_origin(hint) in (typing.Union, types.UnionType)
 
 
 def is_rigid(T: np.ndarray) -> bool:
-    """Whether a matrix [4, 4] is a rotation and a translation: right-handed, without scale, to three digits as people write them."""
+    """Return whether a matrix [4, 4] is a rotation and a translation: right-handed, without scale, to three digits as people write them."""
     R = T[:3, :3]
-    straight = (
-        np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=2e-3) and np.array_equal(T[3], (0, 0, 0, 1))
-    )
-    return bool(straight and np.linalg.det(R) > 0)
+    is_orthogonal = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=2e-3)
+    return bool(is_orthogonal and np.array_equal(T[3], (0, 0, 0, 1)) and np.linalg.det(R) > 0)
 
 
-class Options:
-    """Base of dataclasses whose fields are options of a command, shown and checked as if they were its own."""
+# Reading from JSON and TOML --------------------------------------------------------------------------------------------------------------
+
+_LARGEST = 2**63 - 1
+
+
+def from_dict(cls: type[T], data: Any, where: str = "configuration") -> T:
+    """Build a dataclass from nested dictionaries, as :func:`dataclasses.asdict` and JSON make them.
+
+    A missing entry takes its default, so files stay readable when a field is added: its default must be what was done before.
+    A class may list the fields that it no longer has, with the values that mean what is done now: ``REMOVED: ClassVar[dict[str, Any]]``.
+    Entries with these values are ignored.
+
+    Raises:
+        FileFormatError: names every entry that is unknown, missing, of the wrong type or out of range.
+    """
+    value, problems = parsed(cls, data, where)
+    if value is None:
+        raise FileFormatError("\n".join(problems))
+    return value
+
+
+def parsed(cls: type[T], data: Any, where: str) -> tuple[T | None, list[str]]:
+    """Return the dataclass and no problem, or None and a sentence for each problem."""
+    problems: list[str] = []
+    value = _record(cls, data, where, problems)
+    if problems:
+        return None, problems
+    return value, []
+
+
+def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
+    if not isinstance(data, dict):
+        problems.append(f"{where} is {shown(data)}, expected an object with the entries of {cls.__name__}.")
+        return None
+    count = len(problems)
+    removed = getattr(cls, "REMOVED", {})
+    for name in sorted(data.keys() & removed.keys()):
+        if data[name] != removed[name]:
+            problems.append(
+                f"{where}.{name} is {shown(data[name])}. This option was removed; only {removed[name]!r} can be read. "
+                "Use an earlier version of xreset."
+            )
+    data = {name: value for name, value in data.items() if name not in removed}
+    names = [f.name for f in fields(cls)]
+    required = {f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING}
+    missing = sorted(required - set(data))
+    unknown = sorted(set(data) - set(names))
+    found = []
+    if unknown:
+        found.append(f"unknown: {', '.join(_with_guess(name, names) for name in unknown)}")
+    if missing:
+        found.append(f"missing: {', '.join(missing)}")
+    if found:
+        problems.append(
+            f"{where} does not fit {cls.__name__} ({'; '.join(found)}). Was it written by another version of xreset?"
+        )
+    hints = get_type_hints(cls, include_extras=True)
+    values = {name: _value(hints[name], data[name], f"{where}.{name}", problems) for name in data if name in names}
+    if len(problems) > count:
+        return None
+    try:
+        return cls(**values)
+    except ValueError as error:
+        problems.append(f"{where}: {error}.")
+        return None
+
+
+def _with_guess(name: str, names: list[str]) -> str:
+    guesses = get_close_matches(str(name), names, cutoff=0.75)
+    return f"{name} ({guesses[0]}?)" if guesses else str(name)
+
+
+def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:
+    """Convert a value to the type of a field, and append what is wrong with it to the problems."""
+
+    def wrong(expected: str) -> None:
+        problems.append(f"{where} is {shown(value)}, expected {expected}.")
+
+    origin = get_origin(hint)
+    arguments = get_args(hint)
+    if is_dataclass(hint):
+        return _record(typing.cast(type, hint), value, where, problems)
+    if hint is Any:
+        return value
+    if origin is Annotated:
+        count = len(problems)
+        converted = _value(arguments[0], value, where, problems)
+        if len(problems) == count:
+            for rule in _broken(arguments[1:], converted):
+                wrong(rule.expected)
+        return converted
+    if _is_union(hint):
+        if value is None:
+            return None
+        kind = next(argument for argument in arguments if argument is not types.NoneType)
+        return _value(kind, value, where, problems)
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            return wrong("a list")
+        kinds = arguments
+        if arguments[-1] is Ellipsis:
+            kinds = arguments[:1] * len(value)
+        if len(kinds) != len(value):
+            return problems.append(f"{where} has {len(value)} entries, expected {len(kinds)}.")
+        return tuple(_value(kind, value[i], f"{where}[{i}]", problems) for i, kind in enumerate(kinds))
+    if origin is dict:
+        if not isinstance(value, dict):
+            return wrong("an object")
+        return {name: _value(arguments[1], item, f"{where}.{name}", problems) for name, item in value.items()}
+    if origin is typing.Literal:
+        if value not in arguments:
+            return wrong(f"one of {', '.join(map(repr, arguments))}")
+        return value
+    is_number = hint in (int, float)
+    kinds = (int, float) if hint is float else hint
+    if not isinstance(value, kinds) or (is_number and isinstance(value, bool)):
+        return wrong(hint.__name__)
+    if isinstance(value, int) and abs(value) > _LARGEST:
+        return wrong(hint.__name__)
+    return float(value) if hint is float else value

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from xreset.checks import Number, Text
+from xreset.checks import Number, Text, parsed
 from xreset.errors import RobotError
 from xreset.files import read_toml
 from xreset.geometry.urdf import find_mesh, parse_xml
@@ -27,7 +27,6 @@ from xreset.spec import (
     PlacementSpec,
     RobotSpec,
 )
-from xreset.typed import parsed
 
 DESCRIPTION = "robot.toml"
 """Name of the description in a robot's folder."""

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from xreset.checks import from_dict
 from xreset.errors import PolicyError, needs
 from xreset.files import max_bytes, parse_json
 from xreset.spec import RobotSpec
 from xreset.task.config import NoiseConfig, TaskConfig
 from xreset.task.observations import layout
 from xreset.text import shown
-from xreset.typed import from_dict
 
 if TYPE_CHECKING:
     from tensordict import TensorDict

@@ -35,7 +35,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from xreset.checks import Checked, Finite, Positive, Rule
+from xreset.checks import Checked, Finite, Positive, Rule, from_dict
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.paper import METRICS, paper_tables
 from xreset.files import read_toml
@@ -43,7 +43,6 @@ from xreset.resets.config import ClosingConfig, SqueezeConfig
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.hand.config import HandConfig
 from xreset.text import shown
-from xreset.typed import from_dict
 
 SCHEMA = "xreset-study/1"
 SHIPPED = Path(__file__).parent.parent / "studies"

@@ -8,8 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
+from xreset.checks import from_dict
 from xreset.objects.catalogue import canonical_name
-from xreset.typed import from_dict
 
 FILE = Path(__file__).parent / "paper.toml"
 METRICS = {

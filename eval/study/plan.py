@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from xreset.checks import from_dict
 from xreset.demos.archive import read_demos
 from xreset.errors import DemoError, FileFormatError, RunError, XResetError
 from xreset.eval.study.file import Data, Evaluation, Runs, Study, merged
@@ -28,7 +29,6 @@ from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.objects.catalogue import canonical_name, object_names
 from xreset.plugins import backend_status
 from xreset.text import short_name, shown
-from xreset.typed import from_dict
 
 if TYPE_CHECKING:
     from xreset.eval.results import EvalResult

@@ -6,9 +6,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from xreset import __version__
-from xreset.checks import Checked, NotNegative, Positive
+from xreset.checks import Checked, NotNegative, Positive, from_dict
 from xreset.files import read_json, write_json
-from xreset.typed import from_dict
 
 FILE = "choice.json"
 SCHEMA = "xreset-choice/1"

@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from xreset.checks import NotNegative, Share
+from xreset.checks import NotNegative, Share, from_dict
 from xreset.files import read_json, write_json
-from xreset.typed import from_dict
 
 SCHEMA = "xreset-lift/1"
 FILE = "lift.json"

@@ -13,12 +13,12 @@ from typing import Any
 
 import torch
 
+from xreset.checks import from_dict
 from xreset.files import atomic_write
 from xreset.learning.model import PointNetLstmModel
 from xreset.learning.shrink import drop_exporter_notes
 from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS
 from xreset.task.config import ObservationConfig
-from xreset.typed import from_dict
 
 
 def export_onnx(actor: PointNetLstmModel, path: str | Path, contract: dict[str, Any]) -> None:

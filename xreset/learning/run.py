@@ -18,12 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from xreset import __version__
-from xreset.checks import Checked, NotNegative, Positive
+from xreset.checks import Checked, NotNegative, Positive, from_dict
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.files import read_json, write_json
 from xreset.learning.config import TrainConfig
 from xreset.text import shown
-from xreset.typed import from_dict
 
 SCHEMA = "xreset-run/1"
 

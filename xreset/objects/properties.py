@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from xreset.checks import from_dict
 from xreset.errors import ObjectError
 from xreset.files import atomic_write, read_toml
 from xreset.text import shown
-from xreset.typed import from_dict
 
 _RANGES = {"mass": (1e-4, 50.0), "density": (1.0, 25_000.0), "friction": (0.05, 3.0)}
 """[kg], [kg/m^3] (osmium has 22,600), coefficient."""

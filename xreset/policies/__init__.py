@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from xreset.checks import from_dict
 from xreset.files import read_toml
-from xreset.typed import from_dict
 
 FOLDER = Path(__file__).parent
 """Where they lie."""

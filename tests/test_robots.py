@@ -19,27 +19,24 @@ from xreset.description import load_robot as load
 from xreset.errors import RobotError
 from xreset.geometry.dynamics import damping_ratio, mass_matrix
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.urdf import find_mesh, load_urdf
-from xreset.plugins import robot_names
+from xreset.geometry.urdf import find_mesh, load_urdf, robot_tree
+from xreset.plugins import robot_folder, robot_names
 from xreset.robot_tools.check import check_description
-from xreset.robots.openarm import build as openarm
-from xreset.robots.panda_allegro import build as panda_allegro
-from xreset.robots.ur7e_sharpa import build as ur7e_sharpa
-from xreset.robots.xarm7_leap import build as xarm7_leap
+from xreset.robots import build
 
-BUILT_IN = {"ur7e-sharpa": ur7e_sharpa, "openarm": openarm, "panda-allegro": panda_allegro, "xarm7-leap": xarm7_leap}
+BUILT_IN = ("ur7e-sharpa", "openarm", "panda-allegro", "xarm7-leap")
 
 
 class BuiltIn(unittest.TestCase):
     def test_committed_urdf_is_what_build_writes(self):
-        for name, build in BUILT_IN.items():
+        for name in BUILT_IN:
             with self.subTest(name):
-                self.assertEqual(build.URDF.read_text(), build.text())
+                self.assertEqual(load(name).urdf.read_text(), build.robot_urdf(name.replace("-", "_")))
 
     def test_urdf_read_back_is_the_tree_that_was_written(self):
-        for name, build in BUILT_IN.items():
-            written, _ = build.tree()
-            read = load_urdf(build.URDF)
+        for name in BUILT_IN:
+            written = build.robot_tree(build.read_figures(name.replace("-", "_")))
+            read = load_urdf(load(name).urdf)
             self.assertEqual(sorted(read.link_names), sorted(written.link_names), name)
             for joint in written.joints:
                 again = read.joint(joint.name)
@@ -63,9 +60,9 @@ class BuiltIn(unittest.TestCase):
         )
 
     def test_efforts_in_the_description_are_those_of_the_urdf(self):
-        for name, build in BUILT_IN.items():
-            _, effort = build.tree()
-            self.assertEqual({joint.name: joint.drive.effort for joint in load(name).joints}, effort)
+        for name in BUILT_IN:
+            efforts = build.efforts(build.read_figures(name.replace("-", "_")))
+            self.assertEqual({joint.name: joint.drive.effort for joint in load(name).joints}, efforts)
 
     def test_check_finds_nothing(self):
         for name in BUILT_IN:
@@ -114,7 +111,7 @@ class BuiltIn(unittest.TestCase):
             np.testing.assert_allclose(thumb[:3, 2], -index[:3, 2], atol=1e-9)
 
     def test_rotors_are_in_the_hand_links(self):
-        tree = load_urdf(ur7e_sharpa.URDF)
+        tree = robot_tree(load("ur7e-sharpa"))
         for joint in tree.joints:
             if joint.name.startswith("right_") and joint.type == "revolute":
                 self.assertGreaterEqual(np.linalg.eigvalsh(tree.link(joint.child).inertia)[0], 0.002)
@@ -148,7 +145,7 @@ class Fingerprint(unittest.TestCase):
 
     def test_a_changed_mesh_makes_another_robot(self):
         folder = Path(self.enterContext(tempfile.TemporaryDirectory())) / "robot"
-        shutil.copytree(openarm.URDF.parent, folder)
+        shutil.copytree(robot_folder("openarm"), folder)
         urdf = folder / "robot.urdf"
         urdf.write_text(urdf.read_text().replace('<box size="0.05 0.14 0.04" />', '<mesh filename="body.stl" />', 1))
         trimesh.creation.box((0.05, 0.14, 0.04)).export(folder / "body.stl")
@@ -208,7 +205,7 @@ class Registry(unittest.TestCase):
         self.folder = Path(folder.name) / "robot"
         self.folder.mkdir()
         for name in ("robot.toml", "robot.urdf"):
-            shutil.copy(openarm.URDF.parent / name, self.folder)
+            shutil.copy(robot_folder("openarm") / name, self.folder)
 
     def edit(self, file: str, old: str, new: str) -> None:
         path = self.folder / file

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree
@@ -104,58 +103,6 @@ def fixed(parent: str, child: str, T_parent_child: np.ndarray) -> Joint:
         upper=math.inf,
         velocity=math.inf,
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArmLink:
-    """A link and the joint before it, as makers publish them."""
-
-    name: str
-    joint: str
-    type: Literal["revolute", "prismatic"] = "revolute"
-    xyz: Sequence[float]
-    """Joint origin in the parent link [m]."""
-    rpy: Sequence[float] = (0, 0, 0)
-    """Its orientation [rad]."""
-    axis: Sequence[float] = (0, 0, 1)
-    range: tuple[float, float]
-    """[rad] or [m]"""
-    velocity: float
-    """[rad/s] or [m/s]"""
-    effort: float
-    """[N m] or [N]"""
-    mass: float
-    """[kg]"""
-    com: Sequence[float]
-    """[m]"""
-    inertia: Sequence[float]
-    """ixx ixy ixz iyy iyz izz about the center of mass [kg m^2], along axes rotated by ``inertia_roll``."""
-    inertia_roll: float = 0.0
-    """Rotation of those axes about x [rad]."""
-    shapes: tuple[Shape, ...]
-
-    def below(self, parent: str) -> tuple[Joint, Link]:
-        """Return the joint that attaches the link to a parent link, and the link."""
-        R = pose(rpy=(self.inertia_roll, 0, 0))[:3, :3]
-        joint = Joint(
-            name=self.joint,
-            type=self.type,
-            parent=parent,
-            child=self.name,
-            T_parent_joint=pose(self.xyz, rpy=self.rpy),
-            axis=np.array(self.axis, dtype=float),
-            lower=self.range[0],
-            upper=self.range[1],
-            velocity=self.velocity,
-        )
-        link = Link(
-            name=self.name,
-            mass=self.mass,
-            com=np.array(self.com),
-            inertia=R @ inertia_matrix(*self.inertia) @ R.T,
-            collisions=self.shapes,
-        )
-        return joint, link
 
 
 def urdf_text(

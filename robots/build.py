@@ -1,0 +1,107 @@
+"""Write the ``robot.urdf`` of a built-in robot from the figures in its ``build.toml``: ``python -m xreset.robots.build FOLDER``.
+
+``build.toml`` names its sources. Units are m, rad, kg, N and N m; quaternions are (w, x, y, z).
+
+- ``base`` and ``palm`` are links, ``arm`` and ``hand`` are links with the joint before them. Each link of the arm carries the next one,
+  the last one carries the palm.
+- ``inertia`` is about the center of mass: three principal moments, or ixx ixy ixz iyy iyz izz. ``inertia_rpy`` and ``inertia_quat`` turn
+  its axes.
+- ``rotor`` is added to the diagonal of each moving link of the hand. Makers state it as armature of the joint, or not at all; not every
+  engine has armature, but the inertia of a link means the same in all of them.
+- ``shapes`` are boxes (edge lengths, center) and cylinders and capsules (ends of the axis, radius).
+- ``frames`` are links without shapes.
+"""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from xreset.geometry.urdf import Joint, Link, RobotTree
+from xreset.geometry.urdf_writer import axes, box, capsule, cylinder, fixed, frame, inertia_matrix, pose, urdf_text
+from xreset.spec import MimicSpec
+
+Figures = dict[str, Any]
+SHAPES = {"box": box, "capsule": capsule, "cylinder": cylinder}
+
+
+def read_figures(folder: str) -> Figures:
+    """Return the content of a robot's ``build.toml``."""
+    return tomllib.loads((Path(__file__).parent / folder / "build.toml").read_text())
+
+
+def robot_tree(figures: Figures) -> RobotTree:
+    """Return the links and joints of a robot."""
+    base = figures["base"]
+    palm = figures["palm"]
+    links = [_link(base)]
+    joints = []
+    parent = base["name"]
+    for part in figures["arm"]:
+        links.append(_link(part))
+        joints.append(_joint(part, parent))
+        parent = part["name"]
+    links.append(_link(palm))
+    joints.append(fixed(parent, palm["name"], _pose(palm)))
+    for part in figures["hand"]:
+        links.append(_link(part, figures.get("rotor", 0.0)))
+        joints.append(_joint(part, part["parent"]))
+    for name, (link, position, x, z) in figures["frames"].items():
+        links.append(frame(name))
+        joints.append(fixed(link, name, pose(position) @ axes(x=x, z=z)))
+    return RobotTree(name=figures["name"], root=base["name"], links=tuple(links), joints=tuple(joints))
+
+
+def efforts(figures: Figures) -> dict[str, float]:
+    """Return the effort limit of each joint that has a drive."""
+    parts = [*figures["arm"], *figures["hand"]]
+    return {part["joint"]: part["effort"] for part in parts if "effort" in part}
+
+
+def robot_urdf(folder: str) -> str:
+    """Return the text of a robot's ``robot.urdf``."""
+    figures = read_figures(folder)
+    mimics = [MimicSpec(**mimic) for mimic in figures.get("mimics", [])]
+    return urdf_text(robot_tree(figures), efforts(figures), mimics=mimics, comment=figures["comment"])
+
+
+def _pose(part: Figures) -> np.ndarray:
+    return pose(part["xyz"], rpy=part.get("rpy", (0, 0, 0)), quat=part.get("quat"))
+
+
+def _joint(part: Figures, parent: str) -> Joint:
+    lower, upper = part["range"]
+    return Joint(
+        name=part["joint"],
+        type=part.get("type", "revolute"),
+        parent=parent,
+        child=part["name"],
+        T_parent_joint=_pose(part),
+        axis=np.array(part.get("axis", (0, 0, 1)), dtype=float),
+        lower=lower,
+        upper=upper,
+        velocity=part["velocity"],
+    )
+
+
+def _link(part: Figures, rotor: float = 0.0) -> Link:
+    moments = part["inertia"]
+    inertia = np.diag(moments) if len(moments) == 3 else inertia_matrix(*moments)
+    R = pose(rpy=part.get("inertia_rpy", (0, 0, 0)), quat=part.get("inertia_quat"))[:3, :3]
+    return Link(
+        name=part["name"],
+        mass=part["mass"],
+        com=np.array(part["com"], dtype=float),
+        inertia=R @ inertia @ R.T + rotor * np.eye(3),
+        collisions=tuple(SHAPES[kind](*values) for kind, *values in part.get("shapes", [])),
+    )
+
+
+if __name__ == "__main__":
+    path = Path(__file__).parent / sys.argv[1] / "robot.urdf"
+    path.write_text(robot_urdf(sys.argv[1]))
+    print(f"wrote {path}")

@@ -12,92 +12,82 @@ from xreset.backends.rigid import Mechanism, MovingJoints
 class BulletDrives:
     """Joint torques: PD drives with effort limits, armature, dry friction and mimic couplings.
 
-    Arrays are over the D moving joints in the order of the bodies, which is Bullet's link order. With M the mass matrix and c the Coriolis
-    torque, drives that have armature A and are implicit in their damping give the acceleration a = (M + B)^-1 (tau - c), where tau is the
-    PD torque and B = diag(A + dt kd). Bullet integrates a = M^-1 (tau' - c), so it does the same when given tau' = tau - B a. Mimic joints
-    are coupled by a stiff spring and damper, which add J^T (dt^2 k + dt b) J to B; a drive's torque is shared with those that follow its
-    joint, and so is its dt kd.
+    Arrays are over the D moving joints in the order of the bodies, which is Bullet's link order. With M the mass matrix
+    and c the Coriolis torque, drives that have armature A and are implicit in their damping give the acceleration
+    a = (M + B)^-1 (tau - c), where tau is the PD torque and B = diag(A + dt kd). Bullet integrates a = M^-1 (tau' - c),
+    so it does the same when given tau' = tau - B a. Mimic joints are coupled by a stiff spring and damper, which add
+    J^T (dt^2 k + dt b) J to B; a drive's torque, and its dt kd, are shared with those that follow its joint.
 
-    In contact that alone is wrong: a held joint does not move with a, and would lack the torque B a. So the torque r of contacts and limits
-    in the last step, seen as r = M dv / dt - (tau' - c), is expected again: a = (M + B)^-1 (tau - c + r). A held joint then gets the whole
-    of tau, and an impact delivers the momentum of M + B, both after about 1 + B / M steps. That is one or two for ordinary drives; it is
-    far too many where B dwarfs M, as with armature on the light links of a hand.
+    In contact that alone is wrong: a held joint does not move with a, and would lack the torque B a. So the torque r of
+    contacts and limits in the last step, seen as r = M dv / dt - (tau' - c), is expected again:
+    a = (M + B)^-1 (tau - c + r). A held joint then gets the whole of tau, and an impact delivers the momentum of M + B,
+    both after about 1 + B / M steps. That is one or two for ordinary drives; it is far too many where B dwarfs M, as
+    with armature on the light links of a hand.
     """
 
-    def __init__(
-        self, engine: Any, client: int, body: int, robot: Mechanism, dt: float, mass_matrix_steps: int
-    ) -> None:
-        self._p, self._client, self._body, self._dt = engine, client, body, dt
-        self._mass_matrix_age, self._mass_matrix_steps = 0, mass_matrix_steps
-        spec, names = robot.robot, robot.joint_names
-        self._links = list(range(1, len(names) + 1))  # link 0 is the base
-        self._joints = MovingJoints(spec, names)
-        self.driven = self._joints.driven
+    def __init__(self, client: Any, body: int, robot: Mechanism, dt: float, mass_matrix_steps: int) -> None:
+        self._p = client
+        self._body = body
+        self._dt = dt
+        self._mass_matrix_steps = mass_matrix_steps
+        spec = robot.robot
+        count = len(robot.joint_names)
+        self._links = list(range(1, count + 1))  # link 0 is the base
+        self._joints = joints = MovingJoints(spec, robot.joint_names)
+        self.driven = joints.driven
         """[J] position of each actuated joint among the moving ones."""
-        self.target = spec.home
-        """[J] drive targets."""
-        self._mimic, self._source, self._multiplier = self._joints.mimic, self._joints.source, self._joints.multiplier
-        self._kp, self._kd, self._effort = self._joints.nominal
-        self._brakes = bool(self._joints.friction_loss.any())
-
+        self.scale(np.ones_like(joints.nominal))
         self.reset(spec.home, np.zeros_like(spec.home), spec.home)
-        M = self._mass_matrix(spec.home)
-        self._J = np.zeros((len(self._mimic), len(names)))
-        """Rate of each mimic joint's lag behind its source, by joint."""
-        rows = np.arange(len(self._mimic))
-        self._J[rows, self._mimic] = -1.0
-        self._J[rows, self.driven[self._source]] = self._multiplier
-        inertia = 1.0 / np.diag(np.linalg.inv(M))[self._mimic]
-        self._stiffness, self._damping = (
-            inertia / dt**2,
-            2.0 * inertia / dt,
-        )  # critically damped, as stiff as one step can feel
-        self._coupling = self._J.T @ ((dt**2 * self._stiffness + dt * self._damping)[:, None] * self._J)
-        self._M, self._added, self._inverse = M, np.zeros_like(M), np.zeros_like(M)
+
+        self._M = M = self._mass_matrix(spec.home)
+        self._added = np.zeros_like(M)
+        self._inverse = np.zeros_like(M)
         self._saturated = np.zeros(0, dtype=bool)
+        rows = np.arange(len(joints.mimic))
+        self._J = np.zeros((len(rows), count))
+        """Rate of each mimic joint's lag behind its source, by joint."""
+        self._J[rows, joints.mimic] = -1.0
+        self._J[rows, self.driven[joints.source]] = joints.multiplier
+        inertia = 1.0 / np.diag(np.linalg.inv(M))[joints.mimic]
+        self._stiffness = inertia / dt**2  # critically damped, as stiff as one step can feel
+        self._damping = 2.0 * inertia / dt
+        self._coupling = self._J.T @ ((dt**2 * self._stiffness + dt * self._damping)[:, None] * self._J)
 
         # Bullet's joints start with a motor that brakes them.
-        engine.setJointMotorControlArray(
-            body, self._links, engine.VELOCITY_CONTROL, forces=np.zeros(len(names)), physicsClientId=client
-        )
+        client.setJointMotorControlArray(body, self._links, client.VELOCITY_CONTROL, forces=np.zeros(count))
 
     def reset(self, position: np.ndarray, velocity: np.ndarray, target: np.ndarray) -> None:
         """Set positions, velocities and targets [J] of the actuated joints; mimic joints follow."""
         q, v = self._joints.spread(position, velocity)
-        self._p.resetJointStatesMultiDof(
-            self._body, self._links, [[x] for x in q], targetVelocities=[[x] for x in v], physicsClientId=self._client
-        )
+        self._p.resetJointStatesMultiDof(self._body, self._links, q[:, None].tolist(), v[:, None].tolist())
         self.target = target
+        """[J] drive targets."""
         self._mass_matrix_age = 0
         self._last_step: tuple[np.ndarray, np.ndarray] | None = None
 
     def scale(self, factors: np.ndarray) -> None:
-        """Set factors (3, J) on stiffness, damping and effort limit."""
+        """Set factors [3, J] on stiffness, damping and effort limit."""
         self._kp, self._kd, self._effort = factors * self._joints.nominal
-        self._mass_matrix_age = 0  # what is implicit in the damping has to be factorised anew
+        self._mass_matrix_age = 0  # the implicit damping has to be factorised again
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities [D] of all moving joints."""
-        states = self._p.getJointStates(self._body, self._links, physicsClientId=self._client)
+        """Return positions and velocities [D] of all moving joints."""
+        states = self._p.getJointStates(self._body, self._links)
         return np.array([state[0] for state in states]), np.array([state[1] for state in states])
 
     def apply(self) -> None:
         """Apply the torques of one Bullet step."""
         q, v = self.read()
-        dt, driven = self._dt, self.driven
-        wanted = self._kp * (self.target - q[driven]) - self._kd * v[driven]
-        tau = (
-            np.minimum(np.maximum(wanted, -self._effort), self._effort) @ self._joints.shares
-        )  # np.clip takes three times as long
-        if len(self._mimic):
-            lag = self._multiplier * q[driven[self._source]] + self._joints.offset - q[self._mimic]
+        joints = self._joints
+        dt = self._dt
+        wanted = self._kp * (self.target - q[self.driven]) - self._kd * v[self.driven]
+        given = np.minimum(np.maximum(wanted, -self._effort), self._effort)  # np.clip takes three times as long
+        tau = given @ joints.shares
+        if len(joints.mimic):
+            lag = joints.multiplier * q[self.driven[joints.source]] + joints.offset - q[joints.mimic]
             rate = self._J @ v
             tau -= self._J.T @ (self._stiffness * (lag + dt * rate) + self._damping * rate)
-        bias = np.array(
-            self._p.calculateInverseDynamics(
-                self._body, q.tolist(), v.tolist(), [0.0] * len(q), physicsClientId=self._client
-            )
-        )
+        bias = np.array(self._p.calculateInverseDynamics(self._body, q.tolist(), v.tolist(), [0.0] * len(q)))
         net = tau - bias
         if self._last_step is not None:
             last_velocity, last_net = self._last_step
@@ -106,23 +96,22 @@ class BulletDrives:
         if self._mass_matrix_age == 0 or saturated.tobytes() != self._saturated.tobytes():
             self._factorise(q, saturated)
         self._mass_matrix_age = (self._mass_matrix_age + 1) % self._mass_matrix_steps
-        if self._brakes:
-            stopping = -(v / dt + self._inverse @ net)[driven] / np.diag(self._inverse)[driven]
-            brake = np.clip(stopping, -self._joints.friction_loss, self._joints.friction_loss)
-            tau[driven] += brake
-            net[driven] += brake
+        if joints.has_dry_friction:
+            stopping = -(v / dt + self._inverse @ net)[self.driven] / np.diag(self._inverse)[self.driven]
+            brake = np.clip(stopping, -joints.friction_loss, joints.friction_loss)
+            tau[self.driven] += brake
+            net[self.driven] += brake
         tau -= self._added @ (self._inverse @ net)
-        self._last_step = v, tau - bias
-        self._p.setJointMotorControlArray(
-            self._body, self._links, self._p.TORQUE_CONTROL, forces=tau.tolist(), physicsClientId=self._client
-        )
+        self._last_step = (v, tau - bias)
+        self._p.setJointMotorControlArray(self._body, self._links, self._p.TORQUE_CONTROL, forces=tau.tolist())
 
     def _mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        return np.array(self._p.calculateMassMatrix(self._body, q.tolist(), physicsClientId=self._client))
+        return np.array(self._p.calculateMassMatrix(self._body, q.tolist()))
 
     def _factorise(self, q: np.ndarray, saturated: np.ndarray) -> None:
         """Invert M + B; a drive at its effort limit has no damping left to be implicit in."""
-        shares, armature = self._joints.shares, np.zeros(len(q))
+        shares = self._joints.shares
+        armature = np.zeros(len(q))
         armature[self.driven] = self._joints.armature
         damping = np.where(saturated, 0.0, self._dt * self._kd)
         self._added = self._coupling + np.diag(armature) + shares.T @ (damping[:, None] * shares)

@@ -1,6 +1,6 @@
 """Models for Bullet, which reads URDF files.
 
-They are written here from the fused bodies, so every mass and inertia is the one of the other engines.
+They are written here from the fused bodies, so every mass and inertia is the same as in the other engines.
 """
 
 from __future__ import annotations
@@ -13,62 +13,47 @@ from typing import Any
 import numpy as np
 
 from xreset.backends.rigid import Inertia, Mechanism, rotate
+from xreset.geometry.urdf import Joint
 from xreset.spec import Shape
 
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """A link of a Bullet model: a moving body, or a fixed piece of one."""
+    """A link of a robot's Bullet model: a moving body, or a fixed piece of one."""
 
     body: int
-    """Index of the body that it is (part of)."""
+    """Index of the body that the part is, or belongs to."""
     link: str
-    """URDF link whose shapes it has; empty for objects and the table."""
+    """URDF link whose shapes the part has."""
     shapes: tuple[Shape, ...]
-    tip: int | None = None
-    """Index of the fingertip that it is part of."""
-
-    @property
-    def is_hull(self) -> bool:
-        """Whether its only shape is a convex hull."""
-        return any(shape.geometry.kind == "hull" for shape in self.shapes)
+    tip: int | None
+    """Index of the fingertip that the part belongs to."""
 
 
-@dataclass(frozen=True)
-class Model:
-    """A loaded URDF."""
-
-    body: int
-    """Bullet's number of it."""
-    first: int
-    """Bullet's number of its first part: -1 where that is the root of the URDF."""
-    parts: list[Part]
-
-    @property
-    def links(self) -> list[tuple[int, Part]]:
-        """Bullet's link number and description of every part."""
-        return list(enumerate(self.parts, start=self.first))
-
-
-# What remains inflated by Bullet's margin of 1 mm against anything round: a robot's hulls.
+def is_hull(shapes: Sequence[Shape]) -> bool:
+    """Return whether the shapes of a Bullet link are a single convex hull."""
+    return bool(shapes) and shapes[0].geometry.kind == "hull"
 
 
 def link_groups(shapes: Sequence[Shape]) -> list[tuple[Shape, ...]]:
-    """Shapes that may share a Bullet link: the primitives together, every hull alone, for only then can its margin be removed."""
+    """Return the shapes that may share a Bullet link: the primitives together, every hull alone.
+
+    Only the margin of a link with a single hull can be removed. A robot's hulls keep Bullet's margin of 1 mm against
+    anything round.
+    """
     hulls = [(shape,) for shape in shapes if shape.geometry.kind == "hull"]
     primitives = tuple(shape for shape in shapes if shape.geometry.kind != "hull")
     return [primitives, *hulls] if primitives or not hulls else hulls
 
 
 def robot_parts(robot: Mechanism) -> list[Part]:
-    """The base and the moving bodies, then the fixed pieces: so Bullet's link i is body i."""
-    moving, fixed = [], []
+    """Return the base and the moving bodies, then the fixed pieces, so that Bullet's link i is body i."""
+    moving = []
+    fixed = []
     for i, body in enumerate(robot.bodies):
-        for link in dict.fromkeys((body.name, *(s.link for s in body.shapes))):
-            parts = [
-                Part(body=i, link=link, shapes=group, tip=robot.tip_of.get(link))
-                for group in link_groups([s.shape for s in body.shapes if s.link == link])
-            ]
+        for link in dict.fromkeys((body.name, *(item.link for item in body.shapes))):
+            groups = link_groups([item.shape for item in body.shapes if item.link == link])
+            parts = [Part(body=i, link=link, shapes=group, tip=robot.tip_of.get(link)) for group in groups]
             if link == body.name:
                 moving.append(parts.pop(0))
             fixed += parts
@@ -76,82 +61,92 @@ def robot_parts(robot: Mechanism) -> list[Part]:
 
 
 WEIGHTLESS = Inertia(mass=1e-9, com=np.zeros(3), quat=np.array([1.0, 0, 0, 0]), moments=np.full(3, 1e-14))
-"""Of fixed pieces, whose mass is counted in their body: Bullet would invent one for a link without."""
+"""Inertia of fixed pieces, whose mass is counted in their body: Bullet would invent one for a link without."""
 
 
 def robot_urdf(robot: Mechanism, parts: Sequence[Part], folder: Path) -> Path:
-    """Write the URDF of a robot."""
-    text = [
-        _link_text("root", WEIGHTLESS, (), folder)
-    ]  # Bullet does not count the root as a link, and tells less about it
+    """Write the URDF of a robot, and its meshes, into a folder."""
+    lines = ['<robot name="xreset">']
+    lines.append(_link("root", WEIGHTLESS, (), folder))  # Bullet does not count the root as a link
     for i, part in enumerate(parts):
         body = robot.bodies[part.body]
-        text.append(
-            _link_text(f"link{i}", (body.inertia if i == part.body else None) or WEIGHTLESS, part.shapes, folder)
-        )
-        if i == 0 or i != part.body:
-            text.append(_fixed_joint_text(i, f"link{part.body}" if i else "root"))
-            continue
-        joint = body.joint
-        limited = np.isfinite(joint.lower) and np.isfinite(joint.upper)
-        kind = "prismatic" if joint.type == "prismatic" else "revolute" if limited else "continuous"
-        lower, upper = (joint.lower, joint.upper) if limited else (0.0, -1.0)
-        text.append(
-            f'<joint name="joint{i}" type="{kind}"><parent link="link{body.parent}"/><child link="link{i}"/>'
-            f'{_origin(body.T_parent_body)}<axis xyz="{_numbers(joint.axis)}"/>'
-            f'<limit lower="{lower!r}" upper="{upper!r}" effort="0" velocity="0"/></joint>'
-        )
-    return _write(folder / "robot.urdf", text)
-
-
-def _fixed_joint_text(link: int, parent: str) -> str:
-    return f'<joint name="joint{link}" type="fixed"><parent link="{parent}"/><child link="link{link}"/></joint>'
-
-
-def _write(path: Path, text: Sequence[str]) -> Path:
-    path.write_text("\n".join(['<robot name="xreset">', *text, "</robot>"]))
+        is_body = i == part.body
+        inertia = body.inertia if is_body and body.inertia else WEIGHTLESS
+        lines.append(_link(f"link{i}", inertia, part.shapes, folder))
+        if is_body and body.joint is not None:
+            lines.append(_joint(i, f"link{body.parent}", body.joint, body.T_parent_body))
+        else:
+            parent = f"link{part.body}" if i else "root"
+            lines.append(f'<joint name="joint{i}" type="fixed">{_ends(parent, i)}</joint>')
+    lines.append("</robot>")
+    path = folder / "robot.urdf"
+    path.write_text("\n".join(lines))
     return path
 
 
-def _link_text(name: str, inertia: Inertia, shapes: Sequence[Shape], folder: Path) -> str:
-    x, y, z = (float(m) for m in inertia.moments)
+def _ends(parent: str, child: int) -> str:
+    return f'<parent link="{parent}"/><child link="link{child}"/>'
+
+
+def _joint(i: int, parent: str, joint: Joint, T_parent_body: np.ndarray) -> str:
+    kind = joint.type
+    lower = joint.lower
+    upper = joint.upper
+    if not (np.isfinite(lower) and np.isfinite(upper)):
+        kind = "prismatic" if joint.type == "prismatic" else "continuous"
+        lower = 0.0
+        upper = -1.0  # Bullet's sign of a joint without limits
+    return (
+        f'<joint name="joint{i}" type="{kind}">{_ends(parent, i)}'
+        f'{_origin(T_parent_body)}<axis xyz="{_numbers(joint.axis)}"/>'
+        f'<limit lower="{lower!r}" upper="{upper!r}" effort="0" velocity="0"/></joint>'
+    )
+
+
+def _link(name: str, inertia: Inertia, shapes: Sequence[Shape], folder: Path) -> str:
+    x, y, z = inertia.moments.tolist()
     text = [
         f'<link name="{name}"><inertial>{_origin(inertial_frame(inertia))}<mass value="{inertia.mass!r}"/>'
         f'<inertia ixx="{x!r}" iyy="{y!r}" izz="{z!r}" ixy="0" ixz="0" iyz="0"/></inertial>'
     ]
     for i, shape in enumerate(shapes):
-        geometry = _geometry_text(shape, folder / f"{name}_{i}.obj")
-        origin = _origin(
-            np.eye(4) if shape.geometry.kind == "hull" else shape.T_body_shape
-        )  # a hull's vertices are moved instead
-        text.append(f"<collision>{origin}<geometry>{geometry}</geometry></collision>")
+        geometry = _geometry(shape, folder / f"{name}_{i}.obj")
+        pose = np.eye(4) if shape.geometry.kind == "hull" else shape.T_body_shape  # vertices of a hull are moved
+        text.append(f"<collision>{_origin(pose)}<geometry>{geometry}</geometry></collision>")
     return "".join([*text, "</link>"])
 
 
-def _geometry_text(shape: Shape, mesh: Path) -> str:
-    geometry = shape.geometry
-    if geometry.vertices is not None and geometry.faces is not None:
-        vertices = geometry.vertices @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
-        lines = [f"v {_numbers(v)}" for v in vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in geometry.faces]
+def _geometry(shape: Shape, mesh: Path) -> str:
+    kind = shape.geometry.kind
+    size = shape.geometry.size
+    if shape.geometry.faces is not None:
+        lines = [f"v {_numbers(vertex)}" for vertex in moved_vertices(shape)]
+        lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in shape.geometry.faces]
         mesh.write_text("\n".join(lines) + "\n")
         return f'<mesh filename="{mesh.name}"/>'
-    if geometry.kind == "box":
-        return f'<box size="{_numbers(2.0 * np.array(geometry.size))}"/>'
-    if geometry.kind == "sphere":
-        return f'<sphere radius="{geometry.size[0]!r}"/>'
-    radius, half = geometry.size
-    return f'<{geometry.kind} radius="{radius!r}" length="{2.0 * half!r}"/>'
+    if kind == "box":
+        return f'<box size="{_numbers(2.0 * np.array(size))}"/>'
+    if kind == "sphere":
+        return f'<sphere radius="{size[0]!r}"/>'
+    return f'<{kind} radius="{size[0]!r}" length="{2.0 * size[1]!r}"/>'
+
+
+def moved_vertices(shape: Shape) -> np.ndarray:
+    """[V, 3] vertices of a hull in the frame of its body."""
+    return shape.geometry.vertices @ shape.T_body_shape[:3, :3].T + shape.T_body_shape[:3, 3]
 
 
 def _origin(T: np.ndarray) -> str:
     R = T[:3, :3]
-    run = float(np.hypot(R[0, 0], R[1, 0]))  # cosine of the pitch: 0 where roll and yaw are one
-    roll, yaw = (
-        (np.arctan2(R[2, 1], R[2, 2]), np.arctan2(R[1, 0], R[0, 0]))
-        if run > 1e-9
-        else (np.arctan2(-R[1, 2], R[1, 1]), 0.0)
-    )
-    return f'<origin xyz="{_numbers(T[:3, 3])}" rpy="{_numbers((roll, np.arctan2(-R[2, 0], run), yaw))}"/>'
+    cos_pitch = float(np.hypot(R[0, 0], R[1, 0]))
+    if cos_pitch > 1e-9:
+        roll = np.arctan2(R[2, 1], R[2, 2])
+        yaw = np.arctan2(R[1, 0], R[0, 0])
+    else:  # gimbal lock: roll and yaw turn about the same axis
+        roll = np.arctan2(-R[1, 2], R[1, 1])
+        yaw = 0.0
+    pitch = np.arctan2(-R[2, 0], cos_pitch)
+    return f'<origin xyz="{_numbers(T[:3, 3])}" rpy="{_numbers((roll, pitch, yaw))}"/>'
 
 
 def _numbers(values: Any) -> str:
@@ -161,9 +156,6 @@ def _numbers(values: Any) -> str:
 def inertial_frame(inertia: Inertia) -> np.ndarray:
     """[4, 4] pose of the centre of mass and the principal axes in the body's frame."""
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = _matrix(inertia.quat), inertia.com
+    T[:3, :3] = np.stack([rotate(inertia.quat, axis) for axis in np.eye(3)], axis=1)
+    T[:3, 3] = inertia.com
     return T
-
-
-def _matrix(quat: np.ndarray) -> np.ndarray:
-    return np.stack([rotate(quat, axis) for axis in np.eye(3)], axis=1)

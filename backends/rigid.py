@@ -200,6 +200,7 @@ class MovingJoints:
         """[3, J] stiffness, damping and effort limit."""
         self.armature = np.array([drive.armature for drive in drives])
         self.friction_loss = np.array([drive.friction_loss for drive in drives])
+        self.has_dry_friction = bool(self.friction_loss.any())
 
     def spread(self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities [D] of all moving joints, given those [J] of the actuated ones."""

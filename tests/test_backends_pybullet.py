@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import unittest
 from dataclasses import replace
@@ -93,6 +94,19 @@ class PybulletTest(EngineChecks, unittest.TestCase):
         bad = replace(scene().objects[0], inertia=np.diag([1e-4, 1e-4, 1e-3]))
         with self.assertRaisesRegex(ObjectError, "'brick' has principal moments"):
             PybulletBackend(replace(scene(), objects=(bad,)), 1)
+
+    def test_only_the_first_import_touches_file_descriptors(self):
+        PybulletBackend.engine_version()
+        with mock.patch("os.dup2") as dup2:
+            self.make(scene())
+        dup2.assert_not_called()
+
+    def test_the_first_import_prints_nothing_and_standard_error_may_be_closed(self):
+        code = "from xreset.backends.pybullet import PybulletBackend as B; print(B.engine_version())"
+        for close in ("", "import os; os.close(2); "):
+            done = subprocess.run([sys.executable, "-c", close + code], capture_output=True, text=True, timeout=120)
+            self.assertEqual((done.returncode, done.stderr), (0, ""))
+            self.assertRegex(done.stdout, r"^[\d.]+\n$")
 
     def test_a_missing_engine_says_how_to_get_it(self):
         with (

@@ -3,7 +3,7 @@
 What differs from PyBullet's defaults, and why:
 
 - Gravity is off, and every step applies the object's weight as a force at its centre of mass: the robot is then
-  compensated exactly and gravity fractions cost nothing. (A robot without compensation gets its weight from the engine.)
+  compensated exactly and gravity fractions cost nothing. A robot without compensation gets its weight from the engine.
 - Drives are torques computed in ``bullet_drives``. PyBullet's own position control holds objects with a wrong force.
 - Friction of a pair is the *product* of its bodies' coefficients, and its torsional friction is s_a mu_b + s_b mu_a.
   With mu = 1 and s = 0 on the object, the other body's coefficients are the pair's.

@@ -2,13 +2,14 @@
 
 What differs from SAPIEN's defaults, and why:
 
-- The TGS solver, a contact offset of 1 mm (the default of 10 mm loses grasps), no sleeping, no damping, no joint friction (the default of
-  0.05 is no torque, and brakes).
-- Friction of a pair is the *average* of its materials. With 0 on the object, the other material has twice the pair's coefficient.
-  Torsional friction is mu times ``min_patch_radius``, so that radius is torsional / mu. PhysX leaves it out where a patch has two points
-  and lets half of the sliding friction act at each (``docs/sim-to-sim.md``; ``docs/lab-book.md`` has what that costs a policy).
-- The robot feels no gravity (if it is compensated). The object's weight is applied as a force, which gives gravity fractions.
-- PhysX reports the normal forces of contacts only; friction is worked out from the object's momentum
+- The TGS solver, a contact offset of 1 mm (the default of 10 mm loses grasps), no sleeping, no damping, no joint
+  friction (the default of 0.05 is no torque, and brakes).
+- Friction of a pair is the *average* of its materials. With 0 on the object, the other material has twice the pair's
+  coefficient. Torsional friction is mu times ``min_patch_radius``, so that radius is torsional / mu. PhysX omits it
+  where a patch has two points and lets half of the sliding friction act at each (``docs/sim-to-sim.md``).
+- The robot feels no gravity (if it is compensated). The object's weight is applied as a force, which gives gravity
+  fractions.
+- PhysX reports the normal forces of contacts only; friction is computed from the object's momentum
   (:func:`~xreset.backends.rigid.friction_forces`).
 - Linear velocities refer to the centre of mass; they are converted here. PhysX computes in single precision.
 """
@@ -16,10 +17,11 @@ What differs from SAPIEN's defaults, and why:
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -37,6 +39,7 @@ from xreset.backends.rigid import (
     rotate,
 )
 from xreset.backends.sapien_robot import OBJECT_BIT, TABLE_BIT, SapienJoints, self_collision_bits
+from xreset.geometry.urdf import Joint
 from xreset.physics import Capability, KnownDifference, unavailable
 from xreset.spec import GRAVITY, Geometry, SceneSpec, Shape
 
@@ -46,7 +49,8 @@ class SapienSettings:
     """PhysX's dials."""
 
     position_iterations: int = 20
-    """Substeps of the TGS solver. With 10, objects creep out of grasps by centimetres in seconds; 40 is no better and twice as slow."""
+    """Substeps of the TGS solver. With 10, objects creep out of grasps by centimetres in seconds; 40 is no better and
+    twice as slow."""
     velocity_iterations: int = 1
     """Sweeps of the solver over velocities."""
     contact_offset: float = 0.001
@@ -54,6 +58,9 @@ class SapienSettings:
 
 
 _DEFAULTS = SapienSettings()
+_TABLE = -1
+_LINK = -2
+"""What a shape belongs to: these, or the index of a fingertip."""
 
 
 class SapienWorld(World):
@@ -61,22 +68,23 @@ class SapienWorld(World):
 
     def __init__(self, scene: SceneSpec, object_index: int, *, settings: SapienSettings = _DEFAULTS) -> None:
         self._sapien = sapien = _engine()
-        self._settings, self._dt = settings, scene.timestep
-        _configure(sapien.physx, settings)
+        self._settings = settings
+        self._dt = scene.timestep
         self._mechanism = robot = mechanism(scene.robot)
         self._inertia = object_inertia(scene.objects[object_index])
         self._arm = Arms(self._inertia.com[None])
         self._torsional = scene.friction.torsional
-        self._materials = {
-            role: sapien.physx.PhysxMaterial(0.0, 0.0, 0.0) for role in ("tip", "link", "table", "object")
-        }
-        self._surfaces: dict[Any, _Surface] = {}
+        names = ("tip", "link", "table", "object")
+        self._materials = {name: sapien.physx.PhysxMaterial(0.0, 0.0, 0.0) for name in names}
+        self._owners: dict[Any, int] = {}
+        """Collision shape -> what it belongs to."""
         self._entities: list[Any] = []
-        self._add_table(scene)
-        self._bodies = self._add_robot()
-        self._object = self._add_object(scene.objects[object_index].pieces)
         self._scene: Any = None
         self._system: Any = None
+        with _configured(sapien.physx, settings):
+            self._add_table(scene)
+            self._bodies = self._add_robot()
+            self._object = self._add_object(scene.objects[object_index].pieces)
         self._renew_scene()
         self._joints = SapienJoints(self._bodies, robot, scene.timestep)
         self._frames = TrackedFrames(robot)
@@ -84,7 +92,9 @@ class SapienWorld(World):
         self._axes = Arms(np.array([rotate(self._inertia.quat, axis) for axis in np.eye(3)]))
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
-        self._last_step: tuple[_Motion, np.ndarray, np.ndarray] | None = None
+        self._last_step: tuple[np.ndarray, ...] | None = None
+        """Of the last physics step: the object's velocity, angular velocity and orientation before it; the force and
+        torque given."""
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
         self._renew_scene()
@@ -121,8 +131,8 @@ class SapienWorld(World):
             self._joints.brake()
             body.add_force_torque(force, self.torque)
             if not remaining:
-                start = _Motion(body.linear_velocity, body.angular_velocity, body.entity_pose.q)
-                self._last_step = start, force, self.torque
+                motion = (body.linear_velocity, body.angular_velocity, body.entity_pose.q)
+                self._last_step = (*motion, force, self.torque)
             self._system.step()
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -135,52 +145,52 @@ class SapienWorld(World):
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         tips = len(self._mechanism.robot.fingertips)
-        tip_force, tip_touch, table_force = np.zeros((tips, 3)), np.zeros(tips, dtype=bool), np.zeros(3)
+        tip_force = np.zeros((tips, 3))
+        tip_touch = np.zeros(tips, dtype=bool)
+        table_force = np.zeros(3)
         if self._last_step is None:
             return tip_force, tip_touch, table_force
-        surfaces, points, normal_forces = self._contact_points()
-        if surfaces:
+        owners, points, forces = self._contact_points()
+        if owners:
             pose = self._object.entity_pose
             arms = points - (pose.p + self._arm.turned(pose.q)[0])
-            limits = np.array([self._pair_friction[surface.role] for surface in surfaces])
-            missing = self._missing_wrench(*self._last_step, arms, normal_forces)
-            for surface, force in zip(
-                surfaces, normal_forces + friction_forces(arms, normal_forces, limits, *missing), strict=True
-            ):
-                if surface.role == "table":
-                    table_force += force
-                elif surface.tip is not None:
-                    tip_force[surface.tip] += force
-                    tip_touch[surface.tip] = True
+            coefficients = np.array([self._friction[_material(owner)] for owner in owners])
+            missing = self._missing_wrench(*self._last_step, arms, forces)
+            forces = forces + friction_forces(arms, forces, coefficients, *missing)
+        for owner, force in zip(owners, forces, strict=True):
+            if owner == _TABLE:
+                table_force += force
+            elif owner >= 0:
+                tip_force[owner] += force
+                tip_touch[owner] = True
         return tip_force, tip_touch, table_force
 
     def mass_properties(self) -> list[Inertia]:
-        bodies = (*self._bodies[1:], self._object)
-        frames = [body.cmass_local_pose for body in bodies]
-        return [
-            Inertia(
-                mass=body.mass,
-                com=frame.p.astype(float),
-                quat=frame.q.astype(float),
-                moments=body.inertia.astype(float),
+        found = []
+        for body in (*self._bodies[1:], self._object):
+            frame = body.cmass_local_pose
+            com = frame.p.astype(float)
+            found.append(
+                Inertia(mass=body.mass, com=com, quat=frame.q.astype(float), moments=body.inertia.astype(float))
             )
-            for body, frame in zip(bodies, frames, strict=True)
-        ]
+        return found
 
     def set_object_inertia(self, inertia: Inertia) -> None:
-        self._inertia, self._arm = inertia, Arms(inertia.com[None])
+        self._inertia = inertia
+        self._arm = Arms(inertia.com[None])
         self._set_inertia(self._object, inertia)
 
     def set_friction(self, friction: np.ndarray) -> None:
-        self._pair_friction = dict(zip(("tip", "link", "table"), (float(mu) for mu in friction), strict=True))
-        for role, mu in self._pair_friction.items():
-            self._materials[role].static_friction = self._materials[role].dynamic_friction = 2.0 * mu
+        self._friction = dict(zip(("tip", "link", "table"), friction.tolist(), strict=True))
+        for name, mu in self._friction.items():
+            self._materials[name].static_friction = 2.0 * mu
+            self._materials[name].dynamic_friction = 2.0 * mu
         self.set_torsional_friction(self._torsional)
 
     def set_torsional_friction(self, torsional: float) -> None:
         self._torsional = torsional
-        for shape, surface in self._surfaces.items():
-            mu = self._pair_friction[surface.role]
+        for shape, owner in self._owners.items():
+            mu = self._friction[_material(owner)]
             shape.min_patch_radius = torsional / mu if mu > 0 else 0.0
 
     def set_drives(self, scale: np.ndarray) -> None:
@@ -189,76 +199,78 @@ class SapienWorld(World):
     # Building ---------------------------------------------------------------------------------------------------------
 
     def _add_table(self, scene: SceneSpec) -> None:
-        table = self._sapien.physx.PhysxRigidStaticComponent()
-        self._attach(
-            table,
-            Shape(geometry=Geometry(kind="box", size=scene.table.half_size)),
-            _Surface("table"),
-            [TABLE_BIT, OBJECT_BIT, 0, 0],
-        )
-        self._add(table, "table", self._sapien.Pose([*scene.table.center, -scene.table.half_size[2]]))
+        body = self._sapien.physx.PhysxRigidStaticComponent()
+        shape = Shape(geometry=Geometry(kind="box", size=scene.table.half_size))
+        self._attach(body, shape, _TABLE, (TABLE_BIT, OBJECT_BIT))
+        self._add(body, "table", self._sapien.Pose([*scene.table.center, -scene.table.half_size[2]]))
 
     def _add_object(self, pieces: Sequence[Shape]) -> Any:
         body = self._sapien.physx.PhysxRigidDynamicComponent()
         for piece in pieces:
-            self._attach(body, piece, None, [OBJECT_BIT, 0, 0, 0])
+            self._attach(body, piece, None, (OBJECT_BIT, 0))
         self._set_inertia(body, self._inertia)
         body.disable_gravity = True
         self._add(body, "object", self._sapien.Pose())
         return body
 
     def _add_robot(self) -> list[Any]:
-        sapien, robot = self._sapien, self._mechanism.robot
+        robot = self._mechanism.robot
         self_bits = self_collision_bits(self._mechanism)
         links: list[Any] = []
         for body in self._mechanism.bodies:
-            link = sapien.physx.PhysxArticulationLinkComponent(links[body.parent] if body.parent >= 0 else None)
+            parent = links[body.parent] if body.parent >= 0 else None
+            link = self._sapien.physx.PhysxArticulationLinkComponent(parent)
             for part in body.shapes:
-                tip = self._mechanism.tip_of.get(part.link)
-                kind, affinity = self_bits.get(part.link, (0, 0))
-                near_table = 0 if part.link in robot.table_exclude else TABLE_BIT
-                surface = _Surface("link" if tip is None else "tip", tip)
-                self._attach(link, part.shape, surface, [kind, affinity | OBJECT_BIT | near_table, 0, 0])
+                bits, partner_bits = self_bits.get(part.link, (0, 0))
+                table_bit = 0 if part.link in robot.table_exclude else TABLE_BIT
+                owner = self._mechanism.tip_of.get(part.link, _LINK)
+                self._attach(link, part.shape, owner, (bits, partner_bits | OBJECT_BIT | table_bit))
             if body.inertia is not None:
                 self._set_inertia(link, body.inertia)
             link.disable_gravity = robot.gravity_compensated
             if body.joint is None:
                 link.joint.type = "fixed"
             else:
-                T_joint_axis = np.eye(4)
-                T_joint_axis[:3, :3] = _x_to(body.joint.axis)
-                link.joint.name = body.joint.name
-                link.joint.type = "prismatic" if body.joint.type == "prismatic" else "revolute_unwrapped"
-                link.joint.pose_in_parent = self._pose(body.T_parent_body @ T_joint_axis)
-                link.joint.pose_in_child = self._pose(T_joint_axis)
-                limited = np.isfinite(body.joint.lower) and np.isfinite(body.joint.upper)
-                link.joint.limit = [[body.joint.lower, body.joint.upper] if limited else [-np.inf, np.inf]]
+                self._set_joint(link.joint, body.joint, body.T_parent_body)
             links.append(link)
-        base = sapien.Pose(robot.base_pos, robot.base_quat)
+        base = self._sapien.Pose(robot.base_pos, robot.base_quat)
         for link, body in zip(links, self._mechanism.bodies, strict=True):
             self._add(link, body.name, base)  # the pose of the root decides; joints place the others
         return links
 
-    def _attach(self, body: Any, shape: Shape, surface: _Surface | None, groups: list[int]) -> None:
-        physx, geometry = self._sapien.physx, shape.geometry
-        material = self._materials[surface.role if surface else "object"]
+    def _set_joint(self, made: Any, joint: Joint, T_parent_body: np.ndarray) -> None:
+        T_joint_axis = np.eye(4)
+        T_joint_axis[:3, :3] = _x_to(joint.axis)
+        made.name = joint.name
+        made.type = "prismatic" if joint.type == "prismatic" else "revolute_unwrapped"
+        made.pose_in_parent = self._pose(T_parent_body @ T_joint_axis)
+        made.pose_in_child = self._pose(T_joint_axis)
+        limited = np.isfinite(joint.lower) and np.isfinite(joint.upper)
+        made.limit = [[joint.lower, joint.upper] if limited else [-np.inf, np.inf]]
+
+    def _attach(self, body: Any, shape: Shape, owner: int | None, groups: tuple[int, int]) -> None:
+        """Add a collision shape of the object (no owner), the table, a link or a fingertip."""
+        physx = self._sapien.physx
+        geometry = shape.geometry
+        size = geometry.size
+        material = self._materials["object" if owner is None else _material(owner)]
         T = shape.T_body_shape
         if geometry.kind == "box":
-            made = physx.PhysxCollisionShapeBox(half_size=geometry.size, material=material)
+            made = physx.PhysxCollisionShapeBox(half_size=size, material=material)
         elif geometry.kind == "sphere":
-            made = physx.PhysxCollisionShapeSphere(radius=geometry.size[0], material=material)
+            made = physx.PhysxCollisionShapeSphere(radius=size[0], material=material)
         elif geometry.kind == "hull":
             made = physx.PhysxCollisionShapeConvexMesh(vertices=geometry.vertices, scale=np.ones(3), material=material)
         else:
             kind = physx.PhysxCollisionShapeCapsule if geometry.kind == "capsule" else physx.PhysxCollisionShapeCylinder
-            made = kind(radius=geometry.size[0], half_length=geometry.size[1], material=material)
+            made = kind(radius=size[0], half_length=size[1], material=material)
             T = T.copy()
             T[:3, :3] = T[:3, :3] @ _x_to(np.array([0.0, 0.0, 1.0]))  # PhysX has them along x
         made.local_pose = self._pose(T)
-        made.set_collision_groups(groups)
+        made.set_collision_groups([*groups, 0, 0])
         body.attach(made)
-        if surface is not None:
-            self._surfaces[made] = surface
+        if owner is not None:
+            self._owners[made] = owner
 
     def _set_inertia(self, body: Any, inertia: Inertia) -> None:
         body.mass = inertia.mass
@@ -275,11 +287,12 @@ class SapienWorld(World):
         self._entities.append(entity)
 
     def _renew_scene(self) -> None:
-        """Move everything to a new scene: the only way to make PhysX forget the order in which pairs came into contact."""
-        for entity in self._entities if self._scene else ():
-            self._scene.remove_entity(entity)
-        _configure(self._sapien.physx, self._settings)
-        self._system = self._sapien.physx.PhysxCpuSystem()
+        """Move everything to a new scene: PhysX then forgets the order in which pairs came into contact."""
+        if self._scene:
+            for entity in self._entities:
+                self._scene.remove_entity(entity)
+        with _configured(self._sapien.physx, self._settings):
+            self._system = self._sapien.physx.PhysxCpuSystem()
         self._system.timestep = self._dt
         self._scene = self._sapien.Scene([self._system])
         for entity in self._entities:
@@ -290,46 +303,65 @@ class SapienWorld(World):
 
     # Contacts ---------------------------------------------------------------------------------------------------------
 
-    def _contact_points(self) -> tuple[list[_Surface], np.ndarray, np.ndarray]:
-        """What pressed on the object in the last step: surfaces, points [n, 3], normal forces on the object [n, 3]."""
-        surfaces, points, impulses = [], [], []
+    def _contact_points(self) -> tuple[list[int], np.ndarray, np.ndarray]:
+        """Return the contacts of the last step: owners, points [n, 3], normal forces on the object [n, 3]."""
+        owners = []
+        points = []
+        impulses = []
         for contact in self._system.get_contacts():
             first, second = contact.bodies
             if self._object not in (first, second):
                 continue
-            sign = 1.0 if first == self._object else -1.0  # an impulse acts on the first body
-            surface = self._surfaces[contact.shapes[1 if first == self._object else 0]]
+            is_first = first == self._object
+            sign = 1.0 if is_first else -1.0  # an impulse acts on the first body
+            owner = self._owners[contact.shapes[1 if is_first else 0]]
             for point in contact.points:
                 x, y, z = point.impulse.tolist()
                 if x or y or z:
-                    surfaces.append(surface)
+                    owners.append(owner)
                     points.append(point.position.tolist())
                     impulses.append((sign * x, sign * y, sign * z))
-        return surfaces, np.array(points), np.array(impulses) / self._dt
+        return owners, np.array(points), np.array(impulses) / self._dt
 
     def _missing_wrench(
-        self, start: _Motion, force: np.ndarray, torque: np.ndarray, arms: np.ndarray, contact_forces: np.ndarray
+        self,
+        linvel: np.ndarray,
+        angvel: np.ndarray,
+        quat: np.ndarray,
+        force: np.ndarray,
+        torque: np.ndarray,
+        arms: np.ndarray,
+        contact_forces: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Force and torque [3] about the centre of mass that the object's change of momentum shows beyond the forces given."""
-        axes, omega = self._axes.turned(start.quat), start.angvel.astype(np.float64)
+        """Return the force and torque [3] about the centre of mass that explain the rest of the change of momentum.
+
+        Args:
+            linvel: [3] velocity of the centre of mass before the step.
+            angvel: [3] angular velocity before the step.
+            quat: [4] orientation before the step.
+            force: [3] force given.
+            torque: [3] torque given.
+            arms: [n, 3] contact points from the centre of mass.
+            contact_forces: [n, 3] known forces at these points.
+        """
+        axes = self._axes.turned(quat)
+        omega = angvel.astype(np.float64)
         inertia = (axes.T * self._inertia.moments) @ axes
-        gained = self._inertia.mass * (self._object.linear_velocity - start.linvel) / self._dt
+        gained = self._inertia.mass * (self._object.linear_velocity - linvel) / self._dt
         turned = inertia @ (self._object.angular_velocity - omega) / self._dt + cross(omega, inertia @ omega)
         return gained - force - contact_forces.sum(axis=0), turned - torque - cross(arms, contact_forces).sum(axis=0)
 
 
-KNOWN_DIFFERENCES = tuple(
-    KnownDifference(
-        check="slope",
-        measure=f"creep, mu {mu}, {degrees} degrees",
-        bound=1e-3,
-        reason="PhysX's patch friction gives way a little in every step, the more the nearer the load is to the cone; twice the position "
-        "iterations would bring it to 0.4 mm/s, at twice the time",
-    )
-    for mu in (0.8, 1.2)
-    for degrees in (0, 45)
+_SLOPES = [(mu, degrees) for mu in (0.8, 1.2) for degrees in (0, 45)]  # noqa: XR002
+_CREEPS = (
+    "PhysX's patch friction gives way a little in every step, the more the nearer the load is to the cone; twice the "
+    "position iterations would bring it to 0.4 mm/s, at twice the time"
 )
-"""What PhysX cannot do with these settings."""
+KNOWN_DIFFERENCES = tuple(
+    KnownDifference(check="slope", measure=f"creep, mu {mu}, {degrees} degrees", bound=1e-3, reason=_CREEPS)
+    for mu, degrees in _SLOPES
+)
+"""Checks that PhysX misses with these settings."""
 
 
 class SapienBackend(PoolBackend):
@@ -346,41 +378,31 @@ class SapienBackend(PoolBackend):
         return version("sapien")
 
 
-class _Motion(NamedTuple):
-    """Of the object at the start of a step."""
-
-    linvel: np.ndarray
-    """[3] velocity of the centre of mass."""
-    angvel: np.ndarray
-    """[3]"""
-    quat: np.ndarray
-    """[4] orientation."""
-
-
-class _Surface(NamedTuple):
-    """What a shape is to the object."""
-
-    role: Literal["tip", "link", "table"]
-    tip: int | None = None
-    """Index of its fingertip."""
-
-
-# SAPIEN's habits ------------------------------------------------------------------------------------------------------
+# SAPIEN's conventions -------------------------------------------------------------------------------------------------
 
 _NO_LIMIT = 1e3
 """Speed limit of bodies [m/s, rad/s]: PhysX has lower ones of its own."""
 
 
+def _material(owner: int) -> str:
+    """Return the material of what a shape belongs to."""
+    return {_TABLE: "table", _LINK: "link"}.get(owner, "tip")
+
+
 def _x_to(axis: np.ndarray) -> np.ndarray:
-    """[3, 3] a rotation that turns x into a unit vector: joints, capsules and cylinders lie along x in PhysX."""
+    """[3, 3] a rotation that turns x into a unit vector: joints, capsules and cylinders are along x in PhysX."""
     other = np.eye(3)[np.abs(axis).argmin()]
     y = np.cross(axis, other)
     y /= np.linalg.norm(y)
     return np.stack([axis, y, np.cross(axis, y)], axis=1)
 
 
-def _configure(physx: Any, settings: SapienSettings) -> None:
-    """Set the process-wide configuration that systems, bodies and shapes take when they are made."""
+@contextmanager
+def _configured(physx: Any, settings: SapienSettings) -> Iterator[None]:
+    """Set the process-wide configuration that systems, bodies and shapes take when they are made; put it back after."""
+    scene = physx.get_scene_config()
+    body = physx.get_body_config()
+    shape = physx.get_shape_config()
     physx.set_scene_config(
         gravity=np.array([0.0, 0.0, -GRAVITY]),
         enable_tgs=True,
@@ -395,6 +417,12 @@ def _configure(physx: Any, settings: SapienSettings) -> None:
         sleep_threshold=0.0,
     )
     physx.set_shape_config(contact_offset=settings.contact_offset, rest_offset=0.0)
+    try:
+        yield
+    finally:
+        physx.set_scene_config(scene)
+        physx.set_body_config(body)
+        physx.set_shape_config(shape)
 
 
 def _engine() -> Any:

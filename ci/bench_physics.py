@@ -247,26 +247,24 @@ def _mujoco_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readin
 
 
 def _pybullet_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings) -> Callable[[], object]:
-    p, client, drives, tracked = world._p, world._client, world._drives, world._frames.bodies
-    robot, thing, joints = world._robot.body, world._object.body, drives._links
+    p, drives, tracked = world._p, world._drives, world._frames.bodies
+    robot, thing, joints = world._robot, world._object, drives._links
     weight = [0.0, 0.0, -GRAVITY * scene.objects[0].mass]
 
     def loop() -> object:
         drives.target = targets
-        for _ in range(scene.substeps * world._internal_steps):
+        for _ in range(scene.substeps * world._settings.internal_steps):
             drives.apply()
-            com, _ = p.getBasePositionAndOrientation(thing, physicsClientId=client)
-            p.applyExternalForce(thing, -1, weight, com, p.WORLD_FRAME, physicsClientId=client)
-            p.stepSimulation(physicsClientId=client)
-        states = p.getJointStates(robot, joints, physicsClientId=client)
+            com, _ = p.getBasePositionAndOrientation(thing)
+            p.applyExternalForce(thing, -1, weight, com, p.WORLD_FRAME)
+            p.stepSimulation()
+        states = p.getJointStates(robot, joints)
         joint_pos, joint_vel = np.array([s[0] for s in states]), np.array([s[1] for s in states])
-        pose = p.getBasePositionAndOrientation(thing, physicsClientId=client)
-        state = joint_pos, joint_vel, pose, p.getBaseVelocity(thing, physicsClientId=client)
+        pose = p.getBasePositionAndOrientation(thing)
+        state = joint_pos, joint_vel, pose, p.getBaseVelocity(thing)
         if kind == "state":
             return state
-        links = p.getLinkStates(
-            robot, tracked, computeLinkVelocity=1, computeForwardKinematics=1, physicsClientId=client
-        )
+        links = p.getLinkStates(robot, tracked, computeLinkVelocity=1, computeForwardKinematics=1)
         world._fresh = False
         return state, np.array([s[4] + s[5] + s[6] + s[7] for s in links]), world.contacts()
 
@@ -274,10 +272,8 @@ def _pybullet_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Read
 
 
 def _sapien_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings) -> Callable[[], object]:
-    from xreset.backends.sapien import _Motion
-
     thing, joints, tracked = world._object, world._joints, world._tracked
-    articulation, drives, brakes = joints._articulation, joints._drives, joints._loss.any()
+    articulation, drives, brakes = joints._articulation, joints._drives, joints._moving.has_dry_friction
     weight, nothing = np.array([0.0, 0.0, -GRAVITY * scene.objects[0].mass]), np.zeros(3)
 
     def motion(body: Any) -> tuple[np.ndarray, ...]:
@@ -292,8 +288,8 @@ def _sapien_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readin
                 joints.brake()
             thing.add_force_torque(weight, nothing)
             if kind == "all" and not remaining:
-                start = _Motion(thing.linear_velocity, thing.angular_velocity, thing.entity_pose.q)
-                world._last_step = start, weight, nothing
+                motion_before = (thing.linear_velocity, thing.angular_velocity, thing.entity_pose.q)
+                world._last_step = (*motion_before, weight, nothing)
             world._system.step()  # set_state makes a new one
         state = articulation.qpos, articulation.qvel, *motion(thing)
         return state if kind == "state" else (state, [motion(body) for body in tracked], world.contacts())

@@ -13,7 +13,7 @@ import numpy as np
 
 from tests.engine_checks import EngineChecks
 from xreset.backends.conformance import run
-from xreset.backends.conformance.scene import gripper
+from xreset.backends.conformance.scene import gripper, scene
 from xreset.backends.rigid import friction_forces, mechanism
 from xreset.backends.sapien import SapienBackend
 from xreset.backends.sapien_robot import _couple, self_collision_bits
@@ -30,6 +30,27 @@ class SapienTest(EngineChecks, unittest.TestCase):
             self.assertRaisesRegex(BackendUnavailableError, r"xreset\[sapien\]"),
         ):
             SapienBackend.engine_version()
+
+    def test_the_configuration_of_the_process_stays_as_it_was(self):
+        from sapien import physx
+
+        def configuration() -> tuple:
+            scene_config = physx.get_scene_config()
+            body = physx.get_body_config()
+            shape = physx.get_shape_config()
+            return (
+                scene_config.gravity.tolist(),
+                scene_config.enable_enhanced_determinism,
+                body.solver_position_iterations,
+                body.sleep_threshold,
+                shape.contact_offset,
+            )
+
+        before = configuration()
+        backend = self.make(scene())
+        backend.step()
+        backend.set_state(backend.state())
+        self.assertEqual(configuration(), before)
 
     def test_a_mimic_joint_far_below_its_source_follows_it(self):
         robot = gripper()

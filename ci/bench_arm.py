@@ -14,7 +14,9 @@ from rich.console import Console
 from xreset import robots
 from xreset.demos.archive import demo_objects, read_demos
 from xreset.demos.synth import synthesize
-from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, track
+from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.arm.model import ArmModel, ArmTargets
+from xreset.retarget.arm.solve import track
 from xreset.retarget.pipeline import wrist_paths
 from xreset.retarget.validity import Measures, Thresholds
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from xreset.env import ManipulationEnv
-from xreset.retarget.pipeline import Retargeted
+from xreset.retarget.file import Retargeted
 
 if TYPE_CHECKING:
     from tensordict import TensorDict

@@ -33,7 +33,6 @@ from xreset.learning.run import RunInfo, read_run, write_run
 from xreset.physics import State
 from xreset.resets.bank import read_bank, write_bank
 from xreset.retarget.file import read_retargeted, write_retargeted
-from xreset.retarget.partial import Batch, Partial
 
 SECONDS = 20.0
 """Longest time that a reader may take over a file of some kilobytes."""
@@ -98,18 +97,6 @@ def readers() -> Iterator[dict[str, Reader]]:
         write_retargeted(path, toy_retargeted(openarm), config={}, inputs={})
         path = add("reset bank", "bank.npz", lambda p: read_bank(p, robot=robot), "npz")
         write_bank(path, toy_bank(robot), config={"steps": 8}, inputs={"retargeted": "ab"})
-
-        partial = Partial(folder, "key")
-        add("finished batch", "batch_0000.npz", lambda p: partial.read(0), "npz", ("hand_error", "wrist_error"))
-        partial.write(
-            0,
-            Batch(
-                joint_pos=np.zeros((5, 4)),
-                reason=np.zeros(5, int),
-                hand_error=np.full(5, np.inf),
-                wrist_error=np.ones(5),
-            ),
-        )
 
         soup = load_object("soup")
         home = torch.as_tensor(openarm.home, dtype=torch.float32)[None]

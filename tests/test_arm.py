@@ -17,8 +17,10 @@ from xreset.description import load_robot as load
 from xreset.errors import RobotError
 from xreset.geometry.rotations import matrix_to_quat, quat_multiply
 from xreset.plugins import robot_folder
-from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, track
-from xreset.retarget.arm.splice import splice, spread_over
+from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.arm.model import ArmModel, ArmTargets
+from xreset.retarget.arm.paths import splice, spread_over
+from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools.check import check_description
 from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search, write_placement

@@ -51,7 +51,6 @@ class FaceTest(unittest.TestCase):
             "Any",
             "Self",
             "Data",
-            "Timing",
         }
         for name in xreset.__all__:
             value = name != "VectorEnv" and getattr(xreset, name)

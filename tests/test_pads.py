@@ -12,8 +12,7 @@ from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply, quat_
 from xreset.geometry.surface import Surface
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.cost import system
-from xreset.retarget.hand.model import HandModel
-from xreset.retarget.hand.problem import HandState, HandTargets
+from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.pipeline import RetargetConfig, hand_motions
 
@@ -60,15 +59,17 @@ class PadsTest(unittest.TestCase):
         return math.degrees(axis[..., 1].abs().clamp_max(1.0).acos().max().item())
 
     def test_pads_are_the_faces_that_meet(self):
-        pads, balls = self.model.pads, self.model.balls
+        balls = self.model.balls
         for side, link in ((1.0, "right_finger"), (-1.0, "left_finger")):
-            mine = balls.link[pads.ball] == balls.links.index(link)
-            centers, radii = balls.centers[pads.ball[mine]], balls.radii[pads.ball[mine]]
+            mine = balls.link[self.model.pad_balls] == balls.links.index(link)
+            pad = self.model.pad_balls[mine]
+            centers = balls.centers[pad]
+            radii = balls.radii[pad]
             self.assertLess((side * centers[:, 1] + radii - 0.0055).abs().max().item(), 1.1e-3)
             self.assertGreater(centers[:, 2].max().item() - centers[:, 2].min().item(), 0.05)
-            self.assertAlmostEqual(pads.share[mine].sum().item(), 1.0)
+            self.assertAlmostEqual(self.model.pad_shares[mine].sum().item(), 1.0)
         for name in ("ur7e-sharpa", "xarm7-leap"):
-            self.assertEqual(len(HandModel(robots.load(name)).pads.ball), 0, name)
+            self.assertEqual(len(HandModel(robots.load(name)).pad_balls), 0, name)
 
     def test_a_jaw_that_holds_is_turned_to_the_faces(self):
         _, targets = self.aslant(math.radians(20))

@@ -15,7 +15,7 @@ from xreset.physics import Health, State
 from xreset.resets import filter as filtering
 from xreset.resets.filter import REASONS, make_bank, rejection
 from xreset.resets.probe import settle
-from xreset.retarget.pipeline import Retargeted
+from xreset.retarget.file import Retargeted
 from xreset.spec import SceneSpec
 
 try:

@@ -27,18 +27,18 @@ from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_mul
 from xreset.geometry.shapes import box, half_spaces, hull, shape_mesh, surface_of
 from xreset.geometry.solids import link_field, signed_distance
 from xreset.geometry.surface import Surface, keypoint_contacts
-from xreset.retarget import pipeline as pipeline_module
 from xreset.retarget.arm import cost as arm_cost
-from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, track
+from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.arm.model import ArmModel, ArmTargets
+from xreset.retarget.arm.solve import track
 from xreset.retarget.collisions import colliding_links
 from xreset.retarget.file import Retargeted, read_retargeted, write_retargeted
 from xreset.retarget.hand.clearance import Distances, Objects, too_near
+from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.cost import system
-from xreset.retarget.hand.model import HandModel, keypoint_pairs
-from xreset.retarget.hand.problem import HandState
-from xreset.retarget.hand.solve import HandConfig, HandTargets, retarget_hand
+from xreset.retarget.hand.model import HandModel, HandState, HandTargets, keypoint_pairs
+from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.least_squares import solve_chain
-from xreset.retarget.partial import discard, run_key
 from xreset.retarget.pipeline import RetargetConfig, rest_on_table, retarget_demos
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
 from xreset.spec import KEYPOINTS, Geometry, ObjectSpec, Shape, TableSpec
@@ -351,7 +351,8 @@ class HandTest(unittest.TestCase):
 
     def too_near(self, targets: HandTargets, state: HandState, config: HandConfig) -> Distances:
         """What the clearance term acts on."""
-        bodies = self.model.bodies(*(value.flatten(0, 1) for value in vars(state).values()))
+        values = (state.joints, state.root_pos, state.root_quat)
+        bodies = self.model.bodies(*(value.flatten(0, 1) for value in values))
         objects = Objects.at(
             targets.object_pos.flatten(0, 1),
             targets.object_quat.flatten(0, 1),
@@ -488,9 +489,7 @@ class HandTest(unittest.TestCase):
         depth = []
         for weight in (0.0, 2000.0):
             motion = retarget_hand(self.model, inside, HandConfig(clearance_weight=weight))
-            distance = self.too_near(
-                inside, HandState(motion.joints, motion.root_pos, motion.root_quat), HandConfig()
-            ).value
+            distance = self.too_near(inside, motion, HandConfig()).value
             depth.append(-distance.min().item() if len(distance) else 0.0)
         self.assertGreater(depth[0], 0.02)
         self.assertLess(depth[1], 0.005)
@@ -611,7 +610,7 @@ class ArmTest(unittest.TestCase):
             joints = kinematics.clamp(span * (torch.rand(300, len(span), generator=generator, dtype=FLOAT) - 0.5))
             carriers = kinematics.link_poses(joints, model.carriers)
             hand_poses = model.hand_poses(joints[:, torch.as_tensor(model.hand.joint_indices)])
-            low = model.lowest(carriers[..., :3, 3], carriers[..., :3, :3], hand_poses, 0.02)
+            low = model.low_points(carriers[..., :3, 3], carriers[..., :3, :3], hand_poses, 0.02)
             points = kinematics.points(joints, support.links, torch.as_tensor(support.points))
             heights = height_above_table(points, torch.as_tensor(support.radii), model.table)
             of_carrier = model.carrier_of[[kinematics.link_index(link) for link in support.links]]
@@ -840,143 +839,19 @@ class PipelineTest(unittest.TestCase):
         self.assertIn("005_toma", text.getvalue())
         self.assertEqual((self.folder / "jaws.png").read_bytes()[:4], b"\x89PNG")
 
-
-class StopAndContinueTest(unittest.TestCase):
-    """A run that is stopped and started again ends with what an uninterrupted one gives."""
-
-    CONFIG: ClassVar = RetargetConfig(
-        hand=HandConfig(iterations=3), arm=ArmConfig(restarts=2, branches=1, first_iterations=5, iterations=2)
-    )
-
-    @classmethod
-    def setUpClass(cls):
-        cls.enterClassContext(mock.patch.object(pipeline_module, "_SEQUENCES_PER_BATCH", 1))
-        cls.robot = robots.load("ur7e-sharpa")
-        demos = synthesize(["soup"], per_object=3, seed=1)
-        short = np.concatenate([np.arange(start + 20, start + 26) for start in demos.frame_offsets[:-1]])
-        frames = {name: getattr(demos, name)[short] for name in ("hand_keypoints", "hand_valid", "wrist_quat_wxyz")}
-        frames |= {name: getattr(demos, name)[short] for name in ("object_pos", "object_quat_wxyz")}
-        cls.demos = dataclasses.replace(demos, frame_offsets=np.arange(0, 24, 6, dtype=np.int32), **frames)
-        cls.objects = list(demo_objects(cls.demos).values())
-        cls.whole = retarget_demos(cls.demos, cls.robot, cls.objects, cls.CONFIG)
-
-    def setUp(self):
-        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory())) / "out.npz.partial"
-        self.solved = []
-
-    def run_once(self, stop_in: int | None = None, demos=None, config=None, robot=None):
-        """One run; ``stop_in``: Ctrl-C comes while this batch is worked on. The batches that it works on are noted."""
-
-        def progress(done: float, total: int) -> None:
-            if done % 1:  # only work reports parts
-                self.solved += [int(done)] if int(done) not in self.solved else []
-                if stop_in is not None and int(done) == stop_in:
-                    raise KeyboardInterrupt
-
-        return retarget_demos(
-            demos or self.demos,
-            robot or self.robot,
-            self.objects,
-            config or self.CONFIG,
-            progress=progress,
-            partial=self.folder,
-        )
-
-    def stopped(self, batch: int = 2) -> None:
-        with self.assertRaises(KeyboardInterrupt):
-            self.run_once(stop_in=batch)
-        self.solved = []
-
-    def assert_same(self, result: Retargeted, expected: Retargeted) -> None:
-        for field in dataclasses.fields(Retargeted):
-            np.testing.assert_array_equal(getattr(result, field.name), getattr(expected, field.name), field.name)
-
-    def test_the_second_start_does_the_rest_and_the_result_is_the_same_bit_by_bit(self):
-        self.stopped()
-        result = self.run_once()
-        self.assertEqual(self.solved, [2])
-        self.assert_same(result, self.whole)
-
-    def test_what_other_inputs_made_is_not_used(self):
-        self.stopped()
-        louder = dataclasses.replace(self.CONFIG, contact_distance=0.015)
-        shifted = dataclasses.replace(self.demos, object_pos=self.demos.object_pos + np.float32([0.01, 0, 0]))
-        other = dataclasses.replace(self.robot, name="other")
-        for changes in ({"config": louder}, {"demos": shifted}, {"robot": other}):
-            with self.subTest(*changes), self.assertRaises(KeyboardInterrupt):
-                self.run_once(stop_in=0, **changes)
-        self.assert_same(self.run_once(), self.whole)
-
-    def test_the_objects_count(self):
-        keys = {
-            run_key(self.demos, self.robot, objects, self.CONFIG, size, device)
-            for objects, size, device in (
-                (self.objects, 1, "cpu"),
-                (self.objects, 2, "cpu"),
-                (self.objects, 1, "cuda"),
-                ([dataclasses.replace(self.objects[0], pieces=self.objects[0].pieces * 2)], 1, "cpu"),
-            )
-        }
-        self.assertEqual(len(keys), 4)
-
-    def test_a_damaged_batch_is_made_again(self):
-        self.stopped()
-        first = self.folder / "batch_0000.npz"
-        first.write_bytes(first.read_bytes()[:1000])
-        result = self.run_once()
-        self.assertEqual(self.solved, [0, 2])
-        self.assert_same(result, self.whole)
-
-    def test_discard_removes_its_own_files_only(self):
-        self.folder.mkdir()
-        for name in ("batch_0000.npz", ".xreset-abc.part", "notes.txt"):
-            (self.folder / name).touch()
-        discard(self.folder)
-        self.assertEqual([path.name for path in self.folder.iterdir()], ["notes.txt"])
-        (self.folder / "notes.txt").unlink()
-        discard(self.folder)
-        self.assertFalse(self.folder.exists())
-        discard(self.folder)
-
-    def test_the_command_says_how_to_continue_and_cleans_up(self):
+    def test_a_stopped_command_leaves_no_file(self):
         from xreset.cli.retarget import retarget as command
 
-        demos, out = self.folder.parent / "demos.npz", self.folder.parent / "out.npz"
-        write_demos(demos, self.demos)
-
-        def run(stop_in: int | None = None, restart: bool = False) -> str:
-            """Ctrl-C comes at the beginning of the batch ``stop_in``."""
-            self.solved = []
-            solve = pipeline_module._solve
-
-            def counted(demos, sequences, *rest):
-                if sequences == [stop_in]:
-                    raise KeyboardInterrupt
-                self.solved += sequences
-                return solve(demos, sequences, *rest)
-
-            text = io.StringIO()
-            with (
-                contextlib.redirect_stdout(text),
-                mock.patch.object(pipeline_module, "_solve", counted),
-                mock.patch.object(pipeline_module, "RetargetConfig", lambda **_: self.CONFIG),
-                contextlib.ExitStack() as stack,
-            ):
-                if stop_in is not None:
-                    stack.enter_context(self.assertRaises(KeyboardInterrupt))
-                command(demos, robot="ur7e-sharpa", out=out, restart=restart)
-            return " ".join(text.getvalue().split())
-
-        self.assertIn("give the same command again to continue", run(stop_in=1))
-        self.assertEqual(self.solved, [0])
-        run(stop_in=2)
-        self.assertEqual(self.solved, [1])
-        run(stop_in=1, restart=True)
-        self.assertEqual(self.solved, [0])
-        run()
-        self.assertEqual(self.solved, [1, 2])
-        self.assertFalse(self.folder.exists())
-        self.assert_same(read_retargeted(out), self.whole)
+        demos = self.folder / "stopped" / "demos.npz"
+        demos.parent.mkdir()
+        write_demos(demos, self.demos.select(indices=[0]))
+        with (
+            mock.patch("xreset.retarget.pipeline.track", side_effect=KeyboardInterrupt),
+            contextlib.redirect_stdout(io.StringIO()),
+            self.assertRaises(KeyboardInterrupt),
+        ):
+            command(demos, robot="openarm", out=demos.with_name("out.npz"), hand=HandConfig(iterations=1))
+        self.assertEqual(list(demos.parent.iterdir()), [demos])
 
 
 class RealDataTest(unittest.TestCase):

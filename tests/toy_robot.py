@@ -11,8 +11,7 @@ from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
 
 if TYPE_CHECKING:
-    from xreset.retarget.hand.model import HandModel
-    from xreset.retarget.hand.problem import HandState
+    from xreset.retarget.hand.model import HandModel, HandState
 
 _JOINTS = (
     # name, type, parent, child, xyz, rpy, axis, lower, upper
@@ -84,7 +83,7 @@ def toy_hand_arm(folder: Path) -> RobotSpec:
 def toy_motion(model: HandModel, generator: torch.Generator, *, margin: float, turn: float) -> HandState:
     """Three motions of 12 frames: joints between two postures that keep a share ``margin`` of their range from the limits, the root along
     a line and turning by ``turn`` [rad] about each axis."""
-    from xreset.retarget.hand.problem import HandState
+    from xreset.retarget.hand.model import HandState
 
     low, high = model.kinematics.lower, model.kinematics.upper
     share = torch.linspace(0, 1, 12, dtype=low.dtype)[:, None]

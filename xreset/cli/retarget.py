@@ -17,7 +17,7 @@ from xreset.description import load_robot
 from xreset.files import file_hash
 from xreset.pictures import render
 from xreset.pictures.view import load, sheet
-from xreset.retarget import collisions, file, partial, pipeline
+from xreset.retarget import collisions, file, pipeline
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.hand.config import HandConfig
 
@@ -29,7 +29,6 @@ def retarget(
     out: Path,
     objects: Path | None = None,
     max_per_object: int | None = None,
-    restart: bool = False,
     picture: Path | None = None,
     device: str = "cpu",
     hand: HandConfig = HandConfig(),  # noqa: B008 (frozen)
@@ -37,15 +36,12 @@ def retarget(
 ) -> None:
     """Turn human demonstrations into robot trajectories.
 
-    What is finished is kept in the folder OUT.partial until all is: after a stop, the same command goes on from there.
-
     Args:
         demos: Archive of demonstrations (see `xreset demos`).
         robot: Name of a robot, or the folder of its description.
         out: File to write.
         objects: Folder of real meshes; default: the built-in stand-ins.
         max_per_object: Only the first so many sequences of each object.
-        restart: Begin anew, whatever an earlier run has finished.
         device: Where hand retargeting runs: cpu or cuda. The arm runs on the CPU.
         hand: Weights of hand retargeting.
         arm: Weights and effort of the arm's inverse kinematics.
@@ -59,31 +55,17 @@ def retarget(
     for doubt in plausible.doubts(chosen):
         console.print(f"note: {doubt}", style="yellow", soft_wrap=True, highlight=False)
     specs = archive.demo_objects(chosen, objects)
-    config, timing = pipeline.RetargetConfig(hand=hand, arm=arm), pipeline.Timing()
-    kept = out.with_name(f"{out.name}.partial")
-    if restart:
-        partial.discard(kept)
-    try:
-        with Progress(console) as bar:
-            result = pipeline.retarget_demos(
-                chosen, spec, list(specs.values()), config,
-                progress=bar.count("sequences"), partial=kept, timing=timing,
-                device=device,
-            )  # fmt: skip
-    except KeyboardInterrupt:
-        if kept.is_dir():
-            console.print(
-                f"What is finished is kept in {kept}; give the same command again to continue, with --restart to begin anew."
-            )
-        raise
-    pipeline.write_retargeted(
+    config = pipeline.RetargetConfig(hand=hand, arm=arm)
+    with Progress(console) as bar:
+        count = bar.count("sequences")
+        result = pipeline.retarget_demos(chosen, spec, list(specs.values()), config, progress=count, device=device)
+    file.write_retargeted(
         out,
         result,
         config={"retarget": asdict(config), "robot": robot, "max_per_object": max_per_object},
         inputs={"demos": file_hash(demos), "robot": spec.fingerprint}
         | {f"object {s.name}": s.source for s in specs.values()},
     )
-    partial.discard(kept)
 
     if picture is not None:
         shown = load.load_view(out, demos=demos, robot=robot, objects=objects)
@@ -106,7 +88,6 @@ def retarget(
         console.print(
             f"{chosen.sequence_name[index]}: the object starts on top of something that the scene does not have; not lowered."
         )
-    console.print(f"hand {timing.hand:.1f} s, arm {timing.arm:.1f} s", highlight=False)
     console.print(
         f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}; counts in {accounts_path(out)}"
     )

@@ -20,7 +20,7 @@ from xreset.resets.closing import with_closing_frames
 from xreset.resets.config import ClosingConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
 from xreset.resets.probe import probe
-from xreset.retarget.pipeline import Retargeted
+from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task.config import TerminationConfig
 from xreset.task.terminations import out_of_bounds

@@ -1,4 +1,4 @@
-"""The file between retargeting and reset bank: robot trajectories, frame by frame, with their validity.
+"""The file between retargeting and reset bank: robot trajectories and the validity of every frame.
 
 Shape letters: S sequences, F frames of all sequences, J joints, E fingertips, R reasons.
 """
@@ -26,7 +26,7 @@ class Retargeted(ObjectMotions):
 
     robot: Annotated[str, Field((), "U")]
     robot_fingerprint: Annotated[str, Field((), "U")]
-    """:attr:`xreset.spec.RobotSpec.fingerprint` of the robot that they were made for."""
+    """:attr:`xreset.spec.RobotSpec.fingerprint` of the robot."""
     sequence_name: Annotated[np.ndarray, Field(("S",), "U")]
     object_name: Annotated[np.ndarray, Field(("S",), "U")]
     hand_side: Annotated[np.ndarray, Field(("S",), "U")]
@@ -43,7 +43,7 @@ class Retargeted(ObjectMotions):
     fingertip_names: Annotated[tuple[str, ...], Field(("E",), "U")]
     fingertip_pos: Annotated[np.ndarray, Field(("F", "E", 3), "f", within=POSITION)]
     object_pos: Annotated[np.ndarray, Field(("F", 3), "f", within=POSITION)]
-    """[F, 3] the demonstration's, put onto the table; meaningful in every frame, whether ``valid`` or not."""
+    """[F, 3] object position of the demonstration, put onto the table; meaningful in every frame, valid or not."""
     object_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", unit=True)]
     goal_pos: Annotated[np.ndarray, Field(("S", 3), "f", within=POSITION)]
     """[S, 3] object position in the last frame."""
@@ -62,7 +62,7 @@ class Retargeted(ObjectMotions):
     hand_error: Annotated[np.ndarray, Field(("F",), "f", within=None)]
     """[F] mean distance of the robot's fingertips from the human's [m]; infinite where not annotated."""
     wrist_error: Annotated[np.ndarray, Field(("F",), "f", within=None)]
-    """[F] distance of the hand root from where hand retargeting wants it [m]; infinite where not annotated."""
+    """[F] distance of the hand root from its target of hand retargeting [m]; infinite where not annotated."""
 
     @property
     def post_contact(self) -> np.ndarray:
@@ -72,7 +72,7 @@ class Retargeted(ObjectMotions):
         return (first >= 0) & (np.arange(len(owner)) - self.frame_offsets[owner] >= first)
 
     def accounts(self) -> list[Account]:
-        """What became of every frame, by object and phase."""
+        """Count valid frames and the reasons of invalid ones, by object and phase."""
         reason = np.where(self.valid, "", np.asarray(self.reason_names)[self.reason])
         return accounts(np.asarray(self.object_name)[self.sequence_of_frame], self.post_contact, reason)
 
@@ -85,7 +85,7 @@ def write_retargeted(
 
 
 def read_retargeted(path: str | Path) -> Retargeted:
-    """Read trajectories; all of the file is checked before any of it is used.
+    """Read trajectories; the whole file is checked before any of it is used.
 
     Raises:
         FileFormatError: the file is missing, damaged, of another kind, or inconsistent.
@@ -98,14 +98,14 @@ def _check(arrays: dict[str, np.ndarray]) -> str | None:
     if problem := offsets_problem(arrays, len(arrays["joint_pos"])):
         return problem
     if (wrong := ~np.isin(arrays["hand_side"], SIDES)).any():
-        return f"array 'hand_side' holds {shown(str(arrays['hand_side'][wrong][0]))}, expected right or left."
+        return f"array 'hand_side' contains {shown(str(arrays['hand_side'][wrong][0]))}, expected right or left."
     if ((arrays["reason"] < 0) | (arrays["reason"] >= len(arrays["reason_names"]))).any():
         return "array 'reason' points beyond 'reason_names'."
     if (arrays["valid"] != (arrays["reason"] == 0)).any():
         return "'valid' and 'reason' contradict each other."
     for name in ("hand_error", "wrist_error"):
         if not (arrays[name] >= 0).all():
-            return f"array {name!r} holds negative distances, or some that are no number."
+            return f"array {name!r} contains negative or NaN distances, expected 0 or more."
     if ((arrays["first_contact"] < -1) | (arrays["first_contact"] >= np.diff(offsets))).any():
         return "array 'first_contact' points beyond its sequence."
     return None

@@ -1,4 +1,5 @@
-"""Levenberg-Marquardt with projected steps for a batch of independent problems, and the linear systems of a chain in time.
+"""Levenberg-Marquardt with projected steps for a batch of independent problems, and the linear systems of a chain in
+time.
 
 Shape letters: B problems, R of them that are not done; S chains (sequences), T blocks (frames), n unknowns per block.
 """
@@ -12,10 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from xreset.geometry.rotations import matvec
 from xreset.tensors import where
 
 
-def minimise(
+def minimize(
     x: Any,
     evaluate: Callable[[Any, Tensor], Any],
     step: Callable[[Any, Any, Tensor], Any],
@@ -25,24 +27,28 @@ def minimise(
     damping_range: tuple[float, float] = (0.0, inf),
     progress: Callable[[int], None] = lambda _: None,
 ) -> tuple[Any, Tensor]:
-    """Damped Gauss-Newton steps; a problem takes those that lower its cost, and costs nothing more when it is done.
+    """Take damped Gauss-Newton steps; a problem keeps those that lower its cost, and takes no more time when it is
+    done.
 
     Args:
         x: first guess: a tensor, or a bundle of tensors (:class:`~xreset.tensors.Tensors`), of B rows.
-        evaluate: costs and their approximation, a bundle with ``cost`` [R], at x [R, ...], given which of the problems those are [R].
-        step: where a damped step leads, given x, the approximation and the damping [R].
-        done: [R] whether problems are done, given x before, x tried, both costs [R], and the damping [R] of the next step.
+        evaluate: returns costs and their approximation, a bundle with ``cost`` [R], at x [R, ...] of the problems [R].
+        step: returns where a damped step leads, given x, the approximation and the damping [R].
+        done: returns whether problems are done [R], given x before, x tried, both costs [R], and the damping [R] of the
+            next step.
         iterations: most steps.
-        damping_range: of the damping.
-        progress: called with the number of steps done, before each.
+        damping_range: smallest and largest damping.
+        progress: called before each step with the number of steps done.
 
     Returns:
         The best x found, and its cost [B].
     """
-    first = next(iter(vars(x).values())) if not isinstance(x, Tensor) else x
+    first = x if isinstance(x, Tensor) else next(iter(vars(x).values()))
     rows = torch.arange(len(first), device=first.device)
     damping = torch.full((len(rows),), 1e-3, dtype=torch.float64, device=first.device)
-    best, now, here = x.clone(), x, evaluate(x, rows)
+    best = x.clone()
+    now = x
+    here = evaluate(x, rows)
     cost = here.cost.clone()
     for iteration in range(iterations):
         progress(iteration)
@@ -51,18 +57,26 @@ def minimise(
         better = there.cost < here.cost
         damping = torch.where(better, damping * 0.2, damping * 8.0).clamp(*damping_range)
         left = ~done(now, trial, here.cost, there.cost, damping)
-        now, here = where(better, trial, now), where(better, there, here)
-        best[rows], cost[rows] = now, here.cost
+        now = where(better, trial, now)
+        here = where(better, there, here)
+        best[rows] = now
+        cost[rows] = here.cost
         if not bool(left.any()):
             break
         if not bool(left.all()):
-            rows, damping, now, here = rows[left], damping[left], now[left], here[left]
+            rows = rows[left]
+            damping = damping[left]
+            now = now[left]
+            here = here[left]
     return best, cost
 
 
 def free_to_move(x: Tensor, gradient: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """1 for variables that may move, 0 for those at a bound while the cost pulls them outwards (Bertsekas' projection)."""
-    return (~(((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0)))).to(gradient.dtype)
+    """Return 1 for variables that may move, 0 for those at a bound while the cost pulls them outwards (Bertsekas'
+    projection)."""
+    at_lower = (x <= lower) & (gradient > 0)
+    at_upper = (x >= upper) & (gradient < 0)
+    return (~(at_lower | at_upper)).to(gradient.dtype)
 
 
 def solve_chain(diagonal: Tensor, coupling: Tensor, rhs: Tensor) -> Tensor:
@@ -70,13 +84,14 @@ def solve_chain(diagonal: Tensor, coupling: Tensor, rhs: Tensor) -> Tensor:
 
     Block elimination (the matrix form of Thomas' algorithm): with A_0 = D_0,
 
-        A_t = D_t - C_{t-1} A_{t-1}^-1 C_{t-1},   y_t = b_t - C_{t-1} A_{t-1}^-1 y_{t-1},   x_t = A_t^-1 (y_t - C_t x_{t+1}).
+        A_t = D_t - C_{t-1} A_{t-1}^-1 C_{t-1},   y_t = b_t - C_{t-1} A_{t-1}^-1 y_{t-1},   x_t = A_t^-1 (y_t - C_t
+        x_{t+1}).
 
     The cost is linear in T; every step is batched over S.
 
     Args:
         diagonal: [S, T, n, n] symmetric blocks; H must be positive definite.
-        coupling: [S, T-1, n] diagonals of the blocks beside the diagonal.
+        coupling: [S, T-1, n] diagonals of the blocks next to the diagonal.
         rhs: [S, T, n] right-hand side b.
 
     Returns:
@@ -85,19 +100,19 @@ def solve_chain(diagonal: Tensor, coupling: Tensor, rhs: Tensor) -> Tensor:
     Raises:
         torch.linalg.LinAlgError: H is not positive definite.
     """
-    frames = diagonal.shape[1]
     inverses: list[Tensor] = []
     reduced: list[Tensor] = []
-    block, y = diagonal[:, 0], rhs[:, 0]
-    for t in range(frames):
+    for t in range(diagonal.shape[1]):
+        block = diagonal[:, t]
+        y = rhs[:, t]
         if t:
             link = coupling[:, t - 1]
-            block = diagonal[:, t] - link[:, :, None] * inverses[-1] * link[:, None, :]
-            y = rhs[:, t] - link * (inverses[-1] @ reduced[-1][..., None])[..., 0]
+            block = block - link[:, :, None] * inverses[-1] * link[:, None, :]
+            y = y - link * matvec(inverses[-1], reduced[-1])
         inverses.append(torch.cholesky_inverse(torch.linalg.cholesky(block)))
         reduced.append(y)
-    solution = [(inverses[-1] @ reduced[-1][..., None])[..., 0]]
-    for t in range(frames - 2, -1, -1):
+    solution = [matvec(inverses[-1], reduced[-1])]
+    for t in range(diagonal.shape[1] - 2, -1, -1):
         y = reduced[t] - coupling[:, t] * solution[-1]
-        solution.append((inverses[t] @ y[..., None])[..., 0])
+        solution.append(matvec(inverses[t], y))
     return torch.stack(solution[::-1], dim=1)

@@ -1,13 +1,15 @@
-"""When a retargeted frame may be used, and why not.
+"""Which retargeted frames may be used, and why the others may not.
 
-The paper (appendix D.b): frames are valid only when wrist position and orientation error, retargeting error and arm-joint jumps remain
-below thresholds. Collisions and missing annotations count as well; every invalid frame has one reason, the first that applies.
+The paper (appendix D.b): frames are valid only when wrist position and orientation error, retargeting error and
+arm-joint jumps stay below thresholds. Collisions and missing annotations count as well. Every invalid frame has one
+reason, the first that applies.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 REASONS = (
@@ -21,7 +23,8 @@ REASONS = (
     "table collision",
     "self collision",
 )
-"""Why a frame is invalid, in the order of precedence. ``joint limit``: the wrist pose is missed with an arm joint at its limit."""
+"""Reasons why a frame is invalid, in the order of precedence. ``joint limit``: the wrist is off with an arm joint at
+its limit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +47,7 @@ class Thresholds:
 
 @dataclass(frozen=True, kw_only=True)
 class Measures:
-    """What is measured of frames; every tensor has the same shape."""
+    """Measures of frames; every tensor has the same shape."""
 
     annotated: Tensor
     """bool: whether the human hand was annotated."""
@@ -55,7 +58,7 @@ class Measures:
     wrist_orientation: Tensor
     """[rad]"""
     at_limit: Tensor
-    """bool: an arm joint is at its limit."""
+    """bool: whether an arm joint is at its limit."""
     arm_jump: Tensor
     """[rad or m]; 0 in the first annotated frame."""
     table_clearance: Tensor
@@ -65,7 +68,7 @@ class Measures:
 
 
 def classify(measures: Measures, thresholds: Thresholds) -> Tensor:
-    """Index into :data:`REASONS` of every frame; 0 is valid. A value that is not a number counts as beyond its threshold."""
+    """Return the index into :data:`REASONS` of every frame; 0 is valid. A NaN counts as beyond its threshold."""
     position = ~(measures.wrist_position <= thresholds.wrist_position)
     orientation = ~(measures.wrist_orientation <= thresholds.wrist_orientation)
     applies = {
@@ -78,7 +81,7 @@ def classify(measures: Measures, thresholds: Thresholds) -> Tensor:
         "table collision": ~(measures.table_clearance >= -thresholds.table_depth),
         "self collision": ~(measures.self_clearance >= -thresholds.self_depth),
     }
-    reason = measures.annotated.long() * 0
-    for name in reversed(REASONS[1:]):
-        reason[applies[name]] = REASONS.index(name)
+    reason = torch.zeros_like(measures.annotated, dtype=torch.long)
+    for index in range(len(REASONS) - 1, 0, -1):
+        reason[applies[REASONS[index]]] = index
     return reason

@@ -26,7 +26,9 @@ from scipy.spatial.transform import Rotation
 
 from xreset.errors import RobotError
 from xreset.geometry.rotations import matrix_to_quat
-from xreset.retarget.arm.solve import ArmConfig, ArmModel, ArmTargets, track
+from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.arm.model import ArmModel, ArmTargets
+from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search
 from xreset.spec import RobotSpec

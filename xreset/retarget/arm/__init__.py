@@ -1,1 +1,2 @@
-"""Arm inverse kinematics along a retargeted hand's path: ``solve`` on ``paths``, ``splice``, ``cost``, ``model`` and ``config``."""
+"""Arm inverse kinematics along a retargeted hand's path: ``solve``, on ``paths``, ``cost``, ``model`` and
+``config``."""

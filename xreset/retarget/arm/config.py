@@ -1,4 +1,5 @@
-"""Weights and effort of the arm's inverse kinematics. Imports no torch, so that the command line can show them at once."""
+"""Weights and effort of the arm's inverse kinematics. This module imports no torch, so the command line can show them
+quickly."""
 
 from __future__ import annotations
 
@@ -9,14 +10,15 @@ from xreset.checks import Checked, Finite, NotNegative, Positive
 
 @dataclass(frozen=True, kw_only=True)
 class ArmConfig(Checked):
-    """Weights and effort of the arm's inverse kinematics; the first two weights as in the paper."""
+    """Weights and effort of the arm's inverse kinematics; the first two weights are the paper's."""
 
     position_weight: NotNegative[float] = 50.0
     """Squared distance of the hand root [1/m^2]."""
     orientation_weight: NotNegative[float] = 10.0
     """Squared angle of the hand root [1/rad^2]."""
     smoothness_weight: NotNegative[float] = 0.02
-    """Squared change of the joints since the frame before [1/rad^2]; the paper's lambda_s, whose value it does not give."""
+    """Squared change of the joints since the frame before [1/rad^2]; the paper's lambda_s, whose value it does not
+    give."""
     collision_weight: NotNegative[float] = 1000.0
     """Squared intrusion into the margins [1/m^2]."""
     table_margin: Finite[float] = 0.002
@@ -24,19 +26,21 @@ class ArmConfig(Checked):
     self_margin: Finite[float] = 0.010
     """Distance that the robot's links keep from each other [m]."""
     restarts: Positive[int] = 32
-    """Random starts of the first and of the last frame (the first of them is the home configuration)."""
+    """Starts of the first and of the last frame: the home configuration, then random ones."""
     branches: Positive[int] = 4
-    """Distinct solutions of the first and of the last frame that are followed; the one that home leads to is always among them."""
+    """Distinct solutions of the first and of the last frame that are followed; the one that home leads to is always one
+    of them."""
     detour_cost: NotNegative[float] = 1.0
-    """Valid frames that a path is worth less for each rad^2 of its mean squared distance from home. A policy starts at home: states in
-    another branch of the arm's solutions are of no use to it, because the way there leads through half a turn of the shoulder."""
+    """Valid frames that a path loses per rad^2 of its mean squared distance from home. A policy starts at home: it
+    cannot use states in another branch of the arm's solutions, because the way there leads through half a turn of the
+    shoulder."""
     reseeds: NotNegative[int] = 2
-    """Frames of a sequence, of those whose wrist is still missed, that are solved like a first frame and followed both ways; 0: none."""
+    """Frames of a sequence whose wrist is still missed that are solved like a first frame and followed both ways."""
     switch_cost: NotNegative[float] = 0.5
-    """Valid frames that each change from one of the followed paths to another must bring."""
+    """Valid frames that each change from one of the followed paths to another must gain."""
     first_iterations: NotNegative[int] = 60
     """Most steps for the frame that a path starts from."""
     iterations: NotNegative[int] = 12
     """Most steps for every other frame."""
     seed: NotNegative[int] = 0
-    """Of the restarts."""
+    """Seed of the random starts."""

@@ -1,4 +1,4 @@
-"""Weights and limits of hand retargeting. Imports no torch, so that the command line can show them at once."""
+"""Weights and limits of hand retargeting. This module imports no torch, so the command line can show them quickly."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ Shares = Annotated[tuple[float, ...], Rule("finite numbers, 0 or more", lambda x
 
 @dataclass(frozen=True, kw_only=True)
 class HandConfig(Checked):
-    """Weights and limits of hand retargeting; weights as in the paper's appendix D.b unless a field says otherwise."""
+    """Weights and limits of hand retargeting; weights are the paper's (appendix D.b) unless a field says otherwise."""
 
     local_weight: NotNegative[float] = 10.0
     """Bone vectors and bone directions, averaged over the pairs of keypoints."""
     global_weight: NotNegative[float] = 1.0
     """Positions of the keypoints, per keypoint."""
     tip_factor: NotNegative[float] = 10.0
-    """How much more the position of a fingertip counts than that of another keypoint (not the paper's)."""
+    """Factor on the weight of a fingertip's position (not the paper's)."""
     contact_weight: NotNegative[float] = 5.0
     """Contact points, per keypoint in contact."""
     contact_margin: NotNegative[float] = 0.01
@@ -28,32 +28,32 @@ class HandConfig(Checked):
     contact_knee: Positive[float] = 0.002
     """Excess over the margin below which the contact cost is quadratic [m]."""
     clearance_weight: NotNegative[float] = 2000.0
-    """Depth of the hand in the object, the table and itself, beyond what is allowed (not the paper's)."""
+    """Depth of the hand in the object, the table and itself beyond the allowed one (not the paper's)."""
     object_clearance: Finite[float] = 0.0005
-    """Distance that the hand keeps from the object [m]. Deeper grasps are pushed apart in physics: at -0.001 a third fewer are accepted."""
+    """Distance that the hand keeps from the object [m]. Physics pushes deeper grasps apart."""
     self_depth: Finite[float] = 0.002
-    """Depth of the hand's links in one another that is allowed [m]."""
+    """Allowed depth of the hand's links in one another [m]."""
     pad_weight: NotNegative[float] = 1000.0
-    """Distance of a jaw's pads from the object that the human holds, averaged over each pad (not the paper's). Other hands have no pads."""
+    """Distance of a jaw's pads from the held object, averaged over each pad (not the paper's). Other hands have no
+    pads."""
     pad_reach: Positive[float] = 0.015
-    """Distance from the object beyond which a point of a pad is not drawn to it [m]."""
+    """Distance from the object beyond which a point of a pad is not attracted [m]."""
     smoothness_weight: Positive[float] = 2.0
-    """Change of joints and root between neighbouring frames. Positive: it alone holds what no keypoint determines."""
+    """Change of joints and root between neighboring frames. It must be positive, because it alone determines what no
+    keypoint does."""
     jump_limit: Positive[float] = 0.17
-    """Change of a hand joint between neighbouring frames beyond which ``jump_weight`` applies [rad or m] (not the paper's)."""
+    """Change of a hand joint between neighboring frames beyond which ``jump_weight`` applies [rad or m] (not the
+    paper's)."""
     jump_weight: NotNegative[float] = 1000.0
-    """Change of a hand joint between neighbouring frames beyond ``jump_limit``."""
+    """Change of a hand joint between neighboring frames beyond ``jump_limit``."""
     length_scale: Positive[float] = 0.10
     """Length that counts as much as one radian [m]: about a finger's length."""
-    clearance_growth: Shares = (
-        0.01,
-        0.1,
-    )
-    """Shares of ``clearance_weight`` that the cost is minimised with first, each from the result before: a hand that may pass through the
-    object at first finds the right side of a handle or a rim. Empty: none."""
+    clearance_growth: Shares = (0.01, 0.1)
+    """Shares of ``clearance_weight`` in earlier stages, each of which starts the next. A hand that may pass through the
+    object at first finds the right side of a handle or a rim. Empty: no earlier stage."""
     growth_iterations: NotNegative[int] = 6
-    """Most Levenberg-Marquardt steps with each of those."""
+    """Most Levenberg-Marquardt steps of each earlier stage."""
     iterations: NotNegative[int] = 40
-    """Most Levenberg-Marquardt steps with the whole weight."""
+    """Most Levenberg-Marquardt steps with the full weight."""
     tolerance: NotNegative[float] = 1e-3
     """A sequence is done when a step lowers its cost by less than this fraction."""

@@ -1,6 +1,8 @@
-"""A hand as retargeting sees it: a floating tree, the links that follow human keypoints, and the balls that keep it out of things.
+"""A hand as retargeting sees it: a floating tree, the links that follow human keypoints, and the balls that keep it out
+of other things.
 
-Shape letters: B frames, P mapped keypoints, C pairs of keypoints, J hand joints, n = J + 6 variables, L links, Q balls.
+Shape letters: S sequences padded to T frames, B frames, P mapped keypoints, C pairs of keypoints, J hand joints, n = J
++ 6 variables, L links, Q balls, N balls of pads.
 """
 
 from __future__ import annotations
@@ -16,10 +18,50 @@ from torch import Tensor
 from xreset.errors import RobotError
 from xreset.geometry.balls import hand_balls
 from xreset.geometry.collision import SelfCollision
+from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import quat_to_matrix
-from xreset.retarget.hand.pads import pads_of
+from xreset.geometry.rotations import matvec, quat_to_matrix
 from xreset.spec import FINGERS, KEYPOINTS, RobotSpec, TableSpec
+from xreset.tensors import Tensors
+
+_PAD_DEPTH = 1e-3
+"""A finger's pad are its balls that come within this of the foremost one, towards the other finger [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandTargets(Tensors):
+    """Human motion that the hand follows; all tensors on one device."""
+
+    keypoints: Tensor
+    """[S, T, P, 3] human keypoints; any finite values where not annotated."""
+    annotated: Tensor
+    """[S, T] bool: frames with keypoints. The other frames are held by smoothness alone."""
+    contact_points: Tensor
+    """[S, T, P, 3] object surface points that the keypoints touch."""
+    in_contact: Tensor
+    """[S, T, P] bool"""
+    held: Tensor
+    """[S, T] bool: the human's thumb and another finger touch the object."""
+    object_pos: Tensor
+    """[S, T, 3]"""
+    object_quat: Tensor
+    """[S, T, 4]"""
+    object_index: Tensor
+    """[S] object of each sequence, as an index into ``fields``."""
+    fields: DistanceFields
+    """Signed distances to the objects' surfaces."""
+
+
+@dataclass(frozen=True)
+class HandState(Tensors):
+    """The variables: joints and root pose of every frame."""
+
+    joints: Tensor
+    """[S, T, J]"""
+    root_pos: Tensor
+    """[S, T, 3]"""
+    root_quat: Tensor
+    """[S, T, 4]"""
 
 
 @dataclass(frozen=True)
@@ -37,36 +79,38 @@ class Bodies:
 
 
 class HandModel:
-    """A robot's hand as a floating tree, and which of its links follow which human keypoints."""
+    """A robot's hand as a floating tree, and the human keypoints that its links follow."""
 
     def __init__(self, robot: RobotSpec, *, device: torch.device | str = "cpu") -> None:
         """Prepare the hand.
 
         Raises:
-            RobotError: the description does not allow retargeting; the message says which entry is wrong.
+            RobotError: the description does not allow retargeting; the message names the wrong entry.
         """
         self.robot = robot
+        on_cpu = Kinematics(robot, root=robot.hand_root)
         self.kinematics = Kinematics(robot, root=robot.hand_root, device=device)
         self.device = self.kinematics.device
         if not np.array_equal(self.kinematics.joint_indices, robot.hand_indices):
-            below, group = self.kinematics.joint_names, [robot.joint_names[i] for i in robot.hand_indices]
+            below = ", ".join(self.kinematics.joint_names)
+            group = ", ".join(robot.joint_names[i] for i in robot.hand_indices)
             raise RobotError(
-                f"robot {robot.name!r}: the joints below the hand root {robot.hand_root!r} are {', '.join(below)}, but the hand group is "
-                f"{', '.join(group)}. Choose the last link that the arm moves as hand_root."
+                f"robot {robot.name!r}: the joints below the hand root {robot.hand_root!r} are {below}, but the hand "
+                f"group is {group}. Choose the last link that the arm moves as hand_root."
             )
         self.names: tuple[str, ...] = tuple(spec.keypoint for spec in robot.keypoints)
         """Human keypoint of each mapped keypoint (length P)."""
         self.links: tuple[str, ...] = tuple(spec.link for spec in robot.keypoints)
         """Link of each mapped keypoint."""
-        for name, link in zip(self.names, self.links, strict=True):
+        for name in self.names:
             if name not in KEYPOINTS:
                 raise RobotError(
-                    f"robot {robot.name!r}: there is no human keypoint {name!r}; there are {', '.join(KEYPOINTS)}."
+                    f"robot {robot.name!r}: unknown human keypoint {name!r}. Choose from: {', '.join(KEYPOINTS)}."
                 )
-            self.kinematics.link_index(link)
-        if len(set(self.links)) < 3:
+        count = len(set(self.links))
+        if count < 3:
             raise RobotError(
-                f"robot {robot.name!r}: {len(set(self.links))} links follow keypoints, expected 3 or more (wrist, thumb, finger)."
+                f"robot {robot.name!r}: {count} links follow keypoints, expected 3 or more (wrist, thumb, finger)."
             )
         self.keypoint_indices = np.array([KEYPOINTS.index(name) for name in self.names])
         """[P] indices into the 21 human keypoints."""
@@ -82,29 +126,62 @@ class HandModel:
         """[P, 3] keypoints at home, in the root's frame."""
         self.table = TableSpec()
 
-        on_cpu = (
-            self.kinematics if self.device.type == "cpu" else Kinematics(robot, root=robot.hand_root)
-        )  # as coal wants it
         collision = SelfCollision(robot, on_cpu, only=robot.self_collision_links)
         self.balls = hand_balls(robot, on_cpu, collision).to(self.device)
-        """What keeps the hand out of the object, the table and itself."""
-        self.pads = pads_of(robot.fingertips, self.kinematics, self.balls, self.home)
-        """Those of a jaw; empty for any other hand."""
+        """Balls that keep the hand out of the object, the table and itself."""
+        pads = self._pads()
+        self.pad_balls = torch.cat(pads)
+        """[N] the balls of a jaw's two pads, as indices of the balls; empty for any other hand."""
+        self.pad_shares = torch.cat([self.home.new_full((len(pad),), 1.0 / max(len(pad), 1)) for pad in pads])
+        """[N] share of each of these balls in its pad: the shares of a pad add up to 1."""
         self._bodies = tuple(dict.fromkeys((*self.links, *self.balls.links)))
-        self._keypoint_bodies = torch.tensor([self._bodies.index(link) for link in self.links], device=self.device)
-        self.group_body = torch.tensor(
-            [self._bodies.index(link) for link in self.balls.links], dtype=torch.long, device=self.device
-        )
+        self._keypoint_bodies = self._body_indices(self.links)
+        self.group_body = self._body_indices(self.balls.links)
         """[G] index among the bodies of each link with balls."""
+
+    def _body_indices(self, links: Sequence[str]) -> Tensor:
+        return torch.tensor([self._bodies.index(link) for link in links], dtype=torch.long, device=self.device)
+
+    def _pads(self) -> list[Tensor]:
+        """Return the balls of the two pads of a jaw, a hand whose one joint moves two fingers: where these face each
+        other at home.
+
+        Thumb and fingers of a human press on an object wherever their joints let them; a jaw presses along one axis.
+        Drawn to the human's fingertips alone it touches the object at an angle, with an edge of each pad, and squeezes
+        it out.
+        """
+        none = [torch.zeros(0, dtype=torch.long, device=self.device)]
+        fingertips = self.robot.fingertips
+        if len(self.home) != 1 or len(fingertips) != 2:
+            return none
+        balls = self.balls
+        first, second = self.kinematics.points(self.home, [tip.link for tip in fingertips])
+        pads = []
+        for tip, ahead in zip(fingertips, (second - first, first - second), strict=True):
+            links = [link for link in tip.contact_links if link in balls.links]
+            if not links:
+                return none
+            direction = ahead / ahead.norm().clamp_min(1e-9)
+            rows = []
+            front = []
+            for link, pose in zip(links, self.kinematics.link_poses(self.home, links), strict=True):
+                own = (balls.link == balls.links.index(link)).nonzero()[:, 0]
+                centers = balls.centers[own] @ pose[:3, :3].mT + pose[:3, 3]
+                rows.append(own)
+                front.append(centers @ direction + balls.radii[own])
+            reach = torch.cat(front)
+            pads.append(torch.cat(rows)[reach > reach.max() - _PAD_DEPTH])
+        return pads
 
     def keypoints(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Tensor:
         """[..., P, 3] positions of the keypoint links."""
         return self.kinematics.points(joints, self.links, base=_pose(root_pos, root_quat))
 
     def bodies(self, joints: Tensor, root_pos: Tensor, root_quat: Tensor) -> Bodies:
-        """Links of the hand at joints [B, J] and root poses, and their Jacobians by the variables.
+        """Compute the links of the hand at joints [B, J] and root poses, and their Jacobians.
 
-        Variables: joints, then translation of the root, then rotation of the root about its origin (both along the world's axes).
+        Variables: joints, then translation of the root, then rotation of the root about its origin (both along the
+        world's axes).
         """
         links = self.kinematics.jacobian(joints, self._bodies, base=_pose(root_pos, root_quat))
         identity = torch.eye(3, dtype=links.pos.dtype, device=links.pos.device).expand(*links.pos.shape[:-1], 3, 3)
@@ -117,18 +194,23 @@ class HandModel:
         )
 
     def keypoints_of(self, bodies: Bodies) -> tuple[Tensor, Tensor]:
-        """Keypoints [B, P, 3] and their Jacobian [B, P, 3, n]."""
+        """Return keypoints [B, P, 3] and their Jacobian [B, P, 3, n]."""
         return bodies.pos[:, self._keypoint_bodies], bodies.linear[:, self._keypoint_bodies]
 
     def ball_centers(self, bodies: Bodies, frame: Tensor, ball: Tensor) -> Tensor:
-        """[..., 3] centres in the world of balls [...] in frames [...]."""
-        body = self.group_body[self.balls.link[ball]]
-        return bodies.pos[frame, body] + (bodies.rot[frame, body] @ self.balls.centers[ball][..., None])[..., 0]
+        """[..., 3] centers in the world of balls [...] in frames [...]."""
+        return self.to_world(bodies, frame, self.balls.link[ball], self.balls.centers[ball])
+
+    def to_world(self, bodies: Bodies, frame: Tensor, group: Tensor, points: Tensor) -> Tensor:
+        """[..., 3] points [..., 3] of links [...] with balls in frames [...], in the world."""
+        body = self.group_body[group]
+        return bodies.pos[frame, body] + matvec(bodies.rot[frame, body], points)
 
     def point_slope(self, bodies: Bodies, frame: Tensor, group: Tensor, point: Tensor, direction: Tensor) -> Tensor:
-        """[A, n] how a point of a link moves along a direction: n . (v + w x r) = n . v + (r x n) . w.
+        """[A, n] derivative of a link's point along a direction: n . (v + w x r) = n . v + (r x n) . w.
 
         Args:
+            bodies: links of the hand.
             frame: [A]
             group: [A] the point's link, among the links with balls.
             point: [A, 3] in the world.
@@ -141,28 +223,37 @@ class HandModel:
 
 
 def predicted_gigabytes(model: HandModel) -> float:
-    """Memory that hand retargeting on the CPU will take [GB], all balls of a chunk of 256 frames being near something: an upper bound."""
+    """Return an upper bound of the memory that hand retargeting on the CPU needs [GB]: all balls of 256 frames are near
+    something."""
     return 0.5 + 256 * 400e-9 * len(model.balls.radii)
 
 
 def keypoint_pairs(names: Sequence[str], links: Sequence[str]) -> list[tuple[int, int]]:
-    """Pairs of mapped keypoints: along each finger from the wrist, between neighbouring knuckles, and from the thumb's tip to the others.
+    """Choose pairs of mapped keypoints: along each finger from the wrist, between neighboring knuckles, and thumb tip
+    to other tips.
 
-    Works for any subset of the 21 keypoints; pairs on one and the same link say nothing and are left out.
+    Any subset of the 21 keypoints will do. Pairs on the same link carry no information and are omitted.
     """
     wrist = [i for i, name in enumerate(names) if name == "wrist"]
-    fingers = [
-        sorted((i for i, name in enumerate(names) if name.startswith(f)), key=lambda i: names[i]) for f in FINGERS
-    ]  # base to tip
-    pairs = [pair for finger in fingers for pair in pairwise(wrist + finger)]
-    thumb, others = fingers[0], [finger for finger in fingers[1:] if finger]
+    fingers = []
+    for finger in FINGERS:
+        own = [i for i, name in enumerate(names) if name.startswith(finger)]
+        fingers.append(sorted(own, key=lambda i: names[i]))  # base to tip
+    pairs = []
+    for finger in fingers:
+        pairs += pairwise(wrist + finger)
+    thumb = fingers[0]
+    others = [finger for finger in fingers[1:] if finger]
     for left, right in pairwise(others):
         pairs += [(left[0], right[0]), (left[-1], right[-1])]
-    pairs += [(thumb[-1], finger[-1]) for finger in others if thumb]
+    if thumb:
+        pairs += [(thumb[-1], finger[-1]) for finger in others]
     return [(a, b) for a, b in dict.fromkeys(pairs) if links[a] != links[b]]
 
 
 def _pose(pos: Tensor, quat: Tensor) -> Tensor:
     T = pos.new_zeros(*pos.shape[:-1], 4, 4)
-    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = quat_to_matrix(quat), pos, 1.0
+    T[..., :3, :3] = quat_to_matrix(quat)
+    T[..., :3, 3] = pos
+    T[..., 3, 3] = 1.0
     return T

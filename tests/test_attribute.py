@@ -14,12 +14,12 @@ import torch
 from tests import toy_grasp
 from xreset.cli import main
 from xreset.errors import CapabilityError, XResetError
+from xreset.eval.engines.alteration import Alteration, altered_engine, change_towards
 from xreset.eval.engines.attribution import Attribution, Row, attribute
 from xreset.eval.engines.attribution_view import amount, label, not_tried, rich_table, verdict, write_plot
 from xreset.eval.engines.measure import Measured, measure
-from xreset.eval.engines.perturb import Alteration, altered_engine
-from xreset.eval.engines.properties import PROPERTIES
 from xreset.eval.rollout import Episode
+from xreset.eval.sensitivity import COMPARED, Effect
 from xreset.eval.trial import Engine, engine
 from xreset.physics import State
 from xreset.spec import SceneSpec
@@ -150,18 +150,16 @@ class AlteredBackendTest(unittest.TestCase):
 
 class PropertiesTest(unittest.TestCase):
     def change(self, name: str, engine: str = "mujoco", a: Measured = STATED, **b: float):
-        p = next(p for p in PROPERTIES if p.name == name)
-        return p.change(a, replace(STATED, **b), engine, SCENE)
+        return change_towards(name, a, replace(STATED, **b), engine, SCENE)
 
     def test_every_measured_number_is_a_property(self):
-        self.assertEqual([p.field for p in PROPERTIES], [f.name for f in fields(Measured)])
+        self.assertEqual([p.measured for p in COMPARED.values()], [f.name for f in fields(Measured)])
 
     def test_equal_values_are_not_tried(self):
-        for p in PROPERTIES:
-            self.assertEqual(
-                p.change(STATED, STATED, "mujoco", SCENE), "the same in both, as far as is measured", p.name
-            )
-            self.assertNotIn(Alteration(), p.what_if, p.name)
+        for name, compared in COMPARED.items():
+            self.assertEqual(self.change(name), "the same in both, as far as is measured", name)
+            for value in compared.what_if:
+                self.assertNotEqual(Alteration(**{compared.altered: value}), Alteration(), name)
 
     def test_a_factor_leads_to_the_other_value(self):
         self.assertEqual(self.change("tip friction", tip_friction=0.45), Alteration(tip_friction=0.5))
@@ -205,8 +203,8 @@ class AttributeTest(unittest.TestCase):
     def test_half_the_friction_is_what_costs_the_grasp(self):
         b = toy_grasp.with_scene(mujoco(), "slippery", lambda scene: scene)
         found = self.attribute(replace(altered_engine(b, Alteration(tip_friction=0.5)), name="slippery"))
-        self.assertEqual(found.rows[0].score("grasp").mean(), 1.0)
-        self.assertEqual(found.rows[-1].score("grasp").mean(), 0.0)
+        self.assertEqual(found.rows[0].mean("grasp"), 1.0)
+        self.assertEqual(found.rows[-1].mean("grasp"), 0.0)
         towards = [row.name for row in found.rows if row.kind == "towards"]
         self.assertEqual(towards, ["tip friction"])
         self.assertAlmostEqual(found.rows[1].alteration.tip_friction, 0.5, delta=0.01)
@@ -225,7 +223,7 @@ class AttributeTest(unittest.TestCase):
         worst = found.costs()
         assert worst is not None
         self.assertEqual(worst.name, "hand stiffness")
-        self.assertEqual(found.difference(found.rows[1]), (0.0, (0.0, 0.0)))
+        self.assertEqual(found.rows[1].effect.difference_ci95, (0.0, 0.0))
         self.assertEqual([row.name for row in found.rows if row.kind == "all"], ["all 2 at once"])
 
     def test_the_same_engine_leaves_nothing_to_attribute(self):
@@ -268,12 +266,12 @@ class AttributeTest(unittest.TestCase):
         self.assertEqual(found.rows[4].alteration.torsional_friction, 1.0)
 
     def test_an_unknown_property_is_refused(self):
-        with self.assertRaisesRegex(XResetError, "there is no property colour; there are tip friction, .*latency"):
+        with self.assertRaisesRegex(XResetError, "Unknown property colour. Choose from: tip friction, .*latency"):
             self.attribute(mujoco(), only=["colour"])
 
 
 def row(kind: str, name: str, *scores: float) -> Row:
-    """A run whose episode i is of demonstration i // 2."""
+    """A run whose episode i is of demonstration i // 2; in A as it is, every score is 0.66."""
     episodes = tuple(
         Episode(
             sequence=i // 2, sequence_name=f"demo_{i // 2}", object="brick", repetition=i % 2, approach=True, grasp=score > 0.5,
@@ -282,7 +280,8 @@ def row(kind: str, name: str, *scores: float) -> Row:
         )
         for i, score in enumerate(scores)
     )  # fmt: skip
-    return Row(kind=kind, name=name, alteration=Alteration(mass=0.8), episodes=episodes)  # pyright: ignore[reportArgumentType]
+    effect = Effect.of(episodes, [replace(e, task_progress=0.66) for e in episodes])
+    return Row(kind=kind, name=name, alteration=Alteration(mass=0.8), episodes=episodes, effect=effect)  # pyright: ignore[reportArgumentType]
 
 
 class OutcomeTest(unittest.TestCase):
@@ -317,7 +316,7 @@ class OutcomeTest(unittest.TestCase):
 
     def test_a_difference_of_one_demonstration_among_many_does_not_matter(self):
         found = self.found(row("as it is", "mujoco", *[0.66] * 8), row("other", "sapien", 0.33, 0.33, *[0.66] * 6))
-        self.assertFalse(found.matters(found.rows[-1]))
+        self.assertFalse(found.gap.is_certain)
         self.assertTrue(math.isnan(found.share(found.rows[-1])))
         self.assertIsNone(found.as_dict()["rows"][-1]["share_of_gap"])
 

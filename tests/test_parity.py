@@ -28,7 +28,6 @@ from xreset.eval.engines.agreement import (
 )
 from xreset.eval.engines.episodes import (
     Motion,
-    Recording,
     carried_palm,
     closing_episode,
     lifting_episode,
@@ -37,6 +36,7 @@ from xreset.eval.engines.episodes import (
     squeezing_state,
 )
 from xreset.eval.engines.grasps import NEAR, Frames, find_grasps
+from xreset.eval.engines.recording import Recording
 from xreset.eval.engines.sources import load_frames
 from xreset.eval.engines.trials import ParityConfig
 from xreset.eval.trial import Engine, engine
@@ -191,7 +191,7 @@ class Episodes(unittest.TestCase):
         episode = closing_episode(self.robot, self.home, pos, quat, DT, BRISK)
         closing = BRISK.closing_steps(DT)
         self.assertEqual(closing, 36)
-        self.assertEqual(len(episode), 36 + 30 + 12 + 2 * 24)
+        self.assertEqual(len(episode.targets), 36 + 30 + 12 + 2 * 24)
         gaps = [
             float((t[:, 1:].mean(1) - t[:, 0]).norm())
             for t in (tips(self.kinematics, q.double()) for q in episode.targets)
@@ -330,7 +330,7 @@ class Numbers(unittest.TestCase):
             carried(recording(object_pos=high, broken=torch.tensor([True, False])), 0.1).tolist(), [False, False]
         )
         flags = torch.tensor([True, True, True, False, False])
-        metric = outcome_metric("x", "", 0.7, flags, torch.tensor([True, True, False, True, False]))
+        metric = outcome_metric("closing, outcome", flags, torch.tensor([True, True, False, True, False]))
         self.assertAlmostEqual(metric.measured, 0.6)
         self.assertFalse(metric.ok)
         self.assertEqual(metric.detail, {"both": 2, "neither": 1, "only_here": 1, "only_in_reference": 1})
@@ -558,7 +558,7 @@ class Command(unittest.TestCase):
             (robot.name, [o.name for o in objects], len(frames.frame)), ("ur7e-sharpa", ["005_tomato_soup_can"], 6)
         )
         bank = toy_bank(robot)
-        shown = Frames.of_bank(bank)
+        shown = Frames.of(bank)
         self.assertEqual(shown.sequence_name.tolist(), ["demo_a", "demo_b", "demo_c"])
         np.testing.assert_array_equal(shown.joint_pos, bank.joint_pos[1::2])
         np.testing.assert_array_equal(shown.start_pos, bank.start_pos)

@@ -7,7 +7,7 @@ import json
 import tempfile
 import unittest
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from unittest import mock
 
@@ -16,7 +16,9 @@ import numpy as np
 from xreset.cli import main
 from xreset.errors import XResetError
 from xreset.eval.rollout import Episode
-from xreset.eval.stress import PROPERTIES, Stress, _curve, chosen, read_stress, stressed
+from xreset.eval.sensitivity import SWEEPS
+from xreset.eval.stress import Curve, Stress, chosen, curve, read_stress, stressed
+from xreset.files import write_json
 from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
 
 
@@ -49,23 +51,23 @@ class StressedTest(unittest.TestCase):
             ((0.6000000000000001,) * 2, (1, 1), (1, 1), 0.2),
         )
         self.assertTrue(plain.enabled and not plain.scales_drives)
-        for prop in PROPERTIES:
+        for prop in SWEEPS:
             value = prop.values[0]
             found = stressed(task, prop, value).randomization
-            self.assertEqual(getattr(found, prop.field), (value, value))
-            self.assertEqual(replace(found, **{prop.field: getattr(plain, prop.field)}), plain)
+            self.assertEqual(getattr(found, prop.task_field), (value, value))
+            self.assertEqual(replace(found, **{prop.task_field: getattr(plain, prop.task_field)}), plain)
             self.assertEqual(stressed(task, prop, value).reset, task.reset)
 
     def test_values_of_ones_own(self):
         (prop,) = chosen(["arm-stiffness=2,0.5,1"])
-        self.assertEqual((prop.name, prop.values), ("arm-stiffness", (0.5, 2.0)))
-        self.assertEqual(chosen([]), PROPERTIES)
+        self.assertEqual((prop.option, prop.values), ("arm-stiffness", (0.5, 2.0)))
+        self.assertEqual(chosen([]), SWEEPS)
 
     def test_refusals(self):
         for text, words in (
-            ("colour", "there is no property 'colour'. Properties: arm-stiffness, "),
-            ("effort=much", "states values that are no numbers, expected effort=VALUE"),
-            ("effort=-1", "expected finite values, 0 or more, other than the nominal one, which is 1"),
+            ("colour", "Unknown property 'colour'. Choose from: object-friction, "),
+            ("effort=much", "holds values that are no numbers. Write effort=VALUE"),
+            ("effort=-1", "expected finite values of at least 0, other than the nominal 1"),
             ("effort=nan", "expected finite values"),
         ):
             with self.subTest(text), self.assertRaisesRegex(XResetError, words):
@@ -82,40 +84,62 @@ class StressedTest(unittest.TestCase):
 
 class CurveTest(unittest.TestCase):
     def test_the_limit_lies_between_two_values_that_were_tried(self):
-        (prop,) = chosen(["arm-stiffness=0.5,0.8,1.5,2"])
         base = [1.0, 0.6, 0.8, 0.8]
-        swept = {
-            value: episodes([p + change for p in base])
-            for value, change in ((0.5, -0.3), (0.8, -0.05), (1.0, 0.0), (1.5, -0.02), (2.0, -0.08))
-        }
-        curve = _curve(prop, swept)
-        self.assertEqual([p.value for p in curve.points], [0.5, 0.8, 1.0, 1.5, 2.0])
-        assert curve.lower is not None
-        self.assertAlmostEqual(curve.lower, 0.8 - 0.3 * 0.05 / 0.25)
-        self.assertIsNone(curve.upper)
-        np.testing.assert_allclose(curve.points[0].difference_ci95, (-0.3, -0.3), atol=1e-9)
+
+        def swept(option: str, **changes: float | list[float]) -> Curve:
+            """The curve of a property; at each value every episode changes by so much."""
+            (prop,) = chosen([f"{option}={','.join(value[1:] for value in changes)}"])
+            found = {}
+            for value, change in changes.items():
+                found[float(value[1:])] = episodes(
+                    [p + c for p, c in zip(base, np.broadcast_to(change, 4), strict=True)]
+                )
+            return curve(prop, episodes(base), found)
+
+        stiffness = swept("arm-stiffness", **{"v0.5": -0.3, "v0.8": -0.05, "v1.5": -0.02, "v2.0": -0.08})
+        self.assertEqual([p.value for p in stiffness.points], [0.5, 0.8, 1.0, 1.5, 2.0])
+        assert stiffness.lower is not None
+        self.assertAlmostEqual(stiffness.lower, 0.8 - 0.3 * 0.05 / 0.25)
+        self.assertIsNone(stiffness.upper)
+        np.testing.assert_allclose(stiffness.points[0].difference_ci95, (-0.3, -0.3), atol=1e-9)
         card = Stress(
-            backend="mujoco", backend_version="4", episodes=4, task_progress=0.8, ci95=(0.7, 0.9), curves=(curve,), left_out=(),
-        )  # fmt: skip
-        self.assertEqual(card.sentence(), "mujoco, 4 episodes: 80 %; 10 points less with arm-stiffness x 0.74.")
-        (latency,) = chosen(["action-latency=1,2"])
-        late = _curve(latency, {v: episodes([p - v * 0.15 for p in base]) for v in (0.0, 1.0, 2.0)})
-        (mass,) = chosen(["object-mass=0.5,2"])
-        borne = _curve(mass, {v: episodes(base) for v in (0.5, 1.0, 2.0)})
-        soft = replace(curve, property="hand-stiffness", lower=0.9)
-        (gain,) = chosen(["force-gain=2"])
-        scattered = _curve(
-            gain,
-            {1.0: episodes(base), 2.0: episodes([p + d for p, d in zip(base, (-0.6, -0.6, 0.2, 0.2), strict=True)])},
+            backend="mujoco",
+            backend_version="4",
+            episodes=4,
+            task_progress=0.8,
+            ci95=(0.7, 0.9),
+            curves=(stiffness,),
+            left_out=(),
         )
+        self.assertEqual(card.sentence(), "mujoco, 4 episodes: 80 %; 10 points less with arm-stiffness x 0.74.")
+        late = swept("action-latency", **{"v1.0": -0.15, "v2.0": -0.3})
+        harmless = swept("object-mass", **{"v0.5": 0.0, "v2.0": 0.0})
+        soft = replace(stiffness, property="hand-stiffness", lower=0.9)
+        scattered = swept("force-gain", **{"v2.0": [-0.6, -0.6, 0.2, 0.2]})
         assert scattered.upper is not None
-        self.assertEqual((scattered.is_certain(scattered.upper), curve.is_certain(curve.lower)), (False, True))
+        self.assertEqual((scattered.is_certain(scattered.upper), stiffness.is_certain(stiffness.lower)), (False, True))
         self.assertEqual(
-            replace(card, curves=(curve, late, borne, soft, scattered)).sentence(),
+            replace(card, curves=(stiffness, late, harmless, soft, scattered)).sentence(),
             "mujoco, 4 episodes: 80 %; 10 points less with hand-stiffness x 0.9, or arm-stiffness x 0.74, or action-latency of 0.67 "
             "control steps; perhaps 10 points less, within chance, with force-gain x 1.5; fewer than 10 points less with 1 of 5 "
             "properties, as far as was tried.",
         )
+
+    def test_cards_of_another_policy_are_left_out(self):
+        card = Stress(
+            backend="mujoco",
+            backend_version="4",
+            episodes=4,
+            task_progress=0.8,
+            ci95=(0.7, 0.9),
+            curves=(),
+            left_out=(),
+        )
+        with tempfile.TemporaryDirectory() as name:
+            for backend, inputs in (("mujoco", {"policy": "old"}), ("sapien", {"policy": "new"}), ("pybullet", {})):
+                write_json(Path(name) / f"{backend}.json", asdict(replace(card, backend=backend, inputs=inputs)))
+            self.assertEqual([c.backend for c in read_stress(Path(name), "new")], ["pybullet", "sapien"])
+            self.assertEqual(len(read_stress(Path(name))), 3)
 
 
 class CommandTest(unittest.TestCase):

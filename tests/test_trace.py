@@ -18,8 +18,8 @@ from xreset.cli import main
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.eval.engines.actions import Actions, play_policy, read_actions, recorded_actions, write_actions
 from xreset.eval.engines.divergence import Parting, Thresholds, differences, first_of, partings
-from xreset.eval.engines.episodes import Recording
 from xreset.eval.engines.film import write_strip
+from xreset.eval.engines.recording import Recording
 from xreset.eval.engines.replay import TraceResult, trace, write_trace
 from xreset.eval.engines.sources import from_file
 from xreset.eval.engines.trace_view import rich_table, sentences, write_plot
@@ -383,7 +383,7 @@ class CommandTest(unittest.TestCase):
         wrong = self.folder / "wrong.npz"
         np.savez(wrong, schema="xreset-replays/1")
         self.assertIn("expected 'xreset-demos/1'", self.refuse(str(wrong)))
-        self.assertIn("needs --robot", self.refuse(str(wrong), "--policy", "ik"))
+        self.assertIn("Add --robot", self.refuse(str(wrong), "--policy", "ik"))
 
 
 class RealGraspTest(unittest.TestCase):
@@ -403,7 +403,7 @@ class RealGraspTest(unittest.TestCase):
         demos = read_demos(folder / "dexycb_right_9x20.npz")
         first = int(np.flatnonzero(np.asarray(demos.object_name) == can.name)[0])
         data = retarget_demos(demos.select(indices=[first]), robot, [can])
-        actions = grasp_and_lift(robot, can, find_grasps(Frames.of_retargeted(data), robot, (can,), 1, where="table"))
+        actions = grasp_and_lift(robot, can, find_grasps(Frames.of(data), robot, (can,), 1, where="table"))
         result = trace(actions, engine("mujoco", workers=0), [engine("sapien")], perturbed=1)
         self.assertGreater(result.reference.lifted, 0.07)
         self.assertGreater(result.engines[0].lifted, 0.07)

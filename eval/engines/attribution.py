@@ -1,4 +1,4 @@
-"""The experiment: a policy in engine A, in A with one property of B at a time, with all of them at once, and in B.
+"""The experiment: a policy in engine A, in A with one property of B at a time, with all of these at once, and in B.
 
 Every run plays the same episodes from the same starts, so runs are compared episode by episode.
 """
@@ -14,11 +14,17 @@ from typing import Any, Literal
 import numpy as np
 
 from xreset.errors import XResetError
+from xreset.eval.engines.alteration import (
+    SOFTEST,
+    Alteration,
+    altered_engine,
+    change_towards,
+    has_contact_dial,
+    no_contact_dial,
+)
 from xreset.eval.engines.measure import Measured, measure
-from xreset.eval.engines.perturb import Alteration, altered_engine, contact_dial, no_contact_dial
-from xreset.eval.engines.properties import PROPERTIES
 from xreset.eval.rollout import Episode, roll_out
-from xreset.eval.stats import bootstrap_ci95
+from xreset.eval.sensitivity import COMPARED, Effect
 from xreset.eval.trial import Engine, Trial
 from xreset.policy import Policy
 
@@ -32,21 +38,18 @@ class Row:
     """One run of the policy."""
 
     kind: Kind
-    """A as it is; with one property changed towards B; with one changed farther than that, for want of a finer dial; with all
-    of the former; with a change of a usual size; B as it is."""
+    """``as it is``: A. ``towards``: one property changed to B's value. ``at most``: one property changed farther than that, because there
+    is no finer dial. ``all``: all properties of kind ``towards``. ``what if``: a change of a usual size. ``other``: B."""
     name: str
     """Property, or engine."""
     alteration: Alteration
     episodes: tuple[Episode, ...]
+    effect: Effect
+    """Against A as it is."""
 
-    def score(self, name: str = "task_progress") -> np.ndarray:
-        """[E] one number per episode."""
-        return np.array([float(getattr(e, name)) for e in self.episodes])
-
-    @property
-    def sequences(self) -> np.ndarray:
-        """[E] demonstration of each episode."""
-        return np.array([e.sequence for e in self.episodes])
+    def mean(self, metric: str) -> float:
+        """Mean of one metric over the episodes."""
+        return float(np.mean([float(getattr(e, metric)) for e in self.episodes]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,78 +63,73 @@ class Attribution:
     rows: tuple[Row, ...]
     """The first is A as it is, the last B."""
     skipped: dict[str, str]
-    """Property that was not tried -> why."""
+    """Property that was not tried -> reason."""
 
-    def difference(self, row: Row, score: str = "task_progress") -> tuple[float, tuple[float, float]]:
-        """How much a run differs from A as it is: mean over the episodes, and its 95 % interval (whole demonstrations are drawn)."""
-        d = row.score(score) - self.rows[0].score(score)
-        return float(d.mean()), bootstrap_ci95(d, row.sequences)
-
-    def matters(self, row: Row) -> bool:
-        """Whether the interval of the difference leaves out zero."""
-        _, (low, high) = self.difference(row)
-        return low > 0 or high < 0
+    @property
+    def gap(self) -> Effect:
+        """The difference between B and A."""
+        return self.rows[-1].effect
 
     def share(self, row: Row) -> float:
-        """Which share of the difference between A and B a run brings about; NaN where A and B do not differ for sure."""
-        whole, _ = self.difference(self.rows[-1])
-        return self.difference(row)[0] / whole if self.matters(self.rows[-1]) else math.nan
+        """Return the share of the gap that a run brings about; NaN where A and B do not differ for sure."""
+        return row.effect.difference / self.gap.difference if self.gap.is_certain else math.nan
 
     def costs(self) -> Row | None:
-        """The property that, changed towards B, brings about most of the difference, of those that matter; None if there is none.
+        """Return the property that brings about most of the gap when it is changed to B's value; None if none does for sure.
 
-        One whose cost is but a bound is named only where no other matters.
+        A property whose cost is only a bound is named only where no other matters.
         """
-        if not self.matters(self.rows[-1]):
+        if not self.gap.is_certain:
             return None
-        found = [
-            row for row in self.rows if row.kind in ("towards", "at most") and self.matters(row) and self.share(row) > 0
-        ]
+        found = []
+        for row in self.rows:
+            if row.kind in ("towards", "at most") and row.effect.is_certain and self.share(row) > 0:
+                found.append(row)
         return max(found, key=lambda row: (row.kind == "towards", self.share(row)), default=None)
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-able content."""
-
-        def row(r: Row) -> dict[str, Any]:
-            d, interval = self.difference(r)
-            share = self.share(r)
-            low, high = bootstrap_ci95(r.score(), r.sequences)
-            return {
-                "kind": r.kind,
-                "name": r.name,
-                "alteration": asdict(r.alteration),
-                "task_progress": {"mean": _round(r.score().mean()), "ci95": [_round(low), _round(high)]},
-                "approach_rate": _round(r.score("approach").mean()),
-                "grasp_rate": _round(r.score("grasp").mean()),
-                "reorient_rate": _round(r.score("reorient").mean()),
-                "reorientation_progress": _round(r.score("reorientation_progress").mean()),
-                "difference": {"mean": _round(d), "ci95": [_round(x) for x in interval]},
-                "share_of_gap": None if math.isnan(share) else _round(share),
-                "health": {
-                    name: sum(getattr(e, name) for e in r.episodes)
-                    for name in ("nonfinite", "overflow", "out_of_bounds")
-                },
-            }
-
-        found = self.costs()
+        """Return JSON-able content."""
+        properties = []
+        for name, compared in COMPARED.items():
+            values = [getattr(m, compared.measured) * compared.scale for m in (self.measured_a, self.measured_b)]
+            a, b = [float(f"{value:.6g}") if math.isfinite(value) else None for value in values]
+            properties.append({"name": name, "unit": compared.shown_unit, "a": a, "b": b})
+        costly = self.costs()
         return {
             "schema": SCHEMA,
             "a": self.a,
             "b": self.b,
             "episodes": len(self.rows[0].episodes),
-            "properties": [
-                {
-                    "name": p.name,
-                    "unit": p.unit,
-                    "a": _number(p.value(self.measured_a) * p.scale),
-                    "b": _number(p.value(self.measured_b) * p.scale),
-                }
-                for p in PROPERTIES
-            ],
-            "rows": [row(r) for r in self.rows],
+            "properties": properties,
+            "rows": [self._row(row) for row in self.rows],
             "skipped": [{"name": name, "reason": reason} for name, reason in self.skipped.items()],
-            "costs_most": None if found is None else found.name,
+            "costs_most": None if costly is None else costly.name,
         }
+
+    def _row(self, row: Row) -> dict[str, Any]:
+        share = self.share(row)
+        effect = row.effect
+        return {
+            "kind": row.kind,
+            "name": row.name,
+            "alteration": asdict(row.alteration),
+            "task_progress": _interval(effect.task_progress, effect.ci95),
+            "approach_rate": round(row.mean("approach"), 6),
+            "grasp_rate": round(row.mean("grasp"), 6),
+            "reorient_rate": round(row.mean("reorient"), 6),
+            "reorientation_progress": round(row.mean("reorientation_progress"), 6),
+            "difference": _interval(effect.difference, effect.difference_ci95),
+            "share_of_gap": None if math.isnan(share) else round(share, 6),
+            "health": {
+                "nonfinite": sum(e.nonfinite for e in row.episodes),
+                "overflow": sum(e.overflow for e in row.episodes),
+                "out_of_bounds": sum(e.out_of_bounds for e in row.episodes),
+            },
+        }
+
+
+def _interval(mean: float, ci95: tuple[float, float]) -> dict[str, Any]:
+    return {"mean": round(mean, 6), "ci95": [round(x, 6) for x in ci95]}
 
 
 def attribute(
@@ -151,69 +149,64 @@ def attribute(
     Args:
         policy: makes the policy, a fresh one for each run.
         a: engine that is changed.
-        b: engine towards which it is.
-        trial: what is played; the first object's mass and inertia are measured.
-        episodes: per demonstration.
+        b: engine towards which A is changed.
+        trial: what is played; the mass and inertia of its first object are measured.
+        episodes: episodes of each demonstration.
         sequences: indices of the demonstrations to play; None: all.
         only: names of the properties to try; empty: all.
         what_if: also try the properties in which A and B do not differ, with changes of a usual size.
         progress: called with (name of the run, control steps done, control steps in all).
 
     Raises:
-        XResetError: there is no such property, or an engine cannot be measured.
+        XResetError: a property is unknown, or an engine cannot be measured.
     """
-    known = [p.name for p in PROPERTIES]
-    if unknown := sorted(set(only) - set(known)):
-        raise XResetError(f"there is no property {', '.join(unknown)}; there are {', '.join(known)}.")
+    if unknown := sorted(set(only) - set(COMPARED)):
+        raise XResetError(f"Unknown property {', '.join(unknown)}. Choose from: {', '.join(COMPARED)}.")
     scene = trial.nominal_scene
     progress(f"measuring {a.name}", 0, 0)
     measured_a = measure(a, scene)
     progress(f"measuring {b.name}", 0, 0)
     measured_b = measure(b, scene)
+    rows: list[Row] = []
 
-    def run(kind: Kind, name: str, engine: Engine, alteration: Alteration) -> Row:
+    def run(kind: Kind, name: str, engine: Engine, alteration: Alteration) -> None:
         label = name if kind in ("as it is", "other") else f"{a.name}, {kind} {name}"
         altered = altered_engine(engine, alteration)
-        rollouts = roll_out(
+        played = roll_out(
             policy(), altered, trial, repetitions=episodes, only=sequences, progress=partial(progress, label)
-        )
-        return Row(kind=kind, name=name, alteration=alteration, episodes=rollouts.episodes)
+        ).episodes
+        nominal = rows[0].episodes if rows else played
+        effect = Effect.of(played, nominal)
+        rows.append(Row(kind=kind, name=name, alteration=alteration, episodes=played, effect=effect))
 
-    rows, everything, changed = [run("as it is", a.name, a, Alteration())], Alteration(), 0
+    run("as it is", a.name, a, Alteration())
+    everything = Alteration()
+    changed = 0
     skipped: dict[str, str] = {}
-    for p in PROPERTIES:
-        if only and p.name not in only:
-            skipped[p.name] = "not asked for"
+    for name, compared in COMPARED.items():
+        if only and name not in only:
+            skipped[name] = "not asked for"
             continue
-        change = p.change(measured_a, measured_b, a.name, scene)
+        change = change_towards(name, measured_a, measured_b, a.name, scene)
         if isinstance(change, Alteration):
-            rows.append(run("at most" if p.at_most else "towards", p.name, a, change))
-            if not p.at_most:
-                everything, changed = everything.and_(change), changed + 1
+            run("at most" if compared.at_most else "towards", name, a, change)
+            if not compared.at_most:
+                everything = everything.and_(change)
+                changed += 1
             continue
-        skipped[p.name] = change
-        for usual in p.what_if if what_if else ():
-            if usual.contact_time != 1.0 and contact_dial(a.name) is None:
-                skipped[f"{p.name}, what if"] = no_contact_dial(a.name)
+        skipped[name] = change
+        for usual in compared.what_if if what_if else ():
+            if compared.altered == "contact_time" and not has_contact_dial(a.name):
+                skipped[f"{name}, what if"] = no_contact_dial(a.name)
             else:
-                rows.append(run("what if", p.name, a, usual))
+                run("what if", name, a, Alteration(**{compared.altered: usual}))  # pyright: ignore[reportArgumentType]
     if changed > 1:
-        rows.append(run("all", f"all {changed} at once", a, _allowed(everything, a)))
-    rows.append(run("other", b.name, b, Alteration()))
+        if has_contact_dial(
+            a.name
+        ):  # changes that each fit may together ask for stiffer contacts than the engine allows
+            everything = replace(everything, contact_time=max(everything.contact_time, SOFTEST))
+        run("all", f"all {changed} at once", a, everything)
+    run("other", b.name, b, Alteration())
     return Attribution(
         a=a.name, b=b.name, measured_a=measured_a, measured_b=measured_b, rows=tuple(rows), skipped=skipped
     )
-
-
-def _allowed(alteration: Alteration, engine: Engine) -> Alteration:
-    """Changes that each fit may together ask for stiffer contacts than the engine allows: then as stiff as it does."""
-    dial = contact_dial(engine.name)
-    return alteration if dial is None else replace(alteration, contact_time=max(alteration.contact_time, dial.smallest))
-
-
-def _round(value: float) -> float:
-    return round(float(value), 6)
-
-
-def _number(value: float) -> float | None:
-    return float(f"{value:.6g}") if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Where two recordings of the same action sequence part: of joints, object and contacts, when, where and by how much.
+"""Where two recordings of the same action sequence part: joints, object and contacts; when, where and by how much.
 
 Shape letters: T control steps, J joints, E fingertips.
 """
@@ -10,9 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
-from xreset.eval.engines.episodes import Recording
+from xreset.eval.engines.recording import Recording
 from xreset.geometry.rotations import quat_angle
 from xreset.geometry.urdf import robot_tree
 from xreset.spec import RobotSpec
@@ -20,7 +19,7 @@ from xreset.spec import RobotSpec
 
 @dataclass(frozen=True, kw_only=True)
 class Thresholds:
-    """From which difference on two engines count as parted."""
+    """The differences from which two engines count as parted."""
 
     joint: float = 0.02
     """A joint's angle [rad]."""
@@ -35,9 +34,9 @@ class Thresholds:
     touch: float = 0.1
     """Force [N], averaged over ``window``, from which a fingertip counts as touching."""
     contact_time: float = 0.05
-    """How long other fingers must touch than in the reference for the contact sets to have parted [s]."""
+    """How long other fingers than in the reference must touch for the contacts to have parted [s]."""
     window: float = 0.05
-    """Forces are averaged over the last of these seconds: one step's contact force says little."""
+    """Forces are averaged over the last of these seconds: the contact force of one step says little."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,14 +56,14 @@ class Parting:
     largest: float
     """Largest difference."""
     largest_time: float
-    """When it is that [s]."""
+    """Time of the largest difference [s]."""
     largest_where: str
-    """Where it is that."""
+    """Joint or fingers of the largest difference."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Differences:
-    """Differences of one world to the reference, over time, up to the last step at which both are finite."""
+    """Differences of one world to the reference over time, up to the last step at which both are finite."""
 
     time: np.ndarray
     """[T] end of each control step [s]."""
@@ -85,64 +84,59 @@ class Differences:
 def differences(
     found: Recording, reference: Recording, dt: float, thresholds: Thresholds, *, world: int = 0
 ) -> Differences:
-    """Compare a world of a recording with the first one of the reference's.
+    """Compare a world of a recording with the first world of the reference's recording, which is as long.
 
     Args:
-        reference: the reference's, of the same length.
+        found: the tested recording.
+        reference: the reference's recording.
         dt: control step [s].
         thresholds: of touch, and the window of the forces.
-        world: of ``found``.
+        world: world of ``found``.
     """
-    force, other_force = (
-        _averaged(recording.tip_force[:, i].norm(dim=-1).double().numpy(), max(1, round(thresholds.window / dt)))
-        for recording, i in ((found, world), (reference, 0))
-    )
+    window = max(1, round(thresholds.window / dt))
+    force = _averaged(found.tip_force[:, world].norm(dim=-1).double().numpy(), window)
+    other = _averaged(reference.tip_force[:, 0].norm(dim=-1).double().numpy(), window)
     joint = (found.joint_pos[:, world] - reference.joint_pos[:, 0]).abs().double().numpy()
     position = (found.object_pos[:, world] - reference.object_pos[:, 0]).double().norm(dim=-1).numpy()
     angle = quat_angle(found.object_quat[:, world].double(), reference.object_quat[:, 0].double()).numpy()
-    broken = np.flatnonzero(~np.isfinite(np.column_stack((joint, position, angle, force, other_force))).all(axis=1))
-    steps = int(broken[0]) if len(broken) else len(joint)
+    broken = ~np.isfinite(np.column_stack((joint, position, angle, force, other))).all(axis=1)
+    steps = int(broken.argmax()) if broken.any() else len(joint)
     return Differences(
         time=(np.arange(steps) + 1) * dt,
         joint=joint[:steps],
         position=position[:steps],
         angle=angle[:steps],
-        force=np.abs(force - other_force)[:steps],
+        force=np.abs(force - other)[:steps],
         touch=(force >= thresholds.touch)[:steps],
-        reference_touch=(other_force >= thresholds.touch)[:steps],
+        reference_touch=(other >= thresholds.touch)[:steps],
     )
 
 
 def partings(d: Differences, robot: RobotSpec, thresholds: Thresholds) -> tuple[Parting, ...]:
-    """How each quantity parts; in the order joints, object position, object orientation, contacts, contact force.
+    """Return how each quantity parts: joints, object position, object orientation, contacts, contact force.
 
     Joints are compared by their difference as a share of the threshold of their kind; the joint that differs most is named.
     """
     if not len(d.time):
         return ()
     tree = robot_tree(robot)
-    limit = np.array(
-        [thresholds.travel if tree.joint(n).type == "prismatic" else thresholds.joint for n in robot.joint_names]
-    )
+    prismatic = np.array([tree.joint(name).type == "prismatic" for name in robot.joint_names])
     fingers = robot.fingertip_names
+
+    def finger(step: int) -> str:
+        return fingers[int(d.force[step].argmax())]
+
     return (
-        _joints(d, robot.joint_names, limit, thresholds),
+        _joints(d, robot.joint_names, np.where(prismatic, thresholds.travel, thresholds.joint), prismatic),
         _parting("object position", "m", d.time, d.position, thresholds.position),
         _parting("object orientation", "rad", d.time, d.angle, thresholds.angle),
         _contacts(d, fingers, thresholds),
-        _parting(
-            "contact force",
-            "N",
-            d.time,
-            d.force.max(axis=1),
-            thresholds.force,
-            lambda step: fingers[int(d.force[step].argmax())],
-        ),
+        _parting("contact force", "N", d.time, d.force.max(axis=1), thresholds.force, finger),
     )
 
 
 def worst(several: Sequence[tuple[Parting, ...]]) -> tuple[Parting, ...]:
-    """Of the partings of several worlds, for each quantity the earliest time and the largest differences."""
+    """Return, for each quantity, the earliest time and the largest differences of several worlds."""
     out = []
     for same in zip(*several, strict=True):
         first = min(same, key=lambda p: math.inf if p.time is None else p.time)
@@ -153,57 +147,75 @@ def worst(several: Sequence[tuple[Parting, ...]]) -> tuple[Parting, ...]:
 
 
 def first_of(found: Sequence[Parting]) -> Parting | None:
-    """The quantity that parts first; None if none does."""
+    """Return the quantity that parts first; None if none does."""
     parted = [p for p in found if p.time is not None]
     return min(parted, key=lambda p: p.time or 0.0, default=None)
 
 
 def _parting(
-    quantity: str, unit: str, time: np.ndarray, value: np.ndarray, threshold: float,
-    where: Callable[[int], str] = lambda step: "", beyond: np.ndarray | None = None,
-) -> Parting:  # fmt: skip
-    """How a difference [T] parts: from the first step that is ``beyond`` [T] bool on; default: that reaches the threshold."""
+    quantity: str,
+    unit: str,
+    time: np.ndarray,
+    value: np.ndarray,
+    threshold: float,
+    where: Callable[[int], str] = lambda step: "",
+    beyond: np.ndarray | None = None,
+) -> Parting:
+    """Describe a difference [T]; it parts at the first step of ``beyond`` [T] bool, by default where it reaches the threshold."""
     beyond = value >= threshold if beyond is None else beyond
-    first, most = (int(beyond.argmax()) if beyond.any() else None), int(value.argmax())
+    first = int(beyond.argmax())
+    parts = bool(beyond[first])
+    most = int(value.argmax())
     return Parting(
-        quantity=quantity, unit=unit, threshold=threshold, time=None if first is None else float(time[first]),
-        where="" if first is None else where(first), end=float(value[-1]), largest=float(value[most]), largest_time=float(time[most]),
+        quantity=quantity,
+        unit=unit,
+        threshold=threshold,
+        time=float(time[first]) if parts else None,
+        where=where(first) if parts else "",
+        end=float(value[-1]),
+        largest=float(value[most]),
+        largest_time=float(time[most]),
         largest_where=where(most),
-    )  # fmt: skip
+    )
 
 
-def _joints(d: Differences, names: Sequence[str], limit: np.ndarray, thresholds: Thresholds) -> Parting:
+def _joints(d: Differences, names: Sequence[str], limit: np.ndarray, prismatic: np.ndarray) -> Parting:
     """In rad, or in m where the joint that differs most is prismatic; never a mixture: the joint is chosen first, then its unit."""
     share = d.joint / limit
+    found = _parting("joints", "rad", d.time, share.max(axis=1), 1.0, lambda step: names[int(share[step].argmax())])
     most = int(share.max(axis=1).argmax())
     joint = int(share[most].argmax())
-    kind, unit = limit == limit[joint], "rad" if limit[joint] == thresholds.joint else "m"
-    found = _parting("joints", unit, d.time, share.max(axis=1), 1.0, lambda step: names[int(share[step].argmax())])
     return replace(
-        found, threshold=float(limit[joint]), end=float(d.joint[-1, kind].max()), largest=float(d.joint[most, joint])
+        found,
+        unit="m" if prismatic[joint] else "rad",
+        threshold=float(limit[joint]),
+        end=float(d.joint[-1, prismatic == prismatic[joint]].max()),
+        largest=float(d.joint[most, joint]),
     )
 
 
 def _contacts(d: Differences, fingers: Sequence[str], thresholds: Thresholds) -> Parting:
-    """The difference is the number of fingers that touch in one and not in the other."""
+    """The difference is the number of fingers that touch in one engine and not in the other."""
     other = d.touch != d.reference_touch
     number = other.sum(axis=1)
-    lasting = _runs(number > 0, max(1, round(thresholds.contact_time / float(d.time[0]))))
+    lasting = np.zeros(len(number), dtype=bool)
+    need = max(1, round(thresholds.contact_time / float(d.time[0])))
+    for start, stop in runs(number > 0):
+        lasting[start:stop] = stop - start >= need
 
     def describe(step: int) -> str:
-        touched = np.flatnonzero(other[step]).tolist()
-        return ", ".join(f"{fingers[i]} {'touches' if d.touch[step, i] else 'does not touch'}" for i in touched)
+        parts = []
+        for i in np.flatnonzero(other[step]).tolist():
+            parts.append(f"{fingers[i]} {'touches' if d.touch[step, i] else 'does not touch'}")
+        return ", ".join(parts)
 
     return _parting("contacts", "fingers", d.time, number, 1.0, describe, lasting)
 
 
-def _runs(flags: np.ndarray, need: int) -> np.ndarray:
-    """[T] bool: the flags that are part of a run of at least ``need``."""
-    out = np.zeros_like(flags)
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], flags.astype(np.int8), [0]))))
-    for start, stop in edges.reshape(-1, 2):
-        out[start:stop] = stop - start >= need
-    return out
+def runs(flags: np.ndarray) -> np.ndarray:
+    """Return first step and end [n, 2] of every run of set flags [T]."""
+    edges = np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))
+    return np.flatnonzero(edges).reshape(-1, 2)
 
 
 def _averaged(values: np.ndarray, window: int) -> np.ndarray:
@@ -212,9 +224,3 @@ def _averaged(values: np.ndarray, window: int) -> np.ndarray:
     stop = np.arange(1, len(values) + 1)
     start = np.maximum(stop - window, 0)
     return (total[stop] - total[start]) / (stop - start)[:, None]
-
-
-def lifted(recording: Recording, world: int = 0) -> float:
-    """How much higher the object is at the end than where it began [m]; NaN if it is nowhere."""
-    height = recording.object_pos[-1, world, 2] - recording.start.object_pos[world, 2]
-    return float(height) if bool(torch.isfinite(height)) else math.nan

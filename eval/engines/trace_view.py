@@ -11,54 +11,59 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from xreset.eval.engines.divergence import Differences, Parting, first_of
+from xreset.eval.engines.divergence import Differences, Parting, first_of, runs
 from xreset.eval.engines.replay import EngineTrace, TraceResult
 from xreset.eval.plots import COLORS, picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_SHOWN = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "N": ("N", 1.0), "fingers": ("fingers", 1.0)}
+_UNITS = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "N": ("N", 1.0), "fingers": ("fingers", 1.0)}
+_NOISE = "#999999"
 
 
 def shown(parting: Parting, value: float) -> str:
-    """A difference in the unit in which it is read best."""
-    unit, scale = ("deg", math.degrees(1.0)) if parting.quantity == "object orientation" else _SHOWN[parting.unit]
-    return f"{float(f'{value * scale:.2g}'):g} {unit}"  # two digits, without an exponent
+    """Return a difference in the unit in which it is read best, with two digits and without an exponent."""
+    unit, scale = _UNITS[parting.unit]
+    if parting.quantity == "object orientation":
+        unit = "deg"
+        scale = math.degrees(1.0)
+    return f"{float(f'{value * scale:.2g}'):g} {unit}"
 
 
 def rich_table(result: TraceResult) -> Table:
-    """One column per engine and one for the reference's own noise; per quantity when and where it parts, and by how much."""
+    """One column for each engine and one for the reference's noise; for each quantity when and where it parts, and by how much."""
     reference = result.reference
     title = f"{result.actions.label}\n{result.actions.robot.name}: when, where and by how much engines part from {reference.name}"
     table = Table(title=title, title_justify="left", show_lines=True)
     table.add_column("")
-    for engine in result.engines:
-        table.add_column(f"{engine.name} {engine.version}")
+    for e in result.engines:
+        table.add_column(f"{e.name} {e.engine.version}")
     table.add_column(f"{reference.name}, {len(result.noise_differences)} starts moved by {result.perturbation:.0e}")
     table.add_row("object lifted by", *(_height(e.lifted) for e in result.engines), _height(reference.lifted))
     for i, noise in enumerate(result.noise):
-        cells = [
-            _cell(result, e.partings[i], dim=result.within_noise(e.partings[i])) if e.partings else "-"
-            for e in result.engines
-        ]
-        table.add_row(
-            f"{noise.quantity}\n(from {shown(noise, noise.threshold)})", *cells, _cell(result, noise, dim=False)
-        )
+        cells = []
+        for e in result.engines:
+            if e.partings:
+                cells.append(_cell(result, e.partings[i], dim=result.within_noise(e.partings[i])))
+            else:
+                cells.append("-")
+        quantity = f"{noise.quantity}\n(from {shown(noise, noise.threshold)})"
+        table.add_row(quantity, *cells, _cell(result, noise, dim=False))
     return table
 
 
 def sentences(result: TraceResult) -> Iterator[str]:
-    """What each engine's partings come to, a sentence each."""
+    """Yield one sentence for each engine: where it parts first."""
     for engine in result.engines:
         yield _sentence(result, engine)
 
 
 def _sentence(result: TraceResult, engine: EngineTrace) -> str:
-    total = len(result.actions.joint_target)
-    if len(engine.differences.time) < total:
-        end = engine.differences.time[-1] if len(engine.differences.time) else 0.0
-        return f"{engine.name} is no longer finite after {end:.3f} s; what is said of it ends there."
+    time = engine.differences.time
+    if len(time) < len(result.actions.joint_target):
+        end = time[-1] if len(time) else 0.0
+        return f"{engine.name} is no longer finite after {end:.3f} s, where the comparison ends."
     first = first_of([p for p in engine.partings if not result.within_noise(p)])
     if first is None:
         same = result.reference.name
@@ -70,24 +75,24 @@ def _sentence(result: TraceResult, engine: EngineTrace) -> str:
 
 
 def _cell(result: TraceResult, p: Parting, *, dim: bool) -> Text:
+    lines = []
     if p.time is None:
-        first = "never"
+        lines.append("never")
     else:
         phase = result.actions.phase_at(p.time)
-        first = f"{p.time:.3f} s" + (f", {phase}" if phase else "")
-        first += f"\n{p.where}" if p.where else ""
-    most = f"most {shown(p, p.largest)} at {p.largest_time:.2f} s"
-    if p.largest_where and p.largest_where != p.where:
-        most += f" ({p.largest_where})"
-    text = f"{first}\nend {shown(p, p.end)}\n{most}"
-    return Text(f"{text}\nwithin noise", "dim") if dim and p.time is not None else Text(text)
+        lines.append(f"{p.time:.3f} s, {phase}" if phase else f"{p.time:.3f} s")
+        if p.where:
+            lines.append(p.where)
+    lines.append(f"end {shown(p, p.end)}")
+    other = f" ({p.largest_where})" if p.largest_where and p.largest_where != p.where else ""
+    lines.append(f"most {shown(p, p.largest)} at {p.largest_time:.2f} s{other}")
+    if dim and p.time is not None:
+        return Text("\n".join([*lines, "within noise"]), "dim")
+    return Text("\n".join(lines))
 
 
 def _height(metres: float) -> str:
     return f"{1e3 * metres:.0f} mm" if math.isfinite(metres) else "not finite"
-
-
-_NOISE = "#999999"
 
 
 def write_plot(path: Path, result: TraceResult) -> None:
@@ -104,7 +109,7 @@ def write_plot(path: Path, result: TraceResult) -> None:
         ("contact force [N]", lambda d: d.force.max(axis=1), t.force),
     )
     fingers = result.actions.robot.fingertip_names
-    engines = [result.reference, *result.engines]
+    engines = (result.reference, *result.engines)
     heights = [1.7] * len(rows) + [0.35 + 0.13 * len(fingers) * len(engines)]
     with picture(path, (10, sum(heights) + 0.9), dpi=110, font_size=9) as figure:
         figure.suptitle(f"{result.actions.label}: distance to {result.reference.name}", fontweight="bold")
@@ -112,20 +117,13 @@ def write_plot(path: Path, result: TraceResult) -> None:
         for ax, (title, value, threshold) in zip(axes, rows, strict=False):
             _draw_differences(ax, result, value, threshold)
             ax.set_title(title, loc="left", fontsize="medium")
-        _draw_touches(axes[-1], [(e.name, e.differences) for e in engines], fingers)
+        _draw_touches(axes[-1], engines, fingers)
         axes[-1].set_xlabel("time [s]")
-        for ax in axes:
-            for name, start in result.actions.phases:
+        for name, start in result.actions.phases:
+            for ax in axes:
                 ax.axvline(start, color="black", alpha=0.15, linewidth=0.8)
-                if ax is axes[0]:
-                    ax.annotate(
-                        name,
-                        (start, 1),
-                        xycoords=("data", "axes fraction"),
-                        xytext=(2, -2),
-                        textcoords="offset points",
-                        va="top",
-                    )
+            top = axes[0].get_xaxis_transform()
+            axes[0].annotate(name, (start, 1), xycoords=top, xytext=(2, -2), textcoords="offset points", va="top")
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
 
@@ -136,13 +134,10 @@ def _draw_differences(ax: Axes, result: TraceResult, value, threshold: float) ->
     def draw(d: Differences, **style) -> None:
         ax.plot(d.time, np.maximum(value(d), floor), **style)
 
-    for i, d in enumerate(result.noise_differences):
-        draw(
-            d,
-            color=_NOISE,
-            linewidth=0.7,
-            label=f"{result.reference.name}, start moved by {result.perturbation:.0e}" if i == 0 else None,
-        )
+    label = f"{result.reference.name}, start moved by {result.perturbation:.0e}"
+    for d in result.noise_differences:
+        draw(d, color=_NOISE, linewidth=0.7, label=label)
+        label = None
     for i, engine in enumerate(result.engines, start=1):
         draw(engine.differences, color=COLORS[i % len(COLORS)], linewidth=1.3, label=engine.name)
     ax.axhline(threshold, color="black", linestyle="--", linewidth=0.8, label="threshold")
@@ -151,23 +146,16 @@ def _draw_differences(ax: Axes, result: TraceResult, value, threshold: float) ->
     ax.grid(axis="y", alpha=0.2)
 
 
-def _draw_touches(ax: Axes, engines: list[tuple[str, Differences]], fingers: tuple[str, ...]) -> None:
-    rows = [(finger, name, k) for finger in range(len(fingers)) for k, (name, _) in enumerate(engines)]
-    for y, (finger, _, k) in enumerate(rows):
-        d = engines[k][1]
-        flags = d.touch[:, finger]
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))).reshape(-1, 2)
-        dt = float(d.time[0])
-        ax.broken_barh(
-            [(start * dt, (stop - start) * dt) for start, stop in edges], (y - 0.4, 0.8), color=COLORS[k % len(COLORS)]
-        )
-        if k == 0:
-            ax.axhline(y - 0.5, color="black", alpha=0.15, linewidth=0.8)
-    middle = (len(engines) - 1) / 2
-    ax.set_yticks([i * len(engines) + middle for i in range(len(fingers))], list(fingers))
-    ax.set_ylim(len(rows) - 0.5, -0.5)
-    ax.set_title(
-        f"which fingers touch the object (in each, from above: {', '.join(name for name, _ in engines)})",
-        loc="left",
-        fontsize="medium",
-    )
+def _draw_touches(ax: Axes, engines: tuple[EngineTrace, ...], fingers: tuple[str, ...]) -> None:
+    count = len(engines)
+    for finger in range(len(fingers)):
+        ax.axhline(finger * count - 0.5, color="black", alpha=0.15, linewidth=0.8)
+        for k, engine in enumerate(engines):
+            d = engine.differences
+            dt = float(d.time[0])
+            spans = [(start * dt, (stop - start) * dt) for start, stop in runs(d.touch[:, finger])]
+            ax.broken_barh(spans, (finger * count + k - 0.4, 0.8), color=COLORS[k % len(COLORS)])
+    ax.set_yticks([i * count + (count - 1) / 2 for i in range(len(fingers))], list(fingers))
+    ax.set_ylim(len(fingers) * count - 0.5, -0.5)
+    names = ", ".join(engine.name for engine in engines)
+    ax.set_title(f"which fingers touch the object (in each, from above: {names})", loc="left", fontsize="medium")

@@ -1,6 +1,6 @@
-"""What an engine is put through: closings, presses, holds and paths.
+"""What a comparison tries in every engine: closings, presses, holds and paths.
 
-Shape letters: G grasps (one per world), M moved or chosen ones.
+Shape letters: G grasps (one per world), M chosen grasps.
 """
 
 from __future__ import annotations
@@ -11,16 +11,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from xreset.eval.engines.episodes import (
-    Motion,
-    Recording,
-    closing_episode,
-    holding_episode,
-    lifting_episode,
-    play,
-    squeezing_state,
-)
+from xreset.eval.engines.episodes import Motion, closing_episode, lifting_episode, squeezing_state
 from xreset.eval.engines.grasps import Grasps
+from xreset.eval.engines.recording import Episode, Recording, play
 from xreset.eval.trial import Engine
 from xreset.physics import State
 from xreset.spec import RobotSpec, SceneSpec
@@ -36,23 +29,13 @@ class ParityConfig:
     in_air: float = 1 / 3
     """Share of the common states that demonstrations show in the air; the others come from closings."""
     press_mass: float = 1e6
-    """How many times its own mass an object is given that nothing shall move."""
+    """Factor on the mass of an object that nothing shall move."""
     press_time: float = 0.25
     """Forces are averaged over the last of these seconds of a press."""
     path_time: float = 1.0
-    """[s]"""
+    """Length of a path [s]."""
     path_grasps: int = 16
-    """Grasps whose paths are compared, at most."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Closings:
-    """What came of closing hands."""
-
-    press: Recording
-    """Around objects that nothing moves, up to the lift."""
-    whole: Recording
-    """Around objects at rest on the table, to the end."""
+    """Largest number of grasps whose paths are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,23 +50,26 @@ class CommonStates:
     """[G, ...]"""
 
     def __getitem__(self, chosen: Tensor) -> CommonStates:
-        """Some of them [M]."""
+        """Select grasps [M]."""
         label = tuple(self.label[i] for i in chosen.tolist())
         return CommonStates(label=label, object_index=self.object_index[chosen], start=self.start[chosen])
 
 
-def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps, config: ParityConfig) -> Closings:
-    """Close each hand, at the scene's frictions: around an object too heavy to be moved, and for good."""
-    dt, motion = scene.control_dt, config.motion
-    episode = closing_episode(scene.robot, grasps.joint_pos, grasps.object_pos, grasps.object_quat, dt, motion)
+def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps, config: ParityConfig) -> tuple[Recording, Recording]:
+    """Close each hand at the scene's frictions.
+
+    Returns:
+        The closing around objects too heavy to move, up to the lift; and the whole try around objects at rest on the table.
+    """
+    dt = scene.control_dt
+    episode = closing_episode(scene.robot, grasps.joint_pos, grasps.object_pos, grasps.object_quat, dt, config.motion)
+    closing = Episode(start=episode.start, targets=episode.targets[: config.motion.closing_steps(dt)])
     with tested.make(scene, len(grasps), grasps.object_index) as backend:
         whole = play(backend, episode)
-        n, device = backend.num_worlds, backend.device
-        mass = torch.tensor([scene.objects[i].mass for i in grasps.object_index.tolist()], device=device)
+        mass = torch.tensor([scene.objects[i].mass for i in grasps.object_index.tolist()], device=backend.device)
         backend.set_object_mass(config.press_mass * mass)
-        backend.set_object_gravity(torch.zeros(n, device=device))
-        press = play(backend, episode.first(motion.closing_steps(dt)))
-    return Closings(press=press, whole=whole)
+        backend.set_object_gravity(torch.zeros_like(mass))
+        return play(backend, closing), whole
 
 
 def try_holds(tested: Engine, scene: SceneSpec, common: CommonStates, config: ParityConfig) -> tuple[Recording, ...]:
@@ -98,12 +84,6 @@ def try_holds(tested: Engine, scene: SceneSpec, common: CommonStates, config: Pa
     return tuple(recordings)
 
 
-def try_paths(tested: Engine, scene: SceneSpec, common: CommonStates, config: ParityConfig) -> Recording:
-    """Hold still for a while."""
-    with tested.make(scene, len(common.object_index), common.object_index) as backend:
-        return play(backend, holding_episode(common.start, config.path_time, scene.control_dt))
-
-
 def common_states(
     robot: RobotSpec,
     table: Grasps,
@@ -113,25 +93,29 @@ def common_states(
     dt: float,
     config: ParityConfig,
 ) -> CommonStates:
-    """States that favour no engine: some as demonstrations show them in the air, the others from the closings of all engines in turn.
+    """Return states that favor no engine: some from demonstrations in the air, the others from the closings of all engines in turn.
 
     A closing counts if a fingertip touches the object when the hand has closed.
 
     Args:
-        closings: by engine, the whole closings.
-        count: how many at most; fewer where hands have closed on nothing.
+        robot: the robot.
+        table: grasps of the closings.
+        air: grasps in the air.
+        closings: whole closings, by engine.
+        count: largest number of states; there are fewer where hands have closed on nothing.
         dt: control step [s].
+        config: share of the states in the air.
     """
     shown = min(round(count * config.in_air), len(air))
+    held = squeezing_state(robot, air.joint_pos[:shown], air.object_pos[:shown], air.object_quat[:shown], config.motion)
     labels = [f"{label} as demonstrated" for label in air.label[:shown]]
-    states = [
-        squeezing_state(robot, air.joint_pos[:shown], air.object_pos[:shown], air.object_quat[:shown], config.motion)
-    ]
+    states = [held]
     index = [air.object_index[:shown]]
     last = config.motion.closing_steps(dt) - 1
     names = list(closings)
     for g in range(len(table)):
-        for name in names[g % len(names) :] + names[: g % len(names)]:
+        first = g % len(names)
+        for name in names[first:] + names[:first]:
             if len(labels) < count and closings[name].tip_touch[last, g].any():
                 labels.append(f"{table.label[g]} closed in {name}")
                 states.append(closings[name].state_after(last)[torch.tensor([g])])

@@ -120,7 +120,7 @@ def collect(folder: Path) -> ReportData:
         trained_with=trained_with,
         curves=curves,
         choice=choice if choice and choice.policy_hash in {s.inputs.get("policy") for s in summaries} else None,
-        stress=read_stress(results.parent / "stress"),
+        stress=read_stress(results.parent / "stress", summaries[0].inputs.get("policy")),
         notes=tuple(notes),
     )
 

@@ -44,16 +44,14 @@ def stress(
     folder = out or spec.folder.parent / "stress"
     played = trial.load_trial(spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs)
     with engine_bars(console, [e.name for e in engines]) as progress:
-        found = sweeps.stress(
-            spec, played, engines, folder, properties=properties, repetitions=episodes, progress=progress
-        )
+        found = sweeps.stress(spec, played, engines, folder, sweeps=properties, repetitions=episodes, progress=progress)
     sweeps.write_plot(folder / "stress.png", found, f"{spec.name}: what it bears")
     table = Table("property", title=f"{spec.name}: task progress, and its difference to the same episodes (95 %)")
     table.add_column("value", justify="right")
     for result in found:
         table.add_column(result.backend, justify="right", no_wrap=True)
     for prop in properties:
-        curves = [next((c for c in result.curves if c.property == prop.name), None) for result in found]
+        curves = [next((c for c in result.curves if c.property == prop.option), None) for result in found]
         values = sorted({*prop.values, prop.nominal})
         for i, value in enumerate(values):
             cells = []
@@ -66,7 +64,7 @@ def stress(
                     else ""
                 )
                 cells.append(f"{100 * point.task_progress:.1f} %{change}" if point else "cannot be set")
-            named = prop.name if prop.unit == "x" else f"{prop.name} [{prop.unit}]"
+            named = prop.option if prop.unit == "x" else f"{prop.option} [{prop.unit}]"
             amount = f"x {value:g}" if prop.unit == "x" else f"{value:g}"
             table.add_row("" if i else named, amount, *cells, end_section=i == len(values) - 1)
     console.print(table)

@@ -1,0 +1,105 @@
+"""Open-loop episodes of joint targets, and what an engine does with them.
+
+Shape letters: G worlds, J joints, E fingertips, T control steps, P surface points.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from xreset.eval.trial import Engine
+from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
+from xreset.physics import Backend, State
+from xreset.spec import SceneSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """The starts of G worlds, and the targets of their drives."""
+
+    start: State
+    """[G, ...]"""
+    targets: Tensor
+    """[T, G, J] joint targets of each control step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """What an engine did with an episode, after each control step, on the CPU."""
+
+    start: State
+    """[G, ...] the start of the episode."""
+    joint_pos: Tensor
+    """[T, G, J] rad (m)"""
+    joint_target: Tensor
+    """[T, G, J]"""
+    object_pos: Tensor
+    """[T, G, 3]"""
+    object_quat: Tensor
+    """[T, G, 4]"""
+    palm_pos: Tensor
+    """[T, G, 3]"""
+    palm_quat: Tensor
+    """[T, G, 4]"""
+    tip_force: Tensor
+    """[T, G, E, 3] on the object, world frame [N]."""
+    tip_touch: Tensor
+    """[T, G, E] bool"""
+    broken: Tensor
+    """[G] bool: a number was not finite, or contacts overflowed."""
+
+    @property
+    def lifted(self) -> Tensor:
+        """[G] height of the object at the end above its start [m]."""
+        return self.object_pos[-1, :, 2] - self.start.object_pos[:, 2]
+
+    def state_after(self, step: int) -> State:
+        """Return the states [G] after a control step, brought to rest: positions and targets, without velocities."""
+        return State.at_rest(
+            self.joint_pos[step], self.object_pos[step], self.object_quat[step], self.joint_target[step]
+        )
+
+    def in_palm(self, step: int, points: Tensor) -> Tensor:
+        """Return points [G, P, 3] of the objects' mesh frames in the palm's frame after a control step [m]."""
+        world = self.object_pos[step][:, None] + quat_rotate(self.object_quat[step][:, None], points)
+        return quat_rotate_inverse(self.palm_quat[step][:, None], world - self.palm_pos[step][:, None])
+
+
+def play(backend: Backend, episode: Episode) -> Recording:
+    """Set each world to its start and give the drives the episode's targets."""
+    backend.set_state(episode.start.to(backend.device))
+    frames: dict[str, list[Tensor]] = defaultdict(list)
+    for target in episode.targets.to(backend.device):
+        backend.set_joint_targets(target)
+        backend.step()
+        state = backend.state()
+        links = backend.links()
+        contacts = backend.contacts()
+        now = {
+            "joint_pos": state.joint_pos,
+            "object_pos": state.object_pos,
+            "object_quat": state.object_quat,
+            "palm_pos": links.pos[:, 0],
+            "palm_quat": links.quat[:, 0],
+            "tip_force": contacts.tip_force,
+            "tip_touch": contacts.tip_touch,
+        }
+        for name, value in now.items():
+            frames[name].append(value.cpu().clone())
+    health = backend.health()
+    return Recording(
+        start=episode.start.to("cpu"),
+        joint_target=episode.targets.cpu(),
+        broken=(health.nonfinite | health.overflow).cpu(),
+        **{name: torch.stack(values) for name, values in frames.items()},
+    )
+
+
+def record(engine: Engine, scene: SceneSpec, object_index: Tensor, episode: Episode) -> Recording:
+    """Play an episode in new worlds of an engine; ``object_index``: [G] index of the object in each world."""
+    with engine.make(scene, len(object_index), object_index) as backend:
+        return play(backend, episode)

@@ -351,7 +351,7 @@ class CommandTest(unittest.TestCase):
     def test_bad_input(self):
         rest = ("--demos", "none.npz", "--robot", "ur7e-sharpa")
         self.assertIn(
-            "does not differ from itself", self.refuse("zero", *rest, "--backend", "mujoco", "--towards", "mujoco")
+            "Choose two engines", self.refuse("zero", *rest, "--backend", "mujoco", "--towards", "mujoco")
         )
         self.assertIn(
             "expected a whole number from 1", self.refuse("zero", *rest, "--towards", "sapien", "--episodes", "0")

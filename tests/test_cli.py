@@ -72,6 +72,26 @@ class LightnessTest(unittest.TestCase):
             "{}",
         )
 
+    def test_a_second_thread_never_sees_half_a_module(self):
+        code = """
+import importlib, pathlib, sys, tempfile, threading, time
+from xreset import cli
+folder = tempfile.TemporaryDirectory()
+sys.modules.pop("xreset.slow", None)
+import xreset
+xreset.__path__.append(folder.name)
+pathlib.Path(folder.name, "slow.py").write_text("import time; first = 1; time.sleep(0.5); last = 2")
+sys.meta_path.insert(0, cli._Lazily)
+module = importlib.import_module("xreset.slow")
+first = threading.Thread(target=lambda: module.last)
+first.start()
+while "first" not in vars(module): time.sleep(0.01)
+print(module.last)
+first.join()
+"""
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        self.assertEqual((done.stdout, done.stderr), ("2\n", ""))
+
 
 class UsageTest(unittest.TestCase):
     def test_every_command_has_help(self):
@@ -89,7 +109,7 @@ class UsageTest(unittest.TestCase):
     def test_unknown_command(self):
         code, _, err = run("trian")
         self.assertEqual(code, 2)
-        self.assertIn("no command 'trian'", err)
+        self.assertIn("Unknown command 'trian'", err)
         self.assertIn("train", err)
 
     def test_an_earlier_name_answers_with_the_new_one(self):
@@ -116,9 +136,9 @@ class UsageTest(unittest.TestCase):
             (r"--num-envs is -3, expected", ("resets", "none.npz", "--out", "x.npz", "--num-envs", "-3")),
             (r"--iterations is 0, expected", ("train", "--out", "x", "--iterations", "0")),
             (r"--joint-threshold is not a number", ("engines", "trace", "none.npz", "--joint-threshold", "nan")),
-            (r"no device 'quantum'; expected cpu, cuda or", ("train", "--out", "x", "--device", "quantum")),
+            (r"Unknown device 'quantum'; expected cpu, cuda or", ("train", "--out", "x", "--device", "quantum")),
             (
-                r"no device 'quantum'; expected cpu, cuda or",
+                r"Unknown device 'quantum'; expected cpu, cuda or",
                 ("retarget", "none.npz", "--robot", "openarm", "--out", "x.npz", "--device", "quantum"),
             ),
             (
@@ -141,7 +161,7 @@ class UsageTest(unittest.TestCase):
         with mock.patch("torch.cuda.device_count", return_value=0):
             code, _, err = run("resets", "none.npz", "--out", "x.npz", "--backend", "mujoco-warp", "--device", "cuda")
         self.assertEqual(code, 1)
-        self.assertIn("--device is cuda, but of GPUs there is none", err)
+        self.assertIn("--device is cuda, but torch finds 0 GPUs", err)
 
     def test_what_reaches_the_terminal_is_text(self):
         code, _, err = run("eval", "\x1b[31mred\x1b]0;title\x07", "--demos", "none.npz")

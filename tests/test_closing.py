@@ -313,7 +313,7 @@ class CommandTest(unittest.TestCase):
         except ImportError as error:
             self.skipTest(str(error))
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-        self.enterContext(mock.patch("xreset.cli.resets.load_robot", lambda _: ROBOT))
+        self.enterContext(mock.patch("xreset.description.load_robot", lambda _: ROBOT))
         self.enterContext(mock.patch("xreset.objects.catalogue.load_objects", lambda *_: (toy_grasp.brick(),)))
         write_retargeted(self.folder / "r.npz", grasp_and_lift(), config={}, inputs={})
 

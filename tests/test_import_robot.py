@@ -311,7 +311,7 @@ class Toy(WithFolder):
         ]
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             main([str(word) for word in words])
-        self.assertIn("for you to say", out.getvalue())
+        self.assertIn("for you to decide", out.getvalue())
         self.assertIn("0 errors", out.getvalue())
         self.assertTrue((self.folder / "mine" / "robot.png").read_bytes().startswith(b"\x89PNG"))
 

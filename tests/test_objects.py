@@ -346,7 +346,7 @@ class MeshImport(unittest.TestCase):
         self.assertIn("brick", said.getvalue())
         self.assertTrue(png.read_bytes().startswith(b"\x89PNG"))
         self.assertEqual(load_object("brick", out).mass, 0.2)
-        for words, options in (("say which with --out", []), ("is no name", ["--out", str(out), "--scale", "0.001"])):
+        for words, options in (("Add --out", []), ("is no name", ["--out", str(out), "--scale", "0.001"])):
             with self.subTest(words), contextlib.redirect_stderr(io.StringIO()) as said, self.assertRaises(SystemExit):
                 main(["objects", "import", str(path), *options])
             self.assertIn(words, said.getvalue())

@@ -516,7 +516,7 @@ class WholeTest(unittest.TestCase):
 
     def test_options(self):
         for arguments, message in (
-            (("--slurm", "partition=gpu"), "--slurm goes with --cluster slurm"),
+            (("--slurm", "partition=gpu"), "--slurm needs --cluster slurm"),
             (("--cluster", "slurm", "--slurm", "gpu"), "--slurm gpu is not KEY=VALUE"),
             (("--per-gpu", "0"), "--per-gpu is 0"),
         ):

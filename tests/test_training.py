@@ -270,8 +270,8 @@ class TrainingTest(unittest.TestCase):
                 "no recipe and no run folder 'nothing'. Recipes: paper, the paper's tables .*; minutes, what taught",
             ),
             (("--like", str(self.folder)), "is not a run folder"),
-            (("--like", "minutes", "--resume"), "leave out --like"),
-            (("--weights", str(self.out), "--resume"), "leave out --weights"),
+            (("--like", "minutes", "--resume"), "Omit --like"),
+            (("--weights", str(self.out), "--resume"), "Omit --weights"),
             (("--minutes", "0"), "--minutes is 0.0, expected more than 0"),
             (
                 ("--like", "minutes", "--config.task.action.hand-zero", "home"),

@@ -11,7 +11,8 @@
     with policy.make_env([can], bank, engine="mujoco") as env:             # the task that the policy was trained for
         xreset.film(policy, env, "can.mp4")
 
-Importing this package loads nothing heavy: no torch, no physics engine, no display. A name is imported when it is first used.
+Importing this package loads nothing heavy: no torch, no physics engine, no display. A name is imported when it is first
+used.
 """
 
 import re

@@ -1,11 +1,11 @@
 """The command line: ``xreset COMMAND ...``.
 
-The first word picks a module of this package, which is only then imported, so that ``xreset --help`` is instant. A command module holds
-typed functions; tyro turns their signatures and docstrings into flags.
+The first word selects a module of this package, which is imported only then, so that ``xreset --help`` is instant. A
+command module holds typed functions; tyro turns their signatures and docstrings into flags.
 
-So that a command's own help is instant too, what it imports of xreset runs when something of it is first used. Command modules therefore
-import modules (``from xreset.eval import trial``, then ``trial.engine(...)``), and names of light ones only: of configurations, of errors.
-"""
+The help of a command must be instant too. Therefore every module of xreset that a command imports runs when one of its
+names is first used. Command modules import modules (``from xreset.eval import trial``, then ``trial.engine(...)``), and
+names only from light modules, such as configurations and errors."""
 
 from __future__ import annotations
 
@@ -15,30 +15,34 @@ from importlib import import_module
 from importlib.abc import Loader
 from importlib.machinery import ModuleSpec, PathFinder
 from io import TextIOWrapper
+from threading import RLock
 from types import ModuleType
 from typing import Any, NoReturn
 
 COMMANDS: dict[str, str] = {
-    "demos": "Import, make and describe human demonstrations.",
+    "demos": "Import, synthesize and describe human demonstrations.",
     "objects": "List objects and import meshes.",
-    "robots": "List robots, check one, make one from an arm and a hand, find its place.",
-    "engines": "List physics engines, check them, compare them and trace where they diverge.",
-    "retarget": "Turn human demonstrations into robot trajectories.",
-    "resets": "Try retargeted states in physics and keep the stable ones.",
-    "view": "Look at demonstrations, robot trajectories or a reset bank in a browser, or as pictures.",
+    "robots": "List, check, import and place robots.",
+    "engines": "List, check and compare physics engines, and trace where they diverge.",
+    "retarget": "Turn human demonstrations into robot motion.",
+    "resets": "Test robot states in physics and keep the stable ones.",
+    "view": "Show demonstrations, robot motion or a reset bank in a browser, or as pictures.",
     "train": "Train a policy.",
-    "policies": "Show the policies that ship with xreset, and make exported ones smaller.",
-    "eval": "Evaluate a policy, or a baseline, in one or several engines.",
-    "frontier": "Tell from which demonstrated states a policy reaches the goal, and where its training is stuck.",
-    "stress": "Tell what a policy bears: stiffness, latency, friction and more, swept one at a time.",
-    "select": "Choose among a training's checkpoints by all engines: the best in its worst engine.",
-    "compare": "Put several trainings side by side: curves, results in every engine, and what differs between them.",
-    "study": "Run a study: trainings by object and seed, evaluations, and tables beside the paper's.",
-    "export": "Write evaluation episodes as a LeRobot data set, or as plain arrays.",
-    "report": "Make a self-contained HTML page of a run's evaluations.",
+    "policies": "List the policies that ship with xreset, and shrink exported ones.",
+    "eval": "Evaluate a policy or a baseline in one or several engines.",
+    "frontier": "Show from which demonstrated states a policy reaches the goal.",
+    "stress": "Measure robustness: change stiffness, latency, friction and more, one at a time.",
+    "select": "Choose the checkpoint that is best in its worst engine.",
+    "compare": "Compare trainings: learning curves, results in every engine, and configurations.",
+    "study": "Run a study: trainings by object and seed, evaluations, and tables next to the paper's.",
+    "export": "Write recorded episodes as a LeRobot data set or as plain arrays.",
+    "report": "Make an HTML page of a run's evaluations.",
 }
-"""Command -> one line of help. ``xreset.cli.NAME`` has ``COMMAND``, a function or a dictionary of sub-commands; or ``command_for``,
-arguments -> such a function, where defaults depend on an argument; or ``COMMANDS`` of its own, in modules below it."""
+"""Command -> one line of help.
+
+The module ``xreset.cli.NAME`` has one of: ``COMMAND``, a function or a dictionary of sub-commands; ``command_for``,
+which makes the function from the arguments, if defaults depend on them; or ``COMMANDS`` of its own, whose modules are
+in its folder."""
 
 MOVED = {
     "backends": "engines list",
@@ -47,19 +51,19 @@ MOVED = {
     "trace": "engines trace",
     "attribute": "engines attribute",
 }
-"""Earlier names of commands."""
+"""Earlier names of commands -> today's."""
 
 INVOCATION: list[str] = []
-"""The arguments of the command that is running."""
+"""Arguments of the command that is running."""
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Entry point of the console script. Exits with 1 after an error that the user can mend, 2 after wrong usage, 130 after Ctrl-C."""
+    """Run the command line. Exits with 1 after an error of the user, 2 after wrong usage, 130 after Ctrl-C."""
     from xreset.errors import XResetError
 
     argv = sys.argv[1:] if argv is None else argv
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # what the terminal has no character for is written as an escape
+        if isinstance(stream, TextIOWrapper):  # write an escape for a character that the terminal lacks
             stream.reconfigure(errors="backslashreplace")
     if argv[:1] == ["--version"]:
         from xreset import __version__
@@ -85,7 +89,7 @@ def main(argv: list[str] | None = None) -> None:
             raise
         _fail(argv, f"{error.strerror}: {error.filename}" if error.filename else error.strerror)
     except MemoryError:
-        _fail(argv, "there is too little memory for this. Use fewer worlds (--num-envs) or a smaller file.")
+        _fail(argv, "Out of memory. Use fewer worlds (--num-envs) or a smaller file.")
 
 
 def _fail(argv: list[str], message: str) -> NoReturn:
@@ -97,13 +101,14 @@ def _fail(argv: list[str], message: str) -> NoReturn:
 
 
 def _run(group: str, commands: dict[str, str], argv: list[str]) -> None:
-    """Run the command that the first of the arguments names, of a group of commands."""
+    """Run the command of a group that the first argument names."""
     if not argv or argv[0] in ("-h", "--help"):
         print(_usage(group, commands))
         return
-    name, arguments = argv[0], argv[1:]
+    name = argv[0]
+    arguments = argv[1:]
     if name not in commands:
-        print(f"xreset{group}: there is no command {name!r}.\n\n{_usage(group, commands)}", file=sys.stderr)
+        print(f"xreset{group}: Unknown command {name!r}.\n\n{_usage(group, commands)}", file=sys.stderr)
         raise SystemExit(2)
     sys.meta_path.insert(0, _Lazily)
     try:
@@ -118,36 +123,47 @@ def _run(group: str, commands: dict[str, str], argv: list[str]) -> None:
     from xreset.cli._options import checked
 
     command = module.command_for(arguments) if hasattr(module, "command_for") else module.COMMAND
-    program, description = f"xreset{group} {name}", commands[name]
+    shown = {"prog": f"xreset{group} {name}", "description": commands[name]}
     if isinstance(command, dict):
         verbs = {verb: checked(function) for verb, function in command.items()}
-        two = " ".join(arguments[:2])  # a verb may have two words
-        arguments = [two, *arguments[2:]] if two in verbs else arguments
-        tyro.extras.subcommand_cli_from_dict(verbs, prog=program, description=description, args=arguments)
+        two = " ".join(arguments[:2])
+        if two in verbs:  # a verb may have two words
+            arguments = [two, *arguments[2:]]
+        tyro.extras.subcommand_cli_from_dict(verbs, args=arguments, **shown)
     else:
-        tyro.cli(checked(command), prog=program, description=description, args=arguments)
+        tyro.cli(checked(command), args=arguments, **shown)
+
+
+_LOCK = RLock()
+"""Held while a lazy module runs, so that no other thread sees half of it."""
 
 
 class _LazyModule(ModuleType):
-    """A module that runs when one of its names is first asked for.
+    """A module that runs when one of its names is first used.
 
-    ``importlib.util.LazyLoader`` runs it for the sake of ``__file__`` too, which ``inspect`` asks of all modules in the middle of imports.
-    """
+    ``importlib.util.LazyLoader`` is not enough: it also runs the module for ``__file__``, which ``inspect`` reads of
+    all modules."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(f"module {self.__name__!r} has not run yet and has no {name!r}")
-        self.__class__ = ModuleType
-        try:
-            self.__loader__.loader.exec_module(self)
-        except BaseException:
-            self.__class__ = _LazyModule
-            raise
+        with _LOCK:
+            if (
+                self.__spec__.loader_state == "running"
+            ):  # a name that the module itself, or a circular import, uses too early
+                raise AttributeError(f"module {self.__name__!r} has no {name!r} yet")
+            if isinstance(self, _LazyModule):
+                self.__spec__.loader_state = "running"
+                try:
+                    self.__loader__.loader.exec_module(self)
+                    self.__class__ = ModuleType
+                finally:
+                    self.__spec__.loader_state = None
         return getattr(self, name)
 
 
 class _Lazily(Loader):
-    """Finds xreset's modules, but for the commands' own, as lazy ones."""
+    """Finds the modules of xreset, except the commands, and makes them lazy."""
 
     def __init__(self, loader: Loader) -> None:
         self.loader = loader

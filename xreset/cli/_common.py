@@ -1,4 +1,4 @@
-"""What several commands do alike."""
+"""Types of arguments and steps that several commands share."""
 
 from __future__ import annotations
 
@@ -6,33 +6,45 @@ import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated, TypeVar
 
+import tyro
 from rich.console import Console
 
 from xreset.cli import INVOCATION
 from xreset.cli._terminal import Progress
 from xreset.plugins import backend_names, backend_status
 
+_T = TypeVar("_T")
+Source = Annotated[Path, tyro.conf.Positional]
+"""A file or folder, given without a flag."""
+Name = Annotated[str, tyro.conf.Positional]
+"""A text, given without a flag."""
+Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+"""A flag that may be given again. Its default must be empty, because values are appended to it."""
+Flat = Annotated[_T, tyro.conf.arg(name="")]
+"""A dataclass whose fields are options of the command itself."""
+
 
 @contextmanager
 def engine_bars(console: Console, names: Sequence[str]) -> Iterator[Callable[[str, int, int], None]]:
-    """One bar for each engine; gives the function that moves them: (engine, steps done, steps in all)."""
+    """Show a progress bar for each engine; yields the function that moves them: (engine, steps done, steps in all)."""
     with Progress(console) as bar:
         counts = {name: bar.count(name) for name in names}
         yield lambda name, done, total: counts[name](done, total)
 
 
 def usable_engines(console: Console) -> list[str]:
-    """Names of the engines that can be used here; says why others cannot."""
+    """Return the names of the engines that can be used here, and print why others cannot."""
     statuses = [backend_status(name) for name in backend_names()]
     for status in statuses:
         if status.reason is not None:
-            console.print(f"left out {status.name}: {status.reason}")
+            console.print(f"without {status.name}: {status.reason}")
     return [status.name for status in statuses if status.reason is None]
 
 
 def this_command() -> str:
-    """What to type to get the same numbers: with the names of files and folders but not where they lie, and without ``--json FILE``."""
+    """Return the command to type for the same numbers: without the folders of files, and without ``--json FILE``."""
     words = list(INVOCATION)
     if "--json" in words:
         del words[(i := words.index("--json")) : i + 2]

@@ -1,4 +1,4 @@
-"""What every command's options must be like, by their names: checked before work begins, so that no traceback comes after it."""
+"""Check the options of a command before it begins, by the names of the options."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from xreset.errors import XResetError
 from xreset.files import claim
 
 _COUNTS = {
-    "num_envs", "iterations", "episodes", "states", "grasps", "per_object", "max_per_object", "max_demos", "perturbed", "per_gpu", "most",
-    "processes",
+    "num_envs", "iterations", "episodes", "states", "grasps", "per_object", "max_per_object", "max_demos", "perturbed",
+    "per_gpu", "most", "processes",
 }  # fmt: skip
-"""At least 1."""
+"""Whole numbers from 1."""
 _INDICES = {"seed", "episode", "repetition", "sequence", "frame", "port"}
-"""At least 0."""
+"""Whole numbers from 0."""
 _WRITTEN = ("out", "png", "mp4", "picture", "json")
 """Files or folders that a command writes."""
 _IN_PLACE = {"policy"}
-"""What a command may replace by what it makes of it."""
+"""Options whose file a command may replace by its output."""
 _LARGEST = 2**32 - 1
-"""The largest seed that all of numpy, torch and the engines take; more worlds or episodes no machine holds."""
+"""The largest seed that numpy, torch and all engines accept; also an upper limit for counts."""
 
 
 def checked(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, which now refuses impossible options, and keeps to itself what it writes while it runs."""
+    """Return the command with its options checked and its output files claimed while it runs."""
     if isinstance(command, partial):
         return partial(checked(command.func), **command.keywords)
 
@@ -45,9 +45,10 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _flat(options: dict[str, Any]) -> dict[str, Any]:
-    together = [name for name, value in options.items() if isinstance(value, Options)]
-    own = {name: value for name, value in options.items() if name not in together}
-    return own | {name: value for group in together for name, value in vars(options[group]).items()}
+    flat = {}
+    for name, value in options.items():
+        flat.update(vars(value) if isinstance(value, Options) else {name: value})
+    return flat
 
 
 def _check(options: dict[str, Any]) -> None:
@@ -66,18 +67,17 @@ def _check(options: dict[str, Any]) -> None:
 
 
 def check_device(device: str) -> None:
-    """Refuse what is no device, and a GPU that is not there."""
+    """Refuse an unknown device, and a GPU that this machine does not have."""
     kind, _, number = device.partition(":")
     if kind not in ("cpu", "cuda") or not (number.isdecimal() or (not number and ":" not in device)):
-        raise XResetError(f"there is no device {device!r}; expected cpu, cuda or one of several GPUs, such as cuda:1.")
+        raise XResetError(f"Unknown device {device!r}; expected cpu, cuda or one of several GPUs, such as cuda:1.")
     if kind == "cuda":
         import torch
 
         count = torch.cuda.device_count()
         if int(number or 0) >= count:
-            found = f"{count} of them" if count else "none that torch can use"
             raise XResetError(
-                f"--device is {device}, but of GPUs there is {found}. Check the driver with nvidia-smi, or use --device cpu."
+                f"--device is {device}, but torch finds {count} GPUs. Check nvidia-smi, or use --device cpu."
             )
 
 
@@ -89,7 +89,8 @@ def _check_overwriting(options: dict[str, Any]) -> None:
         for other, path in given.items():
             if other not in (name, *_IN_PLACE) and path.resolve() == given[name].resolve():
                 raise XResetError(
-                    f"--{name} is {path}, which is given as {other.replace('_', ' ')} too. Nothing was overwritten; choose another file."
+                    f"--{name} is {path}, which is also the {other.replace('_', ' ')}. "
+                    "Nothing was overwritten; choose another file."
                 )
 
 

@@ -1,4 +1,6 @@
-"""What the commands print with. Names come from files, so text is shown as it is: square brackets are no markup here."""
+"""Console and progress bars of the commands. Text comes from files, so square brackets are shown and not read as
+markup.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +12,30 @@ from typing import Any
 
 import rich.console
 import rich.progress
+from rich.text import Text
 
 _LOG_SECONDS = 20.0
 
 
 class Console(rich.console.Console):
-    """A console without markup; style whole texts instead. A file or a pipe, which has no width of its own, gets 160 columns."""
+    """A console without markup, which leaves the breaking of lines to the terminal; a file or a pipe gets tables of 160
+    columns.
+    """
 
     def __init__(self, **options: Any) -> None:
         known = sys.stdout.isatty() or os.environ.get("COLUMNS")
         options.setdefault("width", None if known else 160)
-        super().__init__(markup=False, emoji=False, **options)
+        super().__init__(markup=False, emoji=False, highlight=False, **options)
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """See :meth:`rich.console.Console.print`."""
+        if all(isinstance(value, str | Text) for value in objects):
+            options.setdefault("soft_wrap", True)
+        super().print(*objects, **options)
 
 
 class Progress(rich.progress.Progress):
-    """Bars whose descriptions are no markup; they vanish at the end. A log, where no bar can be drawn, gets a line every 20 seconds."""
+    """Progress bars, which vanish at the end. A log, which cannot show a bar, gets a line every 20 seconds."""
 
     def __init__(self, console: rich.console.Console) -> None:
         super().__init__(
@@ -43,9 +54,9 @@ class Progress(rich.progress.Progress):
         if not self.console.is_terminal and (now := perf_counter()) - self._said > _LOG_SECONDS:
             self._said = now
             task = self._tasks[task_id]
-            self.console.print(f"{task.description}: {task.percentage:.0f} %", highlight=False, soft_wrap=True)
+            self.console.print(f"{task.description}: {task.percentage:.0f} %")
 
     def count(self, what: str) -> Callable[[float, float], None]:
-        """Add a bar; gives the function that moves it: (done, in all)."""
+        """Add a bar; returns the function that moves it: (done, in all)."""
         task = self.add_task(what, total=None)
         return lambda done, total: self.update(task, completed=done, total=total)

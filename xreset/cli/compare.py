@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from xreset.cli._common import Several
 from xreset.cli._terminal import Console
 from xreset.eval import table
 from xreset.eval.report import make
@@ -16,22 +17,22 @@ def compare(
     runs: Annotated[tuple[str, ...], tyro.conf.Positional],
     *,
     x: Literal["minutes", "steps", "iterations"] = "minutes",
-    curve: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    curve: Several = (),
     apart: bool = False,
     out: Path = Path("runs/compare"),
 ) -> None:
-    """Put several trainings side by side: learning curves, first success from home, task progress in every engine, and what differs.
+    """Compare trainings: learning curves, first success from home, task progress in every engine, and configurations.
 
-    Runs that differ in their seed only are one line with a band from the lowest to the highest, and one row of the table. What makes the
-    comparison unfair, such as other demonstrations or another version of an engine, is said.
+    Runs that differ only in their seed become one curve, with a band from the lowest to the highest, and one row of the
+    table. Notes say what makes the comparison unfair, such as other demonstrations or another version of an engine.
 
     Args:
-        runs: Run folders, folders of results (of a baseline, for example) or names of policies that ship with xreset; LABEL=FOLDER gives
-            one a name.
+        runs: Run folders, folders of results (of a baseline, for example) or names of policies that ship with xreset;
+            LABEL=FOLDER gives one a name.
         x: Horizontal axis of the curves: minutes of training as measured, environment steps or iterations.
-        curve: Learning curve to draw, as TensorBoard names it (task/grasped_from_home, episode/return, ...); give it again for more.
-            Default: task/success and task/success_from_home.
-        apart: Show also runs that differ in their seed only one by one.
+        curve: Learning curve to draw, as TensorBoard names it (task/grasped_from_home, episode/return, ...); give it
+            again for more. Default: task/success and task/success_from_home.
+        apart: Show runs that differ only in their seed separately.
         out: Folder for compare.png and compare.md.
     """
     console = Console()
@@ -41,10 +42,10 @@ def compare(
         if rows.body:
             console.print(table.rich_table(rows))
     for caption in made.captions:
-        console.print(caption, highlight=False)
+        console.print(caption)
     for note in made.notes:
         console.print(f"note: {note}", style="yellow")
-    console.print(f"picture: {made.picture}\npage:    {made.page}", soft_wrap=True)
+    console.print(f"picture: {made.picture}\npage:    {made.page}")
 
 
 COMMAND = compare

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import degrees
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
 from rich.table import Table
 
+from xreset.cli._common import Source
 from xreset.cli._terminal import Console, Progress
 from xreset.demos import archive, dexycb, ho3d, info, keypoints, mirror, plausible, synth
 from xreset.errors import DemoError
@@ -21,7 +21,7 @@ Side = Literal["right", "left", "both"]
 
 
 def import_dexycb(
-    folder: Annotated[Path, tyro.conf.Positional],
+    folder: Source,
     *,
     out: Path,
     objects: tuple[str, ...] = (),
@@ -41,15 +41,16 @@ def import_dexycb(
     _print_summary(demos, out)
 
 
-def import_ho3d(folder: Annotated[Path, tyro.conf.Positional], *, out: Path, fps: float, cameras: Path) -> None:
-    """Read HO-3D (versions 2 and 3) in its own layout and write an archive of demonstrations. Not yet tried on the original files.
+def import_ho3d(folder: Source, *, out: Path, fps: float, cameras: Path) -> None:
+    """Read HO-3D (versions 2 and 3) in its own layout and write an archive of demonstrations. Not yet tried on the
+    original files.
 
     Args:
         folder: The folder that holds `train`.
         out: Archive to write.
-        fps: Frames per second, which the files do not say.
-        cameras: File with the camera's pose in the table frame (4x4, metres, as text or npy; x right, y down, z where it looks) for all
-            sequences; or a folder with SEQUENCE.txt, where sequences without one are left out.
+        fps: Frames per second; the files do not state it.
+        cameras: File with the camera's pose in the table frame (4x4, metres, as text or npy; x right, y down, z
+            forward) for all sequences; or a folder with SEQUENCE.txt, where sequences without one are left out.
     """
     with _progress("reading HO-3D") as progress:
         demos = ho3d.read_ho3d(folder, fps=fps, cameras=cameras, progress=progress)
@@ -58,7 +59,7 @@ def import_ho3d(folder: Annotated[Path, tyro.conf.Positional], *, out: Path, fps
 
 
 def import_keypoints(
-    path: Annotated[Path, tyro.conf.Positional],
+    path: Source,
     *,
     out: Path,
     order: Literal["mano", "mediapipe", "openpose"] | None = None,
@@ -73,21 +74,21 @@ def import_keypoints(
 ) -> None:
     """Read 21 hand keypoints and object poses of any tracker and write an archive of demonstrations.
 
-    What the numbers mean is never guessed: what is not in the files must be said, and what contradicts them is refused.
-    docs/demonstrations.md has the layout of the files.
+    Nothing is guessed: options must state what the files do not, and options that contradict the numbers are refused.
+    The page docs/demonstrations.md has the layout of the files.
 
     Args:
         path: An npz file (one sequence), a CSV file (one row for each frame), or a folder of them.
         out: Archive to write.
         order: Order of the keypoints.
         units: Unit of keypoints and object positions.
-        coordinates: Frame that all are in: z up with the table's top at z = 0, or that of a camera at rest.
+        coordinates: Frame of all positions: the table's (z up, table top at z = 0) or that of a fixed camera.
         table_from_camera: File with the camera's pose in the table frame: 4x4, metres, as text or npy.
-        quat: Order of quaternions whose name in the file does not say it.
+        quat: Order of quaternions, if the file does not state it.
         fps: Frames per second; files with times are resampled to it.
-        object: The grasped object, where the files do not say it.
-        side: The hand, where the files do not say it.
-        subject: Who demonstrated, where the files do not say it.
+        object: The grasped object, if the files do not state it.
+        side: The hand, if the files do not state it.
+        subject: Who demonstrated, if the files do not state it.
     """
     T = None if table_from_camera is None else keypoints.read_transform(table_from_camera)
     convention = keypoints.Convention(
@@ -118,7 +119,7 @@ def synthesize(
     side: Side = "right",
     meshes: Path | None = None,
 ) -> None:
-    """Make synthetic demonstrations: reach, grasp, lift, turn.
+    """Synthesize demonstrations: reach, grasp, lift, turn.
 
     Args:
         out: Archive to write.
@@ -127,7 +128,7 @@ def synthesize(
         seed: The same seed gives the same file.
         fps: Frames per second.
         side: Hand.
-        meshes: Folder of real meshes, which stand with z up; default: the built-in stand-ins.
+        meshes: Folder of real meshes, with z up; default: the built-in stand-ins.
     """
     with _progress("making demonstrations") as progress:
         demos = archive.concatenate(
@@ -142,15 +143,16 @@ def synthesize(
 
 
 def reflect(
-    file: Annotated[Path, tyro.conf.Positional],
+    file: Source,
     *,
     out: Path,
     objects: Path | None = None,
     tolerance: float = 0.004,
 ) -> None:
-    """Reflect demonstrations of left hands, so that a right-handed robot can train on them.
+    """Mirror demonstrations of left hands, so that a right-handed robot can train on them.
 
-    Only objects that are their own mirror image within the tolerance can be reflected; the others are left out, and the table says so.
+    Only objects that are their own mirror image within the tolerance can be mirrored; the table shows which are left
+    out.
 
     Args:
         file: Archive with left hands.
@@ -160,7 +162,7 @@ def reflect(
     """
     demos = archive.read_demos(file).select(sides=["left"])
     symmetries = {name: mirror.symmetry(spec) for name, spec in archive.demo_objects(demos, objects).items()}
-    table = Table("object", "off its reflection [mm]", "mirrored")
+    table = Table("object", "distance to its reflection [mm]", "mirrored")
     for name, found in sorted(symmetries.items()):
         table.add_row(
             name, f"{1e3 * found.deviation:.1f}", "yes" if found.deviation <= tolerance else "no: not symmetric enough"
@@ -173,12 +175,12 @@ def reflect(
     _print_summary(result, out)
 
 
-def describe(file: Annotated[Path, tyro.conf.Positional], *, objects: Path | None = None) -> None:
-    """Say what an archive of demonstrations contains, object by object, and what is odd about it.
+def describe(file: Source, *, objects: Path | None = None) -> None:
+    """Describe an archive of demonstrations, object by object, and warn of what looks wrong.
 
     Args:
         file: The archive.
-        objects: Folder of meshes; default: the built-in stand-ins. Without meshes it is not seen whether objects stand on the table.
+        objects: Folder of meshes; default: the built-in stand-ins. Needed to check whether objects stand on the table.
     """
     demos = archive.read_demos(file)
     try:
@@ -220,13 +222,9 @@ def _print_summary(demos: archive.Demos, path: Path, objects: dict[str, ObjectSp
         )
     console = Console()
     console.print(table)
-    console.print(
-        f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second",
-        soft_wrap=True,
-        highlight=False,
-    )
+    console.print(f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second")
     for doubt in plausible.doubts(demos, objects):
-        console.print(f"note: {doubt}", style="yellow", soft_wrap=True, highlight=False)
+        console.print(f"note: {doubt}", style="yellow")
 
 
 COMMAND = {

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
-from xreset.cli._common import engine_bars
+from xreset.cli._common import Flat, Name, Several, engine_bars
 from xreset.cli._terminal import Console
 from xreset.eval import evaluate as evaluation
 from xreset.eval import policy_spec, table
@@ -15,25 +12,26 @@ from xreset.eval.setting import Setting
 
 
 def evaluate(
-    policy: Annotated[str, tyro.conf.Positional],
+    policy: Name,
     *,
-    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),  # a default would be appended to
+    backend: Several = (),
     demos: Path,
     episodes: int = 5,
-    setting: Annotated[Setting, tyro.conf.arg(name="")] = Setting(),  # noqa: B008
+    setting: Flat[Setting] = Setting(),  # noqa: B008
     out: Path | None = None,
 ) -> None:
-    """Evaluate a policy, or a baseline, in one or several engines.
+    """Evaluate a policy or a baseline in one or several engines.
 
     Args:
-        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or a baseline: zero,
-            random, ik (open-loop kinematic retargeting).
+        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or
+            a baseline: zero, random, ik (open-loop kinematic retargeting).
         backend: Physics engine; give it again for more engines. Default: mujoco.
-        demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the path of ik.
+        demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the
+            path of ik.
         episodes: Episodes per demonstration, each with another perturbation of robot and object.
         setting: Robot, meshes, seed, device and worlds.
-        out: Folder for the results; default: eval/ in the run folder or beside the policy; runs/NAME/eval for a policy that ships with
-            xreset, runs/BASELINE-ROBOT/eval for a baseline.
+        out: Folder for the results; default: eval/ in the run folder or next to the policy, runs/NAME/eval for a policy
+            that ships with xreset, runs/BASELINE-ROBOT/eval for a baseline.
     """
     engines = tuple(dict.fromkeys(backend or ("mujoco",)))
     console = Console()
@@ -44,7 +42,7 @@ def evaluate(
         )
     console.print(table.results_table(summaries))
     if unseen := summaries[0].unseen:
-        console.print(f"not in the policy's training: {', '.join(unseen)}", highlight=False, soft_wrap=True)
+        console.print(f"not in the policy's training: {', '.join(unseen)}")
     console.print(f"results in {out or spec.folder}")
 
 

@@ -7,13 +7,14 @@ from typing import Annotated
 
 import tyro
 
+from xreset.cli._common import Several
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import RunError
 from xreset.eval.export import lerobot as dataset
 from xreset.eval.export import recorded
 
 Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
-Backends = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+Backends = Several
 
 
 def lerobot(
@@ -27,15 +28,16 @@ def lerobot(
     video: bool = True,
     size: tuple[int, int] = (320, 240),
 ) -> None:
-    """Write recorded evaluation episodes as a LeRobot data set (v3.0): the first episode of each demonstration and engine.
+    """Write recorded evaluation episodes as a LeRobot data set (v3.0): the first episode of each demonstration and
+    engine.
 
     Args:
         folders: Run folders, or folders that xreset eval wrote into.
         out: Folder to write; must not exist.
-        backend: Only of this engine; give it again for more. Default: all.
+        backend: Only episodes of this engine; give it again for more. Default: all.
         robot: Name or folder of the robot; default: as the results name it.
         objects: Folder of meshes; default: as the results name it.
-        task: The task in words; {object} stands for the object's name.
+        task: The task in words; {object} is replaced by the object's name.
         video: Draw a film of each episode.
         size: Width and height of the films, pixels.
     """
@@ -53,9 +55,9 @@ def npz(
     Args:
         folders: Run folders, or folders that xreset eval wrote into.
         out: File to write.
-        backend: Only of this engine; give it again for more. Default: all.
+        backend: Only episodes of this engine; give it again for more. Default: all.
         robot: Name or folder of the robot; default: as the results name it.
-        task: The task in words; {object} stands for the object's name.
+        task: The task in words; {object} is replaced by the object's name.
     """
     recording = _recording(folders, backend, robot, None, task)
     recorded.write_arrays(out, recording)
@@ -66,7 +68,7 @@ def _recording(
     folders: tuple[Path, ...], backends: tuple[str, ...], robot: str | None, objects: Path | None, task: str | None
 ) -> recorded.Recording:
     if not folders:
-        raise RunError("give a run folder, or a folder that xreset eval wrote into.")
+        raise RunError("Nothing to export. Give a run folder, or a folder that xreset eval wrote into.")
     return recorded.read_recorded(folders, backends=backends, robot=robot, objects=objects, task=task or recorded.TASK)
 
 
@@ -74,9 +76,7 @@ def _say(recording: recorded.Recording, out: Path) -> None:
     engines = ", ".join(dict.fromkeys(e.engine for e in recording.episodes))
     Console().print(
         f"{out}: {len(recording.episodes)} episodes of {recording.robot.name} in {engines},"
-        f" {recording.offsets[-1]} frames at {recording.fps:g} per second",
-        soft_wrap=True,
-        highlight=False,
+        f" {recording.offsets[-1]} frames at {recording.fps:g} per second"
     )
 
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from rich.table import Table
 
-from xreset.cli._common import engine_bars
+from xreset.cli._common import Flat, Name, Several, engine_bars
 from xreset.cli._terminal import Console
 from xreset.errors import PolicyError
 from xreset.eval import frontier as frontiers
@@ -17,29 +15,27 @@ from xreset.eval.setting import Setting
 
 
 def frontier(
-    policy: Annotated[str, tyro.conf.Positional],
+    policy: Name,
     *,
     resets: Path,
-    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),  # a default would be appended to
+    backend: Several = (),
     states: int = 400,
-    setting: Annotated[Setting, tyro.conf.arg(name="")] = Setting(),  # noqa: B008
+    setting: Flat[Setting] = Setting(),  # noqa: B008
     out: Path | None = None,
 ) -> None:
-    """Tell from which demonstrated states a policy reaches the goal: what it can do, and where its training is stuck.
+    """Show from which demonstrated states a policy reaches the goal, and so where its training is stuck.
 
     Args:
-        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or the baseline zero or
-            random.
+        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or
+            the baseline zero or random.
         resets: Reset bank (xreset resets) whose states are tried, at full gravity.
         backend: Physics engine; give it again for more engines. Default: mujoco.
-        states: How many of its states are tried.
-        setting: Robot, meshes, seed of their choice, device and worlds.
-        out: Folder for the results; default: frontier/ in the run folder or beside the policy.
+        states: Number of states to try.
+        setting: Robot, meshes, seed of the choice of states, device and worlds.
+        out: Folder for the results; default: frontier/ in the run folder or next to the policy.
     """
     if policy == "ik":
-        raise PolicyError(
-            "ik follows a demonstration from its beginning and cannot go on from a state. Give a policy, zero or random."
-        )
+        raise PolicyError("The baseline ik cannot continue from a state. Give a policy, zero or random.")
     engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
     console = Console()
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
@@ -49,7 +45,7 @@ def frontier(
     )
     with engine_bars(console, [e.name for e in engines]) as progress:
         results = frontiers.frontier(spec, played, engines, folder, states=states, progress=progress)
-    title = f"{spec.name} on {spec.robot.name} goes on from {len(results[0]['tried'])} demonstrated states:"
+    title = f"{spec.name} on {spec.robot.name} continues from {len(results[0]['tried'])} demonstrated states:"
     table = Table(
         "the episode begins with", title=f"{title}\nof them, at the goal at any time / at the end", title_justify="left"
     )

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from rich.table import Table
 
+from xreset.cli._common import Source
 from xreset.cli._terminal import Console
 from xreset.errors import ObjectError
 from xreset.objects import catalogue, meshes, sampling
@@ -29,7 +28,7 @@ def list_(*, objects: Path | None = None) -> None:
 
 
 def import_(
-    path: Annotated[Path, tyro.conf.Positional],
+    path: Source,
     *,
     out: Path | None = None,
     name: str | None = None,
@@ -39,20 +38,21 @@ def import_(
     friction: float | None = None,
     png: Path | None = None,
 ) -> None:
-    """Cut a mesh, or every mesh of a folder, into convex pieces that keep to its surface, and keep them for later runs.
+    """Cut a mesh, or every mesh of a folder, into convex pieces, and keep them for later runs.
 
-    A mesh file goes into a folder of objects (--out), which other commands take as --objects; there, NAME.toml holds what it is made of.
+    A mesh file goes into a folder of objects (--out), which other commands take as --objects. NAME.toml there holds
+    mass and friction.
 
     Args:
-        path: A mesh file; or a folder with NAME.obj, NAME/textured_simple.obj or NAME/textured.obj, in metres, in the frame of the object
-            poses.
-        out: Folder of objects that a mesh file goes into.
+        path: A mesh file; or a folder with NAME.obj, NAME/textured_simple.obj or NAME/textured.obj, in metres, in the
+            frame of the object poses.
+        out: Folder of objects, for a mesh file.
         name: The object's name there; default: the file's.
         scale: Metres in a unit of the file: 0.001 for millimetres.
-        mass: kg.
-        density: kg/m^3, in place of the mass.
-        friction: Coefficient of its material: the middle of what training and evaluation draw.
-        png: Picture of the meshes beside their pieces, with the deviation in millimetres.
+        mass: Mass in kg.
+        density: Density in kg/m^3, instead of the mass.
+        friction: Friction coefficient: the middle of the range that training and evaluation draw from.
+        png: Picture to write: the meshes next to their pieces, with the deviation in millimetres.
     """
     try:
         properties = Properties(mass=mass, density=density, friction=friction)
@@ -61,17 +61,18 @@ def import_(
     if path.is_dir():
         if (out, name, scale, properties) != (None, None, 1.0, Properties()):
             raise ObjectError(
-                f"{path} is a folder, whose meshes stay as they are: --out, --name, --scale, --mass, --density and --friction"
-                " are for one mesh file. NAME.toml beside a mesh may say mass, density and friction."
+                f"{path} is a folder. --out, --name, --scale, --mass, --density and --friction are for one mesh file."
+                " For a folder, write mass, density and friction into NAME.toml next to each mesh."
             )
         files = meshes.mesh_files(path)
     elif out is None:
-        raise ObjectError("a mesh file goes into a folder of objects: say which with --out.")
+        raise ObjectError("A mesh file needs a folder of objects to go into. Add --out.")
     else:
         files = {name or path.stem: path}
     console = Console()
-    table = _table("off surface, mm", "time")
-    found, notes = [], []
+    table = _table("deviation, mm", "time")
+    found = []
+    notes = []
     with console.status("") as status:
         for object_name, file in files.items():
 
@@ -89,14 +90,14 @@ def import_(
             found.append(result)
     console.print(table)
     for note in notes:
-        console.print(note, highlight=False)
+        console.print(note)
     if png is not None:
         captions = [
             f"{r.obj.name}: {len(r.obj.pieces)} pieces, at most {1e3 * r.deviation:.1f} mm off the surface"
             for r in found
         ]
         render.write_png(png, pieces.draw_pieces([r.obj for r in found], captions))
-        console.print(f"{png}: meshes and their pieces", soft_wrap=True, highlight=False)
+        console.print(f"{png}: meshes and their pieces")
 
 
 def _table(*more: str) -> Table:

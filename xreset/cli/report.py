@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
+from xreset.cli._common import Source
 from xreset.cli._terminal import Console, Progress
 from xreset.eval import table
 from xreset.eval.report import film as films
@@ -16,7 +14,7 @@ from xreset.text import short_name
 
 
 def report(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: Source,
     *,
     out: Path | None = None,
     robot: str | None = None,
@@ -26,11 +24,12 @@ def report(
     """Make a self-contained HTML page of a run's evaluations, and one picture.
 
     Args:
-        run: Run folder, a folder of results (of a baseline, for example), or name of a policy that ships with xreset: its runs/NAME.
+        run: Run folder, folder of results (for example of a baseline), or name of a policy that ships with xreset (then
+            runs/NAME).
         out: Folder for index.html and overview.png; default: report/ in the run folder.
         robot: Name or folder of the robot, for the clips; default: as the results name it.
         objects: Folder of real meshes, for the clips; default: as the results name it.
-        film: Also write an mp4 with every object side by side, in all engines.
+        film: MP4 to write as well: every object in every engine, next to each other.
     """
     if not run.exists() and str(run) in shipped():
         run = results_folder(str(run))
@@ -44,9 +43,10 @@ def report(
     if film is not None:
         with Progress(console) as bar:
             shown = films.make_film(run, film, robot=robot, objects=objects, progress=bar.count("drawing the film"))
-        rows, columns = ", ".join(shown.engines), ", ".join(map(short_name, shown.objects))
-        console.print(f"film:    {film}\n         from above: {rows}; from the left: {columns}", soft_wrap=True)
-    console.print(f"page:    {made.html}\npicture: {made.overview}", soft_wrap=True)
+        rows = ", ".join(shown.engines)
+        columns = ", ".join(map(short_name, shown.objects))
+        console.print(f"film:    {film}\n         from the top: {rows}; from the left: {columns}")
+    console.print(f"page:    {made.html}\npicture: {made.overview}")
 
 
 COMMAND = report

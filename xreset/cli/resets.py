@@ -11,9 +11,9 @@ from typing import Annotated
 import tyro
 from rich.table import Table
 
+from xreset import description
 from xreset.accounts import accounts_path, described, with_totals, write_accounts
 from xreset.cli._terminal import Console, Progress
-from xreset.description import load_robot
 from xreset.files import file_hash
 from xreset.objects import catalogue
 from xreset.resets import bank as banks
@@ -41,7 +41,8 @@ def resets(
     Args:
         retargeted: File made by `xreset retarget`.
         out: Reset bank to write.
-        backend: Physics engine to try the states in; give it again to keep only states that are stable in all of them. Default: mujoco.
+        backend: Physics engine to try the states in; give it again to keep only states that are stable in all of them.
+            Default: mujoco.
         robot: Folder of the robot, if it is not one that is known by name.
         objects: Folder of real meshes; default: the built-in stand-ins.
         num_envs: Worlds at a time.
@@ -53,7 +54,7 @@ def resets(
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
     console = Console()
     data = file.read_retargeted(retargeted)
-    spec = load_robot(robot or data.robot)
+    spec = description.load_robot(robot or data.robot)
     banks.check_retargeted(retargeted, data, spec)
     loaded = catalogue.load_objects(sorted({*map(str, data.object_name)}), objects)
     with Progress(console) as bar:

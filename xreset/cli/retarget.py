@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 from rich.table import Table
 
+from xreset import description
 from xreset.accounts import accounts_path, described, with_totals, write_accounts
+from xreset.cli._common import Source
 from xreset.cli._terminal import Console, Progress
 from xreset.demos import align, archive, plausible
-from xreset.description import load_robot
 from xreset.files import file_hash
 from xreset.pictures import render
 from xreset.pictures.view import load, sheet
@@ -23,7 +22,7 @@ from xreset.retarget.hand.config import HandConfig
 
 
 def retarget(
-    demos: Annotated[Path, tyro.conf.Positional],
+    demos: Source,
     *,
     robot: str,
     out: Path,
@@ -34,26 +33,26 @@ def retarget(
     hand: HandConfig = HandConfig(),  # noqa: B008 (frozen)
     arm: ArmConfig = ArmConfig(),  # noqa: B008
 ) -> None:
-    """Turn human demonstrations into robot trajectories.
+    """Turn human demonstrations into robot motion.
 
     Args:
-        demos: Archive of demonstrations (see `xreset demos`).
+        demos: Archive of demonstrations (`xreset demos`).
         robot: Name of a robot, or the folder of its description.
         out: File to write.
         objects: Folder of real meshes; default: the built-in stand-ins.
-        max_per_object: Only the first so many sequences of each object.
+        max_per_object: Use only the first sequences of each object, at most this many.
         device: Where hand retargeting runs: cpu or cuda. The arm runs on the CPU.
         hand: Weights of hand retargeting.
         arm: Weights and effort of the arm's inverse kinematics.
-        picture: PNG to write: first contact, mid-lift and goal for each object, the human keypoints over the robot.
+        picture: PNG to write: first contact, mid-lift and goal for each object, with the human keypoints.
     """
     console = Console()
-    spec = load_robot(robot)
+    spec = description.load_robot(robot)
     chosen = archive.read_demos(demos)
     if max_per_object is not None:
         chosen = chosen.select(max_per_object=max_per_object)
     for doubt in plausible.doubts(chosen):
-        console.print(f"note: {doubt}", style="yellow", soft_wrap=True, highlight=False)
+        console.print(f"note: {doubt}", style="yellow")
     specs = archive.demo_objects(chosen, objects)
     config = pipeline.RetargetConfig(hand=hand, arm=arm)
     with Progress(console) as bar:
@@ -82,11 +81,12 @@ def retarget(
     if colliding:
         console.print(_meeting(colliding))
         console.print(
-            "Links that meet in every position of their joints belong into collision.exclude of the robot.toml."
+            "List links that meet in every position of their joints under collision.exclude in the robot.toml."
         )
     for index in np.flatnonzero(align.on_something(align.levelled(chosen), specs)):
         console.print(
-            f"{chosen.sequence_name[index]}: the object starts on top of something that the scene does not have; not lowered."
+            f"{chosen.sequence_name[index]}: the object starts on top of something that is not in the scene; "
+            "it was not lowered to the table."
         )
     console.print(
         f"{int(result.valid.sum())} valid frames of {len(result.valid)} in {out}; counts in {accounts_path(out)}"
@@ -94,7 +94,7 @@ def retarget(
 
 
 def _table(result: file.Retargeted) -> Table:
-    """What became of the frames, by object and phase."""
+    """Return a table of kept and lost frames, by object and phase."""
     table = Table(
         "object",
         "phase",
@@ -124,7 +124,7 @@ def _table(result: file.Retargeted) -> Table:
 
 
 def _meeting(colliding: dict[tuple[str, str], int]) -> Table:
-    """Which links are in each other's way, and in how many frames."""
+    """Return a table of the links that collide with each other, and in how many frames."""
     table = Table("links that meet", "frames", title="self collision")
     for pair, frames in colliding.items():
         table.add_row(" and ".join(pair), str(frames))

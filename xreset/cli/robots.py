@@ -1,21 +1,21 @@
-"""``xreset robots``: which robots there are, and what is wrong with one."""
+"""``xreset robots``: list, check, import, reshape and place robots."""
 
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 from rich.table import Table
 from rich.text import Text
 
+from xreset import description
 from xreset.backends import workers
+from xreset.cli._common import Name
 from xreset.cli._terminal import Console, Progress
 from xreset.demos import archive
-from xreset.description import DESCRIPTION, load_robot, robot_folder
 from xreset.errors import RobotError
 from xreset.pictures import render
 from xreset.plugins import robot_names
@@ -29,47 +29,48 @@ from xreset.robot_tools.placement import PlaceConfig
 
 
 def list_robots() -> None:
-    """List the robots: built in, and from installed packages."""
+    """List robots: built-in ones and those of installed packages."""
     table = Table("robot", "joints (arm + hand)", "fingertips", "folder")
     for name in robot_names():
         try:
-            spec = load_robot(name)
+            spec = description.load_robot(name)
         except RobotError as error:  # one broken plugin must not hide the others
             table.add_row(name, "-", "-", f"broken: {error}")
             continue
         joints = f"{len(spec.arm_indices)} + {len(spec.hand_indices)}"
-        table.add_row(name, joints, ", ".join(spec.fingertip_names), str(robot_folder(name)))
+        table.add_row(name, joints, ", ".join(spec.fingertip_names), str(description.robot_folder(name)))
     Console().print(table)
 
 
 def check(
-    robot: Annotated[str, tyro.conf.Positional],
+    robot: Name,
     /,
     *,
     picture: Path | None = None,
     engines: bool = True,
 ) -> None:
-    """Say everything that is wrong with a robot, in one go. Exits with 1 if anything is.
+    """Check a robot, and print all errors and warnings. Exits with 1 after an error.
 
     Args:
-        robot: name of a registered robot, or a folder with a robot.toml.
-        picture: write a picture (PNG) of the robot at home, with the frames of its palm, fingertips and joints.
-        engines: build the robot in every installed engine (the first time, mujoco-warp compiles for a minute or two).
+        robot: Name of a robot, or a folder with a robot.toml.
+        picture: PNG to write: the robot at home, with the frames of its palm, fingertips and joints.
+        engines: Also build the robot in every installed engine (the first time, mujoco-warp compiles for a minute or
+            two).
     """
     console = Console()
     styles = {"ok": "green", "skipped": "dim", "warning": "yellow", "error": "bold red"}
 
     def report(finding: checks.Finding) -> None:
         level = (f"{finding.level:8}", styles[finding.level])
-        console.print(Text.assemble(level, f" {finding.topic}: {finding.message}"), soft_wrap=True)
+        console.print(Text.assemble(level, f" {finding.topic}: {finding.message}"))
 
     findings = checks.check(robot, report=report, engines=engines)
-    counts = {level: sum(finding.level == level for finding in findings) for level in ("error", "warning")}
+    levels = [finding.level for finding in findings]
     if picture is not None and findings[0].level == "ok":
-        render.write_png(picture, pictures.robot_picture(load_robot(robot)))
-        console.print(f"wrote {picture}", highlight=False)
-    console.print(f"{counts['error']} errors, {counts['warning']} warnings", highlight=False)
-    if counts["error"]:
+        render.write_png(picture, pictures.robot_picture(description.load_robot(robot)))
+        console.print(f"wrote {picture}")
+    console.print(f"{levels.count('error')} errors, {levels.count('warning')} warnings")
+    if "error" in levels:
         raise SystemExit(1)
 
 
@@ -84,9 +85,10 @@ def import_(
     rpy: tuple[float, float, float] = (0, 0, 0),
     thumb: str | None = None,
 ) -> None:
-    """Make a robot's folder from an arm and a hand as their makers publish them.
+    """Make a robot's folder from the published files of an arm and a hand.
 
-    Writes robot.urdf, the meshes' hulls, a commented robot.toml and a picture; says what it guessed and what only a person can say.
+    Writes robot.urdf, the hulls of the meshes, a commented robot.toml and a picture, and lists what it guessed and what
+    only you can decide.
 
     Args:
         arm: URDF or MJCF of the arm.
@@ -94,31 +96,32 @@ def import_(
         out: Folder to make.
         name: Name of the robot; default: the folder's.
         flange: Link of the arm that carries the hand; default: the arm's last link.
-        offset: Position of the hand's root link in the flange's frame [m]; default: its origin, or as far along its z axis as keeps the
-            hand's body out of the arm.
-        rpy: Its roll, pitch and yaw about the flange's fixed axes [rad].
-        thumb: A link or joint of the thumb, where names and geometry do not tell.
+        offset: Position of the hand's root link in the flange's frame [m]; default: the origin, or as far along z as
+            keeps the hand's body out of the arm.
+        rpy: Roll, pitch and yaw of the hand about the flange's fixed axes [rad].
+        thumb: A link or joint of the thumb, if the import chooses another finger.
     """
     made = importer.import_robot(arm, hand, out, name=name, flange=flange, offset=offset, rpy=rpy, thumb=thumb)
-    render.write_png(out / "robot.png", pictures.robot_picture(load_robot(out)))
+    render.write_png(out / "robot.png", pictures.robot_picture(description.load_robot(out)))
     console = Console()
-    for title, lines in (("guessed", made.guessed), ("for you to say", made.to_say)):
-        console.print(f"{title}:", highlight=False)
+    for title, lines in (("guessed", made.guessed), ("for you to decide", made.to_say)):
+        console.print(f"{title}:")
         for line in lines:
-            console.print(f"  - {line}", highlight=False, soft_wrap=True)
-    console.print(f"wrote {out / 'robot.toml'}, robot.urdf and robot.png; checking it", highlight=False, soft_wrap=True)
+            console.print(f"  - {line}")
+    console.print(f"wrote {out / 'robot.toml'}, robot.urdf and robot.png; checking it")
     check(str(out), engines=False)
 
 
-def reshape(robot: Annotated[str, tyro.conf.Positional], /, *, shapes: Path, out: Path) -> None:
-    """Make a robot's folder from a robot and another URDF or MJCF of some of its links, of which it takes the collision shapes.
+def reshape(robot: Name, /, *, shapes: Path, out: Path) -> None:
+    """Make a copy of a robot with the collision shapes of another URDF or MJCF.
 
-    Joints, masses, drives and frames stay as they are, and policies of the robot play with the new one. Links are matched by name.
+    Joints, masses, drives and frames stay the same, so policies of the robot play on the copy. Links are matched by
+    name.
 
     Args:
-        robot: name of a registered robot, or a folder with a robot.toml.
-        shapes: URDF or MJCF, of the hand for instance.
-        out: Folder to make; its name is the new robot's.
+        robot: Name of a robot, or a folder with a robot.toml.
+        shapes: URDF or MJCF with the new shapes, for example of the hand.
+        out: Folder to make; its name becomes the robot's name.
     """
     for note in reshaping.reshape(robot, shapes, out):
         print(note)
@@ -126,7 +129,7 @@ def reshape(robot: Annotated[str, tyro.conf.Positional], /, *, shapes: Path, out
 
 
 def place(
-    robot: Annotated[str, tyro.conf.Positional],
+    robot: Name,
     /,
     *,
     demos: Path,
@@ -136,19 +139,19 @@ def place(
     write: bool = False,
     search: PlaceConfig = PlaceConfig(),  # noqa: B008  tyro reads flags from the default
 ) -> None:
-    """Find the place of a robot's base from which its arm reaches most wrist poses of demonstrations.
+    """Find the base placement from which a robot's arm follows most of the demonstrations.
 
     Args:
-        robot: name of a registered robot, or a folder with a robot.toml.
-        demos: archive of demonstrations (see `xreset demos`).
-        objects: folder of real meshes; default: the built-in stand-ins.
-        max_per_object: only so many sequences of each object, taken from all over the archive.
-        processes: that try placements at a time, with about 0.5 GB each; default: one for each core, at most 8.
-        write: put the placement, its home and its figure into the robot's robot.toml.
-        search: ranges and effort.
+        robot: Name of a robot, or a folder with a robot.toml.
+        demos: Archive of demonstrations (`xreset demos`).
+        objects: Folder of real meshes; default: the built-in stand-ins.
+        max_per_object: Number of sequences of each object, spread over the archive.
+        processes: Number of processes, with about 0.5 GB each; default: one for each core, at most 8.
+        write: Write the placement and its home into the robot's robot.toml.
+        search: Ranges and effort of the search.
     """
     console = Console()
-    spec = load_robot(robot)
+    spec = description.load_robot(robot)
     chosen = archive.read_demos(demos).select(max_per_object=max_per_object, spread=True)
     specs = list(archive.demo_objects(chosen, objects).values())
     with Progress(console) as bar:
@@ -162,18 +165,14 @@ def place(
 
         found = places.place(spec, paths, avoid, search, report, processes or min(workers.usable_cores(), 8))
     for title, finalist in (("as described", found.own), ("best found", found.best)):
-        pos, quat = (
-            ", ".join(f"{v:.4f}" for v in values) for values in (finalist.placement.pos, finalist.placement.quat)
-        )
+        reach = finalist.reach
         console.print(
-            f"{title:12}  follows {finalist.followed:.1%}, reaches {finalist.reach.reached:.1%}, dexterity {finalist.reach.dexterity:.3f}: "
-            f"pos [{pos}], quat [{quat}]",
-            highlight=False,
-            soft_wrap=True,
+            f"{title:12}  follows {finalist.followed:.1%}, reaches {reach.reached:.1%}, "
+            f"dexterity {reach.dexterity:.3f}: pos [{_digits(finalist.placement.pos)}], quat [{_digits(finalist.placement.quat)}]"
         )
     if found.home is not None:
-        console.print(f"{'its home':12}  {', '.join(f'{v:.3f}' for v in found.home)}", highlight=False, soft_wrap=True)
-    console.print(f"of {found.frames} annotated frames of {chosen.num_sequences} sequences", highlight=False)
+        console.print(f"{'its home':12}  {', '.join(f'{v:.3f}' for v in found.home)}")
+    console.print(f"of {found.frames} annotated frames of {chosen.num_sequences} sequences")
     if write:
         given = [] if objects is None else ["--objects", objects.name]
         command = [
@@ -190,8 +189,14 @@ def place(
         for field in fields(search):
             if (value := getattr(search, field.name)) != field.default:
                 command += [f"--search.{field.name}", *map(str, value if isinstance(value, tuple) else (value,))]
-        placement.write_placement(robot_folder(robot) / DESCRIPTION, spec, found, shlex.join(command))
-        console.print(f"wrote {robot_folder(robot) / DESCRIPTION}", highlight=False)
+        placement.write_placement(
+            description.robot_folder(robot) / description.DESCRIPTION, spec, found, shlex.join(command)
+        )
+        console.print(f"wrote {description.robot_folder(robot) / description.DESCRIPTION}")
+
+
+def _digits(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:.4f}" for value in values)
 
 
 COMMAND = {"list": list_robots, "check": check, "import": import_, "reshape": reshape, "place": place}

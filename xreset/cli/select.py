@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from rich.table import Table
 
+from xreset.cli._common import Flat, Several, Source
 from xreset.cli._terminal import Console
 from xreset.eval import select as selection
 from xreset.eval import trial
@@ -16,28 +15,28 @@ from xreset.eval.setting import Setting
 
 
 def select(
-    folder: Annotated[Path, tyro.conf.Positional],
+    folder: Source,
     *,
     demos: Path,
-    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),  # a default would be appended to
+    backend: Several = (),
     most: int = 8,
     episodes: int = 2,
-    setting: Annotated[Setting, tyro.conf.arg(name="")] = Setting(),  # noqa: B008
+    setting: Flat[Setting] = Setting(),  # noqa: B008
     starts: int | None = None,
 ) -> None:
-    """Choose among a training's checkpoints by all engines: the one that does best in the engine in which it does worst.
+    """Choose the checkpoint of a training that is best in its worst engine.
 
-    The choice is recorded in choice.json; a run's policy is then the chosen checkpoint, until the run has newer ones. The episodes that
-    decide begin with other starts than those of xreset eval.
+    choice.json records the choice, and the run's policy.onnx becomes the chosen checkpoint until the run has newer
+    ones. The episodes use other starts than xreset eval.
 
     Args:
         folder: Run folder, or a folder of exported policies (.onnx).
         demos: Demonstrations whose starts and goals are played.
         backend: Physics engine; give it again for more engines. Default: mujoco, pybullet and sapien.
-        most: Checkpoints to play at most, spread over all of them, the newest one included.
+        most: Largest number of checkpoints to play, spread over the training; the newest is included.
         episodes: Episodes of each demonstration.
         setting: Robot, meshes, device and worlds; --seed is not used, see --starts.
-        starts: Seed of the starts that decide; default: one that no evaluation uses unless it is told to.
+        starts: Seed of the starts; default: one that evaluations do not use.
     """
     engines = [
         trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco", "pybullet", "sapien"))

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from rich.table import Table
 
-from xreset.cli._common import engine_bars
+from xreset.cli._common import Flat, Name, Several, engine_bars
 from xreset.cli._terminal import Console
 from xreset.eval import policy_spec, trial
 from xreset.eval import stress as sweeps
@@ -16,26 +14,27 @@ from xreset.eval.setting import Setting
 
 
 def stress(
-    policy: Annotated[str, tyro.conf.Positional],
+    policy: Name,
     *,
     demos: Path,
-    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),  # a default would be appended to
-    property: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    backend: Several = (),
+    property: Several = (),
     episodes: int = 2,
-    setting: Annotated[Setting, tyro.conf.arg(name="")] = Setting(),  # noqa: B008
+    setting: Flat[Setting] = Setting(),  # noqa: B008
     out: Path | None = None,
 ) -> None:
-    """Tell what a policy bears: the same episodes while stiffness, latency, friction, mass... are swept one at a time.
+    """Measure robustness: the same episodes with changed stiffness, latency, friction, mass and more, one at a time.
 
     Args:
-        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or a baseline (zero,
-            random, ik).
+        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or
+            a baseline (zero, random, ik).
         demos: Demonstrations whose starts and goals are played.
         backend: Physics engine; give it again for more engines. Default: mujoco.
-        property: Property to sweep, or NAME=VALUE,VALUE... for other values than its own; give it again for several. Default: all.
+        property: Property to change, or NAME=VALUE,VALUE... for values of your own; give it again for more. Default:
+            all.
         episodes: Episodes of each demonstration, the same for every value.
         setting: Robot, meshes, seed, device and worlds.
-        out: Folder for the results; default: stress/ in the run folder or beside the policy.
+        out: Folder for the results; default: stress/ in the run folder or next to the policy.
     """
     properties = sweeps.chosen(property)
     engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
@@ -45,7 +44,7 @@ def stress(
     played = trial.load_trial(spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs)
     with engine_bars(console, [e.name for e in engines]) as progress:
         found = sweeps.stress(spec, played, engines, folder, sweeps=properties, repetitions=episodes, progress=progress)
-    sweeps.write_plot(folder / "stress.png", found, f"{spec.name}: what it bears")
+    sweeps.write_plot(folder / "stress.png", found, f"{spec.name}: robustness")
     table = Table("property", title=f"{spec.name}: task progress, and its difference to the same episodes (95 %)")
     table.add_column("value", justify="right")
     for result in found:

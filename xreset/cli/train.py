@@ -45,36 +45,34 @@ def train(
         device: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
         num_envs: Worlds to simulate (per GPU).
         iterations: Iterations in all; default: the configuration's.
-        minutes: Most time to train now, on a machine that is lent for so long: then the run stops as with Ctrl-C, and --resume goes on.
-            Compiling kernels is not counted.
+        minutes: Most time to train now. Then the run stops as with Ctrl-C, and --resume continues it. Compiling kernels
+            is not counted.
         seed: Seed of every random number.
         resume: Continue the run in --out from its newest checkpoint. Reward terms of your own must be named again.
-        like: Where the configuration starts from: a recipe (paper, minutes, robust) or another run's folder. Flags change what they name.
-            Reward terms of your own are not taken from a run; name them again.
-        weights: Another run's folder: begin with the networks of its newest checkpoint, and not with new ones; with their standard
-            deviation and, where it adapts, their learning rate.
+        like: Where the configuration starts from: a recipe (paper, minutes, robust) or another run's folder. Flags
+            change what they name. Reward terms of your own are not taken from a run; name them again.
+        weights: Another run's folder: start with the networks of its newest checkpoint, with their standard deviation
+            and, if it adapts, their learning rate.
         config: Task, model and algorithm. The defaults shown are those of --like.
     """
     if not minutes > 0:
         raise RunError(f"--minutes is {minutes}, expected more than 0.")
     if resume and like != "paper":
-        raise RunError("--resume continues with the run's own configuration; leave out --like.")
+        raise RunError("--resume continues with the run's own configuration. Omit --like.")
     if resume and weights is not None:
-        raise RunError(
-            "--resume continues with the run's own networks; leave out --weights, or start another run with it."
-        )
+        raise RunError("--resume continues with the run's own networks. Omit --weights, or start another run with it.")
     if resume:
         info = training.resumed(out, iterations=iterations, own=config.task.reward.own)
         training.train(out, info, resume=True, seconds=60 * minutes)
         return
     if robot is None or resets is None:
-        raise RunError("a new run needs --robot and --resets; --resume continues the run in --out.")
+        raise RunError("A new run needs --robot and --resets. To continue the run in --out, add --resume.")
     if sentences := without_effect(config, starting_config(like)):
-        raise RunError(f"--config.{'; --config.'.join(sentences)}. Leave it out, or change the other one.")
+        raise RunError(f"--config.{'; --config.'.join(sentences)}. Omit it, or change the other one.")
     if (dropped := dropped_terms(like)) and not config.task.reward.own:
         print(
-            f"{like} was trained with reward terms of your own. They are off here, because a run folder must not decide which code is imported. "
-            f"If you trust this code, add {own_terms_flag(dropped)}.",
+            f"{like} was trained with reward terms of your own. They are off, because a run folder must not decide "
+            f"which code is imported. If you trust this code, add {own_terms_flag(dropped)}.",
             file=sys.stderr,
         )
     new_run.train(
@@ -94,7 +92,7 @@ def train(
 
 
 def command_for(arguments: list[str]) -> Callable[..., None]:
-    """:func:`train` with the defaults that ``--like`` asks for, which have to be known before the other flags are read."""
+    """Return :func:`train` with the defaults of ``--like``, which must be known before the other flags are read."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--like", nargs="?")  # a missing value is for the real parser to say
     like = parser.parse_known_args(arguments)[0].like

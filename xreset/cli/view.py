@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 from rich.progress import track
 
+from xreset.cli._common import Source
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import XResetError
 from xreset.eval.report import clips
@@ -18,7 +17,7 @@ from xreset.pictures.view import data, load, page, picture, sheet
 
 
 def view(
-    file: Annotated[Path, tyro.conf.Positional],
+    file: Source,
     *,
     demos: Path | None = None,
     retargeted: Path | None = None,
@@ -33,28 +32,29 @@ def view(
     moments: bool = False,
     reasons: bool = False,
 ) -> None:
-    """Look at demonstrations, robot trajectories or a reset bank in a browser, or write pictures of them.
+    """Show demonstrations, robot motion or a reset bank in a browser, or write pictures of them.
 
-    Where a frame is not valid the robot has the colour of the reason. The object's goal is translucent. Human keypoints are pink, those
-    in contact yellow, with a black dot where they touch the object; the robot's fingertips are blue.
+    In a frame that is not valid, the robot has the color of the reason. The object's goal is translucent. Human
+    keypoints are pink, keypoints in contact yellow, with a black dot where they touch the object. The robot's
+    fingertips are blue.
 
     Args:
         file: Demonstrations, or what `xreset retarget` or `xreset resets` made.
-        demos: Demonstrations that the file was made from: shows the human hand over the robot.
-        retargeted: Robot trajectories that a bank was made from: shows the states too that physics rejected.
+        demos: Demonstrations of the file, to show the human hand over the robot.
+        retargeted: Robot motion of a bank, to show the states that physics rejected.
         objects: Folder of real meshes; default: the built-in stand-ins.
         robot: Folder of the robot, if it is not one that is known by name.
         sequence: Which sequence, counted from 0. Default: the first; of a bank, all.
         frame: Which frame of the sequence (state of the bank). Default: the first; for --png the middle one.
-        host: Address to serve at; 0.0.0.0 lets other machines in.
-        port: Port to serve at; the next free one if it is taken.
-        png: Picture to write, instead of serving a page.
-        mp4: Film of the sequence to write, instead of serving a page.
-        moments: Let --png show first contact, mid-lift and goal of one demonstration of each object.
-        reasons: Let --png show one example of every reason for which a frame or state is not used.
+        host: Address to serve at; 0.0.0.0 allows other machines.
+        port: Port to serve at; if it is taken, the next free one.
+        png: Picture to write, instead of a page.
+        mp4: Film of the sequence to write, instead of a page.
+        moments: With --png: first contact, mid-lift and goal of one demonstration of each object.
+        reasons: With --png: one example of every reason why a frame or state is not used.
     """
     if (moments or reasons) and (png is None or (moments and reasons)):
-        raise XResetError("--moments and --reasons say what picture to write: give one of them, and a file with --png.")
+        raise XResetError("--moments and --reasons need a file with --png, and exclude each other.")
     shown = load.load_view(file, demos=demos, retargeted=retargeted, robot=robot, objects=objects)
     if png is not None and (moments or reasons):
         _write_sheet(png, shown, moments=moments)
@@ -73,10 +73,8 @@ def _serve(shown: data.View, host: str, port: int, sequence: int | None, frame: 
     opened = page.Page(shown, host=host, port=port, sequence=sequence, frame=frame)
     number = opened.url.rpartition(":")[2]
     print(f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {shown.kind} at {opened.url}", flush=True)
-    print(
-        f"From another machine: ssh -L {number}:localhost:{number} THIS_MACHINE, then open the same address. Ctrl-C ends.",
-        flush=True,
-    )
+    tunnel = f"ssh -L {number}:localhost:{number} THIS_MACHINE"
+    print(f"From another machine: {tunnel}, then open the same address. Ctrl-C ends.", flush=True)
     try:
         opened.serve()
     except KeyboardInterrupt:  # the way to end it, not a failure
@@ -88,7 +86,7 @@ def _serve(shown: data.View, host: str, port: int, sequence: int | None, frame: 
 def _write_png(path: Path, shown: data.View, rows: np.ndarray, frame: int | None) -> None:
     chosen = len(rows) // 2 if frame is None else frame
     if not 0 <= chosen < len(rows):
-        raise XResetError(f"there is no frame {chosen}; the choice has {len(rows)}, counted from 0.")
+        raise XResetError(f"Frame {chosen} does not exist. Choose one from 0 to {len(rows) - 1}.")
     render.write_png(path, picture.Drawer(shown, size=(960, 720), smooth=True).draw(int(rows[chosen])))
     print("\n".join((*shown.text(int(rows[chosen])), f"picture in {path}")))
 
@@ -106,7 +104,7 @@ def _write_sheet(path: Path, shown: data.View, *, moments: bool) -> None:
 
 def _write_mp4(path: Path, shown: data.View, rows: np.ndarray) -> None:
     if not len(rows):
-        raise XResetError("this sequence has no state to film; choose another one with --sequence.")
+        raise XResetError("This sequence has no state to film. Choose another one with --sequence.")
     draw = picture.Drawer(shown).draw
     frames = [draw(int(row)) for row in track(rows, "drawing", console=Console(), transient=True)]
     film = clips.encode_mp4(np.stack(frames), shown.rate)

@@ -1,11 +1,11 @@
-"""``xreset engines``: which engines there are, what they can do, and how far they agree."""
+"""``xreset engines``: list, check, compare and trace physics engines."""
 
 COMMANDS = {
     "list": "List physics engines and whether they can be used here.",
-    "check": "Test that a physics engine keeps the interface's contracts.",
+    "check": "Test whether a physics engine keeps its contract.",
     "compare": "Measure how far physics engines agree on grasps.",
-    "trace": "Replay one action sequence in several engines, and see when, where and by how much they diverge.",
-    "attribute": "Tell which physical difference between two engines costs a policy its skill.",
-    "page": "Make the support matrix: what every engine can do and how far they agree, from measured results.",
+    "trace": "Replay the same actions in several engines, and show when and by how much they diverge.",
+    "attribute": "Find the physical difference between two engines that costs a policy its skill.",
+    "page": "Make a Markdown page of what was measured of the engines.",
 }
 """Command -> one line of help."""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 
 from xreset.checks import Options
+from xreset.cli._common import Flat, Name, Several
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import DemoError, XResetError
 from xreset.eval import policy_spec, trial
@@ -20,49 +19,51 @@ from xreset.files import write_json
 
 @dataclass(frozen=True, kw_only=True)
 class Played(Options):
-    """Which episodes."""
+    """Episodes to play."""
 
     demos: Path
-    """Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the path of ik."""
-    object: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Object to play with; give it again for several. Default: all."""
+    """Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the path of ik.
+    """
+    object: Several = ()
+    """Object to play with; give it again for more. Default: all."""
     max_demos: int | None = None
-    """Demonstrations to play at most, spread over all."""
+    """Largest number of demonstrations, spread over all."""
     episodes: int = 1
     """Episodes per demonstration."""
 
 
 def attribute(
-    policy: Annotated[str, tyro.conf.Positional],
+    policy: Name,
     *,
-    played: Annotated[Played, tyro.conf.arg(name="")],
+    played: Flat[Played],
     towards: str,
     backend: str = "mujoco",
-    only: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    only: Several = (),
     what_if: bool = False,
-    setting: Annotated[Setting, tyro.conf.arg(name="")] = Setting(),  # noqa: B008
+    setting: Flat[Setting] = Setting(),  # noqa: B008
     out: Path | None = None,
 ) -> None:
-    """Tell which physical difference between two engines costs a policy its skill.
+    """Find the physical difference between two engines that costs a policy its skill.
 
-    Both engines are measured, through the interface alone: sliding and torsional friction, object mass and inertia, drive stiffness and
-    damping, timestep, contact softness, latency. Then the policy plays in one engine, in that engine with one property at a time changed to
-    the other's value, with all of them at once, and in the other engine: the same episodes from the same starts.
+    First both engines are measured through their interface: friction, object mass and inertia, drive stiffness and
+    damping, timestep, contact softness, latency. Then the policy plays the same episodes in one engine, in that engine
+    with one property changed to the value of the other engine, with all properties changed, and in the other engine.
 
     Args:
-        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or a baseline: zero,
-            random, ik (open-loop kinematic retargeting).
+        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or
+            a baseline: zero, random, ik (open-loop kinematic retargeting).
         played: Demonstrations and episodes.
         towards: Engine towards which the properties are changed, usually the one in which the policy does worse.
         backend: Engine in which they are changed.
-        only: Property to try; give it again for several. Default: all in which the engines differ.
-        what_if: Also try the properties in which they do not differ, with changes of a usual size.
+        only: Property to change; give it again for more. Default: all in which the engines differ.
+        what_if: Also change properties in which the engines agree, by a usual amount.
         setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
-        out: Folder for attribution.json and attribution.png; default: attribute/ beside the policy's results.
+        out: Folder for attribution.json and attribution.png; default: attribute/ next to the policy's results.
     """
     if backend == towards:
-        raise XResetError(f"--backend and --towards are both {backend!r}; an engine does not differ from itself.")
-    console, demos = Console(), played.demos
+        raise XResetError(f"--backend and --towards are both {backend!r}. Choose two engines.")
+    console = Console()
+    demos = played.demos
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     spec.check_seed(setting.seed)
     a, b = (trial.engine(name, device=setting.device) for name in (backend, towards))
@@ -98,8 +99,8 @@ def attribute(
     attribution_view.write_plot(out / "attribution.png", found, title)
     console.print(attribution_view.rich_table(found, title))
     for line in attribution_view.not_tried(found):
-        console.print(line, style="dim", highlight=False)
-    console.print(attribution_view.verdict(found), highlight=False)
+        console.print(line, style="dim")
+    console.print(attribution_view.verdict(found))
     console.print(f"results in {out}")
 
 

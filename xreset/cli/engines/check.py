@@ -1,4 +1,4 @@
-"""``xreset engines check``: whether physics engines keep the contracts of the interface."""
+"""``xreset engines check``: test physics engines."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from typing import Annotated, Any
 import tyro
 from rich.text import Text
 
-from xreset import __version__
+from xreset import __version__, description
 from xreset.backends import conformance, pool
-from xreset.cli._common import this_command, usable_engines
+from xreset.cli._common import Several, this_command, usable_engines
 from xreset.cli._terminal import Console
-from xreset.description import load_robot
 from xreset.errors import XResetError
 from xreset.files import write_json
 from xreset.plugins import backend_class, backend_status, make_backend
@@ -21,28 +20,28 @@ from xreset.spec import SceneSpec
 
 def check(
     *,
-    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    backend: Several = (),
     robot: str | None = None,
     device: str = "cpu",
     only: Annotated[tuple[str, ...], tyro.conf.arg(name="check"), tyro.conf.UseAppendAction] = (),
     json: Path | None = None,
     verbose: bool = False,
 ) -> None:
-    """Test that physics engines keep the contracts of the interface. Exits with 1 if one does not.
+    """Test whether physics engines keep their contract. Exits with 1 if one does not.
 
     Args:
-        backend: Engine to test, a plugin's too; give it again for several. Default: all that can be used here.
-        robot: Robot to test with, a name or a folder. Default: a small one of the suite's own, with which every check can run.
-        device: Where engines run that can run on GPUs: cpu or cuda.
-        only: Check to run; give it again for several. Default: all.
+        backend: Engine to test; give it again for more. Default: all that can be used here.
+        robot: Name or folder of the robot to test with. Default: a gripper, with which every check can run.
+        device: Where GPU engines run: cpu or cuda.
+        only: Check to run; give it again for more. Default: all.
         json: File to write the results to.
-        verbose: Show every number that was measured, not only the one nearest to its tolerance.
+        verbose: Show every measured number, not only the one nearest to its tolerance.
     """
     known = [c.name for c in conformance.CHECKS]
     if unknown := sorted(set(only) - set(known)):
-        raise XResetError(f"there is no check {', '.join(unknown)}; there are {', '.join(known)}.")
-    console = Console(highlight=False, soft_wrap=True)
-    spec = load_robot(robot) if robot else conformance.scene().robot
+        raise XResetError(f"Unknown check {', '.join(unknown)}. Choose from: {', '.join(known)}.")
+    console = Console()
+    spec = description.load_robot(robot) if robot else conformance.scene().robot
     runs = []
     for name in dict.fromkeys(backend) or usable_engines(console):
         status = backend_status(name)
@@ -77,7 +76,7 @@ def check(
 
 
 def _maker(name: str, device: str) -> conformance.MakeBackend:
-    """Builds worlds on the device; a few of them, for one check only, run in this process sooner than processes start."""
+    """Return what builds worlds on a device. A few worlds run in this process, which is faster than to start others."""
     pooled = issubclass(backend_class(name), pool.PoolBackend)
 
     def make(scene: SceneSpec, num_worlds: int, **chosen: Any) -> Any:

@@ -1,16 +1,14 @@
-"""``xreset engines compare``: whether physics engines agree on grasps."""
+"""``xreset engines compare``: compare grasps in several engines."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from rich.table import Table
 from rich.text import Text
 
 from xreset import __version__
-from xreset.cli._common import this_command, usable_engines
+from xreset.cli._common import Several, Source, this_command, usable_engines
 from xreset.cli._terminal import Console, Progress
 from xreset.eval import trial
 from xreset.eval.engines import agreement, sources
@@ -18,34 +16,35 @@ from xreset.files import file_hash, write_json
 
 
 def compare(
-    motion: Annotated[Path, tyro.conf.Positional],
+    motion: Source,
     *,
     robot: str | None = None,
     objects: Path | None = None,
-    only: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    only: Several = (),
+    backend: Several = (),
     grasps: int = 48,
     device: str = "cpu",
     json: Path | None = None,
 ) -> None:
     """Measure how far physics engines agree with MuJoCo on grasps. Exits with 1 if one misses a target.
 
-    Hands close on objects that nothing moves (press), close on objects on the table, lift and shake them (closing), and lift and shake
-    from common states that favour no engine (hold). MuJoCo-Warp, which solves MuJoCo's equations, is compared step by step (path); on the
-    CPU, where it is slow, that is all. The column of MuJoCo at half the timestep shows how far two honest solutions differ.
+    Press: a hand closes on an object that cannot move. Closing: a hand closes on an object on the table, lifts and
+    shakes it. Hold: lift and shake from a common state. Path: MuJoCo-Warp is compared step by step; on the CPU, where
+    it is slow, only this. The column of MuJoCo at half the timestep shows how far two solutions of the same equations
+    differ.
 
     Args:
-        motion: Where grasps are taken from: a file of `xreset retarget` (best: no engine has had a say), of `xreset resets`, or of
-            `xreset demos`, which is then retargeted first.
+        motion: File with the grasps: of `xreset retarget` (best, because no engine has chosen them), of `xreset
+            resets`, or of `xreset demos`, which is retargeted first.
         robot: Name or folder of the robot; default: the file's. Demonstrations need it.
         objects: Folder of real meshes; default: the built-in stand-ins.
-        only: Object to use; give it again for several. Default: all of the file.
-        backend: Engine to measure; give it again for several. Default: all that can be used here.
-        grasps: How many closings, and how many holds.
-        device: Where engines run that can run on GPUs: cpu or cuda.
+        only: Object to use; give it again for more. Default: all objects of the file.
+        backend: Engine to measure; give it again for more. Default: all that can be used here.
+        grasps: Number of closings, and of holds.
+        device: Where GPU engines run: cpu or cuda.
         json: File to write the results to.
     """
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console()
     names = [name for name in dict.fromkeys(backend) or usable_engines(console) if name != agreement.REFERENCE]
     engines = [trial.engine(name, device=device) for name in names]
     with Progress(console) as bar:
@@ -91,8 +90,8 @@ def _table(result: agreement.Parity) -> Table:
         "against " + result.reference.engine.name,
         "target",
         *(f"{tested.engine.name}\n{tested.engine.version}, {tested.engine.device}" for tested in columns),
-        title=f"{result.robot.name}, {len(result.objects)} objects: {len(result.closing)} closings, {tried} holds, of which "
-        f"{result.reference.engine.name} carries {sum(result.reference.carried['closing'])} and {held}",
+        title=f"{result.robot.name}, {len(result.objects)} objects: {len(result.closing)} closings, {tried} holds, "
+        f"of which {result.reference.engine.name} carries {sum(result.reference.carried['closing'])} and {held}",
     )
     rows = {metric.name: metric for tested in columns for metric in tested.metrics}
     for name, row in rows.items():

@@ -1,4 +1,4 @@
-"""``xreset engines list``: which engines can be used here."""
+"""``xreset engines list``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from xreset.plugins import backend_names, backend_status
 
 
 def engines() -> None:
-    """List the physics engines: name, engine version, device, and why not where one cannot be used."""
+    """List physics engines: name, version, device, and why one cannot be used here."""
     table = Table("backend", "engine version", "device", "available")
     for name in backend_names():
         status = backend_status(name)

@@ -16,11 +16,11 @@ def page(
     source: Annotated[tuple[Path, ...], tyro.conf.arg(name="from"), tyro.conf.UseAppendAction],
     out: Path | None = None,
 ) -> None:
-    """Make the support matrix: a Markdown page of what was measured of the engines.
+    """Make a Markdown page of what was measured of the engines.
 
     Args:
-        source: File that `xreset engines check --json` or `xreset engines compare --json` wrote; give it again for several. Where two have
-            the same check of the same engine, device and robot, the later one counts.
+        source: File of `xreset engines check --json` or `xreset engines compare --json`; give it again for more. Of two
+            results of the same check, engine, device and robot, the later one counts.
         out: File to write; default: print it.
     """
     text = matrix.page(matrix.read(source))

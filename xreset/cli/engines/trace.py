@@ -6,12 +6,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from xreset.checks import Options
-from xreset.cli._common import usable_engines
+from xreset.cli._common import Flat, Several, Source, usable_engines
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import XResetError
 from xreset.eval import trial
@@ -21,10 +18,10 @@ from xreset.eval.setting import Place, Sequence
 
 @dataclass(frozen=True, kw_only=True)
 class Limits(Options):
-    """From which difference on engines have diverged."""
+    """Differences from which engines count as diverged."""
 
     joint_threshold: float = 0.02
-    """Difference of a joint from which it has diverged [rad; a tenth of it in m for a prismatic joint]."""
+    """Difference of a joint [rad; a tenth of it in m for a prismatic joint]."""
     position_threshold: float = 0.005
     """Difference of the object's position [m]."""
     angle_threshold: float = 5.0
@@ -32,11 +29,11 @@ class Limits(Options):
     force_threshold: float = 2.0
     """Difference of a fingertip's force [N], averaged over 50 ms."""
     contact_time: float = 0.05
-    """How long other fingers must touch than in the reference [s]."""
+    """Time for which other fingers touch than in the reference [s]."""
     perturbed: int = 4
-    """Number of starts in the reference that differ by next to nothing: how far they get is the noise floor."""
+    """Number of slightly different starts in the reference, which give the noise floor."""
     perturbation: float = 1e-6
-    """By how much they differ, each joint [rad, m] and each coordinate of the object [m]."""
+    """Difference of these starts, for each joint [rad, m] and each coordinate of the object [m]."""
 
     def __post_init__(self) -> None:
         limits = (
@@ -52,38 +49,38 @@ class Limits(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class Output(Options):
-    """What is written."""
+    """Files to write."""
 
     strip: bool = False
-    """Also write strip.png: pictures at several times, engines one below another."""
+    """Also write strip.png: pictures at several times, one row for each engine."""
     mp4: bool = False
-    """Also write film.mp4: engines side by side."""
+    """Also write film.mp4: engines next to each other."""
     out: Path = Path("runs/trace")
     """Folder for trace.json, replays.npz, actions.npz and trace.png."""
 
 
 def trace(
-    source: Annotated[Path, tyro.conf.Positional],
+    source: Source,
     *,
-    backend: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    backend: Several = (),
     reference: str = "mujoco",
-    sequence: Annotated[Sequence, tyro.conf.arg(name="")] = Sequence(),  # noqa: B008
-    place: Annotated[Place, tyro.conf.arg(name="")] = Place(),  # noqa: B008
-    limits: Annotated[Limits, tyro.conf.arg(name="")] = Limits(),
-    output: Annotated[Output, tyro.conf.arg(name="")] = Output(),
+    sequence: Flat[Sequence] = Sequence(),  # noqa: B008
+    place: Flat[Place] = Place(),  # noqa: B008
+    limits: Flat[Limits] = Limits(),
+    output: Flat[Output] = Output(),
 ) -> None:
-    """Replay one action sequence from one state in several engines, and say when, where and by how much they diverge.
+    """Replay the same actions from the same state in several engines, and show when and by how much they diverge.
 
     Args:
-        source: Where the sequence comes from. Demonstrations, retargeted trajectories or a reset bank: an open-loop grasp and lift of one
-            of their grasps; with --policy: an episode of that policy. An evaluation's trace (eval/BACKEND.trace.npz): the actions of a
-            recorded episode. An actions.npz of this command: the same once more.
-        backend: Engine to compare with the reference; give it again for several. Default: all that can be used here.
+        source: Source of the actions. Demonstrations, robot motion or a reset bank: an open-loop grasp and lift; with
+            --policy, an episode of that policy. The trace of an evaluation (eval/BACKEND.trace.npz): a recorded
+            episode. An actions.npz of this command.
+        backend: Engine to compare with the reference; give it again for more. Default: all that can be used here.
         reference: Engine that the others are compared with, and in which a policy plays.
-        sequence: Which.
+        sequence: The episode or grasp to replay.
         place: Robot, meshes, seed, device.
-        limits: When engines have diverged.
-        output: Files.
+        limits: Differences from which engines count as diverged.
+        output: Files to write.
     """
     thresholds = divergence.Thresholds(
         joint=limits.joint_threshold,
@@ -93,7 +90,8 @@ def trace(
         force=limits.force_threshold,
         contact_time=limits.contact_time,
     )
-    console, out = Console(), output.out
+    console = Console()
+    out = output.out
     base = trial.engine(reference, device=place.device)
     names = [name for name in dict.fromkeys(backend) or usable_engines(console) if name != reference]
     engines = [trial.engine(name, device=place.device) for name in names]
@@ -108,7 +106,8 @@ def trace(
         else:
             played = sources.from_policy(source, base, sequence, place, show("policy"))
         result = replay.trace(
-            played, base, engines, thresholds=thresholds, perturbed=limits.perturbed, perturbation=limits.perturbation, seed=place.seed,
+            played, base, engines, thresholds=thresholds, perturbed=limits.perturbed,
+            perturbation=limits.perturbation, seed=place.seed,
             progress=lambda name: bar.update(task, description=name, completed=0, total=None),
         )  # fmt: skip
         actions.write_actions(out / "actions.npz", played)
@@ -120,7 +119,7 @@ def trace(
             film.write_film(out / "film.mp4", result, progress=show("film"))
     console.print(trace_view.rich_table(result))
     for sentence in trace_view.sentences(result):
-        console.print(sentence, highlight=False)
+        console.print(sentence)
     console.print(f"results in {out}")
 
 

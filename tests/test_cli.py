@@ -142,7 +142,7 @@ class UsageTest(unittest.TestCase):
                 ("retarget", "none.npz", "--robot", "openarm", "--out", "x.npz", "--device", "quantum"),
             ),
             (
-                r"fps is 1000000000.0, expected at least 1, and 5 to 1000",
+                r"fps is 1000000000.0, expected 1 to 100000 sequences and 5 to 1000",
                 ("demos", "synth", "--out", "x.npz", "--fps", "1e9"),
             ),
             (r"(File name too long|there is no)", ("demos", "info", long)),

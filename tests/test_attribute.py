@@ -350,9 +350,7 @@ class CommandTest(unittest.TestCase):
 
     def test_bad_input(self):
         rest = ("--demos", "none.npz", "--robot", "ur7e-sharpa")
-        self.assertIn(
-            "Choose two engines", self.refuse("zero", *rest, "--backend", "mujoco", "--towards", "mujoco")
-        )
+        self.assertIn("Choose two engines", self.refuse("zero", *rest, "--backend", "mujoco", "--towards", "mujoco"))
         self.assertIn(
             "expected a whole number from 1", self.refuse("zero", *rest, "--towards", "sapien", "--episodes", "0")
         )

@@ -12,6 +12,7 @@ from xreset.eval.film import film as film
 from xreset.eval.policy_spec import PolicySpec as PolicySpec
 from xreset.eval.policy_spec import load_policy as load_policy
 from xreset.eval.results import EvalResult as EvalResult
+from xreset.eval.results import Evaluation as Evaluation
 from xreset.eval.trial import Engine as Engine
 from xreset.learning.config import TrainConfig as TrainConfig
 from xreset.learning.new_run import train as train

@@ -231,6 +231,31 @@ class Toy(WithFolder):
         ):
             read_source(self.file("ball.xml", ball))
 
+    def test_damaged_or_huge_mjcf_is_refused(self):
+        def asset(text):
+            return MJCF.replace("<worldbody>", f"<asset>{text}</asset><worldbody>")
+
+        copies = '<replicate count="30000"><replicate count="30000"><geom size="0.01"/></replicate></replicate></body>'
+        for words, text in (
+            ("orientation that is not finite", MJCF.replace('euler="0 0 0.9"', 'euler="-inf 0 0"')),
+            ("1e-300 m small", MJCF.replace('size="0.018 0.007 0.007"', 'size="1e-300 1e-300 1e-300"')),
+            ("hfield has 1.6e.09 entries", asset('<hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/>')),
+            ("texture has 9e.08", asset('<texture name="h" type="2d" builtin="flat" width="30000" height="30000"/>')),
+            ("size has 2e.09", MJCF.replace("<worldbody>", '<size nkey="2000000000"/><worldbody>')),
+            ("replicates up to 9e.08", MJCF.replace("</body></worldbody>", f"{copies}</worldbody>")),
+            ("Give the file that includes it", "<mujocoinclude/>"),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(RobotError, words):
+                read_source(self.file("hand.xml", text))
+
+    def test_the_control_of_a_motor_is_its_effort(self):
+        motor = MJCF.replace(
+            '<position joint="f1_1" kp="3" kv="0.2" forcerange="-2 2"/>',
+            '<motor joint="f1_1" ctrlrange="-3 3" gear="2"/>',
+        )
+        source = read_source(self.file("hand.xml", motor))
+        self.assertEqual((source.effort, source.drives), ({"f1_1": 6.0}, {}))
+
     def test_mjcf_in_place_of_a_urdf_is_told(self):
         with self.assertRaisesRegex(RobotError, "is MJCF, not URDF; `xreset robots import`"):
             load_urdf(self.file("hand.xml", MJCF))

@@ -1,4 +1,4 @@
-"""What others publish of a robot, URDF or MJCF, as one kind of plain data; and an arm and a hand put together."""
+"""Reads what makers publish of a robot, URDF or MJCF, as one kind of plain data, and puts an arm and a hand together."""
 
 from __future__ import annotations
 
@@ -21,11 +21,13 @@ from xreset.spec import DriveSpec, Geometry, MimicSpec, Shape
 from xreset.text import shown
 
 _DENSITY = 1000.0
-"""[kg/m^3] Of links whose mass nobody states."""
+"""[kg/m^3] Density of links whose mass is not stated."""
 _ROTOR_AT_MOST = 0.01
 """[kg m^2] Reflected inertia of a rotor that descriptions add to light links."""
 _TURNS = 2 * math.pi
 """[rad] Range in either direction of a joint without limits."""
+_SMALLEST = 1e-6
+"""[m] Smallest size of a shape."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,9 +37,9 @@ class Source:
     tree: RobotTree
     mimics: tuple[MimicSpec, ...] = ()
     effort: dict[str, float] = field(default_factory=dict)
-    """Largest torque [N m] or force [N] of joints, where it is stated."""
+    """Joint -> largest torque [N m] or force [N], where it is stated."""
     drives: dict[str, DriveSpec] = field(default_factory=dict)
-    """Drives of joints, where they are stated."""
+    """Joint -> drive, where it is stated."""
     notes: tuple[str, ...] = ()
     """What had to be changed or assumed."""
 
@@ -46,81 +48,93 @@ def read_source(path: str | Path) -> Source:
     """Read a URDF, or an MJCF (needs the engine MuJoCo).
 
     Raises:
-        RobotError: it cannot be read, or uses what xreset does not have; the message names all of it.
+        RobotError: the file cannot be read, or uses what xreset does not have; the message names all of it.
     """
     path = Path(path)
     root = parse_xml(path)
-    source = _read_mjcf(path) if root.tag == "mujoco" else _read_urdf(path, root)
+    if root.tag == "mujocoinclude":
+        raise RobotError(f"{path} is a part of an MJCF. Give the file that includes it.")
+    source = _read_mjcf(path, root) if root.tag == "mujoco" else _read_urdf(path, root)
     check_tree(source.tree, path)
-    drives = [
-        number for drive in source.drives.values() for number in (drive.kp, drive.kd, drive.effort, drive.armature)
-    ]
-    if not np.isfinite(
-        [*drives, *(number for mimic in source.mimics for number in (mimic.multiplier, mimic.offset))]
-    ).all():
-        raise RobotError(f"{path} has a drive or a mimicking joint with a number that is not finite.")
+    for link in source.tree.links:
+        for shape in link.collisions:
+            sizes = shape.geometry.size
+            if shape.geometry.kind != "box":
+                sizes = sizes[:1]  # the half length of a capsule may be 0
+            if sizes and min(sizes) < _SMALLEST:
+                raise RobotError(
+                    f"{path}: a {shape.geometry.kind} of link {link.name!r} is {min(sizes):g} m small. "
+                    f"Expected at least {_SMALLEST:g}."
+                )
+    numbers = []
+    for mimic in source.mimics:
+        numbers += [mimic.multiplier, mimic.offset]
+    for drive in source.drives.values():
+        numbers += [drive.kp, drive.kd, drive.effort, drive.armature]
+    if not np.isfinite(numbers).all():
+        raise RobotError(f"{path} has a drive or a mimic joint with a number that is not finite.")
     return _with_masses(_with_limits(source))
 
 
 def _read_urdf(path: Path, root: ElementTree.Element) -> Source:
-    tree, mimics, effort = load_urdf(path), [], {}
-
     def number(tag: ElementTree.Element, name: str, default: float) -> float:
         try:
             return float(tag.get(name, default))
         except ValueError as error:
             raise RobotError(f"{path}: {tag.tag} has the {name} {shown(tag.get(name))}, expected a number.") from error
 
+    tree = load_urdf(path)
+    mimics = []
+    efforts = {}
     for joint in root.findall("joint"):
-        name, tag, limit = joint.get("name", ""), joint.find("mimic"), joint.find("limit")
-        if tag is not None:
-            of = {"multiplier": number(tag, "multiplier", 1), "offset": number(tag, "offset", 0)}
-            mimics.append(MimicSpec(joint=name, source=tag.get("joint", ""), **of))
+        name = joint.get("name", "")
+        mimic = joint.find("mimic")
+        if mimic is not None:
+            multiplier = number(mimic, "multiplier", 1)
+            offset = number(mimic, "offset", 0)
+            mimics.append(MimicSpec(joint=name, source=mimic.get("joint", ""), multiplier=multiplier, offset=offset))
+        limit = joint.find("limit")
         if limit is not None and 0 < number(limit, "effort", 0) < math.inf:
-            effort[name] = number(limit, "effort", 0)
-    return Source(tree=tree, mimics=tuple(mimics), effort=effort)
+            efforts[name] = number(limit, "effort", 0)
+    return Source(tree=tree, mimics=tuple(mimics), effort=efforts)
 
 
 def combined(arm: Source, hand: Source, *, flange: str | None, T_flange_hand: np.ndarray, name: str) -> Source:
-    """An arm with a hand at its flange; whatever the arm carries there already is left out.
+    """Return an arm with a hand at its flange. What the flange carries already is left out.
 
     Args:
-        arm: the arm.
-        hand: the hand.
         flange: link of the arm that carries the hand; None: the arm's last link, if there is only one.
         T_flange_hand: [4, 4] pose of the hand's root link in the flange's frame.
-        name: of the whole.
 
     Raises:
         RobotError: there is no such link, or the last one is not unique.
     """
     notes = [*arm.notes, *hand.notes]
-    parents = {joint.parent for joint in arm.tree.joints}
-    ends = [link for link in arm.tree.link_names if link not in parents]
     if flange is None:
-        if len(ends) != 1:
-            before = ", ".join(link for link in arm.tree.link_names if {*ends} < {*below(arm.tree, link)})
-            raise RobotError(
-                f"the arm ends in {', '.join(ends)}, after {before}; say with --flange which of its links carries the hand;"
-                " what hangs there is left out."
-            )
-        flange = ends[0]
+        flange = _last_link(arm.tree)
         notes.append(f"the hand is carried by the arm's last link, {flange!r} (--flange says another)")
     arm.tree.link(flange)
-    path = {link for link in arm.tree.link_names if flange in below(arm.tree, link)}
-    gone = {*below(arm.tree, flange)} - {flange}
-    if gone:
-        notes.append(f"left out, because it hangs on the flange where the hand goes: {', '.join(sorted(gone))}")
-    kept = [joint for joint in arm.tree.joints if joint.child not in gone]
-    stiff = [joint.name for joint in kept if joint.type != "fixed" and joint.child not in path]
+    carriers = {link for link in arm.tree.link_names if flange in below(arm.tree, link)}
+    removed = set(below(arm.tree, flange)) - {flange}
+    if removed:
+        notes.append(f"left out, because it hangs on the flange where the hand goes: {', '.join(sorted(removed))}")
+    joints = []
+    stiff = []
+    for joint in arm.tree.joints:
+        if joint.child in removed:
+            continue
+        if joint.type != "fixed" and joint.child not in carriers:
+            stiff.append(joint.name)
+            joint = replace(joint, type="fixed")
+        joints.append(joint)
     if stiff:
         notes.append(f"joints of the arm that do not move the hand are fixed at 0: {', '.join(stiff)}")
-    joints = [replace(joint, type="fixed") if joint.name in stiff else joint for joint in kept]
-    hand = _renamed(hand, {*arm.tree.link_names} - gone, {joint.name for joint in kept})
+    links = [link for link in arm.tree.links if link.name not in removed]
+    hand = _renamed(hand, {link.name for link in links}, {joint.name for joint in joints})
     tree = RobotTree(
         name=name,
         root=arm.tree.root,
-        links=(*(link for link in arm.tree.links if link.name not in gone), *hand.tree.links),
+        links=(*links, *hand.tree.links),
         joints=(*joints, fixed(flange, hand.tree.root, T_flange_hand), *hand.tree.joints),
     )
     moving = {joint.name for joint in tree.joints if joint.type != "fixed"}
@@ -133,77 +147,104 @@ def combined(arm: Source, hand: Source, *, flange: str | None, T_flange_hand: np
     )
 
 
-def _renamed(source: Source, links: Iterable[str], joints: Iterable[str]) -> Source:
-    """The source with ``hand_`` before the names of links and joints that are taken."""
-    link = {name: f"hand_{name}" if name in set(links) else name for name in source.tree.link_names}
-    joint = {j.name: f"hand_{j.name}" if j.name in set(joints) else j.name for j in source.tree.joints}
+def _last_link(arm: RobotTree) -> str:
+    parents = {joint.parent for joint in arm.joints}
+    ends = [link for link in arm.link_names if link not in parents]
+    if len(ends) == 1:
+        return ends[0]
+    before = [link for link in arm.link_names if set(ends) < set(below(arm, link))]
+    raise RobotError(
+        f"the arm ends in {', '.join(ends)}, after {', '.join(before)}; say with --flange which of its links carries the hand;"
+        " what hangs there is left out."
+    )
+
+
+def _renamed(source: Source, links: set[str], joints: set[str]) -> Source:
+    """Return the source with ``hand_`` before the names of links and joints that are taken."""
+
+    def link(name: str) -> str:
+        return f"hand_{name}" if name in links else name
+
+    def joint(name: str) -> str:
+        return f"hand_{name}" if name in joints else name
+
+    def moved(each: Joint) -> Joint:
+        return replace(each, name=joint(each.name), parent=link(each.parent), child=link(each.child))
+
     tree = RobotTree(
         name=source.tree.name,
-        root=link[source.tree.root],
-        links=tuple(replace(item, name=link[item.name]) for item in source.tree.links),
-        joints=tuple(
-            replace(j, name=joint[j.name], parent=link[j.parent], child=link[j.child]) for j in source.tree.joints
-        ),
+        root=link(source.tree.root),
+        links=tuple(replace(each, name=link(each.name)) for each in source.tree.links),
+        joints=tuple(moved(each) for each in source.tree.joints),
     )
-    mimics = tuple(
-        replace(mimic, joint=joint[mimic.joint], source=joint.get(mimic.source, mimic.source))
-        for mimic in source.mimics
+    return Source(
+        tree=tree,
+        mimics=tuple(replace(each, joint=joint(each.joint), source=joint(each.source)) for each in source.mimics),
+        effort={joint(name): effort for name, effort in source.effort.items()},
+        drives={joint(name): drive for name, drive in source.drives.items()},
+        notes=source.notes,
     )
-    effort, drives = ({joint[name]: value for name, value in part.items()} for part in (source.effort, source.drives))
-    return replace(source, tree=tree, mimics=mimics, effort=effort, drives=drives)
 
 
 def _with_limits(source: Source) -> Source:
-    notes, joints = list(source.notes), []
+    """Return the source with finite limits; a mimic joint has those that its source gives it."""
+    notes = list(source.notes)
+    joints = {}
     for joint in source.tree.joints:
         if joint.type != "fixed" and not np.isfinite((joint.lower, joint.upper)).all():
             notes.append(f"the joint {joint.name!r} has no limits; it gets one turn in either direction")
             joint = replace(joint, lower=-_TURNS, upper=_TURNS)
         if joint.type != "fixed" and not 0 < joint.velocity < math.inf:
             joint = replace(joint, velocity=math.pi)
-        joints.append(joint)
-    limits = {joint.name: np.array((joint.lower, joint.upper)) for joint in joints}
+        joints[joint.name] = joint
+    stated = dict(joints)
     for mimic in source.mimics:
-        if mimic.source not in limits:
-            raise RobotError(f"{mimic.joint!r} mimics {mimic.source!r}, which is no joint of the same file.")
-        low, high = sorted((mimic.multiplier * limits[mimic.source] + mimic.offset).tolist())
-        row = next(i for i, joint in enumerate(joints) if joint.name == mimic.joint)
-        if low < joints[row].lower or high > joints[row].upper:
-            stated = f"{joints[row].lower:.4g}..{joints[row].upper:.4g}"
+        if mimic.source not in joints:
+            raise RobotError(f"{mimic.joint!r} mimics {mimic.source!r}, which is not a joint of the same file.")
+        driver = stated[mimic.source]
+        joint = joints[mimic.joint]
+        ends = mimic.multiplier * np.array((driver.lower, driver.upper)) + mimic.offset
+        low, high = sorted(ends.tolist())
+        if low < joint.lower or high > joint.upper:
             notes.append(
-                f"{mimic.joint!r} has the limits {low:.4g}..{high:.4g} that {mimic.source!r} gives it, in place of {stated}"
+                f"{mimic.joint!r} has the limits {low:.4g}..{high:.4g} that {mimic.source!r} gives it, "
+                f"in place of {joint.lower:.4g}..{joint.upper:.4g}"
             )
-            joints[row] = replace(joints[row], lower=low, upper=high)
-    return replace(source, tree=replace(source.tree, joints=tuple(joints)), notes=tuple(notes))
+            joints[mimic.joint] = replace(joint, lower=low, upper=high)
+    return replace(source, tree=replace(source.tree, joints=tuple(joints.values())), notes=tuple(notes))
 
 
 def _with_masses(source: Source) -> Source:
-    """Masses and inertias that a solid body can have: from the shapes where none or an impossible one is stated."""
-    links: list[Link] = []
+    """Return the source with masses and inertias that a solid body can have: those of the shapes where the stated ones are impossible."""
+    links = []
     replaced: dict[str, list[str]] = {}
     for link in source.tree.links:
         if not link.collisions:
             if link.mass <= FRAME_MASS or not plausible(link):
                 link = replace(link, mass=max(link.mass, FRAME_MASS), inertia=np.eye(3) * FRAME_INERTIA)
-            links.append(link)
-            continue
-        if link.mass <= 0 or not plausible(link):
-            vertices, faces = surface_of(link.collisions)
-            volume = float(
-                np.einsum("ij,ij->", vertices[faces[:, 0]], np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]])) / 6
-            )
-            mass = link.mass if link.mass > 0 else _DENSITY * volume
-            com, inertia = mass_properties(vertices, faces, mass)
+        elif link.mass <= 0 or not plausible(link):
             why = "have no mass" if link.mass <= 0 else "have an inertia that their mass and size do not allow"
-            replaced.setdefault(why, []).append(f"{link.name} ({mass:.3g} kg)")
-            link = replace(link, mass=mass, com=com, inertia=inertia)
+            link = _with_mass_of_shapes(link)
+            replaced.setdefault(why, []).append(f"{link.name} ({link.mass:.3g} kg)")
         links.append(link)
-    notes = (f"these links {why}, and get that of their shapes: {', '.join(names)}" for why, names in replaced.items())
+    notes = [f"these links {why}, and get that of their shapes: {', '.join(names)}" for why, names in replaced.items()]
     return replace(source, tree=replace(source.tree, links=tuple(links)), notes=(*source.notes, *notes))
 
 
+def _with_mass_of_shapes(link: Link) -> Link:
+    vertices, faces = surface_of(link.collisions)
+    mass = link.mass
+    if mass <= 0:
+        a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+        mass = _DENSITY * float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+    com, inertia = mass_properties(vertices, faces, mass)
+    if not (np.isfinite(com).all() and np.isfinite(inertia).all()):
+        raise RobotError(f"the shapes of link {link.name!r} have no volume. State the mass and inertia of the link.")
+    return replace(link, mass=mass, com=com, inertia=inertia)
+
+
 def plausible(link: Link) -> bool:
-    """Whether a link's moments are positive, those of a solid body, and no larger than its mass at twice its shapes' reach would have."""
+    """Return whether a link's moments are positive, those of a solid body, and at most :func:`largest_moment`."""
     moments = np.linalg.eigvalsh(link.inertia)
     if moments[0] <= 0 or moments[2] > (moments[0] + moments[1]) * 1.001:
         return False
@@ -211,16 +252,22 @@ def plausible(link: Link) -> bool:
 
 
 def largest_moment(link: Link) -> float:
-    """[kg m^2] What a link's mass at twice its shapes' reach would have, and the rotor of a joint besides."""
+    """[kg m^2] Moment of the link's mass at twice the reach of its shapes, and of the rotor of a joint."""
     vertices, _ = surface_of(link.collisions)
     return link.mass * (2 * float(np.linalg.norm(vertices - link.com, axis=1).max())) ** 2 + _ROTOR_AT_MOST
 
 
 # MJCF ------------------------------------------------------------------------------------------------------------------------------------
 
+_LARGEST = {"hfield": ("nrow", "ncol"), "texture": ("width", "height"), "size": ("nkey",)}
+"""Elements whose numbers decide how much memory MuJoCo takes."""
+_ENTRIES = 2**24
+_COPIES = 1000
+_SOLIDS = ("sphere", "capsule", "cylinder", "box", "mesh", "plane")
 
-def _mjcf_model(path: Path) -> tuple[Any, Any]:
-    """The model, and the module that has read it."""
+
+def _read_mjcf(path: Path, root: ElementTree.Element) -> Source:
+    _check_sizes(path, root)
     try:
         import mujoco
     except ImportError as error:
@@ -235,175 +282,215 @@ def _mjcf_model(path: Path) -> tuple[Any, Any]:
         raise RobotError(
             f"{path} uses what xreset does not have:" + "".join(f"\n  - {problem}" for problem in problems)
         )
-    return model, mujoco
+    for quats in (model.body_quat, model.body_iquat, model.geom_quat):
+        if not np.allclose(np.linalg.norm(quats, axis=1), 1, atol=1e-3):
+            raise RobotError(f"{path} has an orientation that is not finite.")
+    return _MjcfReader(path, model, mujoco).source()
 
 
-def _read_mjcf(path: Path) -> Source:
-    model, mujoco = _mjcf_model(path)
-    notes: list[str] = []
-    names = [model.body(i).name or f"body{i}" for i in range(model.nbody)]
-    tops = [i for i in range(1, model.nbody) if model.body_parentid[i] == 0]
-    if len(tops) != 1:
-        raise RobotError(
-            f"{path}: expected one body in the world, found {', '.join(names[i] for i in tops) or 'none'}."
+def _check_sizes(path: Path, root: ElementTree.Element) -> None:
+    """Raise ``RobotError`` for a small file that takes much memory when MuJoCo reads it."""
+
+    def product(element: ElementTree.Element, names: Iterable[str]) -> float:
+        try:
+            return math.prod(float(element.get(name, 1)) for name in names)
+        except ValueError:
+            return 1.0  # MuJoCo says what is wrong
+
+    for tag, names in _LARGEST.items():
+        for element in root.iter(tag):
+            if product(element, names) > _ENTRIES:
+                raise RobotError(f"{path}: a {tag} has {product(element, names):.3g} entries, which is too many.")
+    copies = math.prod(product(element, ["count"]) for element in root.iter("replicate"))
+    if copies > _COPIES:
+        raise RobotError(f"{path} replicates up to {copies:.3g} times, which is too often.")
+
+
+class _MjcfReader:
+    """Turns a model of MuJoCo into links and joints.
+
+    A joint may be away from its body's origin. The link's frame is put onto the joint, ``shift`` from the origin.
+    """
+
+    def __init__(self, path: Path, model: Any, mujoco: Any) -> None:
+        self.path = path
+        self.model = model
+        self.mujoco = mujoco
+        self.names = [model.body(i).name or f"body{i}" for i in range(model.nbody)]
+        self.shift = np.zeros((model.nbody, 3))
+        self.notes: list[str] = []
+        self.links: dict[str, Link] = {}
+        self.joints: list[Joint] = []
+        self.joint_names: dict[int, str] = {}
+
+    def source(self) -> Source:
+        tops = [i for i in range(1, self.model.nbody) if self.model.body_parentid[i] == 0]
+        if len(tops) != 1:
+            found = ", ".join(self.names[i] for i in tops) or "none"
+            raise RobotError(f"{self.path}: expected one body in the world, found {found}.")
+        for body in range(1, self.model.nbody):
+            self._add_body(body, is_root=body == tops[0])
+        root = self.names[tops[0]]
+        order = [root, *(joint.child for joint in self.joints)]
+        tree = RobotTree(
+            name=self.path.stem,
+            root=root,
+            links=tuple(self.links[name] for name in order),
+            joints=tuple(self.joints),
         )
-    shift = np.zeros((model.nbody, 3))  # a joint may lie beside its body's origin: the link's frame is put onto it
-    links, joints, joint_name = [], [], {}
-    for body in range(1, model.nbody):
-        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-        own = [j for j in range(first, first + count) if int(model.jnt_type[j]) != int(mujoco.mjtJoint.mjJNT_FREE)]
-        if count > len(own):
-            notes.append(f"the free joint of {names[body]!r} is left out")
-        shift[body] = model.jnt_pos[own[0]] if own else 0.0
-        if any(np.abs(model.jnt_pos[j] - shift[body]).max() > 1e-9 for j in own):
-            raise RobotError(f"{path}: the joints of body {names[body]!r} do not meet in one point.")
-        inner = np.eye(4)
-        inner[:3, :3], inner[:3, 3] = _matrix(model.body_iquat[body]), model.body_ipos[body] - shift[body]
-        link = Link(
-            name=names[body],
-            mass=float(model.body_mass[body]),
-            com=inner[:3, 3].copy(),
-            inertia=inner[:3, :3] @ np.diag(model.body_inertia[body]) @ inner[:3, :3].T,
-            collisions=tuple(_geoms(model, mujoco, body, shift[body])),
+        mimics = []
+        for equality in map(self.model.equality, range(self.model.neq)):
+            if equality.obj2id[0] >= 0:
+                offset, multiplier = map(float, equality.data[:2])
+                joint = self.joint_names[int(equality.obj1id[0])]
+                driver = self.joint_names[int(equality.obj2id[0])]
+                mimics.append(MimicSpec(joint=joint, source=driver, multiplier=multiplier, offset=offset))
+        drives, efforts = self._drives()
+        return Source(tree=tree, mimics=tuple(mimics), effort=efforts, drives=drives, notes=tuple(self.notes))
+
+    def _add_body(self, number: int, is_root: bool) -> None:
+        body = self.model.body(number)
+        name = self.names[number]
+        first = int(body.jntadr[0])
+        joints = [self.model.joint(first + i) for i in range(int(body.jntnum[0]))]
+        moving = [joint for joint in joints if int(joint.type[0]) != int(self.mujoco.mjtJoint.mjJNT_FREE)]
+        if len(joints) > len(moving):
+            self.notes.append(f"the free joint of {name!r} is left out")
+        if is_root and moving:
+            raise RobotError(f"{self.path}: the first body {name!r} has joints; put it into a body that does not move.")
+        if moving:
+            self.shift[number] = moving[0].pos
+        if any(np.abs(joint.pos - self.shift[number]).max() > 1e-9 for joint in moving):
+            raise RobotError(f"{self.path}: the joints of body {name!r} do not meet in one point.")
+        R = _matrix(body.iquat)
+        self.links[name] = Link(
+            name=name,
+            mass=float(body.mass[0]),
+            com=body.ipos - self.shift[number],
+            inertia=R @ np.diag(body.inertia) @ R.T,
+            collisions=tuple(self._shapes(number)),
         )
-        if body != tops[0]:
-            parent = int(model.body_parentid[body])
-            T = np.eye(4)
-            T[:3, :3] = _matrix(model.body_quat[body])
-            T[:3, 3] = model.body_pos[body] + T[:3, :3] @ shift[body] - shift[parent]
-            above = names[parent]
-            for number, j in enumerate(own):
-                last = number == len(own) - 1
-                below = names[body] if last else f"{names[body]}_axis{number}"
-                joint_name[j] = model.joint(j).name or f"joint{j}"
-                joints.append(_mjcf_joint(model, mujoco, j, joint_name[j], above, below, T))
-                if not last:
-                    links.append(Link(name=below, mass=0.0, com=np.zeros(3), inertia=np.zeros((3, 3)), collisions=()))
-                above, T = below, np.eye(4)
-            if not own:
-                joints.append(fixed(above, names[body], T))
-        elif own:
-            raise RobotError(
-                f"{path}: the first body {names[body]!r} has joints; put it into a body that does not move."
-            )
-        links.append(link)
-    mimics = []
-    for i in range(model.neq):
-        if model.eq_obj2id[i] >= 0:
-            ends = [joint_name[int(model.eq_obj1id[i])], joint_name[int(model.eq_obj2id[i])]]
-            offset, factor = (float(value) for value in model.eq_data[i, :2])
-            mimics.append(MimicSpec(joint=ends[0], source=ends[1], multiplier=factor, offset=offset))
-    order = {link.name: link for link in links}
-    tree = RobotTree(
-        name=Path(path).stem,
-        root=names[tops[0]],
-        links=(order[names[tops[0]]], *(order[j.child] for j in joints)),
-        joints=tuple(joints),
-    )
-    drives, effort = _mjcf_drives(model, joint_name)
-    return Source(tree=tree, mimics=tuple(mimics), effort=effort, drives=drives, notes=tuple(notes))
-
-
-def _mjcf_drives(model, joint_name: dict[int, str]) -> tuple[dict[str, DriveSpec], dict[str, float]]:
-    """Position drives and efforts of the joints that have actuators."""
-    drives, effort = {}, {}
-    for i in range(model.nu):
-        j = int(model.actuator_trnid[i, 0])
-        kp, kd = float(model.actuator_gainprm[i, 0]), float(-model.actuator_biasprm[i, 2])
-        limit = float(model.actuator_forcerange[i, 1]) if model.actuator_forcelimited[i] else 0.0
-        if limit <= 0 and model.jnt_actfrclimited[j]:
-            limit = float(model.jnt_actfrcrange[j, 1])
-        if limit > 0:
-            effort[joint_name[j]] = limit
-        if kp > 0 and model.actuator_biasprm[i, 1] < 0:
-            dof = int(model.jnt_dofadr[j])
-            kd += float(model.dof_damping[dof])
-            armature = float(model.dof_armature[dof])
-            drives[joint_name[j]] = DriveSpec(kp=kp, kd=kd, effort=max(limit, 0.0), armature=armature)
-    return drives, effort
-
-
-def _unsupported(model, mujoco) -> list[str]:
-    """Every feature of a model that a robot of xreset cannot have."""
-    kinds, geoms = mujoco.mjtJoint, mujoco.mjtGeom
-    problems = [
-        f"the ball joint {model.joint(j).name!r}"
-        for j in range(model.njnt)
-        if int(model.jnt_type[j]) == int(kinds.mjJNT_BALL)
-    ]
-    for i in range(model.ngeom):
-        solid = model.geom_contype[i] or model.geom_conaffinity[i]
-        known = {
-            int(getattr(geoms, f"mjGEOM_{kind}")) for kind in ("BOX", "SPHERE", "CAPSULE", "CYLINDER", "MESH", "PLANE")
-        }
-        if solid and int(model.geom_type[i]) not in known:
-            kind = geoms(int(model.geom_type[i])).name.removeprefix("mjGEOM_").lower()
-            problems.append(
-                f"the {kind} {model.geom(i).name or i!r} of body {model.body(int(model.geom_bodyid[i])).name!r}"
-            )
-    for i in range(model.nu):
-        if int(model.actuator_trntype[i]) != int(mujoco.mjtTrn.mjTRN_JOINT):
-            problems.append(f"the actuator {model.actuator(i).name!r}, which does not drive a single joint")
-    for i in range(model.neq):
-        if int(model.eq_type[i]) != int(mujoco.mjtEq.mjEQ_JOINT):
-            problems.append(
-                f"the equality {model.equality(i).name or i!r} of type {mujoco.mjtEq(int(model.eq_type[i])).name[5:].lower()}"
-            )
-        elif np.abs(model.eq_data[i, 2:5]).max() > 0:
-            problems.append(
-                f"the equality {model.equality(i).name or i!r}, which couples joints by a curve that is not straight"
-            )
-    problems += [f"the tendon {model.tendon(i).name or i!r}" for i in range(model.ntendon)]
-    problems += ["flexible bodies"] * bool(model.nflex)
-    return problems
-
-
-def _mjcf_joint(model, mujoco, j: int, name: str, parent: str, child: str, T: np.ndarray) -> Joint:
-    limited = bool(model.jnt_limited[j])
-    return Joint(
-        name=name,
-        type="prismatic" if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_SLIDE) else "revolute",
-        parent=parent,
-        child=child,
-        T_parent_joint=T,
-        axis=np.array(model.jnt_axis[j]) / np.linalg.norm(model.jnt_axis[j]),
-        lower=float(model.jnt_range[j, 0]) if limited else -math.inf,
-        upper=float(model.jnt_range[j, 1]) if limited else math.inf,
-        velocity=math.inf,
-    )
-
-
-def _geoms(model, mujoco, body: int, shift: np.ndarray) -> Iterable[Shape]:
-    """The collision shapes of a body."""
-    kinds = mujoco.mjtGeom
-    for i in range(int(model.body_geomadr[body]), int(model.body_geomadr[body]) + int(model.body_geomnum[body])):
-        if not (model.geom_contype[i] or model.geom_conaffinity[i]) or int(model.geom_type[i]) == int(
-            kinds.mjGEOM_PLANE
-        ):
-            continue
+        if is_root:
+            return
+        parent = int(body.parentid[0])
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = _matrix(model.geom_quat[i]), model.geom_pos[i] - shift
-        size = [float(value) for value in model.geom_size[i]]
-        kind = int(model.geom_type[i])
-        if kind == int(kinds.mjGEOM_MESH):
-            mesh = int(model.geom_dataid[i])
-            begin = int(model.mesh_vertadr[mesh])
-            vertices = np.array(model.mesh_vert[begin : begin + int(model.mesh_vertnum[mesh])], dtype=float)
-            try:
-                geometry = hull(vertices, HULL_TOLERANCE).geometry
-            except ObjectError as error:
-                raise RobotError(
-                    f"the mesh {model.mesh(mesh).name!r} of body {model.body(body).name!r}: {error}"
-                ) from error
-        elif kind == int(kinds.mjGEOM_BOX):
-            geometry = Geometry(kind="box", size=tuple(size))
-        elif kind == int(kinds.mjGEOM_SPHERE):
-            geometry = Geometry(kind="sphere", size=(size[0],))
-        else:
-            geometry = Geometry(
-                kind="capsule" if kind == int(kinds.mjGEOM_CAPSULE) else "cylinder", size=(size[0], size[1])
-            )
-        yield Shape(geometry=geometry, T_body_shape=T)
+        T[:3, :3] = _matrix(body.quat)
+        T[:3, 3] = body.pos + T[:3, :3] @ self.shift[number] - self.shift[parent]
+        above = self.names[parent]
+        if not moving:
+            self.joints.append(fixed(above, name, T))
+        for i, joint in enumerate(moving):
+            child = name
+            if i < len(moving) - 1:  # a link without mass between two joints of one body
+                child = f"{name}_axis{i}"
+                nothing = np.zeros((3, 3))
+                self.links[child] = Link(name=child, mass=0.0, com=np.zeros(3), inertia=nothing, collisions=())
+            self.joints.append(self._joint(joint, above, child, T))
+            above = child
+            T = np.eye(4)
+
+    def _joint(self, joint: Any, parent: str, child: str, T: np.ndarray) -> Joint:
+        name = joint.name or f"joint{joint.id}"
+        self.joint_names[joint.id] = name
+        lower, upper = -math.inf, math.inf
+        if self.model.jnt_limited[joint.id]:
+            lower, upper = map(float, joint.range)
+        is_slide = int(joint.type[0]) == int(self.mujoco.mjtJoint.mjJNT_SLIDE)
+        return Joint(
+            name=name,
+            type="prismatic" if is_slide else "revolute",
+            parent=parent,
+            child=child,
+            T_parent_joint=T,
+            axis=joint.axis / np.linalg.norm(joint.axis),
+            lower=lower,
+            upper=upper,
+            velocity=math.inf,
+        )
+
+    def _drives(self) -> tuple[dict[str, DriveSpec], dict[str, float]]:
+        """Return position drives and efforts of the joints that have actuators."""
+        model = self.model
+        drives = {}
+        efforts = {}
+        for i in range(model.nu):
+            joint = int(model.actuator_trnid[i, 0])
+            name = self.joint_names[joint]
+            gain = float(model.actuator_gainprm[i, 0])
+            _, kp, kd = map(float, -model.actuator_biasprm[i, :3])
+            limit = 0.0
+            if model.actuator_forcelimited[i]:
+                limit = float(model.actuator_forcerange[i, 1])
+            elif kp == 0 and model.actuator_ctrllimited[i]:  # a motor: its control is a force
+                limit = abs(gain * model.actuator_gear[i, 0]) * float(model.actuator_ctrlrange[i, 1])
+            if limit <= 0 and model.jnt_actfrclimited[joint]:
+                limit = float(model.jnt_actfrcrange[joint, 1])
+            if limit > 0:
+                efforts[name] = limit
+            if gain > 0 and kp > 0:
+                dof = int(model.jnt_dofadr[joint])
+                kd += float(model.dof_damping[dof])
+                armature = float(model.dof_armature[dof])
+                drives[name] = DriveSpec(kp=gain, kd=kd, effort=max(limit, 0.0), armature=armature)
+        return drives, efforts
+
+    def _shapes(self, number: int) -> Iterable[Shape]:
+        """Return the collision shapes of a body."""
+        body = self.model.body(number)
+        first = int(body.geomadr[0])
+        for geom in (self.model.geom(first + i) for i in range(int(body.geomnum[0]))):
+            kind = _kind(self.mujoco, geom)
+            if not _is_solid(geom) or kind == "plane":
+                continue
+            T = np.eye(4)
+            T[:3, :3] = _matrix(geom.quat)
+            T[:3, 3] = geom.pos - self.shift[number]
+            count = {"box": 3, "sphere": 1}.get(kind, 2)
+            geometry = Geometry(kind=kind, size=tuple(map(float, geom.size[:count])))  # pyright: ignore[reportArgumentType]
+            if kind == "mesh":
+                mesh = self.model.mesh(int(geom.dataid[0]))
+                begin = int(mesh.vertadr[0])
+                vertices = self.model.mesh_vert[begin : begin + int(mesh.vertnum[0])].astype(float)
+                try:
+                    geometry = hull(vertices, HULL_TOLERANCE).geometry
+                except ObjectError as error:
+                    raise RobotError(f"the mesh {mesh.name!r} of body {body.name!r}: {error}") from error
+            yield Shape(geometry=geometry, T_body_shape=T)
+
+
+def _kind(mujoco: Any, geom: Any) -> str:
+    return mujoco.mjtGeom(int(geom.type[0])).name.removeprefix("mjGEOM_").lower()
+
+
+def _is_solid(geom: Any) -> bool:
+    return bool(geom.contype[0] or geom.conaffinity[0])
+
+
+def _unsupported(model: Any, mujoco: Any) -> list[str]:
+    """Return every feature of a model that a robot of xreset cannot have."""
+    problems = []
+    for joint in map(model.joint, range(model.njnt)):
+        if int(joint.type[0]) == int(mujoco.mjtJoint.mjJNT_BALL):
+            problems.append(f"the ball joint {joint.name!r}")
+    for geom in map(model.geom, range(model.ngeom)):
+        kind = _kind(mujoco, geom)
+        if _is_solid(geom) and kind not in _SOLIDS:
+            body = model.body(int(geom.bodyid[0])).name
+            problems.append(f"the {kind} {geom.name or geom.id!r} of body {body!r}")
+    for actuator in map(model.actuator, range(model.nu)):
+        if int(actuator.trntype[0]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+            problems.append(f"the actuator {actuator.name!r}, which does not drive a single joint")
+    for equality in map(model.equality, range(model.neq)):
+        name = equality.name or equality.id
+        kind = mujoco.mjtEq(int(equality.type[0]))
+        if kind != mujoco.mjtEq.mjEQ_JOINT:
+            problems.append(f"the equality {name!r} of type {kind.name.removeprefix('mjEQ_').lower()}")
+        elif np.abs(equality.data[2:5]).max() > 0:
+            problems.append(f"the equality {name!r}, which couples joints by a curve that is not straight")
+    problems += [f"the tendon {model.tendon(i).name or i!r}" for i in range(model.ntendon)]
+    if model.nflex:
+        problems.append("flexible bodies")
+    return problems
 
 
 def _matrix(quat: np.ndarray) -> np.ndarray:

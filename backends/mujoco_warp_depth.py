@@ -1,14 +1,14 @@
-"""The depth of contacts that MuJoCo-Warp 4.0.0 clips to one point, as MuJoCo 4.0.0 has it.
+"""Correct the depth of contacts that MuJoCo-Warp clips to one point, so that it is as in MuJoCo.
 
-Where a flat face or an edge lies on a face, both engines clip the one with the other and place contacts at the corners of what is left
-(multi-CCD). Often one corner alone is in the other body: of a finger, say, that lies across the rim of a can. MuJoCo takes place and depth
-of such a contact from that corner. MuJoCo-Warp takes its place, and the depth of the pair's deepest point, which is elsewhere: 82, 186 and
-211 um where 34, 126 and 156 um are right, in three of the five grasps with which ``docs/parity.md`` began. Held objects part within
-one step; with the corner's depth the joints of those five follow MuJoCo's to 1.6e-5 rad (median over a second) instead of 6.9e-4.
+Where a flat face or an edge is on a face, both engines clip the one with the other and place contacts at the corners of
+what is left (multi-CCD). Often one corner alone is in the other body: of a finger, say, across the rim of a can. MuJoCo
+takes place and depth of such a contact from that corner. MuJoCo-Warp 4.0.0 takes its place, but the depth of the pair's
+deepest point, which is elsewhere: 82, 186 and 211 um where 34, 126 and 156 um are right, in three of five grasps. Held
+objects part within one step. With the corner's depth the joints follow MuJoCo's to 1.6e-5 rad (median over a second)
+instead of 6.9e-4.
 
-No setting changes it, and the step offers no place between collision and constraints where the corner's depth is still known. So the
-engine's function is wrapped, before any kernel is made of it. This module reads the engine's private modules: import it only with a version
-that is known to need it.
+No setting changes the depth, and no place in the step between collision and constraints still knows it. So the engine's
+function is wrapped before any kernel is made of it. This module reads the engine's private modules.
 """
 
 # Warp compiles these functions from their source; to a type checker of Python they make no sense.
@@ -24,6 +24,8 @@ from mujoco_warp._src.types import mat43
 
 _APART = wp.constant(1e6)
 """Distance [m] at which no contact is written."""
+KNOWN_FAULT = "9587990e6dd180da"
+"""Digest of the source of the engine's ``multicontact`` that has the fault."""
 
 
 @wp.func
@@ -49,10 +51,10 @@ def multicontact_with_depth(
     geomtype1: int,
     geomtype2: int,
 ) -> tuple[int, mat43, mat43, wp.vec4]:
-    """The engine's function; to a single corner it adds one that is apart, for the caller uses the depths of two and more."""
+    """Add a corner that is apart to a single corner, because the caller uses the depths of two and more."""
     count, witness1, witness2, depth = multicontact(
-        polygon, clipped, plane_normal, plane_dist, idx1, idx2, n1, n2, endvert, face1, face2, epa_vert, epa_vert_index, epa_face,
-        x1, x2, geom1, geom2, geomtype1, geomtype2,
+        polygon, clipped, plane_normal, plane_dist, idx1, idx2, n1, n2, endvert, face1, face2, epa_vert, epa_vert_index,
+        epa_face, x1, x2, geom1, geom2, geomtype1, geomtype2,
     )  # fmt: skip
     if count == 1 and depth[0] != 0.0:  # zero: nothing was clipped, and the depth of the pair is right
         depth[1] = _APART
@@ -61,5 +63,5 @@ def multicontact_with_depth(
 
 
 def correct_depths() -> None:
-    """Have the engine's collision use :func:`multicontact_with_depth`. Kernels made before keep the fault."""
+    """Make the engine's collision use :func:`multicontact_with_depth`. Kernels that exist already keep the fault."""
     collision_convex.multicontact = multicontact_with_depth

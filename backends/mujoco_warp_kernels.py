@@ -1,11 +1,12 @@
-"""Warp kernels around MuJoCo-Warp's own: they translate between its arrays and the project's, on the device.
+"""Warp kernels that translate between MuJoCo-Warp's arrays and the project's, on the device.
 
-Letters as in :mod:`xreset.physics`; Q mimic joints. Quaternions are stored (w, x, y, z) in a ``wp.quat``, as MuJoCo does.
+Letters are those of :mod:`xreset.physics`; Q mimic joints. Quaternions are stored (w, x, y, z) in a ``wp.quat``, as in
+MuJoCo.
 """
 
 # Warp compiles these functions from their source; to a type checker of Python they make no sense.
-# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
-# pyright: reportGeneralTypeIssues=false, reportAssignmentType=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false, reportAssignmentType=false
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ import warp as wp
 
 from xreset.backends.mjcf_model import OBJECT, TABLE
 
-_OBJECT, _TABLE = wp.constant(OBJECT), wp.constant(TABLE)
+_OBJECT = wp.constant(OBJECT)
+_TABLE = wp.constant(TABLE)
 
 
 @wp.func
@@ -196,7 +198,8 @@ def read_state(
     for j in range(joint_qpos.shape[0]):
         joint_pos[world, j] = qpos[world, joint_qpos[j]]
         joint_vel[world, j] = qvel[world, joint_dof[j]]
-    q, v = object_qpos, object_dof
+    q = object_qpos
+    v = object_dof
     quat = wp.quat(qpos[world, q + 3], qpos[world, q + 4], qpos[world, q + 5], qpos[world, q + 6])
     object_pos[world] = wp.vec3(qpos[world, q], qpos[world, q + 1], qpos[world, q + 2])
     object_quat[world] = quat
@@ -260,7 +263,8 @@ def read_contacts(
     if contact >= wp.min(nacon[0], naconmax):
         return
     geoms = contact_geom[contact]
-    first, second = geom_role[geoms[0]], geom_role[geoms[1]]
+    first = geom_role[geoms[0]]
+    second = geom_role[geoms[1]]
     if (first == _OBJECT) == (second == _OBJECT):
         return
     world = contact_world[contact]
@@ -283,25 +287,22 @@ def read_contacts(
 
 
 def outputs(num_worlds: int, joints: int, tips: int) -> dict[str, Any]:
-    """Arrays that the kernels read the worlds into; links are the palm and the fingertips."""
-
-    def zeros(shape: int | tuple[int, ...], dtype: Any) -> Any:
-        return wp.zeros(shape, dtype=dtype)
-
-    n, links = num_worlds, 1 + tips
+    """Return the arrays that the kernels read the worlds into; links are the palm and the fingertips."""
+    n = num_worlds
+    links = (num_worlds, 1 + tips)
     return {
-        "joint_pos": zeros((n, joints), float),
-        "joint_vel": zeros((n, joints), float),
-        "object_pos": zeros(n, wp.vec3),
-        "object_quat": zeros(n, wp.quat),
-        "object_linvel": zeros(n, wp.vec3),
-        "object_angvel": zeros(n, wp.vec3),
-        "nonfinite": zeros(n, wp.bool),
-        "link_pos": zeros((n, links), wp.vec3),
-        "link_quat": zeros((n, links), wp.quat),
-        "link_linvel": zeros((n, links), wp.vec3),
-        "link_angvel": zeros((n, links), wp.vec3),
-        "tip_force": zeros((n, tips), wp.vec3),
-        "tip_touch": zeros((n, tips), wp.bool),
-        "table_force": zeros(n, wp.vec3),
+        "joint_pos": wp.zeros((n, joints), dtype=float),
+        "joint_vel": wp.zeros((n, joints), dtype=float),
+        "object_pos": wp.zeros(n, dtype=wp.vec3),
+        "object_quat": wp.zeros(n, dtype=wp.quat),
+        "object_linvel": wp.zeros(n, dtype=wp.vec3),
+        "object_angvel": wp.zeros(n, dtype=wp.vec3),
+        "nonfinite": wp.zeros(n, dtype=wp.bool),
+        "link_pos": wp.zeros(links, dtype=wp.vec3),
+        "link_quat": wp.zeros(links, dtype=wp.quat),
+        "link_linvel": wp.zeros(links, dtype=wp.vec3),
+        "link_angvel": wp.zeros(links, dtype=wp.vec3),
+        "tip_force": wp.zeros((n, tips), dtype=wp.vec3),
+        "tip_touch": wp.zeros((n, tips), dtype=wp.bool),
+        "table_force": wp.zeros(n, dtype=wp.vec3),
     }

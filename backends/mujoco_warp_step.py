@@ -1,7 +1,7 @@
-"""A physics step of MuJoCo-Warp 4.0.0 in which what moves the bodies freely is worked out beside collisions and constraints.
+"""A physics step of MuJoCo-Warp that computes free motion next to collisions and constraints.
 
-Neither reads what the other writes, and neither fills a GPU: most of their kernels are short. A test compares with the engine's step, in
-either order. Import this only with a version of which that is known.
+Neither reads what the other writes, and neither fills a GPU: most of their kernels are short. A test compares with the
+engine's step, in either order. This module reads the engine's private modules.
 """
 
 from __future__ import annotations
@@ -10,11 +10,17 @@ from typing import Any
 
 import mujoco_warp as mjw
 import warp as wp
+from mujoco_warp._src import forward
 from mujoco_warp._src.smooth import tendon_armature
+
+ORIGINAL = (forward.step, forward._forward, forward.fwd_position)
+"""The engine's functions that :class:`ForkedStep` replaces."""
+KNOWN_STEP = "f65bf1f9a5f3ba09"
+"""Digest of their source."""
 
 
 def smooth_dynamics(m: Any, d: Any) -> None:
-    """Inertia, forces that are not of constraints, and what they would accelerate."""
+    """Compute inertia, forces other than those of constraints, and their accelerations."""
     mjw.crb(m, d)
     tendon_armature(m, d)
     mjw.transmission(m, d)
@@ -24,34 +30,34 @@ def smooth_dynamics(m: Any, d: Any) -> None:
 
 
 def constraints(m: Any, d: Any) -> None:
-    """Contacts and rows of constraints."""
+    """Find contacts and rows of constraints."""
     mjw.collision(m, d)
     mjw.make_constraint(m, d)
 
 
 def finish(m: Any, d: Any) -> None:
-    """Forces of the constraints, then the next positions and velocities."""
+    """Compute forces of the constraints, then the next positions and velocities."""
     mjw.solve(m, d)
     mjw.implicit(m, d)
 
 
 class ForkedStep:
-    """``mujoco_warp.step`` from after its kinematics on: those of the present positions must be there."""
+    """``mujoco_warp.step`` after its kinematics: those of the present positions must be there."""
 
     def __init__(self, device: Any) -> None:
         """Make the second stream."""
-        self._beside = wp.Stream(device) if device.is_cuda else None
+        self._second = wp.Stream(device) if device.is_cuda else None
 
     def __call__(self, m: Any, d: Any) -> None:
         """Queue the step on Warp's current stream."""
-        if self._beside is None:
+        if self._second is None:
             smooth_dynamics(m, d)
             constraints(m, d)
         else:
             main = wp.get_stream()
-            self._beside.wait_stream(main)
-            with wp.ScopedStream(self._beside, sync_enter=False):
+            self._second.wait_stream(main)
+            with wp.ScopedStream(self._second, sync_enter=False):
                 smooth_dynamics(m, d)
             constraints(m, d)
-            main.wait_stream(self._beside)
+            main.wait_stream(self._second)
         finish(m, d)

@@ -1,7 +1,8 @@
 """A robot as moving rigid bodies: what the backends build that must know masses and frames themselves.
 
-Links that are fixed to one another are fused into one body with their common mass, centre of mass and inertia; :class:`Mechanism` says
-where every link has gone. Also numpy operations on a few quaternions (w, x, y, z), which backends need every step.
+Links that are fixed to one another are fused into one body with their common mass, centre of mass and inertia;
+:class:`Mechanism` states where every link is. Also numpy operations on a few quaternions (w, x, y, z), which backends
+need every step.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -39,7 +41,13 @@ class Inertia:
         return axes.T @ (self.moments[:, None] * axes)
 
     def changed(self, *, mass: float | None = None, scale: float = 1.0, offset: np.ndarray | float = 0.0) -> Inertia:
-        """With another mass [kg], with which the inertia scales; a further factor on the inertia; the centre of mass moved by [3] m."""
+        """Return the inertia with another mass.
+
+        Args:
+            mass: [kg]; the moments scale with it.
+            scale: a further factor on the moments.
+            offset: [3] by how much the centre of mass moves [m].
+        """
         mass = self.mass if mass is None else mass
         return replace(self, mass=mass, com=self.com + offset, moments=self.moments * (scale * mass / self.mass))
 
@@ -86,38 +94,48 @@ class Mechanism:
 
     @cached_property
     def tip_of(self) -> dict[str, int]:
-        """Link -> index of the fingertip that it is a contact link of."""
-        return {link: i for i, tip in enumerate(self.robot.fingertips) for link in tip.contact_links}
+        """Contact link -> index of its fingertip."""
+        tips = {}
+        for i, tip in enumerate(self.robot.fingertips):
+            tips |= dict.fromkeys(tip.contact_links, i)
+        return tips
 
     def may_collide(self, a: str, b: str) -> bool:
-        """Whether two links of the robot collide with each other in physics.
+        """Return whether two links of the robot collide with each other in physics.
 
-        Both must be among ``self_collision_links``; links of one body or of neighbouring bodies never do, nor do excluded pairs.
+        Both must be among ``self_collision_links``; links of one body or of neighbouring bodies never collide, nor do
+        excluded pairs.
         """
         robot = self.robot
-        if a not in robot.self_collision_links or b not in robot.self_collision_links:
+        if not {a, b} <= set(robot.self_collision_links):
             return False
-        i, j = self.frames[a][0], self.frames[b][0]
-        neighbours = i == j or self.bodies[i].parent == j or self.bodies[j].parent == i
-        return not (neighbours or (a, b) in robot.collision_exclude or (b, a) in robot.collision_exclude)
+        if (a, b) in robot.collision_exclude or (b, a) in robot.collision_exclude:
+            return False
+        i = self.frames[a][0]
+        j = self.frames[b][0]
+        return i != j and self.bodies[i].parent != j and self.bodies[j].parent != i
 
 
 def mechanism(robot: RobotSpec) -> Mechanism:
     """Fuse the fixed links of a robot.
 
     Raises:
-        RobotError: the description names links or joints that the URDF lacks, a moving joint is neither driven nor a mimic, a driven
-            joint is fixed, or a moving body has impossible mass properties.
+        RobotError: the description names links or joints that the URDF lacks, a moving joint is neither driven nor a
+            mimic, a driven joint is fixed, or a moving body has impossible mass properties.
     """
     tree = robot_tree(robot)
     _check_names(robot, tree)
-    joints: list[Joint | None] = [None, *tree.joints]
     frames: dict[str, tuple[int, np.ndarray]] = {}
     members: list[list[Link]] = []
+    """Links of each body."""
     placed: list[tuple[Joint | None, int, np.ndarray]] = []
-    for link, joint in zip(tree.links, joints, strict=True):
-        parent, T = (-1, np.eye(4)) if joint is None else frames[joint.parent]
-        T = T if joint is None else T @ joint.T_parent_joint
+    """Joint, parent and pose of each body."""
+    for link, joint in zip(tree.links, (None, *tree.joints), strict=True):
+        parent = -1
+        T = np.eye(4)
+        if joint is not None:
+            parent, T_parent = frames[joint.parent]
+            T = T_parent @ joint.T_parent_joint
         if joint is not None and joint.type == "fixed":
             frames[link.name] = (parent, T)
             members[parent].append(link)
@@ -125,46 +143,40 @@ def mechanism(robot: RobotSpec) -> Mechanism:
             frames[link.name] = (len(members), np.eye(4))
             members.append([link])
             placed.append((joint, parent, T))
-    bodies = tuple(
-        Body(
-            name=links[0].name,
-            parent=parent,
-            joint=joint,
-            T_parent_body=T,
-            inertia=None if joint is None else _fused_inertia(robot, links, frames),
-            shapes=tuple(
-                LinkShape(
-                    link=link.name, shape=Shape(geometry=s.geometry, T_body_shape=frames[link.name][1] @ s.T_body_shape)
-                )
-                for link in links
-                for s in link.collisions
-            ),
+    bodies = []
+    for links, (joint, parent, T) in zip(members, placed, strict=True):
+        shapes = []
+        for link in links:
+            T_body_link = frames[link.name][1]
+            for shape in link.collisions:
+                moved = replace(shape, T_body_shape=T_body_link @ shape.T_body_shape)
+                shapes.append(LinkShape(link=link.name, shape=moved))
+        inertia = None if joint is None else _fused_inertia(robot, links, frames)
+        body = Body(
+            name=links[0].name, parent=parent, joint=joint, T_parent_body=T, inertia=inertia, shapes=tuple(shapes)
         )
-        for links, (joint, parent, T) in zip(members, placed, strict=True)
-    )
-    return Mechanism(robot=robot, bodies=bodies, frames=frames)
+        bodies.append(body)
+    return Mechanism(robot=robot, bodies=tuple(bodies), frames=frames)
 
 
 class TrackedFrames:
     """The tracked links of a robot as frames on its bodies."""
 
     def __init__(self, robot: Mechanism) -> None:
-        places = [robot.frames[link] for link in robot.robot.tracked_links]
-        self.bodies = [body for body, _ in places]
+        self.bodies, frames = map(list, zip(*(robot.frames[link] for link in robot.robot.tracked_links), strict=True))
         """[K] index of the body of each tracked link."""
         inertias = [robot.bodies[body].inertia for body in self.bodies]
         com = np.array([np.zeros(3) if inertia is None else inertia.com for inertia in inertias])
-        pos = np.array([T[:3, 3] for _, T in places])
+        pos = np.array([T[:3, 3] for T in frames])
+        quat = np.array([matrix_to_quat(T[:3, :3]) for T in frames])
         self._arms = Arms(np.stack((pos, pos - com), axis=1))
-        quat = np.array([matrix_to_quat(T[:3, :3]) for _, T in places])
-        self._turns = np.stack(
-            [multiply(unit, quat) for unit in np.eye(4)], axis=1
-        )  # [K, 4, 4] the product with quat, as a matrix
+        self._turns = np.stack([multiply(unit, quat) for unit in np.eye(4)], axis=1)
+        """[K, 4, 4] the product with quat, as a matrix."""
 
     def locate(
         self, pos: np.ndarray, quat: np.ndarray, com_velocity: np.ndarray, angvel: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Position, orientation, velocity and angular velocity of the tracked links.
+        """Return position, orientation, velocity and angular velocity of the tracked links.
 
         Args:
             pos: [K, 3] position of their bodies' frames.
@@ -177,21 +189,26 @@ class TrackedFrames:
 
 
 class MovingJoints:
-    """The actuated and the mimic joints among all that an engine moves, and the robot's drives. D moving joints, J actuated, Q mimics."""
+    """The actuated and the mimic joints among all that an engine moves, and the robot's drives.
+
+    Letters: D moving joints, J actuated, Q mimics.
+    """
 
     def __init__(self, robot: RobotSpec, names: Sequence[str]) -> None:
         """Take a robot and the names [D] of the moving joints in the engine's order."""
         at = {name: i for i, name in enumerate(names)}
         self.count = len(at)
         """D"""
-        self.driven = np.array([at[name] for name in robot.joint_names])
+        names = robot.joint_names
+        mimics = robot.mimics
+        self.driven = np.array([at[name] for name in names])
         """[J] where each actuated joint is."""
-        self.mimic = np.array([at[mimic.joint] for mimic in robot.mimics], dtype=int)
+        self.mimic = np.array([at[mimic.joint] for mimic in mimics], dtype=int)
         """[Q] where each mimic joint is."""
-        self.source = np.array([robot.joint_names.index(mimic.source) for mimic in robot.mimics], dtype=int)
+        self.source = np.array([names.index(mimic.source) for mimic in mimics], dtype=int)
         """[Q] the actuated joint that it follows."""
-        self.multiplier = np.array([mimic.multiplier for mimic in robot.mimics])
-        self.offset = np.array([mimic.offset for mimic in robot.mimics])
+        self.multiplier = np.array([mimic.multiplier for mimic in mimics])
+        self.offset = np.array([mimic.offset for mimic in mimics])
         drives = [joint.drive for joint in robot.joints]
         self.shares = np.zeros((len(robot.joints), self.count))
         """[J, D] how each drive's torque is shared: see :func:`drive_shares`."""
@@ -203,18 +220,21 @@ class MovingJoints:
         self.has_dry_friction = bool(self.friction_loss.any())
 
     def spread(self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities [D] of all moving joints, given those [J] of the actuated ones."""
-        q, v = np.zeros(self.count), np.zeros(self.count)
-        q[self.driven], v[self.driven] = position, velocity
+        """Return positions and velocities [D] of all moving joints, given those [J] of the actuated joints."""
+        q = np.zeros(self.count)
+        q[self.driven] = position
         q[self.mimic] = self.multiplier * position[self.source] + self.offset
+        v = np.zeros(self.count)
+        v[self.driven] = velocity
         v[self.mimic] = self.multiplier * velocity[self.source]
         return q, v
 
 
 class Arms:
-    """Vectors that are fixed in bodies, to be seen from the world in every step: as :func:`rotate`, in fewer calls of numpy.
+    """Vectors that are fixed in bodies, rotated into the world every step: as :func:`rotate`, in fewer calls of numpy.
 
-    Turning v by q adds a quadratic form of q to it, which is known once v is: 2 w (u x v) + 2 u x (u x v) for q = (w, u).
+    Turning v by q adds a quadratic form of q to it, which is known once v is: 2 w (u x v) + 2 u x (u x v) for
+    q = (w, u).
     """
 
     def __init__(self, vectors: np.ndarray) -> None:
@@ -223,72 +243,77 @@ class Arms:
         forms = np.zeros((*vectors.shape[:-1], 4, 4, 3))
         forms[..., 0, 1:, :] = once
         forms[..., 1:, 1:, :] = cross(np.eye(3)[:, None], once[..., None, :, :])
+        products_first = np.moveaxis(forms.reshape(*vectors.shape[:-1], 16, 3), -3, -2)
         self._vectors = vectors
-        self._forms = np.moveaxis(forms.reshape(*vectors.shape[:-1], 16, 3), -3, -2).reshape(
-            *vectors.shape[:-2], 16, -1
-        )
+        self._forms = products_first.reshape(*vectors.shape[:-2], 16, -1)
 
     def turned(self, quat: np.ndarray) -> np.ndarray:
-        """The vectors [..., A, 3] in the world, given the unit quaternions [..., 4] of their bodies."""
+        """Return the vectors [..., A, 3] in the world, given the unit quaternions [..., 4] of their bodies."""
         products = (quat[..., :, None] * quat[..., None, :]).reshape(*quat.shape[:-1], 1, 16)
         return self._vectors + (products @ self._forms).reshape(self._vectors.shape)
 
 
 def object_inertia(spec: ObjectSpec) -> Inertia:
-    """Mass properties of an object; ``ObjectError`` if no body can have them."""
+    """Return the mass properties of an object; ``ObjectError`` if no body can have them."""
     return principal(spec.mass, spec.com, spec.inertia, ObjectError, f"the object {spec.name!r}")
 
 
 def principal(mass: float, com: np.ndarray, inertia: np.ndarray, error: type[XResetError], what: str) -> Inertia:
-    """Turn an inertia matrix [3, 3] about the centre of mass into principal moments and axes; ``error`` if no body can have it."""
+    """Return the principal moments and axes of an inertia matrix [3, 3] about the centre of mass.
+
+    Raises:
+        error: no body can have these mass properties; ``what`` names the body.
+    """
     if not mass > 0:
         raise error(
-            f"{what} has the mass {mass} kg, expected a positive one. Give it an <inertial> in the URDF, or a mass."
+            f"{what} has the mass {mass} kg, expected a positive mass. Give it an <inertial> in the URDF, or a mass."
         )
     moments, axes = np.linalg.eigh(inertia)
     if not (moments[0] > 0 and moments[0] + moments[1] >= moments[2] * (1 - 1e-6)):
         shown = ", ".join(f"{m:.3g}" for m in moments)
         raise error(
-            f"{what} has principal moments of inertia ({shown}) kg m^2, expected positive ones, none above the sum of the others."
+            f"{what} has principal moments of inertia ({shown}) kg m^2, expected positive moments, "
+            "none above the sum of the others."
         )
     axes[:, 0] *= np.sign(np.linalg.det(axes))
     return Inertia(mass=float(mass), com=np.asarray(com, dtype=float), quat=matrix_to_quat(axes), moments=moments)
 
 
 def _check_names(robot: RobotSpec, tree: RobotTree) -> None:
-    for link in (
-        *robot.tracked_links, *robot.self_collision_links, *robot.table_exclude,
-        *(name for tip in robot.fingertips for name in tip.contact_links), *(name for pair in robot.collision_exclude for name in pair),
-    ):  # fmt: skip
+    links = [*robot.tracked_links, *robot.self_collision_links, *robot.table_exclude]
+    links += chain.from_iterable(tip.contact_links for tip in robot.fingertips)
+    links += chain.from_iterable(robot.collision_exclude)
+    for link in links:
         tree.link(link)
-    for name in (*robot.joint_names, *(name for mimic in robot.mimics for name in (mimic.joint, mimic.source))):
+    who = f"robot {robot.name!r}: the joint"
+    known = [*robot.joint_names, *(mimic.joint for mimic in robot.mimics)]
+    for name in (*known, *(mimic.source for mimic in robot.mimics)):
         if tree.joint(name).type == "fixed":
-            raise RobotError(
-                f"robot {robot.name!r}: the joint {name!r} is driven or mimics another, but it is fixed in the URDF."
-            )
+            raise RobotError(f"{who} {name!r} is driven or mimics another, but it is fixed in the URDF.")
     for mimic in robot.mimics:
         if mimic.source not in robot.joint_names:
-            raise RobotError(
-                f"robot {robot.name!r}: the joint {mimic.joint!r} mimics {mimic.source!r}, expected a driven joint."
-            )
-    known = {*robot.joint_names, *(mimic.joint for mimic in robot.mimics)}
+            raise RobotError(f"{who} {mimic.joint!r} mimics {mimic.source!r}, expected a driven joint.")
     for joint in tree.joints:
         if joint.type != "fixed" and joint.name not in known:
             raise RobotError(
-                f"robot {robot.name!r}: the joint {joint.name!r} moves, but is neither driven nor a mimic. Describe it, or make it fixed."
+                f"{who} {joint.name!r} moves, but is neither driven nor a mimic. Describe it, or make it fixed."
             )
 
 
 def _fused_inertia(robot: RobotSpec, links: list[Link], frames: dict[str, tuple[int, np.ndarray]]) -> Inertia:
     mass = sum(link.mass for link in links)
-    com, inertia = np.zeros(3), np.zeros((3, 3))
+    com = np.zeros(3)
+    inertia = np.zeros((3, 3))
     if mass > 0:
         poses = [frames[link.name][1] for link in links]
         points = [T[:3, :3] @ link.com + T[:3, 3] for T, link in zip(poses, links, strict=True)]
-        com = sum((link.mass * point for link, point in zip(links, points, strict=True)), np.zeros(3)) / mass
+        for link, point in zip(links, points, strict=True):
+            com = com + link.mass * point
+        com = com / mass
         for T, link, point in zip(poses, links, points, strict=True):
+            R = T[:3, :3]
             r = point - com  # parallel axes
-            inertia += T[:3, :3] @ link.inertia @ T[:3, :3].T + link.mass * (r @ r * np.eye(3) - np.outer(r, r))
+            inertia += R @ link.inertia @ R.T + link.mass * (r @ r * np.eye(3) - np.outer(r, r))
     return principal(mass, com, inertia, RobotError, f"robot {robot.name!r}: the link {links[0].name!r}")
 
 
@@ -300,14 +325,11 @@ def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """[..., 4] Hamilton product: rotation b first, then a."""
     aw, ax, ay, az = a.T
     bw, bx, by, bz = b.T
-    return np.array(
-        (
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        )
-    ).T
+    w = aw * bw - ax * bx - ay * by - az * bz
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by - ax * bz + ay * bw + az * bx
+    z = aw * bz + ax * by - ay * bx + az * bw
+    return np.array((w, x, y, z)).T
 
 
 def conjugate(q: np.ndarray) -> np.ndarray:
@@ -323,7 +345,8 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 _CROSS = np.zeros((9, 3))
 """Which products a_i b_j, row after row, make up each component of the vector product."""
-_CROSS[[5, 6, 1], [0, 1, 2]], _CROSS[[7, 2, 3], [0, 1, 2]] = 1.0, -1.0
+_CROSS[[5, 6, 1], [0, 1, 2]] = 1.0
+_CROSS[[7, 2, 3], [0, 1, 2]] = -1.0
 
 
 def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -347,7 +370,7 @@ def nearer(q: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 _ARM = 1.0
-"""Length [m] that makes torques and forces comparable: long beside an object, so that forces are explained first."""
+"""Length [m] that makes torques and forces comparable: longer than an object, so that forces are explained first."""
 
 
 def friction_forces(
@@ -355,8 +378,8 @@ def friction_forces(
 ) -> np.ndarray:
     """Friction forces [n, 3] that explain a force and torque [3] on a body, given its contacts.
 
-    Of all tangential forces that add up to the wrench (in the sense of least squares) these have the smallest sum of (f / (mu N))^2: each
-    contact carries what it can. When a single surface touches the object, the sum is what it really is.
+    Of all tangential forces that add up to the wrench (in the sense of least squares) these have the smallest sum of
+    (f / (mu N))^2: each contact carries what it can. When a single surface touches the object, their sum is exact.
 
     Args:
         arms: [n, 3] contact points from the centre of mass [m].
@@ -367,8 +390,9 @@ def friction_forces(
     """
     limits = np.sqrt((normal_forces * normal_forces).sum(axis=1))
     normals = normal_forces / limits[:, None]
-    # Row j of contact i: its force if its share is 1 along j; what is not tangential is taken away.
-    forces = (limits * coefficients)[:, None, None] * (np.eye(3) - normals[:, :, None] * normals[:, None, :])
+    # Row j of contact i: its force if its share is 1 along j, without the part along the normal.
+    tangential = np.eye(3) - normals[:, :, None] * normals[:, None, :]
+    forces = (limits * coefficients)[:, None, None] * tangential
     wrenches = np.concatenate([forces, cross(arms[:, None], forces) / _ARM], axis=2).reshape(-1, 6)
     shares, *_ = np.linalg.lstsq(wrenches.T, np.concatenate([force, torque / _ARM]), rcond=1e-6)
     return (shares.reshape(-1, 1, 3) @ forces)[:, 0]

@@ -155,7 +155,7 @@ class SapienWorld(World):
             pose = self._object.entity_pose
             arms = points - (pose.p + self._arm.turned(pose.q)[0])
             coefficients = np.array([self._friction[_material(owner)] for owner in owners])
-            missing = self._missing_wrench(*self._last_step, arms, forces)
+            missing = self._missing_wrench(self._last_step, arms, forces)
             forces = forces + friction_forces(arms, forces, coefficients, *missing)
         for owner, force in zip(owners, forces, strict=True):
             if owner == _TABLE:
@@ -181,7 +181,7 @@ class SapienWorld(World):
         self._set_inertia(self._object, inertia)
 
     def set_friction(self, friction: np.ndarray) -> None:
-        self._friction = dict(zip(("tip", "link", "table"), friction.tolist(), strict=True))
+        self._friction: dict[str, float] = dict(zip(("tip", "link", "table"), friction.tolist(), strict=True))
         for name, mu in self._friction.items():
             self._materials[name].static_friction = 2.0 * mu
             self._materials[name].dynamic_friction = 2.0 * mu
@@ -324,26 +324,16 @@ class SapienWorld(World):
         return owners, np.array(points), np.array(impulses) / self._dt
 
     def _missing_wrench(
-        self,
-        linvel: np.ndarray,
-        angvel: np.ndarray,
-        quat: np.ndarray,
-        force: np.ndarray,
-        torque: np.ndarray,
-        arms: np.ndarray,
-        contact_forces: np.ndarray,
+        self, last_step: tuple[np.ndarray, ...], arms: np.ndarray, contact_forces: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the force and torque [3] about the centre of mass that explain the rest of the change of momentum.
 
         Args:
-            linvel: [3] velocity of the centre of mass before the step.
-            angvel: [3] angular velocity before the step.
-            quat: [4] orientation before the step.
-            force: [3] force given.
-            torque: [3] torque given.
+            last_step: see :attr:`_last_step`.
             arms: [n, 3] contact points from the centre of mass.
             contact_forces: [n, 3] known forces at these points.
         """
+        linvel, angvel, quat, force, torque = last_step
         axes = self._axes.turned(quat)
         omega = angvel.astype(np.float64)
         inertia = (axes.T * self._inertia.moments) @ axes

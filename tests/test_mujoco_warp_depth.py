@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import unittest
+import warnings
+from unittest import mock
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import trimesh
 import warp as wp
+from mujoco_warp._src import collision_convex
 
-from xreset.backends.mujoco_warp_setup import prepare_engine
+from xreset.backends import mujoco_warp_depth, mujoco_warp_step
+from xreset.backends.conformance.scene import scene
+from xreset.backends.mujoco_warp import MujocoWarpBackend
+from xreset.backends.mujoco_warp_setup import correct_engine, engine_step, quiet
 
 WORLDS = 200
 
@@ -46,7 +52,7 @@ def poses(rng: np.random.Generator) -> np.ndarray:
 
 class Depth(unittest.TestCase):
     def test_contacts_that_were_clipped_to_one_are_as_deep_as_in_mujoco(self):
-        prepare_engine()  # tested is the engine as the backend leaves it
+        correct_engine()  # tested is the engine as the backend leaves it
         model, qpos = across_an_edge(), poses(np.random.default_rng(0))
         with wp.ScopedDevice("cpu"):
             m, d = mjw.put_model(model), mjw.make_data(model, nworld=WORLDS, nconmax=8, njmax=32)
@@ -65,6 +71,42 @@ class Depth(unittest.TestCase):
             deepest = mujoco.mj_geomDistance(model, data, 0, 1, 1.0, None)
             elsewhere += len(expected) == 1 and expected[0] > deepest + 2e-5
         self.assertGreater(elsewhere, 10, "the deepest point must often be elsewhere, or this shows nothing")
+
+
+class OtherVersions(unittest.TestCase):
+    def test_an_engine_that_finds_contacts_in_another_way_is_announced(self):
+        with (
+            mock.patch.object(mujoco_warp_depth, "KNOWN_FAULT", "another"),
+            mock.patch.object(mujoco_warp_depth, "correct_depths") as correct,
+            self.assertWarnsRegex(UserWarning, r"finds contacts in another way.*Install mujoco-warp==4\.0\.0"),
+        ):
+            correct_engine()
+        correct.assert_not_called()
+
+    def test_what_is_corrected_depends_on_the_code_and_not_on_the_version(self):
+        model = mock.Mock()
+        model.opt.integrator = mjw.IntegratorType.IMPLICITFAST
+        with mock.patch.object(mjw, "__version__", "4.0.1"), warnings.catch_warnings():
+            warnings.simplefilter("error")
+            correct_engine()
+            self.assertIsInstance(engine_step(wp.get_device("cpu"), model), mujoco_warp_step.ForkedStep)
+        self.assertIs(collision_convex.multicontact, mujoco_warp_depth.multicontact_with_depth)
+
+    def test_another_step_or_integrator_is_left_to_the_engine(self):
+        model = mock.Mock()
+        model.opt.integrator = mjw.IntegratorType.EULER
+        self.assertIs(engine_step(wp.get_device("cpu"), model), mjw.step)
+        model.opt.integrator = mjw.IntegratorType.IMPLICITFAST
+        with mock.patch.object(mujoco_warp_step, "KNOWN_STEP", "another"):
+            self.assertIs(engine_step(wp.get_device("cpu"), model), mjw.step)
+
+    def test_the_log_level_of_the_process_stays_as_it_was(self):
+        level = wp.config.log_level
+        with quiet():
+            self.assertEqual(wp.config.log_level, wp.LOG_WARNING)
+        self.assertEqual(wp.config.log_level, level)
+        MujocoWarpBackend(scene(), 1).close()
+        self.assertEqual(wp.config.log_level, level)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import io
 import os
 import tempfile
 import unittest
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +24,7 @@ from xreset.errors import ObjectError, XResetError
 from xreset.geometry.shapes import half_spaces, hull, shape_mesh, shell_properties
 from xreset.objects.catalogue import canonical_name, load_object, load_objects, object_names
 from xreset.objects.decompose import Settings, as_solid, decompose, limited_hull
-from xreset.objects.meshes import DEFAULT_DENSITY, add_mesh, import_with_notes, mesh_files
+from xreset.objects.meshes import DEFAULT_DENSITY, add_mesh, import_with_notes, mesh_files, read_mesh
 from xreset.objects.properties import Properties
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.objects.sampling import bounding_box, keypoints, sample_surface, surface_points, winding_number
@@ -225,7 +226,7 @@ class MeshImport(unittest.TestCase):
         np.testing.assert_allclose(
             np.diag(result.obj.inertia), result.obj.mass / 12 * np.array([0.0052, 0.0116, 0.0136]), rtol=1e-6
         )
-        self.assertIn("mass is not known", result.notes[0])
+        self.assertIn("mass is unknown", result.notes[0])
         self.assertEqual(import_with_notes(path, "thing", mass=0.2).obj.mass, 0.2)
 
     def test_published_mass_by_name(self):
@@ -310,7 +311,7 @@ class MeshImport(unittest.TestCase):
             add_mesh(path, out, "brick", scale=0.001)
         with self.assertRaisesRegex(ObjectError, "millimetres"):
             add_mesh(path, out, "other")
-        with self.assertRaisesRegex(ObjectError, "is no name"):
+        with self.assertRaisesRegex(ObjectError, "cannot be an object's name"):
             add_mesh(path, out, "../other", scale=0.001)
         with (
             mock.patch("xreset.objects.meshes.cached_pieces", side_effect=ObjectError("no")),
@@ -318,6 +319,40 @@ class MeshImport(unittest.TestCase):
         ):
             add_mesh(path, out, "other", scale=0.001, properties=Properties(mass=1.0))
         self.assertEqual(sorted(p.name for p in out.iterdir()), ["brick.obj", "brick.toml"])
+
+    def test_nothing_is_written_before_the_mesh_is_cut(self):
+        """So a command that is killed while it cuts can be repeated."""
+        path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)))
+        out = self.folder / "objects"
+        with mock.patch("xreset.objects.meshes.cached_pieces") as cut:
+            cut.side_effect = lambda *_: self.assertFalse(out.exists()) or exec("raise KeyboardInterrupt")
+            with self.assertRaises(KeyboardInterrupt):
+                add_mesh(path, out, "brick", properties=Properties(mass=0.2))
+        out.mkdir()
+        (out / "brick.toml").write_text("mass = 0.2\n")  # killed between the two files
+        add_mesh(path, out, "brick", properties=Properties(mass=0.2))
+        self.assertEqual(load_object("brick", out).mass, 0.2)
+
+    def test_archives_are_refused_or_bounded(self):
+        box = trimesh.creation.box((0.1, 0.06, 0.04))
+        content = self.write(box).read_bytes() + b"#" * (2 << 20)
+        for name in ("mesh.zip", "mesh.3mf"):
+            with zipfile.ZipFile(self.folder / name, "w", zipfile.ZIP_DEFLATED) as archive:
+                archive.writestr("mesh.obj", content)
+        with self.assertRaisesRegex(ObjectError, "is an archive. Unpack it"):
+            read_mesh(self.folder / "mesh.zip")
+        with (
+            mock.patch.dict(os.environ, {"XRESET_MAX_FILE_MB": "16"}),
+            self.assertRaisesRegex(ObjectError, "takes 32 MB"),
+        ):
+            read_mesh(self.folder / "mesh.3mf")
+
+    def test_the_cache_knows_the_version_of_the_cutter(self):
+        path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)))
+        import_with_notes(path, "thing")
+        self.assertTrue(import_with_notes(path, "thing").cached)
+        with mock.patch("xreset.objects.cache.version", return_value="99"):
+            self.assertFalse(import_with_notes(path, "thing").cached)
 
     def test_the_command_puts_a_mesh_into_a_folder_and_draws_it(self):
         path, out, png = (
@@ -346,7 +381,10 @@ class MeshImport(unittest.TestCase):
         self.assertIn("brick", said.getvalue())
         self.assertTrue(png.read_bytes().startswith(b"\x89PNG"))
         self.assertEqual(load_object("brick", out).mass, 0.2)
-        for words, options in (("Add --out", []), ("is no name", ["--out", str(out), "--scale", "0.001"])):
+        for words, options in (
+            ("Add --out", []),
+            ("cannot be an object's name", ["--out", str(out), "--scale", "0.001"]),
+        ):
             with self.subTest(words), contextlib.redirect_stderr(io.StringIO()) as said, self.assertRaises(SystemExit):
                 main(["objects", "import", str(path), *options])
             self.assertIn(words, said.getvalue())
@@ -380,6 +418,8 @@ class MeshImport(unittest.TestCase):
             "garbage": ("v 0 0\nf 1 2 3\n", "no triangles|cannot be read"),
             "nan": (nan, "finite|cannot be read"),
             "flat": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "flat"),
+            "tilted": ("v 0 0 0\nv 0.1 0 0.1\nv 0 0.1 0.1\nf 1 2 3\n", "flat"),
+            "tilted square": ("v 0 0 0\nv 0.1 0 0.1\nv 0 0.1 0.1\nv 0.1 0.1 0.2\nf 1 2 3\nf 2 4 3\n", "flat"),
             "millimetres": (box.copy().apply_scale(1000).export(file_type="obj"), "millimetres"),
         }
         for name, (text, message) in cases.items():

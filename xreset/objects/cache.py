@@ -7,6 +7,7 @@ import json
 import os
 from contextlib import suppress
 from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,48 +22,49 @@ if TYPE_CHECKING:
     import trimesh
 
 SCHEMA_NAME = "xreset-pieces/3"
-SCHEMA = {
-    "vertices": Field(("V", 3), "f", within=POSITION),
-    "offsets": Field(("K+1",), "i"),
+_NUMBERS = {
     "deviation": Field((), "f", within=POSITION),
     "volume": Field((), "f"),
     "com": Field((3,), "f", within=POSITION),
     "inertia": Field((3, 3), "f"),
 }
+SCHEMA = {"vertices": Field(("V", 3), "f", within=POSITION), "offsets": Field(("K+1",), "i"), **_NUMBERS}
+_ALGORITHM = 1
+"""Raise it when :mod:`xreset.objects.decompose` gives other pieces than before."""
 
 
 def cached_pieces(mesh: trimesh.Trimesh, source: str, progress: Progress) -> Pieces:
-    """The pieces of a mesh, from the cache if they are there. Those of a decomposition that was cut short are not kept.
+    """Return the pieces of a mesh, from the cache if they are there. An unfinished decomposition is not kept.
 
     Args:
-        source: SHA-256 of what it was read from.
+        source: SHA-256 of the mesh's file.
     """
     settings = Settings()
     config = asdict(settings)
-    key = hashlib.sha256(json.dumps([SCHEMA_NAME, source, config], sort_keys=True).encode()).hexdigest()
-    path = cache_folder() / "objects" / f"{key}.npz"
+    try:
+        cutter = version("manifold3d")
+    except PackageNotFoundError:
+        cutter = "none"
+    identity = json.dumps([SCHEMA_NAME, source, config, _ALGORITHM, cutter], sort_keys=True)
+    path = cache_folder() / "objects" / f"{hashlib.sha256(identity.encode()).hexdigest()}.npz"
     if path.is_file():
         try:
             arrays = read_npz(path, SCHEMA_NAME, SCHEMA, what="cached convex pieces")
             shapes = tuple(hull(part) for part in np.split(arrays["vertices"], arrays["offsets"][1:-1]))
-            deviation, volume = float(arrays["deviation"]), float(arrays["volume"])
-            return Pieces(
-                shapes=shapes,
-                deviation=deviation,
-                volume=volume,
-                com=arrays["com"],
-                inertia=arrays["inertia"],
-                cached=True,
-            )
+            deviation = float(arrays["deviation"])
+            volume = float(arrays["volume"])
+            com = arrays["com"]
+            inertia = arrays["inertia"]
+            return Pieces(shapes=shapes, deviation=deviation, volume=volume, com=com, inertia=inertia, cached=True)
         except (FileFormatError, ObjectError):
             path.unlink(missing_ok=True)  # damaged: make it again
     pieces = decompose(mesh, settings, progress)
-    parts = [piece.geometry.vertices for piece in pieces.shapes if piece.geometry.vertices is not None]
+    parts = [np.asarray(piece.geometry.vertices) for piece in pieces.shapes]
     offsets = np.cumsum([0, *map(len, parts)])
-    numbers = {name: np.asarray(getattr(pieces, name)) for name in ("deviation", "volume", "com", "inertia")}
-    arrays = {"vertices": np.concatenate(parts), "offsets": offsets, **numbers}
-    with suppress(XResetError):  # a cache that cannot be written costs time, nothing else
-        if pieces.finished:
+    arrays = {"vertices": np.concatenate(parts), "offsets": offsets}
+    arrays |= {name: np.asarray(getattr(pieces, name)) for name in _NUMBERS}
+    if pieces.finished:
+        with suppress(XResetError):  # a cache that cannot be written costs time, nothing else
             write_npz(path, SCHEMA_NAME, arrays, config=config, inputs={"mesh": source})
     return pieces
 

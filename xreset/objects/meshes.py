@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import logging
+import tempfile
 import time
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial import QhullError
 
 from xreset.errors import ObjectError
-from xreset.files import atomic_write, file_hash, max_bytes
+from xreset.files import file_hash, max_bytes, write_whole
 from xreset.geometry.shapes import shell_properties
 from xreset.objects.cache import cached_pieces
 from xreset.objects.decompose import Progress, Settings
@@ -26,29 +29,37 @@ if TYPE_CHECKING:
 DEFAULT_DENSITY = 500.0
 """Density of an object of unknown mass [kg/m^3]: a packed household object."""
 
-_LARGEST = 2.0  # [m]: beyond it the file is in other units
-_HOLLOW = 120.0  # [kg/m^3]: below it a solid mesh stands for a shell
-_FEW_MM = 0.002  # [m]: pieces that stand farther off the surface are worth a note
+_LARGEST = 2.0
+"""A larger mesh is in other units [m]."""
+_FLAT = 1e-5
+"""A thinner mesh is flat [m]."""
+_HOLLOW = 120.0
+"""A solid mesh of a lower density stands for a shell [kg/m^3]."""
+_FEW_MM = 0.002
+"""Pieces that deviate more from the surface are worth a note [m]."""
+_ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz")
+_UNPACKED = 16
+"""Memory that a byte of a zipped mesh format, such as 3MF, becomes."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Import:
-    """An imported object, and what is to be known about it."""
+    """An imported object, and how it was made."""
 
     obj: ObjectSpec
     notes: tuple[str, ...]
-    """What was assumed."""
+    """Assumptions."""
     seconds: float
     cached: bool
     """Whether the convex pieces came from the cache."""
     deviation: float
-    """[m] Largest distance between the pieces' surface and the mesh's (sampled)."""
+    """Largest distance between the pieces' surface and the mesh's [m]."""
 
 
 def mesh_files(folder: str | Path) -> dict[str, Path]:
-    """Object name -> mesh file, for every object of a folder.
+    """Return object name -> mesh file, for every object of a folder.
 
     Layouts: ``NAME.obj``; ``NAME/textured_simple.obj`` (as in DexYCB's ``models``); ``NAME/textured.obj`` (as in the YCB object set).
 
@@ -56,22 +67,19 @@ def mesh_files(folder: str | Path) -> dict[str, Path]:
         ObjectError: the folder does not exist or has no mesh.
     """
     folder = Path(folder)
+    expected = "Expected NAME.obj, NAME/textured_simple.obj or NAME/textured.obj."
     if not folder.is_dir():
-        raise ObjectError(
-            f"there is no folder {folder}; expected a folder of meshes such as NAME.obj or NAME/textured_simple.obj."
-        )
+        raise ObjectError(f"There is no folder {folder}. {expected}")
     found = {path.stem: path for path in folder.glob("*.obj")}
     for file in ("textured.obj", "textured_simple.obj"):  # the simpler one wins
         found |= {path.parent.name: path for path in folder.glob(f"*/{file}")}
     if not found:
-        raise ObjectError(
-            f"there is no mesh in {folder}; expected NAME.obj, NAME/textured_simple.obj or NAME/textured.obj."
-        )
+        raise ObjectError(f"There is no mesh in {folder}. {expected}")
     return dict(sorted(found.items()))
 
 
 def import_mesh(path: str | Path, name: str) -> ObjectSpec:
-    """The object of a mesh file; see :func:`import_with_notes`. What was assumed is logged as a warning."""
+    """Return the object of a mesh file; see :func:`import_with_notes`. Assumptions are logged as warnings."""
     result = import_with_notes(path, name)
     for note in result.notes:
         _log.warning("%s: %s", name, note)
@@ -81,15 +89,15 @@ def import_mesh(path: str | Path, name: str) -> ObjectSpec:
 def import_with_notes(
     path: str | Path, name: str, *, mass: float | None = None, progress: Progress = lambda parts, worst: None
 ) -> Import:
-    """Read a mesh, cut it into convex pieces and work out its mass properties.
+    """Read a mesh, cut it into convex pieces and compute its mass properties.
 
-    A closed mesh whose mass is that of no solid (below 120 kg/m^3) is a shell: its mass lies evenly on its surface.
+    A closed mesh whose mass is that of no solid (below 120 kg/m^3) is a shell: its mass is spread evenly over its surface.
 
     Args:
-        path: mesh file, in metres, in the frame of the object's poses; beside it,
-            NAME.toml may say what it is made of (:mod:`xreset.objects.properties`).
-        name: the object's name; the masses of the YCB object set are known by it.
-        mass: mass [kg]; None: what stands beside the mesh, else the published one, else by density.
+        path: mesh file, in metres, in the frame of the object's poses; NAME.toml next to it may state its properties
+            (:mod:`xreset.objects.properties`).
+        name: the object's name; the masses of the YCB object set are known by name.
+        mass: mass [kg]; None: from NAME.toml, else the published one, else by density.
         progress: see :func:`xreset.objects.decompose.decompose`.
 
     Raises:
@@ -97,36 +105,41 @@ def import_with_notes(
     """
     start = time.perf_counter()
     path = Path(path)
-    mesh, own = read_mesh(path), properties_of(path)
+    mesh = read_mesh(path)
+    own = properties_of(path)
     source = file_hash(path)
-    pieces = cached_pieces(mesh, source, progress)
+    try:
+        pieces = cached_pieces(mesh, source, progress)
+    except QhullError as error:
+        raise ObjectError(f"{path} spans no volume: it is flat, or damaged. A solid object is needed.") from error
     notes = []
     if not mesh.is_volume:
+        thickness = Settings().thickness
         if len(pieces.shapes) == 1:
-            notes.append("the mesh is not closed: volume, centre of mass and inertia are those of its convex hull")
-        elif pieces.volume < 1.5 * mesh.area * Settings().thickness:
-            notes.append(f"the mesh is not closed: it is taken as a wall {1e3 * Settings().thickness:g} mm thick")
+            notes.append("the mesh is not closed: volume, center of mass and inertia are those of its convex hull")
+        elif pieces.volume < 1.5 * mesh.area * thickness:
+            notes.append(f"the mesh is not closed: it is taken as a wall {1e3 * thickness:g} mm thick")
         else:
             notes.append("the mesh is not closed: its holes were filled")
-    mass = mass or own.mass or (None if own.density else MASSES.get(name))
-    com, inertia = pieces.com, pieces.inertia * (mass or 0.0)
+    mass = mass or own.mass
+    if mass is None and own.density is None:
+        mass = MASSES.get(name)
+    com = pieces.com
     if mass is None:
         mass = (own.density or DEFAULT_DENSITY) * pieces.volume
         inertia = pieces.inertia * mass
         if own.density is None:
-            notes.append(f"its mass is not known: {mass:.3f} kg by a density of {DEFAULT_DENSITY:.0f} kg/m^3")
+            notes.append(f"its mass is unknown: {mass:.3f} kg by a density of {DEFAULT_DENSITY:.0f} kg/m^3")
     elif mesh.is_volume and mass / pieces.volume < _HOLLOW:
         com, inertia = shell_properties(np.asarray(mesh.vertices), np.asarray(mesh.faces), mass)
         litres = pieces.volume * 1e3
-        notes.append(
-            f"the mesh is solid, but {mass:.3f} kg in {litres:.2f} l is a hollow object: its mass is put on its surface"
-        )
+        notes.append(f"{mass:.3f} kg in {litres:.2f} l is a hollow object: its mass is put on its surface")
+    else:
+        inertia = pieces.inertia * mass
     if not pieces.finished:
-        notes.append(
-            "cutting it was stopped early, for it takes too long: a mesh with fewer triangles would fit better"
-        )
+        notes.append("cutting took too long and was stopped: a mesh with fewer triangles would fit better")
     if len(pieces.shapes) > 1 and pieces.deviation > _FEW_MM:
-        notes.append(f"its pieces stand up to {1e3 * pieces.deviation:.1f} mm off its surface")
+        notes.append(f"its pieces deviate by up to {1e3 * pieces.deviation:.1f} mm from its surface")
     obj = ObjectSpec(
         name=name,
         pieces=pieces.shapes,
@@ -138,13 +151,8 @@ def import_with_notes(
         source=source,
         friction=own.friction,
     )
-    return Import(
-        obj=obj,
-        notes=tuple(notes),
-        seconds=time.perf_counter() - start,
-        cached=pieces.cached,
-        deviation=pieces.deviation,
-    )
+    seconds = time.perf_counter() - start
+    return Import(obj=obj, notes=tuple(notes), seconds=seconds, cached=pieces.cached, deviation=pieces.deviation)
 
 
 def add_mesh(
@@ -156,32 +164,34 @@ def add_mesh(
     properties: Properties | None = None,
     progress: Progress = lambda parts, worst: None,
 ) -> Import:
-    """Put a mesh of any format and scale, and what it is made of, as ``NAME.obj`` and ``NAME.toml`` into a folder, and import it there.
+    """Import a mesh of any format and scale, and put it with its properties as ``NAME.obj`` and ``NAME.toml`` into a folder.
+
+    The files are written when the mesh has been cut: a command that was killed can be repeated.
 
     Raises:
-        ObjectError: it cannot be used, is not in metres once scaled, or the folder has one of that name; nothing is then left there.
-        XResetError: it cannot be written.
+        ObjectError: the mesh cannot be used, is not in metres once scaled, or the folder has one of that name; nothing is then written.
+        XResetError: the files cannot be written.
     """
     if not is_name(name):
-        raise ObjectError(f"{shown(name)} is no name for an object; expected letters, digits, - and _.")
+        raise ObjectError(f"{shown(name)} cannot be an object's name. Use letters, digits, - and _.")
     target = folder / f"{name}.obj"
     facts = target.with_suffix(".toml")
-    if target.exists() or facts.exists():
+    known = properties.to_toml() if properties else ""
+    if target.exists() or (facts.exists() and facts.read_bytes() != known.encode()):
         raise ObjectError(
             f"{target} or its .toml is there already. Nothing was changed; choose another --name or --out."
         )
     mesh = read_mesh(path, scale=scale)
     text = mesh.export(file_type="obj", include_normals=False, include_color=False, include_texture=False, header="")
-    try:
-        with atomic_write(target) as file:
-            file.write(text.encode())
-        if properties is not None:
-            properties.write(facts)
-        return import_with_notes(target, name, progress=progress)
-    except BaseException:
-        target.unlink(missing_ok=True)
-        facts.unlink(missing_ok=True)
-        raise
+    with tempfile.TemporaryDirectory() as temporary:
+        draft = Path(temporary) / target.name
+        draft.write_text(text)
+        draft.with_suffix(".toml").write_text(known)
+        result = import_with_notes(draft, name, progress=progress)
+    if known:
+        write_whole(facts, known)
+    write_whole(target, text)
+    return result
 
 
 def is_name(text: str) -> bool:
@@ -190,31 +200,36 @@ def is_name(text: str) -> bool:
 
 
 def read_mesh(path: Path, *, scale: float = 1.0) -> trimesh.Trimesh:
-    """The triangles of a file, in metres, closed where they touch.
+    """Read the triangles of a file, in metres, joined where they touch.
 
     Args:
-        path: file of any format that trimesh reads.
+        path: file of any format that trimesh reads, but not an archive.
         scale: metres in a unit of the file.
 
     Raises:
-        ObjectError: it is missing, damaged, empty or flat, or not in metres once scaled.
+        ObjectError: the file is missing, damaged, too large, empty or flat, or not in metres once scaled.
     """
     import trimesh
 
     if not path.is_file():
-        raise ObjectError(f"there is no mesh at {path}.")
-    if path.stat().st_size > max_bytes():
-        raise ObjectError(f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
+        raise ObjectError(f"There is no mesh at {path}.")
+    if path.suffix.lower() in _ARCHIVES:
+        raise ObjectError(f"{path} is an archive. Unpack it, and give the mesh.")
     try:
-        mesh = trimesh.load(
-            path, force="mesh", skip_materials=True, process=False
-        )  # processing would drop damaged vertices silently
+        size = path.stat().st_size
+        if zipfile.is_zipfile(path):  # the archive states the sizes, and zipfile reads no more than these
+            with zipfile.ZipFile(path) as archive:
+                size = _UNPACKED * sum(member.file_size for member in archive.infolist())
+        if size > max_bytes():
+            raise ObjectError(f"{path} takes {size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
+        # processing would drop damaged vertices silently
+        mesh = trimesh.load(path, force="mesh", skip_materials=True, process=False)
         if isinstance(mesh, trimesh.Trimesh) and scale != 1.0:
             mesh.apply_scale(scale)
         return _checked(mesh, path)
     except ObjectError:
         raise
-    except Exception as error:  # trimesh raises whatever its parsers meet
+    except Exception as error:  # trimesh's parsers raise any kind of error
         raise ObjectError(f"{path} cannot be read as a mesh: {shown(str(error))}") from error
 
 
@@ -226,7 +241,7 @@ def _checked(mesh: object, path: Path) -> trimesh.Trimesh:
     if not np.isfinite(mesh.vertices).all():
         raise ObjectError(f"{path} has a vertex that is not finite; it is damaged.")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
-        raise ObjectError(f"{path} has a triangle of a vertex that is not there; it is damaged.")
+        raise ObjectError(f"{path} has a triangle of an unknown vertex; it is damaged.")
     if mesh.extents is not None and mesh.extents.max() > _LARGEST:  # before merging, which rounds by the size
         raise ObjectError(
             f"{path} measures {_size(mesh)}; meshes must be in metres. Is it in millimetres (--scale 0.001)?"
@@ -236,10 +251,11 @@ def _checked(mesh: object, path: Path) -> trimesh.Trimesh:
     mesh.remove_unreferenced_vertices()
     if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0:
         mesh.invert()  # inside out
-    if not len(mesh.faces) or mesh.extents.min() < 1e-5:
+    if not len(mesh.faces) or mesh.extents.min() < _FLAT:
         raise ObjectError(f"{path} is flat: {_size(mesh)}; a solid object is needed.")
     return mesh
 
 
 def _size(mesh: trimesh.Trimesh) -> str:
-    return " x ".join(f"{length:.4g}" for length in (mesh.extents if mesh.extents is not None else (0, 0, 0))) + " m"
+    lengths = mesh.extents if mesh.extents is not None else (0, 0, 0)
+    return " x ".join(f"{length:.4g}" for length in lengths) + " m"

@@ -1,4 +1,4 @@
-"""What an object is made of, as ``NAME.toml`` beside its mesh: ``mass`` [kg] or ``density`` [kg/m^3], and ``friction``."""
+"""Physical properties of an object, as ``NAME.toml`` next to its mesh: ``mass`` [kg] or ``density`` [kg/m^3], and ``friction``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from xreset.checks import from_dict
 from xreset.errors import ObjectError
-from xreset.files import atomic_write, read_toml
+from xreset.files import read_toml
 from xreset.text import shown
 
 _RANGES = {"mass": (1e-4, 50.0), "density": (1.0, 25_000.0), "friction": (0.05, 3.0)}
@@ -16,7 +16,7 @@ _RANGES = {"mass": (1e-4, 50.0), "density": (1.0, 25_000.0), "friction": (0.05, 
 
 @dataclass(frozen=True, kw_only=True)
 class Properties:
-    """None: not known."""
+    """None: unknown."""
 
     mass: float | None = None
     """[kg]"""
@@ -26,26 +26,28 @@ class Properties:
     """Coefficient of its material; see :attr:`xreset.spec.ObjectSpec.friction`."""
 
     def __post_init__(self) -> None:
-        for name, (low, high) in _RANGES.items():
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
+        for name, value in self.known.items():
+            low, high = _RANGES[name]
+            if not low <= value <= high:
                 raise ValueError(f"{name} is {shown(value)}, expected a number from {low:g} to {high:g}")
         if self.mass is not None and self.density is not None:
             raise ValueError("mass and density are both given; one follows from the other")
 
-    def write(self, path: Path) -> None:
-        """Write those that are known; no file if none is."""
-        known = {name: value for name, value in asdict(self).items() if value is not None}
-        if known:
-            with atomic_write(path, "w") as file:
-                file.writelines(f"{name} = {float(value)!r}\n" for name, value in known.items())
+    @property
+    def known(self) -> dict[str, float]:
+        """The known properties by name."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+    def to_toml(self) -> str:
+        """Return the text of the file; empty if nothing is known."""
+        return "".join(f"{name} = {float(value)!r}\n" for name, value in self.known.items())
 
 
 def properties_of(mesh: Path) -> Properties:
-    """Of the file beside a mesh; nothing known if there is none.
+    """Read the file next to a mesh; nothing is known without a file.
 
     Raises:
-        ObjectError: it is not what it should be.
+        ObjectError: the file is damaged, or a value is out of range.
     """
     path = mesh.with_suffix(".toml")
     if not path.is_file():

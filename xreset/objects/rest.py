@@ -1,4 +1,4 @@
-"""How an object rests on a table."""
+"""Resting poses of an object on a table."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ def rest_height(obj: ObjectSpec, quat: np.ndarray) -> np.ndarray | float:
     """
     w, x, y, z = np.moveaxis(np.asarray(quat, dtype=float), -1, 0)
     norm = w * w + x * x + y * y + z * z
-    up = (
-        np.stack((2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z), axis=-1) / norm[..., None]
-    )  # R's last row
+    last_row = (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z)  # of the rotation matrix
+    up = np.stack(last_row, axis=-1) / norm[..., None]
     height = -(up @ obj.vertices.T).min(axis=-1)
     return float(height) if np.ndim(height) == 0 else height
 
@@ -30,18 +29,19 @@ def rest_height(obj: ObjectSpec, quat: np.ndarray) -> np.ndarray | float:
 def resting_orientation(obj: ObjectSpec, up: np.ndarray) -> np.ndarray:
     """[4] the stable pose on a plane that comes nearest to the mesh direction ``up`` [3] pointing up.
 
-    An object rests on a face of its convex hull if its centre of mass projects into that face.
+    An object rests on a face of its convex hull if its center of mass projects into that face.
     """
     convex = ConvexHull(obj.vertices)
-    corners, normals = obj.vertices[convex.simplices], convex.equations[:, :3]
-    distance = normals @ obj.com + convex.equations[:, 3]  # of the centre of mass, negative as it is inside
+    corners = obj.vertices[convex.simplices]
+    normals = convex.equations[:, :3]
+    distance = normals @ obj.com + convex.equations[:, 3]  # of the center of mass, negative as it is inside
     foot = obj.com - distance[:, None] * normals
-    turn = np.sign(
-        np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), normals)
-    )
+    winding = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    turn = np.sign(np.einsum("ij,ij->i", winding, normals))
     stable = np.ones(len(corners), dtype=bool)
     for i in range(3):
-        edge, to_foot = corners[:, (i + 1) % 3] - corners[:, i], foot - corners[:, i]
+        edge = corners[:, (i + 1) % 3] - corners[:, i]
+        to_foot = foot - corners[:, i]
         stable &= turn * np.einsum("ij,ij->i", np.cross(edge, to_foot), normals) >= -1e-12
     top = -normals[stable][np.argmin(normals[stable] @ up)]
     axis = np.cross(top, (0.0, 0.0, 1.0))

@@ -7,7 +7,10 @@ import numpy as np
 from xreset.spec import ObjectSpec
 
 _CANDIDATES_PER_POINT = 8
-_PROBE = 2e-4  # how far outside the surface a sample is tested [m]: above rounding, below any feature
+_PROBE = 2e-4
+"""Distance from the surface at which a sample is tested [m]: above rounding, below any feature."""
+_PAIRS = 2_000_000
+"""Pairs of a point and a triangle that are handled at once: bounds memory."""
 
 
 def surface_points(obj: ObjectSpec, count: int = 64, seed: int = 0) -> np.ndarray:
@@ -21,29 +24,30 @@ def surface_points(obj: ObjectSpec, count: int = 64, seed: int = 0) -> np.ndarra
 
 
 def sample_surface(obj: ObjectSpec, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Points [count, 3] uniform over the triangles' area, and their outward normals [count, 3]."""
+    """Return points [count, 3] uniform over the triangles' area, and their outward normals [count, 3]."""
     rng = np.random.default_rng(seed)
-    corners = obj.vertices[obj.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    first, second, third = obj.vertices[obj.faces].swapaxes(0, 1)
+    u = second - first
+    v = third - first
+    cross = np.cross(u, v)
     double_area = np.linalg.norm(cross, axis=1)
-    face = rng.choice(len(corners), size=count, p=double_area / double_area.sum())
+    face = rng.choice(len(cross), size=count, p=double_area / double_area.sum())
     a, b = rng.random((2, count, 1))
     fold = a + b > 1  # fold the parallelogram onto the triangle
-    a, b = np.where(fold, 1 - a, a), np.where(fold, 1 - b, b)
-    origin, u, v = corners[face, 0], corners[face, 1] - corners[face, 0], corners[face, 2] - corners[face, 0]
-    return origin + a * u + b * v, cross[face] / double_area[face, None]
+    a = np.where(fold, 1 - a, a)
+    b = np.where(fold, 1 - b, b)
+    return first[face] + a * u[face] + b * v[face], cross[face] / double_area[face, None]
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """[count, 3] points chosen one after the other, each the farthest from those chosen before; the first is the farthest from the mean."""
+    """[count, 3] points chosen one after another, each the farthest from those chosen before; the first is the farthest from the mean."""
     if len(points) < count:
         raise ValueError(f"{count} points wanted of {len(points)}")
-    chosen = np.empty(count, dtype=np.int64)
-    chosen[0] = np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))
-    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
-    for i in range(1, count):
-        chosen[i] = np.argmax(distance)
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[i]], axis=1))
+    chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
+    distance = np.full(len(points), np.inf)
+    while len(chosen) < count:
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        chosen.append(int(np.argmax(distance)))
     return points[chosen]
 
 
@@ -54,29 +58,31 @@ def winding_number(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) 
     (1983). Holes in the mesh change it smoothly, so 0.5 still separates in from out.
     """
     corners = vertices[faces]
-    block = max(1, 2_000_000 // len(faces))  # bounds memory
-    return np.concatenate(
-        [_winding(points[i : i + block], corners) for i in range(0, len(points), block)] or [np.empty(0)]
-    )
+    block = max(1, _PAIRS // len(faces))
+    numbers = [np.empty(0)]
+    for begin in range(0, len(points), block):
+        away = corners[None] - points[begin : begin + block, None, None]
+        a, b, c = np.moveaxis(away, 2, 0)
+        la, lb, lc = (np.sqrt(_dot(v, v)) for v in (a, b, c))
+        volume = _dot(a, np.cross(b, c))
+        angle = np.arctan2(volume, la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb)
+        numbers.append(angle.sum(axis=1) / (2 * np.pi))
+    return np.concatenate(numbers)
 
 
-def _winding(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    a, b, c = (corners[None, :, i] - points[:, None] for i in range(3))
-    la, lb, lc = (np.sqrt(np.einsum("ijk,ijk->ij", v, v)) for v in (a, b, c))
-    volume = np.einsum("ijk,ijk->ij", a, np.cross(b, c))
-    ab, bc, ca = (np.einsum("ijk,ijk->ij", u, v) for u, v in ((a, b), (b, c), (c, a)))
-    return np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=1) / (2 * np.pi)
+def _dot(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return np.einsum("ijk,ijk->ij", u, v)
 
 
 def bounding_box(obj: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner [3], [3] of the axis-aligned bounding box."""
+    """Return the lower and upper corner [3], [3] of the axis-aligned bounding box."""
     return obj.vertices.min(axis=0), obj.vertices.max(axis=0)
 
 
 def keypoints(obj: ObjectSpec) -> np.ndarray:
     """[4, 3] the object-frame keypoints of the pose metric (the paper, appendix A).
 
-    The paper does not say which; here they are four alternating corners of the axis-aligned bounding box: a tetrahedron, so that no
+    The paper does not define them; here they are four alternating corners of the axis-aligned bounding box: a tetrahedron, so that no
     rotation leaves all four in place, at the object's own scale.
     """
     corners = np.array(bounding_box(obj))

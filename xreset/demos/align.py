@@ -14,14 +14,15 @@ from xreset.objects.rest import rest_height
 from xreset.spec import ObjectSpec
 
 CALIBRATION_ERROR = 0.020
-"""Largest height above the table at which an object counts as standing on it [m]. In 270 sequences of DexYCB all but one are within
-12 mm; that one is 44 mm up."""
+"""Largest height above the table at which an object counts as standing on it [m]. In 270 sequences of DexYCB all but
+one are within 12 mm; that one is 44 mm up."""
 
 
 def levelled(demos: Demos) -> Demos:
     """Return the demonstrations in a frame whose z axis is the true table's normal, by ``T_level_from_table``.
 
-    DexYCB's tag plane is tilted by about one degree against the table. Demonstrations without the transforms stay unchanged.
+    DexYCB's tag plane is tilted by about one degree against the table. Demonstrations without the transforms stay
+    unchanged.
 
     Raises:
         DemoError: some subjects have a transform, but another does not.
@@ -70,8 +71,8 @@ def on_something(demos: Demos, objects: Mapping[str, ObjectSpec]) -> np.ndarray:
 def grounded(demos: Demos, objects: Mapping[str, ObjectSpec]) -> Demos:
     """Shift every sequence along z so that its object's lowest vertex is at z = 0 in the first frame.
 
-    A sequence whose object starts on top of something else stays where it is: its hand would else reach into the table. The scene does
-    not have the thing below the object, so in physics the object first drops by that height.
+    A sequence whose object starts on top of something else stays where it is: its hand would else reach into the table.
+    The scene does not have the thing below the object, so in physics the object first drops by that height.
     """
     height = start_height(demos, objects)
     height[height > CALIBRATION_ERROR] = 0.0

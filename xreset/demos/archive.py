@@ -1,7 +1,7 @@
 """The archive of demonstrations: all sequences one after another, in one npz file.
 
-Shape letters: S sequences, F frames of all sequences, 21 keypoints (``xreset.spec.KEYPOINTS``). Metres, quaternions (w, x, y, z). Poses
-are in the table frame: z up, table top at z = 0, the person at +y.
+Shape letters: S sequences, F frames of all sequences, 21 keypoints (``xreset.spec.KEYPOINTS``). Metres, quaternions (w,
+x, y, z). Poses are in the table frame: z up, table top at z = 0, the person at +y.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ class Demos(ObjectMotions):
     hand_valid: Annotated[np.ndarray, Field(("F",), "b")]
     """[F] bool: whether the hand was annotated."""
     wrist_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", within=None)]
-    """[F, 4] orientation of MANO's root: a right hand's fingers point along its -x, its palm faces -y; NaN where not annotated."""
+    """[F, 4] orientation of MANO's root: a right hand's fingers point along its -x, its palm faces -y; NaN where not
+    annotated."""
     object_pos: Annotated[np.ndarray, Field(("F", 3), "f", within=None)]
     """[F, 3] origin of the object's mesh frame."""
     object_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", within=None)]
@@ -90,7 +91,8 @@ class Demos(ObjectMotions):
     subjects: Annotated[np.ndarray, Field(("B",), "U")] | None = None
     """[B] the subjects that ``T_level_from_table`` is given for."""
     T_level_from_table: Annotated[np.ndarray, Field(("B", 4, 4), "f", within=POSITION)] | None = None
-    """[B, 4, 4] per subject: takes poses to a frame whose z axis is the true table's normal (:func:`xreset.demos.align.levelled`)."""
+    """[B, 4, 4] per subject: takes poses to a frame whose z axis is the true table's normal
+    (:func:`xreset.demos.align.levelled`)."""
 
     @property
     def num_sequences(self) -> int:
@@ -121,7 +123,8 @@ class Demos(ObjectMotions):
             indices: sequence indices; the result has their order.
             objects: object names, official or the paper's.
             max_per_object: keep the first n sequences of each object.
-            spread: keep n of each object from all over the archive instead of the first, which in most archives are one person's.
+            spread: keep n of each object from all over the archive instead of the first, which in most archives are one
+                person's.
 
         Raises:
             DemoError: unknown index, name, object or side, or nothing is left.
@@ -131,7 +134,8 @@ class Demos(ObjectMotions):
             chosen = np.asarray(list(indices), dtype=np.int64)
         if ((chosen < 0) | (chosen >= self.num_sequences)).any():
             raise DemoError(
-                f"Unknown sequence index in {chosen.tolist()}: there are {self.num_sequences} sequences, counted from 0."
+                f"Unknown sequence index in {chosen.tolist()}: there are {self.num_sequences} sequences, counted from"
+                " 0."
             )
         if names is not None:
             chosen = self._having("sequence_name", names, chosen)
@@ -211,7 +215,8 @@ def read_demos(path: str | Path) -> Demos:
     """Read an archive; all of it is checked before any of it is used.
 
     Raises:
-        FileFormatError: the file is missing, damaged or not an archive, or a value in it is wrong: the message names sequence and frame.
+        FileFormatError: the file is missing, damaged or not an archive, or a value in it is wrong: the message names
+            sequence and frame.
     """
     return read_record(Demos, path, SCHEMA_NAME, what="an archive of demonstrations", check=_problem)
 

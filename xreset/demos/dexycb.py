@@ -1,12 +1,14 @@
 """Reader of the DexYCB data set (Chao et al. 2021) in its official folder layout.
 
-    ROOT/20200709-subject-01/20200709_141754/meta.yml              object, hand, cameras and calibration
-                                             pose.npz              pose_y: objects, pose_m: MANO; both in the world frame
-                                             SERIAL/labels_000000.npz   joint_3d: hand joints, in that camera's frame
-    ROOT/calibration/extrinsics_ID/extrinsics.yml                  camera poses and the AprilTag's pose in the world frame
+    ROOT/20200709-subject-01/20200709_141754/
+        meta.yml                    object, hand, cameras and calibration
+        pose.npz                    pose_y: objects, pose_m: MANO; both in the world frame
+        SERIAL/labels_000000.npz    joint_3d: hand joints, in that camera's frame
+    ROOT/calibration/extrinsics_ID/
+        extrinsics.yml              camera poses and the AprilTag's pose in the world frame
 
-The world frame is the master camera's; the table frame is the AprilTag's. Object quaternions in ``pose.npz`` are (x, y, z, w). Frames
-without a hand have ``pose_m`` = 0 and joints = -1.
+The world frame is the master camera's; the table frame is the AprilTag's. Object quaternions in ``pose.npz`` are
+(x, y, z, w). Frames without a hand have ``pose_m`` = 0 and joints = -1.
 """
 
 from __future__ import annotations
@@ -70,7 +72,7 @@ def read_dexycb(
         progress: called with (sequences done, sequences in all, name) before each sequence is read.
 
     Raises:
-        DemoError: the folder is not in DexYCB's layout, a part of a sequence is missing, or parts contradict each other.
+        DemoError: the folder is not in DexYCB's layout, or parts of a sequence are missing or contradict each other.
         ObjectError: a name in ``objects`` is not one of DexYCB's.
     """
     root = Path(root)
@@ -139,14 +141,15 @@ def _transform(T: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _read_joints(sequence: _Sequence, frame: int, extrinsics: _Poses) -> np.ndarray:
-    """[21, 3] hand joints in the world frame, from the first camera that has this frame's labels; NaN where there is no hand.
+    """[21, 3] hand joints in the world frame, from the first camera with labels of this frame; NaN without a hand.
 
-    DexYCB's joint order is this project's keypoint order. All cameras' labels come from one fit, so one camera is enough.
+    DexYCB's joint order is this project's keypoint order. All cameras' labels come from one fit: one camera is enough.
     """
     calibrated = [serial for serial in sequence.serials if serial in extrinsics]
     if not calibrated:
         raise DemoError(
-            f"sequence {sequence.name}: no camera of meta.yml ({', '.join(sequence.serials)}) is in extrinsics_{sequence.extrinsics}; the"
+            f"sequence {sequence.name}: no camera of meta.yml ({', '.join(sequence.serials)}) is in"
+            f" extrinsics_{sequence.extrinsics}; the"
             " calibration folder does not belong to these sequences. Download DexYCB's calibration archive again."
         )
     for serial in calibrated:
@@ -228,7 +231,8 @@ _Loader.add_constructor("tag:yaml.org,2002:python/tuple", _Loader.construct_sequ
 def _read_yaml(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise DemoError(
-            f"There is no {path}; the DexYCB folder is incomplete. Unpack its calibration archive next to the subjects' folders."
+            f"There is no {path}; the DexYCB folder is incomplete. Unpack its calibration archive next to the"
+            " subjects' folders."
         )
     try:
         if path.stat().st_size > _MAX_YAML_BYTES:
@@ -252,6 +256,7 @@ def _read_npz(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> list[np.ndar
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise DemoError(
-                f"{path}: {name} has shape {arrays[name].shape}, but meta.yml asks for {shape}. Is it a file of another sequence?"
+                f"{path}: {name} has shape {arrays[name].shape}, but meta.yml asks for {shape}. Is it a file of"
+                " another sequence?"
             )
     return [arrays[name].astype(float) for name in shapes]

@@ -1,8 +1,10 @@
-"""Human-like grasps of an object on a table: where thumb and fingers oppose each other, and the hand pose that puts them there.
+"""Human-like grasps of an object on a table: where thumb and fingers oppose each other, and the hand pose that puts
+them there.
 
-A grasp is planned in two steps. :func:`plan_contacts` looks for lines through the object along which the thumb on one side and the fingers
-on the other can press against it. :func:`fit_hand` then finds the wrist pose and joint angles whose fingertips are there, by nonlinear
-least squares: fingertips on their contacts, no bone inside object or table, near a natural posture.
+A grasp is planned in two steps. :func:`plan_contacts` looks for lines through the object along which the thumb on one
+side and the fingers on the other can press against it. :func:`fit_hand` then finds the wrist pose and joint angles
+whose fingertips are there, by nonlinear least squares: fingertips on their contacts, no bone inside object or table,
+near a natural posture.
 
 Everything is in a frame with z up and the table at z = 0; the object is its convex pieces, moved there.
 """
@@ -61,7 +63,8 @@ class Solid:
         return cls(planes=tuple(planes), vertices=rotation.apply(obj.vertices) + pos, com=rotation.apply(obj.com) + pos)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """[...] signed distance of points [..., 3] to the surface, negative inside; outside it is a lower bound near edges."""
+        """[...] signed distance of points [..., 3] to the surface, negative inside; outside it is a lower bound near
+        edges."""
         return np.min([(points @ plane[:, :3].T + plane[:, 3]).max(axis=-1) for plane in self.planes], axis=0)
 
     def crossings(
@@ -70,7 +73,8 @@ class Solid:
         """Intersect lines through origins [L, 3] along a direction [3] with each piece.
 
         Returns:
-            Line parameters of entry and exit [pieces, L] (entry > exit where the piece is missed), and the normals there [pieces, L, 3].
+            Line parameters of entry and exit [pieces, L] (entry > exit where the piece is missed), and the normals
+            there [pieces, L, 3].
         """
         enter = []
         leave = []

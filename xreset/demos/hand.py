@@ -1,7 +1,7 @@
 """A simple human hand: joint angles to the 21 keypoints, for synthetic demonstrations.
 
-The hand's frame is that of MANO's root, at the wrist: a right hand's fingers point along -x, its palm faces -y and its thumb is on the +z
-side; a left hand is the mirror image in x. Lengths are rounded averages of adult hands.
+The hand's frame is that of MANO's root, at the wrist: a right hand's fingers point along -x, its palm faces -y and its
+thumb is on the +z side; a left hand is the mirror image in x. Lengths are rounded averages of adult hands.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ THUMB_LENGTHS = np.array([42, 33, 30]) * 1e-3
 DIP_PER_PIP = 0.6
 """Flexion of a finger's last joint per flexion of its middle joint: one tendon bends both."""
 
-# The 17 joint angles [rad]; flexion is positive. Of each finger, index to little: abduction, base joint (MCP), middle joint (PIP).
-# Of the thumb: radial and palmar abduction, twist, MCP, IP.
+# The 17 joint angles [rad]; flexion is positive. Of each finger, index to little: abduction, base joint (MCP), middle
+# joint (PIP). Of the thumb: radial and palmar abduction, twist, MCP, IP.
 LOWER = np.array([-0.3, -0.2, 0.0] * 4 + [-0.3, 0.1, -0.2, 0.0, -0.1])
 UPPER = np.array([0.3, 1.5, 1.75] * 4 + [1.0, 1.1, 1.0, 0.9, 1.2])
 """[17] limits of the joint angles [rad]."""
@@ -71,7 +71,8 @@ def _chain(base: np.ndarray, bones: np.ndarray) -> np.ndarray:
 
 
 def hand_axes(direction: np.ndarray, palm: np.ndarray, side: str = "right") -> np.ndarray:
-    """[3, 3] orientation of a hand whose fingers point along ``direction`` and whose palm faces ``palm`` (orthogonal unit vectors)."""
+    """[3, 3] orientation of a hand whose fingers point along ``direction`` and whose palm faces ``palm`` (orthogonal
+    unit vectors)."""
     x = -direction if side == "right" else direction
     return np.stack((x, -palm, np.cross(x, -palm)), axis=-1)
 

@@ -1,9 +1,11 @@
-"""Reader of the HO-3D data set (Hampali et al. 2020, versions 2 and 3) in its own layout. Not yet tried on the original files.
+"""Reader of the HO-3D data set (Hampali et al. 2020, versions 2 and 3) in its own layout. Not yet tried on the files.
 
-    ROOT/train/SEQUENCE/meta/0000.pkl     handJoints3D (21, 3), objRot (3, 1) axis and angle, objTrans (3,), objName; metres
+    ROOT/train/SEQUENCE/meta/0000.pkl
+        handJoints3D (21, 3), objRot (3, 1) axis and angle, objTrans (3,), objName; metres
 
-Each frame's numbers are in the camera's frame with OpenGL's axes: x right, y up, the camera looks along -z. Joints are in MANO's order; all
-hands are right hands. Values that were not annotated are None. The files state neither the rate nor the place of the table.
+Each frame's numbers are in the camera's frame with OpenGL's axes: x right, y up, the camera looks along -z. Joints are
+in MANO's order; all hands are right hands. Values that were not annotated are None. The files state neither the rate
+nor the place of the table.
 """
 
 from __future__ import annotations
@@ -38,8 +40,9 @@ def read_ho3d(
     Args:
         root: the folder that holds ``train``.
         fps: frames per second; consecutive numbers are consecutive frames.
-        cameras: a file with the camera's pose in the table frame (:func:`xreset.demos.keypoints.read_transform`; x right, y down, z
-            forward) for all sequences, or a folder with ``SEQUENCE.txt`` or ``.npy``; sequences without one are omitted.
+        cameras: a file with the camera's pose in the table frame for all sequences (x right, y down, z forward; see
+            :func:`xreset.demos.keypoints.read_transform`), or a folder with ``SEQUENCE.txt`` or ``.npy``, where
+            sequences without one are omitted.
         progress: called with (sequences done, sequences in all, name) before each is read.
 
     Raises:
@@ -58,7 +61,8 @@ def read_ho3d(
                 break
     if not poses:
         raise DemoError(
-            f"{cameras} contains no camera pose for any sequence. Give one file for all, or a folder with {folders[0].parent.name}.txt."
+            f"{cameras} contains no camera pose for any sequence. Give one file for all, or a folder with"
+            f" {folders[0].parent.name}.txt."
         )
     parts = []
     for done, (folder, pose) in enumerate(poses.items()):
@@ -79,7 +83,7 @@ def read_ho3d(
 
 
 def _read_sequence(folder: Path, fps: float) -> dict[str, np.ndarray]:
-    """Return the arrays of a sequence (see :func:`xreset.demos.keypoints.sequence_of`), from its first to its last known object pose."""
+    """Return the arrays of a sequence for :func:`sequence_of`, from its first to its last known object pose."""
     frames = {}
     for path in sorted(folder.glob("*.pkl")):
         if not (path.stem.isdecimal() and len(path.stem) < 10):
@@ -92,7 +96,8 @@ def _read_sequence(folder: Path, fps: float) -> dict[str, np.ndarray]:
     missing = sorted(set(frames) - set(known))
     if missing:
         raise DemoError(
-            f"{folder}: the object's pose is unknown in {len(missing)} frames between others, first in {missing[0]:04d}.pkl."
+            f"{folder}: the object's pose is unknown in {len(missing)} frames between others, first in"
+            f" {missing[0]:04d}.pkl."
         )
     names = sorted({frame["name"] for frame in frames.values()})
     if len(names) > 1:

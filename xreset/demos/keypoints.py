@@ -1,8 +1,9 @@
-"""Reader of demonstrations of any tracker: 21 hand keypoints and the object's pose, frame by frame, as npz, CSV or a folder of either.
+"""Reader of demonstrations of any tracker: 21 hand keypoints and the object's pose, frame by frame, as npz, CSV or a
+folder of either.
 
-The meaning of the numbers (order of the keypoints, unit, frame, quaternions, rate, hand, object) must be in the file or be given: it is
-never guessed. If the numbers contradict what was given, the reader refuses and names the option that fits. ``docs/demonstrations.md``
-has the layout of the files.
+The meaning of the numbers (order of the keypoints, unit, frame, quaternions, rate, hand, object) must be in the file or
+be given: it is never guessed. If the numbers contradict what was given, the reader refuses and names the option that
+fits. ``docs/demonstrations.md`` has the layout of the files.
 """
 
 from __future__ import annotations
@@ -40,19 +41,23 @@ ORDERS: Mapping[Order, tuple[int, ...]] = {
     "mediapipe": tuple(range(21)),
     "openpose": tuple(range(21)),
 }
-"""Index of each of :data:`xreset.spec.KEYPOINTS` in another order. MANO: the 16 joints of the model (wrist, index, middle, little, ring,
-thumb, base to end), then the tips of thumb, index, middle, ring and little finger (Romero et al. 2017; HO-3D's order too)."""
+"""Index of each of :data:`xreset.spec.KEYPOINTS` in another order. MANO: the 16 joints of the model (wrist, index,
+middle, little, ring, thumb, base to end), then the tips of thumb, index, middle, ring and little finger (Romero et al.
+2017; HO-3D's order too)."""
 
 MAX_FRAMES = 1_000_000
 """Most frames that a sequence may be resampled to: nine hours at 30 per second."""
 
 _KNUCKLES = [0, 5, 9, 13, 17]
 _PALM = (60.0, 140.0)
-"""Range of distances from the wrist to the middle finger's knuckle [mm]: 90 to 100 in DexYCB, with room for children and trackers."""
+"""Range of distances from the wrist to the middle finger's knuckle [mm]: 90 to 100 in DexYCB, with room for children
+and trackers."""
 _ORDER_RATIO = 1.1
-"""A hand in a wrong order has longer bones by at least this factor: 1.29 (MANO's read as MediaPipe's) and 1.50 at the median."""
+"""A hand in a wrong order has longer bones by at least this factor: 1.29 (MANO's read as MediaPipe's) and 1.50 at the
+median."""
 _BONE_SPREAD = 0.3
-"""Largest relative standard deviation of a bone's length over a sequence; a tracker's noise is below, image coordinates are above."""
+"""Largest relative standard deviation of a bone's length over a sequence; a tracker's noise is below, image coordinates
+are above."""
 _CURL = 0.015
 """Fingers that bend this far to the back of the hand, at the median of a sequence, are those of the other hand [m]."""
 _CENTERED = 0.05
@@ -118,17 +123,19 @@ def read_keypoints(
     *,
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> Demos:
-    """Read a tracker's sequences: an npz (one sequence), a CSV (one, or several with a column ``sequence``), or a folder of them.
+    """Read a tracker's sequences: an npz (one sequence), a CSV (one, or several with a column ``sequence``), or a
+    folder of them.
 
     Args:
         progress: called with (files done, files in all, name) before each file is read.
 
     Returns:
-        The demonstrations in metres and in the table frame. The wrist's orientation is that of five keypoints (wrist and knuckles) fitted
-        to an average hand: 3.6 degrees from MANO's at most, on DexYCB.
+        The demonstrations in metres and in the table frame. The wrist's orientation is that of five keypoints (wrist
+        and knuckles) fitted to an average hand: 3.6 degrees from MANO's at most, on DexYCB.
 
     Raises:
-        DemoError: something about the numbers is unknown or contradicts itself; the message names the option that states it.
+        DemoError: something about the numbers is unknown or contradicts itself; the message names the option that
+            states it.
         FileFormatError: an npz file is damaged or does not have the arrays.
     """
     path = Path(path)
@@ -166,11 +173,13 @@ def read_transform(path: str | Path) -> np.ndarray:
         T = np.load(path, mmap_mode="r", allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, ndmin=2)
     except Exception as error:  # numpy's parsers raise any kind of error
         raise DemoError(
-            f"{path} cannot be read as a matrix: {shown(str(error))}. Write its four rows as four lines of four numbers."
+            f"{path} cannot be read as a matrix: {shown(str(error))}. Write its four rows as four lines of four"
+            " numbers."
         ) from error
     if T.shape != (4, 4) or not is_rigid(T):
         raise DemoError(
-            f"{path} holds {T.shape} numbers {shown(T.tolist())}, expected the 4x4 matrix of a rotation and a translation,"
+            f"{path} holds {T.shape} numbers {shown(T.tolist())}, expected the 4x4 matrix of a rotation and a"
+            " translation,"
             " with the last row 0 0 0 1."
         )
     if np.abs(T[:3, 3]).max() > 20:
@@ -198,7 +207,7 @@ def _check_convention(convention: Convention) -> None:
         )
 
 
-# Files -----------------------------------------------------------------------------------------------------------------------------------
+# Files
 
 
 def _read_npz(path: Path, name: str) -> dict[str, np.ndarray]:
@@ -246,7 +255,8 @@ def _fields_of(header: Sequence[str], path: Path) -> list[str]:
         missing = sorted(set(columns) - set(header))
         if missing and (field == "keypoints" or len(missing) < len(columns)):
             raise DemoError(
-                f"{path} lacks the columns {shown(missing)} of {field}. The first line must name x0, y0, z0 to z20 and the object's"
+                f"{path} lacks the columns {shown(missing)} of {field}. The first line must name x0, y0, z0 to z20"
+                " and the object's"
                 f" pose (docs/demonstrations.md). Found: {shown(header)}"
             )
         if not missing:
@@ -289,11 +299,12 @@ def _number(row: Mapping[str, Any], column: str) -> float:
         ) from None
 
 
-# One sequence ----------------------------------------------------------------------------------------------------------------------------
+# One sequence
 
 
 def sequence_of(arrays: Mapping[str, np.ndarray], what: str, convention: Convention) -> Demos:
-    """Return one sequence from the arrays of a file; see :func:`read_keypoints` for errors, in which ``what`` names the sequence."""
+    """Return one sequence from the arrays of a file; see :func:`read_keypoints` for errors, in which ``what`` names the
+    sequence."""
     try:
         return _sequence(arrays, convention)
     except DemoError as error:
@@ -324,8 +335,10 @@ def _sequence(arrays: Mapping[str, np.ndarray], convention: Convention) -> Demos
         turn = Rotation.from_matrix(R) * turn
     if not _START[0] <= pos[0, 2] <= _START[1]:
         raise DemoError(
-            f"the object starts at z = {pos[0, 2]:.3f} m, but it must start on a table whose top is at z = 0. Are these the"
-            " camera's coordinates (--coordinates camera --table-from-camera FILE), or is that matrix the inverse of what it should be?"
+            f"the object starts at z = {pos[0, 2]:.3f} m, but it must start on a table whose top is at z = 0. Are"
+            " these the"
+            " camera's coordinates (--coordinates camera --table-from-camera FILE), or is that matrix the"
+            " inverse of what it should be?"
         )
     fps, (points, pos, turn) = _evenly(arrays, convention, (points, pos, turn))
     valid = np.asarray(np.isfinite(points).all(axis=(1, 2)))
@@ -360,7 +373,8 @@ def _text(arrays: Mapping[str, np.ndarray], field: str, option: str | None) -> s
 
 
 def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Iterator[str]:
-    """Yield what in keypoints [F, 21, 3] in metres, in the file's order, contradicts the convention; the likeliest cause first."""
+    """Yield what in keypoints [F, 21, 3] in metres, in the file's order, contradicts the convention; the likeliest
+    cause first."""
     assert convention.order is not None
     order = ORDERS[convention.order]
     palm = 1e3 * float(np.median(np.linalg.norm(points[:, order[9]] - points[:, 0], axis=1)))
@@ -369,14 +383,16 @@ def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Ite
         in_unit = palm / 1e3 if convention.units == "m" else palm * 1e3
         fits = f" With --units {unit} it would." if _PALM[0] <= in_unit <= _PALM[1] else ""
         yield (
-            f"from the wrist to the middle finger's knuckle it is {palm:.3g} mm, expected {_PALM[0]:.0f} to {_PALM[1]:.0f} mm.{fits}"
+            f"from the wrist to the middle finger's knuckle it is {palm:.3g} mm, expected {_PALM[0]:.0f} to"
+            f" {_PALM[1]:.0f} mm.{fits}"
             " Keypoints must be metric and in space, not those of an image."
         )
     lengths = {name: np.median(hand.bone_lengths(points[:, ORDERS[name]]).sum(axis=1)) for name in ORDERS}
     best = min(lengths, key=lambda name: lengths[name])
     if lengths[convention.order] > _ORDER_RATIO * lengths[best]:
         yield (
-            f"in the order {convention.order} the bones of the hand are {lengths[convention.order]:.2f} m long together, in the order"
+            f"in the order {convention.order} the bones of the hand are {lengths[convention.order]:.2f} m long"
+            " together, in the order"
             f" {best} {lengths[best]:.2f} m. Use --order {best}."
         )
     points = points[:, order]
@@ -384,12 +400,14 @@ def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Ite
     spread = np.median(bones.std(axis=0) / bones.mean(axis=0))
     if spread > _BONE_SPREAD:
         yield (
-            f"the lengths of the hand's bones change by {spread:.0%} (standard deviation) during the sequence, so the keypoints are"
+            f"the lengths of the hand's bones change by {spread:.0%} (standard deviation) during the sequence, so"
+            " the keypoints are"
             " not metric. MediaPipe's normalised landmarks, for example, are coordinates of the image."
         )
     if len(points) > 1 and np.linalg.norm(points.mean(axis=1), axis=1).max() < _CENTERED:
         yield (
-            "the keypoints are centred on the hand in every frame, like MediaPipe's world landmarks, so the place of the hand is"
+            "the keypoints are centred on the hand in every frame, like MediaPipe's world landmarks, so the"
+            " place of the hand is"
             " unknown. Add the hand's position in the camera's or the table's frame first."
         )
     palm_normal = np.cross(points[:, 5] - points[:, 0], points[:, 17] - points[:, 0])
@@ -400,7 +418,8 @@ def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Ite
     curl = np.median((fingers * palm_normal[:, None]).sum(axis=-1))
     if curl < -_CURL:
         yield (
-            f"as a {side} hand its fingers bend {-1e3 * curl:.0f} mm towards the back of the hand. It is the other hand (--side)"
+            f"as a {side} hand its fingers bend {-1e3 * curl:.0f} mm towards the back of the hand. It is the"
+            " other hand (--side)"
             " or the coordinates are left-handed, as Unity's are: negate one axis of keypoints and poses."
         )
 
@@ -410,7 +429,8 @@ def _object_pose(arrays: Mapping[str, np.ndarray], convention: Convention) -> tu
     given = [name for name in _FILE if name.startswith("object_") and name in arrays]
     if given != ["object_pose"] and not (len(given) == 2 and given[0] == "object_pos"):
         raise DemoError(
-            "the object's pose must be given once, as object_pose (matrices) or as object_pos and object_quat_wxyz or _xyzw;"
+            "the object's pose must be given once, as object_pose (matrices) or as object_pos and"
+            " object_quat_wxyz or _xyzw;"
             f" found {', '.join(given) or 'none'}."
         )
     name = given[-1]
@@ -457,7 +477,8 @@ def _evenly(arrays: Mapping[str, np.ndarray], convention: Convention, motion: Mo
     even = np.abs(steps * own - 1).max() <= _UNEVEN
     if convention.fps is None and not even:
         raise DemoError(
-            f"frames are {1e3 * steps.min():.1f} to {1e3 * steps.max():.1f} ms apart. Add --fps to resample them evenly."
+            f"frames are {1e3 * steps.min():.1f} to {1e3 * steps.max():.1f} ms apart. Add --fps to resample them"
+            " evenly."
         )
     rate = convention.fps or float(round(own, 3))
     if even and abs(rate / own - 1) < 1e-3:
@@ -480,7 +501,8 @@ def _evenly(arrays: Mapping[str, np.ndarray], convention: Convention, motion: Mo
 
 
 def _wrist(points: np.ndarray, side: str) -> Rotation:
-    """Fit wrist and knuckles of an average hand to keypoints [F, 21, 3] (Kabsch's algorithm); F orientations of MANO's root."""
+    """Fit wrist and knuckles of an average hand to keypoints [F, 21, 3] (Kabsch's algorithm); F orientations of MANO's
+    root."""
     template = np.concatenate((np.zeros((1, 3)), hand.FINGER_BASES))
     if side == "left":
         template[:, 0] *= -1

@@ -1,9 +1,10 @@
 """Mirrored demonstrations: left hands become right hands, for training a right-handed robot.
 
-The world is reflected in the vertical plane through the table's center that the person stands in. A reflected object is no rigid motion of
-the object, unless the object is its own mirror image: with W the world's reflection, T the object's pose and M the reflection in the
-object's own plane of symmetry, W T M is a proper pose, and shows what W T would show. So only objects that are symmetric within a stated
-tolerance can be mirrored. The deviation from symmetry is measured on the collision pieces, which are what physics touches.
+The world is reflected in the vertical plane through the table's center that the person stands in. A reflected object is
+no rigid motion of the object, unless the object is its own mirror image: with W the world's reflection, T the object's
+pose and M the reflection in the object's own plane of symmetry, W T M is a proper pose, and shows what W T would show.
+So only objects that are symmetric within a stated tolerance can be mirrored. The deviation from symmetry is measured on
+the collision pieces, which are what physics touches.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ class Symmetry:
 
 
 def symmetry(obj: ObjectSpec) -> Symmetry:
-    """Find the best plane of symmetry of an object's surface: from the principal axes of its points, refined by Nelder and Mead's method."""
+    """Find the best plane of symmetry of an object's surface: from the principal axes of its points, refined by Nelder
+    and Mead's method."""
     from xreset.geometry.surface import Surface
 
     surface = Surface(obj)
@@ -78,7 +80,8 @@ def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: flo
     if not kept:
         listed = ", ".join(f"{name} {1e3 * deviation:.1f} mm" for name, deviation in measured.items())
         raise DemoError(
-            f"No object is its own mirror image within {1e3 * tolerance:g} mm: {listed}. Raise --tolerance or omit xreset demos mirror."
+            f"No object is its own mirror image within {1e3 * tolerance:g} mm: {listed}. Raise --tolerance or"
+            " omit xreset demos mirror."
         )
     demos = levelled(demos).select(objects=kept)
     shift = np.array([2.0 * TableSpec().center[0], 0.0, 0.0])
@@ -106,7 +109,8 @@ def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: flo
 
 
 def _plane(parameters: np.ndarray, axis: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return normal and offset of the plane through the center across an axis, tilted by two angles [rad] and moved by a length [0.1 m]."""
+    """Return normal and offset of the plane through the center across an axis, tilted by two angles [rad] and moved by
+    a length [0.1 m]."""
     u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     u /= np.linalg.norm(u)
     normal = axis + parameters[0] * u + parameters[1] * np.cross(axis, u)

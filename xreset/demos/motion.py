@@ -15,7 +15,8 @@ LIFT = (0.14, 0.41)
 
 _TRIES = 12
 _CLEAR = 0.001
-"""A path is good if no keypoint comes nearer than this to object or table [m]; a fingertip in contact is at about 2 mm."""
+"""A path is good if no keypoint comes nearer than this to object or table [m]; a fingertip in contact is at about 2
+mm."""
 _OPENING = np.array([0.0, 0.4, 0.2] * 4 + [-0.15, -0.1, 0.0, 0.3, 0.3])
 """[17] joint angles by which a hand opens before a grasp [rad]."""
 
@@ -84,7 +85,8 @@ def object_path(
 def clear_approach(
     solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, side: str, rng: np.random.Generator
 ) -> HandPath:
-    """Return the first of some random approaches that stays clear of object and table, or else the one with the largest gap.
+    """Return the first of some random approaches that stays clear of object and table, or else the one with the largest
+    gap.
 
     Args:
         pos: [3] the object's position.
@@ -108,7 +110,8 @@ def place_hand(pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: st
 def _approach(
     solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, side: str, rng: np.random.Generator
 ) -> HandPath:
-    """Move to a place before the object while the hand opens, then forward, then close: minimum-jerk motions that overlap."""
+    """Move to a place before the object while the hand opens, then forward, then close: minimum-jerk motions that
+    overlap."""
     frame = np.arange(timing.frames)
     mirror = 1.0 if side == "right" else -1.0
     x = pos[0] - mirror * rng.uniform(-0.05, 0.20)
@@ -138,6 +141,7 @@ def _approach(
 
 
 def _minimum_jerk(frame: np.ndarray, start: float, end: float) -> np.ndarray:
-    """Return 0 until ``start``, 1 from ``end``, and between them the smoothest path of human reaching (Flash and Hogan 1985)."""
+    """Return 0 until ``start``, 1 from ``end``, and between them the smoothest path of human reaching (Flash and Hogan
+    1985)."""
     s = np.clip((frame - start) / (end - start), 0.0, 1.0)
     return s**3 * (10 + s * (6 * s - 15))

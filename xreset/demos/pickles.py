@@ -1,7 +1,8 @@
 """Read pickled arrays of unknown origin with an unpickler that can build nothing else.
 
-A pickle is a program that names functions and calls them. Here it finds only those that numpy's arrays need, and they are replaced by
-functions that check kind, shape and length of the data before they make an array. Texts, numbers, lists and dictionaries need no function.
+A pickle is a program that names functions and calls them. Here it finds only those that numpy's arrays need, and they
+are replaced by functions that check kind, shape and length of the data before they make an array. Texts, numbers, lists
+and dictionaries need no function.
 """
 
 from __future__ import annotations

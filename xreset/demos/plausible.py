@@ -1,4 +1,5 @@
-"""Doubts about demonstrations whose numbers are all allowed: units, orders and frames that another convention would explain."""
+"""Doubts about demonstrations whose numbers are all allowed: units, orders and frames that another convention would
+explain."""
 
 from __future__ import annotations
 
@@ -14,13 +15,16 @@ from xreset.demos.keypoints import ORDERS
 from xreset.spec import ObjectSpec
 
 _SHORTER = 0.8
-"""A skeleton that is shorter by this factor in another order is in that order: bones of a wrong order cross the palm."""
+"""A skeleton that is shorter by this factor in another order is in that order: bones of a wrong order cross the
+palm."""
 _HEIGHTS = (-0.1, 0.6)
 """Heights of the origins of objects at the start, on a table or a stand on it [m]."""
 _ALONG = 0.9
-"""Cosine of wrist and fingers: at least 0.983 in 270 sequences of DexYCB; 0.35 and -0.67 at the median if read in a wrong order."""
+"""Cosine of wrist and fingers: at least 0.983 in 270 sequences of DexYCB; 0.35 and -0.67 at the median if read in a
+wrong order."""
 _TILT = 0.01
-"""Largest height of the lowest point of an object on the table [m]: 99 % of these sequences; 25 % if read in a wrong order."""
+"""Largest height of the lowest point of an object on the table [m]: 99 % of these sequences; 25 % if read in a wrong
+order."""
 _SAME_PLACE = 0.02
 """Distance from the start within which the goal counts as reached [m] (:class:`xreset.eval.metrics.MetricsConfig`)."""
 _SAME_TURN = np.radians(15.0)
@@ -42,7 +46,8 @@ def doubts(demos: Demos, objects: Mapping[str, ObjectSpec] | None = None) -> lis
         mano_length = np.median(bone_lengths(hand[:, ORDERS["mano"]]).sum(axis=1))
         if mano_length < _SHORTER * length:
             found.append(
-                f"The hand's bones are {length:.2f} m long together, but {mano_length:.2f} m if the keypoints are in MANO's order."
+                f"The hand's bones are {length:.2f} m long together, but {mano_length:.2f} m if the keypoints are in"
+                " MANO's order."
                 " Put them into the order of xreset.spec.KEYPOINTS."
             )
         right = (demos.hand_side[demos.sequence_of_frame] == "right")[valid]
@@ -76,7 +81,8 @@ def doubts(demos: Demos, objects: Mapping[str, ObjectSpec] | None = None) -> lis
     same = (distance < _SAME_PLACE) & (angle < _SAME_TURN)
     if same.any():
         found.append(
-            f"{_count(same, demos)} at its goal already. A policy that leaves the object untouched solves such a demonstration."
+            f"{_count(same, demos)} at its goal already. A policy that leaves the object untouched solves such a"
+            " demonstration."
         )
     return found
 

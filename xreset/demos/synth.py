@@ -1,7 +1,9 @@
-"""Synthetic demonstrations: a human-like hand reaches for an object on the table, grasps it, lifts it and turns it to a goal pose.
+"""Synthetic demonstrations: a human-like hand reaches for an object on the table, grasps it, lifts it and turns it to a
+goal pose.
 
-They stand in for recorded motion where none may be shipped, and have the same form: the ranges below (starts of objects and hands,
-heights and times of lifts) follow DexYCB's (Chao et al. 2021). Grasps are geometric: nothing here has been simulated.
+They stand in for recorded motion where none may be shipped, and have the same form: the ranges below (starts of objects
+and hands, heights and times of lifts) follow DexYCB's (Chao et al. 2021). Grasps are geometric: nothing here has been
+simulated.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ SUBJECT = "synthetic"
 WORKSPACE = ((0.42, 0.72), (0.12, 0.40))
 """Ranges of x and y in which objects start [m]."""
 CLOSING_AZIMUTH = (np.radians(25.0), np.radians(80.0))
-"""Direction from a right hand's fingers to its thumb, as an angle about z: people at +y hold objects so. A left hand's is mirrored in x."""
+"""Direction from a right hand's fingers to its thumb, as an angle about z: people at +y hold objects so. A left hand's
+is mirrored in x."""
 MAX_SEQUENCES = 100_000
 """Most sequences of each object."""
 
@@ -63,7 +66,8 @@ def synthesize(
     meshes: str | Path | None = None,
     progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> Demos:
-    """Make synthetic demonstrations of the built-in stand-ins, or of the objects of a folder of meshes, which stand with z up.
+    """Make synthetic demonstrations of the built-in stand-ins, or of the objects of a folder of meshes, which stand
+    with z up.
 
     The same arguments give the same arrays, and a sequence does not depend on the other sequences.
 
@@ -82,7 +86,8 @@ def synthesize(
     """
     if not 1 <= per_object <= MAX_SEQUENCES or not 5 <= fps <= 1000:
         raise DemoError(
-            f"per_object is {per_object} and fps is {fps}, expected 1 to {MAX_SEQUENCES} sequences and 5 to 1000 frames per second."
+            f"per_object is {per_object} and fps is {fps}, expected 1 to {MAX_SEQUENCES} sequences and 5 to 1000"
+            " frames per second."
         )
     folder = Path(meshes) if meshes else None
     specs = [load_object(name, folder) for name in objects or object_names(folder)]
@@ -141,7 +146,8 @@ def _start(obj: ObjectSpec, up: np.ndarray, side: str) -> _Rest:
     plans = plan_contacts(Solid.of(obj, pos, upright), np.radians(np.arange(0.0, 360.0, 20.0)), side)
     if not plans:
         raise DemoError(
-            f"No stable pinch found for {obj.name}: no part within reach of thumb and fingers is narrow enough. Omit this object."
+            f"No stable pinch found for {obj.name}: no part within reach of thumb and fingers is narrow enough."
+            " Omit this object."
         )
     good = tuple(plan for plan in plans if plan.cost < plans[0].cost + _NEAR_BEST)
     return _Rest(rotation=upright, pos=pos, plans=good)

@@ -68,7 +68,8 @@ def load_object(name: str, folder: Path | None = None) -> ObjectSpec:
 
     Args:
         name: official name, name without number, or the paper's name.
-        folder: folder of real meshes (``NAME.obj``, ``NAME/textured_simple.obj`` or ``NAME/textured.obj``); None for the stand-in.
+        folder: folder of real meshes (``NAME.obj``, ``NAME/textured_simple.obj`` or ``NAME/textured.obj``); None for
+            the stand-in.
 
     Raises:
         ObjectError: unknown object, or no usable mesh of it in the folder.

@@ -1,9 +1,9 @@
 """Cut a mesh into few convex pieces that keep to its surface, small enough for every engine.
 
-The mesh is made a solid. Planes cut it wherever the convex hull of a part deviates too much from the surface, and pieces whose common hull
-does not are joined again. Both steps measure the deviation quickly, at few points. The deviation of the joined pieces is then measured to
-0.1 mm, and pieces that deviate too much are cut again. PhysX takes hulls of at most 64 vertices in its fast path, and contact cost grows
-with their number.
+The mesh is made a solid. Planes cut it wherever the convex hull of a part deviates too much from the surface, and
+pieces whose common hull does not are joined again. Both steps measure the deviation quickly, at few points. The
+deviation of the joined pieces is then measured to 0.1 mm, and pieces that deviate too much are cut again. PhysX takes
+hulls of at most 64 vertices in its fast path, and contact cost grows with their number.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 _CUTS = 7
 """Planes that are tried along each direction, evenly spaced."""
 _CROSSES = ((0, 1), (0, 2), (1, 2), (3, 4), (3, 5), (4, 5))
-"""Pairs of directions whose middle planes are tried together: halves of a ring are as convex as the ring, quarters are not."""
+"""Pairs of directions whose middle planes are tried together: halves of a ring are as convex as the ring, quarters are
+not."""
 _DIAGONALS = np.array([(1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)]) / np.sqrt(3)
 _SPECK = 1e-11
 """Smaller parts are dropped: a cube of 0.2 mm [m^3]."""
@@ -59,17 +60,19 @@ class Settings:
     max_vertices: int = 64
     """Most vertices of each piece."""
     hull_depth: float = 0.05
-    """A mesh is one convex piece if no point of its hull is farther from its surface than this fraction of its bounding box's diagonal.
+    """A mesh is one convex piece if no point of its hull is farther from its surface than this fraction of its bounding
+    box's diagonal.
 
-    The volume ratio would be no good measure: the recessed lids of a tuna can cost as much volume as a pitcher's handle.
+    The volume ratio would be no good measure: the recessed lids of a tuna can cost as much volume as a pitcher's
+    handle.
     """
     tolerance: float = 0.002
     """Largest deviation of the pieces from the surface of a mesh that is more than one piece [m]."""
     thickness: float = 0.001
     """Thickness of the sheet that stands for a mesh that is not closed [m]."""
     effort: int = 12_000_000
-    """Triangles that cutting may handle in all, about 50 s of one core; the pieces so far are taken then. It is a count and not a time,
-    so that the pieces of a mesh, and with them its physics, are the same on every machine."""
+    """Triangles that cutting may handle in all, about 50 s of one core; the pieces so far are taken then. It is a count
+    and not a time, so that the pieces of a mesh, and with them its physics, are the same on every machine."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,15 +139,15 @@ def decompose(
     )
 
 
-# Solids ----------------------------------------------------------------------------------------------------------------------------------
+# Solids
 
 
 def as_solid(mesh: trimesh.Trimesh, thickness: float = Settings.thickness) -> Manifold:
     """Return the mesh as a solid that can be cut.
 
-    Small holes of an open mesh are capped. If that does not make it a volume, each triangle becomes a plate of the thickness [m], its sides
-    along the normals of its corners, and the space that the plates enclose is filled: a sheet becomes a wall, a scan with cracks a solid,
-    half the thickness larger.
+    Small holes of an open mesh are capped. If that does not make it a volume, each triangle becomes a plate of the
+    thickness [m], its sides along the normals of its corners, and the space that the plates enclose is filled: a sheet
+    becomes a wall, a scan with cracks a solid, half the thickness larger.
 
     Raises:
         ObjectError: the mesh encloses nothing.
@@ -226,8 +229,9 @@ class _Surface:
     def deviation(self, vertices: np.ndarray, faces: np.ndarray) -> float:
         """Return the largest distance of a point of another surface to this one, to ``_EXACT`` [m].
 
-        The distance to a triangle is convex: over another triangle, it is greatest at a corner. So no point of that triangle is farther
-        from this surface than its corners are from the nearest triangle; it is quartered while that exceeds what its middles have shown.
+        The distance to a triangle is convex: over another triangle, it is greatest at a corner. So no point of that
+        triangle is farther from this surface than its corners are from the nearest triangle; it is quartered while that
+        exceeds what its middles have shown.
         """
         farthest = 0.0
         pool = vertices[faces]
@@ -250,7 +254,8 @@ class _Surface:
         return farthest
 
     def _distances(self, corners: np.ndarray) -> np.ndarray:
-        """[4, n, k] distances of triangles' [n, 3, 3] middles and corners to the k triangles here that are nearest to the middles [m]."""
+        """[4, n, k] distances of triangles' [n, 3, 3] middles and corners to the k triangles here that are nearest to
+        the middles [m]."""
         from trimesh.triangles import closest_point
 
         middle = corners.mean(axis=1)
@@ -262,7 +267,8 @@ class _Surface:
         return np.linalg.norm(points - closest.reshape(points.shape), axis=3)
 
     def uncovered(self, shapes: Sequence[Shape]) -> float:
-        """Return the distance of its worst point from all pieces: exact next to a face, too small next to an edge [m]."""
+        """Return the distance of its worst point from all pieces: exact next to a face, too small next to an edge
+        [m]."""
         distance = np.full(len(self._points), np.inf)
         for shape in shapes:
             planes = half_spaces(shape)
@@ -285,11 +291,12 @@ class _Solid(_Surface):
         return self.quick_deviation(*_arrays(outside)) if quick else self.deviation(*_arrays(outside))
 
 
-# Cutting and joining ---------------------------------------------------------------------------------------------------------------------
+# Cutting and joining
 
 
 class _Cutter:
-    """One decomposition of a solid. Pieces are made of the solid with fewer triangles, and measured on the whole one in the end."""
+    """One decomposition of a solid. Pieces are made of the solid with fewer triangles, and measured on the whole one in
+    the end."""
 
     def __init__(self, whole: Manifold, settings: Settings, progress: Progress) -> None:
         self.surface = _Solid(whole)
@@ -341,7 +348,8 @@ class _Cutter:
         return done + [part for _, _, part in queue]
 
     def _cut_again(self, pieces: Sequence[Manifold]) -> tuple[list[Shape], float]:
-        """Cut the pieces again that deviate too much, the worst first; return all as shapes, and their largest deviation [m]."""
+        """Cut the pieces again that deviate too much, the worst first; return all as shapes, and their largest
+        deviation [m]."""
         hull_points = _manifold3d().Manifold.hull_points
         queue: list[tuple[float, int, Manifold, Shape]] = []
         done: list[tuple[float, int, Manifold, Shape]] = []
@@ -369,7 +377,8 @@ class _Cutter:
         return [shape for *_, shape in made], max(-excess for excess, *_ in made)
 
     def _best_cut(self, part: Manifold) -> list[Manifold]:
-        """Return the parts by the planes that take away most of the hulls' volume for each further part; one if none cuts it."""
+        """Return the parts by the planes that take away most of the hulls' volume for each further part; one if none
+        cuts it."""
         best = [part]
         best_gain = -np.inf
         whole = part.hull().volume()
@@ -426,7 +435,8 @@ class _Cutter:
 
 
 def _planes(vertices: np.ndarray, faces: np.ndarray) -> list[list[tuple[np.ndarray, float]]]:
-    """Return the sets of planes (normal, offset) that are tried on a part: across its principal axes and x, y, z, then some in pairs."""
+    """Return the sets of planes (normal, offset) that are tried on a part: across its principal axes and x, y, z, then
+    some in pairs."""
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     if not area.sum():
@@ -453,7 +463,8 @@ def _arrays(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _samples(vertices: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points [count, 3] uniform over the triangles' area, the same for the same mesh, and the triangle of each [count]."""
+    """Return points [count, 3] uniform over the triangles' area, the same for the same mesh, and the triangle of each
+    [count]."""
     rng = np.random.default_rng(0)
     a, b, c = vertices[faces].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -471,7 +482,7 @@ def _manifold3d() -> Any:
     return manifold3d
 
 
-# Hulls ---------------------------------------------------------------------------------------------------------------------------------
+# Hulls
 
 
 def limited_hull(points: np.ndarray, max_vertices: int) -> Shape:

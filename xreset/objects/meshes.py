@@ -61,7 +61,8 @@ class Import:
 def mesh_files(folder: str | Path) -> dict[str, Path]:
     """Return object name -> mesh file, for every object of a folder.
 
-    Layouts: ``NAME.obj``; ``NAME/textured_simple.obj`` (as in DexYCB's ``models``); ``NAME/textured.obj`` (as in the YCB object set).
+    Layouts: ``NAME.obj``; ``NAME/textured_simple.obj`` (as in DexYCB's ``models``); ``NAME/textured.obj`` (as in the
+        YCB object set).
 
     Raises:
         ObjectError: the folder does not exist or has no mesh.
@@ -91,7 +92,8 @@ def import_with_notes(
 ) -> Import:
     """Read a mesh, cut it into convex pieces and compute its mass properties.
 
-    A closed mesh whose mass is that of no solid (below 120 kg/m^3) is a shell: its mass is spread evenly over its surface.
+    A closed mesh whose mass is that of no solid (below 120 kg/m^3) is a shell: its mass is spread evenly over its
+    surface.
 
     Args:
         path: mesh file, in metres, in the frame of the object's poses; NAME.toml next to it may state its properties
@@ -164,12 +166,14 @@ def add_mesh(
     properties: Properties | None = None,
     progress: Progress = lambda parts, worst: None,
 ) -> Import:
-    """Import a mesh of any format and scale, and put it with its properties as ``NAME.obj`` and ``NAME.toml`` into a folder.
+    """Import a mesh of any format and scale, and put it with its properties as ``NAME.obj`` and ``NAME.toml`` into a
+    folder.
 
     The files are written when the mesh has been cut: a command that was killed can be repeated.
 
     Raises:
-        ObjectError: the mesh cannot be used, is not in metres once scaled, or the folder has one of that name; nothing is then written.
+        ObjectError: the mesh cannot be used, is not in metres once scaled, or the folder has one of that name; nothing
+            is then written.
         XResetError: the files cannot be written.
     """
     if not is_name(name):
@@ -181,8 +185,10 @@ def add_mesh(
         raise ObjectError(
             f"{target} or its .toml is there already. Nothing was changed; choose another --name or --out."
         )
+    from trimesh.exchange.obj import export_obj
+
     mesh = read_mesh(path, scale=scale)
-    text = mesh.export(file_type="obj", include_normals=False, include_color=False, include_texture=False, header="")
+    text = export_obj(mesh, include_normals=False, include_color=False, include_texture=False, header="")
     with tempfile.TemporaryDirectory() as temporary:
         draft = Path(temporary) / target.name
         draft.write_text(text)

@@ -1,4 +1,5 @@
-"""Physical properties of an object, as ``NAME.toml`` next to its mesh: ``mass`` [kg] or ``density`` [kg/m^3], and ``friction``."""
+"""Physical properties of an object, as ``NAME.toml`` next to its mesh: ``mass`` [kg] or ``density`` [kg/m^3], and
+``friction``."""
 
 from __future__ import annotations
 

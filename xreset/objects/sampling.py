@@ -16,7 +16,8 @@ _PAIRS = 2_000_000
 def surface_points(obj: ObjectSpec, count: int = 64, seed: int = 0) -> np.ndarray:
     """[count, 3] well spread points of the object's outer surface; the same seed gives the same points.
 
-    Uniform samples by area, without those inside the solid (where pieces of a stand-in overlap), thinned by farthest-point selection.
+    Uniform samples by area, without those inside the solid (where pieces of a stand-in overlap), thinned by
+    farthest-point selection.
     """
     points, normals = sample_surface(obj, max(_CANDIDATES_PER_POINT * count, 256), seed)
     outside = winding_number(points + _PROBE * normals, obj.vertices, obj.faces) < 0.5
@@ -40,7 +41,8 @@ def sample_surface(obj: ObjectSpec, count: int, seed: int = 0) -> tuple[np.ndarr
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """[count, 3] points chosen one after another, each the farthest from those chosen before; the first is the farthest from the mean."""
+    """[count, 3] points chosen one after another, each the farthest from those chosen before; the first is the farthest
+    from the mean."""
     if len(points) < count:
         raise ValueError(f"{count} points wanted of {len(points)}")
     chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
@@ -52,10 +54,11 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def winding_number(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[n] how often the triangles enclose each of the points [n, 3]: about 0 outside, 1 inside, 2 where two closed parts overlap.
+    """[n] how often the triangles enclose each of the points [n, 3]: about 0 outside, 1 inside, 2 where two closed
+    parts overlap.
 
-    The sum of the triangles' solid angles over 4 pi (Jacobson et al. 2013), each by the formula of Van Oosterom and Strackee
-    (1983). Holes in the mesh change it smoothly, so 0.5 still separates in from out.
+    The sum of the triangles' solid angles over 4 pi (Jacobson et al. 2013), each by the formula of Van Oosterom and
+    Strackee (1983). Holes in the mesh change it smoothly, so 0.5 still separates in from out.
     """
     corners = vertices[faces]
     block = max(1, _PAIRS // len(faces))
@@ -82,8 +85,8 @@ def bounding_box(obj: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:
 def keypoints(obj: ObjectSpec) -> np.ndarray:
     """[4, 3] the object-frame keypoints of the pose metric (the paper, appendix A).
 
-    The paper does not define them; here they are four alternating corners of the axis-aligned bounding box: a tetrahedron, so that no
-    rotation leaves all four in place, at the object's own scale.
+    The paper does not define them; here they are four alternating corners of the axis-aligned bounding box: a
+    tetrahedron, so that no rotation leaves all four in place, at the object's own scale.
     """
     corners = np.array(bounding_box(obj))
     pick = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]])

@@ -39,7 +39,8 @@ def stand_in(name: str) -> ObjectSpec:
 
 
 def _box(made: dict[str, Any]) -> list[Shape]:
-    return [box(np.array(made["center"]) * _MM, np.array(made["size"]) * _MM)]
+    size = [length * _MM for length in made["size"]]
+    return [box(np.array(made["center"]) * _MM, size)]
 
 
 def _cylinder(made: dict[str, Any]) -> list[Shape]:
@@ -99,7 +100,11 @@ def _bars(made: dict[str, Any]) -> list[Shape]:
 
 def _prisms(made: list[dict[str, Any]]) -> list[Shape]:
     """Polygons between two heights."""
-    return [prism(np.array(part["outline"]) * _MM, part["bottom"] * _MM, part["top"] * _MM) for part in made]
+    shapes = []
+    for part in made:
+        outline = [(x * _MM, y * _MM) for x, y in part["outline"]]
+        shapes.append(prism(outline, part["bottom"] * _MM, part["top"] * _MM))
+    return shapes
 
 
 def _axes(degrees: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,5 @@
-"""Published facts of the YCB object set (Calli et al. 2015, "Benchmarking in Manipulation Research") that DexYCB uses."""
+"""Published facts of the YCB object set (Calli et al. 2015, "Benchmarking in Manipulation Research") that DexYCB
+uses."""
 
 from __future__ import annotations
 

@@ -62,7 +62,8 @@ def join(parts: Sequence[Triangles]) -> Triangles:
 
 
 def shade_smoothly(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the mesh with its faces separated along sharp edges, so that its vertex normals suit round and flat parts."""
+    """Return the mesh with its faces separated along sharp edges, so that its vertex normals suit round and flat
+    parts."""
     return trimesh.graph.smooth_shade(mesh, angle=_CREASE, facet_minarea=None)
 
 
@@ -72,7 +73,8 @@ def object_mesh(obj: ObjectSpec) -> trimesh.Trimesh:
 
 
 def link_meshes(robot: RobotSpec) -> list[trimesh.Trimesh | None]:
-    """Return the collision shapes of each link of the robot's URDF as one mesh in the link's frame; None for no shape."""
+    """Return the collision shapes of each link of the robot's URDF as one mesh in the link's frame; None for no
+    shape."""
     meshes = []
     tree = robot_tree(robot)
     for name in tree.link_names:

@@ -85,7 +85,8 @@ class Camera:
         return np.stack((right, down, np.ones_like(x)), axis=-1).reshape(-1, 3) @ np.float32(self.axes())
 
     def project(self, points: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Return pixels [P, 2] and distances along the view axis [P] of world points [P, 3] that are before the camera."""
+        """Return pixels [P, 2] and distances along the view axis [P] of world points [P, 3] that are before the
+        camera."""
         local = (points - self.eye) @ self.axes().T
         local = local[local[:, 2] > _NEAR]
         pixels = self.focal_length(size[1]) * local[:, :2] / local[:, 2:] + np.array(size) / 2

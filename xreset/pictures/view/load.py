@@ -185,7 +185,8 @@ def _whole_frames(part: np.ndarray | None, count: int) -> np.ndarray:
 
 
 def _human(demos: Demos, objects: Sequence[ObjectSpec]) -> tuple[Demos, Human]:
-    """Return the demonstrations with the objects on the table, as retargeting uses them, and their hands with contacts."""
+    """Return the demonstrations with the objects on the table, as retargeting uses them, and their hands with
+    contacts."""
     demos = rest_on_table(demos, objects)
     keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan)
     touching = np.zeros(keypoints.shape[:2], dtype=bool)
@@ -204,7 +205,8 @@ def _human(demos: Demos, objects: Sequence[ObjectSpec]) -> tuple[Demos, Human]:
 
 
 def _human_of(path: Path, demos_path: Path, view: View) -> Human:
-    """Return the hands of a view's rows, found in demonstrations by the name of the sequence and the frame within it."""
+    """Return the hands of a view's rows, found in demonstrations by the name of the sequence and the frame within
+    it."""
     demos = read_demos(demos_path)
     used = [view.sequence_name[number] for number in np.unique(view.sequence)]
     missing = sorted(set(used) - set(demos.sequence_name.tolist()))

@@ -287,8 +287,9 @@ class _Scene:
 def _own_page_only(host: str) -> Iterator[list[str]]:
     """Make servers that viser starts in this block answer requests of their own pages only.
 
-    A page of another site may open a socket to any address, and a foreign name may point to this machine. viser checks neither and has
-    no option for it, so the function that starts its server is replaced. The block's value lists the servers that are
+    A page of another site may open a socket to any address, and a foreign name may point to this machine. viser checks
+    neither and has no option for it, so the function that starts its server is replaced. The block's value lists the
+    servers that are
     restricted: none if viser starts its server in another way.
     """
     from websockets.asyncio import server

@@ -21,13 +21,15 @@ _NEAR_REACH = 0.20
 _NEAR_RISE = np.radians(25.0)
 """Elevation of the camera of a near picture."""
 _NEAR_TURN = 70.0
-"""Angle seen from above between the directions from the object to the hand and to the camera [degrees]: neither hides the other."""
+"""Angle seen from above between the directions from the object to the hand and to the camera [degrees]: neither hides
+the other."""
 _NEAR_SIDE = np.array([0.76, -0.65])
 """Preferred horizontal direction to the camera: from the front right, like :class:`~xreset.pictures.render.Camera`."""
 
 
 class Drawer:
-    """Draws rows of a view. Colors are those of :mod:`xreset.pictures.view.colors`; the goal is a translucent object."""
+    """Draws rows of a view. Colors are those of :mod:`xreset.pictures.view.colors`; the goal is a translucent
+    object."""
 
     def __init__(self, view: View, *, size: tuple[int, int] = (640, 480), smooth: bool = False) -> None:
         """Prepare the meshes; see :class:`~xreset.pictures.render.Renderer` for the options."""
@@ -72,7 +74,8 @@ class Drawer:
 
 
 def _side_of(to_hand: np.ndarray) -> np.ndarray:
-    """Return the horizontal direction [2] to the camera of a near picture, for the direction [3] from object to hand."""
+    """Return the horizontal direction [2] to the camera of a near picture, for the direction [3] from object to
+    hand."""
     flat = np.append(to_hand[:2], 0.0)
     length = np.linalg.norm(flat)
     if length < 1e-3:

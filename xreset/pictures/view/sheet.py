@@ -30,11 +30,13 @@ class Tile:
 
 
 def moment_tiles(view: View) -> list[Tile]:
-    """Return tiles of first contact, mid-lift and goal of one demonstration of each object, in the view's order of objects.
+    """Return tiles of first contact, mid-lift and goal of one demonstration of each object, in the view's order of
+    objects.
 
-    First contact is the first row that touches the object. Mid-lift is the first later row in which the object has risen half as high as
-    it ever does. The goal is the last row with an annotated hand. The demonstration is the object's first in which all three rows are
-    valid, or else its first with any contact. The tiles of an object without contact have no row.
+    First contact is the first row that touches the object. Mid-lift is the first later row in which the object has
+    risen half as high as it ever does. The goal is the last row with an annotated hand. The demonstration is the
+    object's first in which all three rows are valid, or else its first with any contact. The tiles of an object without
+    contact have no row.
     """
     tiles = []
     for index, spec in enumerate(view.objects):

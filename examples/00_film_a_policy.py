@@ -12,7 +12,7 @@ def main(meshes: str, name: str, out: str) -> None:
     policy = xreset.load_policy("nine-objects")  # or a run folder, or an .onnx file
 
     motion = xreset.retarget_demos(demos, policy.robot, [thing])  # robot states that follow the human hand
-    bank = xreset.make_bank(motion, policy.robot, [thing], ["pybullet"])  # those that the engine finds stable
+    bank = xreset.make_bank(motion, policy.robot, [thing], engine="pybullet")  # those that the engine finds stable
     with policy.make_env([thing], bank, engine="pybullet") as env:  # the task that the policy was trained for
         xreset.film(policy, env, out)
 

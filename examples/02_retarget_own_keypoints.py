@@ -37,7 +37,7 @@ def main(out: Path) -> None:
 
     robot, can = xreset.load_robot("openarm"), xreset.load_object("soup")
     motion = xreset.retarget_demos(demos, robot, [can])
-    bank = xreset.make_bank(motion, robot, [can], ["mujoco"], num_envs=8)
+    bank = xreset.make_bank(motion, robot, [can], num_envs=8)
     xreset.write_bank(out / "bank.npz", bank, config={}, inputs={})
     print(f"{int(motion.valid.sum())} of {demos.num_frames} frames can be reached, {bank.num_states} states are stable")
 

@@ -7,7 +7,7 @@
     policy = xreset.load_policy("nine-objects")                            # or a run folder, or an .onnx file
 
     motion = xreset.retarget_demos(demos, policy.robot, [can])             # robot states that follow the human hand
-    bank = xreset.make_bank(motion, policy.robot, [can], ["mujoco"])       # those that a physics engine finds stable
+    bank = xreset.make_bank(motion, policy.robot, [can], engine="mujoco")  # those that a physics engine finds stable
     with policy.make_env([can], bank, engine="mujoco") as env:             # the task that the policy was trained for
         xreset.film(policy, env, "can.mp4")
 

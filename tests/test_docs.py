@@ -1,0 +1,84 @@
+"""The documentation names commands and options that exist, and fits on the page."""
+
+import re
+import shlex
+import unittest
+from functools import cache
+from pathlib import Path
+
+from tests.test_cli import run
+from xreset.cli import COMMANDS
+from xreset.cli.engines import COMMANDS as ENGINES
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+GROUPS = ("demos", "objects", "robots", "policies", "export")
+"""Commands whose second word is a verb."""
+
+
+def blocks(page: Path) -> list[str]:
+    """Return the lines of the page's code blocks, without the indentation that makes them one; continued lines are joined."""
+    lines = [line[4:] for line in page.read_text().splitlines() if line.startswith("    ")]
+    return re.sub(r"\\\n *", " ", "\n".join(lines)).splitlines()
+
+
+def commands(page: Path) -> list[list[str]]:
+    """Return the words of the page's `xreset` commands: in code blocks, and in running text."""
+    text = page.read_text()
+    found = [line.strip() for line in blocks(page)]
+    found += re.findall(r"`(xreset [^`]+)`", text)
+    found = [re.sub(r"^.*-m (?=xreset )", "", line) for line in found]
+    return [shlex.split(line, comments=True)[1:] for line in found if line.startswith("xreset ")]
+
+
+@cache
+def help_of(words: tuple[str, ...]) -> str:
+    """Return the help text of a command."""
+    code, out, err = run(*words, "--help")
+    assert code == 0, err
+    return out
+
+
+def command_of(words: list[str]) -> tuple[str, ...]:
+    """Return the words that name a command: one, or two or three in a group."""
+    if words[0] in GROUPS:
+        return tuple(words[:3] if words[:2] == ["demos", "import"] else words[:2])
+    return tuple(words[:2] if words[0] == "engines" else words[:1])
+
+
+class DocumentedCommandsTest(unittest.TestCase):
+    def test_every_command_and_option_exists(self):
+        seen = 0
+        for page in PAGES:
+            for words in commands(page):
+                if not words or not re.fullmatch(r"[a-z]+", words[0]) or (words[0] in GROUPS and len(words) < 2):
+                    continue
+                with self.subTest(page=page.name, command=" ".join(words)):
+                    self.assertIn(words[0], COMMANDS)
+                    if words[0] == "engines" and len(words) > 1:
+                        self.assertIn(words[1], ENGINES)
+                    options = {word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)}
+                    if options:
+                        help_text = help_of(command_of(words))
+                        missing = {option for option in options if not re.search(rf"{option}(?![\w-])", help_text)}
+                        self.assertFalse(missing)
+                        seen += len(options)
+        self.assertGreater(seen, 100)
+
+
+class PageTest(unittest.TestCase):
+    def test_code_blocks_fit_on_the_page(self):
+        for page in PAGES:
+            for line in page.read_text().splitlines():
+                if line.startswith("    ") and not line.lstrip().startswith(("-", "|")):
+                    self.assertLessEqual(len(line) - 4, 100, f"{page.name}: {line}")
+
+    def test_every_public_name_is_in_the_reference(self):
+        import xreset
+
+        headings = set(re.findall(r"heading: xreset\.(\w+)", (ROOT / "docs/reference.md").read_text()))
+        self.assertEqual(headings, {*xreset.__all__})
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -6,7 +6,7 @@ Nothing here knows any engine, so plugins and altered engines are measured alike
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.geometry.shapes import hull
 from xreset.geometry.urdf import robot_tree
-from xreset.physics import State
+from xreset.physics import Backend, State
 from xreset.pictures.meshes import link_meshes
 from xreset.spec import GRAVITY, ObjectSpec, SceneSpec
 
@@ -63,20 +63,58 @@ class Measured:
 
 
 _SLAB_HALF = (0.06, 0.06, 0.02)
+"""[m] of a box that slides or is loaded."""
 _SLAB_MASS = 0.5
-_SPEED = 0.5  # [m/s] of a slab that slides
-_LOAD = 10.0  # on a slab at rest, in its weight
-_PRESS = 3.0  # [N] of the paddle on a link
-_PULL = 3.0  # along the link, in what friction should carry
-_STEP = 0.03  # [rad, m] of the drives, where that is within two fifths of their effort
-_SETTLE = 0.25  # [s] before loads and pulls
-_TIME = 0.40  # [s] of all
-_PULL_WINDOW = (0.05, 0.12)  # [s] after the pull begins
-_PUSH_STEPS = 24  # physics steps of constant force on the free object
-_TOP_HEIGHT, _TOP_RADIUS = 0.04, 0.02  # [m] of a cone that stands on its point
-_TOP_INERTIA = (1.0, 1.0, 1e-3)  # [kg m^2]: it can hardly fall, and turns easily
-_SECOND_POINT = (2e-3, 0.0, 5e-4)  # [m]; PhysX takes two that are 1 mm apart for one
-_LEAST_TORSION = 1e-4  # [m] below which torsional friction counts as none
+_SPEED = 0.5
+"""[m/s] of a slab that slides."""
+_LOAD = 10.0
+"""Load on a slab at rest, in its weight."""
+_PRESS = 3.0
+"""[N] of the paddle on a link."""
+_PULL = 3.0
+"""Pull along the link, as a factor on what friction should carry."""
+_STEP = 0.03
+"""[rad, m] of the drives, where that is within two fifths of their effort."""
+_SETTLE = 0.25
+"""[s] before loads and pulls."""
+_TIME = 0.40
+"""[s] of all experiments."""
+_PULL_WINDOW = (0.05, 0.12)
+"""[s] after the pull begins."""
+_PUSH_STEPS = 24
+"""Physics steps of constant force on the free object."""
+_TOP_HEIGHT = 0.04
+"""[m] of a cone on its point."""
+_TOP_RADIUS = 0.02
+_TOP_INERTIA = (1.0, 1.0, 1e-3)
+"""[kg m^2] The cone can hardly fall, and turns easily."""
+_SECOND_POINT = (2e-3, 0.0, 5e-4)
+"""[m] PhysX takes two points that are 1 mm apart for one."""
+_LEAST_TORSION = 1e-4
+"""[m] Torsional friction below this counts as none."""
+
+_SLAB = 0
+_PADDLE = 1
+_THING = 2
+_TOP = 3
+_TOP_OF_TWO = 4
+_WORLDS = {
+    "slide x": _SLAB,
+    "slide xy": _SLAB,
+    "load": _SLAB,
+    "one point": _TOP,
+    "two points": _TOP_OF_TWO,
+    "tip": _PADDLE,
+    "link": _PADDLE,
+    "force": _THING,
+    "torque x": _THING,
+    "torque y": _THING,
+    "torque z": _THING,
+    "drives": _THING,
+}
+"""Experiment -> index of its object; one world each."""
+_AT = {name: i for i, name in enumerate(_WORLDS)}
+_TORQUES = ("torque x", "torque y", "torque z")
 
 
 def measure(engine: Engine, scene: SceneSpec) -> Measured:
@@ -103,58 +141,60 @@ def measure(engine: Engine, scene: SceneSpec) -> Measured:
         XResetError: the state is not finite, or no link can be reached from outside.
     """
     bench = _Bench(scene)
-    with engine.make(bench.scene, bench.count, bench.object_index) as backend:
+    with engine.make(bench.scene, len(_WORLDS), torch.tensor(list(_WORLDS.values()))) as backend:
         log = bench.run(backend)
     return bench.evaluate(log)
-
-
-_SLABS, _TOPS = ("slide x", "slide xy", "load"), ("one point", "two points")
-"""Worlds in which an object rests on the table."""
 
 
 class _Bench:
     """The worlds of the experiments."""
 
     def __init__(self, scene: SceneSpec) -> None:
-        robot, thing = scene.robot, scene.objects[0]
-        slab = _block("slab", inertia=_SLAB_MASS / 3 * (sum(h * h for h in _SLAB_HALF) - np.square(_SLAB_HALF)))
+        self._robot = scene.robot
+        self._thing = scene.objects[0]
+        squares = np.square(_SLAB_HALF)
+        slab = _block("slab", inertia=_SLAB_MASS / 3 * (sum(h * h for h in _SLAB_HALF) - squares))
         paddle = _block("paddle", inertia=np.ones(3))
-        tops = _top("top", ((0.0, 0.0, 0.0),)), _top("top with two points", ((0.0, 0.0, 0.0), _SECOND_POINT))
-        self.scene = replace(scene, objects=(slab, paddle, thing, *tops))
-        self._thing, self._robot = thing, robot
-        self._names = (*_SLABS, *_TOPS, "tip", "link", "force", "torque x", "torque y", "torque z", "drives")
-        objects = (0, 0, 0, 3, 4, 1, 1, 2, 2, 2, 2, 2)
-        self.count, self.object_index = len(objects), torch.tensor(objects)
+        top = _top("top", [(0.0, 0.0, 0.0)])
+        two = _top("top with two points", [(0.0, 0.0, 0.0), _SECOND_POINT])
+        self.scene = replace(scene, objects=(slab, paddle, self._thing, top, two))
         self._presses = {"tip": _reachable(scene, tip=True), "link": _reachable(scene, tip=False)}
         self._dt = scene.timestep
         self._place = free_place(scene)
-        _, axes = np.linalg.eigh(thing.inertia)
-        self._axes = axes.T  # principal axes in the object's frame: the torque about the first acts along it, and so on
+        _, axes = np.linalg.eigh(self._thing.inertia)
+        self._axes = axes.T  # principal axes in the object's frame, one for each torque
+        self._principal = [float(axis @ self._thing.inertia @ axis) for axis in self._axes]
+        self._push = 2.0 * self._thing.mass  # [N] for 2 m/s^2
+        self._torques = [10.0 * inertia for inertia in self._principal]  # [N m] for 10 rad/s^2
+        friction = scene.friction
+        self._pull = {
+            "tip": _PULL * _PRESS * max(friction.tip, 0.1),
+            "link": _PULL * _PRESS * max(friction.link, 0.1),
+        }
+        # Four times the spin [rad/s] that the stated torsional friction takes; not so much that a contact patters.
+        self._spin = 4.0 * max(friction.torsional, 1e-3) * _SLAB_MASS * GRAVITY / _TOP_INERTIA[2] * _TIME
 
-    def run(self, backend) -> dict[str, Tensor]:
-        """Play all experiments; returns what the worlds did: [T, N, ...] after each physics step, the start first."""
+    def run(self, backend: Backend) -> dict[str, Tensor]:
+        """Play all experiments; returns the worlds' states [T, N, ...] after each physics step, the start first."""
         start = self._start()
-        n, device = self.count, backend.device
-        grounded = torch.tensor([name in _SLABS + _TOPS for name in self._names])
-        backend.set_object_gravity(grounded.float().to(device))
-        backend.set_state(start.to(device))
+        grounded = [index in (_SLAB, _TOP, _TOP_OF_TWO) for index in _WORLDS.values()]
+        backend.set_object_gravity(torch.tensor(grounded).float().to(backend.device))
+        backend.set_state(start.to(backend.device))
         targets = start.joint_target.clone()
-        targets[-1] += self._drive_step()
-        substeps = self.scene.substeps
-        rows = {f.name: [getattr(start, f.name)] for f in fields(State)}
+        targets[_AT["drives"]] += torch.tensor(self._drive_steps(), dtype=torch.float32)
+        rows = {name: [value] for name, value in vars(start).items()}
         for step in range(round(_TIME / self._dt)):
             force, torque = self._loads(step)
-            backend.set_object_wrench(force.to(device), torque.to(device))
-            if step % substeps == 0:
-                backend.set_joint_targets(targets.to(device))
+            backend.set_object_wrench(force.to(backend.device), torque.to(backend.device))
+            if step % self.scene.substeps == 0:
+                backend.set_joint_targets(targets.to(backend.device))
             backend.step(1)
             state = backend.state()
             for name, values in rows.items():
                 values.append(getattr(state, name).cpu().clone())
         log = {name: torch.stack(values).double() for name, values in rows.items()}
-        broken = [
-            self._names[i] for i in range(n) if not all(bool(torch.isfinite(v[:, i]).all()) for v in log.values())
-        ]
+        sound = torch.stack([values.isfinite().flatten(2).all(-1).all(0) for values in log.values()]).all(0)
+        broken = [name for name, i in _AT.items() if not sound[i]]
         if broken:
             raise XResetError(
                 f"{backend.name}: the experiments {', '.join(broken)} are not finite, so nothing can be measured."
@@ -162,43 +202,30 @@ class _Bench:
         return log
 
     def evaluate(self, log: dict[str, Tensor]) -> Measured:
-        """The numbers."""
-        dt, at = self._dt, {name: i for i, name in enumerate(self._names)}
-        t, row = _PUSH_STEPS * dt, at["force"]
+        """Return what the worlds' states say of the engine."""
+        dt = self._dt
+        t = _PUSH_STEPS * dt
+        row = _AT["force"]
         velocity = float(log["object_linvel"][_PUSH_STEPS, row, 0])
         distance = float(log["object_pos"][_PUSH_STEPS, row, 0] - log["object_pos"][0, row, 0])
-        mass, step = self._push_force() * t / velocity / self._thing.mass, 2.0 * distance / velocity - t
-        slides = [self._slid(log, at[name], step) for name in ("slide x", "slide xy")]
-        height = log["object_pos"][:, at["load"], 2]
-        give = float(height[round(_SETTLE / dt)] - height[-1])
-
-        def pulled(name: str) -> float:
-            _, normal, along = self._presses[name]
-            begin, end = (round((_SETTLE + t) / dt) for t in _PULL_WINDOW)
-            gained = (
-                mass
-                * _SLAB_MASS
-                * (log["object_linvel"][end, at[name]] - log["object_linvel"][begin, at[name]]).numpy()
-            )
-            time = (end - begin) * dt
-            carried = self._pull(name) * time - float(gained @ along)
-            pressed = _PRESS * time + float(gained @ normal)  # the press pushes against the normal
-            return carried / pressed if pressed > 0.05 * _PRESS * time else float("nan")
-
+        mass = self._push * t / velocity / self._thing.mass
+        step = 2.0 * distance / velocity - t
         shares = []
-        for i, name in enumerate(("torque x", "torque y", "torque z")):
-            turned = quat_rotate_inverse(
-                log["object_quat"][_PUSH_STEPS, at[name]], log["object_angvel"][_PUSH_STEPS, at[name]]
-            ).numpy()
-            shares.append(self._push_torque(i) * t / float(turned @ self._axes[i]) / self._principal(i))
-        stiffness, damping, delay = self._drives(log["joint_pos"][:, -1].numpy(), log["joint_vel"][:, -1].numpy())
+        for i, name in enumerate(_TORQUES):
+            quat = log["object_quat"][_PUSH_STEPS, _AT[name]]
+            turned = quat_rotate_inverse(quat, log["object_angvel"][_PUSH_STEPS, _AT[name]]).numpy()
+            shares.append(self._torques[i] * t / float(turned @ self._axes[i]) / self._principal[i])
         inertia = float(np.median(shares)) / mass
-        point, patch = (inertia * self._torsion(log, at[name]) for name in _TOPS)
-        arm, hand = self._robot.arm_indices, self._robot.hand_indices
+        point = inertia * self._torsion(log, _AT["one point"])
+        patch = inertia * self._torsion(log, _AT["two points"])
+        height = log["object_pos"][:, _AT["load"], 2]
+        stiffness, damping, delay = self._drives(log)
+        arm = self._robot.arm_indices
+        hand = self._robot.hand_indices
         return Measured(
-            tip_friction=pulled("tip"),
-            link_friction=pulled("link"),
-            table_friction=sum(slides) / len(slides),
+            tip_friction=self._pulled(log, "tip", mass),
+            link_friction=self._pulled(log, "link", mass),
+            table_friction=(self._slid(log, _AT["slide x"], step) + self._slid(log, _AT["slide xy"], step)) / 2,
             torsional_friction=point,
             patch_torsional_friction=patch / point if point > _LEAST_TORSION else float("nan"),
             mass=mass,
@@ -208,20 +235,32 @@ class _Bench:
             hand_stiffness=_median(stiffness[hand]),
             hand_damping=_median(damping[hand]),
             timestep=step,
-            contact_give=give,
+            contact_give=float(height[round(_SETTLE / dt)] - height[-1]),
             delay=float(delay),
         )
 
+    def _pulled(self, log: dict[str, Tensor], name: str, mass: float) -> float:
+        """Return the friction of a paddle, from the impulses that were missing along and across the link."""
+        _, normal, along = self._presses[name]
+        begin = round((_SETTLE + _PULL_WINDOW[0]) / self._dt)
+        end = round((_SETTLE + _PULL_WINDOW[1]) / self._dt)
+        velocity = log["object_linvel"][:, _AT[name]]
+        gained = mass * _SLAB_MASS * (velocity[end] - velocity[begin]).numpy()
+        time = (end - begin) * self._dt
+        carried = self._pull[name] * time - float(gained @ along)
+        pressed = _PRESS * time + float(gained @ normal)  # the press pushes against the normal
+        return carried / pressed if pressed > 0.05 * _PRESS * time else float("nan")
+
     def _slid(self, log: dict[str, Tensor], world: int, step: float) -> float:
-        """Friction from how far a slab has slid."""
+        """Return the friction from how far a slab has slid."""
         end = log["object_linvel"][-1, world, :2].norm()
         way = (log["object_pos"][-1, world, :2] - log["object_pos"][0, world, :2]).norm()
         return float((_SPEED**2 - end**2) / (2 * GRAVITY * (way + _SPEED * step / 2)))
 
     def _torsion(self, log: dict[str, Tensor], world: int) -> float:
-        """Torsional friction [m] from the spin that a top has lost, if its inertia at its mass is as stated.
+        """Return the torsional friction [m] from the spin that a top has lost, if its inertia at its mass is as stated.
 
-        It is measured while the top has half of its spin. What takes that in one step cannot be measured.
+        It is measured while the top has half of its spin; NaN if friction takes that in one step.
         """
         spin = log["object_angvel"][:, world, 2]
         steps = int((spin > spin[0] / 2).long().cumprod(0).sum()) - 1
@@ -230,104 +269,85 @@ class _Bench:
         load = GRAVITY * steps * self._dt + float(log["object_linvel"][steps, world, 2])  # its impulse, for the mass
         return _TOP_INERTIA[2] / _SLAB_MASS * float(spin[0] - spin[steps]) / load
 
-    # What is done to the worlds ----------------------------------------------------------------------------------------------------------
-
     def _start(self) -> State:
-        start = State.initial(self.scene, self.object_index)
-        pos, quat, linvel = start.object_pos, start.object_quat, start.object_linvel
-        for i, name in enumerate(self._names):
-            if name in _SLABS:
-                pos[i] = torch.tensor([*self._place, _SLAB_HALF[2]])
-            elif name in _TOPS:
-                pos[i] = torch.tensor([*self._place, 0.0])
-                start.object_angvel[i, 2] = self._spin()
-            elif name in self._presses:
-                point, normal, _ = self._presses[name]
-                pos[i] = torch.as_tensor(point + (_SLAB_HALF[2] + 5e-4) * normal)
-                quat[i] = torch.as_tensor(_z_to(normal))
-            else:
-                pos[i] = torch.tensor([*self._place, 0.6])
-        linvel[0, 0] = _SPEED
-        linvel[1, :2] = _SPEED * np.sqrt(0.5)
+        start = State.initial(self.scene, torch.tensor(list(_WORLDS.values())))
+        pos = start.object_pos
+        for name, i in _AT.items():
+            match _WORLDS[name]:
+                case 0:
+                    pos[i] = torch.tensor([*self._place, _SLAB_HALF[2]])
+                case 1:
+                    point, normal, _ = self._presses[name]
+                    pos[i] = torch.as_tensor(point + (_SLAB_HALF[2] + 5e-4) * normal)
+                    start.object_quat[i] = torch.as_tensor(_z_to(normal))
+                case 2:
+                    pos[i] = torch.tensor([*self._place, 0.6])
+                case _:
+                    pos[i] = torch.tensor([*self._place, 0.0])
+                    start.object_angvel[i, 2] = self._spin
+        start.object_linvel[_AT["slide x"], 0] = _SPEED
+        start.object_linvel[_AT["slide xy"], :2] = _SPEED * np.sqrt(0.5)
         return start
 
     def _loads(self, step: int) -> tuple[Tensor, Tensor]:
-        """Force and torque [N, 3] on the objects in a physics step."""
-        force, torque = np.zeros((self.count, 3)), np.zeros((self.count, 3))
+        """Return force and torque [N, 3] on the objects in a physics step."""
+        force = np.zeros((len(_WORLDS), 3))
+        torque = np.zeros((len(_WORLDS), 3))
         late = step * self._dt >= _SETTLE
-        for i, name in enumerate(self._names):
-            if name == "load" and late:
-                force[i, 2] = -_LOAD * _SLAB_MASS * GRAVITY
-            elif name in self._presses:
-                _, normal, along = self._presses[name]
-                force[i] = -_PRESS * normal + (self._pull(name) * along if late else 0.0)
-            elif name == "force" and step < _PUSH_STEPS:
-                force[i, 0] = self._push_force()
-            elif name.startswith("torque") and step < _PUSH_STEPS:
-                axis = "xyz".index(name[-1])
-                torque[i] = (
-                    self._push_torque(axis) * self._axes[axis]
-                )  # the object starts unturned, and turns about this axis only
+        for name, (_, normal, along) in self._presses.items():
+            force[_AT[name]] = -_PRESS * normal + (self._pull[name] * along if late else 0.0)
+        if late:
+            force[_AT["load"], 2] = -_LOAD * _SLAB_MASS * GRAVITY
+        if step < _PUSH_STEPS:
+            force[_AT["force"], 0] = self._push
+            for i, name in enumerate(_TORQUES):  # the object starts unturned, and turns about this axis only
+                torque[_AT[name]] = self._torques[i] * self._axes[i]
         return torch.as_tensor(force, dtype=torch.float32), torch.as_tensor(torque, dtype=torch.float32)
 
-    def _pull(self, name: str) -> float:
-        friction = self.scene.friction
-        return _PULL * _PRESS * max(friction.tip if name == "tip" else friction.link, 0.1)
-
-    def _spin(self) -> float:
-        """[rad/s] four times what the stated torsional friction takes; not so much that a contact patters."""
-        return 4.0 * max(self.scene.friction.torsional, 1e-3) * _SLAB_MASS * GRAVITY / _TOP_INERTIA[2] * _TIME
-
-    def _push_force(self) -> float:
-        return 2.0 * self._thing.mass  # 2 m/s^2
-
-    def _push_torque(self, axis: int) -> float:
-        return 10.0 * self._principal(axis)  # 10 rad/s^2
-
-    def _principal(self, axis: int) -> float:
-        return float(self._axes[axis] @ self._thing.inertia @ self._axes[axis])
-
-    def _drive_step(self) -> Tensor:
-        """[J] change of the targets, away from the nearer joint limit."""
-        robot, tree = self._robot, robot_tree(self._robot)
+    def _drive_steps(self) -> list[float]:
+        """[J] change of each target, away from the nearer joint limit."""
+        tree = robot_tree(self._robot)
         out = []
-        for joint in robot.joints:
+        for joint in self._robot.joints:
             limits = tree.joint(joint.name)
-            size = min(_STEP, 0.4 * joint.drive.effort / joint.drive.kp)
-            size = min(size, 0.2 * (limits.upper - limits.lower))
+            size = min(_STEP, 0.4 * joint.drive.effort / joint.drive.kp, 0.2 * (limits.upper - limits.lower))
             out.append(size if limits.upper - joint.home >= joint.home - limits.lower else -size)
-        return torch.tensor(out, dtype=torch.float32)
+        return out
 
-    def _drives(self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-        """Shares [J] of kp and kd, and the delay in control steps, from [T, J] positions and velocities after a step of the targets."""
-        robot, dt = self._robot, self._dt
-        drives = [joint.drive for joint in robot.joints]
-        change = self._drive_step().double().numpy()
-        moved = np.flatnonzero((np.abs(position - position[0]) > 1e-3 * np.abs(change)).any(axis=1))
-        if not len(moved):
+    def _drives(self, log: dict[str, Tensor]) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return the shares [J] of kp and kd, and the delay in control steps, from the motion after a step of the targets."""
+        position = log["joint_pos"][:, _AT["drives"]].numpy()
+        velocity = log["joint_vel"][:, _AT["drives"]].numpy()
+        drives = [joint.drive for joint in self._robot.joints]
+        change = np.array(self._drive_steps(), dtype=np.float32).astype(float)
+        moved = (np.abs(position - position[0]) > 1e-3 * np.abs(change)).any(axis=1)
+        if not moved.any():
             raise XResetError("no joint follows its target, so its drives cannot be measured.")
-        late = (int(moved[0]) - 1) // self.scene.substeps * self.scene.substeps
-        position, velocity = position[late:], velocity[late:]
-        M = mass_matrix(robot, robot.home) + np.diag([drive.armature for drive in drives])
+        late = (int(moved.argmax()) - 1) // self.scene.substeps * self.scene.substeps
+        position = position[late:]
+        velocity = velocity[late:]
+        M = mass_matrix(self._robot, self._robot.home) + np.diag([drive.armature for drive in drives])
         loss = np.array([drive.friction_loss for drive in drives])
-        momentum = velocity @ M + np.cumsum(loss * np.sign(velocity), axis=0) * dt
+        momentum = velocity @ M + np.cumsum(loss * np.sign(velocity), axis=0) * self._dt
         lag = position[0] + change - position
-        pulled = np.concatenate((np.zeros((1, len(drives))), np.cumsum((lag[1:] + lag[:-1]) / 2 * dt, axis=0)))
-        kp, kd = np.empty(len(drives)), np.empty(len(drives))
-        for j in range(len(drives)):
+        pulled = np.zeros_like(lag)
+        pulled[1:] = np.cumsum((lag[1:] + lag[:-1]) / 2 * self._dt, axis=0)
+        gains = []
+        for j, drive in enumerate(drives):
             columns = np.stack((pulled[:, j], position[0, j] - position[:, j]), axis=1)
-            (kp[j], kd[j]), *_ = np.linalg.lstsq(columns, momentum[:, j], rcond=None)
-        return kp / [d.kp for d in drives], kd / [d.kd for d in drives], late // self.scene.substeps
+            fit, *_ = np.linalg.lstsq(columns, momentum[:, j], rcond=None)
+            gains.append(fit / (drive.kp, drive.kd))
+        kp, kd = np.transpose(gains)
+        return kp, kd, late // self.scene.substeps
 
 
 def _block(name: str, *, inertia: np.ndarray) -> ObjectSpec:
-    return replace(
-        solid(name, _SLAB_MASS, (shape("box", _SLAB_HALF, (0, 0, 0)),)), com=np.zeros(3), inertia=np.diag(inertia)
-    )
+    block = solid(name, _SLAB_MASS, (shape("box", _SLAB_HALF, (0, 0, 0)),))
+    return replace(block, com=np.zeros(3), inertia=np.diag(inertia))
 
 
 def _top(name: str, points: Sequence[Sequence[float]]) -> ObjectSpec:
-    """A cone upside down, with these points [m] at its lower end; the mesh's origin is on the floor, and so is the centre of mass."""
+    """Return a cone upside down with these points [m] at its lower end; the mesh's origin is on the floor, and so is the centre of mass."""
     angle = np.arange(8) * np.pi / 4
     rim = np.stack((_TOP_RADIUS * np.cos(angle), _TOP_RADIUS * np.sin(angle), np.full(8, _TOP_HEIGHT)), axis=1)
     cone = solid(name, _SLAB_MASS, (hull(np.concatenate((np.array(points), rim))),))
@@ -335,56 +355,59 @@ def _top(name: str, points: Sequence[Sequence[float]]) -> ObjectSpec:
 
 
 def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where a paddle can be pressed on a fingertip (or on another link) of the robot at home, and nothing else is in its way.
+    """Find where a paddle can be pressed on a fingertip (or on another link) of the robot at home, with nothing else in its way.
 
     Of many directions, the one in which the link sticks out farthest beyond links of the other kind.
 
     Returns:
-        The point [3] that sticks out, the direction [3] it does in, and a direction [3] along the paddle's face.
+        The point [3] that sticks out, the direction [3] it sticks out in, and a direction [3] along the paddle's face.
     """
     robot = scene.robot
     kinematics = Kinematics(robot)
     poses = kinematics.link_poses(torch.as_tensor(robot.home, dtype=torch.float64)).numpy()
-    contact_links = {link for finger in robot.fingertips for link in finger.contact_links}
+    contact_links = set()
+    for finger in robot.fingertips:
+        contact_links.update(finger.contact_links)
     points: dict[bool, list[np.ndarray]] = {True: [], False: []}
     for name, mesh, T in zip(kinematics.link_names, link_meshes(robot), poses, strict=True):
         if mesh is not None:
             points[name in contact_links].append(mesh.vertices @ T[:3, :3].T + T[:3, 3])
-    mine, others = np.concatenate(points[tip]), np.concatenate(points[not tip])
-    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
+    mine = np.concatenate(points[tip])
+    others = np.concatenate(points[not tip])
+    best = None
+    best_margin = 0.002
     for normal in _directions(400):
         reach = mine @ normal
-        margin = float(reach.max() - (others @ normal).max())
         point = mine[reach.argmax()]
         along = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
         along /= np.linalg.norm(along)
         if along[2] < 0:
             along = -along  # away from the table
-        lowest = (
-            point[2]
-            + min(0.0, 2 * _SLAB_HALF[2] * normal[2])
-            - np.hypot(*_SLAB_HALF[:2]) * np.sqrt(max(0.0, 1 - normal[2] ** 2))
-        )
-        if lowest > 0.03 and (best is None or margin > best[0]):
-            best = margin, point, normal, along
-    if best is None or best[0] <= 0.002:
+        below = min(0.0, 2 * _SLAB_HALF[2] * normal[2])
+        tilted = np.hypot(*_SLAB_HALF[:2]) * np.sqrt(max(0.0, 1 - normal[2] ** 2))
+        margin = float(reach.max() - (others @ normal).max())
+        if point[2] + below - tilted > 0.03 and margin > best_margin:
+            best_margin = margin
+            best = (point, normal, along)
+    if best is None:
         what = "fingertip" if tip else "link beside the fingertips"
         raise XResetError(
             f"no {what} of {robot.name!r} at home can be reached from outside, so its friction cannot be measured."
         )
-    return best[1:]
+    return best
 
 
 def _directions(count: int) -> np.ndarray:
     """[count, 3] unit vectors spread over the sphere (a Fibonacci lattice)."""
     i = np.arange(count) + 0.5
-    z, angle = 1 - 2 * i / count, np.pi * (1 + np.sqrt(5)) * i
+    z = 1 - 2 * i / count
+    angle = np.pi * (1 + np.sqrt(5)) * i
     r = np.sqrt(1 - z * z)
     return np.stack((r * np.cos(angle), r * np.sin(angle), z), axis=1)
 
 
 def _z_to(direction: np.ndarray) -> np.ndarray:
-    """[4] a rotation that turns z into a unit vector."""
+    """[4] rotation that turns z into a unit vector [3]."""
     x = np.cross(np.eye(3)[np.abs(direction).argmin()], direction)
     x /= np.linalg.norm(x)
     return Rotation.from_matrix(np.stack((x, np.cross(direction, x), direction), axis=1)).as_quat(scalar_first=True)

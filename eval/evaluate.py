@@ -44,7 +44,8 @@ def evaluate(
         progress: called with (engine, control steps done, control steps in all).
 
     Returns:
-        The results that were written, in the order of the engines. They print as a table; ``to_frame()`` has a row for each episode.
+        The results that were written, in the order of the engines. They print as a table; ``to_frame()`` has a row for
+        each episode.
 
     Raises:
         PolicyError: the policy is unknown, or the seed chose this checkpoint.

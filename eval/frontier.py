@@ -1,7 +1,7 @@
 """From which demonstrated states a policy reaches the goal: what it can do, and where its training is stuck.
 
-Demonstrated states are the stages of the task from its end backwards: held at the goal, lifted, touched, approached. A policy learns them
-in about that order, so training has to discover the first stage from which the policy fails.
+Demonstrated states are the stages of the task from its end backwards: held at the goal, lifted, touched, approached. A
+policy learns them in about that order, so training has to discover the first stage from which the policy fails.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def try_policy(
 
 
 def by_stage(tried: list[Tried]) -> list[dict[str, Any]]:
-    """Return one entry for each stage that has states: its name, their number, and the shares that reached the goal and stayed there."""
+    """Return an entry for each stage with states: their number, and the shares that reached the goal and stayed."""
     out = []
     for stage in STAGES:
         mine = [t for t in tried if t.stage == stage]

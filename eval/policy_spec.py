@@ -105,7 +105,8 @@ def load_policy(policy: str | Path, *, robot: str | Path | None = None, seed: in
     """Find the policy that a name means. A file or folder comes before a shipped policy of the same name.
 
     Args:
-        policy: run folder, exported policy (.onnx), name of a policy that ships with xreset, or one of :data:`BASELINES`.
+        policy: run folder, exported policy (.onnx), name of a policy that ships with xreset, or one of
+            :data:`BASELINES`.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.
         seed: seed of the baseline ``random``.
 

@@ -163,8 +163,8 @@ def play_all(
         trial: what it plays.
         object_index: index of each item's object.
         start: makes the starts [N] of items [N].
-        visit: called in every round with the environment, which was just reset, the item [N] of each world, the worlds whose item no
-            earlier world has played, and the function that plays the episodes.
+        visit: called in every round with the environment, which was just reset, the item [N] of each world, the worlds
+            whose item no earlier world has played, and the function that plays the episodes.
         progress: called with (control steps done, control steps in all).
     """
     plan = schedule(np.array(object_index), trial.num_envs)
@@ -212,7 +212,7 @@ def play(policy: Policy, env: ManipulationEnv, points: torch.Tensor, look: Look)
 
 
 def episode_starts(distribution: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int) -> Reset:
-    """Return one start for each world. Each has its own random numbers, so the engine and the number of worlds change nothing."""
+    """Return one start for each world. Each has random numbers of its own, whatever the engine and number of worlds."""
     parts = []
     for s, r in zip(sequence.tolist(), repetition.tolist(), strict=True):
         state = np.random.SeedSequence([seed, s, r]).generate_state(1)

@@ -1,6 +1,7 @@
 """How a change of the world changes a policy's score, and the physical properties that are changed.
 
-Sweeps (:mod:`xreset.eval.stress`) and the attribution to differences of engines (:mod:`xreset.eval.engines.attribution`) share both.
+Sweeps (:mod:`xreset.eval.stress`) and the attribution to differences of engines
+(:mod:`xreset.eval.engines.attribution`) share both.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Effect:
 
 @dataclass(frozen=True, kw_only=True)
 class Property:
-    """One physical property. Without ``task_field`` no task can set it, without ``measured`` it is not measured in engines."""
+    """One physical property. No task can set one without ``task_field``; one without ``measured`` is not measured."""
 
     name: str
     task_field: str = ""
@@ -75,7 +76,7 @@ class Property:
     what_if: tuple[float, ...] = ()
     """Changes of a usual size, which show how much a skill depends on the property."""
     at_most: str = ""
-    """Why the possible change goes farther than the other engine does, so that the cost is a bound; empty: it does not."""
+    """Why the possible change goes farther than the other engine does, so that its cost is a bound; else empty."""
 
     @property
     def option(self) -> str:

@@ -1,4 +1,4 @@
-"""How an evaluation is set up, as the commands' options say it. Imports no torch, so that the command line can show it at once."""
+"""Options that several evaluating commands share. Imports no torch, so that the command line shows them at once."""
 
 from __future__ import annotations
 
@@ -10,33 +10,34 @@ from xreset.checks import Options
 
 @dataclass(frozen=True, kw_only=True)
 class Place(Options):
-    """With which robot and meshes, and where."""
+    """Robot, meshes, seed and device."""
 
     robot: str | None = None
     """Name or folder of the robot; default: the policy's, or the file's."""
     objects: Path | None = None
     """Folder of real meshes; default: what the policy was trained with, else the stand-ins."""
     seed: int = 0
-    """Seed of everything that is drawn; the same in every engine."""
+    """Seed of everything that is drawn; draws are the same in every engine."""
     device: str = "cpu"
     """Where GPU engines run: cpu or cuda."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Setting(Place):
-    """The same, and with how many worlds."""
+    """Robot, meshes, seed, device and worlds."""
 
     num_envs: int = 64
-    """Worlds at a time."""
+    """Worlds that run at the same time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sequence(Options):
-    """Which action sequence of a file."""
+    """An action sequence of a file."""
 
     policy: str | None = None
-    """Run folder, exported policy (.onnx), name of a policy that ships with xreset, or a baseline (zero, random, ik) that plays in the
-    reference; its actions are replayed."""
+    """Run folder, exported policy (.onnx), name of a policy that ships with xreset, or a baseline (zero, random, ik)
+    that plays in the reference; its actions are replayed.
+    """
     object: str | None = None
     """Object, if the source has several; default: the first."""
     episode: int = 0

@@ -1,7 +1,7 @@
 """How robust a policy is: the same episodes while one property of the world at a time is swept over a range.
 
-A property is a field of the task's randomization, held at one value: what a training may draw at random and what is tried here are one
-list. Everything else is as in an evaluation.
+A property is a field of the task's randomization, held at one value: what a training may draw at random and what is
+tried here are one list. Everything else is as in an evaluation.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Curve:
     points: tuple[Point, ...]
     """In ascending order of the value, the nominal one included."""
     lower: float | None
-    """Value below the nominal one at which ten points are lost, interpolated; None: no value that was tried loses as much."""
+    """Value below the nominal one at which ten points are lost, interpolated; None: no tried value loses as much."""
     upper: float | None
     """The same above the nominal value."""
 
@@ -100,7 +100,7 @@ class Stress:
     """Properties that the engine cannot set."""
 
     def sentence(self) -> str:
-        """Return the result in one line: the smallest changes that cost ten points, and how many properties cost less."""
+        """Return one line: the smallest changes that cost ten points, and how many properties cost less."""
         sure: list[tuple[float, str]] = []
         perhaps: list[tuple[float, str]] = []
         harmless = 0
@@ -192,7 +192,8 @@ def stress(
     repetitions: int = 2,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> list[Stress]:
-    """Sweep properties in each engine and write ``OUT/BACKEND.json`` after each property, so that a stopped command keeps its results.
+    """Sweep properties in each engine and write ``OUT/BACKEND.json`` after each property, so that a stopped command
+    keeps its results.
 
     Args:
         policy: what is tried.
@@ -261,7 +262,8 @@ def read_stress(folder: Path, policy: str | None = None) -> tuple[Stress, ...]:
 
     Args:
         folder: folder that ``xreset stress`` wrote.
-        policy: SHA-256 of a policy; results of another policy, or of an earlier checkpoint, are left out. None: all results.
+        policy: SHA-256 of a policy; results of another policy, or of an earlier checkpoint, are left out. None: all
+            results.
 
     Raises:
         FileFormatError: a file is damaged, or of another version.
@@ -287,7 +289,7 @@ def curve(prop: Property, nominal: Sequence[Episode], swept: dict[float, tuple[E
 
 
 def _limit(outwards: Sequence[Point]) -> float | None:
-    """Return where ten points are lost on the way from the nominal value outwards, between two values that were tried."""
+    """Return the value at which ten points are lost on the way outwards, between two values that were tried."""
     for near, far in pairwise(outwards):
         if far.difference <= -COSTLY < near.difference:
             share = (near.difference + COSTLY) / (near.difference - far.difference)

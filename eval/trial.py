@@ -51,7 +51,8 @@ class Engine:
 def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
     """Return an installed backend.
 
-    A backend that solves the equations of the reference is compared path by path; on the CPU in no other way, because it is slow there.
+    A backend that solves the equations of the reference is compared path by path; on the CPU in no other way, because
+    it is slow there.
 
     Args:
         name: name of the backend.
@@ -82,7 +83,7 @@ class Trial:
     task: TaskConfig
     """Usually :func:`xreset.task.config.evaluation_task` of the policy's own task."""
     seed: int = 0
-    """Seed of the perturbations of robot and object, which are the same in every engine and for every number of worlds."""
+    """Seed of the perturbations of robot and object: the same in every engine and for every number of worlds."""
     num_envs: int = 64
     """Worlds that run at the same time."""
     motion: Retargeted | None = None

@@ -1,4 +1,4 @@
-"""How far engines agree on grasps (``agreement``) and on one action sequence (``replay``); which difference costs skill (``attribution``).
+"""How far engines agree on grasps and on one action sequence, and which difference costs a policy its skill.
 
 .. code-block:: python
 

@@ -1,7 +1,9 @@
-"""An action sequence that can be replayed anywhere: a state, the drives' target at each control step, and the physics meant.
+"""An action sequence that can be replayed anywhere: a state, the drives' target at each control step, and the physics
+meant.
 
-Actions are kept as joint targets, not as a policy's outputs: what a policy's output becomes depends on where the joints are (see
-:mod:`xreset.task.actions`), and would no longer be the same in every engine. Shape letters: T control steps, J joints, P phases.
+Actions are kept as joint targets, not as a policy's outputs: what a policy's output becomes depends on where the joints
+are (see :mod:`xreset.task.actions`), and would no longer be the same in every engine. Shape letters: T control steps, J
+joints, P phases.
 """
 
 from __future__ import annotations
@@ -157,7 +159,8 @@ def play_policy(
 
 
 def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label: str) -> Actions:
-    """Return the actions of an episode that an evaluation has recorded; it began at rest, with the physics of an evaluation.
+    """Return the actions of an episode that an evaluation has recorded; it began at rest, with the physics of an
+    evaluation.
 
     Raises:
         FileFormatError: the episode was not played at the control rate of the default task.
@@ -168,8 +171,8 @@ def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label
     length = len(trace.joint_target) * scene.control_dt
     if not trace.time[-1] <= length + 1e-6 < trace.time[-1] + interval + 1e-6:
         raise FileFormatError(
-            f"{len(trace.joint_target)} actions at {1 / scene.control_dt:.0f} Hz last {length:.2f} s, but the episode lasts "
-            f"{trace.time[-1]:.2f} s: it was played at another control rate. Give --policy instead, which knows its own."
+            f"{len(trace.joint_target)} actions at {1 / scene.control_dt:.0f} Hz last {length:.2f} s, but the episode "
+            f"lasts {trace.time[-1]:.2f} s: it was played at another control rate. Give --policy instead."
         )
     first = [
         torch.as_tensor(x[:1], dtype=torch.float32) for x in (trace.joint_pos, trace.object_pos, trace.object_quat)

@@ -1,7 +1,7 @@
 """The comparison of engines: they try the same grasps, and are measured against a reference.
 
-Where two recordings of the same episode are compared, the first is of the tested engine, the second of the reference. Shape letters as in
-:mod:`xreset.eval.engines.recording`.
+Where two recordings of the same episode are compared, the first is of the tested engine, the second of the reference.
+Shape letters as in :mod:`xreset.eval.engines.recording`.
 """
 
 from __future__ import annotations
@@ -289,7 +289,7 @@ def _at_half_timestep(base: Engine) -> Engine:
 
 
 def press_metrics(found: Recording, reference: Recording, steps: int) -> list[Metric]:
-    """Compare the forces with which a hand presses on an object that does not move, averaged over the last control steps."""
+    """Compare the forces of a hand on an object that does not move, averaged over the last control steps."""
     force = found.tip_force[-steps:].mean(0)
     expected = reference.tip_force[-steps:].mean(0)
     press = force.norm(dim=-1)
@@ -346,18 +346,18 @@ def outcome_metric(name: str, found: Tensor, reference: Tensor) -> Metric:
 
 
 def palm_distance(found: Recording, reference: Recording, points: Tensor) -> Tensor:
-    """[G] mean distance of the surface points [G, P, 3] in the palm's frame at the end [m]: place and orientation in one."""
+    """[G] mean distance of the surface points [G, P, 3] in the palm's frame at the end [m]."""
     return (found.in_palm(-1, points) - reference.in_palm(-1, points)).norm(dim=-1).mean(-1)
 
 
 def path_difference(found: Recording, reference: Recording) -> tuple[Tensor, Tensor]:
-    """After each step, the difference [T, G] of the joint that differs most (rad, m), and the distance [T, G] of the objects (m)."""
+    """[T, G] difference of the joint that differs most (rad, m), and distance of the objects (m), after each step."""
     joints = (found.joint_pos - reference.joint_pos).abs().amax(-1)
     return joints, (found.object_pos - reference.object_pos).norm(dim=-1)
 
 
 def path_metrics(joints: Tensor, distance: Tensor) -> list[Metric]:
-    """Judge the differences [T, G] of paths in contact, of engines that solve the same equations: long contact is chaotic."""
+    """Judge the differences [T, G] of paths in contact. Long contact is chaotic, even with the same equations."""
     millimetres = 1e3 * distance
     n = distance.numel()
     above = int((millimetres.amax(0) > 1.0).sum()) if n else 0

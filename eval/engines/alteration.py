@@ -1,4 +1,4 @@
-"""An engine whose physics is changed by known factors, through the interface alone: any backend can be altered, a plugin's too."""
+"""An engine whose physics is changed by known factors, through the interface alone: any backend can be altered."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SOFTEST = MIN_TIME_CONSTANT_STEPS / NOMINAL_STEPS
 """The smallest factor on this time constant that MuJoCo allows."""
 
 _RIGID = {
-    "pybullet": "Bullet's sequential impulses have no stiffness: how much a contact gives follows from its iterations and steps",
+    "pybullet": "Bullet's contacts have no stiffness: how much one gives follows from its iterations and steps",
     "sapien": "PhysX's contacts are rigid: how much one gives follows from its solver's iterations",
 }
 
@@ -147,7 +147,7 @@ def change_towards(name: str, a: Measured, b: Measured, engine: str, scene: Scen
 
 
 def _timestep(ratio: float, engine: str, scene: SceneSpec) -> Alteration | str:
-    """Take more or fewer physics steps per control step; contacts keep their time constant where it is counted in timesteps."""
+    """Change the physics steps per control step; contacts that count time in timesteps keep their time constant."""
     substeps = max(1, round(scene.substeps * ratio))
     if substeps == scene.substeps:
         return f"with {scene.substeps} physics steps per control step, no other timestep comes nearer"

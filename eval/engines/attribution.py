@@ -38,8 +38,10 @@ class Row:
     """One run of the policy."""
 
     kind: Kind
-    """``as it is``: A. ``towards``: one property changed to B's value. ``at most``: one property changed farther than that, because there
-    is no finer dial. ``all``: all properties of kind ``towards``. ``what if``: a change of a usual size. ``other``: B."""
+    """``as it is``: A. ``towards``: one property changed to B's value. ``at most``: one property changed farther than
+    that, because there is no finer dial. ``all``: all properties of kind ``towards``. ``what if``: a change of a usual
+    size. ``other``: B.
+    """
     name: str
     """Property, or engine."""
     alteration: Alteration
@@ -75,7 +77,8 @@ class Attribution:
         return row.effect.difference / self.gap.difference if self.gap.is_certain else math.nan
 
     def costs(self) -> Row | None:
-        """Return the property that brings about most of the gap when it is changed to B's value; None if none does for sure.
+        """Return the property that brings about most of the gap when it is changed to B's value; None if none does for
+        sure.
 
         A property whose cost is only a bound is named only where no other matters.
         """

@@ -16,7 +16,7 @@ from xreset.eval.sensitivity import COMPARED
 
 
 def rich_table(found: Attribution, title: str) -> Table:
-    """One row for each run: the change, the score, and its difference to A as it is. Bold: the interval leaves out zero."""
+    """One row for each run: change, score, and difference to A as it is. Bold: the interval leaves out zero."""
     table = Table(title=title, title_justify="left")
     table.add_column("")
     for name in ("value", "task progress", "grasp", "reorient", f"against {found.a}", "of gap"):

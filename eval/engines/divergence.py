@@ -115,7 +115,8 @@ def differences(
 def partings(d: Differences, robot: RobotSpec, thresholds: Thresholds) -> tuple[Parting, ...]:
     """Return how each quantity parts: joints, object position, object orientation, contacts, contact force.
 
-    Joints are compared by their difference as a share of the threshold of their kind; the joint that differs most is named.
+    Joints are compared by their difference as a share of the threshold of their kind; the joint that differs most is
+    named.
     """
     if not len(d.time):
         return ()
@@ -161,7 +162,7 @@ def _parting(
     where: Callable[[int], str] = lambda step: "",
     beyond: np.ndarray | None = None,
 ) -> Parting:
-    """Describe a difference [T]; it parts at the first step of ``beyond`` [T] bool, by default where it reaches the threshold."""
+    """Describe a difference [T], which parts at the first flag of ``beyond`` [T]; default: beyond the threshold."""
     beyond = value >= threshold if beyond is None else beyond
     first = int(beyond.argmax())
     parts = bool(beyond[first])
@@ -180,7 +181,7 @@ def _parting(
 
 
 def _joints(d: Differences, names: Sequence[str], limit: np.ndarray, prismatic: np.ndarray) -> Parting:
-    """In rad, or in m where the joint that differs most is prismatic; never a mixture: the joint is chosen first, then its unit."""
+    """Choose the joint that differs most, then its unit: rad, or m if it is prismatic; never a mixture."""
     share = d.joint / limit
     found = _parting("joints", "rad", d.time, share.max(axis=1), 1.0, lambda step: names[int(share[step].argmax())])
     most = int(share.max(axis=1).argmax())

@@ -1,7 +1,8 @@
-"""Action sequences that try a grasp: close the hand, lift, shake. They are open loop, in joint targets, made without any engine.
+"""Action sequences that try a grasp: close the hand, lift, shake. They are open loop, in joint targets, made without
+any engine.
 
-The hand closes along the line between thumb and fingers, which any hand with a thumb and another finger has, whatever its joints are.
-Shape letters: G grasps (one per world), J joints, H joints of the hand, E fingertips, T control steps.
+The hand closes along the line between thumb and fingers, which any hand with a thumb and another finger has, whatever
+its joints are. Shape letters: G grasps (one per world), J joints, H joints of the hand, E fingertips, T control steps.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class Motion:
     opening: float = 0.025
     """Distance of the fingertips at the start from where they hold, away from the opposite fingertips [m]."""
     reach: float = 0.010
-    """Distance that they move on towards the opposite ones [m], because demonstrated tips need not touch the robot's object."""
+    """Distance that they move on towards the opposite ones [m]: demonstrated tips may not touch the robot's object."""
     squeeze: float = 12.0
     """Force [N] with which thumb and fingers press against each other if the object is there."""
     settle: float = 0.2
@@ -111,8 +112,8 @@ def squeezing_state(
 def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float) -> Tensor:
     """Return joint positions [G, J] with the fingertips moved towards the opposite ones, and the arm unmoved.
 
-    The hand's joints take a few steps of damped least squares, dq = J^T (J J^T + d^2)^-1 dx, within their limits. Fingers that are
-    stretched or at a limit move less.
+    The hand's joints take a few steps of damped least squares, dq = J^T (J J^T + d^2)^-1 dx, within their limits.
+    Fingers that are stretched or at a limit move less.
 
     Args:
         kinematics: of the robot.
@@ -131,8 +132,8 @@ def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float)
 def squeezed(kinematics: Kinematics, joint_pos: Tensor, motion: Motion) -> Tensor:
     """Return joint targets [G, J] with which the hand reaches and squeezes.
 
-    Held where the reach ends, each joint's drive gives the torque J^T f of the fingertip forces f, because its target is K^-1 J^T f away.
-    The thumb presses as much as the other fingers together, and each of these as much as another.
+    Held where the reach ends, each joint's drive gives the torque J^T f of the fingertip forces f, because its target
+    is K^-1 J^T f away. The thumb presses as much as the other fingers together, and each of these as much as another.
 
     Args:
         kinematics: of the robot.
@@ -155,7 +156,7 @@ def _tip_links(kinematics: Kinematics) -> list[str]:
 
 
 def _closing_direction(kinematics: Kinematics, q: Tensor) -> Tensor:
-    """[G, E, 3] unit vectors: the thumb's from its tip to the mean of the other tips, the others' in the opposite direction."""
+    """[G, E, 3] unit vectors: the thumb's from its tip to the mean of the other tips, and theirs the other way."""
     tips = kinematics.points(q, _tip_links(kinematics))
     line = torch.nn.functional.normalize(tips[:, 1:].mean(1) - tips[:, 0], dim=-1)
     return torch.stack([line, *[-line] * (tips.shape[1] - 1)], dim=1)
@@ -168,7 +169,8 @@ def _tip_jacobian(kinematics: Kinematics, q: Tensor) -> Tensor:
 
 
 def carried_palm(kinematics: Kinematics, joint_pos: Tensor, offset: Tensor) -> Tensor:
-    """Return joint positions [T, G, J] that move the palm without turning it; each step starts from the arm's last pose.
+    """Return joint positions [T, G, J] that move the palm without turning it; each step starts from the arm's last
+    pose.
 
     Args:
         kinematics: of the robot.

@@ -25,7 +25,7 @@ Progress = Callable[[int, int], None]
 def write_strip(
     path: Path, result: TraceResult, *, count: int = 7, progress: Progress = lambda done, total: None
 ) -> None:
-    """Write a PNG: a row for each engine, the reference first, and a column for each of ``count`` times over the sequence."""
+    """Write a PNG: a row for each engine, the reference first, and ``count`` columns spread over the sequence."""
     engines = (result.reference, *result.engines)
     actions = result.actions
     steps = np.unique(np.linspace(0, len(actions.joint_target) - 1, count).round().astype(int)).tolist()

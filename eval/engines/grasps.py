@@ -29,7 +29,7 @@ REST_ANGLE = np.radians(10.0)
 LIFTED = 0.030
 """Height [m] above its start from which an object counts as lifted."""
 CLEARANCE = 0.0005
-"""Least height [m] of an object above the table: demonstrated poses may be sunk into it, and engines throw such objects up."""
+"""Least height [m] of an object above the table. Demonstrated poses may be sunk into it; engines eject such objects."""
 NEAR = 0.025
 """A fingertip nearer than this [m] to the object's collision surface may touch it once the hand closes."""
 
@@ -57,7 +57,7 @@ class Frames:
 
     @classmethod
     def of(cls, data: Retargeted | ResetBank) -> Frames:
-        """Return the frames after the first contact: valid frames of motion, which no engine has judged; or the states of a bank."""
+        """Return the frames after first contact: of motion the valid frames, of a bank its states."""
         if isinstance(data, ResetBank):
             rows = np.flatnonzero(data.post_contact)
             sequence = data.sequence_index[rows]
@@ -106,11 +106,12 @@ class Grasps:
 def find_grasps(
     frames: Frames, robot: RobotSpec, objects: Sequence[ObjectSpec], count: int, *, where: Literal["table", "air"]
 ) -> Grasps:
-    """Choose grasps, equally many of each object and spread over the sequences; the same arguments give the same grasps.
+    """Choose grasps, equally many of each object and spread over the sequences; the same arguments give the same
+    grasps.
 
-    In the frames that count, the thumb's tip and another tip are near the object's surface. ``table``: the object is still where it
-    started; of a sequence, the last such frame comes first, in which the person is about to lift. ``air``: the object is lifted; the
-    middle frame comes first.
+    In the frames that count, the thumb's tip and another tip are near the object's surface. ``table``: the object is
+    still where it started; of a sequence, the last such frame comes first, in which the person is about to lift.
+    ``air``: the object is lifted; the middle frame comes first.
 
     Args:
         frames: where to look.
@@ -135,8 +136,9 @@ def find_grasps(
     rows = rows[_turns(frames, rows, last_first=where == "table")[:count]]
     if not len(rows) and where == "table":
         raise DemoError(
-            f"no grasp was found in {len(frames.frame)} frames after first contact: in none is an object of {', '.join(names)} "
-            f"on the table with the thumb and another fingertip within {1e3 * NEAR:.0f} mm of it. Retarget more demonstrations."
+            f"no grasp was found in {len(frames.frame)} frames after first contact: in none is an object of "
+            f"{', '.join(names)} on the table with the thumb and another fingertip within {1e3 * NEAR:.0f} mm of it. "
+            "Retarget more demonstrations."
         )
     object_index = [names.index(name) for name in frames.object_name[rows].tolist()]
     object_pos = frames.object_pos[rows].astype(np.float64)
@@ -152,7 +154,7 @@ def find_grasps(
 
 
 def _lowest(thing: ObjectSpec, quat: np.ndarray) -> float:
-    """Return the smallest z of the collision pieces, relative to the mesh frame's origin, with the object turned by ``quat`` [m]."""
+    """Return the smallest z of the object turned by ``quat``, relative to the origin of its mesh frame [m]."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(quat, scalar_first=True).as_matrix()
     return lowest_point([replace(piece, T_body_shape=T @ piece.T_body_shape) for piece in thing.pieces])
@@ -179,7 +181,7 @@ def _at_hand(frames: Frames, rows: np.ndarray, robot: RobotSpec, objects: Sequen
 
 
 def _turns(frames: Frames, rows: np.ndarray, *, last_first: bool) -> np.ndarray:
-    """Return the order of rows [R] in which objects take turns, then an object's sequences; a sequence's best frame comes first."""
+    """Order rows [R]: objects take turns, then an object's sequences; a sequence's best frame comes first."""
     rank = np.zeros(len(rows), dtype=int)
     sequence_name = frames.sequence_name[rows]
     for name in dict.fromkeys(sequence_name.tolist()):

@@ -1,6 +1,7 @@
-"""What physics an engine really has, measured through the interface: eight short experiments, all at once, each in a world of its own.
+"""The physics that an engine really has, measured through the interface by eight short experiments at once.
 
-Nothing here knows any engine, so plugins and altered engines are measured alike. Gravity is off except where an object rests on the table.
+Nothing here knows any engine, so plugins and altered engines are measured alike. Gravity is off except where an object
+rests on the table.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from xreset.spec import GRAVITY, ObjectSpec, SceneSpec
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """What an engine was found to have. Shares are of what the scene says, so they are 1 where the engine does as it is told."""
+    """Measured properties of an engine. A share of 1 means that the engine does what the scene states."""
 
     tip_friction: float
     """Pair friction of object and fingertip."""
@@ -38,10 +39,11 @@ class Measured:
     table_friction: float
     """Pair friction of object and table."""
     torsional_friction: float
-    """Torsional friction of object and table, where they touch in one point [m]; NaN where it stops the object at once."""
+    """Torsional friction of object and table touching in one point [m]; NaN where it stops the object at once."""
     patch_torsional_friction: float
-    """Share of it that is left where a second point, 2 mm beside the one that presses, comes as near as 0.5 mm to the table; NaN where
-    there is none to begin with."""
+    """Share of it that is left where a second point, 2 mm beside the one that presses, comes as near as 0.5 mm to the
+    table; NaN where there is none to begin with.
+    """
     mass: float
     """Share of the object's mass."""
     inertia: float
@@ -120,19 +122,22 @@ _TORQUES = ("torque x", "torque y", "torque z")
 def measure(engine: Engine, scene: SceneSpec) -> Measured:
     """Put an engine through the experiments.
 
-    - A slab slides over the table from 0.5 m/s, along x and along the diagonal: its way d tells the friction,
-      (v0^2 - v1^2) / (2 g (d + v0 h / 2)) with h the step of the integration. (Its deceleration does not tell it: MuJoCo's contacts lift
-      what slides, so it patters.)
-    - A top that can hardly fall spins on its point: what it loses, I dw, tells the torsional friction, I dw / int(N) dt with the load's
-      impulse from the momentum (contacts may patter). A second one has another point beside the first that does not reach the table: there
-      some engines let sliding friction act at both points, instead of torsional friction at one.
+    - A slab slides over the table from 0.5 m/s, along x and along the diagonal: its way d tells the friction, (v0^2 -
+      v1^2) / (2 g (d + v0 h / 2)) with h the step of the integration. (Its deceleration does not tell it: MuJoCo's
+      contacts lift what slides, so it patters.)
+    - A top that can hardly fall spins on its point: what it loses, I dw, tells the torsional friction, I dw / int(N) dt
+      with the load's impulse from the momentum (contacts may patter). A second one has another point beside the first
+      that does not reach the table: there some engines let sliding friction act at both points, instead of torsional
+      friction at one.
     - A slab at rest is loaded with ten times its weight: how much it gives.
-    - A paddle that can hardly turn is pressed onto a fingertip, and onto the farthest other link, with 3 N and then pulled sideways with
-      three times what friction should carry: the friction is the ratio of the impulses that were missing along and across.
-    - A force on the free object: its acceleration is F / m, and its distance x after n steps, x = a t (t + h) / 2, tells the step h of the
-      integration. A torque about each of its axes tells its inertia.
-    - Every drive gets a small step of its target q*. M v = kp int(q* - q) dt - kd (q - q0), fitted over the response, tells kp and kd (of
-      what moves, so an integrator's numerical damping counts as damping); when it begins tells the delay.
+    - A paddle that can hardly turn is pressed onto a fingertip, and onto the farthest other link, with 3 N and then
+      pulled sideways with three times what friction should carry: the friction is the ratio of the impulses that were
+      missing along and across.
+    - A force on the free object: its acceleration is F / m, and its distance x after n steps, x = a t (t + h) / 2,
+      tells the step h of the integration. A torque about each of its axes tells its inertia.
+    - Every drive gets a small step of its target q*. M v = kp int(q* - q) dt - kd (q - q0), fitted over the response,
+      tells kp and kd (of what moves, so an integrator's numerical damping counts as damping); when it begins tells the
+      delay.
 
     Args:
         scene: robot and object (the first) of the skill, and its friction and timestep.
@@ -315,7 +320,7 @@ class _Bench:
         return out
 
     def _drives(self, log: dict[str, Tensor]) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return the shares [J] of kp and kd, and the delay in control steps, from the motion after a step of the targets."""
+        """Return the shares [J] of kp and kd, and the delay in control steps, after a step of the targets."""
         position = log["joint_pos"][:, _AT["drives"]].numpy()
         velocity = log["joint_vel"][:, _AT["drives"]].numpy()
         drives = [joint.drive for joint in self._robot.joints]
@@ -347,7 +352,7 @@ def _block(name: str, *, inertia: np.ndarray) -> ObjectSpec:
 
 
 def _top(name: str, points: Sequence[Sequence[float]]) -> ObjectSpec:
-    """Return a cone upside down with these points [m] at its lower end; the mesh's origin is on the floor, and so is the centre of mass."""
+    """Return a cone upside down, with these points [m] at its lower end. Origin and centre of mass are on the floor."""
     angle = np.arange(8) * np.pi / 4
     rim = np.stack((_TOP_RADIUS * np.cos(angle), _TOP_RADIUS * np.sin(angle), np.full(8, _TOP_HEIGHT)), axis=1)
     cone = solid(name, _SLAB_MASS, (hull(np.concatenate((np.array(points), rim))),))
@@ -355,7 +360,8 @@ def _top(name: str, points: Sequence[Sequence[float]]) -> ObjectSpec:
 
 
 def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find where a paddle can be pressed on a fingertip (or on another link) of the robot at home, with nothing else in its way.
+    """Find where a paddle can be pressed on a fingertip (or on another link) of the robot at home, with nothing else in
+    its way.
 
     Of many directions, the one in which the link sticks out farthest beyond links of the other kind.
 

@@ -1,4 +1,5 @@
-"""The support matrix: a page of what was measured of the engines, made from files of ``xreset engines check`` and ``... compare``.
+"""The support matrix: a page of what was measured of the engines, made from files of ``xreset engines check`` and ``...
+compare``.
 
 Nothing on the page is written by hand: every number is read from a file, and every file names the command that made it.
 """
@@ -7,9 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, NamedTuple, get_args
 
 from jinja2 import UndefinedError
 
@@ -22,11 +23,11 @@ from xreset.files import read_json
 from xreset.physics import Capability
 from xreset.text import shown
 
-_T = TypeVar("_T")
+_NONE = "-"
+Json = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """One engine on one device."""
 
     engine: str
@@ -39,39 +40,46 @@ class Column:
         return f"{self.engine} {self.version}" + ("" if self.device == "cpu" else f", {self.device}")
 
 
-@dataclass(frozen=True)
-class Source:
-    """A file, and how it came about."""
-
-    name: str
-    command: str
-    version: str
-    """Of xreset."""
-    covers: str
-    """What it measured, in words."""
-
-
-Checks = dict[Column, dict[str, dict[str, Any]]]
-"""Of each engine on each device, side by side, its checks by name, as in the file."""
+Checks = dict[Column, dict[str, Json]]
+"""Checks of each engine on each device, by name, as in the file."""
 
 
 @dataclass(frozen=True)
 class Results:
-    """All that the page is made of."""
+    """The content of the page."""
 
-    sources: list[Source] = field(default_factory=list)
+    commands: list[tuple[str, str, str]] = field(default_factory=list)
+    """What a file measured, the command that made it, and the version of xreset."""
     checks: dict[str, Checks] = field(default_factory=dict)
-    """By robot."""
+    """Checks by robot."""
     capabilities: dict[Column, set[str]] = field(default_factory=dict)
-    parities: list[tuple[Source, Mapping[str, Any]]] = field(default_factory=list)
+    parities: list[Json] = field(default_factory=list)
     """Comparisons of grasps, as in their files."""
+
+    def add(self, data: Json) -> None:
+        """Add the content of a file. A later check replaces one of the same engine, version, device and robot."""
+        covers = []
+        for run in data.get("runs", ()):
+            column = Column(run["engine"], run["engine_version"], run["device"])
+            found = self.checks.setdefault(run["robot"], {}).setdefault(column, {})
+            found.update({check["check"]: check for check in run["checks"]})
+            self.capabilities.setdefault(column, set()).update(run["capabilities"])
+            covers.append(f"{column.engine} {column.version} with {run['robot']} on {column.device}")
+        if data["schema"] == PARITY:
+            engines = ", ".join(_column(engine).title for engine in data["engines"])
+            covers.append(f"grasps of {data['robot']}: {engines} against {_column(data['reference']).title}")
+            self.parities.append(data)
+        command = data.get("command", "")
+        self.commands.append(
+            ("; ".join(covers), f"`{command}`" if command else "not recorded", data.get("xreset_version", ""))
+        )
 
 
 def read(paths: Iterable[Path]) -> Results:
-    """Read the files. Where two have the same check of the same engine, version, device and robot, the later one counts.
+    """Read the files.
 
     Raises:
-        FileFormatError: a file is neither of the two kinds, or lacks something.
+        FileFormatError: a file is of neither kind, or incomplete.
         XResetError: there is no file.
     """
     results = Results()
@@ -82,119 +90,90 @@ def read(paths: Iterable[Path]) -> Results:
             raise FileFormatError(
                 f"{path} has the schema {schema!r}, expected {CONFORMANCE} or {PARITY}. Make it again with --json."
             )
-        add = _add_conformance if schema == CONFORMANCE else _add_parity
         try:
             alone = Results()
-            add(alone, path.name, data)
-            page(alone)  # whatever the page asks of a file is there
+            alone.add(data)
+            page(alone)  # asks the file for everything that the page needs
         except (KeyError, TypeError, AttributeError, ValueError, IndexError, OverflowError, UndefinedError) as error:
             what = f"{type(error).__name__} {shown(str(error))}"
             raise FileFormatError(f"{path} is no complete {schema}: {what}. Make it again.") from error
-        add(results, path.name, data)
-    if not results.sources:
+        results.add(data)
+    if not results.commands:
         raise XResetError(
-            "there is nothing to make a page of. Give files that `xreset engines check` or `xreset engines compare` wrote with --json."
+            "there is nothing to make a page of. Give files of xreset engines check --json, or of engines compare."
         )
-    checks = {robot: _side_by_side(found) for robot, found in results.checks.items()}
-    return replace(results, checks=checks, capabilities=_side_by_side(results.capabilities))
+    return results
 
 
-def _side_by_side(columns: Mapping[Column, _T]) -> dict[Column, _T]:
-    """Engines in the order of the files, and each one's versions and devices next to each other, whatever files they came in."""
-    engines = list(dict.fromkeys(column.engine for column in columns))
-    return {column: columns[column] for column in sorted(columns, key=lambda column: engines.index(column.engine))}
-
-
-def _add_conformance(results: Results, name: str, data: Mapping[str, Any]) -> None:
-    covers = []
-    for run in data["runs"]:
-        column = Column(run["engine"], run["engine_version"], run["device"])
-        results.checks.setdefault(run["robot"], {}).setdefault(column, {}).update(
-            {check["check"]: check for check in run["checks"]}
-        )
-        results.capabilities.setdefault(column, set()).update(run["capabilities"])
-        covers.append(f"{column.engine} {column.version} with {run['robot']} on {column.device}")
-    results.sources.append(Source(name, data["command"], data["xreset_version"], "; ".join(covers)))
-
-
-def _add_parity(results: Results, name: str, data: Mapping[str, Any]) -> None:
-    engines = ", ".join(_column(engine).title for engine in data["engines"])
-    covers = f"grasps of {data['robot']}: {engines} against {_column(data['reference']).title}"
-    source = Source(name, data.get("command", ""), data.get("xreset_version", ""), covers)
-    results.sources.append(source)
-    results.parities.append((source, data))
-
-
-def _column(engine: Mapping[str, Any]) -> Column:
-    """Of an engine as in the file of a comparison."""
+def _column(engine: Json) -> Column:
+    """The column of an engine in the file of a comparison."""
     return Column(engine["backend"], engine["version"], engine["device"])
 
 
+def _order(columns: Iterable[Column]) -> list[Column]:
+    """Engines in the order of the files, with each one's versions and devices next to each other."""
+    known = list(columns)
+    engines = list(dict.fromkeys(column.engine for column in known))
+    return sorted(known, key=lambda column: engines.index(column.engine))
+
+
 def page(results: Results) -> str:
-    """The page, in Markdown."""
-    found = [
-        (column.title, robot, name, check)
-        for robot, checks in results.checks.items()
-        for column, of in checks.items()
-        for name, check in of.items()
-    ]
-    known = [
-        (
-            title,
-            robot,
-            f"`{name}`: {m['what']}",
-            *(_amount(m[key], m) for key in ("measured", "tolerance", "bound")),
-            m["reason"],
-        )
-        for title, robot, name, check in found
-        for m in check["measures"]
-        if m["verdict"] == "known difference"
-    ]
-    not_done = [
-        (title, robot, f"`{name}`", check["verdict"], check["problem"] or _failures(check))
-        for title, robot, name, check in found
-        if check["verdict"] in ("failed", "unsupported", "skipped")
-    ]
-    commands = [(s.covers, f"`{s.command}`" if s.command else "not recorded", s.version) for s in results.sources]
+    """Return the page, in Markdown."""
+    known = []
+    not_done = []
+    for robot, checks in results.checks.items():
+        for column in _order(checks):
+            for name, check in checks[column].items():
+                where = (column.title, robot)
+                for m in check["measures"]:
+                    if m["verdict"] == "known difference":
+                        amounts = [_amount(m[key], m) for key in ("measured", "tolerance", "bound")]
+                        known.append((*where, f"`{name}`: {m['what']}", *amounts, m["reason"]))
+                if check["verdict"] in ("failed", "unsupported", "skipped"):
+                    not_done.append((*where, f"`{name}`", check["verdict"], check["problem"] or _failures(check)))
+    measured = ("engine", "robot", "measure", "measured", "tolerance", "accepted up to", "why")
     return render(
         "engines.md.j2",
-        commands=_table(("what", "command", "xreset"), commands),
+        commands=_table(("what", "command", "xreset"), results.commands),
         capabilities=_capabilities(results.capabilities),
         summaries={robot: _summary(checks) for robot, checks in results.checks.items()},
-        known_differences=_table(
-            ("engine", "robot", "measure", "measured", "tolerance", "accepted up to", "why"), known
-        ),
+        known_differences=_table(measured, known),
         not_done=_table(("engine", "robot", "check", "", "why"), not_done),
-        parities=[_parity(source, data) for source, data in results.parities],
+        parities=[_parity(data) for data in results.parities],
         numbers={robot: _every_number(checks) for robot, checks in results.checks.items()},
     )
 
 
 def _capabilities(found: Mapping[Column, set[str]]) -> str:
-    names = dict.fromkeys((*get_args(Capability), *sorted(set().union(*found.values()))))
-    rows = [(name.replace("_", " "), *("yes" if name in able else "no" for able in found.values())) for name in names]
-    return _table(("", *(column.title for column in found)), rows if found else ())
+    columns = _order(found)
+    others = sorted(set().union(*found.values()))
+    rows = []
+    for name in dict.fromkeys((*get_args(Capability), *others)) if found else ():
+        rows.append((name.replace("_", " "), *("yes" if name in found[column] else "no" for column in columns)))
+    return _table(("", *(column.title for column in columns)), rows)
 
 
-def _every_check(checks: Checks) -> dict[str, dict[str, Any]]:
-    """What any engine has run, in the order of the suite."""
-    found: dict[str, dict[str, Any]] = {}
-    for of in checks.values():
-        found |= {name: check for name, check in of.items() if name not in found}
+def _every_check(checks: Checks) -> dict[str, Json]:
+    """Return all checks that any engine has run, by name, in the order of the suite."""
+    found: dict[str, Json] = {}
+    for column in _order(checks):
+        found = found | checks[column] | found  # an earlier column wins
     return found
 
 
 def _summary(checks: Checks) -> str:
-    rows, group = [], None
+    columns = _order(checks)
+    rows = []
+    group = None
     for name, check in _every_check(checks).items():
         if check["group"] != group:
             group = check["group"]
-            rows.append((f"**{group}**", *[""] * (1 + len(checks))))
-        rows.append((f"`{name}`", check["statement"], *(_verdict(of.get(name)) for of in checks.values())))
-    return _table(("check", "what must hold", *(c.title for c in checks)), rows)
+            rows.append((f"**{group}**", *[""] * (1 + len(columns))))
+        rows.append((f"`{name}`", check["statement"], *(_verdict(checks[column].get(name)) for column in columns)))
+    return _table(("check", "what must hold", *(column.title for column in columns)), rows)
 
 
-def _verdict(check: Mapping[str, Any] | None) -> str:
+def _verdict(check: Json | None) -> str:
     if check is None or check["verdict"] == "skipped":
         return _NONE
     if check["verdict"] == "unsupported":
@@ -204,53 +183,74 @@ def _verdict(check: Mapping[str, Any] | None) -> str:
     return {"passed": share, "known difference": f"known, {share}"}.get(check["verdict"], f"**failed, {share}**")
 
 
-def _failures(check: Mapping[str, Any]) -> str:
-    failed = [m for m in check["measures"] if m["verdict"] == "failed"]
-    return "; ".join(
-        f"{m['what']}: {_amount(m['measured'], m)}, tolerance {_amount(m['tolerance'], m)}" for m in failed
-    )
+def _failures(check: Json) -> str:
+    parts = []
+    for m in check["measures"]:
+        if m["verdict"] == "failed":
+            parts.append(f"{m['what']}: {_amount(m['measured'], m)}, tolerance {_amount(m['tolerance'], m)}")
+    return "; ".join(parts)
 
 
-def _parity(source: Source, data: Mapping[str, Any]) -> dict[str, Any]:
+def _parity(data: Json) -> dict[str, Any]:
     columns = [data["floor"], *data["engines"]]
-    known = {metric["metric"]: metric for engine in columns for metric in engine["metrics"]}
+    metrics = [{m["metric"]: m for m in engine["metrics"]} for engine in columns]  # noqa: XR002
+    known: dict[str, Json] = {}
+    for found in metrics:
+        known |= found
     rows = []
     for name, metric in known.items():
-        found = [next((m for m in engine["metrics"] if m["metric"] == name), None) for engine in columns]
-        cells = [_NONE if m is None else _missed(m, f"{_amount(m['measured'], m)} ({m['n']})") for m in found]
+        cells = [_metric(found.get(name)) for found in metrics]
         rows.append((metric["claim"], f"{metric['sense']} {_amount(metric['target'], metric)}", *cells))
     titles = [_column(engine).title for engine in columns]
     return {
-        "robot": data["robot"], "engines": titles[1:], "closings": len(data["grasps"]["closing"]), "holds": len(data["grasps"]["hold"]),
-        "objects": [thing["name"] for thing in data["objects"]], "reference": _column(data["reference"]).title,
-        "floor": data["floor"]["backend"], "source": source.command or source.name,
+        "robot": data["robot"],
+        "engines": titles[1:],
+        "closings": len(data["grasps"]["closing"]),
+        "holds": len(data["grasps"]["hold"]),
+        "objects": [thing["name"] for thing in data["objects"]],
+        "reference": _column(data["reference"]).title,
+        "floor": data["floor"]["backend"],
+        "source": data.get("command") or "a command that is not recorded",
         "table": _table(("what is compared", "target", *titles), rows),
-    }  # fmt: skip
+    }
 
 
-def _missed(metric: Mapping[str, Any], text: str) -> str:
+def _metric(metric: Json | None) -> str:
+    if metric is None:
+        return _NONE
+    text = f"{_amount(metric['measured'], metric)} ({metric['n']})"
     return text if metric["verdict"] == "met" else f"**missed: {text}**"
 
 
 def _every_number(checks: Checks) -> tuple[int, str]:
-    """How many, and the table."""
+    """Return the number of measures, and their table."""
+    columns = _order(checks)
     rows = []
     for name in _every_check(checks):
-        by_column = [{m["what"]: m for m in of[name]["measures"]} if name in of else {} for of in checks.values()]
-        for what, measure in {what: m for measures in by_column for what, m in measures.items()}.items():
+        by_column = []
+        for column in columns:
+            measures = checks[column][name]["measures"] if name in checks[column] else ()
+            by_column.append({m["what"]: m for m in measures})
+        every: dict[str, Json] = {}
+        for measures in by_column:
+            every |= measures
+        for what, measure in every.items():
             cells = [_number(measures[what]["measured"]) if what in measures else _NONE for measures in by_column]
             rows.append((f"`{name}`", what, _amount(measure["tolerance"], measure), *cells))
-    return len(rows), _table(("check", "measure", "tolerance", *(c.title for c in checks)), rows)
+    return len(rows), _table(("check", "measure", "tolerance", *(column.title for column in columns)), rows)
 
 
-def _share(measure: Mapping[str, Any]) -> float:
-    measured, tolerance = float(measure["measured"]), measure["tolerance"]
+def _share(measure: Json) -> float:
+    measured = float(measure["measured"])
+    tolerance = measure["tolerance"]
     if not math.isfinite(measured):
         return math.inf
-    return measured / tolerance if tolerance else (0.0 if measured == 0 else math.inf)
+    if tolerance:
+        return measured / tolerance
+    return 0.0 if measured == 0 else math.inf
 
 
-def _amount(value: Any, measure: Mapping[str, Any]) -> str:
+def _amount(value: Any, measure: Json) -> str:
     return f"{_number(value)} {measure['unit']}".rstrip()
 
 
@@ -259,13 +259,10 @@ def _number(value: Any) -> str:
     return "not measured" if value is None else f"{float(value):.2g}"
 
 
-_NONE = "-"
-
-
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    """In Markdown, which cells may hold; empty without a row."""
-    return (
-        markdown(Rows(head=head, body=tuple(rows)), escape=lambda cell: " ".join(cell.replace("|", "\\|").split()))
-        if rows
-        else ""
-    )
+    """A table in Markdown, whose cells may hold Markdown; empty without a row."""
+
+    def escape(cell: str) -> str:
+        return " ".join(cell.replace("|", "\\|").split())
+
+    return markdown(Rows(head=head, body=tuple(rows)), escape=escape) if rows else ""

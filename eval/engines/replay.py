@@ -75,7 +75,7 @@ class TraceResult:
     """Size of the perturbations [m, rad]."""
 
     def within_noise(self, parting: Parting) -> bool:
-        """Whether the reference parts as far from itself, and no later, from a start that differs by next to nothing."""
+        """Whether the reference parts as far from itself, and no later, from a start that hardly differs."""
         for n in self.noise:
             if n.quantity == parting.quantity and n.unit == parting.unit and parting.largest <= n.largest:
                 return parting.time is None or (n.time is not None and n.time <= parting.time)
@@ -136,9 +136,10 @@ def trace(
         reference: engine that the others are compared with.
         engines: the others.
         thresholds: the differences from which engines count as parted.
-        perturbed: number of perturbed starts in the reference. Long contact is chaotic: what such a start does to the reference itself is
-            no fault of an engine.
-        perturbation: size of the perturbations: each joint [rad, m] and each coordinate of the object [m] is moved by plus or minus this.
+        perturbed: number of perturbed starts in the reference. Long contact is chaotic: what such a start does to the
+            reference itself is no fault of an engine.
+        perturbation: size of the perturbations: each joint [rad, m] and each coordinate of the object [m] is moved by
+            plus or minus this.
         seed: seed of the signs.
         progress: called with the name of each engine as it begins.
 
@@ -148,7 +149,7 @@ def trace(
     thresholds = thresholds or Thresholds()
     if perturbed < 0 or not perturbation > 0:
         raise XResetError(
-            f"{perturbed} perturbed starts of size {perturbation} were asked for; expected at least 0, and a size above 0."
+            f"There are {perturbed} perturbed starts of size {perturbation}; expected at least 0, and a size above 0."
         )
     dt = actions.scene.control_dt
 
@@ -170,8 +171,8 @@ def trace(
     steps = len(base.differences.time)
     if steps < len(actions.joint_target):
         raise XResetError(
-            f"the reference {reference.name!r} is not finite after {steps * dt:.3f} s of this sequence, so nothing can be compared with "
-            "it. Choose another --reference, or another sequence."
+            f"the reference {reference.name!r} is not finite after {steps * dt:.3f} s of this sequence, so nothing can "
+            "be compared with it. Choose another --reference, or another sequence."
         )
     noise = tuple(differences(expected, expected, dt, thresholds, world=1 + i) for i in range(perturbed))
     return TraceResult(

@@ -1,4 +1,4 @@
-"""The partings for a terminal, and as a picture: differences to the reference over time, and which fingers touch in each engine."""
+"""The partings for a terminal and as a picture: differences over time, and which fingers touch in each engine."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def shown(parting: Parting, value: float) -> str:
 
 
 def rich_table(result: TraceResult) -> Table:
-    """One column for each engine and one for the reference's noise; for each quantity when and where it parts, and by how much."""
+    """One column for each engine and one for the reference's noise; a row for each quantity."""
     reference = result.reference
-    title = f"{result.actions.label}\n{result.actions.robot.name}: when, where and by how much engines part from {reference.name}"
-    table = Table(title=title, title_justify="left", show_lines=True)
+    part = f"{result.actions.robot.name}: when, where and by how much engines part from {reference.name}"
+    table = Table(title=f"{result.actions.label}\n{part}", title_justify="left", show_lines=True)
     table.add_column("")
     for e in result.engines:
         table.add_column(f"{e.name} {e.engine.version}")
@@ -98,8 +98,8 @@ def _height(metres: float) -> str:
 def write_plot(path: Path, result: TraceResult) -> None:
     """Write the plot as PNG.
 
-    Four rows of differences on logarithmic axes, with the thresholds (dashed) and the reference's distance to itself from perturbed starts
-    (grey); then, for each engine, when each finger touches the object.
+    Four rows of differences on logarithmic axes, with the thresholds (dashed) and the reference's distance to itself
+    from perturbed starts (grey); then, for each engine, when each finger touches the object.
     """
     t = result.thresholds
     rows = (

@@ -59,7 +59,8 @@ def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps, config: Parit
     """Close each hand at the scene's frictions.
 
     Returns:
-        The closing around objects too heavy to move, up to the lift; and the whole try around objects at rest on the table.
+        The closing around objects too heavy to move, up to the lift; and the whole try around objects at rest on the
+        table.
     """
     dt = scene.control_dt
     episode = closing_episode(scene.robot, grasps.joint_pos, grasps.object_pos, grasps.object_quat, dt, config.motion)
@@ -93,7 +94,8 @@ def common_states(
     dt: float,
     config: ParityConfig,
 ) -> CommonStates:
-    """Return states that favor no engine: some from demonstrations in the air, the others from the closings of all engines in turn.
+    """Return states that favor no engine: some from demonstrations in the air, the others from the closings of all
+    engines in turn.
 
     A closing counts if a fingertip touches the object when the hand has closed.
 

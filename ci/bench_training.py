@@ -26,9 +26,9 @@ from rich.console import Console
 from rich.table import Table
 
 from xreset.env import ManipulationEnv, make_scene
+from xreset.inputs import load_inputs
 from xreset.learning.config import PpoConfig, TrainConfig
 from xreset.learning.runner import TrainingRunner
-from xreset.learning.train import load_inputs
 from xreset.plugins import backend_status, make_backend
 from xreset.resets.distribution import ResetDistribution
 
@@ -47,7 +47,7 @@ def run(options: Options, console: Console) -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         resets = options.extra["resets"] or _synthetic_bank(options.robot, Path(folder))
-        inputs = load_inputs(options.robot, resets, options.extra["objects"])
+        inputs = load_inputs(resets, robot=options.robot, objects=options.extra["objects"])
         config = TrainConfig(ppo=PpoConfig(precision=options.extra["precision"]))
         scene = make_scene(inputs.robot, inputs.objects, config.task)
         names = tuple(o.name for o in inputs.objects)

@@ -119,7 +119,7 @@ def load_policy(policy: str | Path, *, robot: str | Path | None = None, seed: in
     path = Path(policy)
     objects_folder = None
     if path.is_dir():
-        from xreset.learning.train import ensure_policy
+        from xreset.learning.export import ensure_policy
 
         run = read_run(path)
         file = ensure_policy(path)

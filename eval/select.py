@@ -81,7 +81,7 @@ def select(
         for path in found:
             file = files[path.name] = Path(scratch) / f"{path.stem}.onnx" if is_run else path
             if is_run:
-                from xreset.learning.train import export_checkpoint  # rsl-rl, which exported policies do not need
+                from xreset.learning.export import export_checkpoint  # rsl-rl, which exported policies do not need
 
                 export_checkpoint(folder, path, file)
             policy = load_policy(file, robot=setting.robot)

@@ -2,6 +2,8 @@
 
 import io
 import json
+import logging
+import math
 import os
 import resource
 import shutil
@@ -12,7 +14,7 @@ import tempfile
 import threading
 import time
 import unittest
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -26,20 +28,14 @@ from xreset import robots
 from xreset.cli import main
 from xreset.errors import BackendUnavailableError, FileFormatError, PolicyError, RunError, XResetError
 from xreset.files import claim, file_hash
+from xreset.learning.checkpoint import read_checkpoint
 from xreset.learning.choice import read_choice, write_choice
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
+from xreset.learning.export import current_choice, ensure_policy, export_checkpoint
 from xreset.learning.recipes import RECIPES
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
-from xreset.learning.runner import TrainingRunner, _stop_on_interrupt, read_checkpoint
-from xreset.learning.train import (
-    current_choice,
-    ensure_policy,
-    export_checkpoint,
-    load_inputs,
-    resumed,
-    start_run,
-    train,
-)
+from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
+from xreset.learning.train import resume, train
 from xreset.plugins import make_backend
 from xreset.policy import OnnxPolicy, check_contract
 from xreset.resets.bank import write_bank
@@ -59,11 +55,8 @@ CONFIG = TrainConfig(
 )
 
 
-def train_only(*args, **options) -> None:
-    """Training without what takes longer than all the rest here: processes for the engine, and the export at the end."""
-    in_this_process = mock.patch("xreset.env.make_backend", partial(make_backend, workers=0))
-    with in_this_process, mock.patch("xreset.learning.train.export_onnx"):
-        train(*args, **options)
+def newest(out: Path) -> dict:
+    return read_checkpoint(latest_checkpoint(out))
 
 
 class TrainingTest(unittest.TestCase):
@@ -75,19 +68,35 @@ class TrainingTest(unittest.TestCase):
         cls.bank = cls.folder / "bank.npz"
         write_bank(cls.bank, toy_bank(cls.robot, joint_pos=home), config={}, inputs={})
         cls.out = cls.folder / "run"
-        cls.info = cls.start(cls.out)
-        train(cls.out, cls.info)
+        train(cls.bank, out=cls.out, **cls.options())
 
     @classmethod
-    def start(cls, out, **changes):
-        inputs = load_inputs(changes.pop("robot", "openarm"), changes.pop("resets", cls.bank), None)
-        options = {"backend": "mujoco", "device": "cpu", "num_envs": 4, "seed": 3, "config": CONFIG, "out": out}
-        return start_run(inputs, **(options | changes))
+    def options(cls, **changes):
+        return {"engine": "mujoco", "device": "cpu", "num_envs": 4, "seed": 3, "config": CONFIG} | changes
+
+    @contextmanager
+    def quickly(self):
+        """Leave out what takes longer than all the rest: processes for the engine, and the export at the end."""
+        in_this_process = mock.patch("xreset.env.make_backend", partial(make_backend, workers=0))
+        with in_this_process, mock.patch("xreset.learning.train.export_onnx"), redirect_stdout(io.StringIO()) as said:
+            yield said
+
+    def train(self, name: str, **changes) -> Path:
+        """Train a run of that name in the folder, without an export."""
+        with self.quickly():
+            return train(changes.pop("bank", self.bank), out=self.folder / name, **self.options(**changes))
+
+    def resume(self, out: Path, **options) -> str:
+        """Continue a run without an export; returns what it printed."""
+        with self.quickly() as said:
+            resume(out, **options)
+        return said.getvalue()
 
     def test_the_run_says_how_it_was_made(self):
         info = read_run(self.out)
-        self.assertEqual(info, self.info)
         self.assertEqual(info.config, CONFIG)
+        self.assertEqual((info.backend, info.num_envs, info.seed), ("mujoco", 4, 3))
+        self.assertEqual((info.robot, info.resets, info.resets_hash), ("openarm", str(self.bank), file_hash(self.bank)))
         self.assertEqual(info.contract["objects"], [SOUP, SPAM])
         self.assertEqual(info.contract["joint_names"], list(self.robot.joint_names))
 
@@ -95,7 +104,7 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual([c.name for c in checkpoints(self.out)], ["000001.pt", "000002.pt"])
         self.assertTrue(list(self.out.glob("events.out.tfevents.*")))
         self.assertFalse([f for f in self.out.rglob("*") if f.name.endswith(".part")])
-        content = read_checkpoint(latest_checkpoint(self.out))
+        content = newest(self.out)
         self.assertEqual((content["iteration"], content["env_steps"]), (2, 2 * 8 * 4))
 
     def test_the_policy_fits_the_robot_and_acts(self):
@@ -103,22 +112,18 @@ class TrainingTest(unittest.TestCase):
         check_contract("policy", policy.contract, self.robot, CONFIG.task)
 
     def test_the_same_seed_gives_the_same_policy(self):
-        again = self.folder / "again"
-        train_only(again, self.start(again))
-        one, two = (read_checkpoint(latest_checkpoint(run))["actor_state_dict"] for run in (self.out, again))
+        one = newest(self.out)["actor_state_dict"]
+        two = newest(self.train("again"))["actor_state_dict"]
         for name, value in one.items():
             torch.testing.assert_close(value, two[name], msg=name)
-        other = self.folder / "other"
-        train_only(other, self.start(other, seed=4))
-        changed = read_checkpoint(latest_checkpoint(other))["actor_state_dict"]
+        changed = newest(self.train("other", seed=4))["actor_state_dict"]
         self.assertTrue(any(not torch.equal(value, changed[name]) for name, value in one.items()))
 
     def test_resume_continues_where_it_stopped(self):
-        out = self.folder / "resumed"
-        train_only(out, self.start(out))
-        before = read_checkpoint(latest_checkpoint(out))
-        train_only(out, resumed(out, iterations=3), resume=True)
-        after = read_checkpoint(latest_checkpoint(out))
+        out = self.train("resumed")
+        before = newest(out)
+        self.resume(out, iterations=3)
+        after = newest(out)
         self.assertEqual((after["iteration"], after["env_steps"]), (3, 3 * 8 * 4))
         self.assertGreater(after["elapsed"], before["elapsed"])
         self.assertEqual(read_run(out).config.iterations, 3)
@@ -130,15 +135,16 @@ class TrainingTest(unittest.TestCase):
     def test_resume_goes_on_in_the_middle_of_episodes(self):
         """Two iterations and one more are three in one go, up to the engine's warm start and the single precision of the saved state."""
         config = replace(CONFIG, iterations=3)
-        runs = whole, parts, worldless = [self.folder / name for name in ("whole", "parts", "worldless")]
-        train_only(whole, self.start(whole, config=config))
-        for run in (parts, worldless):
-            train_only(run, self.start(run, config=replace(config, iterations=2)))
+        runs = whole, parts, worldless = (
+            self.train("whole", config=config),
+            self.train("parts"),
+            self.train("worldless"),
+        )
         (worldless / "worlds.pt").write_bytes(b"damaged")
-        for run in (parts, worldless):
-            train_only(run, resumed(run, iterations=3), resume=True)
+        self.assertNotIn("episodes start again", self.resume(parts, iterations=3))
+        self.assertIn("episodes start again", self.resume(worldless, iterations=3))
 
-        one, two, _ = (read_checkpoint(latest_checkpoint(run)) for run in runs)
+        one, two = newest(whole), newest(parts)
         for name, value in one["actor_state_dict"].items():
             torch.testing.assert_close(two["actor_state_dict"][name], value, rtol=1e-3, atol=3e-3, msg=name)
         self.assertEqual((two["iteration"], two["learning_rate"]), (3, one["learning_rate"]))
@@ -163,40 +169,12 @@ class TrainingTest(unittest.TestCase):
 
     def test_a_killed_run_loses_no_more_than_the_last_save_interval(self):
         out = self.folder / "killed"
-        small = [
-            "--config.task.observation.cloud-points",
-            "16",
-            "--config.task.distance-points",
-            "64",
-            "--config.model.pointnet",
-            "8",
-            "6",
-        ]
-        small += ["--config.model.lstm", "12", "--config.model.mlp", "16", "--config.ppo.minibatch-size", "32"]
-        new = [
-            "--robot",
-            "openarm",
-            "--resets",
-            str(self.bank),
-            "--backend",
-            "mujoco",
-            "--device",
-            "cpu",
-            "--num-envs",
-            "8",
-        ]
-        command = [
-            sys.executable,
-            "-m",
-            "xreset",
-            "train",
-            "--out",
-            str(out),
-            *new,
-            "--config.save-interval",
-            "2",
-            *small,
-        ]
+        flags = (
+            f"--out {out} --robot openarm --resets {self.bank} --backend mujoco --device cpu --num-envs 8 "
+            "--config.save-interval 2 --config.task.observation.cloud-points 16 --config.task.distance-points 64 "
+            "--config.model.pointnet 8 6 --config.model.lstm 12 --config.model.mlp 16 --config.ppo.minibatch-size 32"
+        )
+        command = [sys.executable, "-m", "xreset", "train", *flags.split()]
         with subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
         ) as process:
@@ -206,14 +184,13 @@ class TrainingTest(unittest.TestCase):
                 time.sleep(0.02)
             os.killpg(process.pid, signal.SIGKILL)  # the engine's workers too
         self.assertEqual(process.returncode, -signal.SIGKILL)
-        newest = read_checkpoint(latest_checkpoint(out))  # whole, however the run ended
-        self.assertGreaterEqual(newest["iteration"], 6)
-        self.assertEqual(newest["env_steps"], newest["iteration"] * 16 * 8)
-        train(out, resumed(out, iterations=newest["iteration"] + 1), resume=True)
-        content = read_checkpoint(latest_checkpoint(out))
-        self.assertEqual(
-            (content["iteration"], content["env_steps"]), (newest["iteration"] + 1, newest["env_steps"] + 16 * 8)
-        )
+        before = newest(out)  # whole, however the run ended
+        self.assertGreaterEqual(before["iteration"], 6)
+        self.assertEqual(before["env_steps"], before["iteration"] * 16 * 8)
+        resume(out, iterations=before["iteration"] + 1)
+        after = newest(out)
+        self.assertEqual(after["iteration"], before["iteration"] + 1)
+        self.assertEqual(after["env_steps"], before["env_steps"] + 16 * 8)
         self.assertTrue((out / "policy.onnx").is_file())
 
     def test_the_same_ctrl_c_told_twice_is_one(self):
@@ -229,7 +206,6 @@ class TrainingTest(unittest.TestCase):
 
     def test_ctrl_c_ends_after_an_iteration_with_a_checkpoint_and_a_policy(self):
         out = self.folder / "stopped"
-        info = self.start(out, config=replace(CONFIG, iterations=100000, save_interval=100000))
 
         def interrupt():
             while not list(out.glob("events.out.tfevents.*")):
@@ -238,18 +214,18 @@ class TrainingTest(unittest.TestCase):
             os.kill(os.getpid(), signal.SIGINT)
 
         threading.Thread(target=interrupt, daemon=True).start()
-        train(out, info)
-        content = read_checkpoint(latest_checkpoint(out))
+        endless = replace(CONFIG, iterations=100000, save_interval=100000)
+        train(self.bank, out=out, **self.options(config=endless))
+        content = newest(out)
         self.assertGreater(content["iteration"], 0)
         self.assertEqual(latest_checkpoint(out).name, f"{content['iteration']:06d}.pt")
         self.assertTrue((out / "policy.onnx").is_file())
 
     def test_a_configuration_starts_from_a_recipe_or_from_another_run(self):
         def parsed(*arguments: str) -> TrainConfig:
-            with mock.patch("xreset.learning.train.load_inputs"), mock.patch("xreset.learning.train.train"):
-                with mock.patch("xreset.learning.train.start_run") as start:
-                    main(["train", "--robot", "openarm", "--resets", "bank.npz", "--out", "run", *arguments])
-                return start.call_args.kwargs["config"]
+            with mock.patch("xreset.learning.train.train") as started:
+                main(["train", "--robot", "openarm", "--resets", "bank.npz", "--out", "run", *arguments])
+            return started.call_args.kwargs["config"]
 
         self.assertEqual(parsed(), TrainConfig())
         minutes = parsed("--like", "minutes", "--config.ppo.entropy", "0.001")
@@ -272,10 +248,9 @@ class TrainingTest(unittest.TestCase):
             (("--like", str(self.folder)), "is not a run folder"),
             (("--like", "minutes", "--resume"), "Omit --like"),
             (("--weights", str(self.out), "--resume"), "Omit --weights"),
-            (("--minutes", "0"), "--minutes is 0.0, expected more than 0"),
             (
                 ("--like", "minutes", "--config.task.action.hand-zero", "home"),
-                "task.action.hand_zero is home, which means something where hand is absolute; it is relative. Leave it out",
+                "task.action.hand_zero is home, which means something where hand is absolute; it is relative. (Leave it out|Omit it)",
             ),
             (
                 ("--config.task.action.hand-step", "0.1", "--config.task.reward.progress", "3"),
@@ -304,10 +279,7 @@ class TrainingTest(unittest.TestCase):
         naming = ["--config.task.reward.own", "strangers_term:zero", "1"]
 
         def said(*arguments: str) -> str:
-            in_this_process = mock.patch("xreset.env.make_backend", partial(make_backend, workers=0))
-            no_export = mock.patch("xreset.learning.train.export_onnx")
-            text = io.StringIO()
-            with in_this_process, no_export, redirect_stdout(io.StringIO()), redirect_stderr(text):
+            with self.quickly(), redirect_stderr(io.StringIO()) as text:
                 main(["train", *arguments])
             return text.getvalue()
 
@@ -323,17 +295,13 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual(read_run(self.folder / "with").config.task.reward.own, {"strangers_term:zero": 1.0})
 
     def test_a_run_begins_with_the_networks_of_another(self):
-        out, still = (
-            self.folder / "onwards",
-            replace(CONFIG, ppo=replace(CONFIG.ppo, learning_rate=1e-12, schedule="fixed"), iterations=1),
-        )
-        info = self.start(out, config=still, weights=self.out)
+        still = replace(CONFIG, ppo=replace(CONFIG.ppo, learning_rate=1e-12, schedule="fixed"), iterations=1)
         given = latest_checkpoint(self.out)
+        out = self.train("onwards", config=still, weights=self.out)
+        info = read_run(out)
         self.assertEqual((info.weights, info.weights_hash), (str(given), file_hash(given)))
-        train_only(out, info)
-        self.assertEqual(read_run(out), info)
-        content, before = read_checkpoint(latest_checkpoint(out)), read_checkpoint(given)
-        self.assertEqual((content["iteration"], content["env_steps"]), (1, 8 * 4))  # counters begin anew
+        content, before = newest(out), read_checkpoint(given)
+        self.assertEqual((content["iteration"], content["env_steps"]), (1, 8 * 4))  # counters start at zero
         for networks in ("actor_state_dict", "critic_state_dict"):
             for name, value in before[networks].items():
                 if "normalizer" not in name:  # which goes on to learn
@@ -367,75 +335,94 @@ class TrainingTest(unittest.TestCase):
 
     def test_networks_that_do_not_fit_are_refused(self):
         with self.assertRaisesRegex(RunError, "is not a run folder"):
-            self.start(self.folder / "a", weights=self.folder)
+            self.train("a", weights=self.folder)
         task = replace(CONFIG.task, observation=replace(CONFIG.task.observation, cloud_history=3))
         with self.assertRaisesRegex(PolicyError, "another observation layout"):
-            self.start(self.folder / "b", config=replace(CONFIG, task=task), weights=self.out)
+            self.train("b", config=replace(CONFIG, task=task), weights=self.out)
         with self.assertRaisesRegex(RunError, "'lstm': 12.*'lstm': 16.*--like"):
-            self.start(
-                self.folder / "c", config=replace(CONFIG, model=replace(CONFIG.model, lstm=16)), weights=self.out
-            )
+            self.train("c", config=replace(CONFIG, model=replace(CONFIG.model, lstm=16)), weights=self.out)
         self.assertFalse([name for name in "abc" if (self.folder / name).exists()])
 
     def test_a_run_ends_when_its_time_is_over_and_can_go_on(self):
-        out = self.folder / "timed"
-        train_only(out, self.start(out, config=replace(CONFIG, iterations=100000, save_interval=100000)), seconds=1.0)
-        done = read_checkpoint(latest_checkpoint(out))["iteration"]
+        endless = replace(CONFIG, iterations=100000, save_interval=100000)
+        out = self.train("timed", config=endless, minutes=1 / 60)
+        done = newest(out)["iteration"]
         self.assertGreater(done, 0)
-        train_only(out, resumed(out, iterations=done + 1), resume=True)
-        self.assertEqual(read_checkpoint(latest_checkpoint(out))["iteration"], done + 1)
+        self.resume(out, iterations=done + 1)
+        self.assertEqual(newest(out)["iteration"], done + 1)
 
-    def test_a_policy_that_is_missing_is_exported_from_the_checkpoint(self):
+    def test_a_policy_that_is_missing_or_old_is_exported_from_the_checkpoint(self):
         out = self.folder / "exported"
-        train(out, self.start(out))
-        made = OnnxPolicy(out / "policy.onnx")
-        (out / "policy.onnx").unlink()
-        again = OnnxPolicy(ensure_policy(out))
-        self.assertEqual(made.contract, again.contract)
+        shutil.copytree(self.out, out)
+        policy = out / "policy.onnx"
+        contract = OnnxPolicy(policy).contract
+        policy.unlink()
+        made = ensure_policy(out).read_bytes()
+        self.assertEqual(OnnxPolicy(policy).contract, contract)
+        export_checkpoint(out, out / "checkpoints" / "000001.pt", policy)  # newer by its time, of an older checkpoint
+        self.assertNotEqual(policy.read_bytes(), made)
+        self.assertEqual(ensure_policy(out).read_bytes(), made)
+        written = policy.stat().st_mtime_ns
+        os.utime(latest_checkpoint(out), (2e9, 2e9))  # copied: its time says nothing
+        ensure_policy(out)
+        self.assertEqual(policy.stat().st_mtime_ns, written)
+
+    def test_a_training_leaves_global_settings_as_they_were(self):
+        before = torch.get_float32_matmul_precision(), logging.getLogger("torch.onnx").level
+        self.addCleanup(torch.set_float32_matmul_precision, before[0])
+        self.addCleanup(logging.getLogger("torch.onnx").setLevel, before[1])
+        torch.set_float32_matmul_precision("medium")
+        logging.getLogger("torch.onnx").setLevel(logging.DEBUG)
+        torch.distributed.init_process_group("gloo", store=torch.distributed.HashStore(), rank=0, world_size=1)
+        self.addCleanup(torch.distributed.destroy_process_group)
+        self.train("polite", config=replace(CONFIG, iterations=1))
+        export_checkpoint(self.out, latest_checkpoint(self.out), self.folder / "polite.onnx")
+        self.assertEqual(torch.get_float32_matmul_precision(), "medium")
+        self.assertEqual(logging.getLogger("torch.onnx").level, logging.DEBUG)
+        self.assertTrue(torch.distributed.is_initialized())
 
     def test_a_run_without_a_checkpoint_goes_on_or_begins_anew(self):
         """Killed before the first one: whether the same command is given again or --resume, and whatever is left of the first."""
-        for resume in (True, False):
-            with self.subTest(resume=resume):
-                out = self.folder / f"early-{resume}"
-                info = self.start(out)
+        for is_resumed in (True, False):
+            with self.subTest(is_resumed=is_resumed):
+                name = f"early-{is_resumed}"
                 with (
                     mock.patch.object(TrainingRunner, "learn", side_effect=ZeroDivisionError),
                     self.assertRaises(ZeroDivisionError),
                 ):
-                    train_only(out, info)
+                    self.train(name)
+                out = self.folder / name
                 (out / "events.out.tfevents.old").write_bytes(b"half")
                 (out / ".xreset-abc.part").write_bytes(b"half")
                 (out / "checkpoints" / ".xreset-abd.part").write_bytes(b"half")
-                said = io.StringIO()
-                with redirect_stdout(said):
-                    train_only(out, resumed(out, iterations=None) if resume else self.start(out, seed=5), resume=resume)
-                self.assertEqual("beginning anew" in said.getvalue(), resume)
-                self.assertEqual(read_run(out).seed, 3 if resume else 5)
+                if is_resumed:
+                    self.assertIn("starting from the beginning", self.resume(out))
+                else:
+                    self.train(name, seed=5)
+                self.assertEqual(read_run(out).seed, 3 if is_resumed else 5)
                 self.assertEqual(len(checkpoints(out)), 2)
                 self.assertFalse([f.name for f in out.rglob("*") if f.name.endswith((".part", ".old", ".lock"))])
 
     def test_an_engine_that_does_not_stand_leaves_no_run(self):
-        out = self.folder / "nothing"
         broken = mock.patch("xreset.env.make_backend", side_effect=BackendUnavailableError("no GPU"))
         with broken, self.assertRaisesRegex(BackendUnavailableError, "no GPU"):
-            train(out, self.start(out))
-        self.assertFalse((out / "run.json").exists())
+            train(self.bank, out=self.folder / "nothing", **self.options())
         for problem, options in (
             ("--num-envs is 0", {"num_envs": 0}),
+            ("--minutes is 0", {"minutes": 0.0}),
             ("no device 'quantum'", {"device": "quantum"}),
             ("'mujoco' does not run on 'cuda'", {"device": "cuda"}),
         ):
             with self.subTest(problem), self.assertRaisesRegex(XResetError, problem):
-                self.start(out, **options)
+                self.train("nothing", **options)
+        self.assertFalse((self.folder / "nothing" / "run.json").exists())
 
     def test_two_trainings_do_not_share_a_folder(self):
         out = self.folder / "shared"
-        info = self.start(out)
         out.mkdir()
-        with claim(out), self.assertRaisesRegex(XResetError, "another command is writing"):
-            train_only(out, info)
-        train_only(out, info)
+        with claim(out), self.assertRaisesRegex(XResetError, "nother (command|process) is writing"):
+            self.train("shared")
+        self.train("shared")
 
     def test_a_full_disk_ends_a_training_in_one_sentence_and_it_goes_on(self):
         out = self.folder / "full"
@@ -447,41 +434,35 @@ class TrainingTest(unittest.TestCase):
             resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
 
         full_at(20_000)  # enough for the description and the curves, not for a checkpoint
-        with self.assertRaisesRegex(XResetError, "cannot write .*worlds.pt: File too large. Nothing was changed"):
-            train_only(out, self.start(out, config=config))
+        with self.assertRaisesRegex(XResetError, r"cannot write .*\.pt: File too large. Nothing was changed"):
+            self.train("full", config=config)
         full_at(limits[0])
-        train_only(out, self.start(out, config=config))
-        for size, said in ((20_000, "cannot write .*worlds.pt"), (200, "cannot write the learning curves.*--resume")):
+        self.train("full", config=config)
+        for size, said in ((20_000, r"cannot write .*\.pt"), (200, "cannot write the learning curves.*--resume")):
             full_at(size)
-            with (
-                self.subTest(size),
-                mock.patch("xreset.learning.train.write_run"),
-                self.assertRaisesRegex(XResetError, said),
-            ):
-                train_only(out, resumed(out, iterations=3), resume=True)
+            unchanged = mock.patch("xreset.learning.train.write_run")
+            with self.subTest(size), unchanged, self.assertRaisesRegex(XResetError, said):
+                self.resume(out, iterations=3)
             full_at(limits[0])
-            self.assertEqual(read_checkpoint(latest_checkpoint(out))["iteration"], 1)
+            self.assertEqual(newest(out)["iteration"], 1)
             self.assertFalse([f.name for f in out.rglob("*.part")])
-        train_only(out, resumed(out, iterations=2), resume=True)
-        self.assertEqual(read_checkpoint(latest_checkpoint(out))["iteration"], 2)
+        self.resume(out, iterations=2)
+        self.assertEqual(newest(out)["iteration"], 2)
 
     def test_too_little_memory_is_said(self):
-        out = self.folder / "memory"
-        for error in (
-            torch.OutOfMemoryError("CUDA out of memory"),
-            RuntimeError("Failed to allocate 10 bytes on device 'cuda:0'"),
-            MemoryError(),
+        for error, wanted in (
+            (torch.OutOfMemoryError("CUDA out of memory"), RunError),
+            (RuntimeError("Failed to allocate 10 bytes on device 'cuda:0'"), RunError),
+            (MemoryError(), RunError),
+            (RuntimeError("cannot allocate a name"), RuntimeError),
         ):
-            info = self.start(out)
-            with (
-                mock.patch.object(TrainingRunner, "learn", side_effect=error),
-                self.assertRaisesRegex(RunError, "4 worlds on cpu need more memory.*--num-envs"),
-            ):
-                train_only(out, info)
+            said = "4 worlds on cpu need more memory.*--num-envs" if wanted is RunError else "a name"
+            broken = mock.patch.object(TrainingRunner, "learn", side_effect=error)
+            with self.subTest(error), broken, self.assertRaisesRegex(wanted, said):
+                self.train("memory")
 
     def test_damaged_worlds_begin_episodes_anew(self):
-        out = self.folder / "damaged-worlds"
-        train_only(out, self.start(out))
+        out = self.train("damaged-worlds")
         whole = torch.load(out / "worlds.pt", weights_only=True)
         for content in (
             {"iteration": 10},
@@ -491,38 +472,45 @@ class TrainingTest(unittest.TestCase):
         ):
             torch.save(content, out / "worlds.pt")
             done = len(checkpoints(out))
-            train_only(out, resumed(out, iterations=done + 1), resume=True)
+            self.resume(out, iterations=done + 1)
             self.assertEqual(len(checkpoints(out)), done + 1)
 
     def test_a_run_is_never_overwritten(self):
         with self.assertRaisesRegex(RunError, "holds a run already.*--resume"):
-            self.start(self.out)
+            self.train("run")
 
     def test_a_bank_without_states_needs_p_zero(self):
         empty = self.folder / "empty.npz"
         write_bank(empty, toy_bank(self.robot).select(sequences=np.zeros(3, dtype=bool)), config={}, inputs={})
         with self.assertRaisesRegex(RunError, "no state to reset to.*demo-probability 0"):
-            self.start(self.folder / "none", resets=empty)
+            self.train("none", bank=empty)
         self.assertFalse((self.folder / "none").exists())
 
     def test_a_bank_that_has_changed_is_refused(self):
         bank = self.folder / "changing.npz"
         write_bank(bank, toy_bank(self.robot), config={}, inputs={})
-        out = self.folder / "changed"
-        info = self.start(out, resets=bank)
+        out = self.train("changed", bank=bank)
         write_bank(bank, toy_bank(self.robot, post_contact=np.zeros(6, dtype=bool)), config={}, inputs={})
         with self.assertRaisesRegex(RunError, "not the file that this run was started with"):
-            train_only(out, info)
+            self.resume(out)
 
     def test_a_bank_for_another_robot_is_refused(self):
         with self.assertRaisesRegex(FileFormatError, "reset bank for the robot 'openarm'"):
-            self.start(self.folder / "none", robot="ur7e-sharpa")
+            self.train("none", robot="ur7e-sharpa")
 
     def test_a_damaged_checkpoint_is_named(self):
         file = self.folder / "000009.pt"
         file.write_bytes(latest_checkpoint(self.out).read_bytes()[:1000])
         with self.assertRaisesRegex(RunError, "cannot be read as a checkpoint"):
             read_checkpoint(file)
+        good = torch.load(latest_checkpoint(self.out), weights_only=True)
+        for key, wrong in (
+            ("iteration", "3"), ("iteration", -1), ("env_steps", 1.5), ("elapsed", math.nan), ("learning_rate", math.inf),
+            ("random", {}), ("actor_state_dict", []),
+        ):  # fmt: skip
+            torch.save(good | {key: wrong}, file)
+            with self.subTest(key), self.assertRaisesRegex(RunError, f"not a checkpoint of xreset: its {key} is"):
+                read_checkpoint(file)
 
     def test_a_run_of_another_configuration_is_named(self):
         data = json.loads((self.out / "run.json").read_text())
@@ -542,15 +530,9 @@ class TrainingTest(unittest.TestCase):
             ("device is 0.5, expected str", {"device": 0.5}),
             ("contract in which joint_names", {"contract": good["contract"] | {"joint_names": 3}}),
         ):
-            (out / "run.json").write_text(
-                json.dumps(
-                    {
-                        k: v
-                        for k, v in (good | changes).items()
-                        if v is not None or k in ("objects", "weights", "weights_hash")
-                    }
-                )
-            )
+            optional = ("objects", "weights", "weights_hash")
+            data = {name: x for name, x in (good | changes).items() if x is not None or name in optional}
+            (out / "run.json").write_text(json.dumps(data))
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
                 read_run(out)
 

@@ -15,7 +15,7 @@ from xreset.eval.results import EvalResult as EvalResult
 from xreset.eval.results import Evaluation as Evaluation
 from xreset.eval.trial import Engine as Engine
 from xreset.learning.config import TrainConfig as TrainConfig
-from xreset.learning.new_run import train as train
+from xreset.learning.train import train as train
 from xreset.objects.catalogue import load_object as load_object
 from xreset.physics import Backend as Backend
 from xreset.plugins import make_backend as make_backend

@@ -73,7 +73,7 @@ class Run:
         """How far it has come: what its newest checkpoint says, or else its lift clock."""
         if not checkpoints(self.folder):
             return read_lift(self.folder)
-        from xreset.learning.runner import read_checkpoint
+        from xreset.learning.checkpoint import read_checkpoint
 
         content = read_checkpoint(latest_checkpoint(self.folder))
         return Lift(

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from xreset.checks import without_effect
 from xreset.errors import RunError
-from xreset.learning import new_run
 from xreset.learning import train as training
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import dropped_terms, own_terms_flag, starting_config
@@ -55,15 +54,12 @@ def train(
             and, if it adapts, their learning rate.
         config: Task, model and algorithm. The defaults shown are those of --like.
     """
-    if not minutes > 0:
-        raise RunError(f"--minutes is {minutes}, expected more than 0.")
     if resume and like != "paper":
         raise RunError("--resume continues with the run's own configuration. Omit --like.")
     if resume and weights is not None:
         raise RunError("--resume continues with the run's own networks. Omit --weights, or start another run with it.")
     if resume:
-        info = training.resumed(out, iterations=iterations, own=config.task.reward.own)
-        training.train(out, info, resume=True, seconds=60 * minutes)
+        training.resume(out, iterations=iterations, minutes=minutes, own=config.task.reward.own)
         return
     if robot is None or resets is None:
         raise RunError("A new run needs --robot and --resets. To continue the run in --out, add --resume.")
@@ -75,7 +71,7 @@ def train(
             f"which code is imported. If you trust this code, add {own_terms_flag(dropped)}.",
             file=sys.stderr,
         )
-    new_run.train(
+    training.train(
         resets,
         out=out,
         config=config,

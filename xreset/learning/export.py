@@ -1,4 +1,4 @@
-"""Export of a policy to ONNX, with all that another engine needs to run it unchanged."""
+"""Export of policies to ONNX, with all that another engine needs to run them unchanged."""
 
 from __future__ import annotations
 
@@ -8,57 +8,139 @@ import json
 import logging
 import tempfile
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 
 from xreset.checks import from_dict
-from xreset.files import atomic_write
+from xreset.files import atomic_write, file_hash
+from xreset.learning.checkpoint import read_checkpoint
+from xreset.learning.choice import Choice, read_choice
+from xreset.learning.config import rsl_rl_config
 from xreset.learning.model import PointNetLstmModel
+from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.learning.shrink import drop_exporter_notes
 from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS
 from xreset.task.config import ObservationConfig
 
+_CHECKPOINT_KEY = "xreset-checkpoint"
+"""Key of the ONNX metadata entry that holds the SHA-256 of the checkpoint."""
 
-def export_onnx(actor: PointNetLstmModel, path: str | Path, contract: dict[str, Any]) -> None:
+
+def export_onnx(actor: PointNetLstmModel, path: str | Path, contract: dict[str, Any], *, checkpoint: Path) -> None:
     """Write the deterministic policy as one ONNX file.
 
     Args:
         actor: trained actor.
         path: file to write.
         contract: what the policy needs to run: see :func:`xreset.policy.policy_contract`.
+        checkpoint: file with the actor's weights, of which the policy states the hash.
     """
     import onnx
 
     policy = actor.as_onnx()
-    observation = from_dict(
-        ObservationConfig, contract["task"]["observation"], "the policy's contract: task.observation"
-    )
     n = 2  # an example batch that is not 1, so that the exporter keeps the world dimension free
-    state = torch.zeros(1, n, policy.lstm_dim)  # pyright: ignore[reportArgumentType, reportCallIssue]
-    example = (torch.zeros(n, policy.flat_dim), torch.zeros(n, *observation.cloud_shape), state, state.clone())  # pyright: ignore[reportArgumentType, reportCallIssue]
+    state = torch.zeros(1, n, policy.lstm_dim)
+    example = (torch.zeros(n, policy.flat_dim), torch.zeros(n, *_cloud_shape(contract)), state, state.clone())
     worlds = torch.export.Dim("worlds", min=1, max=65536)
-    shapes = ({0: worlds}, {0: worlds}, {1: worlds}, {1: worlds})
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, _quiet(), torch.no_grad():
         file = Path(folder) / "policy.onnx"
-        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()), torch.no_grad():
-            warnings.simplefilter("ignore")
-            torch.onnx.export(
-                policy,
-                example,
-                str(file),
-                input_names=list(INPUTS),
-                output_names=list(OUTPUTS),
-                dynamic_shapes=shapes,
-                external_data=False,
-                dynamo=True,
-                verbose=False,
-            )
+        torch.onnx.export(
+            policy,
+            example,
+            str(file),
+            input_names=list(INPUTS),
+            output_names=list(OUTPUTS),
+            dynamic_shapes=({0: worlds}, {0: worlds}, {1: worlds}, {1: worlds}),
+            external_data=False,
+            dynamo=True,
+            verbose=False,
+        )
         model = onnx.load(str(file))
     drop_exporter_notes(model)
-    entry = model.metadata_props.add()
-    entry.key, entry.value = METADATA_KEY, json.dumps(contract, sort_keys=True)
+    for key, value in (
+        (METADATA_KEY, json.dumps(contract, sort_keys=True)),
+        (_CHECKPOINT_KEY, file_hash(checkpoint)),
+    ):
+        entry = model.metadata_props.add()
+        entry.key = key
+        entry.value = value
     with atomic_write(path) as out:
         out.write(model.SerializeToString())
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the exporter's warnings and progress from the terminal."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+def _cloud_shape(contract: dict[str, Any]) -> tuple[int, int, int]:
+    where = "the policy's contract: task.observation"
+    return from_dict(ObservationConfig, contract["task"]["observation"], where).cloud_shape
+
+
+def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
+    """Write the policy of one of a run's checkpoints as an ONNX file."""
+    info = read_run(out)
+    settings = rsl_rl_config(info.config, info.num_envs)
+    options = {name: value for name, value in settings["actor"].items() if name != "class_name"}
+    layout = info.contract["observation_layout"]
+    example = {name: torch.zeros(1, sum(layout[name].values())) for name in ("policy", "proprio")}
+    example["perception"] = torch.zeros(1, *_cloud_shape(info.contract))
+    groups = {"actor": settings["obs_groups"]["actor"]}
+    num_actions = len(info.contract["joint_names"])
+    actor = PointNetLstmModel(TensorDict(example, batch_size=[1]), groups, "actor", num_actions, **options)
+    actor.load_state_dict(read_checkpoint(checkpoint)["actor_state_dict"])
+    export_onnx(actor, policy, info.contract, checkpoint=checkpoint)
+
+
+def ensure_policy(out: Path) -> Path:
+    """Return the run's ``policy.onnx``, exported if it is missing or old.
+
+    It is the policy of the checkpoint that ``xreset select`` chose, if there is none newer, else of the newest one.
+    """
+    policy = out / "policy.onnx"
+    checkpoint = latest_checkpoint(out)
+    choice = current_choice(out)
+    if choice is not None:
+        checkpoint = checkpoint.with_name(choice.chosen)
+    if not policy.exists() or not _is_of(policy, checkpoint, choice):
+        export_checkpoint(out, checkpoint, policy)
+    return policy
+
+
+def _is_of(policy: Path, checkpoint: Path, choice: Choice | None) -> bool:
+    """Return whether a policy was exported from a checkpoint."""
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        entries = {entry.key: entry.value for entry in onnx.load(str(policy), load_external_data=False).metadata_props}
+    except DecodeError:
+        return False
+    if _CHECKPOINT_KEY in entries:
+        return entries[_CHECKPOINT_KEY] == file_hash(checkpoint)
+    if choice is not None:
+        return file_hash(policy) == choice.policy_hash
+    return policy.stat().st_mtime >= checkpoint.stat().st_mtime  # exported by an earlier version
+
+
+def current_choice(out: Path) -> Choice | None:
+    """Return the choice of ``xreset select``, if the run still has the chosen checkpoint and no newer one than it knew."""
+    choice = read_choice(out)
+    names = [checkpoint.name for checkpoint in checkpoints(out)]
+    if choice is None or choice.chosen not in names or names[-1] != choice.candidates[0].name:
+        return None
+    return choice

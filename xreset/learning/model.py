@@ -256,7 +256,7 @@ class PointNetLstmModel(MLPModel):
             normalizer.update(torch.cat([obs[group] for group in self.obs_groups], dim=-1))
             normalizer._std = std.copy_(normalizer._std)
 
-    def as_onnx(self, verbose: bool = False) -> nn.Module:
+    def as_onnx(self, verbose: bool = False) -> ExportedPolicy:
         """The deterministic policy as a plain module; see :class:`ExportedPolicy`."""
         return ExportedPolicy(self)
 
@@ -328,7 +328,8 @@ class ExportedPolicy(nn.Module):
         self.output = (
             model.distribution.as_deterministic_output_module() if model.distribution is not None else nn.Identity()
         )
-        self.flat_dim, self.lstm_dim = model.obs_dim, model._latent_dim
+        self.flat_dim: int = model.obs_dim
+        self.lstm_dim: int = model._latent_dim
         self.cpu().eval()
 
     def forward(self, flat: Tensor, cloud: Tensor, h_in: Tensor, c_in: Tensor) -> tuple[Tensor, Tensor, Tensor]:

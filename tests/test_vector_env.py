@@ -5,8 +5,10 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
+from xreset.errors import XResetError
 from xreset.task.config import ResetConfig, TerminationConfig
 
 try:
@@ -115,16 +117,43 @@ class VectorEnvTest(WithEnv):
         )
         inner = self.make(task, kind=BreakableBackend)
         env, still = VectorEnv(inner), np.zeros((N, inner.num_actions), np.float32)
+        before, *_ = env.step(still)
         inner.backend.broken[0] = True
-        _, _, _, truncated, infos = env.step(still)
-        self.assertEqual((truncated.tolist(), infos["faulty"].tolist()), ([True, False, False],) * 2)
-        _, _, _, truncated, infos = env.step(still)
-        self.assertFalse(truncated.any() or infos["faulty"].any())
+        seen, reward, terminated, truncated, infos = env.step(still)
+        self.assertEqual((terminated.tolist(), infos["faulty"].tolist()), ([True, False, False],) * 2)
+        self.assertFalse(truncated.any(), "a fault is no truncation: nobody may bootstrap from it")
+        self.assertEqual(reward[0], 0.0)
+        for name, value in seen.items():
+            self.assertTrue(np.isfinite(value).all(), name)
+            np.testing.assert_array_equal(value[0], before[name][0])
+        _, _, terminated, truncated, infos = env.step(still)
+        self.assertFalse(terminated.any() or truncated.any() or infos["faulty"].any())
         self.assertEqual(int(inner.nonfinite_count), 1)
-        for _ in range(inner.max_episode_length - 2):
+        for _ in range(inner.max_episode_length - 3):
             *_, truncated, _ = env.step(still)
         self.assertEqual(truncated.tolist(), [False, True, True])
         env.close()
+
+    def test_actions_of_another_shape_or_kind_are_refused(self):
+        env = self.vector_env(0.5)
+        joints = env.env.num_actions
+        right = np.zeros((N, joints))
+        for wrong in (
+            0.0,
+            np.zeros(joints),
+            right[:1],
+            right[:, :1],
+            right + 1j,
+            right.astype(bool),
+            [["left"] * joints] * N,
+        ):
+            with (
+                self.subTest(shape=np.shape(wrong)),
+                self.assertRaisesRegex(XResetError, rf"of shape \({N}, {joints}\)"),
+            ):
+                env.step(wrong)
+        for taken in (right, right.astype(int), right.tolist(), torch.zeros(N, joints)):
+            env.step(taken)
 
     def test_the_seed_decides(self):
         runs = []

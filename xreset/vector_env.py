@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,13 +15,21 @@ with needs("gymnasium", "gymnasium"):
     from gymnasium.vector import AutoresetMode
     from gymnasium.vector.utils import batch_space
 
+if TYPE_CHECKING:
+    from tensordict import TensorDict
+
 
 class VectorEnv(gymnasium.vector.VectorEnv):
     """N worlds of the task in any engine.
 
-    Observations are a dictionary of the environment's groups, [N, ...] float32; actions are [N, J] in [-1, 1]. An episode that leaves the
-    scene is terminated; one whose time is over, or whose simulation fails, is truncated. The step after, its world ignores the action,
-    gives no reward, and shows the next episode's beginning (Gymnasium's ``AutoresetMode.NEXT_STEP``).
+    Observations are a dictionary of the environment's groups, [N, ...] float32 and always finite; actions are [N, J] in [-1, 1].
+
+    An episode is truncated when its time is over: a learner bootstraps its value from the last observation, which is the one that the step
+    returns. An episode is terminated when the object leaves the scene or the simulation fails. A world whose simulation fails repeats its
+    last sound observation, gives no reward, and is named by ``infos["faulty"]``.
+
+    The step after an end ignores the world's action, gives no reward, and returns the first observation of the next episode (Gymnasium's
+    ``AutoresetMode.NEXT_STEP``).
     """
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012
@@ -40,6 +48,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._ended = torch.zeros(self.num_envs, dtype=torch.bool, device=env.device)
+        self._observations = env.get_observations()
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -56,26 +65,59 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             self.env.generator.manual_seed(seed)
         self._ended.zero_()
         self.env.reset()
-        return self._observations(), {}
+        self._observations = self.env.get_observations()
+        return _arrays(self._observations), {}
 
     def step(self, actions: Any) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Observations, reward [N], terminated [N] and truncated [N], and ``faulty`` [N]: whether the simulation has failed."""
-        action = torch.as_tensor(np.asarray(actions), dtype=torch.float32, device=self.env.device)
-        action = torch.where(self._ended[:, None], 0.0, action)  # ignored: the world begins anew
-        _, reward, done, extras = self.env.step(action, begin=self._ended)
+        """Take one control step in every world.
+
+        Args:
+            actions: [N, J] real numbers in [-1, 1]; numbers beyond are limited. A world whose numbers are not finite fails.
+
+        Returns:
+            Observations, reward [N], terminated [N], truncated [N], and ``faulty`` [N] (whether the simulation failed) in a dictionary.
+
+        Raises:
+            XResetError: the actions have another shape, or are not real numbers.
+        """
+        action = self._action(actions)
+        action = torch.where(self._ended[:, None], 0.0, action)  # ignored: the world begins a new episode
+        observations, reward, done, extras = self.env.step(action, begin=self._ended)
         reward = torch.where(self._ended, 0.0, reward)
+        faulty = extras["faulty"]
+        self._observations = with_sound_rows(observations, self._observations)
         self._ended = done.bool()
-        truncated = self._ended & extras["time_outs"].bool()
-        infos = {"faulty": _numpy(extras["faulty"])}
-        return self._observations(), _numpy(reward), _numpy(self._ended & ~truncated), _numpy(truncated), infos
+        truncated = self._ended & extras["time_outs"].bool() & ~faulty
+        terminated = self._ended & ~truncated
+        infos = {"faulty": _array(faulty)}
+        return _arrays(self._observations), _array(reward), _array(terminated), _array(truncated), infos
+
+    def _action(self, actions: Any) -> torch.Tensor:
+        """Check actions and bring them to the environment's device."""
+        values = np.asarray(actions.detach().cpu() if isinstance(actions, torch.Tensor) else actions)
+        expected = (self.num_envs, self.env.num_actions)
+        if values.shape != expected or values.dtype.kind not in "fiu":
+            raise XResetError(
+                f"The actions are {values.dtype} of shape {values.shape}. Give real numbers of shape {expected}: "
+                "one row for each world, one column for each joint."
+            )
+        return torch.as_tensor(values, dtype=torch.float32, device=self.env.device)
 
     def close_extras(self, **_: Any) -> None:
         """Close the engine."""
         self.env.close()
 
-    def _observations(self) -> dict[str, np.ndarray]:
-        return {name: _numpy(value) for name, value in self.env.get_observations().items()}
+
+def with_sound_rows(observations: TensorDict, before: TensorDict) -> TensorDict:
+    """Replace the observations of every world that shows a number that is not finite with its observations before."""
+    finite = [value.flatten(1).isfinite().all(dim=1) for value in observations.values()]
+    sound = torch.stack(finite).all(dim=0)
+    return observations.apply(lambda new, old: torch.where(sound.view(-1, *[1] * (new.ndim - 1)), new, old), before)
 
 
-def _numpy(x: Any) -> np.ndarray:
-    return x.detach().cpu().numpy()
+def _arrays(observations: TensorDict) -> dict[str, np.ndarray]:
+    return {name: _array(value) for name, value in observations.items()}
+
+
+def _array(value: torch.Tensor) -> np.ndarray:
+    return value.detach().cpu().numpy()

@@ -7,6 +7,7 @@ import tempfile
 import unittest
 from itertools import product
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import torch
@@ -104,6 +105,20 @@ class PlaceTest(unittest.TestCase):
         self.assertEqual(seen, sorted(seen))  # the best yet never gets worse
         self.assertIsNone(found.home)  # home held the hand three metres up
 
+    def test_a_placement_that_keeps_home_is_preferred(self):
+        def home(robot, placement):
+            homes.append(placement)
+            return None if len(homes) == 1 else robot.home[robot.arm_indices]
+
+        homes = []
+        lost = dataclasses.replace(self.robot, base_pos=(0.45, 0.6, 3.0))
+        with mock.patch.object(placing, "_home", home):
+            config = dataclasses.replace(CONFIG, elite=2, candidates=16, rounds=1)
+            found = placing.place(lost, [self.wrists], np.zeros((0, 3)), config)
+        self.assertEqual(len(homes), 2)
+        self.assertEqual(found.best.placement, homes[1])
+        self.assertIsNotNone(found.home)
+
     def test_the_same_seed_finds_the_same_in_any_number_of_processes(self):
         small = dataclasses.replace(CONFIG, candidates=2, rounds=2)
         first, second = (placing.place(self.robot, [self.wrists], np.zeros((0, 3)), small, processes=n) for n in (1, 2))
@@ -113,7 +128,7 @@ class PlaceTest(unittest.TestCase):
         trial = placing._Trial(
             robot=self.robot, config=CONFIG, tried=self.wrists, kept=self.wrists, paths=[self.wrists]
         )
-        with self.assertRaisesRegex(RobotError, "was killed; is there memory"), placing._tried_by(trial, 2) as each:
+        with self.assertRaisesRegex(RobotError, "was killed; is there memory"), placing._mapper(trial, 2) as each:
             list(each(_die, [9]))
 
     def test_a_candidate_that_cannot_come_in_is_given_up(self):
@@ -352,7 +367,7 @@ class WritePlacementTest(unittest.TestCase):
 
     def test_refusals(self):
         robot = load(self.folder)
-        with self.assertRaisesRegex(RobotError, "choose a home by hand"):
+        with self.assertRaisesRegex(RobotError, "Change the home of the arm's joints"):
             write_placement(self.file, robot, dataclasses.replace(self.found, home=None), "x")
         self.file.write_text(self.file.read_text().replace("pos = [", "position = ["))
         with self.assertRaisesRegex(RobotError, "edit it by hand"):

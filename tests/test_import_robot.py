@@ -119,10 +119,17 @@ class Toy(WithFolder):
             {(m.joint, m.multiplier, m.offset) for m in spec.mimics}, {(f"f{i}_2", 0.8, 0.1) for i in range(1, 5)}
         )
         self.assertTrue(any("thumb is the finger of f4_a, f4_b" in note for note in made.guessed), made.guessed)
-        self.assertIn("--offset", made.to_say[0])
+        self.assertRegex(made.to_say[0], "--offset.*--rpy 0 -1.5708 0$")
         self.assertEqual([path.name for path in self.folder.iterdir() if path.name.startswith(".")], [])
         keypoints = {point.keypoint: point.link for point in spec.keypoints}
         self.assertEqual([keypoints[f"index{i}"] for i in (1, 2, 4)], ["f1_a", "f1_b", "index_tip_frame"])
+
+    def test_home_is_within_the_limits_after_rounding(self):
+        narrow = self.file("narrow.urdf", ARM.replace('lower="-2.9" upper="2.9"', 'lower="-0.123456" upper="0.123456"'))
+        spec = load_robot(import_robot(narrow, self.hand, self.folder / "mine").folder)
+        arm = spec.home[spec.arm_indices]
+        self.assertLessEqual(np.abs(arm).max(), 0.123456)
+        self.assertEqual(np.abs(arm).max(), 0.1234)
 
     def test_centres_of_mass_that_lie_in_the_joints_are_doubted(self):
         at_joint = HAND.replace(
@@ -285,7 +292,9 @@ class Toy(WithFolder):
         T = load_urdf(made.folder / "robot.urdf").joint("hand_base_fixed").T_parent_joint
         np.testing.assert_allclose(T[:3, 3], 0, atol=1e-9)
         self.assertRegex(made.to_say[0], r"its fingers point along \(0.05, 0.00, 1.00\) of 'l5'")
+        self.assertNotIn("for fingers along", made.to_say[0])
         back = import_robot(self.arm, self.hand, self.folder / "back", rpy=(0, np.pi / 2, 0))
+        self.assertRegex(back.to_say[0], "for fingers along its z axis: --rpy 0 -1.5708 0$")
         T = load_urdf(back.folder / "robot.urdf").joint("hand_base_fixed").T_parent_joint
         np.testing.assert_allclose(T[:3, 3], (0, 0, 0.08), atol=1e-9)
         self.assertTrue(any("80 mm along z of 'l5'" in note for note in back.guessed), back.guessed)
@@ -376,6 +385,13 @@ class Reshaped(WithFolder):
         arm, hand = read_source(self.robot.urdf), read_source(self.folder / "hand.urdf")
         whole = combined(arm, hand, flange="l5", T_flange_hand=np.eye(4), name="again").tree
         self.assertEqual(set(hand.tree.link_names) - set(whole.link_names), set())
+
+    def test_names_of_files_and_of_links_that_arm_and_hand_share(self):
+        import_robot(self.folder / "arm.urdf", self.file("hand--v2.urdf", HAND), self.folder / "shared")
+        for name in (r"a\qb", r"a\1b", 'a"b'):
+            with self.subTest(name):
+                reshape(str(self.folder / "shared"), self.folder / "hand--v2.urdf", self.folder / name)
+                self.assertEqual(load_robot(self.folder / name).name, name)
 
     def test_another_hand_is_refused_and_leaves_nothing(self):
         for hand, expected in (

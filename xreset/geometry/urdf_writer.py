@@ -183,7 +183,7 @@ def _add_link(robot: Element, link: Link) -> None:
 
 
 def _add_origin(element: Element, T: np.ndarray) -> None:
-    _add(element, "origin", xyz=T[:3, 3], rpy=_roll_pitch_yaw(T[:3, :3]))
+    _add(element, "origin", xyz=T[:3, 3], rpy=roll_pitch_yaw(T[:3, :3]))
 
 
 def _add(parent: Element, tag: str, **attributes: str | ArrayLike) -> None:
@@ -194,7 +194,7 @@ def _add(parent: Element, tag: str, **attributes: str | ArrayLike) -> None:
     SubElement(parent, tag, texts)
 
 
-def _roll_pitch_yaw(R: np.ndarray) -> tuple[float, float, float]:
+def roll_pitch_yaw(R: np.ndarray) -> tuple[float, float, float]:
     """Return the angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad].
 
     Where pitch is +-90 degrees, only the sum of roll and yaw is defined; yaw is 0 there.

@@ -1,9 +1,9 @@
-"""Where a robot should stand: the base placement from which its arm reaches most of what human hands did.
+"""Finds the base placement from which a robot's arm reaches most of what human hands did.
 
 Hand retargeting says where the hand root must be in every frame of some demonstrations. Candidates are drawn at random, then around the
-best of them (the cross-entropy method), and tried on frames each on its own, from several starts: what the arm *can* reach. The few best,
-and the robot's own placement, then follow whole motions as in ``xreset retarget``, and the one that follows most wins. In how many
-processes they are tried makes no difference to the result.
+best of them (the cross-entropy method), and tried on single frames, from several starts: what the arm *can* reach. The few best, and the
+robot's own placement, then follow whole motions as in ``xreset retarget``, and the one that follows most wins. The number of processes
+does not change the result.
 
 Shape letters: F frames, n arm joints.
 """
@@ -35,7 +35,7 @@ from xreset.spec import RobotSpec
 from xreset.tensors import one_thread
 
 _LENGTH = 0.10
-"""Length that counts as much as one radian in the measure of dexterity [m]."""
+"""[m] Length that counts as much as one radian in the measure of dexterity."""
 _FIRST = 12
 """Frames that a candidate is tried on before all others: most fail on enough of them."""
 _WAVE = 8
@@ -44,6 +44,8 @@ _DRAWS = 1000
 """Times that a candidate is drawn until it is clear of wrists and objects; then the round goes without it."""
 _SHRINK = 0.6
 """Factor by which the spread of candidates about the best shrinks from round to round."""
+_FINALIST = 10
+"""A finalist takes about as long as this many candidates."""
 
 
 @one_thread()
@@ -55,54 +57,68 @@ def place(
     progress: Callable[[float, Reach], None] = lambda done, best: None,
     processes: int = 1,
 ) -> Search:
-    """The placement from which the robot follows most of the motions.
+    """Find the placement from which the robot follows most of the motions.
+
+    A placement is preferred from which the arm can hold the hand where home holds it.
 
     Args:
         robot: the robot; its own placement is the first candidate, and a finalist.
         paths: what hand retargeting asks of the arm: see :func:`xreset.retarget.pipeline.wrist_paths`.
         avoid: [., 3] points that the base keeps clear of.
-        config: ranges and effort.
         progress: called with the share that is done and the best reach yet.
-        processes: that try placements at a time; each needs about 0.5 GB.
+        processes: number of processes that try placements; each needs about 0.5 GB.
 
     Raises:
-        RobotError: there is no wrist pose to reach, or a process was killed.
+        RobotError: there is no wrist pose to reach, no room for the base, or a process was killed.
     """
     config = config or PlaceConfig()
     wrists = single_frames(paths, Thresholds().hand_error)
-    if not len(wrists.annotated):
+    count = len(wrists.annotated)
+    if not count:
         raise RobotError(
             f"robot {robot.name!r}: there is no frame to reach; hand retargeting followed none within its threshold."
         )
     random = np.random.default_rng(config.seed)
-    order = torch.as_tensor(random.permutation(len(wrists.annotated)))
-    tried, kept = wrists[order[: config.frames]], wrists[order[config.frames :][: config.final_frames]]
+    order = torch.as_tensor(random.permutation(count))
+    tried = wrists[order[: config.frames]]
+    kept = wrists[order[config.frames :][: config.final_frames]]
     if not len(kept.annotated):
         kept = tried
     own = Placement(pos=robot.base_pos, quat=robot.base_quat)
     trial = _Trial(robot=robot, config=config, tried=tried, kept=kept, paths=paths)
     found = [(own, trial.reach(own, 0))]
-    effort = config.rounds * config.candidates + 10 * (
-        1 + config.elite
-    )  # a finalist takes as long as ten candidates or so
-    with _tried_by(trial, processes) as each:
-        for number, drawn in enumerate(_rounds(robot, avoid, config, random, found)):
+    effort = config.rounds * config.candidates + _FINALIST * (1 + config.elite)
+    with _mapper(trial, processes) as each:
+        for number in range(config.rounds):
+            drawn = _candidates(robot, avoid, config, random, number, found[: config.elite])
             for begin in range(0, len(drawn), _WAVE):
                 wave = drawn[begin : begin + _WAVE]
-                least = found[config.elite - 1][1].rank[0] if len(found) >= config.elite else 0
+                least = 0
+                if len(found) >= config.elite:
+                    least = found[config.elite - 1][1].rank[0]
                 found += zip(wave, each(_Trial.reach, wave, [least] * len(wave)), strict=True)
                 found.sort(key=lambda pair: pair[1].rank, reverse=True)
                 progress((number * config.candidates + begin + len(wave)) / effort, found[0][1])
+        chosen = [own]
+        if config.rounds:
+            chosen += [placement for placement, _ in found[: config.elite] if placement != own]
         finalists: list[Finalist] = []
-        chosen = list(
-            dict.fromkeys([own, *(placement for placement, _ in found[: config.elite if config.rounds else 0])])
-        )
         for finalist in each(_Trial.finalist, chosen):
             finalists.append(finalist)
-            progress(1.0 - 10 * (1 + config.elite - len(finalists)) / effort, found[0][1])
+            progress(1.0 - _FINALIST * (1 + config.elite - len(finalists)) / effort, found[0][1])
+    frames = sum(int(path.annotated.sum()) for path in paths)
     best = max(finalists, key=lambda finalist: finalist.followed)
-    home = robot.home[robot.arm_indices] if best.placement == own else _home(robot, best.placement)
-    return Search(best=best, own=finalists[0], home=home, frames=sum(int(path.annotated.sum()) for path in paths))
+    home = None
+    if best.placement == own:
+        home = robot.home[robot.arm_indices]
+    else:
+        better = [finalist for finalist in finalists if finalist.followed > finalists[0].followed]
+        for finalist in sorted(better, key=lambda finalist: finalist.followed, reverse=True):
+            home = _home(robot, finalist.placement)
+            if home is not None:
+                best = finalist
+                break
+    return Search(best=best, own=finalists[0], home=home, frames=frames)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +138,13 @@ class _Trial:
 
     def finalist(self, placement: Placement) -> Finalist:
         reached = reach(self.robot, placement, self.kept, self.config)
-        return Finalist(placement=placement, reach=reached, followed=_followed(self.robot, placement, self.paths))
+        model = ArmModel(_placed(self.robot, placement))
+        valid = annotated = 0
+        for path in self.paths:
+            _, measures = track(model, path, Thresholds())
+            valid += int((classify(measures, Thresholds()) == 0).sum())
+            annotated += int(path.annotated.sum())
+        return Finalist(placement=placement, reach=reached, followed=valid / annotated)
 
 
 _own_trial: list[_Trial] = []
@@ -140,7 +162,7 @@ def _call(method: Callable[..., Any], *args: Any) -> Any:
 
 
 @contextmanager
-def _tried_by(trial: _Trial, processes: int) -> Iterator[Callable[..., Iterable[Any]]]:
+def _mapper(trial: _Trial, processes: int) -> Iterator[Callable[..., Iterable[Any]]]:
     """``map`` of a method of the trial, here or in several processes."""
     if processes < 2:
         yield lambda method, *args: map(partial(method, trial), *args)
@@ -157,115 +179,116 @@ def _tried_by(trial: _Trial, processes: int) -> Iterator[Callable[..., Iterable[
 
 
 def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: PlaceConfig, least: int = 0) -> Reach:
-    """What the robot reaches of wrist poses [F, 1, ...] from a placement.
+    """Return what the robot reaches of wrist poses [F, 1, ...] from a placement.
 
     It is given up as soon as the first number of its rank must stay below ``least``; then all frames that were not tried count as reached.
     """
-    model = ArmModel(replace(robot, base_pos=placement.pos, base_quat=placement.quat))
+    model = ArmModel(_placed(robot, placement))
     thresholds = Thresholds(
         hand_error=np.inf, wrist_position=config.position, wrist_orientation=np.radians(config.orientation)
     )
     effort = ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0)
-    frames, begin, end = len(wrists.annotated), 0, _FIRST if least else len(wrists.annotated)
-    possible, dexterity = frames, torch.zeros(0, dtype=torch.float64)
+    frames = len(wrists.annotated)
+    begin = 0
+    end = _FIRST if least else frames
+    possible = frames
+    dexterity = torch.zeros(0, dtype=torch.float64)
     while begin < frames and Reach(reached=possible / frames, dexterity=0.0).rank[0] >= least:
         part = wrists[begin:end]
         joints, measures = track(model, part, thresholds, effort)
         reached = (classify(measures, thresholds) == 0)[:, 0]
         possible -= int((~reached).sum())
-        jacobian = model.kinematics.jacobian(
-            model.full(joints[reached, 0], part.hand_joints[reached, 0]), [robot.hand_root]
-        )
+        configurations = model.full(joints[reached, 0], part.hand_joints[reached, 0])
+        jacobian = model.kinematics.jacobian(configurations, [robot.hand_root])
         rows = torch.cat((jacobian.linear[:, 0] / _LENGTH, jacobian.angular[:, 0]), dim=1)[..., model.arm]
         dexterity = torch.cat((dexterity, torch.linalg.svdvals(rows)[:, -1]))
-        begin, end = end, 4 * end
+        begin = end
+        end = 4 * end
     return Reach(reached=possible / frames, dexterity=float(dexterity.mean()) if len(dexterity) else 0.0)
 
 
 def single_frames(paths: list[ArmTargets], hand_error: float) -> ArmTargets:
-    """[F, 1, ...] the annotated frames of paths, each on its own, that hand retargeting follows within ``hand_error`` [m]."""
-
-    def flat(name: str) -> torch.Tensor:
-        return torch.cat([getattr(path, name)[path.annotated & (path.hand_error <= hand_error)] for path in paths])[
-            :, None
-        ]
-
-    return ArmTargets(**{name: flat(name) for name in vars(paths[0])})
+    """[F, 1, ...] the annotated frames of paths, each by itself, that hand retargeting follows within ``hand_error`` [m]."""
+    parts = [path[path.annotated & (path.hand_error <= hand_error)] for path in paths]
+    return ArmTargets.cat(parts).map(lambda x: x[:, None])
 
 
-def _followed(robot: RobotSpec, placement: Placement, paths: list[ArmTargets]) -> float:
-    """Share of the annotated frames that are valid when the arm follows the paths from a placement."""
-    model = ArmModel(replace(robot, base_pos=placement.pos, base_quat=placement.quat))
-    valid = sum(int((classify(track(model, path, Thresholds())[1], Thresholds()) == 0).sum()) for path in paths)
-    return valid / sum(int(path.annotated.sum()) for path in paths)
+def _placed(robot: RobotSpec, placement: Placement) -> RobotSpec:
+    return replace(robot, base_pos=placement.pos, base_quat=placement.quat)
 
 
-def _rounds(
+def _candidates(
     robot: RobotSpec,
     avoid: np.ndarray,
     config: PlaceConfig,
     random: np.random.Generator,
-    found: list[tuple[Placement, Reach]],
-) -> Iterator[list[Placement]]:
-    """The candidates of each round: first evenly over the ranges, then around the best that ``found`` holds by then."""
-    own_tilt = float(
-        np.degrees(np.arccos(np.clip(Rotation.from_quat(robot.base_quat, scalar_first=True).as_matrix()[2, 2], -1, 1)))
-    )
-    tilt = config.tilt or (own_tilt, own_tilt)
+    number: int,
+    elite: list[tuple[Placement, Reach]],
+) -> list[Placement]:
+    """Return the candidates of a round: first evenly over the ranges, then around the elite."""
+    tilt = config.tilt
+    if tilt is None:
+        upright = Rotation.from_quat(robot.base_quat, scalar_first=True).as_matrix()[2, 2]
+        own = float(np.degrees(np.arccos(np.clip(upright, -1, 1))))
+        tilt = (own, own)
     low = np.array([config.x[0], config.y[0], config.z[0], -180.0, tilt[0], -180.0])
     high = np.array([config.x[1], config.y[1], config.z[1], 180.0, tilt[1], 180.0])
-    for number in range(config.rounds):
-        centres = [_parameters(placement) for placement, _ in found[: config.elite]]
-        candidates = []
-        for _ in range(config.candidates):
-            for _ in range(_DRAWS):
-                if number == 0:
-                    drawn = random.uniform(low, high)
-                else:
-                    spread = (high - low) / 4 * _SHRINK**number
-                    drawn = centres[random.integers(len(centres))] + spread * random.standard_normal(6)
-                drawn[:3] = np.clip(drawn[:3], low[:3], high[:3])
-                drawn[4] = np.clip(drawn[4], tilt[0], tilt[1])
-                if not len(avoid) or np.linalg.norm(avoid - drawn[:3], axis=1).min() >= config.clear:
-                    candidates.append(_placement(drawn))
-                    break
-        if number == 0 and not candidates:
-            raise RobotError(
-                f"robot {robot.name!r}: no place in the searched ranges is {config.clear:g} m away from all wrists and objects. "
-                "Lower --search.clear, or widen --search.x, --search.y or --search.z."
-            )
-        yield candidates
+    spread = (high - low) / 4 * _SHRINK**number
+    centers = [_parameters(placement) for placement, _ in elite]
+    bounded = [0, 1, 2, 4]  # all but the angles that go round
+    candidates = []
+    for _ in range(config.candidates):
+        for _ in range(_DRAWS):
+            if number == 0:
+                drawn = random.uniform(low, high)
+            else:
+                drawn = centers[random.integers(len(centers))] + spread * random.standard_normal(6)
+            drawn[bounded] = np.clip(drawn[bounded], low[bounded], high[bounded])
+            if not len(avoid) or np.linalg.norm(avoid - drawn[:3], axis=1).min() >= config.clear:
+                candidates.append(_placement(drawn))
+                break
+    if number == 0 and not candidates:
+        raise RobotError(
+            f"robot {robot.name!r}: no place in the searched ranges is {config.clear:g} m away from all wrists and objects. "
+            "Lower --search.clear, or widen --search.x, --search.y or --search.z."
+        )
+    return candidates
 
 
 def _placement(parameters: np.ndarray) -> Placement:
     """From (x, y, z, azimuth, tilt, spin): the base is spun about its z axis, which is tilted towards an azimuth; angles in degrees."""
     turn = Rotation.from_euler("ZYZ", parameters[3:], degrees=True)
-    x, y, z = (float(v) for v in parameters[:3])
-    a, b, c, d = (float(v) for v in turn.as_quat(canonical=True, scalar_first=True))
-    return Placement(pos=(x, y, z), quat=(a, b, c, d))
+    quat = turn.as_quat(canonical=True, scalar_first=True)
+    return Placement(pos=tuple(parameters[:3].tolist()), quat=tuple(quat.tolist()))
 
 
 def _parameters(placement: Placement) -> np.ndarray:
+    """The inverse of :func:`_placement`."""
     R = Rotation.from_quat(placement.quat, scalar_first=True).as_matrix()
     tilt = np.arccos(np.clip(R[2, 2], -1.0, 1.0))
-    azimuth = np.arctan2(R[1, 2], R[0, 2]) if np.sin(tilt) > 1e-6 else 0.0
+    azimuth = 0.0
+    if np.sin(tilt) > 1e-6:
+        azimuth = np.arctan2(R[1, 2], R[0, 2])
     back = Rotation.from_euler("ZY", (azimuth, tilt)).inv().as_matrix() @ R
-    return np.array([*placement.pos, *np.degrees((azimuth, tilt, np.arctan2(back[1, 0], back[0, 0])))])
+    spin = np.arctan2(back[1, 0], back[0, 0])
+    return np.array([*placement.pos, *np.degrees((azimuth, tilt, spin))])
 
 
 def _home(robot: RobotSpec, placement: Placement) -> np.ndarray | None:
-    """[n] arm joints near home, from a placement, that hold the hand where the description's own placement and home hold it."""
-    own, model = ArmModel(robot), ArmModel(replace(robot, base_pos=placement.pos, base_quat=placement.quat))
+    """[n] arm joints near home, from a placement, that hold the hand where the robot's own placement and home hold it; or None."""
+    own = ArmModel(robot)
     home = torch.as_tensor(robot.home)[None, None]
     root = own.kinematics.link_poses(home, [robot.hand_root])[..., 0, :, :]
-    hand = home[..., torch.as_tensor(own.hand.joint_indices)]
+    zero = torch.zeros(1, 1, dtype=root.dtype)
     target = ArmTargets(
         root_pos=root[..., :3, 3],
         root_quat=matrix_to_quat(root[..., :3, :3]),
-        hand_joints=hand,
+        hand_joints=home[..., torch.as_tensor(own.hand.joint_indices)],
         annotated=torch.ones(1, 1, dtype=torch.bool),
-        hand_error=torch.zeros(1, 1, dtype=root.dtype),
-        hand_clearance=torch.zeros(1, 1, dtype=root.dtype),
+        hand_error=zero,
+        hand_clearance=zero,
     )
-    joints, measures = track(model, target, Thresholds())
-    return joints[0, 0].numpy() if int(classify(measures, Thresholds())) == 0 else None
+    joints, measures = track(ArmModel(_placed(robot, placement)), target, Thresholds())
+    if int(classify(measures, Thresholds())) != 0:
+        return None
+    return joints[0, 0].numpy()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -84,51 +85,54 @@ class Search:
     """Result of :func:`xreset.robot_tools.place.place`."""
 
     best: Finalist
-    """The one that follows most."""
+    """The finalist that follows most. If possible, the arm can hold the hand from there where the description's home holds it."""
     own: Finalist
     """The description's own placement."""
     home: np.ndarray | None
-    """[n] arm joints that hold the hand, from the best placement, where the description's home holds it; None: it is out of reach there."""
+    """[n] arm joints that hold the hand, from the best placement, where the description's home holds it; None: they cannot."""
     frames: int
     """Annotated frames of the motions."""
 
 
 def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) -> None:
-    """Put the placement found, its home configuration and its figure into a ``robot.toml``, and leave every other line as it is.
+    """Put the placement found, its home configuration and its figures into a ``robot.toml``; all other lines stay as they are.
 
     Raises:
         RobotError: the file does not have the lines that would change, or there is no home to put there.
     """
     if search.home is None:
         raise RobotError(
-            f"robot {robot.name!r}: from the best placement the arm cannot hold the hand where home holds it; choose a home by hand."
+            f"robot {robot.name!r}: from none of the best placements can the arm hold the hand where home holds it. "
+            f"Change the home of the arm's joints in {path}, look at it (xreset robots check --picture), and search again."
         )
-    text = path.read_text()
-    text = re.sub(r"^placement *=.*\n", "", text, flags=re.MULTILINE)
-    quoted = command.replace("\\", "\\\\").replace('"', '\\"')
-    figures = (
-        f"reached = {search.best.reach.reached:.3f}, followed = {search.best.followed:.3f}, frames = {search.frames}"
-    )
-    edits = [(r"^(quat *=.*)$", rf'\g<1>\nplacement = {{ {figures}, command = "{_literal(quoted)}" }}')]
-    if search.best.placement != search.own.placement:  # else not a digit may change: it would be another robot
-        pos, quat = (
-            ", ".join(f"{v:.8g}" for v in values) for values in (search.best.placement.pos, search.best.placement.quat)
-        )
-        edits = [(r"^pos *=.*$", f"pos = [{pos}]"), (r"^quat *=.*$", f"quat = [{quat}]"), *edits]
-        for name, value in zip((robot.joint_names[i] for i in robot.arm_indices), search.home, strict=True):
-            edits.append((rf'(name *= *"{re.escape(name)}".*?\bhome *= *)[-+.\deE]+', rf"\g<1>{value:.3f}"))
+    text = re.sub(r"^placement *=.*\n", "", path.read_text(), flags=re.MULTILINE)
+    best = search.best
+    figures = f"reached = {best.reach.reached:.3f}, followed = {best.followed:.3f}, frames = {search.frames}"
+    command = json.dumps(command, ensure_ascii=False)
+    edits = [(r"^quat *=.*()$", f"\nplacement = {{ {figures}, command = {command} }}")]
+    if best.placement != search.own.placement:  # else not a digit may change: it would be another robot
+        edits.append((r"^pos *= *(.*)$", _listed(best.placement.pos)))
+        edits.append((r"^quat *= *(.*)$", _listed(best.placement.quat)))
+        for index, value in zip(robot.arm_indices, search.home, strict=True):
+            name = re.escape(robot.joint_names[index])
+            edits.append((rf'name *= *"{name}".*?\bhome *= *([-+.\deE]+)', f"{value:.3f}"))
     write_whole(path, edited(text, path, edits))
 
 
+def _listed(values: Sequence[float]) -> str:
+    return f"[{', '.join(f'{value:.8g}' for value in values)}]"
+
+
 def edited(text: str, path: Path, edits: Sequence[tuple[str, str]]) -> str:
-    """The text of a ``robot.toml`` with the first match of every pattern replaced; ``RobotError`` names one that nothing matches."""
+    """Return the text of a ``robot.toml`` with the first match of each pattern, or of the group in it, replaced.
+
+    Raises:
+        RobotError: names a pattern that matches nothing.
+    """
     for pattern, new in edits:
-        text, count = re.subn(pattern, new, text, count=1, flags=re.MULTILINE)
-        if not count:
+        match = re.search(pattern, text, flags=re.MULTILINE)
+        if match is None:
             raise RobotError(f"{path} has no line like {pattern!r} to change; edit it by hand: {new}")
+        start, end = match.span(match.re.groups)
+        text = text[:start] + new + text[end:]
     return text
-
-
-def _literal(text: str) -> str:
-    """The text as a replacement of ``re.sub``, which would take a backslash for the beginning of a group."""
-    return text.replace("\\", "\\\\")

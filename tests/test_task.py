@@ -769,7 +769,7 @@ class PolicyTest(WithRobot):
     def test_files_that_are_no_policies(self):
         with tempfile.TemporaryDirectory() as name:
             path = Path(name) / "policy.onnx"
-            with self.assertRaisesRegex(PolicyError, "there is no policy file"):
+            with self.assertRaisesRegex(PolicyError, "here is no policy file"):
                 OnnxPolicy(path)
             path.write_bytes(b"hello")
             with self.assertRaisesRegex(PolicyError, "cannot be read as an ONNX policy"):

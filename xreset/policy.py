@@ -1,13 +1,13 @@
-"""Policies as evaluation sees them: something that turns observations into actions, world by world.
+"""Policies for evaluation: objects that turn observations into actions, world by world.
 
-A trained policy is an ONNX file that carries its own contract: robot, joint order, observation layout, action mapping and control rate.
-Running one needs neither warp nor rsl-rl.
+A trained policy is an ONNX file that carries its own contract: robot, joint order, observation layout, action mapping
+and control rate. Running one needs neither warp nor rsl-rl.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -19,7 +19,7 @@ from xreset.checks import from_dict
 from xreset.errors import PolicyError, needs
 from xreset.files import max_bytes, parse_json
 from xreset.spec import RobotSpec
-from xreset.task.config import NoiseConfig, TaskConfig
+from xreset.task.config import TaskConfig
 from xreset.task.observations import layout
 from xreset.text import shown
 
@@ -32,18 +32,19 @@ SCHEMA = "xreset-policy/1"
 METADATA_KEY = "xreset"
 """Key of the ONNX metadata entry that holds the contract as JSON."""
 INPUTS = ("flat", "cloud", "h_in", "c_in")
-"""Of the ONNX graph: the observation's groups ``policy`` and ``proprio`` side by side, its point clouds, and the LSTM's state."""
+"""Inputs of the ONNX graph: the observation's groups ``policy`` and ``proprio`` in one, the point clouds, the LSTM's
+state."""
 OUTPUTS = ("actions", "h_out", "c_out")
-"""Of the ONNX graph: actions, and the LSTM's next state."""
+"""Outputs of the ONNX graph: actions, and the LSTM's next state."""
 
 
 class Policy(Protocol):
-    """What evaluation asks of a policy."""
+    """Interface of a policy."""
 
     name: str
 
     def begin(self, env: ManipulationEnv) -> None:
-        """Called when episodes have just begun in every world of the environment."""
+        """Prepare for new episodes in every world of the environment."""
         ...
 
     def act(self, observations: TensorDict) -> Tensor:
@@ -52,7 +53,7 @@ class Policy(Protocol):
 
 
 def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]) -> dict[str, Any]:
-    """Everything that must agree between training and evaluation, as JSON."""
+    """Return everything that must agree between training and evaluation, as JSON."""
     return {
         "schema": SCHEMA,
         "robot": robot.name,
@@ -72,48 +73,30 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
     Raises:
         PolicyError: names the first thing that differs.
     """
-    here = policy_contract(robot, task, ())
     check_contract_entries(source, contract)
+    here = policy_contract(robot, task, ())
     if contract["robot_fingerprint"] == robot.like:
         here |= {key: contract[key] for key in ("robot", "robot_fingerprint")}
     for key, what in (("robot", "robot"), ("joint_names", "joint order"), ("fingertip_names", "fingertips")):
         if contract[key] != here[key]:
             raise PolicyError(
-                f"{source} was trained with another {what}: {contract[key]}, here it is {here[key]}. Use --robot {contract['robot']}."
+                f"{source} was trained with another {what}: {contract[key]}, here it is {here[key]}. "
+                f"Use --robot {contract['robot']}."
             )
-    fingerprint = contract["robot_fingerprint"]
-    if fingerprint != robot.like and not robot.has_fingerprint(fingerprint):
+    if contract["robot_fingerprint"] != here["robot_fingerprint"]:
         raise PolicyError(
-            f"{source} was trained on another version of {robot.name!r}: its URDF or description has changed. Train again."
-        )
-    if contract["observation_layout"] != here["observation_layout"]:
-        differing = [
-            f"{group}.{term}: {theirs.get(term)} in the policy, {ours.get(term)} here"
-            for group in here["observation_layout"]
-            for theirs, ours in [(contract["observation_layout"].get(group, {}), here["observation_layout"][group])]
-            for term in dict.fromkeys([*theirs, *ours])
-            if theirs.get(term) != ours.get(term)
-        ]
-        raise PolicyError(
-            f"{source} was trained with another observation layout ({'; '.join(differing)}). Use the run's own configuration."
+            f"{source} was trained on another version of {robot.name!r}: its URDF or description has changed. "
+            "Train again."
         )
     trained = from_dict(TaskConfig, contract["task"], f"{source}: task")
-    quiet = NoiseConfig()
-    meanings = (
-        ("another action mapping", trained.action, task.action),
-        (
-            "other scales of observations",
-            replace(trained.observation, noise=quiet),
-            replace(task.observation, noise=quiet),
-        ),
-    )
-    for what, of_policy, of_task in meanings:
-        differing = [
-            f"{f.name}: {getattr(of_policy, f.name)!r} in the policy, {getattr(of_task, f.name)!r} here"
-            for f in fields(of_policy)
-            if getattr(of_policy, f.name) != getattr(of_task, f.name)
-        ]
-        if differing:
+    for what, of_policy, of_task in (
+        ("another observation layout", _widths(contract), _widths(here)),
+        ("another action mapping", asdict(trained.action), asdict(task.action)),
+        ("other scales of observations", _scales(trained), _scales(task)),
+    ):
+        names = [name for name in of_policy | of_task if of_policy.get(name) != of_task.get(name)]
+        if names:
+            differing = [f"{n}: {of_policy.get(n)!r} in the policy, {of_task.get(n)!r} here" for n in names]
             raise PolicyError(
                 f"{source} was trained with {what} ({'; '.join(differing)}). Use the run's own configuration."
             )
@@ -123,10 +106,29 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
         )
 
 
+def _widths(contract: dict[str, Any]) -> dict[str, int]:
+    """Return the width of every term of a contract's observations, keyed by group and term."""
+    widths = {}
+    for group, terms in contract["observation_layout"].items():
+        widths |= {f"{group}.{term}": width for term, width in terms.items()}
+    return widths
+
+
+def _scales(task: TaskConfig) -> dict[str, Any]:
+    """Return what gives observations their meaning: all of their configuration except the noise."""
+    return {name: value for name, value in asdict(task.observation).items() if name != "noise"}
+
+
 _ENTRIES: dict[str, type | tuple[type, ...]] = {
-    "robot": str, "robot_fingerprint": str, "joint_names": list, "fingertip_names": list, "objects": list, "observation_layout": dict,
-    "control_dt": (int, float), "task": dict,
-}  # fmt: skip
+    "robot": str,
+    "robot_fingerprint": str,
+    "joint_names": list,
+    "fingertip_names": list,
+    "objects": list,
+    "observation_layout": dict,
+    "control_dt": (int, float),
+    "task": dict,
+}
 
 
 def check_contract_entries(source: str, contract: dict[str, Any]) -> None:
@@ -135,11 +137,16 @@ def check_contract_entries(source: str, contract: dict[str, Any]) -> None:
         raise PolicyError(
             f"{source} has policy schema {contract.get('schema')!r}, expected {SCHEMA!r}. Export it again."
         )
-    wrong = [name for name, kind in _ENTRIES.items() if not isinstance(contract.get(name), kind)]
-    texts = ("joint_names", "fingertip_names", "objects")
-    wrong += [name for name in texts if name not in wrong and not all(isinstance(text, str) for text in contract[name])]
-    if "observation_layout" not in wrong and not _is_layout(contract["observation_layout"]):
-        wrong.append("observation_layout")
+    wrong = []
+    for name, kind in _ENTRIES.items():
+        value = contract.get(name)
+        is_right = isinstance(value, kind)
+        if is_right and isinstance(value, list):
+            is_right = all(isinstance(text, str) for text in value)
+        if is_right and name == "observation_layout":
+            is_right = _is_layout(contract[name])
+        if not is_right:
+            wrong.append(name)
     if wrong:
         raise PolicyError(
             f"{source} states a contract in which {', '.join(wrong)} is missing or of another type. Export it again."
@@ -147,8 +154,11 @@ def check_contract_entries(source: str, contract: dict[str, Any]) -> None:
 
 
 def _is_layout(layout: dict[str, Any]) -> bool:
-    widths = [width for terms in layout.values() for width in (terms.values() if isinstance(terms, dict) else [None])]
-    return {"policy", "proprio"} <= set(layout) and all(type(width) is int and 0 < width < 1 << 20 for width in widths)
+    """Return whether a value maps groups to the widths of their terms."""
+    if not {"policy", "proprio"} <= set(layout) or not all(isinstance(terms, dict) for terms in layout.values()):
+        return False
+    widths = _widths({"observation_layout": layout}).values()
+    return all(type(width) is int and 0 < width < 1 << 20 for width in widths)
 
 
 def _read_contract(path: Path, metadata: dict[str, str]) -> dict[str, Any]:
@@ -177,17 +187,20 @@ class OnnxPolicy:
         """
         path = Path(path)
         if not path.is_file():
-            raise PolicyError(f"there is no policy file {path}.")
+            raise PolicyError(f"There is no policy file {path}.")
+        if path.stat().st_size > max_bytes():
+            raise PolicyError(f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
         with needs("onnxruntime", "eval", PolicyError):
             import onnxruntime
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3
-        if path.stat().st_size > max_bytes():
-            raise PolicyError(f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
         try:
             self._session = onnxruntime.InferenceSession(
-                path.read_bytes(), options, providers=["CPUExecutionProvider"], enable_fallback=0
-            )  # to nothing else, which it would announce
+                path.read_bytes(),
+                options,
+                providers=["CPUExecutionProvider"],
+                enable_fallback=0,  # no other provider, which onnxruntime would announce
+            )
             metadata = self._session.get_modelmeta().custom_metadata_map
         except Exception as error:
             raise PolicyError(
@@ -199,48 +212,46 @@ class OnnxPolicy:
             raise PolicyError(
                 f"{path} takes the inputs {shown(inputs)}; a policy takes {', '.join(INPUTS)}. Export it again."
             )
-        self._lstm_dim = self._try(path)
+        self._lstm_dim = self._read_lstm_dim(path)
+        self._try_step(path)
         self.name = path.stem if path.stem != "policy" else path.resolve().parent.name
         self._state: list[np.ndarray] | None = None
 
-    def _try(self, path: Path) -> int:
-        """One step with zeros, so that what cannot act is refused before work begins; returns the units of the LSTM."""
+    def _read_lstm_dim(self, path: Path) -> int:
+        """Return the units of the LSTM."""
         shape = self._session.get_inputs()[2].shape
         width = shape[2] if len(shape) == 3 else None
         if not isinstance(width, int) or not 0 < width <= _MAX_LSTM:
             raise PolicyError(
-                f"{path} has an LSTM state of shape {shown(shape)}, expected (1, worlds, 1 to {_MAX_LSTM}). Export it again."
+                f"{path} has an LSTM state of shape {shown(shape)}, expected (1, worlds, 1 to {_MAX_LSTM}). "
+                "Export it again."
             )
-        task = from_dict(TaskConfig, self.contract["task"], f"{path}: task").observation
-        layout_, worlds = self.contract["observation_layout"], 2
-        shapes = {
-            "flat": (worlds, sum(sum(layout_[group].values()) for group in ("policy", "proprio"))),
-            "cloud": (worlds, *task.cloud_shape),
-            "h_in": (1, worlds, width),
-            "c_in": (1, worlds, width),
-        }
+        return width
+
+    def _try_step(self, path: Path) -> None:
+        """Take one step with zeros, so that a policy that cannot act is refused before work begins."""
+        task = from_dict(TaskConfig, self.contract["task"], f"{path}: task")
+        layout = self.contract["observation_layout"]
+        worlds = 2
+        flat = sum(layout["policy"].values()) + sum(layout["proprio"].values())
+        state = (1, worlds, self._lstm_dim)
+        shapes = ((worlds, flat), (worlds, *task.observation.cloud_shape), state, state)
+        feed = {name: np.zeros(shape, np.float32) for name, shape in zip(INPUTS, shapes, strict=True)}
         try:
-            found: Any = self._session.run(
-                None, {name: np.zeros(shape, dtype=np.float32) for name, shape in shapes.items()}
-            )
+            outputs: Any = self._session.run(None, feed)
         except Exception as error:
             raise PolicyError(f"{path} cannot act: {shown(str(error))}. Export it again.") from error
-        expected = [(worlds, len(self.contract["joint_names"])), shapes["h_in"], shapes["c_in"]]
-        if [getattr(value, "shape", None) for value in found] != expected or any(
-            value.dtype != np.float32 for value in found
-        ):
-            described = ", ".join(
-                f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
-                for value in found
-            )
+        expected = [(worlds, len(self.contract["joint_names"])), state, state]
+        found = [f"{getattr(x, 'dtype', type(x).__name__)} {getattr(x, 'shape', '')}" for x in outputs]
+        if found != [f"float32 {shape}" for shape in expected]:
             raise PolicyError(
-                f"{path} gives {described} for {worlds} worlds, expected float32 {', '.join(map(str, expected))}. Export it again."
+                f"{path} gives {', '.join(found)} for {worlds} worlds, expected float32 "
+                f"{', '.join(map(str, expected))}. Export it again."
             )
-        if not all(np.isfinite(value).all() for value in found):
+        if not all(np.isfinite(value).all() for value in outputs):
             raise PolicyError(
                 f"{path} gives numbers that are not finite: its training broke down, or the file is damaged."
             )
-        return width
 
     def begin(self, env: ManipulationEnv) -> None:
         """Zero the recurrent state."""
@@ -249,16 +260,11 @@ class OnnxPolicy:
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] mean action, on the observations' device."""
         flat = torch.cat((observations["policy"], observations["proprio"]), dim=-1)
-        n = flat.shape[0]
-        if self._state is None or self._state[0].shape[1] != n:
-            self._state = [np.zeros((1, n, self._lstm_dim), dtype=np.float32) for _ in range(2)]
-        feed = {
-            "flat": flat.cpu().numpy(),
-            "cloud": observations["perception"].cpu().numpy(),
-            "h_in": self._state[0],
-            "c_in": self._state[1],
-        }
-        actions, h, c = self._session.run(None, feed)
+        shape = (1, len(flat), self._lstm_dim)
+        if self._state is None or self._state[0].shape != shape:
+            self._state = [np.zeros(shape, dtype=np.float32) for _ in range(2)]
+        values = (flat.cpu().numpy(), observations["perception"].cpu().numpy(), *self._state)
+        actions, h, c = self._session.run(None, dict(zip(INPUTS, values, strict=True)))
         self._state = [np.array(h), np.array(c)]
         return torch.as_tensor(actions, device=flat.device).clamp(-1.0, 1.0)
 
@@ -272,7 +278,7 @@ class ZeroPolicy:
         self._num_actions = num_actions
 
     def begin(self, env: ManipulationEnv) -> None:
-        """Nothing to forget."""
+        """Do nothing: the policy has no memory."""
 
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] zeros."""
@@ -286,10 +292,11 @@ class RandomPolicy:
     name = "random"
 
     def __init__(self, num_actions: int, seed: int) -> None:
-        self._num_actions, self._generator = num_actions, torch.Generator().manual_seed(seed)
+        self._num_actions = num_actions
+        self._generator = torch.Generator().manual_seed(seed)
 
     def begin(self, env: ManipulationEnv) -> None:
-        """Nothing to forget."""
+        """Do nothing: the policy has no memory."""
 
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] uniform."""

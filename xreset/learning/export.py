@@ -30,14 +30,16 @@ _CHECKPOINT_KEY = "xreset-checkpoint"
 """Key of the ONNX metadata entry that holds the SHA-256 of the checkpoint."""
 
 
-def export_onnx(actor: PointNetLstmModel, path: str | Path, contract: dict[str, Any], *, checkpoint: Path) -> None:
+def export_onnx(
+    actor: PointNetLstmModel, path: str | Path, contract: dict[str, Any], *, checkpoint: Path | None = None
+) -> None:
     """Write the deterministic policy as one ONNX file.
 
     Args:
         actor: trained actor.
         path: file to write.
         contract: what the policy needs to run: see :func:`xreset.policy.policy_contract`.
-        checkpoint: file with the actor's weights, of which the policy states the hash.
+        checkpoint: file with the actor's weights, of which the policy states the hash; None: there is none.
     """
     import onnx
 
@@ -61,13 +63,10 @@ def export_onnx(actor: PointNetLstmModel, path: str | Path, contract: dict[str, 
         )
         model = onnx.load(str(file))
     drop_exporter_notes(model)
-    for key, value in (
-        (METADATA_KEY, json.dumps(contract, sort_keys=True)),
-        (_CHECKPOINT_KEY, file_hash(checkpoint)),
-    ):
-        entry = model.metadata_props.add()
-        entry.key = key
-        entry.value = value
+    entries = {METADATA_KEY: json.dumps(contract, sort_keys=True)}
+    if checkpoint is not None:
+        entries[_CHECKPOINT_KEY] = file_hash(checkpoint)
+    onnx.helper.set_model_props(model, entries)
     with atomic_write(path) as out:
         out.write(model.SerializeToString())
 

@@ -11,7 +11,6 @@ from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.report.clips import encode_mp4
 from xreset.files import write_whole
-from xreset.pictures.render import Renderer, pose_matrix
 
 
 def film(
@@ -44,21 +43,9 @@ def film(
     env.reset()
     player = policy.begin(env)
     every = max(1, round(1.0 / (fps * env.backend.scene.control_dt)))
-    renderer = Renderer(env.backend.scene, size=size)
-    frames = [_draw(renderer, env, world)]
+    frames = [env.render(world, size)]
     for step in range(1, env.max_episode_length + 1):
         env.advance(player.act(env.get_observations()))
         if step % every == 0:
-            frames.append(_draw(renderer, env, world))
+            frames.append(env.render(world, size))
     write_whole(Path(path), encode_mp4(np.stack(frames), 1.0 / (every * env.backend.scene.control_dt)))
-
-
-def _draw(renderer: Renderer, env: ManipulationEnv, world: int) -> np.ndarray:
-    """Return a picture of one world, [H, W, 3] uint8."""
-    state = env.backend.state()
-    return renderer.draw(
-        state.joint_pos[world].cpu().numpy(),
-        pose_matrix(state.object_pos[world].cpu().numpy(), state.object_quat[world].cpu().numpy()),
-        goal_pose=pose_matrix(env.goal_pos[world].cpu().numpy(), env.goal_quat[world].cpu().numpy()),
-        object_index=int(env.backend.object_index[world]),
-    )

@@ -19,6 +19,8 @@ def main(bank: Path, engine: str = "mujoco", steps: int = 60) -> None:
             action = 2 * torch.rand(env.num_envs, env.num_actions) - 1
             _observations, reward, _done, _extras = env.step(action)
             total += reward
+        picture = env.render(world=0)  # [480, 640, 3]
+        print(f"a picture of the first world: {picture.shape}, mean brightness {picture.mean():.0f}")
         state = env.backend.state()  # everything in SI units; quaternions are (w, x, y, z)
         print(f"heights of the objects [m]: {[round(z, 3) for z in state.object_pos[:, 2].tolist()]}")
     print(f"return after {steps} steps of {env.backend.scene.control_dt * 1e3:.1f} ms: {total.mean():.3f}")

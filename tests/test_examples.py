@@ -116,7 +116,19 @@ class FromABankTest(unittest.TestCase):
         self.assertGreater((self.folder / "demos.png").stat().st_size, 1000)
 
     def test_an_environment_is_stepped(self):
-        self.assertIn("return after 60 steps", run("03_step_an_environment", self.bank))
+        said = run("03_step_an_environment", self.bank)
+        self.assertIn("return after 60 steps", said)
+        self.assertRegex(said, r"picture of the first world: \(480, 640, 3\), mean brightness [1-9]")
+
+    def test_pictures_show_the_world_that_was_asked_for(self):
+        bank = xreset.read_bank(self.bank)
+        objects = [xreset.load_object(name) for name in bank.object_names]
+        with xreset.make_env(xreset.load_robot("openarm"), objects, bank, num_envs=2) as env:
+            first = env.render(0, (64, 48))
+            self.assertEqual(first.shape, (48, 64, 3))
+            self.assertTrue((first == env.render(0, (64, 48))).all())
+            env.goal_pos[1] += 0.1
+            self.assertTrue((first != env.render(1, (64, 48))).any())
 
     def test_a_reward_term_pays(self):
         self.assertRegex(run("04_own_reward", self.bank), r"upright pays 0\.[0-4]\d*[1-9]\d* per step")

@@ -33,6 +33,8 @@ from xreset.task.variation import Variation
 if TYPE_CHECKING:
     from tensordict import TensorDict
 
+    from xreset.pictures.render import Renderer
+
 
 _LASTING = (
     "goal_pos", "goal_quat", "gravity_fraction", "sequence", "bank_state", "_episode_length", "_target", "_previous_action", "_best_reach",
@@ -88,11 +90,13 @@ class ManipulationEnv:
         num_envs: N.
         num_actions: J.
         max_episode_length: control steps until the time limit.
-        goal_pos, goal_quat: [N, 3], [N, 4] goal of each world.
+        goal_pos: [N, 3] goal position of each world, world frame [m].
+        goal_quat: [N, 4] goal orientation of each world.
         sequence: [N] demonstration of each world.
         bank_state: [N] bank state that each world's episode began with, -1 for home.
-        gravity_fraction: [N]
-        nonfinite_count, overflow_count: [] times that a world was ended because a number was not finite; because it dropped contacts.
+        gravity_fraction: [N] share of the object's weight that acts.
+        nonfinite_count: [] number of episodes that ended because a number was not finite.
+        overflow_count: [] number of episodes that ended because the engine dropped contacts.
         faults: the last of those worlds, before and after the step in which they broke.
         variation: what else differs between one world and the next.
     """
@@ -130,6 +134,7 @@ class ManipulationEnv:
             for limit, sign in ((self.actions.lower, -1.0), (self.actions.upper, 1.0))
         )
 
+        self._renderer: Renderer | None = None
         self._allocate()
         self.reset()
 
@@ -260,6 +265,27 @@ class ManipulationEnv:
     def reading(self) -> Reading:
         """The present physical state and what follows from it."""
         return Reading.of(self.backend, self._surface_points, self._bad_action)
+
+    def render(self, world: int = 0, size: tuple[int, int] = (640, 480)) -> np.ndarray:
+        """Return a picture of one world, [H, W, 3] uint8, with the goal as a translucent object.
+
+        Args:
+            world: index of the world.
+            size: width and height in pixels.
+        """
+        from xreset.pictures.render import Renderer, pose_matrix  # trimesh, which training does not need
+
+        if self._renderer is None or self._renderer.size != size:
+            self._renderer = Renderer(self.backend.scene, size=size)
+        state = self.backend.state()
+        values = (state.joint_pos, state.object_pos, state.object_quat, self.goal_pos, self.goal_quat)
+        joints, pos, quat, goal_pos, goal_quat = (value[world].cpu().numpy() for value in values)
+        return self._renderer.draw(
+            joints,
+            pose_matrix(pos, quat),
+            goal_pose=pose_matrix(goal_pos, goal_quat),
+            object_index=int(self.backend.object_index[world]),
+        )
 
     @property
     def joint_target(self) -> Tensor:

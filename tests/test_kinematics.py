@@ -8,6 +8,7 @@ import numpy as np
 import torch
 import trimesh
 
+from tests.toy_retarget import FLOAT, slope
 from tests.toy_robot import toy_hand_arm, write_urdf
 from xreset import robots
 from xreset.backends.conformance.scene import gripper
@@ -15,7 +16,9 @@ from xreset.errors import RobotError
 from xreset.geometry.dynamics import drive_shares, mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import load_urdf
-from xreset.spec import DriveSpec, JointSpec
+from xreset.spec import DriveSpec, JointSpec, MimicSpec
+
+assert_close = torch.testing.assert_close
 
 FIXED = '<joint name="{name}" type="fixed"><parent link="base"/><child link="{child}"/><!----></joint>'
 
@@ -61,11 +64,15 @@ class UrdfTest(unittest.TestCase):
         self.assertAlmostEqual(np.ptp(vertices[:, 0]), 0.3)
 
     def test_shapes_and_defaults(self):
-        shapes = '<box size="2 4 6"/>', '<sphere radius="1"/>', '<cylinder radius="1" length="4"/>'
-        collisions = "".join(
-            f'<collision><origin xyz="1 2 3" rpy="0 0 {np.pi / 2}"/><geometry>{shape}</geometry></collision>'
-            for shape in (*shapes, '<capsule radius="1" length="4"/>')
-        )
+        origin = f'<origin xyz="1 2 3" rpy="0 0 {np.pi / 2}"/>'
+        collisions = ""
+        for shape in (
+            'box size="2 4 6"',
+            'sphere radius="1"',
+            'cylinder radius="1" length="4"',
+            'capsule radius="1" length="4"',
+        ):
+            collisions += f"<collision>{origin}<geometry><{shape}/></geometry></collision>"
         joint = FIXED.format(name="j", child="end").replace("fixed", "continuous")
         tree = load_urdf(self.urdf(f'<link name="end">{collisions}</link>', joint))
         found = [(shape.geometry.kind, shape.geometry.size) for shape in tree.link("end").collisions]
@@ -106,103 +113,93 @@ class KinematicsTest(unittest.TestCase):
         cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         cls.robot = toy_hand_arm(cls.folder)
         cls.kinematics = Kinematics(cls.robot)
+        cls.q = cls.drawn(cls.kinematics, 3, 5)
+
+    @staticmethod
+    def drawn(kinematics: Kinematics, *shape: int) -> torch.Tensor:
+        """[*shape, J] joint positions within the limits."""
+        low = kinematics.lower
         generator = torch.Generator().manual_seed(0)
-        low, high = cls.kinematics.lower, cls.kinematics.upper
-        cls.q = low + (high - low) * torch.rand(3, 5, len(low), dtype=torch.float64, generator=generator)
+        return low + (kinematics.upper - low) * torch.rand(*shape, len(low), dtype=FLOAT, generator=generator)
 
     def test_link_poses_agree_with_mujoco(self):
         import mujoco
 
-        model = mujoco.MjModel.from_xml_path(str(self.robot.urdf))
-        data = mujoco.MjData(model)
-        kinematics = self.kinematics
-        identity = torch.eye(4, dtype=torch.float64)
-        poses = kinematics.link_poses(self.q, base=identity)
-        mimics = {mimic.joint: mimic for mimic in self.robot.mimics}
-        for index in np.ndindex(3, 5):
+        for robot, count, atol in (
+            (self.robot, 15, 1e-9),
+            (robots.load("ur7e-sharpa"), 1000, 1e-6),
+            (robots.load("openarm"), 1000, 1e-6),
+        ):
+            kinematics = Kinematics(robot)
+            description = mujoco.MjSpec.from_file(str(robot.urdf))
+            description.compiler.fusestatic = False
+            model = description.compile()
+            data = mujoco.MjData(model)
+            q = self.drawn(kinematics, count)
+            poses = kinematics.link_poses(q, base=torch.eye(4, dtype=FLOAT)).numpy()
+            values = np.zeros((count, model.nq))
+            mimics = {mimic.joint: mimic for mimic in robot.mimics}
             for j in range(model.njnt):
                 name = model.joint(j).name
-                mimic = mimics.get(name)
-                value = self.q[index][kinematics.joint_names.index(mimic.source if mimic else name)].item()
-                data.qpos[model.jnt_qposadr[j]] = mimic.multiplier * value + mimic.offset if mimic else value
-            mujoco.mj_kinematics(model, data)
-            for i, name in enumerate(kinematics.link_names):
-                if name == kinematics.root:
-                    continue
-                body = model.body(name).id
-                np.testing.assert_allclose(poses[index][i, :3, 3], data.xpos[body], atol=1e-9)
-                np.testing.assert_allclose(poses[index][i, :3, :3], data.xmat[body].reshape(3, 3), atol=1e-9)
+                mimic = mimics.get(name, MimicSpec(joint=name, source=name, multiplier=1.0, offset=0.0))
+                source = q[:, robot.joint_names.index(mimic.source)].numpy()
+                values[:, model.jnt_qposadr[j]] = mimic.multiplier * source + mimic.offset
+            links = [i for i, link in enumerate(kinematics.link_names) if link != kinematics.root]
+            bodies = [model.body(kinematics.link_names[i]).id for i in links]
+            with self.subTest(robot=robot.name):
+                for pose, qpos in zip(poses[:, links], values, strict=True):
+                    data.qpos[:] = qpos
+                    mujoco.mj_kinematics(model, data)
+                    np.testing.assert_allclose(pose[:, :3, 3], data.xpos[bodies], atol=atol)
+                    np.testing.assert_allclose(pose[:, :3, :3].reshape(-1, 9), data.xmat[bodies], atol=atol)
 
     def test_jacobian_is_the_derivative(self):
         links = ["tip_a", "finger_a2", "palm", "tip_b"]
-        offsets = torch.tensor([[0.01, 0.02, -0.03], [0, 0, 0], [0.1, 0, 0], [0, 0.01, 0]], dtype=torch.float64)
+        offsets = torch.tensor([[0.01, 0.02, -0.03], [0, 0, 0], [0.1, 0, 0], [0, 0.01, 0]], dtype=FLOAT)
         jacobian = self.kinematics.jacobian(self.q, links, offsets)
-        torch.testing.assert_close(jacobian.pos, self.kinematics.points(self.q, links, offsets))
-        step = 1e-6
+        assert_close(jacobian.pos, self.kinematics.points(self.q, links, offsets))
         for j in range(self.q.shape[-1]):
-            shift = torch.zeros(self.q.shape[-1], dtype=torch.float64)
-            shift[j] = step
-            ahead, behind = (
-                self.kinematics.link_poses(self.q + shift, links),
-                self.kinematics.link_poses(self.q - shift, links),
-            )
-            points = [T[..., :3, 3] + (T[..., :3, :3] @ offsets[..., None])[..., 0] for T in (ahead, behind)]
-            torch.testing.assert_close(jacobian.linear[..., j], (points[0] - points[1]) / (2 * step), atol=1e-8, rtol=0)
-            spin = (
-                (ahead - behind)[..., :3, :3] / (2 * step) @ jacobian.rot.mT
-            )  # the cross-product matrix of the angular velocity
+            T = slope(lambda q: self.kinematics.link_poses(q, links), self.q, (..., j))
+            points = T[..., :3, 3] + (T[..., :3, :3] @ offsets[..., None])[..., 0]
+            assert_close(jacobian.linear[..., j], points, atol=1e-8, rtol=0)
+            spin = T[..., :3, :3] @ jacobian.rot.mT  # the cross-product matrix of the angular velocity
             omega = torch.stack((spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]), dim=-1)
-            torch.testing.assert_close(jacobian.angular[..., j], omega, atol=1e-8, rtol=0)
+            assert_close(jacobian.angular[..., j], omega, atol=1e-8, rtol=0)
 
     def test_base_places_the_robot_in_the_world(self):
-        kinematics = self.kinematics
-        root = kinematics.link_poses(self.q, [kinematics.root])[0, 0, 0]
+        poses = self.kinematics.link_poses(self.q)
+        root = poses[0, 0, self.kinematics.link_index(self.kinematics.root)]
         np.testing.assert_allclose(root[:3, 3], self.robot.base_pos)
-        moved = torch.eye(4, dtype=torch.float64)
-        moved[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
-        torch.testing.assert_close(
-            kinematics.link_poses(self.q, base=moved @ kinematics.base),
-            moved @ kinematics.link_poses(self.q),
-            atol=1e-12,
-            rtol=0,
-        )
+        shift = torch.eye(4, dtype=FLOAT)
+        shift[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+        moved = self.kinematics.link_poses(self.q, base=shift @ self.kinematics.base)
+        assert_close(moved, shift @ poses, atol=1e-12, rtol=0)
 
     def test_a_subtree_moves_as_in_the_whole(self):
         hand = Kinematics(self.robot, root="palm")
         self.assertEqual(hand.joint_names, tuple(self.robot.joint_names[i] for i in self.robot.hand_indices))
         whole = self.kinematics.link_poses(self.q, hand.link_names)
         palm = self.kinematics.link_poses(self.q, ["palm"])[..., 0, :, :]
-        torch.testing.assert_close(
-            hand.link_poses(self.q[..., hand.joint_indices], base=palm), whole, atol=1e-12, rtol=0
-        )
+        assert_close(hand.link_poses(self.q[..., hand.joint_indices], base=palm), whole, atol=1e-12, rtol=0)
 
     def test_joint_order_is_the_descriptions(self):
         self.assertEqual(self.kinematics.joint_names, self.robot.joint_names)
-        self.assertNotEqual(
-            self.robot.joint_names,
-            tuple(j.name for j in self.kinematics.tree.joints if j.name in self.robot.joint_names),
-        )
+        in_urdf = [j.name for j in self.kinematics.tree.joints if j.name in self.robot.joint_names]
+        self.assertNotEqual(list(self.robot.joint_names), in_urdf)
 
     def test_limits_take_the_mimic_joint_into_account(self):
-        column = self.robot.joint_names.index("jaw_a")
-        self.assertAlmostEqual(
-            self.kinematics.upper[column].item(), 0.025
-        )  # the mimic, at half its travel, is the first to end
+        # The mimic, at half its travel, is the first to end.
+        self.assertAlmostEqual(self.kinematics.upper[self.robot.joint_names.index("jaw_a")].item(), 0.025)
 
     def test_errors_name_the_cause(self):
         with self.assertRaisesRegex(RobotError, "no link 'nose' below"):
             self.kinematics.points(self.q, ["nose"])
         with self.assertRaisesRegex(ValueError, "expected"):
             self.kinematics.link_poses(self.q[..., :2])
-
-        passive = dataclasses.replace(self.robot, mimics=())
-        with self.assertRaisesRegex(RobotError, "jaw_b"):
-            Kinematics(passive)
-        misnamed = dataclasses.replace(
-            self.robot, urdf=write_urdf(self.folder / "other.urdf", rename={"arm_2": "arm_two"})
-        )
-        with self.assertRaisesRegex(RobotError, "arm_two"):
-            Kinematics(misnamed)
+        renamed = write_urdf(self.folder / "other.urdf", rename={"arm_2": "arm_two"})
+        for changes, cause in (({"mimics": ()}, "jaw_b"), ({"urdf": renamed}, "arm_two")):
+            with self.assertRaisesRegex(RobotError, cause):
+                Kinematics(dataclasses.replace(self.robot, **changes))
 
 
 if __name__ == "__main__":

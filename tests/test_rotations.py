@@ -15,7 +15,8 @@ class AgainstScipy(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
         rng = np.random.default_rng(0)
-        cls.a, cls.b = Rotation.random(500, rng), Rotation.random(500, rng)
+        cls.a = Rotation.random(500, rng)
+        cls.b = Rotation.random(500, rng)
         cls.points = rng.normal(size=(500, 3))
 
     def assert_near(self, function, expected, *arguments):

@@ -1,0 +1,254 @@
+"""Surfaces, convex shapes, and the distances of a robot from itself and the table."""
+
+import unittest
+from types import SimpleNamespace
+from unittest import mock
+
+import numpy as np
+import torch
+import trimesh
+
+from tests.toy_retarget import FLOAT, UPRIGHT, box_object, slope
+from xreset import robots
+from xreset.geometry.balls import BARE, SPACING, inscribed_balls, shape_balls, sharp_points
+from xreset.geometry.collision import SelfCollision, height_above_table, support_points
+from xreset.geometry.fields import DistanceFields
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import box, half_spaces, hull, shape_mesh
+from xreset.geometry.solids import link_field, signed_distance
+from xreset.geometry.surface import Surface, keypoint_contacts
+from xreset.retarget.collisions import colliding_links
+from xreset.retarget.hand.clearance import Objects, too_near
+from xreset.retarget.hand.model import HandModel
+from xreset.retarget.validity import REASONS
+from xreset.spec import Geometry, Shape, TableSpec
+
+
+def distance_from_box(points: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """[n] signed distance of points [n, 3] from a box around the origin."""
+    beyond = np.abs(points) - half
+    return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+
+
+class SurfaceTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        size = (0.06, 0.08, 0.10)
+        cls.surface = Surface(box_object(((0, 0, 0), size)))
+        cls.points = np.random.default_rng(0).uniform(-0.065, 0.065, (500, 3))
+        cls.exact = distance_from_box(cls.points, np.array(size) / 2)
+
+    def test_signed_distance_of_a_box(self):
+        distance = self.surface.signed_distance(torch.as_tensor(self.points))[0].numpy()
+        near = self.exact < 0.01
+        # The field is off by half a cell where it has an edge.
+        np.testing.assert_allclose(distance[near], self.exact[near], atol=2.1e-3)
+        np.testing.assert_allclose(distance, self.exact, atol=4e-3)
+        self.assertLess(np.abs(distance - self.exact).mean(), 4e-4)
+
+    def test_gradient_is_the_derivative_of_the_interpolation(self):
+        points = torch.as_tensor(self.points)
+        _, gradient = self.surface.signed_distance(points)
+        for axis in range(3):
+            expected = slope(lambda x: self.surface.signed_distance(x)[0], points, (slice(None), axis), 1e-8)
+            close = torch.isclose(expected, gradient[:, axis], atol=1e-5)
+            self.assertGreater(close.double().mean().item(), 0.99)
+
+    def test_nearest_point_is_exact(self):
+        nearest, distance = self.surface.nearest(self.points)
+        np.testing.assert_allclose(distance, np.abs(self.exact), atol=1e-9)
+        np.testing.assert_allclose(np.linalg.norm(nearest - self.points, axis=1), distance, atol=1e-12)
+
+    def test_faces_inside_the_solid_do_not_count(self):
+        two = Surface(box_object(((-0.02, 0, 0), (0.08, 0.06, 0.06)), ((0.02, 0, 0), (0.08, 0.06, 0.06))))
+        distance, _ = two.signed_distance(torch.zeros(1, 3, dtype=FLOAT))
+        # To the outer faces, not to the ends of the boxes at x = +-0.02.
+        self.assertAlmostEqual(distance.item(), -0.03, delta=2.1e-3)
+
+    def test_contacts_need_annotation_and_nearness(self):
+        quat = np.array([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])  # x of the object is y of the world
+        keypoints = np.array([[[1.0, 2.045, 3.0], [1.0, 2.060, 3.0], [np.nan] * 3]])
+        points, contact = keypoint_contacts(self.surface, keypoints, np.array([[1.0, 2.0, 3.0]]), quat, 0.02)
+        self.assertEqual(contact.tolist(), [[True, False, False]])
+        np.testing.assert_allclose(points[0, 0], [1.0, 2.03, 3.0], atol=1e-9)
+        np.testing.assert_array_equal(points[0, 1:], 0.0)
+
+
+class ShapesTest(unittest.TestCase):
+    BOX = Geometry(kind="box", size=(0.02, 0.03, 0.01))
+    SPHERE = Geometry(kind="sphere", size=(0.02,))
+    CAPSULE = Geometry(kind="capsule", size=(0.01, 0.03))
+    LONG = Geometry(kind="cylinder", size=(0.01, 0.03))
+    FLAT = Geometry(kind="cylinder", size=(0.03, 0.01))
+    PRIMITIVES = (BOX, SPHERE, CAPSULE, LONG, FLAT)
+
+    def test_support_points_span_the_shape(self):
+        tetrahedron = Geometry(kind="hull", vertices=np.array([[0, 0, 0], *(0.05 * np.eye(3))]))
+        for geometry, extent in (
+            (self.BOX, (0.02, 0.03, 0.01)),
+            (self.SPHERE, (0.02, 0.02, 0.02)),
+            (self.CAPSULE, (0.01, 0.01, 0.04)),
+            (self.LONG, (0.01, 0.01, 0.03)),
+            (self.FLAT, (0.03, 0.03, 0.01)),
+            (tetrahedron, (0.05, 0.05, 0.05)),
+        ):
+            points, radius = support_points(geometry)
+            np.testing.assert_allclose(points.max(axis=0) + radius, extent, atol=1e-9)
+
+    def test_inscribed_balls_are_inside(self):
+        for geometry in self.PRIMITIVES:
+            with self.subTest(kind=geometry.kind):
+                centers, radius = inscribed_balls(geometry)
+                points, ball = support_points(geometry)
+                if len(points) > 3:
+                    planes = half_spaces(hull(points))
+                    depth = -(centers @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+                    self.assertGreaterEqual(depth.min(), radius - ball - 3e-4)  # a rim is a polygon
+                else:
+                    np.testing.assert_allclose(np.abs(centers).max(axis=0), np.abs(points).max(axis=0))
+                    self.assertEqual(radius, ball)
+
+    def test_thin_shapes_take_no_more_balls_than_spacing_asks_for(self):
+        centers, radius = inscribed_balls(Geometry(kind="box", size=(0.04, 0.03, 0.0005)))
+        self.assertEqual(radius, 0.0005)
+        self.assertLessEqual(len(centers), 21 * 16)
+        steps = np.diff(np.unique(centers[:, 0].round(9)))
+        self.assertLessEqual(steps.max(), SPACING + 1e-9)
+
+    def test_sharp_points_lie_on_edges_and_round_shapes_have_none(self):
+        points = sharp_points(self.BOX, 0.01)
+        at_side = np.isclose(np.abs(points), self.BOX.size).sum(axis=1)
+        self.assertTrue((at_side >= 2).all())
+        self.assertEqual((at_side == 3).sum(), 8)
+        lonely = np.linalg.norm(points[:, None] - points, axis=-1) + np.eye(len(points))
+        self.assertLessEqual(lonely.min(axis=1).max(), 0.01 + 1e-12)
+        self.assertEqual(len(sharp_points(self.SPHERE, 0.01)) + len(sharp_points(self.CAPSULE, 0.01)), 0)
+
+    def test_no_surface_of_a_thick_shape_lies_bare(self):
+        """Without balls under its surface the OpenArm's gripper was 7 mm deep between its balls, and bananas sank
+        in."""
+        for shape in (box((0, 0, 0), (0.05, 0.14, 0.04)), hull(trimesh.creation.cone(0.04, 0.08).vertices)):
+            centers, radii = shape_balls(shape)
+            surface = trimesh.sample.sample_surface(shape_mesh(shape), 4000, seed=0)[0]
+            bare = (np.linalg.norm(surface[:, None] - centers, axis=-1) - radii).min(axis=1)
+            self.assertLess(np.quantile(bare, 0.98), BARE + SPACING / 2)
+            planes = half_spaces(shape)
+            outside = (centers @ planes[:, :3].T + planes[:, 3]).max(axis=1) + radii
+            self.assertLess(outside[radii < radii.max()].max(), 1e-3)
+        self.assertTrue((shape_balls(Shape(geometry=self.CAPSULE))[1] == 0.01).all())
+
+    def test_near_points_of_several_solids_are_those_that_looking_at_all_of_them_finds(self):
+        sizes = ((0.06, 0.04, 0.02), (0.02, 0.02, 0.1))
+        fields = DistanceFields.join([link_field([box((0, 0, 0), size)]) for size in sizes])
+        rng = np.random.default_rng(0)
+        points = torch.as_tensor(rng.uniform(-0.06, 0.06, (5000, 3)))
+        limit = torch.as_tensor(rng.uniform(-0.01, 0.03, 5000))
+        which = torch.as_tensor(rng.integers(2, size=5000))
+        value, direction = fields.signed_distance(points, which)
+        expected = (value < limit).nonzero()[:, 0]
+        self.assertGreater(len(expected), 500)
+        for found, of_all in zip(fields.nearer(points, which, limit), (None, value, direction), strict=True):
+            self.assertTrue(torch.equal(found, expected if of_all is None else of_all[expected]))
+
+    def test_a_link_of_thin_walls_is_solid_for_other_links_and_no_thicker(self):
+        # A tube, open at both ends.
+        walls = [box((0, 0, z), (0.06, 0.04, 0.001)) for z in (-0.0095, 0.0095)]
+        walls += [box((0, y, 0), (0.06, 0.001, 0.02)) for y in (-0.0195, 0.0195)]
+        half = np.array((0.03, 0.02, 0.01))
+        points = np.random.default_rng(0).uniform(-1.2 * half, 1.2 * half, (2000, 3))
+        which = torch.zeros(len(points), dtype=torch.long)
+        found = link_field(walls).signed_distance(torch.as_tensor(points), which)[0].numpy()
+        solid = distance_from_box(points, half)
+        middle = np.abs(points[:, 0]) < 0.015  # at its open ends a ball of a gap's size looks in
+        np.testing.assert_allclose(found[middle], solid[middle], atol=1e-3)
+        self.assertGreater((found - solid).min(), -1e-3)
+
+    def test_distances_to_every_kind_of_shape(self):
+        points = np.random.default_rng(0).uniform(-0.07, 0.07, (300, 3))
+        turn = trimesh.transformations.euler_matrix(0.3, -0.4, 0.5)
+        for geometry in (*self.PRIMITIVES, hull(trimesh.creation.icosphere(1, 0.03).vertices).geometry):
+            with self.subTest(kind=geometry.kind):
+                shape = Shape(geometry=geometry, T_body_shape=turn)
+                expected = -trimesh.proximity.signed_distance(shape_mesh(shape), points)
+                np.testing.assert_allclose(signed_distance(shape, points), expected, atol=5e-4)
+
+    def test_height_counts_only_above_the_table(self):
+        table = TableSpec(center=(0.0, 0.0), half_size=(0.5, 0.5, 0.02))
+        points = torch.tensor([[0.0, 0.0, 0.03], [0.0, 0.6, -1.0]], dtype=FLOAT)
+        heights = height_above_table(points, torch.tensor([0.01, 0.01], dtype=FLOAT), table)
+        self.assertAlmostEqual(heights[0].item(), 0.02)
+        self.assertEqual(heights[1].item(), float("inf"))
+
+
+class SelfCollisionTest(unittest.TestCase):
+    """The UR7e with the Sharpa hand: at home, and with fingers that cross."""
+
+    CROSSED = (("right_middle_MCP_AA", 0.3), ("right_ring_MCP_AA", -0.3))
+
+    @classmethod
+    def setUpClass(cls):
+        cls.robot = robots.load("ur7e-sharpa")
+
+    def home_and(self, *changes: tuple[str, float]) -> np.ndarray:
+        """[2, J] joints at home, and with some changed."""
+        joints = np.tile(self.robot.home, (2, 1))
+        for name, value in changes:
+            joints[1, self.robot.joint_names.index(name)] = value
+        return joints
+
+    def test_fingers_that_cross_are_found_and_neighbours_are_not(self):
+        kinematics = Kinematics(self.robot)
+        collision = SelfCollision(self.robot, kinematics)
+        indices = [kinematics.link_index(f"right_index_{part}") for part in ("MP", "DP")]
+        for pair in collision.link_pairs:
+            self.assertFalse(set(indices) <= set(pair))
+        poses = kinematics.link_poses(torch.as_tensor(self.home_and(("right_index_MCP_AA", 0.35)))).numpy()
+        clearance = collision.clearance(poses, 0.01)
+        self.assertGreaterEqual(clearance[0], 0.0)
+        self.assertLess(clearance[1], -0.002)
+        near = collision.near(poses, 0.0)
+        self.assertEqual(set(near.configuration.tolist()), {1})
+        for pair in near.links.tolist():
+            self.assertTrue(any("right_index" in kinematics.link_names[i] for i in pair), pair)
+
+    def test_self_collision_names_the_links(self):
+        hand = Kinematics(self.robot, root=self.robot.hand_root)
+        counted = SelfCollision(self.robot, hand, only=self.robot.self_collision_links).link_pairs
+        reason = np.array([0, REASONS.index("self collision")])
+        result = SimpleNamespace(joint_pos=self.home_and(*self.CROSSED), reason=reason)
+        found = colliding_links(result, self.robot)  # pyright: ignore[reportArgumentType]
+        names = {link for link in hand.link_names if "middle" in link or "ring" in link}
+        fingers = [pair for pair in found if set(pair) <= names]
+        self.assertTrue(fingers, found)
+        self.assertEqual(set(found.values()), {1})
+        for a, b in fingers:
+            self.assertIn((hand.link_index(a), hand.link_index(b)), counted)
+        result.reason = np.zeros(2)
+        self.assertEqual(colliding_links(result, self.robot), {})  # pyright: ignore[reportArgumentType]
+
+    def test_one_link_is_kept_out_of_another_however_many_balls_are_looked_at_in_one_go(self):
+        model = HandModel(self.robot)
+        joints = torch.as_tensor(self.home_and(*self.CROSSED)[:, self.robot.hand_indices])[[0, 1, 1]]
+        above = torch.tensor([0.0, 0.0, 1.0], dtype=FLOAT).expand(3, 3)
+        quat = UPRIGHT.expand(3, 4)
+        field = link_field([box((0, 0, 0), (0.1, 0.1, 0.1))])
+        nothing = Objects.at(above + 10.0, quat, torch.zeros(3, dtype=torch.long), field)
+
+        def found(q: torch.Tensor):
+            return too_near(model, model.bodies(q, above, quat), nothing, torch.ones(3, dtype=torch.bool), 0.0, 0.0)
+
+        here = found(joints)
+        self.assertEqual(sorted(set(here.frame.tolist())), [1, 2])
+        self.assertLess(float(here.value.min()), -0.003)
+        with mock.patch.dict("xreset.geometry.balls._ROWS", {"cpu": 7}):
+            pieces = found(joints)
+        self.assertTrue(torch.equal(here.value.sort().values, pieces.value.sort().values))
+        column = model.kinematics.joint_names.index("right_middle_MCP_AA")
+        moved = joints.clone()
+        moved[:, column] += 1e-5
+        change = (found(moved).value - here.value) / 1e-5
+        torch.testing.assert_close(change, here.slope[:, column], atol=2e-3, rtol=0.0)
+
+
+if __name__ == "__main__":
+    unittest.main()

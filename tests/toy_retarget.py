@@ -1,0 +1,92 @@
+"""Targets for tests of retargeting, and derivatives by central differences."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from xreset.geometry.fields import DistanceFields
+from xreset.geometry.rotations import matrix_to_quat, quat_from_axis_angle, quat_multiply
+from xreset.geometry.shapes import box, surface_of
+from xreset.retarget.arm.model import ArmModel, ArmTargets
+from xreset.retarget.hand.config import HandConfig
+from xreset.retarget.hand.cost import system
+from xreset.retarget.hand.model import HandModel, HandState, HandTargets
+from xreset.spec import ObjectSpec
+
+FLOAT = torch.float64
+UPRIGHT = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=FLOAT)
+
+
+def box_object(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> ObjectSpec:
+    """An object made of boxes (center, size)."""
+    pieces = tuple(box(center, size) for center, size in boxes)
+    vertices, faces = surface_of(pieces)
+    return ObjectSpec(
+        name="block", pieces=pieces, mass=1.0, com=np.zeros(3), inertia=np.eye(3), vertices=vertices, faces=faces
+    )
+
+
+def hand_targets(keypoints: Tensor, fields: DistanceFields, **changes: Tensor) -> HandTargets:
+    """Keypoints [S, T, P, 3] that touch nothing, and an upright object far away."""
+    shape = keypoints.shape[:2]
+    targets = HandTargets(
+        keypoints=keypoints,
+        annotated=torch.ones(shape, dtype=torch.bool),
+        contact_points=torch.zeros_like(keypoints),
+        in_contact=torch.zeros(keypoints.shape[:3], dtype=torch.bool),
+        held=torch.ones(shape, dtype=torch.bool),
+        object_pos=torch.full((*shape, 3), 9.0, dtype=FLOAT),
+        object_quat=UPRIGHT.expand(*shape, 4),
+        object_index=torch.zeros(len(keypoints), dtype=torch.long),
+        fields=fields,
+    )
+    return dataclasses.replace(targets, **changes)
+
+
+def arm_targets(model: ArmModel, joints: Tensor) -> ArmTargets:
+    """The path of the hand root along all joints [S, T, J], free of errors."""
+    T = model.kinematics.link_poses(joints, [model.robot.hand_root])[:, :, 0]
+    shape = joints.shape[:2]
+    return ArmTargets(
+        root_pos=T[..., :3, 3].clone(),
+        root_quat=matrix_to_quat(T[..., :3, :3]),
+        hand_joints=joints[..., model.robot.hand_indices],
+        annotated=torch.ones(shape, dtype=torch.bool),
+        hand_error=torch.zeros(shape, dtype=FLOAT),
+        hand_clearance=torch.ones(shape, dtype=FLOAT),
+    )
+
+
+def slope(function: Callable[[Tensor], Tensor], x: Tensor, index: Any, step: float = 1e-6) -> Tensor:
+    """Derivative of a function by the elements of x at an index, which is moved by a step both ways."""
+    shift = torch.zeros_like(x)
+    shift[index] = step
+    return (function(x + shift) - function(x - shift)) / (2 * step)
+
+
+def check_gradient(
+    model: HandModel, targets: HandTargets, config: HandConfig, state: HandState, frames: tuple[int, ...]
+) -> None:
+    """Assert that the gradient of the hand's cost is its derivative by every variable of some frames."""
+
+    def cost(shift: Tensor) -> Tensor:
+        joints, move, turn = shift.split((state.joints.shape[-1], 3, 3), dim=-1)
+        moved = HandState(
+            joints=state.joints + joints,
+            root_pos=state.root_pos + move,
+            root_quat=quat_multiply(quat_from_axis_angle(turn), state.root_quat),
+        )
+        return system(model, targets, config, moved).cost
+
+    gradient = system(model, targets, config, state).gradient
+    atol = 2e-4 * float(gradient.abs().max())
+    for frame in frames:
+        for k in range(gradient.shape[-1]):
+            half = slope(cost, torch.zeros_like(gradient), (slice(None), frame, k)) / 2
+            torch.testing.assert_close(gradient[:, frame, k], half, rtol=2e-3, atol=atol)

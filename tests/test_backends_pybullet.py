@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from tests.engine_checks import EngineChecks, hull_box
+from tests.engine_checks import JOINT, EngineChecks
 from xreset.backends.bullet_models import _origin
-from xreset.backends.conformance.scene import gripper, objects, scene
+from xreset.backends.conformance.scene import gripper, objects, scene, shape
 from xreset.backends.pybullet import PybulletBackend, PybulletSettings, PybulletWorld
 from xreset.backends.rigid import mechanism
 from xreset.errors import BackendUnavailableError, ObjectError
@@ -50,44 +50,47 @@ class PybulletTest(EngineChecks, unittest.TestCase):
             np.testing.assert_allclose(Rotation.from_euler("xyz", rpy).as_matrix(), T[:3, :3], atol=1e-7)
 
     def test_a_hull_touches_where_it_is(self):
-        """Round pads hold a box, its hull, and the hulls of its halves, all off their frames' origins, with the same opening."""
-
-        def rounded(pad: Shape) -> Shape:
-            return (
-                replace(pad, geometry=Geometry(kind="sphere", size=(min(pad.geometry.size),)))
-                if pad.geometry.kind == "box"
-                else pad
-            )
+        """Round pads hold a box, its hull, and the hulls of its halves, all off their frames' origins, alike."""
 
         def round_pads(robot):
             made = mechanism(robot)
-            bodies = [
-                replace(b, shapes=tuple(replace(s, shape=rounded(s.shape)) for s in b.shapes)) for b in made.bodies
-            ]
+            bodies = []
+            for body in made.bodies:
+                shapes = []
+                for item in body.shapes:
+                    if item.shape.geometry.kind == "box":
+                        ball = Geometry(kind="sphere", size=(min(item.shape.geometry.size),))
+                        item = replace(item, shape=replace(item.shape, geometry=ball))
+                    shapes.append(item)
+                bodies.append(replace(body, shapes=tuple(shapes)))
             return replace(made, bodies=tuple(bodies))
+
+        def hull(size, T) -> Shape:
+            return replace(shape("hull", tuple(size)), T_body_shape=T)
 
         def opening(*pieces: Shape) -> float:
             held = replace(brick, pieces=pieces)
-            with (
-                mock.patch("xreset.backends.pybullet.mechanism", round_pads),
-                mock.patch("tests.engine_checks.scene", lambda: replace(scene(), objects=(held,))),
-            ):
-                backend, _ = self.grasp()
+            with mock.patch("xreset.backends.pybullet.mechanism", round_pads):
+                backend, _ = self.grasp(replace(scene(), objects=(held,)))
             backend.set_object_gravity(torch.zeros(1))
             backend.step(240)
-            return float(backend.state().joint_pos[0, gripper().joint_names.index("jaw_a_slide")])
+            return float(backend.state().joint_pos[0, JOINT["jaw_a_slide"]])
 
         brick = objects()[0]
         self.assertGreater(float(np.abs(brick.com).max()), 0.0)
         (whole,) = brick.pieces
+        T = whole.T_body_shape
         box = opening(whole)
-        self.assertAlmostEqual(opening(replace(whole, geometry=hull_box(*whole.geometry.size))), box, delta=5e-5)
+        self.assertAlmostEqual(opening(hull(whole.geometry.size, T)), box, delta=5e-5)
         for axis in range(3):
             with self.subTest(axis=axis):
-                half, moved = np.array(whole.geometry.size), np.stack([whole.T_body_shape] * 2)
+                half = np.array(whole.geometry.size)
                 half[axis] /= 2
-                moved[:, :3, 3] += np.outer((half[axis], -half[axis]), whole.T_body_shape[:3, axis])
-                pieces = [Shape(geometry=hull_box(*half.tolist()), T_body_shape=T) for T in moved]
+                pieces = []
+                for side in (half[axis], -half[axis]):
+                    moved = T.copy()
+                    moved[:3, 3] += side * T[:3, axis]
+                    pieces.append(hull(half, moved))
                 self.assertAlmostEqual(opening(*pieces), box, delta=5e-5)
 
     def test_an_impossible_object_is_refused(self):

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from xreset.backends.conformance import CHECKS, CheckResult, Measure, run
-from xreset.backends.mjcf_model import OBJECT
+from xreset.backends.mjcf_model import OBJECT, SceneModel
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.rigid import Inertia, conjugate, rotate
 from xreset.cli import main
@@ -228,28 +228,30 @@ class HiddenBrokenWorld(MujocoWorld):
 # The robot ------------------------------------------------------------------------------------------------------------
 
 
-class _Remodelled(MujocoWorld):
-    """A world whose engine model is changed once it is made."""
+def remodelled(*checks: str) -> Callable[[Callable[[mujoco.MjModel, SceneModel], None]], None]:
+    """Make a defect of a function that changes the engine's model once it is made."""
 
-    def __init__(self, scene, object_index):
-        super().__init__(scene, object_index)
-        self.change(self._model)
-        mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
+    def note(change: Callable[[mujoco.MjModel, SceneModel], None]) -> None:
+        class World(MujocoWorld):
+            def __init__(self, scene, object_index):
+                super().__init__(scene, object_index)
+                change(self._model, self._at)
+                mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
 
-    def change(self, model: mujoco.MjModel) -> None:
-        raise NotImplementedError
+        World.__name__ = change.__name__
+        breaks(*checks)(World)
 
-
-@breaks("mass_properties")
-class MassInventedForALink(_Remodelled):
-    def change(self, model):
-        model.body_mass[self._at.moving_bodies[1]] += 0.001
+    return note
 
 
-@breaks("mass_properties", "free_spin")
-class PrincipalAxesDropped(_Remodelled):
-    def change(self, model):
-        model.body_iquat[:] = (1.0, 0.0, 0.0, 0.0)
+@remodelled("mass_properties")
+def mass_invented_for_a_link(model, at):
+    model.body_mass[at.moving_bodies[1]] += 0.001
+
+
+@remodelled("mass_properties", "free_spin")
+def principal_axes_dropped(model, at):
+    model.body_iquat[:] = (1.0, 0.0, 0.0, 0.0)
 
 
 @breaks("mass_properties")
@@ -260,50 +262,43 @@ class CentreOfMassAtTheOrigin(MujocoWorld):
         ]
 
 
-@breaks("joint_tracking", "drive_equation")
-class StiffnessScaled(_Remodelled):
-    def change(self, model):
-        model.actuator_gainprm[:, 0] *= 0.8
-        model.actuator_biasprm[:, 1] *= 0.8
+@remodelled("joint_tracking", "drive_equation")
+def stiffness_scaled(model, at):
+    model.actuator_gainprm[:, 0] *= 0.8
+    model.actuator_biasprm[:, 1] *= 0.8
 
 
-@breaks("own_weight")
-class StiffnessAndDampingScaled(_Remodelled):
+@remodelled("own_weight")
+def stiffness_and_damping_scaled(model, at):
     """Free motion hardly tells, a load does."""
 
-    def change(self, model):
-        model.actuator_gainprm[:] *= 0.8
-        model.actuator_biasprm[:] *= 0.8
+    model.actuator_gainprm[:] *= 0.8
+    model.actuator_biasprm[:] *= 0.8
 
 
-@breaks("joint_tracking")
-class JointsDampedByDefault(_Remodelled):
-    def change(self, model):
-        model.dof_damping[:] = 0.5
+@remodelled("joint_tracking")
+def joints_damped_by_default(model, at):
+    model.dof_damping[:] = 0.5
 
 
-@breaks("joint_tracking", "drive_equation")
-class DriveWithoutArmature(_Remodelled):
-    def change(self, model):
-        model.dof_armature[:] = 0.0
+@remodelled("joint_tracking", "drive_equation")
+def drive_without_armature(model, at):
+    model.dof_armature[:] = 0.0
 
 
-@breaks("drive_equation", "effort_limit")
-class DriveWithoutEffortLimit(_Remodelled):
-    def change(self, model):
-        model.actuator_forcelimited[:] = 0
+@remodelled("drive_equation", "effort_limit")
+def drive_without_effort_limit(model, at):
+    model.actuator_forcelimited[:] = 0
 
 
-@breaks("joint_limits")
-class JointsWithoutLimits(_Remodelled):
-    def change(self, model):
-        model.jnt_limited[:] = 0
+@remodelled("joint_limits")
+def joints_without_limits(model, at):
+    model.jnt_limited[:] = 0
 
 
-@breaks("gravity_compensation")
-class GravityOnTheRobot(_Remodelled):
-    def change(self, model):
-        model.body_gravcomp[1:-1] = 0.0
+@remodelled("gravity_compensation")
+def gravity_on_the_robot(model, at):
+    model.body_gravcomp[1:-1] = 0.0
 
 
 @breaks("own_weight")
@@ -432,17 +427,15 @@ class FingersMixedUp(MujocoWorld):
         return tip_force[::-1], touch[::-1], table_force
 
 
-@breaks("rest_and_bounce")
-class CollisionMargin(_Remodelled):
-    def change(self, model):
-        model.geom_margin[:] = 5e-4
-        model.geom_pos[self._at.geom_role == OBJECT, 2] -= 5e-4
+@remodelled("rest_and_bounce")
+def collision_margin(model, at):
+    model.geom_margin[:] = 5e-4
+    model.geom_pos[at.geom_role == OBJECT, 2] -= 5e-4
 
 
-@breaks("rest_and_bounce")
-class BouncyContacts(_Remodelled):
-    def change(self, model):
-        model.geom_solref[:] = (-2e4, -20.0)
+@remodelled("rest_and_bounce")
+def bouncy_contacts(model, at):
+    model.geom_solref[:] = (-2e4, -20.0)
 
 
 @breaks("drive_scale")
@@ -472,16 +465,14 @@ class FrictionAveragedWithTheObjects(MujocoWorld):
         super().set_friction((friction + 0.5) / 2)
 
 
-@breaks("slope")
-class FrictionPyramid(_Remodelled):
-    def change(self, model):
-        model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+@remodelled("slope")
+def friction_pyramid(model, at):
+    model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
 
 
-@breaks("torsional_friction", "torsional_friction_set")
-class NoTorsionalFriction(_Remodelled):
-    def change(self, model):
-        model.geom_condim[:] = 3
+@remodelled("torsional_friction", "torsional_friction_set")
+def no_torsional_friction(model, at):
+    model.geom_condim[:] = 3
 
 
 @breaks("torsional_friction_set")
@@ -499,10 +490,9 @@ class TorsionalFrictionTimesSlidingFriction(MujocoWorld):
         self._model.geom_friction[:, 1] = self._at.model.geom_friction[:, 1] * self._model.geom_friction[:, 0]
 
 
-@breaks("shaken_grasp")
-class WeakFingers(_Remodelled):
-    def change(self, model):
-        model.actuator_forcerange[-1] = (-2.5, 2.5)
+@remodelled("shaken_grasp")
+def weak_fingers(model, at):
+    model.actuator_forcerange[-1] = (-2.5, 2.5)
 
 
 class TheSuiteCanFail(unittest.TestCase):

@@ -41,8 +41,10 @@ def across_an_edge() -> mujoco.MjModel:
 def poses(rng: np.random.Generator) -> np.ndarray:
     """[N, 7] the capsule beside the can, up to 1 mm deep and inclined by some hundredths, as fingertips are."""
     out = np.zeros((WORLDS, 7), dtype=np.float32)
-    azimuth, radius = rng.uniform(0, 2 * np.pi, WORLDS), 0.033 + 0.009 - rng.uniform(0.0, 1e-3, WORLDS)
-    out[:, 0], out[:, 1] = radius * np.cos(azimuth), radius * np.sin(azimuth)
+    azimuth = rng.uniform(0, 2 * np.pi, WORLDS)
+    radius = 0.033 + 0.009 - rng.uniform(0.0, 1e-3, WORLDS)
+    out[:, 0] = radius * np.cos(azimuth)
+    out[:, 1] = radius * np.sin(azimuth)
     out[:, 2] = rng.uniform(-0.03, 0.03, WORLDS)
     out[:, 3] = 1.0
     out[:, 4:] = rng.uniform(-0.04, 0.04, (WORLDS, 3))
@@ -53,16 +55,20 @@ def poses(rng: np.random.Generator) -> np.ndarray:
 class Depth(unittest.TestCase):
     def test_contacts_that_were_clipped_to_one_are_as_deep_as_in_mujoco(self):
         correct_engine()  # tested is the engine as the backend leaves it
-        model, qpos = across_an_edge(), poses(np.random.default_rng(0))
+        model = across_an_edge()
+        qpos = poses(np.random.default_rng(0))
         with wp.ScopedDevice("cpu"):
-            m, d = mjw.put_model(model), mjw.make_data(model, nworld=WORLDS, nconmax=8, njmax=32)
+            m = mjw.put_model(model)
+            d = mjw.make_data(model, nworld=WORLDS, nconmax=8, njmax=32)
             d.qpos = wp.array(qpos, dtype=float)
             for stage in (mjw.kinematics, mjw.com_pos, mjw.collision):
                 stage(m, d)
         found = int(d.nacon.numpy()[0])
-        world, dist = d.contact.worldid.numpy()[:found], d.contact.dist.numpy()[:found]
+        world = d.contact.worldid.numpy()[:found]
+        dist = d.contact.dist.numpy()[:found]
 
-        data, elsewhere = mujoco.MjData(model), 0
+        data = mujoco.MjData(model)
+        elsewhere = 0
         for i in range(WORLDS):
             data.qpos[:] = qpos[i]
             mujoco.mj_forward(model, data)

@@ -53,7 +53,7 @@ class Curve:
     upper: float | None
     """The same above the nominal value."""
 
-    def bears(self) -> str:
+    def tolerated(self) -> str:
         """Return the range in which fewer than ten points are lost, as far as was tried."""
         low = self.points[0].value
         high = self.points[-1].value

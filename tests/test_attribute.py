@@ -198,7 +198,7 @@ class AttributeTest(unittest.TestCase):
     """A grasp that just holds, and engines with one deliberate mistake each."""
 
     def attribute(self, b: Engine, **options) -> Attribution:
-        return attribute(toy_grasp.OpenLoop, mujoco(), b, toy_grasp.trial(TASK, num_envs=3), episodes=1, **options)
+        return attribute(toy_grasp.policy(), mujoco(), b, toy_grasp.trial(TASK, num_envs=3), episodes=1, **options)
 
     def test_half_the_friction_is_what_costs_the_grasp(self):
         b = toy_grasp.with_scene(mujoco(), "slippery", lambda scene: scene)

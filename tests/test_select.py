@@ -15,6 +15,7 @@ from unittest import mock
 from tests.test_stress import episodes
 from xreset.cli import main
 from xreset.errors import FileFormatError, PolicyError, RunError
+from xreset.eval.engines.attribution import attribute
 from xreset.eval.evaluate import evaluate
 from xreset.eval.frontier import frontier
 from xreset.eval.policy_spec import PolicySpec
@@ -101,6 +102,7 @@ class SelectTest(unittest.TestCase):
             lambda: evaluate(policy, self.demos, [], seed=SEED),
             lambda: stress(policy, trial, [], self.folder),
             lambda: frontier(policy, trial, [], self.folder, states=1),
+            lambda: attribute(policy, mock.Mock(), mock.Mock(), trial, episodes=1),
         ):
             with self.assertRaisesRegex(PolicyError, f"Seed {SEED} chose this checkpoint"):
                 measure()

@@ -4,6 +4,7 @@ decides whether half the friction, or half the drive's stiffness, is still enoug
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.toy_bank import toy_bank
 from xreset.backends.conformance.scene import gripper, objects
+from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.trial import Engine, Trial
 from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
@@ -79,6 +81,13 @@ def bank() -> ResetBank:
 
 def trial(task: TaskConfig, **setting) -> Trial:
     return Trial(robot=robot(), objects=(brick(),), bank=bank(), task=task, **setting)
+
+
+def policy() -> PolicySpec:
+    """The policy :class:`OpenLoop` by name."""
+    return PolicySpec(
+        name="open-loop", start=lambda motion: OpenLoop(), robot=robot(), task=TaskConfig(), folder=Path("eval")
+    )
 
 
 class OpenLoop:

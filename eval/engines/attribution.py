@@ -23,10 +23,10 @@ from xreset.eval.engines.alteration import (
     no_contact_dial,
 )
 from xreset.eval.engines.measure import Measured, measure
+from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.rollout import Episode, roll_out
 from xreset.eval.sensitivity import COMPARED, Effect
 from xreset.eval.trial import Engine, Trial
-from xreset.policy import Policy
 
 SCHEMA = "xreset-attribution/1"
 
@@ -136,7 +136,7 @@ def _interval(mean: float, ci95: tuple[float, float]) -> dict[str, Any]:
 
 
 def attribute(
-    policy: Callable[[], Policy],
+    policy: PolicySpec,
     a: Engine,
     b: Engine,
     trial: Trial,
@@ -150,7 +150,7 @@ def attribute(
     """Measure both engines, and play the policy in A, in A changed towards B, and in B.
 
     Args:
-        policy: makes the policy, a fresh one for each run.
+        policy: what plays.
         a: engine that is changed.
         b: engine towards which A is changed.
         trial: what is played; the mass and inertia of its first object are measured.
@@ -161,8 +161,9 @@ def attribute(
         progress: called with (name of the run, control steps done, control steps in all).
 
     Raises:
-        XResetError: a property is unknown, or an engine cannot be measured.
+        XResetError: a property is unknown, an engine cannot be measured, or the seed chose this checkpoint.
     """
+    policy.check_seed(trial.seed)
     if unknown := sorted(set(only) - set(COMPARED)):
         raise XResetError(f"Unknown property {', '.join(unknown)}. Choose from: {', '.join(COMPARED)}.")
     scene = trial.nominal_scene
@@ -175,8 +176,9 @@ def attribute(
     def run(kind: Kind, name: str, engine: Engine, alteration: Alteration) -> None:
         label = name if kind in ("as it is", "other") else f"{a.name}, {kind} {name}"
         altered = altered_engine(engine, alteration)
+        player = policy.start(trial.motion)
         played = roll_out(
-            policy(), altered, trial, repetitions=episodes, only=sequences, progress=partial(progress, label)
+            player, altered, trial, repetitions=episodes, only=sequences, progress=partial(progress, label)
         ).episodes
         nominal = rows[0].episodes if rows else played
         effect = Effect.of(played, nominal)

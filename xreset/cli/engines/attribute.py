@@ -65,7 +65,6 @@ def attribute(
     console = Console()
     demos = played.demos
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
-    spec.check_seed(setting.seed)
     a, b = (trial.engine(name, device=setting.device) for name in (backend, towards))
     played_trial = trial.load_trial(spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs)
     if unknown := sorted(set(played.object) - set(played_trial.names)):
@@ -80,7 +79,7 @@ def attribute(
     with Progress(console) as bar:
         task = bar.add_task("", total=None)
         found = attribution.attribute(
-            lambda: spec.start(played_trial.motion), a, b, replace(played_trial, objects=objects),
+            spec, a, b, replace(played_trial, objects=objects),
             episodes=played.episodes, sequences=chosen, only=only, what_if=what_if,
             progress=lambda run, done, total: bar.update(task, description=run, completed=done, total=total or None),
         )  # fmt: skip

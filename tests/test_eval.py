@@ -6,6 +6,7 @@ import tempfile
 import unittest
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -28,6 +29,7 @@ from xreset.physics import Contacts, Health, Links, State
 from xreset.task.config import TaskConfig
 from xreset.task.reading import Reading
 from xreset.task.rewards import keypoint_distance
+from xreset.tensors import Tensors
 
 CORNERS = torch.tensor([[-1.0, -1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]]) * 0.05
 IDENTITY = torch.tensor([1.0, 0, 0, 0])
@@ -62,116 +64,101 @@ def turned(degrees: float) -> torch.Tensor:
     return quat_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(degrees)]))
 
 
-def episode(
-    *steps: Reading, start: Reading | None = None, goal_quat=IDENTITY, lost_at: int | None = None
-) -> EpisodeMetrics:
-    metrics = EpisodeMetrics(start or reading(), GOAL[None], goal_quat[None], CORNERS[None], MetricsConfig())
+def episode(*steps: Reading, start: Reading | None = None, lost_at: int | None = None) -> EpisodeMetrics:
+    """The metrics of an episode; at step ``lost_at`` the object leaves the scene."""
+    metrics = EpisodeMetrics(start or reading(), GOAL[None], IDENTITY[None], CORNERS[None], MetricsConfig())
     for i, step in enumerate(steps):
         metrics.update(step, torch.tensor([i == lost_at]))
     return metrics
 
 
+def together(a: Tensors, b: Tensors) -> Any:
+    """The worlds of two bundles of tensors."""
+    return type(a)(**{name: torch.cat((value, getattr(b, name))) for name, value in vars(a).items()})
+
+
+SCORES = {"": 0.0, "a": 0.33, "ag": 0.66, "g": 0.66}
+HELD = {"press": PRESS, "tips": (0.0, 0.0, 0.0)}
+OFF = GOAL + torch.tensor([0.0, 0.0195, 0.0])
+
+
 class MetricsTest(unittest.TestCase):
-    def assert_stages(self, m: EpisodeMetrics, approach: bool, grasp: bool, reorient: bool):
-        self.assertEqual((bool(m.approach), bool(m.grasp), bool(m.reorient)), (approach, grasp, reorient))
-        expected = 1.0 if reorient else 0.66 if grasp else 0.33 if approach else 0.0
-        self.assertAlmostEqual(float(m.task_progress), expected, places=6)
-
-    def test_nothing(self):
-        m = episode(reading(tips=(0.06, 0.051, 0.2)))
-        self.assert_stages(m, False, False, False)
-        self.assertEqual(float(m.reorientation_progress), 0.0)
-
-    def test_approach_is_one_finger_within_five_centimetres_at_any_time(self):
-        self.assert_stages(episode(reading(tips=(0.2, 0.049, 0.2)), reading()), True, False, False)
-        self.assert_stages(episode(reading(), start=reading(tips=(0.2, 0.2, 0.04))), True, False, False)
-
-    def test_grasp_needs_thumb_and_finger_and_a_lift_at_once(self):
+    def test_stages(self):
+        """Reached stages are given by their first letters."""
         near = {"tips": (0.0, 0.0, 0.0)}
-        self.assert_stages(episode(reading(raised(0.011), press=PRESS, **near)), True, True, False)
-        self.assert_stages(episode(reading(raised(0.009), press=PRESS, **near)), True, False, False)
-        self.assert_stages(episode(reading(raised(0.011), press=LIGHT, **near)), True, False, False)
-        self.assert_stages(episode(reading(raised(0.011), press=(0.09, 1, 1), **near)), True, False, False)
-        apart = episode(reading(press=PRESS, **near), reading(raised(0.05), **near))
-        self.assert_stages(apart, True, False, False)
-
-    def test_a_grasp_counts_though_the_object_is_dropped_later(self):
-        self.assert_stages(episode(reading(raised(0.05), press=PRESS, tips=(0, 0, 0)), reading()), True, True, False)
-
-    def test_reorientation_is_judged_at_the_episodes_end(self):
-        self.assert_stages(episode(reading(GOAL)), False, False, True)
-        left = episode(reading(GOAL), reading(raised(0.1)))
-        self.assert_stages(left, False, False, False)
-        self.assertTrue(bool(left.reorient_once))
-
-    def test_reorientation_within_two_centimetres_and_fifteen_degrees(self):
-        off = GOAL + torch.tensor([0.0, 0.0195, 0.0])
-        self.assert_stages(episode(reading(off, turned(14.8))), False, False, True)
-        self.assert_stages(episode(reading(off, -turned(14.8))), False, False, True)
-        self.assert_stages(episode(reading(off, turned(15.2))), False, False, False)
-        self.assert_stages(episode(reading(GOAL + torch.tensor([0.0, 0.0205, 0.0]))), False, False, False)
+        for name, expected, m in (
+            ("nothing", "", episode(reading(tips=(0.06, 0.051, 0.2)))),
+            ("one finger within five centimetres", "a", episode(reading(tips=(0.2, 0.049, 0.2)), reading())),
+            ("at the start", "a", episode(reading(), start=reading(tips=(0.2, 0.2, 0.04)))),
+            ("thumb, finger and lift at once", "ag", episode(reading(raised(0.011), **HELD))),
+            ("too low", "a", episode(reading(raised(0.009), **HELD))),
+            ("no thumb", "a", episode(reading(raised(0.011), press=LIGHT, **near))),
+            ("thumb too light", "a", episode(reading(raised(0.011), press=(0.09, 1, 1), **near))),
+            ("not at once", "a", episode(reading(press=PRESS, **near), reading(raised(0.05), **near))),
+            ("dropped later", "ag", episode(reading(raised(0.05), **HELD), reading())),
+            ("at the goal", "r", episode(reading(GOAL))),
+            ("left the goal", "", episode(reading(GOAL), reading(raised(0.1)))),
+            ("two centimetres, fifteen degrees", "r", episode(reading(OFF, turned(14.8)))),
+            ("the other sign of the quaternion", "r", episode(reading(OFF, -turned(14.8)))),
+            ("turned too far", "", episode(reading(OFF, turned(15.2)))),
+            ("too far away", "", episode(reading(GOAL + torch.tensor([0.0, 0.0205, 0.0])))),
+            ("left the scene first", "", episode(reading(), reading(raised(0.05), **HELD), reading(GOAL), lost_at=1)),
+            ("left later", "ag", episode(reading(raised(0.1), **HELD), reading(GOAL), reading(GOAL), lost_at=2)),
+            ("overflow ends nothing", "r", episode(reading(overflow=True), reading(GOAL))),
+        ):
+            with self.subTest(name):
+                found = "".join(stage[0] for stage in ("approach", "grasp", "reorient") if getattr(m, stage))
+                self.assertEqual(found, expected)
+                self.assertAlmostEqual(float(m.task_progress), SCORES.get(expected, 1.0), places=6)
+                self.assertEqual(bool(m.reorient_once), expected == "r" or name in ("left the goal", "left later"))
+                self.assertEqual(bool(m.out_of_bounds), name.startswith("left the scene") or name == "left later")
+                self.assertEqual(bool(m.overflow), name.startswith("overflow"))
 
     def test_pose_error_is_the_largest_keypoint_distance(self):
         """Half a turn about z moves every corner of the tetrahedron by 2 sqrt(2) 5 cm; a shift adds to it in the worst corner."""
-        args = (START[None], IDENTITY[None], START[None])
-        self.assertAlmostEqual(
-            float(keypoint_distance(*args, turned(180)[None], CORNERS[None])), 0.1 * math.sqrt(2), places=6
-        )
-        shift = torch.tensor([[0.1, 0.1, 0.0]])
-        found = keypoint_distance(START[None] + shift, IDENTITY[None], START[None], turned(180)[None], CORNERS[None])
-        self.assertAlmostEqual(float(found), 0.2 * math.sqrt(2), places=6)
+        for shift, expected in ((0.0, 0.1), (0.1, 0.2)):
+            pos = START[None] + torch.tensor([[shift, shift, 0.0]])
+            found = keypoint_distance(pos, IDENTITY[None], START[None], turned(180)[None], CORNERS[None])
+            self.assertAlmostEqual(float(found), expected * math.sqrt(2), places=6)
 
     def test_reorientation_progress_is_the_best_of_the_episode(self):
         """The goal is 0.20 above the start without a turn, so every keypoint is that far."""
-        m = episode(reading(raised(0.05)), reading(raised(0.15)), reading(raised(0.1)))
-        self.assertAlmostEqual(float(m.reorientation_progress), 0.75, places=5)
-        self.assertEqual(float(episode(reading(raised(-0.1))).reorientation_progress), 0.0)
-        self.assertEqual(float(episode(reading(GOAL)).reorientation_progress), 1.0)
-        there = episode(
-            reading(GOAL), start=reading(GOAL)
-        )  # a start at the goal leaves nothing to do: no division by zero
+        for expected, m in (
+            (0.75, episode(reading(raised(0.05)), reading(raised(0.15)), reading(raised(0.1)))),
+            (0.0, episode(reading(raised(-0.1)))),
+            (1.0, episode(reading(GOAL))),
+            (0.0, episode(reading(), reading(raised(0.05)), reading(GOAL), lost_at=1)),
+        ):
+            self.assertAlmostEqual(float(m.reorientation_progress), expected, places=5)
+        there = episode(reading(GOAL), start=reading(GOAL))  # nothing is left to do: no division by zero
         self.assertTrue(0.0 <= float(there.reorientation_progress) <= 1.0)
-
-    def test_a_world_that_left_the_scene_is_no_longer_looked_at(self):
-        m = episode(reading(), reading(raised(0.05), press=PRESS, tips=(0, 0, 0)), reading(GOAL), lost_at=1)
-        self.assert_stages(m, False, False, False)
-        self.assertEqual(float(m.reorientation_progress), 0.0)
-        self.assertTrue(bool(m.out_of_bounds))
-
-    def test_what_was_reached_before_leaving_counts_but_not_the_goal(self):
-        m = episode(reading(raised(0.1), press=PRESS, tips=(0, 0, 0)), reading(GOAL), reading(GOAL), lost_at=2)
-        self.assert_stages(m, True, True, False)
-        self.assertTrue(bool(m.reorient_once))
 
     def test_a_world_that_is_not_finite_is_counted_and_no_longer_looked_at(self):
         nan = torch.full((3,), math.nan)
         broken = reading(nan, tips=(math.nan,) * 3, press=(math.nan,) * 3, nonfinite=True)
         m = episode(reading(raised(0.05)), broken, broken, reading(GOAL, tips=(0, 0, 0), nonfinite=True))
-        self.assert_stages(m, False, False, False)
+        self.assertFalse(m.approach or m.grasp or m.reorient or m.out_of_bounds)
+        self.assertTrue(m.nonfinite)
         self.assertAlmostEqual(float(m.reorientation_progress), 0.25, places=5)
-        self.assertEqual((bool(m.nonfinite), bool(m.out_of_bounds)), (True, False))
 
     def test_an_episode_has_one_end(self):
-        """What happens to a world after its end is not counted, nor is where a broken world seems to be."""
+        """What happens to a world after its end is not counted, nor is the place of a broken world."""
         broken = reading(torch.full((3,), math.inf), nonfinite=True)
-        for lost_at in (0, 1):
-            m = episode(broken, reading(), lost_at=lost_at)
-            self.assertEqual((bool(m.nonfinite), bool(m.out_of_bounds)), (True, False))
-        m = episode(reading(), reading(nonfinite=True, overflow=True), lost_at=0)
-        self.assertEqual((bool(m.nonfinite), bool(m.overflow), bool(m.out_of_bounds)), (False, False, True))
-
-    def test_overflow_is_counted_but_ends_nothing(self):
-        m = episode(reading(overflow=True), reading(GOAL))
-        self.assertTrue(bool(m.overflow))
-        self.assert_stages(m, False, False, True)
+        late = reading(nonfinite=True, overflow=True)
+        for expected, m in (
+            ((True, False, False), episode(broken, reading(), lost_at=0)),
+            ((True, False, False), episode(broken, reading(), lost_at=1)),
+            ((False, False, True), episode(reading(), late, lost_at=0)),
+        ):
+            self.assertEqual((bool(m.nonfinite), bool(m.overflow), bool(m.out_of_bounds)), expected)
 
     def test_worlds_are_judged_one_by_one(self):
         def both(a: Reading, b: Reading) -> Reading:
             return Reading(
-                state=State(**{k: torch.cat((v, getattr(b.state, k))) for k, v in vars(a.state).items()}),
+                state=together(a.state, b.state),
                 links=a.links,
-                contacts=Contacts(**{k: torch.cat((v, getattr(b.contacts, k))) for k, v in vars(a.contacts).items()}),
-                health=Health(**{k: torch.cat((v, getattr(b.health, k))) for k, v in vars(a.health).items()}),
+                contacts=together(a.contacts, b.contacts),
+                health=together(a.health, b.health),
                 tip_distance=torch.cat((a.tip_distance, b.tip_distance)),
             )
 
@@ -233,9 +220,7 @@ class ResultsTest(unittest.TestCase):
     JOINTS = ("a", "b", "c")
 
     def setUp(self):
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.folder = Path(folder.name)
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
 
     def test_summary(self):
         s = toy_summary()
@@ -322,13 +307,9 @@ class ResultsTest(unittest.TestCase):
     def test_a_result_that_is_not_a_number_is_not_written(self):
         rollouts = toy_rollouts()
         bad = replace(rollouts.episodes[0], reorientation_progress=math.nan)
+        broken = replace(rollouts, episodes=(bad,))
         with self.assertRaises(ValueError):
-            write_results(
-                self.folder,
-                toy_summary(rollouts=replace(rollouts, episodes=(bad,))),
-                replace(rollouts, episodes=(bad,)),
-                self.JOINTS,
-            )
+            write_results(self.folder, toy_summary(rollouts=broken), broken, self.JOINTS)
         self.assertEqual(list(self.folder.iterdir()), [])
 
 

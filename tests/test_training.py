@@ -327,6 +327,13 @@ class TrainingTest(unittest.TestCase):
         shutil.copy(out / "checkpoints" / "000002.pt", out / "checkpoints" / "000003.pt")
         self.assertIsNone(current_choice(out))
 
+    def test_a_run_without_checkpoints_keeps_its_policy(self):
+        out = self.folder / "copied"
+        shutil.copytree(self.out, out, ignore=shutil.ignore_patterns("checkpoints"))
+        before = file_hash(out / "policy.onnx")
+        self.assertEqual(ensure_policy(out), out / "policy.onnx")
+        self.assertEqual(file_hash(out / "policy.onnx"), before)
+
     def test_an_adaptive_learning_rate_goes_on_with_the_networks(self):
         runner = mock.Mock(device="cpu", train_config=CONFIG)
         path = latest_checkpoint(self.out)

@@ -1,6 +1,5 @@
 """What costs a skill: probes against what was altered, the wrapper, and altered engines whose one mistake is named."""
 
-import contextlib
 import io
 import json
 import math
@@ -12,13 +11,13 @@ from pathlib import Path
 import torch
 
 from tests import toy_grasp
-from xreset.cli import main
+from tests.command import xreset
+from tests.toy_results import episodes
 from xreset.errors import CapabilityError, XResetError
 from xreset.eval.engines.alteration import Alteration, altered_engine, change_towards
 from xreset.eval.engines.attribution import Attribution, Row, attribute
 from xreset.eval.engines.attribution_view import amount, label, not_tried, rich_table, verdict, write_plot
 from xreset.eval.engines.measure import Measured, measure
-from xreset.eval.rollout import Episode
 from xreset.eval.sensitivity import COMPARED, Effect
 from xreset.eval.trial import Engine, engine
 from xreset.physics import State
@@ -238,30 +237,18 @@ class AttributeTest(unittest.TestCase):
 
     def test_torsional_friction_is_tried_without_and_with_more_of_it(self):
         found = self.attribute(replace(mujoco(), name="same"), only=["torsional friction"], what_if=True)
-        tried = [(row.name, row.alteration, amount(row)) for row in found.rows if row.kind == "what if"]
-        name = "torsional friction"
-        self.assertEqual(
-            tried,
-            [(name, Alteration(torsional_friction=0.0), "none"), (name, Alteration(torsional_friction=2.0), "x 2")],
-        )
+        tried = [(row.alteration.torsional_friction, amount(row)) for row in found.rows if row.kind == "what if"]
+        self.assertEqual(tried, [(0.0, "none"), (2.0, "x 2")])
 
     def test_a_change_that_goes_too_far_is_told_from_the_others(self):
         b = replace(
             altered_engine(engine("sapien", workers=0), Alteration(table_friction=0.7, mass=1.1)), name="sapien"
         )
         found = self.attribute(b, only=["table friction", "patch torsional friction", "object mass"])
-        kinds = [(row.kind, row.name) for row in found.rows]
-        self.assertEqual(
-            kinds,
-            [
-                ("as it is", "mujoco"),
-                ("towards", "table friction"),
-                ("at most", "patch torsional friction"),
-                ("towards", "object mass"),
-                ("all", "all 2 at once"),
-                ("other", "sapien"),
-            ],
-        )
+        kinds = ["as it is", "towards", "at most", "towards", "all", "other"]
+        self.assertEqual([row.kind for row in found.rows], kinds)
+        names = ["mujoco", "table friction", "patch torsional friction", "object mass", "all 2 at once", "sapien"]
+        self.assertEqual([row.name for row in found.rows], names)
         self.assertAlmostEqual(found.rows[2].alteration.torsional_friction, 0.7 * 0.7 / 2, delta=0.01)
         self.assertEqual(found.rows[4].alteration.torsional_friction, 1.0)
 
@@ -271,17 +258,13 @@ class AttributeTest(unittest.TestCase):
 
 
 def row(kind: str, name: str, *scores: float) -> Row:
-    """A run whose episode i is of demonstration i // 2; in A as it is, every score is 0.66."""
-    episodes = tuple(
-        Episode(
-            sequence=i // 2, sequence_name=f"demo_{i // 2}", object="brick", repetition=i % 2, approach=True, grasp=score > 0.5,
-            reorient=False, reorient_once=False, reorientation_progress=0.0, task_progress=score, out_of_bounds=False, nonfinite=False,
-            overflow=False,
-        )
-        for i, score in enumerate(scores)
-    )  # fmt: skip
-    effect = Effect.of(episodes, [replace(e, task_progress=0.66) for e in episodes])
-    return Row(kind=kind, name=name, alteration=Alteration(mass=0.8), episodes=episodes, effect=effect)  # pyright: ignore[reportArgumentType]
+    """A run of two episodes of each demonstration; in A as it is, every score is 0.66."""
+    effect = Effect.of(episodes(list(scores)), episodes([0.66] * len(scores)))
+    return Row(kind=kind, name=name, alteration=Alteration(mass=0.8), episodes=episodes(list(scores)), effect=effect)  # pyright: ignore[reportArgumentType]
+
+
+A = row("as it is", "mujoco", *[0.66] * 8)
+B = row("other", "sapien", *[0.33] * 8)
 
 
 class OutcomeTest(unittest.TestCase):
@@ -292,22 +275,21 @@ class OutcomeTest(unittest.TestCase):
 
     def test_shares_of_the_gap(self):
         found = self.found(
-            row("as it is", "mujoco", *[0.66] * 8),
+            A,
             row("towards", "tip friction", *[0.33] * 4, *[0.66] * 4),
             row("towards", "object mass", *[0.33] * 6, *[0.66] * 2),
             row("towards", "latency", *[0.99] * 8),
-            row("other", "sapien", *[0.33] * 8),
+            B,
         )
         self.assertAlmostEqual(found.share(found.rows[1]), 0.5)
         self.assertAlmostEqual(found.share(found.rows[3]), -1.0)
         self.assertEqual(found.costs(), found.rows[2])
 
     def test_a_bound_is_named_only_where_nothing_else_matters(self):
-        ends = row("as it is", "mujoco", *[0.66] * 8), row("other", "sapien", *[0.33] * 8)
         bound = row("at most", "patch torsional friction", *[0.0] * 8)
-        found = self.found(ends[0], bound, row("towards", "tip friction", *[0.33] * 6, *[0.66] * 2), ends[1])
+        found = self.found(A, bound, row("towards", "tip friction", *[0.33] * 6, *[0.66] * 2), B)
         self.assertEqual(found.costs(), found.rows[2])
-        found = self.found(ends[0], bound, ends[1])
+        found = self.found(A, bound, B)
         self.assertEqual(found.costs(), bound)
         self.assertIn(
             "'patch torsional friction' may bring about 200% of it, at most (changed in every contact", verdict(found)
@@ -315,16 +297,16 @@ class OutcomeTest(unittest.TestCase):
         self.assertEqual(label(bound), "patch torsional friction (at most)")
 
     def test_a_difference_of_one_demonstration_among_many_does_not_matter(self):
-        found = self.found(row("as it is", "mujoco", *[0.66] * 8), row("other", "sapien", 0.33, 0.33, *[0.66] * 6))
+        found = self.found(A, row("other", "sapien", 0.33, 0.33, *[0.66] * 6))
         self.assertFalse(found.gap.is_certain)
         self.assertTrue(math.isnan(found.share(found.rows[-1])))
         self.assertIsNone(found.as_dict()["rows"][-1]["share_of_gap"])
 
     def test_json_table_and_plot(self):
         found = self.found(
-            row("as it is", "mujoco", *[0.66] * 8),
+            A,
             row("towards", "object mass", *[0.33] * 8),
-            row("other", "sapien", *[0.33] * 8),
+            B,
         )
         data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
         self.assertEqual((data["schema"], data["costs_most"]), ("xreset-attribution/1", "object mass"))
@@ -342,21 +324,19 @@ class OutcomeTest(unittest.TestCase):
 
 
 class CommandTest(unittest.TestCase):
-    def refuse(self, *arguments: str) -> str:
-        with contextlib.redirect_stderr(io.StringIO()) as text, self.assertRaises(SystemExit) as stopped:
-            main(["engines", "attribute", *arguments])
-        self.assertEqual(stopped.exception.code, 1)
-        return text.getvalue()
-
     def test_bad_input(self):
-        rest = ("--demos", "none.npz", "--robot", "ur7e-sharpa")
-        self.assertIn("Choose two engines", self.refuse("zero", *rest, "--backend", "mujoco", "--towards", "mujoco"))
-        self.assertIn(
-            "expected a whole number from 1", self.refuse("zero", *rest, "--towards", "sapien", "--episodes", "0")
-        )
-        self.assertIn("there is no backend 'havok'", self.refuse("zero", *rest, "--towards", "havok"))
-        self.assertIn("there is no none.npz", self.refuse("zero", *rest, "--towards", "sapien"))
-        self.assertIn("Unknown policy", self.refuse("none", *rest, "--towards", "sapien"))
+        options = ("--demos", "none.npz", "--robot", "ur7e-sharpa", "--towards")
+        for message, policy, *more in (
+            ("does not differ from itself|Choose two engines", "zero", "mujoco"),
+            ("expected a whole number from 1", "zero", "sapien", "--episodes", "0"),
+            ("there is no backend 'havok'", "zero", "havok"),
+            ("there is no none.npz", "zero", "sapien"),
+            ("Unknown policy", "none", "sapien"),
+        ):
+            with self.subTest(message):
+                code, _, err = xreset("engines", "attribute", policy, *options, *more)
+                self.assertEqual(code, 1)
+                self.assertRegex(err, message)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """From which demonstrated states a policy goes on to the goal."""
 
-import contextlib
-import io
 import json
 import tempfile
 import unittest
@@ -10,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.command import xreset
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
-from xreset.cli import main
 from xreset.errors import DemoError
 from xreset.eval.frontier import STAGES, Tried, by_stage, frontier, stage_of
 from xreset.eval.policy_spec import PolicySpec
@@ -126,10 +124,7 @@ class FrontierTest(unittest.TestCase):
             (("ik", "--robot", "ur7e-sharpa"), "cannot go on from a state"),
             (("zero", "--states", "0"), "expected a whole number from 1"),
         ):
-            err = io.StringIO()
-            with self.subTest(words), contextlib.redirect_stderr(err), self.assertRaises(SystemExit):
-                main(["frontier", *arguments, "--resets", str(self.resets)])
-            self.assertIn(words, err.getvalue())
+            self.assertIn(words, xreset("frontier", *arguments, "--resets", self.resets)[2])
 
 
 if __name__ == "__main__":

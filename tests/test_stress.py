@@ -2,42 +2,22 @@
 
 from __future__ import annotations
 
-import io
-import json
 import tempfile
 import unittest
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict, replace
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 
-from xreset.cli import main
+from tests.command import xreset
+from tests.toy_bank import SOUP
+from tests.toy_results import episodes
 from xreset.errors import XResetError
-from xreset.eval.rollout import Episode
 from xreset.eval.sensitivity import SWEEPS
 from xreset.eval.stress import Curve, Stress, chosen, curve, read_stress, stressed
 from xreset.files import write_json
 from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
-
-
-def episodes(progress: list[float]) -> tuple[Episode, ...]:
-    flags = dict.fromkeys(
-        ("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow"), False
-    )
-    return tuple(
-        Episode(
-            sequence=i // 2,
-            sequence_name=f"s{i // 2}",
-            object="o",
-            repetition=i % 2,
-            reorientation_progress=0.0,
-            task_progress=p,
-            **flags,
-        )
-        for i, p in enumerate(progress)
-    )
 
 
 class StressedTest(unittest.TestCase):
@@ -147,36 +127,22 @@ class CommandTest(unittest.TestCase):
         """A hand that does nothing, two demonstrations and one value: files, table, picture; and an engine that cannot set drives."""
         from xreset.backends.mujoco import MujocoBackend
 
-        with tempfile.TemporaryDirectory() as name:
-            folder, out, err = Path(name), io.StringIO(), io.StringIO()
-            demos = str(folder / "demos.npz")
-            with redirect_stdout(out), redirect_stderr(err):
-                main(["demos", "synth", "--objects", "005_tomato_soup_can", "--per-object", "2", "--out", demos])
-                options = ["--robot", "openarm", "--demos", demos, "--episodes", "1", "--out", str(folder)]
-                with mock.patch.object(MujocoBackend, "capabilities", MujocoBackend.capabilities - {"drives"}):
-                    main(
-                        [
-                            "stress",
-                            "zero",
-                            *options,
-                            "--property",
-                            "arm-stiffness=0.5",
-                            "--property",
-                            "action-latency=1",
-                        ]
-                    )
-            found = json.loads((folder / "mujoco.json").read_text())
-            self.assertEqual(
-                (found["schema"], found["episodes"], found["left_out"]), ("xreset-stress/1", 2, ["arm-stiffness"])
-            )
-            (curve,) = found["curves"]
-            self.assertEqual([p["value"] for p in curve["points"]], [0.0, 1.0])
-            (card,) = read_stress(folder)
-            self.assertEqual((card.left_out, card.curves[0].property), (("arm-stiffness",), "action-latency"))
-            self.assertEqual(curve["points"][0]["task_progress"], found["task_progress"])
-            self.assertTrue((folder / "stress.png").read_bytes().startswith(b"\x89PNG"))
-            self.assertIn("left out in mujoco, which cannot set them: arm-stiffness", out.getvalue())
-            self.assertIn("cannot be set", out.getvalue())
+        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        demos = folder / "demos.npz"
+        xreset("demos", "synth", "--objects", SOUP, "--per-object", 2, "--out", demos)
+        options = ("--robot", "openarm", "--demos", demos, "--episodes", 1, "--out", folder)
+        sweeps = ("--property", "arm-stiffness=0.5", "--property", "action-latency=1")
+        with mock.patch.object(MujocoBackend, "capabilities", MujocoBackend.capabilities - {"drives"}):
+            _, out, _ = xreset("stress", "zero", *options, *sweeps)
+        (card,) = read_stress(folder)
+        self.assertEqual((card.schema, card.policy, card.episodes), ("xreset-stress/1", "zero", 2))
+        self.assertEqual(card.left_out, ("arm-stiffness",))
+        (curve,) = card.curves
+        self.assertEqual((curve.property, [p.value for p in curve.points]), ("action-latency", [0.0, 1.0]))
+        self.assertEqual(curve.points[0].task_progress, card.task_progress)
+        self.assertTrue((folder / "stress.png").read_bytes().startswith(b"\x89PNG"))
+        for expected in ("left out in mujoco, which cannot set them: arm-stiffness", "cannot be set"):
+            self.assertIn(expected, out)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,29 @@ from xreset.eval.rollout import Episode, Rollouts, Trace
 OBJECTS = (SOUP, SPAM)
 
 
+def toy_episode(sequence: int, repetition: int, *reached: str, thing: str = "", **changes: Any) -> Episode:
+    """An episode of a demonstration that reached some stages; nothing else is special but for ``changes``."""
+    flags = ("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow")
+    values = {"reorientation_progress": 0.0, "task_progress": 0.0} | changes
+    return Episode(
+        sequence=sequence,
+        sequence_name=f"demo_{sequence}",
+        object=thing or OBJECTS[sequence],
+        repetition=repetition,
+        **{name: name in reached for name in flags},
+        **values,
+    )
+
+
+def episodes(scores: list[float]) -> tuple[Episode, ...]:
+    """Two episodes of each demonstration, with these task progresses; above 0.5 with a grasp."""
+    found = []
+    for i, score in enumerate(scores):
+        reached = ("approach", "grasp") if score > 0.5 else ("approach",)
+        found.append(toy_episode(i // 2, i % 2, *reached, thing=SOUP, task_progress=score))
+    return tuple(found)
+
+
 def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
     """Demonstration 0 (soup) reaches the goal once and the approach once, demonstration 1 (spam) a grasp and nothing.
 
@@ -20,19 +43,6 @@ def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
         joint_pos: [J] where the robot of the traces stands; default: three joints at 0.
     """
     joints = np.zeros(3) if joint_pos is None else joint_pos
-
-    def episode(sequence: int, repetition: int, **changes: Any) -> Episode:
-        flags = dict.fromkeys(
-            ("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow"), False
-        )
-        values = flags | {"reorientation_progress": 0.0, "task_progress": 0.0} | changes
-        return Episode(
-            sequence=sequence,
-            sequence_name=f"demo_{sequence}",
-            object=OBJECTS[sequence],
-            repetition=repetition,
-            **values,
-        )
 
     def trace(sequence: int) -> Trace:
         time = np.arange(5) * 0.05
@@ -49,20 +59,13 @@ def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
             joint_target=joints + 0.01 * np.arange(12)[:, None],
         )
 
+    lifted = ("approach", "grasp")
+    done = ("reorient", "reorient_once")
     episodes = (
-        episode(
-            0,
-            0,
-            approach=True,
-            grasp=True,
-            reorient=True,
-            reorient_once=True,
-            reorientation_progress=0.9,
-            task_progress=1.0,
-        ),
-        episode(0, 1, approach=True, reorientation_progress=0.1, task_progress=0.33, overflow=True),
-        episode(1, 0, approach=True, grasp=True, reorientation_progress=0.5, task_progress=0.66, out_of_bounds=True),
-        episode(1, 1, nonfinite=True),
+        toy_episode(0, 0, *lifted, *done, reorientation_progress=0.9, task_progress=1.0),
+        toy_episode(0, 1, "approach", "overflow", reorientation_progress=0.1, task_progress=0.33),
+        toy_episode(1, 0, *lifted, "out_of_bounds", reorientation_progress=0.5, task_progress=0.66),
+        toy_episode(1, 1, "nonfinite"),
     )
     return Rollouts(episodes=episodes, traces=(trace(0), trace(1)), control_steps_per_second=1234.56)
 

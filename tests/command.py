@@ -1,0 +1,19 @@
+"""The command line in a test."""
+
+import contextlib
+import io
+
+from xreset.cli import main
+
+
+def xreset(*arguments: object) -> tuple[int, str, str]:
+    """Run ``xreset ARGUMENTS``: its exit code, and what it prints as output and as errors."""
+    code = 0
+    out = io.StringIO()
+    err = io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return code, out.getvalue(), err.getvalue()

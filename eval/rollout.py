@@ -279,8 +279,8 @@ class _Recorder:
                 goal_pos=goal_pos[i],
                 goal_quat=goal_quat[i],
                 time=np.array(self._time),
-                joint_target=np.stack([targets[i] for targets in self._targets]),
-                **{name: np.stack([frame[i] for frame in frames]) for name, frames in self._frames.items()},  # noqa: XR002
+                joint_target=np.stack(self._targets)[:, i],
+                **{name: np.stack(frames)[:, i] for name, frames in self._frames.items()},
             )
             out.append(trace)
         return out

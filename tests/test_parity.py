@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import math
 import tempfile
@@ -13,8 +11,10 @@ from unittest import mock
 import numpy as np
 import torch
 
+from tests import toy_grasp
+from tests.command import xreset
 from tests.toy_bank import toy_bank
-from xreset import cli, robots
+from xreset import robots
 from xreset.errors import DemoError
 from xreset.eval.engines.agreement import (
     Metric,
@@ -44,7 +44,6 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.objects.catalogue import load_object
 from xreset.objects.rest import rest_height
-from xreset.physics import State
 from xreset.plugins import backend_status
 from xreset.retarget.file import Retargeted, write_retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
@@ -270,23 +269,10 @@ class Finding(unittest.TestCase):
         )
 
 
-def recording(**changes) -> Recording:
-    """Two worlds, three steps, one joint, two fingertips; ``changes`` replace fields."""
-    t, g = 3, 2
-    still = State.at_rest(torch.zeros(g, 1), torch.zeros(g, 3), torch.tensor([[1.0, 0, 0, 0]] * g))
-    fields = {
-        "start": still,
-        "joint_pos": torch.zeros(t, g, 1),
-        "joint_target": torch.zeros(t, g, 1),
-        "object_pos": torch.zeros(t, g, 3),
-        "object_quat": torch.tensor([1.0, 0, 0, 0]).expand(t, g, 4),
-        "palm_pos": torch.zeros(t, g, 3),
-        "palm_quat": torch.tensor([1.0, 0, 0, 0]).expand(t, g, 4),
-        "tip_force": torch.tensor([[2.0, 0, 0], [-2.0, 0, 0]]).expand(t, g, 2, 3),
-        "tip_touch": torch.ones(t, g, 2, dtype=torch.bool),
-        "broken": torch.zeros(g, dtype=torch.bool),
-    }
-    return Recording(**fields | changes)
+def recording(**changes: torch.Tensor) -> Recording:
+    """Two worlds, three steps, one joint; both fingertips press with 2 N against each other."""
+    force = torch.tensor([[2.0, 0, 0], [-2.0, 0, 0]]).expand(3, 2, 2, 3)
+    return toy_grasp.recording(steps=3, worlds=2, joints=1, **{"tip_force": force} | changes)
 
 
 class Numbers(unittest.TestCase):
@@ -311,9 +297,8 @@ class Numbers(unittest.TestCase):
     def test_only_the_last_steps_of_a_press_count(self):
         force = recording().tip_force.clone()
         force[0] *= 100
-        self.assertEqual(
-            [m.measured for m in press_metrics(recording(tip_force=force), recording(), steps=2)], [0.0, 0.0]
-        )
+        metrics = press_metrics(recording(tip_force=force), recording(), steps=2)
+        self.assertEqual([m.measured for m in metrics], [0.0, 0.0])
 
     def test_nothing_to_compare_misses_the_target(self):
         none = recording(tip_force=torch.zeros(3, 2, 2, 3))
@@ -447,16 +432,15 @@ class Comparing(unittest.TestCase):
 class Engines(unittest.TestCase):
     """A reduced comparison in the other engines."""
 
-    def compared(self, *engines: Engine, config: ParityConfig) -> dict[str, Metric]:
-        robot, can = robots.load("ur7e-sharpa"), load_object("soup")
-        frames = frames_above(robot, can, FREE_OFFSETS, gap=FREE_GAP)
-        result = compare(robot, [can], frames, engines, grasps=3, config=config, reference=engine("mujoco", workers=0))
-        return {metric.name: metric for metric in result.engines[0].metrics}
-
     def check(self, name: str) -> None:
         if backend_status(name).reason is not None:
             self.skipTest(f"{name} cannot be used here")
-        metrics = self.compared(engine(name, workers=0), config=replace(CONFIG, frictions=(0.8,)))
+        robot, can = robots.load("ur7e-sharpa"), load_object("soup")
+        frames = frames_above(robot, can, FREE_OFFSETS, gap=FREE_GAP)
+        config = replace(CONFIG, frictions=(0.8,))
+        tested, reference = engine(name, workers=0), engine("mujoco", workers=0)
+        result = compare(robot, [can], frames, [tested], grasps=3, config=config, reference=reference)
+        metrics = {metric.name: metric for metric in result.engines[0].metrics}
         for metric in ("press, total", "press, fingertip", "closing, outcome"):  # a few holds near the edge say little
             with self.subTest(metric):
                 self.assertTrue(metrics[metric].ok, metrics[metric])
@@ -471,16 +455,6 @@ class Engines(unittest.TestCase):
 class Command(unittest.TestCase):
     def setUp(self):
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-
-    def run_command(self, *words: object) -> tuple[str, object]:
-        """What the command prints, and its exit code."""
-        out = io.StringIO()
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
-            try:
-                cli.main(["engines", "compare", *map(str, words)])
-            except SystemExit as end:
-                return out.getvalue(), end.code
-        return out.getvalue(), None
 
     def retargeted(self) -> Path:
         """A file with the frames of :func:`frames_above`, each a sequence of two."""
@@ -527,27 +501,28 @@ class Command(unittest.TestCase):
             engine("mujoco", workers=0),
             altered(engine("mujoco", workers=0), "pybullet", robot=lambda r: with_drives(r, 0.3)),
         )
-        for made, code in ((replace(good, name="pybullet"), None), (bad, 1)):
+        for made, code in ((replace(good, name="pybullet"), 0), (bad, 1)):
             with (
                 mock.patch("xreset.eval.trial.engine", lambda name, made=made, **_: made),
                 mock.patch("xreset.eval.engines.agreement.engine", lambda name: good),
             ):
-                text, found = self.run_command(path, "--backend", "pybullet", "--grasps", 2, "--json", out)
+                options = ("--backend", "pybullet", "--grasps", 2, "--json", out)
+                found, text, _ = xreset("engines", "compare", path, *options)
             self.assertEqual(found, code)
             self.assertIn("press, fingertip", text)
             self.assertIn("missed: pybullet: press, total" if code else "all targets met", text)
-            self.assertEqual(json.loads(out.read_text())["ok"], code is None)
+            self.assertEqual(json.loads(out.read_text())["ok"], not code)
 
     def test_wrong_use_is_explained(self):
         path = self.retargeted()
         for said, words in (
             ("there is no ", [self.folder / "none.npz"]),
             ("--grasps is 0, expected a whole number from 1", [path, "--grasps", 0]),
-            ("there is no object 'bottle'", [path, "--only", "bottle"]),
+            ("Unknown object 'bottle'", [path, "--only", "bottle"]),
             ("for the robot 'ur7e-sharpa'", [path, "--robot", "openarm"]),
         ):
             with self.subTest(said):
-                text, code = self.run_command(*words, "--backend", "mujoco")
+                code, _, text = xreset("engines", "compare", *words, "--backend", "mujoco")
                 self.assertEqual(code, 1)
                 self.assertIn("xreset engines compare:", text)
                 self.assertIn(said, text)

@@ -1,6 +1,5 @@
 """Replays in several engines: partings of constructed recordings, altered engines found at the right place, files, refusals."""
 
-import contextlib
 import io
 import json
 import math
@@ -13,8 +12,10 @@ import numpy as np
 import torch
 
 from tests import toy_grasp
+from tests.command import xreset
 from tests.data import data_dir
-from xreset.cli import main
+from tests.toy_bank import SOUP, SPAM
+from tests.toy_grasp import recording
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.eval.engines.actions import Actions, play_policy, read_actions, recorded_actions, write_actions
 from xreset.eval.engines.divergence import Parting, Thresholds, differences, first_of, partings
@@ -59,25 +60,6 @@ def wave_actions() -> Actions:
     return replace(actions, start=start, joint_target=(home + step).expand(30, -1).clone(), phases=())
 
 
-def recording(joint=None, pos=None, quat=None, force=None, steps: int = 20) -> Recording:
-    """One world of the toy robot with two fingers; what is not given stands still and touches nothing."""
-    joints = len(toy_grasp.robot().joints)
-    zero3 = torch.zeros(steps, 1, 3)
-    start = toy_grasp.start()
-    return Recording(
-        start=start,
-        joint_pos=torch.zeros(steps, 1, joints) if joint is None else joint,
-        joint_target=torch.zeros(steps, 1, joints),
-        object_pos=zero3 if pos is None else pos,
-        object_quat=torch.tensor([1.0, 0, 0, 0]).expand(steps, 1, 4) if quat is None else quat,
-        palm_pos=zero3,
-        palm_quat=torch.tensor([1.0, 0, 0, 0]).expand(steps, 1, 4),
-        tip_force=torch.zeros(steps, 1, 2, 3) if force is None else force,
-        tip_touch=torch.zeros(steps, 1, 2, dtype=torch.bool),
-        broken=torch.tensor([False]),
-    )
-
-
 def compare(found: Recording, reference: Recording, **thresholds: float) -> dict[str, Parting]:
     t = Thresholds(**thresholds)
     return {p.quantity: p for p in partings(differences(found, reference, DT, t), toy_grasp.robot(), t)}
@@ -92,7 +74,7 @@ class PartingsTest(unittest.TestCase):
         joint = torch.zeros(20, 1, 5)
         joint[7:, 0, 3] = 0.03  # turn
         joint[12, 0, 1] = 0.05  # swing, for one step
-        p = compare(recording(joint=joint), recording())["joints"]
+        p = compare(recording(joint_pos=joint), recording())["joints"]
         self.assertEqual((p.where, p.unit, p.largest_where), ("turn", "rad", "swing"))
         self.assertAlmostEqual(p.time or 0.0, 8 * DT)
         self.assertAlmostEqual(p.largest_time, 13 * DT)
@@ -102,9 +84,9 @@ class PartingsTest(unittest.TestCase):
     def test_a_prismatic_joint_has_its_own_threshold(self):
         joint = torch.zeros(20, 1, 5)
         joint[5:, 0, 0] = 0.003  # lift
-        p = compare(recording(joint=joint), recording())["joints"]
+        p = compare(recording(joint_pos=joint), recording())["joints"]
         self.assertEqual((p.where, p.unit, p.threshold), ("lift", "m", 0.002))
-        self.assertIsNone(compare(recording(joint=joint), recording(), travel=0.004)["joints"].time)
+        self.assertIsNone(compare(recording(joint_pos=joint), recording(), travel=0.004)["joints"].time)
 
     def test_position_and_orientation(self):
         pos, quat = torch.zeros(20, 1, 3), torch.tensor([1.0, 0, 0, 0]).repeat(20, 1, 1)
@@ -112,7 +94,7 @@ class PartingsTest(unittest.TestCase):
         quat[15:] = -quat_from_axis_angle(
             torch.tensor([0.0, 0.0, math.radians(6)])
         )  # the sign of a quaternion means nothing
-        found = compare(recording(pos=pos, quat=quat), recording())
+        found = compare(recording(object_pos=pos, object_quat=quat), recording())
         self.assertAlmostEqual(found["object position"].time or 0.0, 11 * DT)
         self.assertAlmostEqual(found["object position"].end, 0.006, places=6)
         self.assertAlmostEqual(found["object orientation"].time or 0.0, 16 * DT)
@@ -122,16 +104,16 @@ class PartingsTest(unittest.TestCase):
         force, other = torch.zeros(20, 1, 2, 3), torch.zeros(20, 1, 2, 3)
         force[4, 0, 0] = torch.tensor([0.0, 0.0, 3.0])  # the thumb flickers: one step, not averaged
         other[9:, 0, 1, 0] = 1.0  # the index finger touches in the reference only
-        p = compare(recording(force=force), recording(force=other), window=DT)["contacts"]
+        p = compare(recording(tip_force=force), recording(tip_force=other), window=DT)["contacts"]
         self.assertEqual(p.where, "index does not touch")
         self.assertAlmostEqual(p.time or 0.0, 10 * DT)
-        self.assertIsNone(compare(recording(force=force), recording(), window=DT)["contacts"].time)
+        self.assertIsNone(compare(recording(tip_force=force), recording(), window=DT)["contacts"].time)
 
     def test_forces_are_averaged_and_their_direction_does_not_count(self):
         force, other = torch.zeros(20, 1, 2, 3), torch.zeros(20, 1, 2, 3)
         force[:, 0, 0, 2], other[:, 0, 0, 0] = 5.0, 5.0
         force[10, 0, 1, 2] = 5.0  # one step of 5 N is 5 / 3 N over 50 ms
-        p = compare(recording(force=force), recording(force=other))["contact force"]
+        p = compare(recording(tip_force=force), recording(tip_force=other))["contact force"]
         self.assertIsNone(p.time)
         self.assertAlmostEqual(p.largest, 5 / 3, places=5)
         self.assertEqual(p.largest_where, "index")
@@ -139,16 +121,9 @@ class PartingsTest(unittest.TestCase):
     def test_what_is_not_finite_ends_the_comparison(self):
         pos = torch.zeros(20, 1, 3)
         pos[8:] = math.nan
-        d = differences(recording(pos=pos), recording(), DT, Thresholds())
+        d = differences(recording(object_pos=pos), recording(), DT, Thresholds())
         self.assertEqual(len(d.time), 8)
-        self.assertEqual(
-            partings(
-                differences(recording(pos=pos * math.nan), recording(), DT, Thresholds()),
-                toy_grasp.robot(),
-                Thresholds(),
-            ),
-            (),
-        )
+        self.assertEqual(compare(recording(object_pos=pos * math.nan), recording()), {})
 
 
 class TraceTest(unittest.TestCase):
@@ -261,9 +236,7 @@ class TraceTest(unittest.TestCase):
 
 class ActionsTest(unittest.TestCase):
     def setUp(self):
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.path = Path(folder.name) / "actions.npz"
+        self.path = Path(self.enterContext(tempfile.TemporaryDirectory())) / "actions.npz"
         actions = grasp_actions()
         self.actions = replace(
             actions, scene=replace(actions.scene, friction=PairFriction(tip=0.7, link=0.4, table=0.3))
@@ -334,56 +307,47 @@ class EvaluationTest(unittest.TestCase):
         from xreset import robots
 
         robot = robots.load("openarm")
-        with tempfile.TemporaryDirectory() as folder:
-            rollouts = toy_rollouts(robot.home)
+        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        made = toy_rollouts(robot.home)
+
+        def load(episode: int, thing: str | None = None, **changes) -> Actions:
+            """The actions of an evaluation whose traces have some changes."""
+            rollouts = replace(made, traces=tuple(replace(t, **changes) for t in made.traces))
             summary = toy_summary("sapien", rollouts, robot="openarm")
-            write_results(Path(folder), summary, rollouts, robot.joint_names)
-            path = Path(folder) / "sapien.trace.npz"
-            actions = from_file(path, Sequence(object="010_potted_meat_can", episode=0), Place())
-            self.assertEqual(
-                (actions.object.name, actions.label), ("010_potted_meat_can", "zero in sapien, demonstration 1")
-            )
-            np.testing.assert_allclose(actions.joint_target.numpy(), rollouts.traces[1].joint_target, atol=1e-6)
-            with self.assertRaisesRegex(
-                DemoError, "records 1 episodes of 010_potted_meat_can, so --episode is at most 0"
-            ):
-                from_file(path, Sequence(object="010_potted_meat_can", episode=1), Place())
-            soup = replace(rollouts, traces=tuple(replace(t, object="005_tomato_soup_can") for t in rollouts.traces))
-            write_results(Path(folder), summary, soup, robot.joint_names)
-            for episode in (0, 1):
-                label = from_file(path, Sequence(object=None, episode=episode), Place()).label
-                self.assertEqual(label, f"zero in sapien, demonstration {episode}")
-            write_results(Path(folder), summary, rollouts, robot.joint_names)
-            with self.assertRaisesRegex(DemoError, "has no mug; it has 005_tomato_soup_can, 010_potted_meat_can"):
-                from_file(path, Sequence(object="mug", episode=0), Place())
-            old = replace(rollouts, traces=tuple(replace(t, joint_target=None) for t in rollouts.traces))
-            write_results(Path(folder), summary, old, robot.joint_names)
-            with self.assertRaisesRegex(FileFormatError, "states without the actions"):
-                from_file(path, Sequence(object=None, episode=0), Place())
+            write_results(folder, summary, rollouts, robot.joint_names)
+            return from_file(folder / "sapien.trace.npz", Sequence(object=thing, episode=episode), Place())
+
+        actions = load(0, SPAM)
+        self.assertEqual((actions.object.name, actions.label), (SPAM, "zero in sapien, demonstration 1"))
+        np.testing.assert_allclose(actions.joint_target.numpy(), made.traces[1].joint_target, atol=1e-6)
+        for episode in (0, 1):
+            self.assertEqual(load(episode, object=SOUP).label, f"zero in sapien, demonstration {episode}")
+        with self.assertRaisesRegex(DemoError, f"records 1 episodes of {SPAM}, so --episode is at most 0"):
+            load(1, SPAM)
+        with self.assertRaisesRegex(DemoError, f"has no mug; it has {SOUP}, {SPAM}"):
+            load(0, "mug")
+        with self.assertRaisesRegex(FileFormatError, "states without the actions"):
+            load(0, joint_target=None)
 
 
 class CommandTest(unittest.TestCase):
-    def setUp(self):
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.folder = Path(folder.name)
-
-    def refuse(self, *arguments: str) -> str:
-        with contextlib.redirect_stderr(io.StringIO()) as text, self.assertRaises(SystemExit) as stopped:
-            main(["engines", "trace", *arguments])
-        self.assertEqual(stopped.exception.code, 1)
-        return text.getvalue()
-
     def test_bad_input(self):
-        missing = str(self.folder / "none.npz")
-        self.assertIn("there is no", self.refuse(missing))
-        self.assertIn("thresholds must be above 0", self.refuse(missing, "--force-threshold", "0"))
-        self.assertIn("expected a whole number from 0", self.refuse(missing, "--episode", "-1"))
-        self.assertIn("there is no backend 'havok'", self.refuse(missing, "--backend", "havok"))
-        wrong = self.folder / "wrong.npz"
+        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        missing = folder / "none.npz"
+        wrong = folder / "wrong.npz"
         np.savez(wrong, schema="xreset-replays/1")
-        self.assertIn("expected 'xreset-demos/1'", self.refuse(str(wrong)))
-        self.assertIn("Add --robot", self.refuse(str(wrong), "--policy", "ik"))
+        for message, *arguments in (
+            ("there is no", missing),
+            ("thresholds must be above 0", missing, "--force-threshold", "0"),
+            ("expected a whole number from 0", missing, "--episode", "-1"),
+            ("there is no backend 'havok'", missing, "--backend", "havok"),
+            ("expected 'xreset-demos/1'", wrong),
+            ("Add --robot", wrong, "--policy", "ik"),
+        ):
+            with self.subTest(message):
+                code, _, err = xreset("engines", "trace", *arguments)
+                self.assertEqual(code, 1)
+                self.assertIn(message, err)
 
 
 class RealGraspTest(unittest.TestCase):

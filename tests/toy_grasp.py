@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.toy_bank import toy_bank
 from xreset.backends.conformance.scene import gripper, objects
+from xreset.eval.engines.recording import Recording
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.trial import Engine, Trial
 from xreset.geometry.kinematics import Kinematics
@@ -60,6 +61,24 @@ def targets(step: int) -> np.ndarray:
     wanted[spec.joint_names.index("jaw_a_slide")] = CLOSED
     wanted[spec.joint_names.index("lift")] += RAISED * np.clip((step - 15) / 30, 0, 1)
     return wanted
+
+
+def recording(*, steps: int = 20, worlds: int = 1, joints: int = 5, **changes: torch.Tensor) -> Recording:
+    """A recording with two fingertips in which everything stands still and touches nothing; ``changes`` replace fields."""
+    upright = torch.tensor([1.0, 0, 0, 0])
+    still = State.at_rest(torch.zeros(worlds, joints), torch.zeros(worlds, 3), upright.expand(worlds, 4))
+    fields = {
+        "joint_pos": torch.zeros(steps, worlds, joints),
+        "joint_target": torch.zeros(steps, worlds, joints),
+        "object_pos": torch.zeros(steps, worlds, 3),
+        "object_quat": upright.expand(steps, worlds, 4),
+        "palm_pos": torch.zeros(steps, worlds, 3),
+        "palm_quat": upright.expand(steps, worlds, 4),
+        "tip_force": torch.zeros(steps, worlds, 2, 3),
+        "tip_touch": torch.zeros(steps, worlds, 2, dtype=torch.bool),
+        "broken": torch.zeros(worlds, dtype=torch.bool),
+    }
+    return Recording(start=still, **fields | changes)
 
 
 def bank() -> ResetBank:

@@ -219,9 +219,13 @@ def compare(
     for done, e in enumerate(whole):
         progress(f"{e.name}: closing {len(table)} hands", done, total)
         tries[e.name].press, tries[e.name].closing = try_closings(e, scene, table, config)
-    closings = {e.name: tries[e.name].closing for e in whole if e is not floor}
+    closings = {}
+    for e in whole:
+        closing = tries[e.name].closing
+        if closing is not None and e is not floor:
+            closings[e.name] = closing
     air = find_grasps(frames, robot, objects, grasps, where="air")
-    common = common_states(robot, table, air, closings, grasps, scene.control_dt, config)  # pyright: ignore[reportArgumentType]
+    common = common_states(robot, table, air, closings, grasps, scene.control_dt, config)
     for done, e in enumerate(whole, len(whole)):
         progress(f"{e.name}: holding {len(common.label)} objects", done, total)
         tries[e.name].holds = try_holds(e, scene, common, config)

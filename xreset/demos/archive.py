@@ -6,12 +6,13 @@ x, y, z). Poses are in the table frame: z up, table top at z = 0, the person at 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from xreset.checks import is_rigid
 from xreset.errors import DemoError, ObjectError
@@ -22,6 +23,9 @@ from xreset.text import shown
 
 SCHEMA_NAME = "xreset-demos/1"
 SIDES = ("right", "left")
+
+Progress = Callable[[int, int, str], None]
+"""Called with (sequences or files done, all of them, name) before each one."""
 
 _HAND = 0.5
 """Largest distance of a keypoint from its wrist [m]; the longest hand on record has 0.33 m."""
@@ -180,6 +184,49 @@ class Demos(ObjectMotions):
                 picks = ((picks + place) * len(rows) / max(len(picks), 1)).astype(int)
             kept.extend(rows[picks])
         return chosen[np.sort(kept)] if kept else chosen[:0]
+
+
+def no_progress(done: int, total: int, name: str) -> None:
+    """Show nothing: the default of :data:`Progress`."""
+
+
+def one_sequence(
+    *,
+    name: str,
+    subject: str,
+    object_name: str,
+    side: str,
+    fps: float,
+    keypoints: np.ndarray,
+    wrist: Rotation | None,
+    object_pos: np.ndarray,
+    object_rot: Rotation,
+) -> Demos:
+    """Make the demonstrations of one sequence of F frames, in the types of the file.
+
+    Args:
+        keypoints: [F, 21, 3] NaN in frames without a hand.
+        wrist: orientations in the frames with a hand; None: no frame has one.
+        object_pos: [F, 3]
+        object_rot: F orientations.
+    """
+    valid = np.asarray(np.isfinite(keypoints).all(axis=(1, 2)))
+    wrist_quat = np.full((len(keypoints), 4), np.nan, dtype=np.float32)
+    if wrist is not None:
+        wrist_quat[valid] = wrist.as_quat(canonical=True, scalar_first=True)
+    return Demos(
+        sequence_name=np.array([name]),
+        subject=np.array([subject]),
+        object_name=np.array([object_name]),
+        hand_side=np.array([side]),
+        frame_offsets=_offsets([len(keypoints)]),
+        hand_keypoints=keypoints.astype(np.float32),
+        hand_valid=valid,
+        wrist_quat_wxyz=wrist_quat,
+        object_pos=object_pos.astype(np.float32),
+        object_quat_wxyz=object_rot.as_quat(canonical=True, scalar_first=True).astype(np.float32),
+        fps=fps,
+    )
 
 
 def concatenate(parts: Sequence[Demos]) -> Demos:

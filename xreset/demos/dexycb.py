@@ -23,7 +23,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from xreset.checks import is_rigid
-from xreset.demos.archive import SIDES, Demos, concatenate
+from xreset.demos.archive import SIDES, Demos, Progress, concatenate, no_progress, one_sequence
 from xreset.errors import DemoError, FileFormatError
 from xreset.objects.catalogue import canonical_name
 from xreset.objects.ycb import NAME_OF_ID
@@ -61,7 +61,7 @@ def read_dexycb(
     *,
     objects: Iterable[str] | None = None,
     sides: Iterable[str] = SIDES,
-    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
+    progress: Progress = no_progress,
 ) -> Demos:
     """Read all sequences below a DexYCB folder, in the table frame.
 
@@ -118,21 +118,16 @@ def _read(sequence: _Sequence, extrinsics: _Poses) -> Demos:
     keypoints = np.stack([_read_joints(sequence, frame, extrinsics) for frame in range(frames)])
     valid = np.isfinite(keypoints).all(axis=(1, 2)) & (pose_hand != 0).any(axis=1)
     keypoints[~valid] = np.nan
-    wrist = np.full((frames, 4), np.nan)
-    wrist[valid] = (turn * Rotation.from_rotvec(pose_hand[valid, :3])).as_quat(canonical=True, scalar_first=True)
-    object_turn = turn * Rotation.from_quat(pose_object[:, :4])
-    return Demos(
-        sequence_name=np.array([sequence.name]),
-        subject=np.array([sequence.folder.parent.name]),
-        object_name=np.array([sequence.object_name]),
-        hand_side=np.array([sequence.side]),
-        frame_offsets=np.array([0, frames], dtype=np.int32),
-        hand_keypoints=_transform(T_table_world, keypoints).astype(np.float32),
-        hand_valid=valid,
-        wrist_quat_wxyz=wrist.astype(np.float32),
-        object_pos=_transform(T_table_world, pose_object[:, 4:]).astype(np.float32),
-        object_quat_wxyz=object_turn.as_quat(canonical=True, scalar_first=True).astype(np.float32),
+    return one_sequence(
+        name=sequence.name,
+        subject=sequence.folder.parent.name,
+        object_name=sequence.object_name,
+        side=sequence.side,
         fps=FPS,
+        keypoints=_transform(T_table_world, keypoints),
+        wrist=turn * Rotation.from_rotvec(pose_hand[valid, :3]) if valid.any() else None,
+        object_pos=_transform(T_table_world, pose_object[:, 4:]),
+        object_rot=turn * Rotation.from_quat(pose_object[:, :4]),
     )
 
 

@@ -10,14 +10,14 @@ nor the place of the table.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.demos.archive import Demos, concatenate
+from xreset.demos.archive import Demos, Progress, concatenate, no_progress
 from xreset.demos.keypoints import Convention, read_transform, sequence_of
 from xreset.demos.pickles import read_pickle
 from xreset.errors import DemoError
@@ -33,7 +33,7 @@ def read_ho3d(
     *,
     fps: float,
     cameras: str | Path,
-    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
+    progress: Progress = no_progress,
 ) -> Demos:
     """Read the training sequences below an HO-3D folder that have a camera pose.
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from xreset.checks import is_rigid
 from xreset.demos import hand
-from xreset.demos.archive import SIDES, Demos, concatenate
+from xreset.demos.archive import SIDES, Demos, Progress, concatenate, no_progress, one_sequence
 from xreset.errors import DemoError
 from xreset.files import max_bytes
 from xreset.objects.catalogue import official_name
@@ -121,7 +121,7 @@ def read_keypoints(
     path: str | Path,
     convention: Convention | None = None,
     *,
-    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
+    progress: Progress = no_progress,
 ) -> Demos:
     """Read a tracker's sequences: an npz (one sequence), a CSV (one, or several with a column ``sequence``), or a
     folder of them.
@@ -342,21 +342,16 @@ def _sequence(arrays: Mapping[str, np.ndarray], convention: Convention) -> Demos
         )
     fps, (points, pos, turn) = _evenly(arrays, convention, (points, pos, turn))
     valid = np.asarray(np.isfinite(points).all(axis=(1, 2)))
-    wrist = np.full((len(points), 4), np.nan)
-    if valid.any():
-        wrist[valid] = _wrist(points[valid], side).as_quat(canonical=True, scalar_first=True)
-    return Demos(
-        sequence_name=np.array([_text(arrays, "sequence", None)]),
-        subject=np.array([_text({"subject": np.array(convention.subject), **arrays}, "subject", None)]),
-        object_name=np.array([official_name(_text(arrays, "object", convention.object_name))]),
-        hand_side=np.array([side]),
-        frame_offsets=np.array([0, len(points)], dtype=np.int32),
-        hand_keypoints=points.astype(np.float32),
-        hand_valid=valid,
-        wrist_quat_wxyz=wrist.astype(np.float32),
-        object_pos=pos.astype(np.float32),
-        object_quat_wxyz=turn.as_quat(canonical=True, scalar_first=True).astype(np.float32),
+    return one_sequence(
+        name=_text(arrays, "sequence", None),
+        subject=_text({"subject": np.array(convention.subject), **arrays}, "subject", None),
+        object_name=official_name(_text(arrays, "object", convention.object_name)),
+        side=side,
         fps=fps,
+        keypoints=points,
+        wrist=_wrist(points[valid], side) if valid.any() else None,
+        object_pos=pos,
+        object_rot=turn,
     )
 
 

@@ -9,7 +9,7 @@ simulated.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.demos.archive import Demos, concatenate
+from xreset.demos.archive import Demos, Progress, concatenate, no_progress, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, plan_contacts
 from xreset.demos.motion import clear_approach, object_path, place_hand, random_timing
 from xreset.errors import DemoError
@@ -64,7 +64,7 @@ def synthesize(
     fps: float = 30.0,
     side: Literal["right", "left"] = "right",
     meshes: str | Path | None = None,
-    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
+    progress: Progress = no_progress,
 ) -> Demos:
     """Make synthetic demonstrations of the built-in stand-ins, or of the objects of a folder of meshes, which stand
     with z up.
@@ -122,19 +122,16 @@ def _sequence(
     wrist_pos = np.where(held, moved.apply(grasp.wrist_pos - rest.pos) + object_pos, path.wrist_pos)
     wrist_quat = np.where(held, (moved * grasp.wrist_rot).as_quat(), path.wrist_rot.as_quat())
     wrist_rot = Rotation.from_quat(wrist_quat)
-    points = place_hand(wrist_pos, wrist_rot, path.angles, side)
-    return Demos(
-        sequence_name=np.array([name]),
-        subject=np.array([SUBJECT]),
-        object_name=np.array([obj.name]),
-        hand_side=np.array([side]),
-        frame_offsets=np.array([0, timing.frames], dtype=np.int32),
-        hand_keypoints=points.astype(np.float32),
-        hand_valid=np.ones(timing.frames, dtype=bool),
-        wrist_quat_wxyz=_quaternions(wrist_rot),
-        object_pos=object_pos.astype(np.float32),
-        object_quat_wxyz=_quaternions(object_rot),
+    return one_sequence(
+        name=name,
+        subject=SUBJECT,
+        object_name=obj.name,
+        side=side,
         fps=fps,
+        keypoints=place_hand(wrist_pos, wrist_rot, path.angles, side),
+        wrist=wrist_rot,
+        object_pos=object_pos,
+        object_rot=object_rot,
     )
 
 
@@ -179,7 +176,3 @@ def _grasped(obj: ObjectSpec, start: _Rest, side: str, rng: np.random.Generator)
 
 def _badness(grasp: Grasp) -> float:
     return grasp.tip_error / _GOOD_TIP_ERROR + grasp.penetration / _GOOD_PENETRATION
-
-
-def _quaternions(rotation: Rotation) -> np.ndarray:
-    return rotation.as_quat(canonical=True, scalar_first=True).astype(np.float32)

@@ -18,8 +18,9 @@ from typing import Any
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--disable-extensions", "--mute-audio", "--hide-scrollbars",
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-extensions",
+    "--mute-audio", "--hide-scrollbars",
     "--enable-unsafe-swiftshader",  # WebGL without a GPU
     "--remote-debugging-port=0", "--window-size=640,600",
 )  # fmt: skip
@@ -110,7 +111,7 @@ class Browser:
         self.send("Input.insertText", text=text)
 
     def click(self, element: str) -> None:
-        """Click the middle of the element that a JavaScript expression gives, once it stays where it is and nothing covers it."""
+        """Click the middle of a JavaScript expression's element, once it stays where it is and nothing covers it."""
         at = (
             f"(e => {{ e.scrollIntoView({{block: 'center'}}); const r = e.getBoundingClientRect();"
             " const x = r.x + r.width / 2, y = r.y + r.height / 2, top = document.elementFromPoint(x, y);"

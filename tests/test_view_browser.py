@@ -11,11 +11,9 @@ import numpy as np
 
 from tests.browser import Browser, find_chromium, wait_until
 from tests.test_view import toy_demos, toy_retargeted
-from tests.toy_bank import SOUP, toy_bank
 from xreset import robots
 from xreset.demos.archive import write_demos
 from xreset.pictures.view.load import load_view
-from xreset.resets.bank import write_bank
 from xreset.retarget.file import write_retargeted
 
 INPUT = (
@@ -35,12 +33,10 @@ class InTheBrowser(unittest.TestCase):
         folder = tempfile.TemporaryDirectory()
         cls.addClassCleanup(folder.cleanup)
         robot = robots.load("openarm")
-        cls.demos, cls.retargeted, cls.bank = (
-            Path(folder.name) / f"{name}.npz" for name in ("demos", "retargeted", "bank")
-        )
+        cls.demos = Path(folder.name) / "demos.npz"
+        cls.retargeted = Path(folder.name) / "retargeted.npz"
         write_demos(cls.demos, toy_demos())
         write_retargeted(cls.retargeted, toy_retargeted(robot), config={}, inputs={})
-        write_bank(cls.bank, toy_bank(robot), config={}, inputs={})
 
     def open(self, path: Path, **options):
         """A page that the browser shows."""
@@ -113,21 +109,6 @@ class InTheBrowser(unittest.TestCase):
         self.assertGreater(self.orange_pixels(), 20, "the object is not to be seen")
         self.assert_no_problem()
 
-    def test_stepping_through_the_states_of_a_bank(self):
-        page = self.open(self.bank)
-        self.assertEqual(page.row, 0)
-        self.press("next")
-        can = page._scene._objects[0]
-        self.until(lambda: np.allclose(can.position, page.view.object_pos[1], rtol=0, atol=1e-6), "the next state")
-        self.choose("object", SOUP)
-        self.until(lambda: len(page._rows) == 4, "the states of one object")
-        self.choose("phase", "after contact")
-        self.until(lambda: len(page._rows) == 2, "the states of one phase")
-        self.press("previous")
-        self.until(lambda: page.row == 5, "the last state")
-        self.until(lambda: "2 of 2" in self.text() and "sequence 2: demo_c" in self.text(), "the text in the browser")
-        self.assert_no_problem()
-
     def test_only_frames_with_one_reason(self):
         page = self.open(self.retargeted)
         self.choose("sequence", "all")
@@ -135,6 +116,8 @@ class InTheBrowser(unittest.TestCase):
         self.choose("state", "joint limit (2)")
         self.until(lambda: page._rows.tolist() == [1, 5], "the frames with that reason")
         self.assertTrue(self.exists("document.querySelector('div[title=\"joint limit\"]')"))
+        self.press("previous")
+        self.until(lambda: page.row == 5, "the last frame with that reason")
         self.assert_no_problem()
 
 

@@ -1,46 +1,46 @@
 """Demonstrations: the archive, DexYCB's layout, synthetic ones, and the commands."""
 
-import contextlib
 import importlib.util
-import io
-import tempfile
 import unittest
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import trimesh
 import yaml
 from scipy.spatial.transform import Rotation
 
-from tests.data import data_dir
-from xreset.cli import main
+from tests.data import InFolder, data_dir, run
 from xreset.demos import hand
 from xreset.demos.align import grounded, levelled, on_something
 from xreset.demos.archive import concatenate, demo_objects, read_demos, write_demos
 from xreset.demos.dexycb import read_dexycb
 from xreset.demos.grasp import TIPS, Solid
 from xreset.demos.info import summarize
+from xreset.demos.keypoints import ORDERS
+from xreset.demos.plausible import doubts
 from xreset.demos.synth import synthesize
 from xreset.errors import DemoError, FileFormatError, ObjectError
 from xreset.objects.catalogue import object_names
 
-PARENTS = [0 if k % 4 == 1 else k - 1 for k in range(1, 21)]
+ARCHIVES = (("dexycb_right_9x20.npz", "right"), ("dexycb_left_9x10.npz", "left"))
+KNUCKLES = [5, 9, 13, 17]
+
+
+def turns(quats):
+    return Rotation.from_quat(quats, scalar_first=True)
 
 
 def angles(a, b):
     """Angles between orientations (w, x, y, z) [rad]."""
-    return (Rotation.from_quat(a, scalar_first=True).inv() * Rotation.from_quat(b, scalar_first=True)).magnitude()
+    return (turns(a).inv() * turns(b)).magnitude()
 
 
-class WithFolder(unittest.TestCase):
-    def setUp(self):
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.folder = Path(folder.name)
+def in_frame(pos, quats, points):
+    """Points [F, K, 3] in frames at positions [F, 3] and orientations [F, 4]."""
+    return np.einsum("fji,fkj->fki", turns(quats).as_matrix(), points - pos[:, None])
 
 
-class Archive(WithFolder):
+class Archive(InFolder):
     @classmethod
     def setUpClass(cls):
         cls.demos = synthesize(["soup", "banana"], per_object=2, seed=1, fps=10)
@@ -50,95 +50,102 @@ class Archive(WithFolder):
         array[index] = value
         return replace(self.demos, **{name: array})
 
-    def test_round_trip_is_exact(self):
-        first, second = self.folder / "a.npz", self.folder / "b.npz"
-        write_demos(first, self.demos, config={"seed": 1})
-        again = read_demos(first)
-        for field in fields(self.demos):
-            np.testing.assert_array_equal(getattr(again, field.name), getattr(self.demos, field.name), field.name)
-        write_demos(second, again, config={"seed": 1})
-        self.assertEqual(first.read_bytes(), second.read_bytes())
+    def moved(self, by):
+        """The demonstrations moved by [F, 3]."""
+        return replace(
+            self.demos, object_pos=self.demos.object_pos + by, hand_keypoints=self.demos.hand_keypoints + by[:, None]
+        )
 
-    def test_optional_arrays_are_kept(self):
-        T = np.eye(4)[None]
-        write_demos(self.folder / "a.npz", replace(self.demos, subjects=np.array(["synthetic"]), T_level_from_table=T))
-        again = read_demos(self.folder / "a.npz")
-        self.assertEqual(again.subjects.tolist(), ["synthetic"])
-        np.testing.assert_array_equal(again.T_level_from_table, T)
+    def assert_same(self, a, b):
+        for field in fields(a):
+            np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name), field.name)
+
+    def test_round_trip_is_exact(self):
+        first = self.folder / "a.npz"
+        second = self.folder / "b.npz"
+        with_level = replace(self.demos, subjects=np.array(["synthetic"]), T_level_from_table=np.eye(4)[None])
+        for demos in (self.demos, with_level):
+            write_demos(first, demos, config={"seed": 1})
+            again = read_demos(first)
+            self.assert_same(again, demos)
+            write_demos(second, again, config={"seed": 1})
+            self.assertEqual(first.read_bytes(), second.read_bytes())
 
     def test_hand_less_frames_may_be_nan(self):
-        demos = replace(self.changed("hand_valid", [0, 1], False))
-        points, quats = demos.hand_keypoints.copy(), demos.wrist_quat_wxyz.copy()
-        points[:2], quats[:2] = np.nan, np.nan
-        write_demos(self.folder / "a.npz", replace(demos, hand_keypoints=points, wrist_quat_wxyz=quats))
+        demos = replace(
+            self.changed("hand_valid", [0, 1], False),
+            hand_keypoints=self.changed("hand_keypoints", [0, 1], np.nan).hand_keypoints,
+            wrist_quat_wxyz=self.changed("wrist_quat_wxyz", [0, 1], np.nan).wrist_quat_wxyz,
+        )
+        write_demos(self.folder / "a.npz", demos)
         self.assertEqual(int((~read_demos(self.folder / "a.npz").hand_valid).sum()), 2)
 
     def test_bad_values_name_sequence_and_frame(self):
-        second = self.demos.frames(1)
-        cases = [
+        begin = self.demos.frames(1).start
+        end = self.demos.frames(1).stop
+        first_name = str(self.demos.sequence_name[0])
+        for demos, message in (
             (
-                self.changed("hand_keypoints", (second.start + 3, 8, 1), np.nan),
-                r"hand_keypoints is not finite in frame 3 of sequence 1",
+                self.changed("hand_keypoints", (begin + 3, 8, 1), np.nan),
+                "hand_keypoints is not finite in frame 3 of sequence 1",
             ),
             (
-                self.changed("wrist_quat_wxyz", second.start + 4, np.nan),
-                r"wrist_quat_wxyz is not finite in frame 4 of sequence 1",
+                self.changed("wrist_quat_wxyz", begin + 4, np.nan),
+                "wrist_quat_wxyz is not finite in frame 4 of sequence 1",
             ),
+            (self.changed("object_pos", (begin, 2), np.inf), "object_pos is not finite in frame 0 of sequence 1"),
             (
-                self.changed("object_pos", (second.start, 2), np.inf),
-                r"object_pos is not finite in frame 0 of sequence 1",
+                self.changed("object_quat_wxyz", end - 1, (1, 1, 0, 0)),
+                r"length 1.4142 in frame \d+ of sequence 1 .* unit",
             ),
-            (
-                self.changed("object_quat_wxyz", second.stop - 1, (1, 1, 0, 0)),
-                r"object_quat_wxyz has length 1.4142 in frame \d+ of sequence 1 .* unit",
-            ),
+            (self.changed("object_pos", (begin, 2), 200), "object_pos is 200 m away in frame 0 of sequence 1"),
             (self.changed("hand_side", 2, "Right"), r"sequence 2 .* hand_side 'Right', expected 'right' or 'left'"),
             (self.changed("frame_offsets", 2, 0), "frame_offsets must increase"),
             (self.changed("frame_offsets", -1, 5), "expected 0 to"),
-            (self.changed("sequence_name", 1, str(self.demos.sequence_name[0])), "must be unique"),
+            (self.changed("sequence_name", 1, first_name), "must be unique"),
+            (replace(self.demos, hand_keypoints=1000 * self.demos.hand_keypoints), "Are these millimetres"),
             (replace(self.demos, fps=0.0), "fps"),
             (replace(self.demos, subjects=np.array(["a"])), "belong together"),
-        ]
-        for demos, message in cases:
+        ):
             with self.subTest(message), self.assertRaisesRegex(DemoError, message):
                 write_demos(self.folder / "bad.npz", demos)
             self.assertEqual(list(self.folder.iterdir()), [])
 
     def test_reader_refuses_what_the_writer_would(self):
-        write_demos(self.folder / "a.npz", self.demos)
-        with np.load(self.folder / "a.npz") as file:
+        good = self.folder / "a.npz"
+        bad = self.folder / "bad.npz"
+        write_demos(good, self.demos)
+        with np.load(good) as file:
             arrays = dict(file)
         arrays["hand_keypoints"][7, 0, 0] = np.nan
-        np.savez(self.folder / "nan.npz", **arrays)
-        with self.assertRaisesRegex(
-            FileFormatError, r"nan\.npz.*hand_keypoints is not finite in frame 7 of sequence 0 \(synthetic/005"
-        ):
-            read_demos(self.folder / "nan.npz")
+        np.savez(bad, **arrays)
+        words = r"bad\.npz.*hand_keypoints is not finite in frame 7 of sequence 0 \(synthetic/005"
+        with self.assertRaisesRegex(FileFormatError, words):
+            read_demos(bad)
         arrays.pop("hand_valid")
-        np.savez(self.folder / "short.npz", **arrays)
+        np.savez(bad, **arrays)
         with self.assertRaisesRegex(FileFormatError, "no array 'hand_valid'"):
-            read_demos(self.folder / "short.npz")
-        data = (self.folder / "a.npz").read_bytes()
+            read_demos(bad)
+        data = good.read_bytes()
         for keep in (0.1, 0.5, 0.95):
-            (self.folder / "cut.npz").write_bytes(data[: int(keep * len(data))])
+            bad.write_bytes(data[: int(keep * len(data))])
             with self.assertRaisesRegex(FileFormatError, "damaged or truncated"):
-                read_demos(self.folder / "cut.npz")
+                read_demos(bad)
 
     def test_select(self):
         self.assertEqual(self.demos.select(objects=["banana"]).object_name.tolist(), ["011_banana"] * 2)
         self.assertEqual(self.demos.select(max_per_object=1).num_sequences, 2)
         picked = self.demos.select(indices=[3, 0])
         self.assertEqual(picked.sequence_name.tolist(), self.demos.sequence_name[[3, 0]].tolist())
-        np.testing.assert_array_equal(
-            picked.hand_keypoints[picked.frames(0)], self.demos.hand_keypoints[self.demos.frames(3)]
-        )
+        whole = self.demos.hand_keypoints[self.demos.frames(3)]
+        np.testing.assert_array_equal(picked.hand_keypoints[picked.frames(0)], whole)
         np.testing.assert_array_equal(picked.goal_pose[0][1], self.demos.object_pos[self.demos.frames(0)][-1])
         np.testing.assert_array_equal(picked.start_pose[1][1], self.demos.object_quat_wxyz[0])
         name = str(self.demos.sequence_name[1])
         self.assertEqual(self.demos.select(names=[name], sides=["right"]).sequence_name.tolist(), [name])
         for options, message in (
             ({"objects": ["tuna"]}, "'tuna'. Choose from: 005_tomato_soup_can"),
-            ({"sides": ["left"]}, "no hand_side left. Choose from: \\['right"),
+            ({"sides": ["left"]}, r"no hand_side left. Choose from: \['right"),
             ({"names": ["x"]}, "no sequence_name x"),
             ({"indices": [4]}, "there are 4 sequences"),
             ({"indices": [0], "objects": ["banana"]}, "No sequence meets"),
@@ -148,13 +155,13 @@ class Archive(WithFolder):
 
     def test_concatenate(self):
         parts = [self.demos.select(indices=[i]) for i in range(4)]
-        whole = concatenate(parts)
-        for field in fields(self.demos):
-            np.testing.assert_array_equal(getattr(whole, field.name), getattr(self.demos, field.name), field.name)
-        with self.assertRaisesRegex(DemoError, "unique"):
-            concatenate([self.demos, self.demos])
-        with self.assertRaisesRegex(DemoError, "frame rates"):
-            concatenate([parts[0], replace(parts[1], fps=25.0)])
+        self.assert_same(concatenate(parts), self.demos)
+        for wrong, message in (
+            ([self.demos, self.demos], "unique"),
+            ([parts[0], replace(parts[1], fps=25.0)], "rates"),
+        ):
+            with self.assertRaisesRegex(DemoError, message):
+                concatenate(wrong)
 
     def test_unknown_object(self):
         demos = self.changed("object_name", 3, "055_baseball")
@@ -167,114 +174,105 @@ class Archive(WithFolder):
         T = np.eye(4)
         T[:3, :3] = Rotation.from_rotvec([0.02, 0, 0]).as_matrix()
         T[:3, 3] = (0, 0, 0.01)
-        demos = replace(
-            self.demos, subjects=np.array(["other", "synthetic"]), T_level_from_table=np.stack([np.eye(4), T])
-        )
+        levels = np.stack([np.eye(4), T])
+        demos = replace(self.demos, subjects=np.array(["other", "synthetic"]), T_level_from_table=levels)
         level = levelled(demos)
-        np.testing.assert_allclose(level.object_pos, demos.object_pos @ T[:3, :3].T + T[:3, 3], atol=1e-6)
-        np.testing.assert_allclose(level.hand_keypoints, demos.hand_keypoints @ T[:3, :3].T + T[:3, 3], atol=1e-6)
+        for name in ("object_pos", "hand_keypoints"):
+            expected = getattr(demos, name) @ T[:3, :3].T + T[:3, 3]
+            np.testing.assert_allclose(getattr(level, name), expected, atol=1e-6)
         np.testing.assert_allclose(angles(demos.object_quat_wxyz, level.object_quat_wxyz), 0.02, atol=1e-5)
         np.testing.assert_allclose(levelled(level).object_pos, level.object_pos, atol=1e-7)
         self.assertIs(levelled(self.demos), self.demos)
         with self.assertRaisesRegex(DemoError, "not for synthetic"):
             levelled(replace(demos, subjects=np.array(["other", "third"])))
 
-    def test_grounded_puts_the_first_frame_on_the_table(self):
-        up = np.array([0, 0, 0.013])
-        raised = replace(
-            self.demos, object_pos=self.demos.object_pos + up, hand_keypoints=self.demos.hand_keypoints + up
-        )
-        down = grounded(raised, demo_objects(raised))
-        np.testing.assert_allclose(down.object_pos, self.demos.object_pos, atol=1e-6)
-        np.testing.assert_allclose(down.hand_keypoints, self.demos.hand_keypoints, atol=1e-6)
-
-    def test_grounded_leaves_alone_what_starts_on_top_of_something(self):
+    def test_grounded_lowers_to_the_table_but_not_what_starts_on_top_of_something(self):
+        objects = demo_objects(self.demos)
         first = self.demos.frames(0)
         up = np.zeros((self.demos.num_frames, 3))
-        up[:, 2], up[first, 2] = -0.03, 0.05  # the others are below the table: they are lifted, however far
-        moved = replace(
-            self.demos, object_pos=self.demos.object_pos + up, hand_keypoints=self.demos.hand_keypoints + up[:, None]
-        )
-        objects = demo_objects(moved)
-        self.assertEqual(on_something(moved, objects).tolist(), [True] + [False] * (len(moved) - 1))
-        after = grounded(moved, objects)
-        np.testing.assert_allclose(after.object_pos[first], self.demos.object_pos[first] + [0, 0, 0.05], atol=1e-6)
-        np.testing.assert_allclose(
-            after.hand_keypoints[first], self.demos.hand_keypoints[first] + [0, 0, 0.05], atol=1e-6
-        )
-        np.testing.assert_allclose(after.object_pos[first.stop :], self.demos.object_pos[first.stop :], atol=1e-6)
+        for height, elsewhere, stays in ((0.013, 0.013, 0.0), (0.05, -0.03, 0.05)):
+            up[:, 2] = elsewhere  # below the table: lifted, however far
+            up[first, 2] = height
+            raised = self.moved(up)
+            self.assertEqual(on_something(raised, objects).tolist(), [stays > 0] + [False] * (len(raised) - 1))
+            after = grounded(raised, objects)
+            expected = np.zeros_like(up)
+            expected[first, 2] = stays
+            np.testing.assert_allclose(after.object_pos, self.moved(expected).object_pos, atol=1e-6)
+            np.testing.assert_allclose(after.hand_keypoints, self.moved(expected).hand_keypoints, atol=1e-6)
 
     def test_summary(self):
         soup, banana = summarize(self.demos)
         self.assertEqual((soup.object_name, soup.sequences, soup.right), ("005_tomato_soup_can", 2, 2))
         self.assertEqual(banana.frames, self.demos.frames(3).stop - self.demos.frames(2).start)
-        goal, start = self.demos.goal_pose, self.demos.start_pose
-        self.assertAlmostEqual(
-            banana.goal_distance, np.median(np.linalg.norm(goal[0] - start[0], axis=1)[2:]), places=6
-        )
-        self.assertAlmostEqual(banana.goal_angle, np.median(angles(start[1], goal[1])[2:]), places=5)
+        goal_pos, goal_quat = self.demos.goal_pose
+        start_pos, start_quat = self.demos.start_pose
+        distance = np.linalg.norm(goal_pos - start_pos, axis=1)
+        self.assertAlmostEqual(banana.goal_distance, np.median(distance[2:]), places=6)
+        self.assertAlmostEqual(banana.goal_angle, np.median(angles(start_quat, goal_quat)[2:]), places=5)
 
 
-class DexYCB(WithFolder):
+class DexYCB(InFolder):
     """A small data set in DexYCB's layout, made from known motion in the table frame."""
 
     SERIALS = ("840412060917", "932122060861")
 
+    @classmethod
+    def setUpClass(cls):
+        cls.demos = synthesize(["spam"], per_object=1, seed=3, fps=5)
+
     def setUp(self):
         super().setUp()
         rng = np.random.default_rng(0)
-        self.demos = synthesize(["spam"], per_object=1, seed=3, fps=5)
-        self.poses = {}  # pose of each camera, and of the tag, in the world frame
+        poses = {}  # of each camera, and of the tag, in the world frame
         for key in (*self.SERIALS, "apriltag"):
-            self.poses[key] = (Rotation.random(random_state=rng), rng.normal(size=3))
-        self.poses[self.SERIALS[0]] = (Rotation.identity(), np.zeros(3))
+            poses[key] = (Rotation.random(random_state=rng), rng.normal(size=3))
+        poses[self.SERIALS[0]] = (Rotation.identity(), np.zeros(3))
         self.sequence = self.folder / "20200709-subject-01" / "20200709_141754"
         self.calibration = self.folder / "calibration" / "extrinsics_20200702_151821" / "extrinsics.yml"
-        self.write()
-
-    def write(self):
-        frames = self.demos.num_frames
-        tag_rot, tag_pos = self.poses["apriltag"]
         self.calibration.parent.mkdir(parents=True)
-        rows = {key: np.column_stack((rot.as_matrix(), pos)).ravel().tolist() for key, (rot, pos) in self.poses.items()}
         lines = ["extrinsics:"]
-        for key, values in rows.items():
-            lines += [f"  '{key}': !!python/tuple", *(f"  - {value!r}" for value in values)]
+        for key, (rot, pos) in poses.items():
+            lines.append(f"  '{key}': !!python/tuple")
+            lines += [f"  - {value!r}" for value in np.column_stack((rot.as_matrix(), pos)).ravel().tolist()]
         self.calibration.write_text("\n".join([*lines, f"master: '{self.SERIALS[0]}'"]) + "\n")
         self.sequence.mkdir(parents=True)
-        self.meta = {
-            "extrinsics": "20200702_151821",
-            "mano_sides": ["right"],
-            "num_frames": frames,
-            "serials": list(self.SERIALS),
-            "ycb_grasp_ind": 1,
-            "ycb_ids": [2, 9],
-        }
         self.write_meta()
-        object_rot = tag_rot * Rotation.from_quat(self.demos.object_quat_wxyz, scalar_first=True)
+        frames = self.demos.num_frames
+        tag_rot, tag_pos = poses["apriltag"]
         pose_y = np.zeros((frames, 2, 7), dtype=np.float32)
         pose_y[:, 0, 3] = 1
-        pose_y[:, 1] = np.column_stack((object_rot.as_quat(), tag_rot.apply(self.demos.object_pos) + tag_pos))
+        pose_y[:, 1, :4] = (tag_rot * turns(self.demos.object_quat_wxyz)).as_quat()
+        pose_y[:, 1, 4:] = tag_rot.apply(self.demos.object_pos) + tag_pos
         pose_m = np.zeros((frames, 1, 51), dtype=np.float32)
-        pose_m[:, 0, :3] = (tag_rot * Rotation.from_quat(self.demos.wrist_quat_wxyz, scalar_first=True)).as_rotvec()
+        pose_m[:, 0, :3] = (tag_rot * turns(self.demos.wrist_quat_wxyz)).as_rotvec()
         pose_m[0] = 0  # no hand yet
         np.savez(self.sequence / "pose.npz", pose_y=pose_y, pose_m=pose_m)
         world = tag_rot.apply(self.demos.hand_keypoints.reshape(-1, 3)) + tag_pos
         for serial in self.SERIALS:
-            rot, pos = self.poses[serial]
+            rot, pos = poses[serial]
             joints = rot.inv().apply(world - pos).reshape(frames, 1, 21, 3).astype(np.float32)
             joints[0] = -1
             (self.sequence / serial).mkdir()
             for frame in range(frames):
-                np.savez(self.sequence / serial / f"labels_{frame:06d}.npz", joint_3d=joints[frame])
+                np.savez(self.labels(serial, frame), joint_3d=joints[frame])
 
     def write_meta(self, **changes):
-        (self.sequence / "meta.yml").write_text(yaml.safe_dump(self.meta | changes))
+        meta = {
+            "extrinsics": "20200702_151821",
+            "mano_sides": ["right"],
+            "num_frames": self.demos.num_frames,
+            "serials": list(self.SERIALS),
+            "ycb_grasp_ind": 1,
+            "ycb_ids": [2, 9],
+        }
+        (self.sequence / "meta.yml").write_text(yaml.safe_dump(meta | changes))
 
     def labels(self, serial, frame):
         return self.sequence / serial / f"labels_{frame:06d}.npz"
 
-    def check(self, read):
+    def check(self, **options):
+        read = read_dexycb(self.folder, **options)
         self.assertEqual(read.sequence_name.tolist(), ["20200709-subject-01/20200709_141754"])
         self.assertEqual((read.object_name[0], read.hand_side[0], read.fps), ("010_potted_meat_can", "right", 30.0))
         self.assertEqual(read.hand_valid.tolist(), [False] + [True] * (self.demos.num_frames - 1))
@@ -284,97 +282,71 @@ class DexYCB(WithFolder):
         self.assertLess(angles(read.object_quat_wxyz, self.demos.object_quat_wxyz).max(), 1e-5)
         self.assertLess(angles(read.wrist_quat_wxyz[1:], self.demos.wrist_quat_wxyz[1:]).max(), 1e-5)
 
+    def refused(self, message, **options):
+        with self.subTest(message), self.assertRaisesRegex(DemoError, message):
+            read_dexycb(**{"root": self.folder, **options})
+
     def test_reads_back_the_table_frame(self):
-        self.check(read_dexycb(self.folder))
-
-    def test_another_camera_fills_in(self):
-        self.labels(self.SERIALS[0], 4).unlink()
-        for frame in range(6, 9):
+        self.check()
+        for frame in (4, 6, 7, 8):  # the other camera fills in
             self.labels(self.SERIALS[0], frame).unlink()
-        self.check(read_dexycb(self.folder))
-
-    def test_only_what_is_asked_for(self):
-        self.check(read_dexycb(self.folder, objects=["spam"], sides=["right"]))
-        with self.assertRaisesRegex(DemoError, r"None of the 1 sequences.*010_potted_meat_can \(right\)"):
-            read_dexycb(self.folder, objects=["soup"])
-        with self.assertRaisesRegex(DemoError, "None of the 1 sequences"):
-            read_dexycb(self.folder, sides=["left"])
+        self.check(objects=["spam"], sides=["right"])
+        self.refused(r"None of the 1 sequences.*010_potted_meat_can \(right\)", objects=["soup"])
+        self.refused("None of the 1 sequences", sides=["left"])
         with self.assertRaises(ObjectError):
             read_dexycb(self.folder, objects=["teapot"])
 
     def test_incomplete(self):
-        with self.subTest("labels"):
-            for serial in self.SERIALS:
-                self.labels(serial, 5).rename(self.folder / serial)
-            with self.assertRaisesRegex(DemoError, r"labels_000005\.npz.*Unpack"):
-                read_dexycb(self.folder)
-            for serial in self.SERIALS:
-                (self.folder / serial).rename(self.labels(serial, 5))
-        with self.subTest("frames"):
-            self.write_meta(num_frames=self.demos.num_frames + 1)
-            with self.assertRaisesRegex(DemoError, r"pose_y has shape .* but meta\.yml asks for"):
-                read_dexycb(self.folder)
-        with self.subTest("cameras"):
-            self.write_meta(serials=["000000000000"])
-            with self.assertRaisesRegex(DemoError, "no camera of meta.yml"):
-                read_dexycb(self.folder)
-        with self.subTest("grasped object"):
-            self.write_meta(ycb_grasp_ind=2)
-            with self.assertRaisesRegex(DemoError, "ycb_grasp_ind is 2"):
-                read_dexycb(self.folder)
+        for changes, message in (
+            ({"num_frames": self.demos.num_frames + 1}, r"pose_y has shape .* but meta\.yml asks for"),
+            ({"serials": ["000000000000"]}, "no camera of meta.yml"),
+            ({"ycb_grasp_ind": 2}, "ycb_grasp_ind is 2"),
+        ):
+            self.write_meta(**changes)
+            self.refused(message)
         self.write_meta()
-        with self.subTest("tag"):
-            text = self.calibration.read_text()
-            self.calibration.write_text(text.replace("apriltag", "tag"))
-            with self.assertRaisesRegex(DemoError, "no pose 'apriltag'"):
-                read_dexycb(self.folder)
-        with self.subTest("calibration"):
-            self.calibration.unlink()
-            with self.assertRaisesRegex(DemoError, "calibration"):
-                read_dexycb(self.folder)
-        with self.subTest("damaged labels"):
-            self.calibration.write_text(text)
-            self.labels(self.SERIALS[0], 3).write_bytes(b"PK")
-            with self.assertRaisesRegex(DemoError, "labels_000003.npz cannot be read"):
-                read_dexycb(self.folder)
-        with self.subTest("nothing"), self.assertRaisesRegex(DemoError, "no DexYCB sequence"):
-            read_dexycb(self.folder / "calibration")
+        text = self.calibration.read_text()
+        self.calibration.write_text(text.replace("apriltag", "tag"))
+        self.refused("no pose 'apriltag'")
+        self.calibration.unlink()
+        self.refused("calibration")
+        self.refused("no DexYCB sequence", root=self.folder / "calibration")
+        self.calibration.write_text(text)
+        for serial in self.SERIALS:
+            self.labels(serial, 5).unlink()
+        self.refused(r"labels_000005\.npz.*Unpack")
+        self.labels(self.SERIALS[0], 3).write_bytes(b"PK")
+        self.refused("labels_000003.npz cannot be read")
 
     def test_yaml_is_read_safely(self):
         marker = self.folder / "marker"
         for tag in (f"!!python/object/apply:os.mkdir ['{marker}']", "!!python/name:os.system"):
             (self.sequence / "meta.yml").write_text(f"extrinsics: {tag}\n")
-            with self.assertRaisesRegex(DemoError, "not valid YAML"):
-                read_dexycb(self.folder)
+            self.refused("not valid YAML")
         self.assertFalse(marker.exists())
 
 
 class RealData(unittest.TestCase):
-    def test_official_layout_agrees_with_the_prepared_sequence(self):
-        demos = read_dexycb(data_dir() / "dexycb_layout")
-        self.assertEqual(sorted(demos.hand_side.tolist()), ["left", "right", "right"])
+    def test_official_layout_agrees_with_the_prepared_files(self):
+        layout = read_dexycb(data_dir() / "dexycb_layout")
+        self.assertEqual(sorted(layout.hand_side.tolist()), ["left", "right", "right"])
         with np.load(data_dir() / "dexycb_sequence.npz") as file:
             expected = dict(file)
-        own = demos.select(names=[str(expected["sequence_name"])])
+        own = layout.select(names=[str(expected["sequence_name"])])
         self.assertEqual(own.object_name[0], str(expected["object_name"]))
         valid = np.isfinite(expected["hand_keypoints_table"]).all(axis=(1, 2))
         np.testing.assert_array_equal(own.hand_valid, valid)
         np.testing.assert_allclose(own.hand_keypoints[valid], expected["hand_keypoints_table"][valid], atol=1e-4)
         np.testing.assert_allclose(own.object_pos, expected["object_pose_table"][:, :3, 3], atol=1e-4)
         for quat, pose in ((own.object_quat_wxyz, "object_pose_table"), (own.wrist_quat_wxyz, "wrist_pose_table")):
-            turn = Rotation.from_quat(quat[valid], scalar_first=True).inv() * Rotation.from_matrix(
-                expected[pose][valid, :3, :3]
-            )
-            self.assertLess(np.degrees(turn.magnitude()).max(), 0.1)
-
-    def test_archives_agree_with_the_official_layout(self):
-        layout = read_dexycb(data_dir() / "dexycb_layout")
+            off = turns(quat[valid]).inv() * Rotation.from_matrix(expected[pose][valid, :3, :3])
+            self.assertLess(np.degrees(off.magnitude()).max(), 0.1)
         compared = 0
-        for name in ("dexycb_right_9x20.npz", "dexycb_left_9x10.npz"):
+        for name, _ in ARCHIVES:
             archive = read_demos(data_dir() / name)
-            shared = sorted(set(layout.sequence_name.tolist()) & set(archive.sequence_name.tolist()))
-            for sequence in shared:
-                a, b = archive.select(names=[sequence]), layout.select(names=[sequence])
+            for sequence in set(layout.sequence_name.tolist()) & set(archive.sequence_name.tolist()):
+                a = archive.select(names=[sequence])
+                b = layout.select(names=[sequence])
                 compared += 1
                 self.assertEqual(a.hand_side[0], b.hand_side[0])
                 np.testing.assert_array_equal(a.hand_valid, b.hand_valid)
@@ -384,7 +356,7 @@ class RealData(unittest.TestCase):
         self.assertEqual(compared, 3)
 
     def test_objects_rest_on_the_table(self):
-        demos = levelled(read_demos(data_dir() / "dexycb_right_9x20.npz"))
+        demos = levelled(read_demos(data_dir() / ARCHIVES[0][0]))
         self.assertEqual(sorted(set(demos.object_name.tolist())), list(object_names()))
         shift = grounded(demos, demo_objects(demos)).object_pos[:, 2] - demos.object_pos[:, 2]
         shift = np.abs(shift[demos.frame_offsets[:-1]])
@@ -392,21 +364,41 @@ class RealData(unittest.TestCase):
         self.assertLess(np.percentile(shift, 90), 0.012)
         self.assertLessEqual(on_something(demos, demo_objects(demos)).sum(), 3)  # a few objects start on top of others
 
+    def test_synthetic_hands_have_the_conventions_of_real_hands(self):
+        """Knuckles of real hands in the wrist's frame are where the model's are, for both sides."""
+        for file, side in ARCHIVES:
+            real = read_demos(data_dir() / file)
+            points = real.hand_keypoints[real.hand_valid]
+            local = in_frame(points[:, 0], real.wrist_quat_wxyz[real.hand_valid], points).mean(axis=0)
+            model = hand.keypoints(hand.RELAXED, side)
+            np.testing.assert_allclose(local[KNUCKLES], model[KNUCKLES], atol=0.01)
+            np.testing.assert_allclose(local, model, atol=0.04)  # real fingers are bent more or less
+
+    def test_recorded_demonstrations_are_not_doubted(self):
+        for name, _ in ARCHIVES:
+            demos = read_demos(data_dir() / name)
+            objects = demo_objects(demos)
+            self.assertEqual(doubts(demos, objects), [])
+            for field, words in (
+                ("object_quat_wxyz", "of the objects stand on the table if"),
+                ("wrist_quat_wxyz", "put w first"),
+            ):
+                (doubt,) = doubts(replace(demos, **{field: getattr(demos, field)[:, [1, 2, 3, 0]]}), objects)
+                self.assertIn(words, doubt)
+
 
 class Hand(unittest.TestCase):
     def test_bones_keep_their_lengths(self):
         rng = np.random.default_rng(0)
-        points = hand.keypoints(rng.uniform(hand.LOWER, hand.UPPER, (50, 17)))
-        lengths = np.linalg.norm(points[:, 1:] - points[:, PARENTS], axis=-1)
+        lengths = hand.bone_lengths(hand.keypoints(rng.uniform(hand.LOWER, hand.UPPER, (50, 17))))
         np.testing.assert_allclose(lengths, lengths[:1].repeat(50, axis=0), atol=1e-12)
         np.testing.assert_allclose(lengths[0].reshape(5, 4)[1:, 1:], hand.FINGER_LENGTHS, atol=1e-12)
 
     def test_flexion_bends_towards_the_palm(self):
-        straight = hand.keypoints(np.zeros(17))
         for finger in range(4):
             bent = np.zeros(17)
             bent[3 * finger + 1] = 0.5
-            moved = hand.keypoints(bent) - straight
+            moved = hand.keypoints(bent) - hand.keypoints(np.zeros(17))
             tip = 8 + 4 * finger
             self.assertLess(moved[tip, 1], -0.02)
             np.testing.assert_allclose(np.delete(moved, range(tip - 2, tip + 1), axis=0), 0, atol=1e-12)
@@ -420,42 +412,38 @@ class Hand(unittest.TestCase):
             self.assertAlmostEqual(np.linalg.det(axes), 1)
             points = hand.keypoints(np.zeros(17), side) @ axes.T
             np.testing.assert_allclose(points[12] / np.linalg.norm(points[12]), [0, -1, 0], atol=0.05)
-            self.assertGreater(
-                sign * points[4, 0], 0.02
-            )  # palm down, seen from behind: a right hand's thumb is on the left, towards +x
+            # palm down, seen from behind: a right hand's thumb is on the left, towards +x
+            self.assertGreater(sign * points[4, 0], 0.02)
 
 
-class Synthetic(unittest.TestCase):
+class Synthetic(InFolder):
     @classmethod
     def setUpClass(cls):
-        cls.demos = concatenate(
-            [synthesize(None, per_object=1, seed=0), synthesize(["soup", "banana"], per_object=1, seed=0, side="left")]
-        )
+        right = synthesize(None, per_object=1, seed=0)
+        left = synthesize(["soup", "banana"], per_object=1, seed=0, side="left")
+        cls.demos = concatenate([right, left])
         cls.objects = demo_objects(cls.demos)
 
     def sequences(self):
+        """Each sequence with its object and the frame of the lift."""
         for i in range(self.demos.num_sequences):
             with self.subTest(str(self.demos.sequence_name[i])):
                 one = self.demos.select(indices=[i])
                 lifted = int(np.argmax(one.object_pos[:, 2] > one.object_pos[0, 2] + 1e-6))
                 yield one, self.objects[str(one.object_name[0])], lifted
 
-    def in_object(self, demos, points):
-        """Points [F, K, 3] in the object's frame."""
-        rotation = Rotation.from_quat(demos.object_quat_wxyz, scalar_first=True).as_matrix()
-        return np.einsum("fji,fkj->fki", rotation, points - demos.object_pos[:, None])
+    def hand_in_object(self, demos):
+        return in_frame(demos.object_pos, demos.object_quat_wxyz, demos.hand_keypoints.astype(float))
 
     def distances(self, demos, obj):
-        solid = Solid.of(obj, np.zeros(3), Rotation.identity())
-        return solid.distance(self.in_object(demos, demos.hand_keypoints.astype(float)))
-
-    def test_all_nine_objects(self):
-        self.assertEqual(self.demos.object_name[:9].tolist(), list(object_names()))
+        return Solid.of(obj, np.zeros(3), Rotation.identity()).distance(self.hand_in_object(demos))
 
     def test_the_same_seed_gives_the_same_bits(self):
+        self.assertEqual(self.demos.object_name[:9].tolist(), list(object_names()))
         again = synthesize(["banana", "soup"], per_object=1, seed=0)  # another order, fewer objects
         for name in ("banana", "soup"):
-            a, b = self.demos.select(objects=[name], sides=["right"]), again.select(objects=[name])
+            a = self.demos.select(objects=[name], sides=["right"])
+            b = again.select(objects=[name])
             for array in ("hand_keypoints", "wrist_quat_wxyz", "object_pos", "object_quat_wxyz"):
                 self.assertEqual(getattr(a, array).tobytes(), getattr(b, array).tobytes())
         other = synthesize(["soup"], per_object=1, seed=1)
@@ -463,10 +451,9 @@ class Synthetic(unittest.TestCase):
 
     @unittest.skipUnless(importlib.util.find_spec("manifold3d"), "manifold3d is not installed")
     def test_a_wall_of_ones_own_mesh_is_held_from_both_sides(self):
-        with tempfile.TemporaryDirectory() as folder:
-            trimesh.creation.annulus(0.0365, 0.04, 0.09, sections=16).export(Path(folder) / "tube.obj")
-            demos = synthesize(None, per_object=1, seed=0, meshes=folder)
-        tips = self.in_object(demos, demos.hand_keypoints.astype(float))[-1, TIPS]
+        trimesh.creation.annulus(0.0365, 0.04, 0.09, sections=16).export(self.folder / "tube.obj")
+        demos = synthesize(None, per_object=1, seed=0, meshes=self.folder)
+        tips = self.hand_in_object(demos)[-1, TIPS]
         radius = np.linalg.norm(tips[:3, :2], axis=1)  # thumb, index, middle
         inside = radius < 0.0365
         self.assertTrue(((radius < 0.040) == inside).all(), radius)  # none is in the wall
@@ -479,8 +466,9 @@ class Synthetic(unittest.TestCase):
             np.testing.assert_array_equal(one.object_pos[:lifted, :2], one.object_pos[:1, :2].repeat(lifted, axis=0))
             x, y, _ = one.object_pos[0]
             self.assertTrue(0.33 <= x <= 0.81 and 0.04 <= y <= 0.47)
-            rotation = Rotation.from_quat(one.object_quat_wxyz, scalar_first=True)
-            lowest = [(r.apply(obj.vertices) + p)[:, 2].min() for r, p in zip(rotation, one.object_pos, strict=True)]
+            lowest = []
+            for turn, pos in zip(turns(one.object_quat_wxyz), one.object_pos, strict=True):
+                lowest.append((turn.apply(obj.vertices) + pos)[:, 2].min())
             self.assertAlmostEqual(lowest[0], 0, delta=1e-4)
             self.assertGreater(min(lowest), -1e-4)
             self.assertTrue(20 <= lifted <= 45 and 60 <= one.num_frames <= 90)
@@ -493,16 +481,11 @@ class Synthetic(unittest.TestCase):
             self.assertTrue((np.abs(distance[:3]) < 0.008).all(), distance)  # thumb, index, middle
             tips = one.hand_keypoints[lifted, TIPS].astype(float)
             to_fingers = tips[1:3].mean(axis=0) - tips[0]
-            span = np.linalg.norm(to_fingers)
             points = tips[0] + np.linspace(0, 1, 41)[1:-1, None] * to_fingers
-            solid = Solid.of(
-                obj,
-                one.object_pos[lifted].astype(float),
-                Rotation.from_quat(one.object_quat_wxyz[lifted], scalar_first=True),
-            )
-            inside = solid.distance(points) < 0
-            self.assertGreater(inside.mean() * span, 0.008)  # the object is between them
-            self.assertGreater(inside.mean(), 0.5)
+            solid = Solid.of(obj, one.object_pos[lifted].astype(float), turns(one.object_quat_wxyz[lifted]))
+            inside = (solid.distance(points) < 0).mean()
+            self.assertGreater(inside * np.linalg.norm(to_fingers), 0.008)  # the object is between them
+            self.assertGreater(inside, 0.5)
 
     def test_the_hand_goes_through_nothing(self):
         for one, obj, _ in self.sequences():
@@ -514,129 +497,83 @@ class Synthetic(unittest.TestCase):
             points = one.hand_keypoints.astype(float)
             acceleration = np.diff(points, n=2, axis=0) * 30**2
             self.assertLess(np.linalg.norm(acceleration, axis=-1).max(), 20)
-            lengths = np.linalg.norm(points[:, 1:] - points[:, PARENTS], axis=-1)
-            np.testing.assert_allclose(lengths, lengths[:1].repeat(len(lengths), axis=0), atol=1e-6)
-            held = self.in_object(one, points)[lifted - 1 :]
-            np.testing.assert_allclose(held, held[:1].repeat(len(held), axis=0), atol=1e-5)
+            self.assertLess(np.ptp(hand.bone_lengths(points), axis=0).max(), 2e-6)
+            self.assertLess(np.ptp(self.hand_in_object(one)[lifted - 1 :], axis=0).max(), 2e-5)
 
     def test_wrist_orientation_is_that_of_manos_root(self):
-        knuckles = [5, 9, 13, 17]
         for one, _, _ in self.sequences():
-            rotation = Rotation.from_quat(one.wrist_quat_wxyz, scalar_first=True).as_matrix()
-            local = np.einsum("fji,fkj->fki", rotation, one.hand_keypoints[:, knuckles] - one.hand_keypoints[:, :1])
+            local = in_frame(one.hand_keypoints[:, 0], one.wrist_quat_wxyz, one.hand_keypoints[:, KNUCKLES])
             expected = hand.FINGER_BASES * ((-1, 1, 1) if one.hand_side[0] == "left" else (1, 1, 1))
             np.testing.assert_allclose(local, expected[None].repeat(one.num_frames, axis=0), atol=1e-5)
-
-    def test_same_conventions_as_real_hands(self):
-        """Knuckles of real hands in the wrist's frame lie where the model's are, for both sides."""
-        for file, side in (("dexycb_right_9x20.npz", "right"), ("dexycb_left_9x10.npz", "left")):
-            real = read_demos(data_dir() / file)
-            valid = real.hand_valid
-            rotation = Rotation.from_quat(real.wrist_quat_wxyz[valid], scalar_first=True).as_matrix()
-            points = real.hand_keypoints[valid]
-            local = np.einsum("fji,fkj->fki", rotation, points - points[:, :1]).mean(axis=0)
-            model = hand.keypoints(hand.RELAXED, side)
-            np.testing.assert_allclose(local[[5, 9, 13, 17]], model[[5, 9, 13, 17]], atol=0.01)
-            np.testing.assert_allclose(local, model, atol=0.04)  # real fingers are bent more or less
 
     def test_bad_options(self):
         with self.assertRaises(ObjectError):
             synthesize(["teapot"])
-        with self.assertRaisesRegex(DemoError, "per_object is 0"):
-            synthesize(["soup"], per_object=0)
-        with self.assertRaisesRegex(DemoError, "per_object is 1000000000 .* 1 to 100000"):
-            synthesize(["soup"], per_object=10**9)
-        with self.assertRaisesRegex(DemoError, "fps is 1"):
-            synthesize(["soup"], fps=1)
-
-
-class Commands(WithFolder):
-    def run_command(self, *arguments):
-        out, err = io.StringIO(), io.StringIO()
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            try:
-                main(["demos", *map(str, arguments)])
-                code = 0
-            except SystemExit as exit:
-                code = exit.code
-        return code, out.getvalue(), err.getvalue()
-
-    def test_synth_then_info(self):
-        file = self.folder / "demos.npz"
-        code, out, err = self.run_command(
-            "synth", "--out", file, "--objects", "soup", "--per-object", 1, "--side", "both", "--fps", 10
-        )
-        self.assertEqual(code, 0, err)
-        first = file.read_bytes()
-        self.assertEqual(read_demos(file).hand_side.tolist(), ["right", "left"])
-        code, info, _ = self.run_command("info", file)
-        self.assertEqual((code, info), (0, out))
-        self.assertRegex(info, r"005_tomato_soup_can\W+1\W+1\W")
-        self.run_command("synth", "--out", file, "--objects", "soup", "--per-object", 1, "--side", "both", "--fps", 10)
-        self.assertEqual(file.read_bytes(), first)
-
-    def test_import(self):
-        layout = data_dir() / "dexycb_layout"
-        file = self.folder / "demos.npz"
-        code, out, err = self.run_command("import", "dexycb", layout, "--out", file, "--objects", "cheez-its")
-        self.assertEqual(code, 0, err)
-        self.assertEqual(read_demos(file).object_name.tolist(), ["003_cracker_box"] * 2)
-        self.assertIn("2 sequences", out)
-
-    def test_errors_leave_no_file(self):
-        file = self.folder / "demos.npz"
-        code, _, err = self.run_command("import", "dexycb", self.folder, "--out", file)
-        self.assertEqual(code, 1)
-        self.assertIn("no DexYCB sequence", err)
-        code, _, err = self.run_command("synth", "--out", file, "--objects", "teapot")
-        self.assertEqual(code, 1)
-        self.assertIn("Unknown object 'teapot'", err)
-        self.assertEqual(list(self.folder.iterdir()), [])
+        for options, words in (
+            ({"per_object": 0}, "per_object is 0"),
+            ({"per_object": 10**9}, "per_object is 1000000000 .* 1 to 100000"),
+            ({"fps": 1}, "fps is 1"),
+        ):
+            with self.assertRaisesRegex(DemoError, words):
+                synthesize(["soup"], **options)
 
 
 class Plausible(unittest.TestCase):
-    """What another convention would explain is said; what is right, is not doubted."""
-
-    def test_other_conventions(self):
-        from xreset.demos.keypoints import ORDERS
-        from xreset.demos.plausible import doubts
-
+    def test_other_conventions_are_doubted_and_right_ones_are_not(self):
         for side in ("right", "left"):
             demos = synthesize(["soup"], 1, side=side)
             self.assertEqual(doubts(demos), [])
             mano = np.empty_like(demos.hand_keypoints)
             mano[:, ORDERS["mano"]] = demos.hand_keypoints
-            high, end = demos.object_pos + np.float32([0, 0, 0.9]), demos.object_pos.copy()
-            end[-1], turn = end[0], demos.object_quat_wxyz.copy()
-            turn[-1] = turn[0]
+            pos = demos.object_pos.copy()
+            pos[-1] = pos[0]
+            quat = demos.object_quat_wxyz.copy()
+            quat[-1] = quat[0]
             for words, changes in (
                 ("MANO's order", {"hand_keypoints": mano}),
                 (r"\(x, y, z, w\)", {"wrist_quat_wxyz": demos.wrist_quat_wxyz[:, [1, 2, 3, 0]]}),
-                ("1 of 1 sequences begins .* Are these coordinates of a camera", {"object_pos": high}),
-                ("1 of 1 sequences begins .* at its goal already", {"object_pos": end, "object_quat_wxyz": turn}),
+                ("1 of 1 sequences begins .* coordinates of a camera", {"object_pos": demos.object_pos + 0.9}),
+                ("1 of 1 sequences begins .* at its goal already", {"object_pos": pos, "object_quat_wxyz": quat}),
             ):
                 with self.subTest(words, side=side):
                     (doubt,) = doubts(replace(demos, **changes))
                     self.assertRegex(doubt, words)
 
-    def test_millimetres_are_refused(self):
-        demos = synthesize(["soup"], 1)
-        with tempfile.TemporaryDirectory() as folder, self.assertRaisesRegex(DemoError, "Are these millimetres"):
-            write_demos(Path(folder) / "d.npz", replace(demos, hand_keypoints=1000 * demos.hand_keypoints))
 
-    def test_recorded_demonstrations_are_not_doubted(self):
-        from xreset.demos.plausible import doubts
+class Commands(InFolder):
+    def test_synth_then_info(self):
+        file = self.folder / "demos.npz"
+        synth = ("demos", "synth", "--out", file, "--objects", "soup", "--per-object", 1, "--side", "both", "--fps", 10)
+        code, out = run(*synth)
+        self.assertEqual(code, 0, out)
+        first = file.read_bytes()
+        self.assertEqual(read_demos(file).hand_side.tolist(), ["right", "left"])
+        code, info = run("demos", "info", file)
+        self.assertEqual(code, 0)
+        self.assertIn(info, out)
+        self.assertRegex(info, r"005_tomato_soup_can\W+1\W+1\W")
+        run(*synth)
+        self.assertEqual(file.read_bytes(), first)
 
-        for name in ("dexycb_right_9x20.npz", "dexycb_left_9x10.npz"):
-            demos = read_demos(data_dir() / name)
-            objects = demo_objects(demos)
-            self.assertEqual(doubts(demos, objects), [])
-            for field, words in (
-                ("object_quat_wxyz", "of the objects stand on the table if"),
-                ("wrist_quat_wxyz", "ut w first"),
-            ):
-                (doubt,) = doubts(replace(demos, **{field: getattr(demos, field)[:, [1, 2, 3, 0]]}), objects)
-                self.assertIn(words, doubt)
+    def test_import(self):
+        file = self.folder / "demos.npz"
+        code, out = run(
+            "demos", "import", "dexycb", data_dir() / "dexycb_layout", "--out", file, "--objects", "cheez-its"
+        )
+        self.assertEqual(code, 0, out)
+        self.assertEqual(read_demos(file).object_name.tolist(), ["003_cracker_box"] * 2)
+        self.assertIn("2 sequences", out)
+
+    def test_errors_leave_no_file(self):
+        file = self.folder / "demos.npz"
+        for words, command in (
+            ("no DexYCB sequence", ("import", "dexycb", self.folder, "--out", file)),
+            ("Unknown object 'teapot'", ("synth", "--out", file, "--objects", "teapot")),
+        ):
+            code, out = run("demos", *command)
+            self.assertEqual(code, 1)
+            self.assertIn(words, out)
+        self.assertEqual(list(self.folder.iterdir()), [])
 
 
 if __name__ == "__main__":

@@ -145,10 +145,9 @@ def readers() -> Iterator[dict[str, Reader]]:
 
         write_policy(add("policy", "policy.onnx", OnnxPolicy, "bytes"), contract)
         path = add("checkpoint", "000001.pt", read_checkpoint, "bytes")
-        keys = ("actor_state_dict", "critic_state_dict", "optimizer_state_dict", "random")
-        torch.save(
-            {**{k: {} for k in keys}, "iteration": 1, "env_steps": 1, "elapsed": 0.1, "learning_rate": 1e-3}, path
-        )
+        states = {key: {} for key in ("actor_state_dict", "critic_state_dict", "optimizer_state_dict")}
+        numbers = {"iteration": 1, "env_steps": 1, "elapsed": 0.1, "learning_rate": 1e-3}
+        torch.save({**states, **numbers, "random": []}, path)
 
         described = openarm.urdf.with_name("robot.toml")
         (folder / "robot.toml").write_bytes(described.read_bytes())
@@ -172,7 +171,13 @@ def readers() -> Iterator[dict[str, Reader]]:
         }
         add("DexYCB meta", "meta.yml", _read_meta, "yaml").write_text(yaml.safe_dump(meta))
         np.savez(
-            add("DexYCB poses", "pose.npz", lambda p: _read_npz(p, {"pose_y": (4, 1, 7)}), "npz", ("pose_y",)),
+            add(
+                "DexYCB poses",
+                "pose.npz",
+                lambda p: {"pose_y": _read_npz(p, {"pose_y": (4, 1, 7)})},
+                "npz",
+                ("pose_y",),
+            ),
             pose_y=np.zeros((4, 1, 7)),
         )
 

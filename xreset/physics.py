@@ -20,15 +20,14 @@ from xreset.tensors import Tensors
 Parameter = Literal[
     "friction", "torsional_friction", "object_mass", "object_inertia", "object_com", "object_gravity", "drives"
 ]
-"""A physical parameter that each world has its own value of: ``Backend.set_...`` sets it."""
+"""A physical parameter with a value per world, set by ``Backend.set_...``."""
 Capability = Literal[Parameter, "object_wrench", "overflow", "mass_properties"]
-"""What a backend may be unable to do: setting a parameter world by world; a wrench; counting overflows; reading back masses, centres of
-mass and inertias."""
+"""What some backends cannot do: set a parameter per world, apply a wrench, count overflows, read back masses, centers of mass and inertias."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class State(Tensors):
-    """The full state of worlds. Setting it leaves nothing of the past: no warm start, no old target, no external force."""
+    """The full state of worlds. Setting it removes everything else: warm starts, old targets, external forces."""
 
     joint_pos: Tensor
     """[N, J] rad (m)."""
@@ -49,17 +48,25 @@ class State(Tensors):
     def at_rest(
         cls, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, joint_target: Tensor | None = None
     ) -> Self:
-        """Nothing moves; the drives hold the joint positions [N, J], or are told targets [N, J]."""
-        q, pos, still = joint_pos.float(), object_pos.float(), torch.zeros_like(object_pos, dtype=torch.float32)
+        """Return a state in which nothing moves. ``joint_target`` [N, J] defaults to the joint positions [N, J]."""
+        q = joint_pos.float()
+        pos = object_pos.float()
+        if joint_target is None:
+            joint_target = q.clone()
         return cls(
-            joint_pos=q, joint_vel=torch.zeros_like(q), joint_target=q.clone() if joint_target is None else joint_target.float(),
-            object_pos=pos, object_quat=object_quat.float(), object_linvel=still, object_angvel=still.clone(),
-        )  # fmt: skip
+            joint_pos=q,
+            joint_vel=torch.zeros_like(q),
+            joint_target=joint_target.float(),
+            object_pos=pos,
+            object_quat=object_quat.float(),
+            object_linvel=torch.zeros_like(pos),
+            object_angvel=torch.zeros_like(pos),
+        )
 
     @classmethod
     def initial(cls, scene: SceneSpec, object_index: Tensor) -> Self:
-        """What worlds with these objects [N] begin with: nothing moves, the robot is at home, the object upright at the table's centre."""
-        places = torch.tensor([(*scene.table.center, -lowest_point(thing.pieces)) for thing in scene.objects])
+        """Return the first state of worlds with these objects [N]: nothing moves, the robot at home, the object upright in the table's middle."""
+        places = torch.tensor([(*scene.table.center, -lowest_point(spec.pieces)) for spec in scene.objects])
         home = torch.as_tensor(scene.robot.home).repeat(len(object_index), 1)
         upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(object_index), 1)
         return cls.at_rest(home, places[object_index.cpu()], upright)
@@ -67,7 +74,7 @@ class State(Tensors):
 
 @dataclass(frozen=True, kw_only=True)
 class Parameters(Tensors):
-    """Physical parameters of worlds, each as its setter takes it; None leaves it as it is."""
+    """Physical parameters of worlds, as their setters take them; None: unchanged."""
 
     friction: Tensor | None = None
     """[N, 3] of the pairs object-fingertip, object-other link, object-table."""
@@ -85,8 +92,8 @@ class Parameters(Tensors):
     """[N, 3, J] factors."""
 
     def given(self) -> dict[Parameter, Tensor]:
-        """Those that are not None, by name."""
-        return {name: value for name in get_args(Parameter) if (value := getattr(self, name)) is not None}
+        """Return the parameters that are not None, by name."""
+        return {name: getattr(self, name) for name in get_args(Parameter) if getattr(self, name) is not None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +129,7 @@ class Health(Tensors):
     nonfinite: Tensor
     """[N] bool: a position or velocity is not finite."""
     overflow: Tensor
-    """[N] bool: contacts or constraints were dropped for want of room."""
+    """[N] bool: contacts or constraints were dropped because a buffer was full."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -335,28 +342,15 @@ class Backend(ABC):
     def _require(self, capability: Capability) -> None:
         """Raise the error that the contract asks for if a capability is missing."""
         if capability not in self.capabilities:
-            raise CapabilityError(
-                f"the backend {self.name!r} cannot set {capability.replace('_', ' ')}: {_REMEDIES[capability]}"
-            )
+            remedy = "build a scene that has it."
+            if capability in ("object_gravity", "object_wrench"):
+                remedy = "use another backend."
+            raise CapabilityError(f"the backend {self.name!r} cannot set {capability.replace('_', ' ')}: {remedy}")
 
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
-        """Set a physical parameter [M, ...], as the setter of that name says: what all of them do."""
+        """Set a physical parameter [M, ...]. Every setter calls this, so a backend overrides either."""
         self._require(name)
-        raise NotImplementedError(
-            f"the backend {self.name!r} says that it can set {name.replace('_', ' ')}, and does not"
-        )
-
-
-_REMEDIES: dict[str, str] = {
-    "friction": "build a scene with that friction.",
-    "torsional_friction": "build a scene with that friction.",
-    "object_mass": "build a scene whose objects have the mass.",
-    "object_inertia": "build a scene whose objects have the inertia.",
-    "object_com": "build a scene whose objects have their centre of mass there.",
-    "object_gravity": "use another backend for gravity fractions.",
-    "drives": "build a scene whose robot has such drives.",
-    "object_wrench": "use another backend for external wrenches.",
-}
+        raise NotImplementedError(f"the backend {self.name!r} declares {name!r} and does not set it")
 
 
 def unavailable(package: str, install: str, error: Exception) -> BackendUnavailableError:

@@ -52,15 +52,15 @@ class Shape:
 class DriveSpec:
     """An implicit PD position drive: torque = kp (target - q) - kd qd, limited to the effort limit."""
 
-    kp: float
+    kp: Number
     """Stiffness [N m/rad] (prismatic: N/m)."""
-    kd: float
+    kd: Number
     """Damping [N m s/rad] (prismatic: N s/m)."""
-    effort: float
+    effort: Number
     """Largest torque [N m] (force [N]) of the drive."""
-    armature: float = 0.0
+    armature: Number = 0.0
     """Rotor inertia as seen at the joint [kg m^2] (mass [kg])."""
-    friction_loss: float = 0.0
+    friction_loss: Number = 0.0
     """Dry friction [N m] ([N])."""
 
 

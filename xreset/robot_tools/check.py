@@ -1,4 +1,4 @@
-"""Says everything that is wrong with a robot in one go: its description, its URDF, its physics, and what the engines make of it."""
+"""Checks a robot in one go: its description, its URDF, its physics, and how the engines build it."""
 
 from __future__ import annotations
 
@@ -18,10 +18,12 @@ from xreset.geometry.dynamics import damping_ratio, drive_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import surface_of
 from xreset.geometry.urdf import Link, RobotTree, find_mesh, parse_xml, robot_tree
+from xreset.physics import Backend
 from xreset.plugins import backend_names, make_backend, robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
-from xreset.robot_tools.sources import largest_moment
-from xreset.spec import Geometry, ObjectSpec, RobotSpec, SceneSpec, Shape, TableSpec
+from xreset.robot_tools.draft import below
+from xreset.robot_tools.sources import largest_moment, read_source
+from xreset.spec import Geometry, MimicSpec, ObjectSpec, RobotSpec, SceneSpec, Shape, TableSpec
 from xreset.text import shown
 
 Level = Literal["ok", "skipped", "warning", "error"]
@@ -64,7 +66,10 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
         spec = load_robot(name_or_folder)
     except XResetError as error:
         return None, [Finding("error", "description", str(error))]
-    found = [Finding("ok", "description", f"{folder / DESCRIPTION}: {_summary(spec)}")]
+    counts = (
+        f"{len(spec.arm_indices)} arm joints, {len(spec.hand_indices)} hand joints, {len(spec.fingertips)} fingertips"
+    )
+    found = [Finding("ok", "description", f"{folder / DESCRIPTION}: {counts}")]
     if missing := _missing_meshes(spec.urdf):
         return None, [*found, *(Finding("error", "meshes", problem) for problem in missing)]
     try:
@@ -73,32 +78,24 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
         return None, [*found, Finding("error", "URDF", str(error))]
     shapes = sum(len(link.collisions) for link in tree.links)
     mass = sum(link.mass for link in tree.links)
-    found.append(
-        Finding(
-            "ok",
-            "URDF",
-            f"{len(tree.links)} links, {len(tree.joints)} joints, {shapes} collision shapes, {mass:.1f} kg",
-        )
-    )
-
-    found += _topic(
-        "joints",
-        _joints(spec, tree),
-        f"{len(spec.joints)} actuated joints exist, have limits, and are at home within them",
-    )
+    content = f"{len(tree.links)} links, {len(tree.joints)} joints, {shapes} collision shapes, {mass:.1f} kg"
+    found.append(Finding("ok", "URDF", content))
+    joints = f"{len(spec.joints)} actuated joints exist, have limits, and are at home within them"
+    found += _topic("joints", _joints(spec, tree), joints)
     found += _topic("mimic joints", _mimics(spec, tree), f"{len(spec.mimics)} follow an actuated joint")
     found += _topic("links", _links(spec, tree), "palm, fingertips, keypoints and collision links exist")
     found += _topic("inertias", _inertias(tree), "masses are positive, inertias are those of solid bodies")
     if any(finding.level == "error" for finding in found):
-        found.append(Finding("skipped", "home", "mend the errors above first"))
-        return spec, found
-    found += _topic("drives", _drives(spec), _drive_summary(spec))
+        return spec, [*found, Finding("skipped", "home", "fix the errors above first")]
+    ratio = damping_ratio(spec, spec.home)
+    found += _topic("drives", _drives(spec), f"damping ratios at home are {ratio.min():.2f}..{ratio.max():.2f}")
     found += _topic("frames", _frames(spec), "the palm looks along the fingers")
     found += _home(spec)
-    found += _size(spec)
+    found.append(_size(spec))
     if spec.placement is not None:
-        stated = f"reaches {spec.placement.reached:.1%} and follows {spec.placement.followed:.1%} of {spec.placement.frames} frames"
-        found.append(Finding("ok", "placement", f"{stated}, says {DESCRIPTION}: {spec.placement.command}"))
+        place = spec.placement
+        stated = f"reaches {place.reached:.1%} and follows {place.followed:.1%} of {place.frames} frames"
+        found.append(Finding("ok", "placement", f"{stated}, says {DESCRIPTION}: {place.command}"))
     return spec, found
 
 
@@ -136,7 +133,7 @@ def check(
     if spec is None or not engines:
         return found
     if any(finding.level == "error" for finding in found):
-        found.append(Finding("skipped", "engines", "mend the errors above first"))
+        found.append(Finding("skipped", "engines", "fix the errors above first"))
         report(found[-1])
         return found
     for backend in backend_names():
@@ -145,87 +142,75 @@ def check(
     return found
 
 
-def _topic(topic: str, problems: Iterator[tuple[Level, str]], otherwise: str) -> list[Finding]:
+Problems = Iterator[tuple[Level, str]]
+
+
+def _topic(topic: str, problems: Problems, otherwise: str) -> list[Finding]:
     found = []
     try:
-        found += (Finding(level, topic, message) for level, message in problems)
-    except XResetError as error:  # a check that asks for what the URDF lacks: the others are still told
+        for level, message in problems:
+            found.append(Finding(level, topic, message))
+    except XResetError as error:  # a check that asks for what the URDF lacks must not hide the others
         found.append(Finding("error", topic, str(error)))
     return found or [Finding("ok", topic, otherwise)]
-
-
-def _summary(spec: RobotSpec) -> str:
-    return (
-        f"{len(spec.arm_indices)} arm joints, {len(spec.hand_indices)} hand joints, {len(spec.fingertips)} fingertips"
-    )
 
 
 # Description against URDF ----------------------------------------------------------------------------------------------------------------
 
 
 def _missing_meshes(urdf: Path) -> list[str]:
-    """Every mesh of a collision shape that is not there (reading the URDF stops at the first)."""
+    """Name every mesh of a collision shape that does not exist (reading the URDF stops at the first)."""
     try:
         xml = parse_xml(urdf)
     except RobotError:
-        return []  # load_urdf says so
-    names = [mesh.get("filename", "") for collision in xml.iter("collision") for mesh in collision.iter("mesh")]
-    return [
-        f"{urdf.name} uses {shown(name)}, which is not in its folders. Put it there."
-        for name in dict.fromkeys(names)
-        if not find_mesh(name, urdf)
-    ]
+        return []  # reading the URDF says so
+    problems = {}
+    for mesh in xml.iterfind(".//collision//mesh"):
+        name = mesh.get("filename", "")
+        if not find_mesh(name, urdf):
+            problems[name] = f"{urdf.name} uses {shown(name)}, which is not in its folders. Put it there."
+    return list(problems.values())
 
 
-def _joints(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
+def _joints(spec: RobotSpec, tree: RobotTree) -> Problems:
     known = {joint.name: joint for joint in tree.joints}
-    below = _below(tree, spec.hand_root)
+    moving = [joint.name for joint in tree.joints if joint.type != "fixed"]
+    inside = set(below(tree, spec.hand_root)) - {spec.hand_root}
     for joint in spec.joints:
-        if joint.name not in known:
-            yield (
-                "error",
-                f"{joint.name!r} is not in the URDF, which has {_listed(n for n, j in known.items() if j.type != 'fixed')}.",
-            )
+        found = known.get(joint.name)
+        if found is None:
+            yield "error", f"{joint.name!r} is not in the URDF, which has {', '.join(moving)}."
             continue
-        found = known[joint.name]
+        limits = f"{found.lower:g}..{found.upper:g}"
         if found.type == "fixed":
             yield "error", f"{joint.name!r} is fixed in the URDF; an actuated joint must move."
         elif not np.isfinite((found.lower, found.upper)).all() or found.lower >= found.upper:
-            yield (
-                "error",
-                f"{joint.name!r} has the limits {found.lower:g}..{found.upper:g}; expected finite ones, the lower one first.",
-            )
+            yield "error", f"{joint.name!r} has the limits {limits}; expected finite ones, the lower one first."
         elif not found.lower <= joint.home <= found.upper:
-            yield (
-                "error",
-                f"{joint.name!r} is at home at {joint.home:g}, outside its limits {found.lower:g}..{found.upper:g}.",
-            )
-        elif (found.child in below) != (joint.group == "hand"):
-            where = "below" if found.child in below else "not below"
-            yield (
-                "warning",
-                f"{joint.name!r} is of group {joint.group!r} but lies {where} the hand's root {spec.hand_root!r}.",
-            )
+            yield "error", f"{joint.name!r} is at home at {joint.home:g}, outside its limits {limits}."
+        elif (found.child in inside) != (joint.group == "hand"):
+            where = "below" if found.child in inside else "not below"
+            text = f"{joint.name!r} is of group {joint.group!r} but lies {where} the hand's root {spec.hand_root!r}."
+            yield "warning", text
     moved = {*spec.joint_names, *(mimic.joint for mimic in spec.mimics)}
-    for name in (name for name, joint in known.items() if joint.type != "fixed" and name not in moved):
-        yield (
-            "error",
-            f"the URDF's {name!r} moves but is neither actuated nor a mimic joint; add it to either, or make it fixed.",
-        )
+    for name in moving:
+        if name not in moved:
+            text = "moves but is neither actuated nor a mimic joint; add it to either, or make it fixed."
+            yield "error", f"the URDF's {name!r} {text}"
 
 
-def _mimics(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
+def _mimics(spec: RobotSpec, tree: RobotTree) -> Problems:
     known = {joint.name: joint for joint in tree.joints if joint.type != "fixed"}
-    stated = _mimic_tags(spec.urdf)
+    tags = {mimic.joint: mimic for mimic in read_source(spec.urdf).mimics}
     for mimic in spec.mimics:
-        if mimic.joint not in known:
+        tag = tags.pop(mimic.joint, mimic)
+        own = known.get(mimic.joint)
+        source = known.get(mimic.source)
+        if own is None:
             yield "error", f"{mimic.joint!r} is not a moving joint of the URDF."
-        elif mimic.joint in stated and stated[mimic.joint] != (mimic.source, mimic.multiplier, mimic.offset):
-            here, there = (mimic.source, mimic.multiplier, mimic.offset), stated[mimic.joint]
-            described, tagged = (f"{factor:g} {source} + {offset:g}" for source, factor, offset in (here, there))
-            yield "error", f"{mimic.joint!r} = {described} in the description, but {tagged} in the URDF."
-        elif mimic.source in known:
-            source, own = known[mimic.source], known[mimic.joint]
+        elif tag != mimic:
+            yield "error", f"{mimic.joint!r} = {_line(mimic)} in the description, but {_line(tag)} in the URDF."
+        elif source is not None:
             low, high = sorted(mimic.multiplier * limit + mimic.offset for limit in (source.lower, source.upper))
             if low < own.lower - _LIMIT_SLACK or high > own.upper + _LIMIT_SLACK:
                 yield (
@@ -233,101 +218,88 @@ def _mimics(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
                     f"{mimic.joint!r} goes from {low:.4g} to {high:.4g} with {mimic.source!r}, beyond its own limits "
                     f"{own.lower:.4g}..{own.upper:.4g}: the two would hold each other up. Widen its limits, or narrow those of the source.",
                 )
-    for name in stated.keys() - {mimic.joint for mimic in spec.mimics}:
-        yield (
-            "error",
-            f"the URDF lets {name!r} mimic {stated[name][0]!r}, but the description has no such entry in mimics.",
-        )
+    for tag in tags.values():
+        text = f"the URDF lets {tag.joint!r} mimic {tag.source!r}, but the description has no such entry in mimics."
+        yield "error", text
 
 
-def _mimic_tags(urdf: Path) -> dict[str, tuple[str, float, float]]:
-    found = {}
-    for joint in parse_xml(urdf).findall("joint"):
-        tag = joint.find("mimic")
-        if tag is not None:
-            found[joint.get("name", "")] = (
-                tag.get("joint", ""),
-                float(tag.get("multiplier", 1)),
-                float(tag.get("offset", 0)),
-            )
-    return found
+def _line(mimic: MimicSpec) -> str:
+    return f"{mimic.multiplier:g} {mimic.source} + {mimic.offset:g}"
 
 
-def _links(spec: RobotSpec, tree: RobotTree) -> Iterator[tuple[Level, str]]:
+def _links(spec: RobotSpec, tree: RobotTree) -> Problems:
     known = {link.name: link for link in tree.links}
-    wanted = [("hand.root", spec.hand_root), ("hand.palm", spec.palm)]
-    wanted += [(f"fingertip {tip.name!r}", tip.link) for tip in spec.fingertips]
-    wanted += [(f"contact_links of {tip.name!r}", link) for tip in spec.fingertips for link in tip.contact_links]
-    wanted += [(f"keypoint {point.keypoint!r}", point.link) for point in spec.keypoints]
-    wanted += [("collision.self", link) for link in spec.self_collision_links]
-    wanted += [("collision.exclude", link) for pair in spec.collision_exclude for link in pair]
-    wanted += [("collision.table_exclude", link) for link in spec.table_exclude]
-    absent = [(where, link) for where, link in wanted if link not in known]
-    for where, link in absent:
-        yield "error", f"{where}: the URDF has no link {link!r}."
+    wanted = {"hand.root": [spec.hand_root], "hand.palm": [spec.palm]}
+    for tip in spec.fingertips:
+        wanted[f"fingertip {tip.name!r}"] = [tip.link]
+        wanted[f"contact_links of {tip.name!r}"] = [*tip.contact_links]
+    for point in spec.keypoints:
+        wanted[f"keypoint {point.keypoint!r}"] = [point.link]
+    wanted["collision.self"] = [*spec.self_collision_links]
+    wanted["collision.exclude"] = [link for pair in spec.collision_exclude for link in pair]  # noqa: XR002
+    wanted["collision.table_exclude"] = [*spec.table_exclude]
+    absent = False
+    for where, links in wanted.items():
+        for link in links:
+            if link not in known:
+                absent = True
+                yield "error", f"{where}: the URDF has no link {link!r}."
     if absent:
-        yield "error", f"the URDF's links are {_listed(known)}."
+        yield "error", f"the URDF's links are {', '.join(known)}."
         return
-    below = _below(tree, spec.hand_root)
+    inside = set(below(tree, spec.hand_root)) - {spec.hand_root}
     for tip in spec.fingertips:
         if not any(known[link].collisions for link in tip.contact_links):
-            yield (
-                "error",
-                f"fingertip {tip.name!r}: none of {_listed(tip.contact_links)} has a collision shape, so it can touch nothing.",
-            )
-        if tip.link not in below:
-            yield (
-                "error",
-                f"fingertip {tip.name!r}: {tip.link!r} does not lie below the hand's root {spec.hand_root!r}.",
-            )
+            links = ", ".join(tip.contact_links)
+            yield "error", f"fingertip {tip.name!r}: none of {links} has a collision shape, so it can touch nothing."
+        if tip.link not in inside:
+            text = f"{tip.link!r} does not lie below the hand's root {spec.hand_root!r}."
+            yield "error", f"fingertip {tip.name!r}: {text}"
     for link in spec.self_collision_links:
         if not known[link].collisions:
             yield "warning", f"collision.self: {link!r} has no collision shape."
 
 
-def _inertias(tree: RobotTree) -> Iterator[tuple[Level, str]]:
-    at_joints = [
-        link.name
-        for link in tree.links
-        if link.mass > 0 and link.collisions and not link.com.any() and _off_middle(link) > _OFF
-    ]
+def _inertias(tree: RobotTree) -> Problems:
+    at_joints = []
+    for link in tree.links:
+        if link.mass > 0 and link.collisions and not link.com.any() and _off_middle(link) > _OFF:
+            at_joints.append(link.name)
     if at_joints:
         yield (
             "warning",
-            f"the centre of mass of {_listed(at_joints)} lies in the joint, more than {1e3 * _OFF:.0f} mm from the middle of the link's "
+            f"the centre of mass of {', '.join(at_joints)} lies in the joint, more than {1e3 * _OFF:.0f} mm from the middle of the link's "
             "shapes. Is it a placeholder?",
         )
-    fixed = {joint.child for joint in tree.joints if joint.type == "fixed"}
+    moved = {joint.child for joint in tree.joints if joint.type != "fixed"}
     for link in tree.links:
+        name = link.name
         if link.mass <= 0:
-            if link.name not in fixed and link.name != tree.root:
-                yield (
-                    "error",
-                    f"{link.name!r} moves but has the mass {link.mass:g} kg; every moving link needs a mass and an inertia.",
+            if name in moved:
+                text = (
+                    f"{name!r} moves but has the mass {link.mass:g} kg; every moving link needs a mass and an inertia."
                 )
+                yield "error", text
             continue
         moments = np.linalg.eigvalsh(link.inertia)
+        listed = ", ".join(f"{moment:.3g}" for moment in moments)
         if moments[0] <= 0:
-            yield (
-                "error",
-                f"{link.name!r} has the principal moments {_numbers(moments)} kg m^2; expected positive ones.",
-            )
+            yield "error", f"{name!r} has the principal moments {listed} kg m^2; expected positive ones."
         elif moments[2] > (moments[0] + moments[1]) * (1 + _ROUNDING):
             yield (
                 "error",
-                f"{link.name!r} has the principal moments {_numbers(moments)} kg m^2: the largest exceeds the sum of the others, which no "
-                "solid body has.",
+                f"{name!r} has the principal moments {listed} kg m^2: the largest exceeds the sum of the others, which no solid body has.",
             )
-        elif link.collisions and moments[2] > (most := largest_moment(link)):
+        elif link.collisions and moments[2] > largest_moment(link):
             yield (
                 "warning",
-                f"{link.name!r} has a moment of {moments[2]:.3g} kg m^2; {link.mass:.3g} kg of its size can have {most:.2g} at most. Is it"
-                " a placeholder? `xreset robots import` replaces such.",
+                f"{name!r} has a moment of {moments[2]:.3g} kg m^2; {link.mass:.3g} kg of its size can have {largest_moment(link):.2g} at "
+                "most. Is it a placeholder? `xreset robots import` replaces such.",
             )
 
 
 def _off_middle(link: Link) -> float:
-    """Distance of a link's centre of mass from the middle of its shapes' bounding box [m]."""
+    """Distance of a link's center of mass from the middle of its shapes' bounding box [m]."""
     vertices, _ = surface_of(link.collisions)
     return float(np.linalg.norm((vertices.min(axis=0) + vertices.max(axis=0)) / 2 - link.com))
 
@@ -335,128 +307,116 @@ def _off_middle(link: Link) -> float:
 # Physics ---------------------------------------------------------------------------------------------------------------------------------
 
 
-def _drives(spec: RobotSpec) -> Iterator[tuple[Level, str]]:
+def _drives(spec: RobotSpec) -> Problems:
     for joint in spec.joints:
         drive = joint.drive
         if drive.kp <= 0 or drive.effort <= 0 or min(drive.kd, drive.armature, drive.friction_loss) < 0:
-            yield (
-                "error",
-                f"{joint.name!r}: kp and effort must be positive; kd, armature and friction_loss must not be negative.",
-            )
+            text = "kp and effort must be positive; kd, armature and friction_loss must not be negative."
+            yield "error", f"{joint.name!r}: {text}"
             return
     step = SceneSpec.timestep
-    for joint, ratio, inertia in zip(
-        spec.joints, damping_ratio(spec, spec.home), drive_inertia(spec, spec.home), strict=True
-    ):
+    ratios = damping_ratio(spec, spec.home)
+    inertias = drive_inertia(spec, spec.home)
+    for joint, ratio, inertia in zip(spec.joints, ratios, inertias, strict=True):
+        has = f"{joint.name!r} has the damping ratio"
         if ratio < 0.5:
-            yield (
-                "warning",
-                f"{joint.name!r} has the damping ratio {ratio:.2f} at home and will swing; 0.7 to 1.5 is usual: raise kd.",
-            )
+            yield "warning", f"{has} {ratio:.2f} at home and will swing; 0.7 to 1.5 is usual: raise kd."
         if ratio > 5:
-            yield (
-                "warning",
-                f"{joint.name!r} has the damping ratio {ratio:.1f} at home and will creep; 0.7 to 1.5 is usual: lower kd.",
-            )
+            yield "warning", f"{has} {ratio:.1f} at home and will creep; 0.7 to 1.5 is usual: lower kd."
         if joint.drive.kd * step > inertia:
             yield (
                 "warning",
-                f"{joint.name!r}: kd = {joint.drive.kd:g} is more than its inertia {inertia:.3g} bears at a step of 1/{1 / step:.0f} s; "
+                f"{joint.name!r}: kd = {joint.drive.kd:g} is too much for its inertia {inertia:.3g} at a step of 1/{1 / step:.0f} s; "
                 "engines that integrate drives explicitly become unstable. Lower kp and kd, or state the rotor as the joint's armature.",
             )
 
 
-def _drive_summary(spec: RobotSpec) -> str:
-    ratio = damping_ratio(spec, spec.home)
-    return f"damping ratios at home are {ratio.min():.2f}..{ratio.max():.2f}"
-
-
-def _frames(spec: RobotSpec) -> Iterator[tuple[Level, str]]:
-    poses = Kinematics(spec).link_poses(torch.tensor(spec.home), spec.tracked_links).numpy()
-    palm, tips = poses[0], poses[1:]
-    ahead = (tips[:, :3, 3] - palm[:3, 3]).mean(axis=0) @ palm[:3, 0]
-    along = (tips[1:, :3, 3] - palm[:3, 3]).mean(axis=0) @ palm[:3, :3]
+def _frames(spec: RobotSpec) -> Problems:
+    palm, *tips = Kinematics(spec).link_poses(torch.tensor(spec.home), spec.tracked_links).numpy()
+    away = np.array([tip[:3, 3] - palm[:3, 3] for tip in tips])
+    along = away[1:].mean(axis=0) @ palm[:3, :3] if len(tips) > 1 else np.zeros(3)
     longest = int(np.abs(along).argmax())
-    if len(tips) > 1 and longest != 0:
-        axis = "-" * bool(along[longest] < 0) + "xyz"[longest]
-        yield (
-            "warning",
-            f"the fingers lie along {axis} of the palm {spec.palm!r}: its x should point towards them, z out of its inner side.",
-        )
+    ahead = away.mean(axis=0) @ palm[:3, 0]
+    if longest != 0:
+        axis = ("-" if along[longest] < 0 else "") + "xyz"[longest]
+        text = "its x should point towards them, z out of its inner side."
+        yield "warning", f"the fingers lie along {axis} of the palm {spec.palm!r}: {text}"
     elif ahead <= 0:
-        yield (
-            "warning",
-            f"the fingertips lie {-ahead:.3f} m behind the palm {spec.palm!r}: its x should point towards the fingers.",
-        )
+        text = "its x should point towards the fingers."
+        yield "warning", f"the fingertips lie {-ahead:.3f} m behind the palm {spec.palm!r}: {text}"
 
 
 def _home(spec: RobotSpec) -> list[Finding]:
-    """Home, and configurations spread around it as at the start of episodes, against the table and against the robot itself."""
+    """Check home, and configurations spread around it as at the start of episodes, against the table and the robot itself."""
     kinematics = Kinematics(spec)
     home = torch.tensor(spec.home)
     spread = torch.zeros_like(home)
     spread[spec.arm_indices], spread[spec.hand_indices] = spec.home_std
     noise = torch.randn(_SAMPLES, len(home), generator=torch.Generator().manual_seed(0), dtype=home.dtype)
     q = torch.cat((home[None], kinematics.clamp(home + spread * noise)))
-    found = []
+    return [_above_table(spec, kinematics, q), *_free_of_itself(spec, kinematics, q)]
 
+
+def _above_table(spec: RobotSpec, kinematics: Kinematics, q: torch.Tensor) -> Finding:
     support = table_points(spec, kinematics)
     points = kinematics.points(q, support.links, torch.tensor(support.points))
     height = height_above_table(points, torch.tensor(support.radii), TableSpec())
     clearance, lowest = height[0].min(dim=0)
-    below = 100 * float((height.min(dim=1).values < 0).double().mean())
-    text = f"lowest at {clearance * 1e3:.0f} mm above the table ({support.links[int(lowest)]}); {below:.0f} % of the spread below it"
-    level = "error" if clearance < 0 else "warning" if clearance < MIN_CLEARANCE or below > 1 else "ok"
-    found.append(Finding(level, "home and table", text))
+    share = 100 * float((height.min(dim=1).values < 0).double().mean())
+    level: Level = "ok"
+    if clearance < 0:
+        level = "error"
+    elif clearance < MIN_CLEARANCE or share > 1:
+        level = "warning"
+    link = support.links[int(lowest)]
+    text = f"lowest at {clearance * 1e3:.0f} mm above the table ({link}); {share:.0f} % of the spread below it"
+    return Finding(level, "home and table", text)
 
+
+def _free_of_itself(spec: RobotSpec, kinematics: Kinematics, q: torch.Tensor) -> list[Finding]:
+    topic = "home and self"
     try:
         collision = SelfCollision(spec, kinematics)
     except XResetError as error:
-        return [*found, Finding("skipped", "home and self", str(error))]
-    poses = kinematics.link_poses(q).numpy()
-    names = np.array(kinematics.link_names)
+        return [Finding("skipped", topic, str(error))]
+    found = []
     for pair in collision.overlapping_at_home:
-        found.append(
-            Finding(
-                "error",
-                "home and self",
-                f"{' and '.join(pair)} overlap at home: move home, or add the pair to collision.exclude.",
-            )
-        )
-    near = collision.near(poses, 0.0)
+        text = f"{' and '.join(pair)} overlap at home: move home, or add the pair to collision.exclude."
+        found.append(Finding("error", topic, text))
+    near = collision.near(kinematics.link_poses(q).numpy(), 0.0)
     share = 100 * len(np.unique(near.configuration)) / len(q)
-    meetings = {(int(at), " and ".join(names[pair])) for at, pair in zip(near.configuration, near.links, strict=True)}
-    pairs = Counter(pair for _, pair in meetings).most_common()
     if share > 20:
-        often = _listed(f"{pair} ({100 * count / len(q):.0f} %)" for pair, count in pairs[:_LISTED])
-        more = f" and {len(pairs) - _LISTED} more pairs" if len(pairs) > _LISTED else ""
-        text = f"{share:.0f} % of the spread around home touches itself: {often}{more}; episodes that start so are pushed apart."
-        found.append(
-            Finding(
-                "warning",
-                "home and self",
-                f"{text} Move home away, spread less (home_std), or exclude what always meets.",
-            )
+        names = np.array(kinematics.link_names)
+        meetings = set()
+        for configuration, pair in zip(near.configuration, near.links, strict=True):
+            meetings.add((int(configuration), " and ".join(names[pair])))
+        pairs = Counter(pair for _, pair in meetings).most_common()
+        often = ", ".join(f"{pair} ({100 * count / len(q):.0f} %)" for pair, count in pairs[:_LISTED])
+        if len(pairs) > _LISTED:
+            often += f" and {len(pairs) - _LISTED} more pairs"
+        text = (
+            f"{share:.0f} % of the spread around home touches itself: {often}; episodes that start so are pushed apart. "
+            "Move home away, spread less (home_std), or exclude what always meets."
         )
-    elif not collision.overlapping_at_home:
-        found.append(
-            Finding("ok", "home and self", f"free at home; {share:.0f} % of the spread around it touches itself")
-        )
+        found.append(Finding("warning", topic, text))
+    elif not found:
+        text = f"free at home; {share:.0f} % of the spread around it touches itself"
+        found.append(Finding("ok", topic, text))
     return found
 
 
-def _size(spec: RobotSpec) -> list[Finding]:
-    """What retargeting makes of the collision shapes, and the memory that it will take."""
+def _size(spec: RobotSpec) -> Finding:
+    """Say what retargeting makes of the collision shapes, and the memory that it will take."""
     try:
         model = HandModel(spec)
     except XResetError as error:
-        return [Finding("skipped", "retargeting", str(error))]
+        return Finding("skipped", "retargeting", str(error))
     balls = model.balls
     text = (
         f"{len(balls.radii)} balls on {len(balls.links)} links of the hand, {len(balls.guards)} of them kept out of other links in"
         f" {len(balls.link_pairs) // 2} pairs of links; about {predicted_gigabytes(model):.1f} GB"
     )
-    return [Finding("ok", "retargeting", text)]
+    return Finding("ok", "retargeting", text)
 
 
 def _probe() -> ObjectSpec:
@@ -476,16 +436,17 @@ def _probe() -> ObjectSpec:
     )
 
 
-def _links_disagree(spec: RobotSpec, engine) -> str | None:
+def _links_disagree(spec: RobotSpec, engine: Backend) -> str | None:
     state = engine.state()
     expected = Kinematics(spec).link_poses(state.joint_pos[0].double().cpu(), spec.tracked_links)[:, :3, 3]
     away = (engine.links().pos[0].double().cpu() - expected).norm(dim=-1)
     if bool(torch.isfinite(away).all()) and float(away.max()) < _POSE_TOLERANCE:
         return None
-    return f"at home {spec.tracked_links[int(away.argmax())]!r} is {float(away.max()) * 1e3:.1f} mm from where xreset's kinematics has it."
+    link = spec.tracked_links[int(away.argmax())]
+    return f"at home {link!r} is {float(away.max()) * 1e3:.1f} mm from where xreset's kinematics has it."
 
 
-def _does_not_hold(spec: RobotSpec, engine) -> str | None:
+def _does_not_hold(spec: RobotSpec, engine: Backend) -> str | None:
     home = torch.tensor(spec.home, dtype=torch.float32)
     engine.set_joint_targets(home.to(engine.device)[None])
     for _ in range(_HOLD_STEPS):
@@ -495,20 +456,3 @@ def _does_not_hold(spec: RobotSpec, engine) -> str | None:
         return None
     joint = spec.joint_names[int(away.nan_to_num(torch.inf).argmax())]
     return f"after {_HOLD_STEPS} control steps with home as the target {joint!r} is {float(away.max()):.3f} rad (m) away from it."
-
-
-def _below(tree: RobotTree, root: str) -> set[str]:
-    """The links below ``root``, without itself."""
-    below = {root}
-    for joint in tree.joints:  # parents come before children
-        if joint.parent in below:
-            below.add(joint.child)
-    return below - {root}
-
-
-def _listed(names) -> str:
-    return ", ".join(names)
-
-
-def _numbers(values: np.ndarray) -> str:
-    return ", ".join(f"{value:.3g}" for value in values)

@@ -130,7 +130,7 @@ def _mounting(spec: RobotSpec, flange: str, T_flange_hand: np.ndarray) -> str:
         return text
     if np.abs(ahead).max() > 0.95:
         ahead = ahead.round()  # along an axis, as far as fingers are straight
-    turn, _ = Rotation.align_vectors([[0, 0, 1]], [ahead])
+    turn = Rotation.align_vectors([[0, 0, 1]], [ahead])[0]
     turned = turn * Rotation.from_matrix(T_flange_hand[:3, :3])
     angles = np.round(roll_pitch_yaw(turned.as_matrix()), 4) + 0.0
     return f"{text}; for fingers along its z axis: --rpy {' '.join(f'{angle:g}' for angle in angles)}"

@@ -1,4 +1,4 @@
-"""Which checkpoint of a run is its policy, where not the newest one: ``RUN/choice.json``, made by ``xreset select``."""
+"""The checkpoint that ``xreset select`` chose as a run's policy: ``RUN/choice.json``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ class Candidate:
     name: str
     """File name of the checkpoint or policy."""
     task_progress: dict[str, float]
-    """Engine -> mean over the episodes; without the engines in which it was not played, because it could not be chosen any more."""
+    """Engine -> mean over the episodes; without engines in which it was not played because it could no longer be
+    chosen."""
 
     def __post_init__(self) -> None:
         values = self.task_progress.values()
@@ -31,24 +32,24 @@ class Candidate:
 
     @property
     def worst(self) -> float:
-        """The least of what was played."""
+        """Task progress in the worst engine."""
         return min(self.task_progress.values())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Choice(Checked):
-    """What was tried, and what was taken: the best in its worst engine."""
+    """The candidates that were played, and the one that is best in its worst engine."""
 
     chosen: str
     """Name of the candidate."""
     policy_hash: str
-    """SHA-256 of the chosen one as an ONNX file."""
+    """SHA-256 of the chosen candidate as an ONNX file."""
     candidates: tuple[Candidate, ...]
     """The newest first."""
     engines: dict[str, str]
     """Name -> version."""
     seed: NotNegative[int]
-    """Of the starts that were played; results with another seed are of other starts."""
+    """Seed of the starts that were played; results with another seed are of other starts."""
     episodes_per_demo: Positive[int]
     demos: str
     """SHA-256 of the demonstrations."""
@@ -60,18 +61,20 @@ class Choice(Checked):
 
     @property
     def candidate(self) -> Candidate:
-        """The chosen one."""
+        """The chosen candidate."""
         return next(c for c in self.candidates if c.name == self.chosen)
 
     def sentence(self) -> str:
-        """What was chosen and by what, in one line."""
-        last, own = self.candidates[0], self.candidate
-        worst = (
-            f"{100 * own.worst:.1f} % in its worst engine ({min(own.task_progress, key=own.task_progress.__getitem__)})"
-        )
-        against = "it is the newest" if last is own else f"the newest, {last.name}, has {100 * last.worst:.1f} %"
+        """Return what was chosen and why, in one line."""
+        newest = self.candidates[0]
+        own = self.candidate
+        engine = min(own.task_progress, key=own.task_progress.__getitem__)
+        against = f"the newest, {newest.name}, has {100 * newest.worst:.1f} %"
+        if newest is own:
+            against = "it is the newest"
         return (
-            f"{self.chosen}, {worst}, of {len(self.candidates)} checkpoints in {len(self.engines)} engines; {against}."
+            f"{self.chosen}, {100 * own.worst:.1f} % in its worst engine ({engine}), of {len(self.candidates)} "
+            f"checkpoints in {len(self.engines)} engines; {against}."
         )
 
 
@@ -81,7 +84,7 @@ def write_choice(folder: Path, choice: Choice) -> None:
 
 
 def read_choice(folder: Path) -> Choice | None:
-    """The choice that was made in a folder; None: there was none.
+    """Return the choice that was made in a folder, or None.
 
     Raises:
         FileFormatError: the file is damaged, or of another version.

@@ -1,7 +1,7 @@
 """The lift clock: when a training first succeeds from home.
 
-Until it has lifted the object from home, a training has learned nothing that its reward curves would show; after the first lift the rest
-follows within minutes. So this is what trainings are compared by.
+The reward curves show little until a policy has lifted the object from home; after the first lift the rest follows
+within minutes. So trainings are compared by this time.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from xreset.files import read_json, write_json
 
 SCHEMA = "xreset-lift/1"
 FILE = "lift.json"
-"""Beside ``run.json``."""
+"""File next to ``run.json``."""
 SHARES = (0.01, 0.1, 0.5)
 """Shares of the home worlds' steps spent at the goal whose first passing is noted."""
 
@@ -26,9 +26,9 @@ class Passing:
     share: Share[float]
     iteration: NotNegative[int]
     env_steps: NotNegative[int]
-    """Of all worlds, until then."""
+    """Control steps of all worlds until then."""
     minutes: NotNegative[float]
-    """Of training until then, without compiling."""
+    """Minutes of training until then, without compiling."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,11 +38,11 @@ class Lift:
     passed: tuple[Passing, ...] = ()
     """In the order of :data:`SHARES`."""
     iteration: NotNegative[int] = 0
-    """How far the training has come."""
+    """Iterations done."""
     env_steps: NotNegative[int] = 0
     minutes: NotNegative[float] = 0.0
     success_from_home: Share[float] = 0.0
-    """In the last iteration."""
+    """Share in the last iteration."""
 
 
 @dataclass
@@ -53,13 +53,13 @@ class LiftClock:
     lift: Lift = field(default_factory=Lift)
 
     def resume(self, iteration: int) -> None:
-        """Go on from the file, if there is one, forgetting what came after ``iteration``."""
+        """Continue from the file, if there is one, without what came after ``iteration``."""
         if iteration and (self.folder / FILE).is_file():
             old = read_lift(self.folder)
             self.lift = Lift(passed=tuple(p for p in old.passed if p.iteration <= iteration))
 
     def tick(self, share: float, *, iteration: int, env_steps: int, seconds: float) -> None:
-        """Take note of an iteration's share of success from home."""
+        """Record an iteration's share of success from home."""
         now = {"iteration": iteration, "env_steps": env_steps, "minutes": seconds / 60}
         known = {p.share for p in self.lift.passed}
         new = tuple(Passing(share=s, **now) for s in SHARES if s not in known and share >= s)
@@ -73,7 +73,7 @@ class LiftClock:
 
 
 def read_lift(folder: Path) -> Lift:
-    """Read a run's ``lift.json``; an empty one if the run has none, because it is of an earlier version.
+    """Read a run's ``lift.json``; an empty one for runs of earlier versions, which have none.
 
     Raises:
         FileFormatError: the file is damaged.

@@ -1,4 +1,4 @@
-"""Learning's typed configuration. Defaults are the paper's Table VIII; what it leaves open is said in the docstrings."""
+"""Configuration of learning. Defaults are the paper's Table VIII; docstrings say what it leaves open."""
 
 from __future__ import annotations
 
@@ -25,16 +25,18 @@ class ModelConfig(Checked):
     mlp: Widths = (512, 256, 128)
     activation: str = "elu"
     initial_std: Positive[float] = 1.0
-    """Initial standard deviation of the Gaussian policy. Its logarithm does not depend on the state and is learned. Not in the paper."""
+    """Initial standard deviation of the Gaussian policy, which does not depend on the state. Not in the paper."""
     normalize_returns: bool = False
-    """Whether the critic learns returns in units of their running standard deviation (:class:`xreset.learning.model.ReturnCritic`), as the
-    paper's library does if told so. Trained policies' returns lie between 0 and 20, so the clip of values means something else without."""
+    """Whether the critic learns returns in units of their running standard deviation
+    (:class:`xreset.learning.model.ReturnCritic`), as the paper's library can. It changes the meaning of
+    ``clip_values``: returns of trained policies are between 0 and 20."""
     normalize_observations: bool = True
-    """Running normalisation of the flat observations (not of the clouds). Not in the paper; its library's usual setting."""
+    """Running normalisation of the flat observations (not of the clouds). Not in the paper; its library's usual
+    setting."""
 
     @property
     def layers(self) -> dict[str, Any]:
-        """What networks must share for one to take over the weights of the other."""
+        """What two networks must share for one to take over the weights of the other."""
         names = ("pointnet", "lstm", "mlp", "activation", "normalize_observations", "normalize_returns")
         return {name: getattr(self, name) for name in names}
 
@@ -51,28 +53,30 @@ class PpoConfig(Checked):
     """Length of truncated back-propagation through time; divides the horizon."""
     mini_epochs: Positive[int] = 5
     minibatch_size: Positive[int] = 32768
-    """Transitions per minibatch. With fewer transitions per iteration than two of these, an iteration is one minibatch."""
+    """Transitions per minibatch. With fewer transitions per iteration than two of these, an iteration is one
+    minibatch."""
     discount: Share[float] = 0.99
     gae_lambda: Share[float] = 0.95
     learning_rate: Positive[float] = 1e-3
     """Learning rate of actor and critic; with an adaptive schedule the initial one."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
-    """``adaptive``: the rate is divided (multiplied) by 1.5 where the policy moved more than twice (less than half) ``desired_kl``."""
+    """``adaptive``: the rate is divided (multiplied) by 1.5 where the policy moved more than twice (less than half)
+    ``desired_kl``."""
     desired_kl: Annotated[Positive[float], Only("schedule", "adaptive")] = 0.01
     clip: Positive[float] = 0.2
     entropy: NotNegative[float] = 0.005
     bounds_loss: NotNegative[float] = 0.0
-    """Weight of the squared excess of the actions' means over +-1.1, summed over actions: beyond the limit noise explores nothing. The
-    paper's library has it, with 1e-4."""
+    """Weight of the squared excess of the actions' means over +-1.1, summed over actions: beyond the limit, noise
+    explores nothing. The paper's library uses 1e-4."""
     value_loss: NotNegative[float] = 1.0
     """Weight of the value loss. Not in the paper."""
     clip_values: bool = True
-    """Whether values, too, move by at most ``clip`` per iteration. Returns of trained policies have a standard deviation of 6 to 9, so it
-    takes a critic some hundred iterations to learn that range. Not in the paper; a usual setting, where returns are normalised."""
+    """Whether values, too, move by at most ``clip`` per iteration. A critic then needs about a hundred iterations to
+    learn the range of returns of a trained policy. Not in the paper; usual where returns are normalized."""
     grad_norm: Positive[float] = 1.0
     precision: Literal["float32", "tf32", "bfloat16"] = "tf32"
-    """Arithmetic of matrix products on a GPU. ``bfloat16``: factors of point-cloud encoder and LSTM in bfloat16 (sums in float32), all else
-    in TF32. The CPU and the exported policy use float32. Not in the paper."""
+    """Arithmetic of matrix products on a GPU. ``bfloat16``: factors of point-cloud encoder and LSTM in bfloat16 (sums
+    in float32), the rest in TF32. The CPU and the exported policy use float32. Not in the paper."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -84,7 +88,7 @@ class PpoConfig(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig(Checked):
-    """A whole training run: all that is saved in the run folder before it starts."""
+    """Configuration of a training run, as saved in the run folder."""
 
     task: TaskConfig = field(default_factory=TaskConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
@@ -99,7 +103,8 @@ class TrainConfig(Checked):
 
 def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
     """Return the nested dictionary that rsl-rl's runner takes; ``num_envs`` counts the worlds of one process."""
-    m, p = config.model, config.ppo
+    m = config.model
+    p = config.ppo
     network: dict[str, Any] = {
         "class_name": "xreset.learning.model:PointNetLstmModel",
         "hidden_dims": list(m.mlp),
@@ -115,6 +120,9 @@ def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
         "std_type": "log",
         "learn_std": True,
     }
+    critic = network.copy()
+    if m.normalize_returns:
+        critic["class_name"] = "xreset.learning.model:ReturnCritic"
     return {
         "num_steps_per_env": p.horizon,
         "save_interval": config.save_interval,
@@ -123,9 +131,7 @@ def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
             "critic": ["policy", "proprio", "privileged", "perception"],
         },
         "actor": network | {"distribution_cfg": gaussian},
-        "critic": network | {"class_name": "xreset.learning.model:ReturnCritic"}
-        if m.normalize_returns
-        else dict(network),
+        "critic": critic,
         "algorithm": {
             "class_name": "xreset.learning.ppo:SequencePpo",
             "sequence_length": p.sequence_length,

@@ -1,4 +1,7 @@
-"""Learning curves as TensorBoard reads them, written in this thread: a full disk is an error of the training, and said as one."""
+"""Learning curves for TensorBoard, written in this thread, so that a full disk becomes an error of the training.
+
+TensorBoard's own writer works in a thread that prints a traceback.
+"""
 
 from __future__ import annotations
 
@@ -13,18 +16,19 @@ from xreset.errors import XResetError
 
 
 class CurveFile:
-    """An event file of a training; each start of it writes its own."""
+    """An event file of a training; each start of a training writes its own."""
 
     def __init__(self, folder: Path) -> None:
-        """Begin the file.
+        """Start the file.
 
         Raises:
-            XResetError: it cannot be written.
+            XResetError: the file cannot be written.
         """
         from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportMissingImports]
         from tensorboard.summary.writer.record_writer import RecordWriter
 
-        self._folder, self._event = folder, Event
+        self._folder = folder
+        self._event = Event
         name = f"events.out.tfevents.{time.time_ns()}.{socket.gethostname()}.{os.getpid()}"
         with self._writing():
             folder.mkdir(parents=True, exist_ok=True)
@@ -35,7 +39,7 @@ class CurveFile:
         """Add values by tag.
 
         Raises:
-            XResetError: they cannot be written.
+            XResetError: the file cannot be written.
         """
         event = self._event(wall_time=time.time(), step=step)
         for tag, value in scalars.items():
@@ -57,6 +61,6 @@ class CurveFile:
             yield
         except OSError as error:
             raise XResetError(
-                f"cannot write the learning curves in {self._folder}: {error.strerror or error}. Free some space, then go on from the last "
-                f"checkpoint: xreset train --out {self._folder} --resume"
+                f"cannot write the learning curves in {self._folder}: {error.strerror or error}. Free some space, then "
+                f"continue from the last checkpoint: xreset train --out {self._folder} --resume"
             ) from error

@@ -11,7 +11,7 @@ import torch
 from xreset.errors import RunError
 
 SEED_STRIDE = 7919
-"""Between the seeds of two processes: each simulates other episodes."""
+"""Difference between the seeds of two processes, so that each simulates other episodes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,53 +20,53 @@ class Processes:
 
     rank: int = 0
     local_rank: int = 0
-    """Number among the processes of this machine: its GPU."""
+    """Number among the processes of this machine, and of its GPU."""
     count: int = 1
 
     @classmethod
     def of_environment(cls) -> Processes:
-        """What ``torchrun`` has put into the environment; one process without it.
+        """Read what ``torchrun`` has put into the environment; without it there is one process.
 
         Raises:
             RunError: the variables contradict one another.
         """
-        rank, local_rank, count = (
-            int(os.environ.get(name, default)) for name, default in (("RANK", 0), ("LOCAL_RANK", 0), ("WORLD_SIZE", 1))
-        )
+        rank = int(os.environ.get("RANK", 0))
+        local_rank = int(os.environ.get("LOCAL_RANK", 0))
+        count = int(os.environ.get("WORLD_SIZE", 1))
         if not 0 <= local_rank <= rank < count:
             raise RunError(
-                f"RANK={rank}, LOCAL_RANK={local_rank}, WORLD_SIZE={count} contradict one another; start with torchrun."
+                f"RANK={rank}, LOCAL_RANK={local_rank}, WORLD_SIZE={count} contradict one another. Start with torchrun."
             )
         return cls(rank=rank, local_rank=local_rank, count=count)
 
     @property
     def is_main(self) -> bool:
-        """Whether this one writes the run's files."""
+        """Whether this process writes the run's files."""
         return self.rank == 0
 
     def device(self, wanted: str) -> str:
-        """The device of this process: with several processes, each has its own GPU."""
+        """Return the device of this process: with several processes, each has its own GPU."""
         return f"cuda:{self.local_rank}" if wanted.startswith("cuda") and self.count > 1 else wanted
 
     def seed(self, seed: int) -> int:
-        """The seed of this process."""
+        """Return the seed of this process."""
         return seed + SEED_STRIDE * self.rank
 
     def join(self, device: str) -> None:
-        """Make the process group that models are averaged in: NCCL for GPUs, Gloo for CPUs. Does nothing for one process."""
+        """Make the process group that averages models: NCCL for GPUs, Gloo for CPUs. One process needs none."""
         if self.count > 1 and not torch.distributed.is_initialized():
             kind = "nccl" if device.startswith("cuda") else "gloo"
             torch.distributed.init_process_group(backend=kind, rank=self.rank, world_size=self.count)
 
     def sum(self, values: torch.Tensor) -> torch.Tensor:
-        """The sum of a tensor over all processes."""
+        """Return the sum of a tensor over all processes."""
         if self.count > 1:
             values = values.clone()
             torch.distributed.all_reduce(values)
         return values
 
     def gather(self, value: Any) -> list[Any]:
-        """Every process's value, by rank; only the main process needs the answer, so the others get an empty list."""
+        """Return every process's value, by rank, in the main process; an empty list in the others."""
         if self.count == 1:
             return [value]
         gathered = [None] * self.count if self.is_main else None

@@ -140,7 +140,8 @@ def _is_of(policy: Path, checkpoint: Path, choice: Choice | None) -> bool:
 
 
 def current_choice(out: Path) -> Choice | None:
-    """Return the choice of ``xreset select``, if the run still has the chosen checkpoint and no newer one than it knew."""
+    """Return the choice of ``xreset select``, if the run still has the chosen checkpoint and no newer one than it
+    knew."""
     choice = read_choice(out)
     names = [checkpoint.name for checkpoint in checkpoints(out)]
     if choice is None or choice.chosen not in names or names[-1] != choice.candidates[0].name:

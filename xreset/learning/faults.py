@@ -1,4 +1,4 @@
-"""When a training has too many broken worlds to go on, and what it leaves behind for whoever looks into it."""
+"""End a training with too many broken worlds, and keep these worlds for a diagnosis."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from xreset.records import write_npz
 MAX_SHARE = 1e-3
 """Largest share of world-steps that may break; the run ends beyond it."""
 WINDOW = 200
-"""Iterations over which that share is taken. The first ones may spend the whole window's allowance: few worlds break one by one."""
+"""Iterations over which the share is taken. The first iterations may use the allowance of the whole window."""
 
 SCHEMA = "xreset-faults/1"
 
 
 @dataclass(frozen=True, kw_only=True)
 class FaultCounts:
-    """Worlds that were ended in some steps."""
+    """Number of worlds that were ended in some steps."""
 
     nonfinite: int
-    """Because a position or velocity was not finite."""
+    """Ended because a position or velocity was not finite."""
     overflow: int
-    """Because contacts or constraints were dropped for want of room."""
+    """Ended because contacts or constraints were dropped: a buffer was full."""
 
 
 class FaultBudget:
@@ -41,14 +41,16 @@ class FaultBudget:
         self._recent: deque[FaultCounts] = deque(maxlen=WINDOW)
 
     def add(self, counts: FaultCounts) -> str | None:
-        """Take an iteration's faults into account; returns what is wrong if they are too many."""
+        """Add an iteration's faults; return a message if there are too many."""
         self._recent.append(counts)
-        nonfinite, overflow = sum(c.nonfinite for c in self._recent), sum(c.overflow for c in self._recent)
+        nonfinite = sum(counts.nonfinite for counts in self._recent)
+        overflow = sum(counts.overflow for counts in self._recent)
         if nonfinite + overflow <= self.allowed:
             return None
         return (
-            f"{nonfinite} worlds were not finite and {overflow} dropped contacts or constraints in the last {len(self._recent)} "
-            f"iterations, more than {MAX_SHARE:.1%} of the {self._window_steps} world-steps of {WINDOW} iterations"
+            f"{nonfinite} worlds were not finite and {overflow} dropped contacts or constraints in the last "
+            f"{len(self._recent)} iterations, more than {MAX_SHARE:.1%} of the {self._window_steps} world-steps of "
+            f"{WINDOW} iterations"
         )
 
 
@@ -56,8 +58,8 @@ def dump_faults(path: Path, env: ManipulationEnv, config: TrainConfig, *, iterat
     """Write the last broken worlds of an environment.
 
     Args:
-        path: npz file: arrays [F, ...] of :attr:`ManipulationEnv.faults`, ``joint_names``, ``object_names`` and ``iteration``; the
-            configuration is in its ``meta``.
+        path: npz file: arrays [F, ...] of :attr:`ManipulationEnv.faults`, ``joint_names``, ``object_names`` and
+            ``iteration``; the configuration is in its ``meta``.
         env: the environment.
         config: what the run was started with.
         iteration: the iteration under way.
@@ -74,8 +76,9 @@ def dump_faults(path: Path, env: ManipulationEnv, config: TrainConfig, *, iterat
 
 
 def too_many_faults(problem: str, path: Path, folder: Path) -> RunError:
-    """The error that ends a run."""
+    """Return the error that ends a run."""
     return RunError(
-        f"the run ends: {problem}. Their states before and after the step, and the drives' targets, are in {path}. Look for what they have "
-        f"in common (object, reset, gravity fraction); the last checkpoint is sound: xreset train --out {folder} --resume"
+        f"the run ends: {problem}. Their states before and after the step, and the drives' targets, are in {path}. "
+        "Look for what they have in common (object, reset, gravity fraction). Then continue from the last checkpoint: "
+        f"xreset train --out {folder} --resume"
     )

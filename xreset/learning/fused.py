@@ -1,10 +1,12 @@
 """The PointNet as one GPU kernel: a cloud's activations never leave the chip (Triton, bfloat16 products, float32 sums).
 
-The plain layers write some 500 values per point to memory and read them back, forward and backward; that, not arithmetic, is their cost.
-Here one program takes a cloud through all three layers and the maximum. The backward kernel computes the activations anew and starts from
-the points that were the maximum of a channel: no other point has a gradient.
+The plain layers write some 500 values per point to memory and read them back, forward and backward; that, not
+arithmetic, is their cost. Here one program takes a cloud through all three layers and the maximum. The backward kernel
+computes the activations again and starts from the points that were the maximum of a channel: no other point has a
+gradient.
 
-Letters: F clouds, P points, K numbers per point, A, B, C widths of the three layers. :class:`xreset.learning.model.PointNet` is the reference.
+Letters: F clouds, P points, K numbers per point, A, B, C widths of the three layers.
+:class:`xreset.learning.model.PointNet` is the reference.
 """
 
 # Triton takes plain numbers for its constants; a type checker sees the kernels' own declarations.
@@ -21,12 +23,15 @@ import triton.language as tl
 from torch import Tensor
 
 FACTORS = torch.bfloat16
-"""Precision of the matrix products' factors. (Triton's interpreter, with which tests run the kernels on a CPU, knows no bfloat16.)"""
+"""Precision of the matrix products' factors. (Triton's interpreter, with which tests run the kernels on a CPU, knows no
+bfloat16.)"""
 _FORWARD = {"num_warps": 2, "num_stages": 3}
 _BACKWARD = {"num_warps": 4, "num_stages": 1}
-_FORWARD_PROGRAMS, _BACKWARD_PROGRAMS = 8, 2
-"""Programs on each multiprocessor; each loops over clouds and loads the weights once. These settings were the fastest of those tried on an
-H100: 65,536 clouds of 64 points forward in 0.8 ms and backward in 3.6 ms, where plain layers in bfloat16 take 12.5 ms."""
+_FORWARD_PROGRAMS = 8
+_BACKWARD_PROGRAMS = 2
+"""Programs on each multiprocessor; each loops over clouds and loads the weights once. These settings were the fastest
+ones tried on an H100: 65,536 clouds of 64 points forward in 0.8 ms and backward in 3.6 ms, where plain layers in
+bfloat16 take 12.5 ms."""
 
 
 @triton.jit
@@ -72,10 +77,13 @@ def _forward(
     cloud, w1, b1, w2, b2, w3, b3, out, winner, frames,
     P: tl.constexpr, K: tl.constexpr, A: tl.constexpr, B: tl.constexpr, C: tl.constexpr,
 ):  # fmt: skip
-    a, b, c = tl.arange(0, A), tl.arange(0, B), tl.arange(0, C)
+    a = tl.arange(0, A)
+    b = tl.arange(0, B)
+    c = tl.arange(0, C)
     second = tl.load(w2 + b[None, :] * A + a[:, None])  # [A, B], in the factors' precision
     third = tl.load(w3 + c[None, :] * B + b[:, None])  # [B, C]
-    bias2, bias3 = tl.load(b2 + b), tl.load(b3 + c)
+    bias2 = tl.load(b2 + b)
+    bias3 = tl.load(b3 + c)
     for frame in range(tl.program_id(0), frames, tl.num_programs(0)):
         z2 = tl.dot(_elu(_first_layer(cloud, frame, w1, b1, P, K, A)).to(second.dtype), second) + bias2[None, :]
         z3 = tl.dot(_elu(z2).to(second.dtype), third)
@@ -95,12 +103,18 @@ def _backward(
 
     The rows of d1 and db2 are the columns of :func:`_points`. Together the sums would not fit into the registers.
     """
-    a, b, c, p, k = tl.arange(0, A), tl.arange(0, B), tl.arange(0, C), tl.arange(0, P), tl.arange(0, W)
+    a = tl.arange(0, A)
+    b = tl.arange(0, B)
+    c = tl.arange(0, C)
+    p = tl.arange(0, P)
+    k = tl.arange(0, W)
     second = tl.load(w2 + b[None, :] * A + a[:, None])  # [A, B]
     second_t = tl.load(w2 + b[:, None] * A + a[None, :])  # [B, A]
     third_t = tl.load(w3 + c[:, None] * B + b[None, :])  # [C, B]
     bias2 = tl.load(b2 + b)
-    sum_1, sum_2, sum_b2 = tl.zeros([W, A], tl.float32), tl.zeros([A, B], tl.float32), tl.zeros([W, B], tl.float32)
+    sum_1 = tl.zeros([W, A], tl.float32)
+    sum_2 = tl.zeros([A, B], tl.float32)
+    sum_b2 = tl.zeros([W, B], tl.float32)
     sum_3 = tl.zeros([B, C], tl.float32)
     for frame in range(tl.program_id(0), frames, tl.num_programs(0)):
         a1 = _elu(_first_layer(cloud, frame, w1, b1, P, K, A))
@@ -129,7 +143,8 @@ def _backward(
 
 
 class _FusedPointNet(torch.autograd.Function):
-    """(cloud [F, P, K], weights and biases of three layers) -> [F, C]. Clouds are observations: they get no gradient."""
+    """(cloud [F, P, K], weights and biases of three layers) -> [F, C]. Clouds are observations: they get no
+    gradient."""
 
     @staticmethod
     def forward(
@@ -141,7 +156,8 @@ class _FusedPointNet(torch.autograd.Function):
             raise ValueError(
                 f"{frames} clouds of {points} points are more than the kernels can address at once; pass fewer"
             )
-        low2, low3 = w2.to(FACTORS), w3.to(FACTORS)
+        low2 = w2.to(FACTORS)
+        low3 = w3.to(FACTORS)
         out = torch.empty(frames, len(w3), device=cloud.device)
         winner = torch.empty(frames, len(w3), dtype=torch.int16, device=cloud.device)
         grid = (min(frames, _FORWARD_PROGRAMS * _processors(cloud.device)),)
@@ -155,14 +171,19 @@ class _FusedPointNet(torch.autograd.Function):
         cloud, w1, b1, low2, b2, low3, winner = ctx.saved_tensors
         gradient = gradient.contiguous()
         programs = min(len(cloud), _BACKWARD_PROGRAMS * _processors(cloud.device))
-        a, b, c = len(w1), len(low2), len(low3)
+        a = len(w1)
+        b = len(low2)
+        c = len(low3)
 
         def partial(*shape: int) -> Tensor:
             return torch.empty(programs, *shape, device=cloud.device)
 
         width = ctx.sizes["K"]
         columns = _columns(width)
-        d1, d2, db2, d3 = partial(columns, a), partial(a, b), partial(columns, b), partial(b, c)
+        d1 = partial(columns, a)
+        d2 = partial(a, b)
+        db2 = partial(columns, b)
+        d3 = partial(b, c)
         for lower in (False, True):
             _backward[(programs,)](
                 cloud, w1, b1, low2, b2, low3, gradient, winner, d1, d2, db2, d3, len(cloud),
@@ -181,7 +202,8 @@ class _FusedPointNet(torch.autograd.Function):
 
 
 def _columns(width: int) -> int:
-    """Columns of :func:`_points` for points of ``width`` numbers: the least power of two that holds them, 16 or more."""
+    """Columns of :func:`_points` for points of ``width`` numbers: the least power of two that holds them, 16 or
+    more."""
     return max(16, 1 << (2 * width).bit_length())
 
 
@@ -192,7 +214,8 @@ def _processors(device: torch.device) -> int:
 
 
 def supports(points: int, widths: tuple[int, ...]) -> bool:
-    """Whether the kernels can take clouds of that many points through layers of these widths: three of them, powers of two."""
+    """Whether the kernels can take clouds of that many points through layers of these widths: three of them, powers of
+    two."""
     return (
         len(widths) == 3
         and all(n >= 16 and n & (n - 1) == 0 for n in (points, *widths))
@@ -202,9 +225,11 @@ def supports(points: int, widths: tuple[int, ...]) -> bool:
 
 
 def fused_pointnet(cloud: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor) -> Tensor:
-    """Embed clouds [..., P, K] as [..., C]: layers K -> A -> B -> C (weights as of ``nn.Linear``) with ELU between, maximum over points.
+    """Embed clouds [..., P, K] as [..., C]: layers K -> A -> B -> C (weights as of ``nn.Linear``) with ELU between,
+    maximum over points.
 
-    Matrix products take bfloat16 factors: against the plain layers in float32 the result differs by some 1e-3 of its size.
+    Matrix products take bfloat16 factors: against the plain layers in float32 the result differs by some 1e-3 of its
+    size.
     """
     frames = cloud.reshape(-1, *cloud.shape[-2:]).contiguous()
     return _FusedPointNet.apply(frames, w1, b1, w2, b2, w3, b3).reshape(*cloud.shape[:-2], -1)  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]

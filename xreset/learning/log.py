@@ -22,7 +22,8 @@ _LINE_SECONDS = 10.0
 
 
 class TrainingLog:
-    """Sums on the device during an iteration, so that nothing waits for a GPU; one line and one set of curves after it."""
+    """Sums on the device during an iteration, so that nothing waits for a GPU; one line and one set of curves after
+    it."""
 
     def __init__(self, folder: Path, num_envs: int, device: str, total: int) -> None:
         """Start a log in a run folder; ``total`` is the number of iterations in all."""
@@ -91,9 +92,10 @@ class TrainingLog:
         self._curves.write(iteration, curves)
         from_home = means["task/success_from_home"]
         self.clock.tick(from_home, iteration=iteration, env_steps=env_steps, seconds=elapsed)
+        speed = scalars["speed/env_steps_per_second"]
         text = (
             f"return {returns / max(episodes, 1):7.3f}  grasped {means['task/grasped']:5.1%}  "
-            f"success {means['task/success']:5.1%}, from home {from_home:5.1%}  {scalars['speed/env_steps_per_second']:,.0f} steps/s"
+            f"success {means['task/success']:5.1%}, from home {from_home:5.1%}  {speed:,.0f} steps/s"
         )
         self._progress.update(self._task, completed=iteration, text=text)
         is_due = time.monotonic() - self._last_line > _LINE_SECONDS or iteration == self._total

@@ -1,7 +1,8 @@
 """The paper's network (appendix C, Table VIII): PointNet per cloud frame, LSTM with layer norm, MLP.
 
-Observation groups with two dimensions are flat; groups with four, [N, H, P, K], are cloud histories. Shape letters: N worlds (or
-sequences), T steps of a rollout, L steps of a sequence, H history (or the LSTM's width), P points, K numbers per point, D flat width.
+Observation groups with two dimensions are flat; groups with four, [N, H, P, K], are cloud histories. Shape letters: N
+worlds (or sequences), T steps of a rollout, L steps of a sequence, H history (or the LSTM's width), P points, K numbers
+per point, D flat width.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ class PointNet(nn.Module):
         super().__init__()
         act = {"elu": nn.ELU, "relu": nn.ReLU}[activation]
         layers: list[nn.Module] = []
-        for i, (width_in, width_out) in enumerate(zip([point_width, *dims[:-1]], dims, strict=True)):
-            layers += [act()] * (i > 0) + [nn.Linear(width_in, width_out)]
-        self.mlp = nn.Sequential(*layers)
+        for width_in, width_out in zip([point_width, *dims[:-1]], dims, strict=True):
+            layers += [nn.Linear(width_in, width_out), act()]
+        self.mlp = nn.Sequential(*layers[:-1])
         self.use_bfloat16 = False
         """Whether to compute in bfloat16 where the clouds are on a GPU; the result is float32 all the same."""
         self._fusible = activation == "elu" and len(dims) == 3
@@ -44,42 +45,40 @@ class PointNet(nn.Module):
             from xreset.learning import fused
 
             if fused.supports(cloud.shape[-2], tuple(layer.out_features for layer in linear)):
-                return fused.fused_pointnet(
-                    cloud, *(parameter for layer in linear for parameter in (layer.weight, layer.bias))
-                )
+                one, two, three = linear
+                return fused.fused_pointnet(cloud, one.weight, one.bias, two.weight, two.bias, three.weight, three.bias)
         with torch.autocast("cuda", dtype=torch.bfloat16):
             return self.mlp(cloud).amax(dim=-2).float()
 
 
 def embed_sequences(pointnet: PointNet, cloud: Tensor, first: Tensor) -> Tensor:
-    """[L, N, H, embedding] embeddings of cloud histories [L, N, H, P, K], every distinct frame embedded once.
+    """Return embeddings [L, N, H, embedding] of cloud histories [L, N, H, P, K]; every distinct frame is embedded once.
 
-    Step t's history is step t-1's, shifted by one, with the newest frame at the end; where an episode begins (``first`` [L, N]) it is H
-    copies of the newest. So L steps hold H - 1 + L distinct frames and not L * H: with a horizon of 16 and a history of 5, 20 and not 80.
+    A step's history is that of the step before, shifted by one, with the newest frame at the end. Where an episode
+    starts (``first`` [L, N]) it is H copies of the newest frame. So L steps hold H - 1 + L distinct frames, not L * H:
+    with a horizon of 16 and a history of 5, 20 and not 80.
     """
     steps, _, history = cloud.shape[:3]
     frames = torch.cat((cloud[0, :, :-1].transpose(0, 1), cloud[:, :, -1]))  # [H - 1 + L, N, P, 3]
     embedded = pointnet(frames)
     step = torch.arange(steps, device=cloud.device)
-    begin = (
-        torch.where(first, step[:, None], -history).cummax(dim=0).values
-    )  # [L, N] step of this episode's beginning, if it is in here
-    shifted = step[:, None, None] + torch.arange(
-        1 - history, 1, device=cloud.device
-    )  # [L, 1, H] step whose newest frame it was
+    # [L, N] step in which this episode started, if it is one of these
+    begin = torch.where(first, step[:, None], -history).cummax(dim=0).values
+    # [L, 1, H] step of which each frame was the newest
+    shifted = step[:, None, None] + torch.arange(1 - history, 1, device=cloud.device)
     source = torch.maximum(shifted, begin[..., None]) + history - 1
     return embedded.transpose(0, 1)[torch.arange(cloud.shape[1], device=cloud.device)[:, None], source]
 
 
 def run_lstm(lstm: nn.LSTM, x: Tensor, keep: Tensor, state: LstmState) -> tuple[Tensor, LstmState]:
-    """One LSTM layer over L steps whose state may be zeroed before any of them.
+    """Run one LSTM layer over L steps, with a state that may be zeroed before any of them.
 
-    On a GPU the inputs of all steps are multiplied at once, with widths that suit the matrix units, and each step is one product and one
-    fused kernel: the library's layer would have to be called, forward and backward, for every step. Elsewhere it is.
+    The library's layer has to be called once for every step. On a GPU the inputs of all steps are multiplied at once
+    instead, with widths that suit the matrix units, and each step is one product and one fused kernel.
 
     Args:
         lstm: the layer.
-        x: [L, N, D]; in bfloat16 (on a GPU) all products take such factors, and sums and the state are float32 all the same.
+        x: [L, N, D]; in bfloat16 (on a GPU) all products have such factors, while sums and the state are float32.
         keep: [L, N] False where an episode begins.
         state: [1, N, H] each.
 
@@ -98,13 +97,12 @@ def run_lstm(lstm: nn.LSTM, x: Tensor, keep: Tensor, state: LstmState) -> tuple[
     weight, recurrent, bias, recurrent_bias = lstm.all_weights[0]
     inputs = nn.functional.linear(nn.functional.pad(x, padding), nn.functional.pad(weight, padding).to(low))
     recurrent = recurrent.to(low)
-    h, c = h[0], c[0]
+    h = h[0]
+    c = c[0]
     for step, kept in zip(inputs, keep.to(h.dtype)[..., None], strict=True):
-        gates = (
-            step.to(h.dtype),
-            nn.functional.linear((h * kept).to(low), recurrent).to(h.dtype),
-        )  # one step's, while it is in the cache
-        h, c, _ = torch.ops.aten._thnn_fused_lstm_cell(*gates, c * kept, bias, recurrent_bias)
+        gates = nn.functional.linear((h * kept).to(low), recurrent).to(h.dtype)
+        # torch has no public name for the cell's kernel
+        h, c, _ = torch.ops.aten._thnn_fused_lstm_cell(step.to(h.dtype), gates, c * kept, bias, recurrent_bias)
         out.append(h)
     return torch.stack(out), (h[None], c[None])
 
@@ -132,7 +130,7 @@ class Trunk(nn.Module):
     def join(self, flat: Tensor, embeddings: Tensor) -> Tensor:
         """Flat [..., D] and embeddings [..., H, embedding] -> [..., D + H * embedding], the LSTM's input.
 
-        It is in the precision of the LSTM's factors from the start: what copies it later moves half as much.
+        It already has the precision of the LSTM's factors, so that later copies move half as much.
         """
         dtype = torch.bfloat16 if self.pointnet.use_bfloat16 and flat.is_cuda else flat.dtype
         return torch.cat((self.normalizer(flat).to(dtype), embeddings.flatten(-2).to(dtype)), dim=-1)
@@ -144,7 +142,7 @@ class Trunk(nn.Module):
 
 
 class Gaussian(GaussianDistribution):
-    """rsl-rl's, but sampling does not wait for the GPU (torch's ``normal`` looks whether every deviation is positive)."""
+    """rsl-rl's, but sampling does not wait for the GPU: torch's ``normal`` checks that every deviation is positive."""
 
     def sample(self) -> Tensor:
         """[..., J]"""
@@ -154,9 +152,9 @@ class Gaussian(GaussianDistribution):
 class PointNetLstmModel(MLPModel):
     """Actor or critic for rsl-rl's runner.
 
-    In a rollout the model keeps its own LSTM state. In an update it gets whole rollouts [T, N, ...] of some worlds, the state that each
-    piece of them began with, and ``masks`` [T, N], True where a step is the first of an episode: there the state is zeroed, so gradients
-    cross neither an episode's end nor that of a piece.
+    In a rollout the model keeps its own LSTM state. In an update it gets whole rollouts [T, N, ...] of some worlds, the
+    state with which each piece starts, and ``masks`` [T, N], True where a step is the first of an episode. There the
+    state is zeroed, so gradients cross neither the end of an episode nor that of a piece.
     """
 
     is_recurrent: bool = True
@@ -185,27 +183,28 @@ class PointNetLstmModel(MLPModel):
         self.trunk.pointnet.use_bfloat16 = bfloat16_clouds
         self.state: LstmState | None = None
         self.reuse_embeddings = False
-        """Whether successive clouds in a rollout are shifted histories, so that only the newest frame is new. Training switches it on."""
+        """Whether successive clouds in a rollout are shifted histories, so that only the newest frame is new."""
         self._embeddings: Tensor | None = None
         self._began: Tensor | None = None
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None) -> Tensor:
-        """The MLP's input: [N, lstm] in a rollout, [T, N, lstm] in an update.
+        """Return the MLP's input: [N, lstm] in a rollout, [T, N, lstm] in an update.
 
-        In an update the T steps are cut into pieces; ``hidden_state`` [1, pieces * N, lstm] is what each began with, piece by piece.
+        In an update the T steps are cut into pieces; ``hidden_state`` [1, pieces * N, lstm] has the state with which
+        each piece starts, piece by piece.
         """
         flat = torch.cat([obs[group] for group in self.obs_groups], dim=-1)
-        cloud, trunk = obs[self.cloud_group], self.trunk
+        cloud = obs[self.cloud_group]
+        trunk = self.trunk
         if masks is None:
             if self.state is None:
                 zero = flat.new_zeros(1, flat.shape[0], self._latent_dim)
                 self.state = (zero, zero.clone())
-            joined = trunk.join(flat, self._embed(cloud))
-            out, self.state = run_lstm(
-                trunk.lstm, joined[None], torch.ones_like(joined[None, :, 0], dtype=torch.bool), self.state
-            )
+            joined = trunk.join(flat, self._embed(cloud))[None]
+            keep = torch.ones_like(joined[..., 0], dtype=torch.bool)
+            out, self.state = run_lstm(trunk.lstm, joined, keep, self.state)
             return trunk.norm(out[0])
-        assert isinstance(hidden_state, tuple), "an update needs the LSTM state that each sequence began with"
+        assert isinstance(hidden_state, tuple), "an update needs the LSTM state of each sequence's start"
         self._embeddings = None  # the weights are about to change
         joined = trunk.join(flat, embed_sequences(trunk.pointnet, cloud, masks))
         pieces = hidden_state[0].shape[1] // joined.shape[1]
@@ -218,19 +217,21 @@ class PointNetLstmModel(MLPModel):
         return trunk.norm(out).unflatten(1, (pieces, -1)).transpose(0, 1).flatten(0, 1)
 
     def _embed(self, cloud: Tensor) -> Tensor:
-        """[N, H, embedding] embeddings of the histories [N, H, P, K] that an environment shows in a rollout."""
-        known, began = self._embeddings, self._began
+        """Return embeddings [N, H, embedding] of an environment's cloud histories [N, H, P, K] in a rollout."""
+        known = self._embeddings
+        began = self._began
         if known is None or not self.reuse_embeddings:
             embeddings = self.trunk.pointnet(cloud)
         else:
             newest = self.trunk.pointnet(cloud[:, -1:])
             shifted = torch.cat((known[:, 1:], newest), dim=1)
             embeddings = shifted if began is None else torch.where(began[:, None, None], newest, shifted)
-        self._embeddings, self._began = embeddings, None
+        self._embeddings = embeddings
+        self._began = None
         return embeddings
 
     def reset(self, dones: Tensor | None = None, hidden_state: HiddenState = None) -> None:
-        """Forget everything, take over a state, or zero the state of worlds whose episode has ended ([N] bool or 0/1)."""
+        """Forget all, take over a state, or zero the state of worlds whose episode has ended ([N] bool or 0/1)."""
         if dones is None:
             self.state = hidden_state  # pyright: ignore[reportAttributeAccessIssue]
             self._embeddings = None
@@ -249,10 +250,10 @@ class PointNetLstmModel(MLPModel):
             self.state = (self.state[0].detach(), self.state[1].detach())
 
     def update_normalization(self, obs: TensorDict) -> None:
-        """Take observations [M, ...] into the running mean and variance, whose tensors stay where captured updates find them."""
+        """Take observations [M, ...] into the running mean and variance."""
         normalizer = self.trunk.normalizer
         if isinstance(normalizer, EmpiricalNormalization):
-            std = normalizer._std
+            std = normalizer._std  # rsl-rl replaces this tensor; captured updates read it where it is
             normalizer.update(torch.cat([obs[group] for group in self.obs_groups], dim=-1))
             normalizer._std = std.copy_(normalizer._std)
 
@@ -275,15 +276,15 @@ class PointNetLstmModel(MLPModel):
 class ReturnCritic(PointNetLstmModel):
     """A critic whose last layer gives returns in units of their running standard deviation, around their running mean.
 
-    When mean and deviation change, the last layer is changed so that the values stay what they were (van Hasselt et al. 2016, Learning
-    values across many orders of magnitude).
+    When mean and deviation change, the last layer changes so that the values stay the same (van Hasselt et al. 2016,
+    Learning values across many orders of magnitude).
     """
 
     RATE = 0.01
     """Weight of a rollout in the running moments, once there have been a hundred."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        """Build; returns are first taken for numbers around 0 with a deviation of 1."""
+        """Build, with a mean of 0 and a deviation of 1."""
         super().__init__(*args, **options)
         self.return_mean: Tensor
         self.return_std: Tensor
@@ -298,7 +299,7 @@ class ReturnCritic(PointNetLstmModel):
 
     @torch.no_grad()
     def take_returns(self, returns: Tensor) -> None:
-        """Take a rollout's returns into mean and deviation; the values of any observation stay."""
+        """Take a rollout's returns into mean and deviation; the values of observations do not change."""
         self.rollouts += 1
         rate = (1.0 / self.rollouts).clamp_min(self.RATE)
         shift = returns.mean() - self.return_mean
@@ -317,7 +318,10 @@ class ReturnCritic(PointNetLstmModel):
 
 
 class ExportedPolicy(nn.Module):
-    """The deterministic policy: ``(flat [N, D], cloud [N, H, P, K], h_in, c_in [1, N, lstm]) -> (actions [N, J], h_out, c_out)``."""
+    """The deterministic policy.
+
+    ``(flat [N, D], cloud [N, H, P, K], h_in, c_in [1, N, lstm]) -> (actions [N, J], h_out, c_out)``.
+    """
 
     def __init__(self, model: PointNetLstmModel) -> None:
         """Copy the parts of a trained model; the copy is on the CPU and in evaluation mode."""

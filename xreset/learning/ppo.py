@@ -1,8 +1,9 @@
 """PPO over short sequences: Table VIII's sequence length 4 inside a horizon of 16, on top of rsl-rl's PPO.
 
-rsl-rl back-propagates through whole horizons. Here a rollout [T, N] is cut into pieces [T / L, L, N]; each piece starts from the LSTM state
-that the rollout had there, and an episode's end inside a piece zeroes the state. A minibatch holds all pieces of some worlds, drawn anew in
-every epoch, so that the cloud frames that pieces share are embedded once. Returns use the whole horizon.
+rsl-rl back-propagates through whole horizons. Here a rollout [T, N] is cut into pieces [T / L, L, N]. Each piece starts
+with the LSTM state that the rollout had there, and an episode's end inside a piece zeroes the state. A minibatch holds
+all pieces of some worlds, so that the cloud frames that pieces share are embedded once; the worlds are drawn again in
+every epoch. Returns use the whole horizon.
 """
 
 from __future__ import annotations
@@ -22,6 +23,15 @@ from torch import Tensor
 from xreset.capture import GraphRunner
 from xreset.learning.model import ReturnCritic
 
+Batch = Any
+"""A :class:`RolloutStorage.Batch` with all of its fields, which rsl-rl declares as optional."""
+
+BOUND = 1.1
+"""Mean of an action beyond which ``bounds_loss`` pulls it back."""
+SLOWEST = 1e-5
+FASTEST = 1e-2
+"""Limits of an adaptive learning rate (rsl-rl's)."""
+
 
 class SequenceStorage(RolloutStorage):
     """A rollout that is handed out world by world, cut into sequences of fixed length."""
@@ -32,20 +42,15 @@ class SequenceStorage(RolloutStorage):
         self.sequence_length = sequence_length
 
     def minibatch(self, worlds: Tensor) -> Batch:
-        """The rollout [T, M, ...] of M worlds [M].
+        """Return the rollout [T, M, ...] of M worlds [M].
 
-        ``masks`` [T, M] is True where a step is the first of an episode; ``hidden_states`` [1, pieces * M, lstm] are the states that the
-        pieces began with, all worlds of the first piece first.
+        ``masks`` [T, M] is True where a step is the first of an episode. ``hidden_states`` [1, pieces * M, lstm] are
+        the states that the pieces start with, all worlds of the first piece first.
         """
         first = torch.zeros_like(self.dones[:, worlds, 0], dtype=torch.bool)
-        # step 0 begins with the state that was saved there, zeroed where an episode had ended
+        # step 0 starts with the state that was saved there, zeroed where an episode had ended
         first[1:] = self.dones[:-1, worlds, 0].bool()
-        states = tuple(
-            tuple(s[:: self.sequence_length, 0, worlds].flatten(0, 1)[None] for s in saved)
-            if saved is not None
-            else None
-            for saved in (self.saved_hidden_state_a, self.saved_hidden_state_c)
-        )  # [T, 1, N, lstm] -> [1, pieces * M, lstm]
+        states = (self._states(self.saved_hidden_state_a, worlds), self._states(self.saved_hidden_state_c, worlds))
         return RolloutStorage.Batch(
             observations=self.observations[:, worlds],
             actions=self.actions[:, worlds],
@@ -58,14 +63,11 @@ class SequenceStorage(RolloutStorage):
             masks=first,
         )
 
-
-Batch = Any
-"""A :class:`RolloutStorage.Batch` whose every field is there; rsl-rl declares them optional."""
-
-BOUND = 1.1
-"""Mean of an action beyond which ``bounds_loss`` pulls it back."""
-SLOWEST, FASTEST = 1e-5, 1e-2
-"""Limits of an adaptive learning rate (rsl-rl's)."""
+    def _states(self, saved: Any, worlds: Tensor) -> tuple[Tensor, ...] | None:
+        """[T, 1, N, lstm] each -> [1, pieces * M, lstm] each."""
+        if saved is None:
+            return None
+        return tuple(state[:: self.sequence_length, 0, worlds].flatten(0, 1)[None] for state in saved)
 
 
 class SequencePpo(PPO):
@@ -81,21 +83,21 @@ class SequencePpo(PPO):
         """
         super().__init__(*args, **options)
         self.bounds_loss = bounds_loss
-        device, count = torch.device(self.device), self.storage.num_envs
-        self._rate = torch.tensor(
-            self.learning_rate, device=device, dtype=torch.float32 if device.type == "cuda" else torch.float64
-        )
+        device = torch.device(self.device)
+        on_gpu = device.type == "cuda"
+        count = self.storage.num_envs
+        self._rate = torch.tensor(self.learning_rate, device=device, dtype=torch.float32 if on_gpu else torch.float64)
         self._sums = torch.zeros(4, device=device)
         self._worlds = torch.zeros(count // self.num_mini_batches, dtype=torch.long, device=device)
-        self._beside = torch.cuda.Stream(device) if device.type == "cuda" else None
+        self._beside = torch.cuda.Stream(device) if on_gpu else None
         self._graphs = GraphRunner(device)
         self._graphs.active &= not self.is_multi_gpu and count % self.num_mini_batches == 0  # all minibatches alike
 
     def update(self) -> dict[str, float]:
-        """Learn from the rollout; the mean losses of its minibatches.
+        """Learn from the rollout; return the mean losses of its minibatches.
 
-        Unlike rsl-rl's, it reads no number back from the device until the end (the adaptive learning rate lives there, too), and on one
-        GPU a minibatch is a CUDA graph: its many small kernels take longer to launch than to run.
+        Unlike rsl-rl's, it reads no number from the device until the end: the adaptive learning rate is on the device,
+        too. On one GPU a minibatch is a CUDA graph, because its many small kernels take longer to launch than to run.
         """
         storage = self.storage
         if isinstance(self.critic, ReturnCritic):
@@ -120,7 +122,7 @@ class SequencePpo(PPO):
         return dict(zip(("value", "surrogate", "entropy", "bounds"), means, strict=True))
 
     def _learn(self) -> None:
-        """One step of the optimiser, on the minibatch of ``_worlds``; adds its losses to ``_sums``."""
+        """Take one step of the optimizer on the minibatch of ``_worlds``, and add its losses to ``_sums``."""
         batch: Batch = cast(SequenceStorage, self.storage).minibatch(self._worlds)
         self.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0], stochastic_output=True)
         log_prob = self.actor.get_output_log_prob(batch.actions)
@@ -131,9 +133,8 @@ class SequencePpo(PPO):
             self._use_rate()
         advantages = batch.advantages.squeeze(-1)
         ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze(-1))
-        surrogate = torch.max(
-            -advantages * ratio, -advantages * ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        ).mean()
+        clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
         value = self._value_loss(values, batch)
         excess = (self.actor.output_mean.abs() - BOUND).clamp_min(0.0).square().sum(dim=-1).mean()
         loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy + self.bounds_loss * excess
@@ -147,6 +148,7 @@ class SequencePpo(PPO):
         self._sums += torch.stack((value, surrogate, entropy, excess)).detach()
 
     def _value_loss(self, values: Tensor, batch: Batch) -> Tensor:
+        """Return the mean squared error of values, in units of the returns' deviation if the critic knows it."""
         unit = self.critic.return_std if isinstance(self.critic, ReturnCritic) else 1.0
         error = (values - batch.returns) / unit
         if not self.use_clipped_value_loss:
@@ -156,77 +158,84 @@ class SequencePpo(PPO):
 
     @torch.no_grad()
     def _adapt(self, batch: Batch) -> None:
-        """Divide (multiply) the rate by 1.5 where the policy moved more than twice (less than half) the desired divergence."""
+        """Divide (multiply) the rate by 1.5 where the policy moved more than twice (less than half) the desired KL."""
         kl = self.actor.get_kl_divergence(batch.old_distribution_params, self.actor.output_distribution_params).mean()
         if self.is_multi_gpu:
             torch.distributed.all_reduce(kl)
             kl = kl / self.gpu_world_size
-        rate = self._rate
-        slower, faster = (rate / 1.5).clamp_min(SLOWEST), (rate * 1.5).clamp_max(FASTEST)
+        slower = (self._rate / 1.5).clamp_min(SLOWEST)
+        faster = (self._rate * 1.5).clamp_max(FASTEST)
         too_little = (kl < self.desired_kl / 2.0) & (kl > 0.0)
-        rate.copy_(torch.where(kl > self.desired_kl * 2.0, slower, torch.where(too_little, faster, rate)))
+        too_much = kl > self.desired_kl * 2.0
+        self._rate.copy_(torch.where(too_much, slower, torch.where(too_little, faster, self._rate)))
 
     def _use_rate(self) -> None:
-        """Give the rate to the optimiser: on a GPU as the tensor itself, which it reads there; for that it has to be the fused one."""
-        groups, on_gpu = self.optimizer.param_groups, self._rate.is_cuda
+        """Give the rate to the optimizer. On a GPU it reads the tensor itself; only the fused optimizer can."""
+        groups = self.optimizer.param_groups
+        on_gpu = self._rate.is_cuda
         for group in groups:
             group["lr"] = self._rate if on_gpu else float(self._rate)
         if groups[0]["capturable"] != on_gpu:  # new, or from a checkpoint of another kind of device
             for group in groups:
-                group["fused"], group["foreach"], group["capturable"] = on_gpu, False, on_gpu
+                group |= {"fused": on_gpu, "foreach": False, "capturable": on_gpu}
             for state in self.optimizer.state.values():
                 state["step"] = state["step"].to(self.device)
 
     def act(self, obs: TensorDict) -> Tensor:
-        """Sample actions; the very first step of a run starts from a zero LSTM state, which is stored like any other.
+        """Sample actions. The first step of a run starts from a zero LSTM state, which is stored like any other.
 
-        As rsl-rl does; but on a GPU the values, which no action needs, are computed beside what follows, until :meth:`process_env_step`.
+        As rsl-rl does; but on a GPU the values, which no action needs, are computed on a second stream, next to what
+        follows until :meth:`process_env_step`.
         """
-        for model in (self.actor, self.critic):
+        actor = self.actor
+        critic = self.critic
+        for model in (actor, critic):
             if model.is_recurrent and model.get_hidden_state() is None:
                 with torch.no_grad():
                     model(obs)
                 h, c = model.get_hidden_state()  # pyright: ignore[reportGeneralTypeIssues]
                 model.reset(hidden_state=(torch.zeros_like(h), torch.zeros_like(c)))
-        step, critic = self.transition, self.critic
-        step.observations, step.hidden_states = obs, (self.actor.get_hidden_state(), critic.get_hidden_state())
+        step = self.transition
+        step.observations = obs
+        step.hidden_states = (actor.get_hidden_state(), critic.get_hidden_state())
         if self._beside is not None:
             self._beside.wait_stream(torch.cuda.current_stream())
-            self._needed = vars(
-                critic
-            ).copy()  # what was allocated on one stream must not be freed while another reads it
-        actions = step.actions = self.actor(obs, stochastic_output=True).detach()
-        step.actions_log_prob = self.actor.get_output_log_prob(actions).detach()
-        step.distribution_params = tuple(p.detach() for p in self.actor.output_distribution_params)
+            # what was allocated on one stream must not be freed while another one reads it
+            self._needed = vars(critic).copy()
+        actions = actor(obs, stochastic_output=True).detach()
+        step.actions = actions
+        step.actions_log_prob = actor.get_output_log_prob(actions).detach()
+        step.distribution_params = tuple(p.detach() for p in actor.output_distribution_params)
         with torch.cuda.stream(self._beside):
             step.values = critic(obs).detach()
         return actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
-        """Record one environment step, and which worlds' part of it is not to be learned from (``extras["faulty"]`` [N] bool)."""
+        """Record one environment step; ``extras["faulty"]`` [N] bool marks worlds whose step teaches nothing."""
         if self._beside is not None:
             torch.cuda.current_stream().wait_stream(self._beside)
             self._needed = {}
         step = self.storage.step
         if not step:
-            self._faulty = torch.zeros(
-                self.storage.num_transitions_per_env, *dones.shape, dtype=torch.bool, device=self.device
-            )
+            steps = self.storage.num_transitions_per_env
+            self._faulty = torch.zeros(steps, *dones.shape, dtype=torch.bool, device=self.device)
         if "faulty" in extras:
             self._faulty[step] = extras["faulty"]
         super().process_env_step(obs, rewards, dones, extras)
 
     def compute_returns(self, obs: TensorDict) -> None:
-        """Returns and advantages; those of faulty steps are the value itself and zero, so that neither loss has a gradient there.
+        """Compute returns and advantages; at faulty steps neither loss gets a gradient from them.
 
-        A faulty step is the last of its episode: with the value as its reward, its error is zero, whatever the simulation said.
+        A faulty step is the last of its episode. With the value as its reward, its error is zero, whatever the
+        simulation gave.
         """
-        storage, faulty, advantages = self.storage, self._faulty[..., None], self.storage.advantages
+        storage = self.storage
+        faulty = self._faulty[..., None]
+        advantages = storage.advantages
         storage.rewards = torch.where(faulty, storage.values, storage.rewards)
         super().compute_returns(obs)
-        storage.advantages = advantages.copy_(
-            torch.where(faulty, 0.0, storage.advantages)
-        )  # where the update's graph finds them
+        # written in place, where the update's graph reads them
+        storage.advantages = advantages.copy_(torch.where(faulty, 0.0, storage.advantages))
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> PPO:
@@ -238,7 +247,8 @@ class SequencePpo(PPO):
             groups = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
         actor = actor_class(obs, groups, "actor", env.num_actions, **actor_cfg).to(device)
         critic = critic_class(obs, groups, "critic", 1, **critic_cfg).to(device)
-        actor.reuse_embeddings = critic.reuse_embeddings = True
+        actor.reuse_embeddings = True
+        critic.reuse_embeddings = True
         length = alg_cfg.pop("sequence_length")
         storage = SequenceStorage(length, "rl", env.num_envs, cfg["num_steps_per_env"], obs, [env.num_actions], device)
         return alg_class(actor, critic, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])

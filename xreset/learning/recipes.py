@@ -34,9 +34,9 @@ _MINUTES = TrainConfig(
     model=ModelConfig(initial_std=0.3),
     ppo=PpoConfig(mini_epochs=3, minibatch_size=16384, precision="bfloat16", desired_kl=0.02, entropy=0.0),
 )
-"""The paper's entropy bonus of 0.005 makes the standard deviation grow; one that only shrinks, and steps of twice the size, learn in a
-fraction of the iterations. With 4,096 worlds its epochs and minibatches make twelve steps of the optimiser an iteration: as far as
-``desired_kl`` lets it go. What the task's levers are for stands with their fields, what they did in docs/lab-book.md."""
+"""Without the paper's entropy bonus the standard deviation only shrinks. With that and a doubled ``desired_kl`` a
+policy learns in a fraction of the iterations (docs/lab-book.md). With 4,096 worlds an iteration has twelve steps of the
+optimizer."""
 
 _ROBUST = replace(
     _MINUTES,
@@ -58,22 +58,25 @@ _ROBUST = replace(
         ),
     ),
 )
-"""Drives: policies that went from simulation to a real hand had factors of 0.75 to 1.5 on stiffness and 0.3 to 3 on damping (OpenAI et al.
-2018, Learning Dexterous In-Hand Manipulation; Handa et al. 2022, DeXtreme, manual randomisation), Isaac Lab's dexterous lift has 0.5
-to 2 on both; here narrower for the arm, whose lag a policy has to guess. Latency: two control steps are 33 ms; DeXtreme lets a pose be two
-of its steps old. Hand friction: from bare metal (Table IX has 0.1) to a skin. Effort: makers state approximate limits. Force gain: tactile
-sensors without calibration. Torsional friction: PhysX leaves 0.3 of it beside a second point, a soft fingertip has more than a hard one.
-What each costs a policy that never met it: docs/sim-to-sim.md."""
+"""Sources of the ranges. Drives: policies that went from simulation to a real hand had factors of 0.75 to 1.5 on
+stiffness and 0.3 to 3 on damping (OpenAI et al. 2018, Learning Dexterous In-Hand Manipulation; Handa et al. 2022,
+DeXtreme, manual randomization), Isaac Lab's dexterous lift has 0.5 to 2 on both. Latency: two control steps are 33 ms;
+in DeXtreme a pose is up to two steps old. Hand friction: from bare metal (0.1 in Table IX) to a skin. Torsional
+friction: PhysX leaves 0.3 of it next to a second contact point. The cost of each range for a policy that was trained
+without it: docs/sim-to-sim.md."""
 
 RECIPES: dict[str, Recipe] = {
     "paper": Recipe(config=TrainConfig(), about="the paper's tables VIII and IX, for hours on several GPUs"),
     "minutes": Recipe(
         config=_MINUTES,
-        about="what taught an object alone in minutes on one GPU (docs/lab-book.md): 4,096 worlds, with closing states that press",
+        about=(
+            "what taught an object alone in minutes on one GPU (docs/lab-book.md): 4,096 worlds, with closing states "
+            "that press"
+        ),
     ),
     "robust": Recipe(
         config=_ROBUST,
-        about="minutes, with drives, latency, the hand's friction and its force readings at random (docs/sim-to-sim.md)",
+        about="minutes, with random drives, latency, friction of the hand and force readings (docs/sim-to-sim.md)",
     ),
 }
 """Name -> recipe."""
@@ -82,7 +85,8 @@ RECIPES: dict[str, Recipe] = {
 def starting_config(like: str) -> TrainConfig:
     """Return the configuration of a recipe, or of a run without the reward terms that its user added.
 
-    Such a term names code to import. A file must not decide that, so the terms have to be named again (:func:`dropped_terms`).
+    Such a term names code to import. A file must not decide that, so the terms have to be named again
+    (:func:`dropped_terms`).
 
     Args:
         like: name of a recipe, or a run folder.
@@ -94,14 +98,15 @@ def starting_config(like: str) -> TrainConfig:
         return RECIPES[like].config
     if not Path(like).exists():
         recipes = "; ".join(f"{name}, {recipe.about}" for name, recipe in RECIPES.items())
-        raise RunError(f"there is no recipe and no run folder {like!r}. Recipes: {recipes}.")
+        raise RunError(f"There is no recipe and no run folder {like!r}. Recipes: {recipes}.")
     config = read_run(like).config
     reward = replace(config.task.reward, own={})
     return replace(config, task=replace(config.task, reward=reward))
 
 
 def dropped_terms(like: str) -> dict[str, float]:
-    """Return the user's own reward terms of a run, which :func:`starting_config` leaves out: ``module:function`` -> weight."""
+    """Return the user's own reward terms of a run, which :func:`starting_config` leaves out: ``module:function`` ->
+    weight."""
     return {} if like in RECIPES else read_run(like).config.task.reward.own
 
 

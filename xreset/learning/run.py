@@ -1,8 +1,8 @@
-"""The run folder: what a training was, where its checkpoints and its policy are.
+"""The run folder: the description of a training, its checkpoints and its policy.
 
 RUN/run.json                 everything that the training was started with
-RUN/checkpoints/000050.pt    model, optimiser, random state and counters after 50 iterations
-RUN/worlds.pt                the worlds at the newest checkpoint, so that a resumed run goes on in the middle of its episodes
+RUN/checkpoints/000050.pt    model, optimizer, random state and counters after 50 iterations
+RUN/worlds.pt                the worlds at the newest checkpoint, with which a resumed run continues its episodes
 RUN/lift.json                when success from home passed 1, 10 and 50 %
 RUN/faults.npz               the last worlds whose simulation failed, if the run ended because of too many
 RUN/policy.onnx              the policy, with its contract
@@ -36,7 +36,7 @@ class RunInfo(Checked):
     resets: str
     """Path of the reset bank."""
     resets_hash: str
-    """Its SHA-256."""
+    """SHA-256 of the bank."""
     objects: str | None
     """Folder of object meshes; None: the built-in stand-ins."""
     backend: str
@@ -48,9 +48,9 @@ class RunInfo(Checked):
     contract: dict[str, Any]
     """:func:`xreset.policy.policy_contract`."""
     weights: str | None = None
-    """Path of the checkpoint whose networks the training began with; None: new ones."""
+    """Path of the checkpoint whose networks the training started with; None: new networks."""
     weights_hash: str | None = None
-    """Its SHA-256."""
+    """SHA-256 of the checkpoint."""
 
 
 def write_run(folder: Path, info: RunInfo) -> None:
@@ -62,10 +62,10 @@ def read_run(folder: str | Path) -> RunInfo:
     """Read ``run.json``.
 
     Raises:
-        RunError: the folder is no run.
+        RunError: the folder is not a run.
         FileFormatError: the file is damaged, or of another version of xreset.
     """
-    from xreset.policy import check_contract_entries  # torch, which --help must not wait for
+    from xreset.policy import check_contract_entries  # imports torch, which --help must not wait for
 
     folder = Path(folder)
     if not (folder / "run.json").is_file():
@@ -83,12 +83,12 @@ def read_run(folder: str | Path) -> RunInfo:
 
 
 def checkpoints(folder: Path) -> list[Path]:
-    """Checkpoints, oldest first."""
+    """Return the checkpoints, oldest first."""
     return sorted((folder / "checkpoints").glob("[0-9]*.pt"))
 
 
 def latest_checkpoint(folder: Path) -> Path:
-    """The newest checkpoint; ``RunError`` if there is none."""
+    """Return the newest checkpoint; ``RunError`` if there is none."""
     found = checkpoints(folder)
     if not found:
         raise RunError(f"{folder} has no checkpoint yet. Train it: xreset train --out {folder} --resume")

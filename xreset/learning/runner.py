@@ -148,8 +148,8 @@ class TrainingRunner(OnPolicyRunner):
     def save_checkpoint(self, log: TrainingLog | None = None) -> None:
         """Write ``checkpoints/ITERATION.pt`` and ``worlds.pt``. All processes must call it; the main one writes.
 
-        ``worlds.pt`` holds the worlds, the models' memories and the running means of the log: with it a run continues in
-        the middle of its episodes. Only the newest one is kept.
+        ``worlds.pt`` holds the worlds, the models' memories and the running means of the log: with it a run continues
+        in the middle of its episodes. Only the newest one is kept.
         """
         worlds = self.processes.gather(self._worlds_state())
         random = self.processes.gather(self._random_state())
@@ -167,7 +167,8 @@ class TrainingRunner(OnPolicyRunner):
         write_state(self.folder / "checkpoints" / f"{self.iteration:06d}.pt", content)
 
     def load_checkpoint(self, path: Path) -> None:
-        """Continue from a checkpoint: models, optimizer, counters and random state; the worlds too if ``worlds.pt`` fits."""
+        """Continue from a checkpoint: models, optimizer, counters and random state; the worlds too if ``worlds.pt``
+        fits."""
         content = read_checkpoint(path, self.device)
         with must_fit(path):
             self.alg.load(content, None, strict=True)
@@ -182,8 +183,8 @@ class TrainingRunner(OnPolicyRunner):
     def load_networks(self, path: Path) -> None:
         """Start with the actor and the critic of another run's checkpoint, with normalization and standard deviation.
 
-        An adaptive learning rate starts where the other run's rate was: a new run's rate would undo in one step what the
-        networks have learned.
+        An adaptive learning rate starts where the other run's rate was: a new run's rate would undo in one step what
+        the networks have learned.
         """
         content = read_checkpoint(path, self.device)
         with must_fit(path):
@@ -238,7 +239,8 @@ class TrainingRunner(OnPolicyRunner):
             self.world.set_rng_state(state["env"])
 
     def _check_faults(self, budget: FaultBudget) -> None:
-        """End the run if too many worlds broke, leaving them in ``faults.npz``. Every process comes to the same result."""
+        """End the run if too many worlds broke, leaving them in ``faults.npz``. Every process comes to the same
+        result."""
         env = self.world
         total = torch.stack((env.nonfinite_count, env.overflow_count))
         nonfinite, overflow = self.processes.sum(total - self._faults_before).tolist()

@@ -33,12 +33,14 @@ ShareSchedule = Annotated[
 class ScheduleConfig(Checked):
     """Settings that change during a run.
 
-    A schedule is a list of points: a share of the run and the setting's value there, such as ``0 0.9 1 0.25``. Values between two points
-    lie on a straight line. The share of the run counts iterations, or minutes if the run is limited to some and more of them have passed.
+    A schedule is a list of points: a share of the run and the setting's value there, such as ``0 0.9 1 0.25``. Values
+    between two points lie on a straight line. The share of the run counts iterations, or minutes if the run is limited
+    to some and more of them have passed.
     """
 
     demo_probability: ShareSchedule = ()
-    """Replaces ``task.reset.demo_probability``: demonstrated states teach the first grasp, starts from home are what is evaluated."""
+    """Replaces ``task.reset.demo_probability``: demonstrated states teach the first grasp, starts from home are what is
+    evaluated."""
 
 
 def value_at(points: Points, progress: float) -> float:

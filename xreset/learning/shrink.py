@@ -1,8 +1,8 @@
-"""Exported policies at half the size: weight matrices stored in float16, computed with in float32.
+"""Exported policies at half the size: weight matrices are stored in float16 and used in float32.
 
-Each weight becomes the nearest float16 number, and a Cast back to float32 stands before its first use; the runtime does these casts once,
-when it loads the file. A rounded weight is off by at most 2^-11 of its size (2^-25 where it is below 6e-5). Biases and the normalisation of
-observations stay float32: they are few, and their range is not bounded by training.
+Each weight becomes the nearest float16 number, and a Cast to float32 comes before its first use; the runtime does these
+casts once, when it loads the file. The error of a rounded weight is at most 2^-11 of its size (2^-25 below 6e-5).
+Biases and the normalization of observations stay float32: they are few, and training does not bound their range.
 """
 
 from __future__ import annotations
@@ -23,29 +23,30 @@ _SUFFIX = "_float16"
 
 
 def shrink(source: str | Path, path: str | Path) -> None:
-    """Write an exported policy with its weight matrices in float16; contract, inputs and outputs stay as they are.
+    """Write an exported policy with its weight matrices in float16; contract, inputs and outputs do not change.
 
     Args:
         source: policy as exported (``.onnx``).
         path: file to write; may be the source.
 
     Raises:
-        PolicyError: the source is missing, damaged or no policy, holds no float32 matrix, or one that float16 cannot hold.
+        PolicyError: the source is missing, damaged or not a policy, has no float32 matrix, or one that float16 cannot
+            hold.
         XResetError: the file cannot be written.
     """
-    OnnxPolicy(source)  # says what is wrong with a file that is none
+    OnnxPolicy(source)  # refuses other files
     with needs("onnx", "train", PolicyError):
         import onnx
     model = onnx.load(str(source))
     if not halve_matrices(model, str(source)):
-        raise PolicyError(f"{source} holds no weight matrix in float32: it was shrunk before. Use it as it is.")
+        raise PolicyError(f"{source} holds no weight matrix in float32: it was shrunk before. Use the file as it is.")
     drop_exporter_notes(model)
     with atomic_write(path) as out:
         out.write(model.SerializeToString())
 
 
 def halve_matrices(model: ModelProto, source: str) -> int:
-    """Store every float32 matrix of the model in float16, in place; returns how many.
+    """Store every float32 matrix of the model in float16, in place; return their number.
 
     Args:
         model: the model.
@@ -56,20 +57,24 @@ def halve_matrices(model: ModelProto, source: str) -> int:
     """
     from onnx import TensorProto, helper, numpy_helper
 
-    graph, casts = model.graph, []
+    graph = model.graph
+    casts = []
     for weights in graph.initializer:
         if weights.data_type != TensorProto.FLOAT or len(weights.dims) != 2 or min(weights.dims) == 1:
             continue
-        name, exact = weights.name, numpy_helper.to_array(weights)
+        name = weights.name
+        exact = numpy_helper.to_array(weights)
         if not np.isfinite(exact).all():
             raise PolicyError(
-                f"{source} has weights in {name} that are NaN or infinite: its training has diverged. Use an earlier checkpoint."
+                f"{source} has weights in {name} that are NaN or infinite: its training has diverged. "
+                "Use an earlier checkpoint."
             )
         with np.errstate(over="ignore"):
             rounded = exact.astype(np.float16)
         if not np.isfinite(rounded).all():
             raise PolicyError(
-                f"{source} has weights up to {np.abs(exact).max():.3g} in {name}, float16 ends at 65504. Use the file as it was exported."
+                f"{source} has weights up to {np.abs(exact).max():.3g} in {name}, float16 ends at 65504. "
+                "Use the file as it was exported."
             )
         weights.CopyFrom(numpy_helper.from_array(rounded, name + _SUFFIX))
         casts.append(
@@ -82,7 +87,7 @@ def halve_matrices(model: ModelProto, source: str) -> int:
 
 
 def drop_exporter_notes(model: ModelProto) -> None:
-    """Remove, in place, what the exporter notes on nodes and values: lines of source code with paths of its machine."""
+    """Remove, in place, the exporter's notes on nodes and values: lines of source code with paths of its machine."""
     graph = model.graph
     for noted in (graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
         del noted.metadata_props[:]

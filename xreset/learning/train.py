@@ -67,8 +67,8 @@ def train(
         The run folder, which ``xreset.load_policy`` reads.
 
     Raises:
-        RunError: the folder holds a run already, there is no state to reset to, ``weights`` has no checkpoint of networks
-            like these, or there is too little memory.
+        RunError: the folder holds a run already, there is no state to reset to, ``weights`` has no checkpoint of
+            networks like these, or there is too little memory.
         PolicyError: ``weights`` is of another robot, or its policy observes something else.
         XResetError: bank, robot, objects and configuration do not fit together.
     """
@@ -153,8 +153,8 @@ def resume(
             decide.
 
     Raises:
-        RunError: the run has other reward terms of the user's own, the bank is not the run's, the newest checkpoint does
-            not fit, another process is training here, or there is too little memory.
+        RunError: the run has other reward terms of the user's own, the bank is not the run's, the newest checkpoint
+            does not fit, another process is training here, or there is too little memory.
     """
     out = Path(out)
     info = read_run(out)

@@ -1,4 +1,7 @@
-"""Trained policies that ship with xreset: ``NAME.onnx`` in this folder, known to the command line as NAME, and its card ``NAME.toml``."""
+"""Trained policies that ship with xreset: ``NAME.onnx`` in this folder, and the card ``NAME.toml``.
+
+The command line knows such a policy as NAME.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +12,20 @@ from xreset.checks import from_dict
 from xreset.files import read_toml
 
 FOLDER = Path(__file__).parent
-"""Where they lie."""
+"""Folder of the policies and their cards."""
 SCHEMA = "xreset-policy-card/1"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Card:
-    """What a policy is, and what it was seen to do."""
+    """Description of a policy, with measured results."""
 
     schema: str
     about: str
     data: str
-    """What it was trained with."""
+    """Data of the training."""
     recipe: str
-    """How, and for how long."""
+    """Recipe of the training, and how long it took."""
     licence: str
     results: dict[str, dict[str, str]]
     """Episodes -> engine -> task progress with its interval."""

@@ -67,7 +67,7 @@ class SceneModel:
 
     @property
     def friction_column(self) -> np.ndarray:
-        """[G] which friction (object-tip, object-other link, object-table) a geom decides; 3 for the object's own geoms.
+        """[G] which friction (object-tip, object-other link, object-table) a geom sets; 3 for the object's own geoms.
 
         MuJoCo gives a pair the larger friction of its geoms, and the object's own stays at :data:`MIN_FRICTION`.
         """

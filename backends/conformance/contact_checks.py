@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, Worlds, random_state, replace_fields, rotation_angle
+from xreset.backends.conformance.harness import Bench, Worlds, named, replace_fields, rotation_angle
 from xreset.backends.conformance.results import Measured
 from xreset.backends.conformance.scene import flat_objects
 from xreset.physics import State
@@ -60,12 +60,12 @@ def _height_on_side(thing: ObjectSpec) -> float:
 
 
 def rest_and_bounce(bench: Bench) -> Measured:
-    """Put flat objects on the table, then drop them from 30 mm: their height after a second, and how far they bounce."""
+    """Put flat objects on the table, then drop them from 30 mm: their height after a second, and their bounce."""
     objects = flat_objects()
     names = [thing.name for thing in objects]
     scene = replace(bench.scene, objects=objects)
-    which = torch.arange(len(objects))
-    start = bench.placed(State.initial(scene, which))
+    which = range(len(objects))
+    start = bench.initial(scene, which)
     height = start.object_pos[:, 2]
 
     def heights(worlds: Worlds, above: float) -> Tensor:
@@ -77,16 +77,16 @@ def rest_and_bounce(bench: Bench) -> Measured:
             rows.append(worlds.state().object_pos[:, 2])
         return torch.stack(rows)
 
-    with bench.other(scene, len(objects), which) as worlds:
+    with bench.other(scene, which) as worlds:
         resting = heights(worlds, 0.0)
         dropped = heights(worlds, 0.03)
     bounce = []
     for i, lowest in enumerate(dropped.argmin(dim=0).tolist()):
         bounce.append(float(dropped[lowest:, i].max() - height[i]))
     return {
-        "height after 1 s": zip(names, (resting[-1] - height).abs().tolist(), strict=True),
-        "height 1 s after a drop": zip(names, (dropped[-1] - height).abs().tolist(), strict=True),
-        "bounce": zip(names, bounce, strict=True),
+        "height after 1 s": named(names, resting[-1] - height),
+        "height 1 s after a drop": named(names, dropped[-1] - height),
+        "bounce": list(zip(names, bounce, strict=True)),
     }
 
 
@@ -120,7 +120,7 @@ def set_as_built(bench: Bench) -> Measured:
         scenes.append(replace(bench.scene, objects=(built,), friction=pairs))
     [errors] = _against_built(bench, worlds, scenes, [_slide])
     names = [thing.name for thing in bench.scene.objects]
-    return {what: zip(names, values, strict=True) for what, values in errors.items()}
+    return {what: named(names, values) for what, values in errors.items()}
 
 
 def object_inertia_set(bench: Bench) -> Measured:
@@ -169,7 +169,7 @@ def _against_built(
     found = [move(bench, worlds, everyone) for move in motions]
     errors = [{"pos": [], "angle": [], "force": []} for _ in motions]
     for i, scene in enumerate(scenes):
-        with bench.other(scene, 1) as other:
+        with bench.other(scene) as other:
             built = [move(bench, other, [i]) for move in motions]
         for error, (state, force), (state_built, force_built) in zip(errors, found, built, strict=True):
             angle = rotation_angle(state.object_quat[i], state_built.object_quat[0])
@@ -195,7 +195,7 @@ def _slide(bench: Bench, worlds: Worlds, which: Sequence[int]) -> tuple[State, T
 
 def _tumble(bench: Bench, worlds: Worlds, which: Sequence[int]) -> tuple[State, Tensor]:
     """Let objects tumble through the air for a moment, under a torque."""
-    start = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=21)[list(which)]
+    start = bench.random_state(seed=21)[list(which)]
     worlds.set(start)
     size = torch.tensor([float(np.trace(bench.objects[i].inertia)) for i in which])
     torque = size[:, None] * torch.tensor([20.0, -10.0, 5.0])  # some rad/s^2

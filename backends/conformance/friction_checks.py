@@ -9,10 +9,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, Worlds, replace_fields
+from xreset.backends.conformance.harness import Bench, Worlds, named, replace_fields
 from xreset.backends.conformance.results import Measured
 from xreset.backends.conformance.scene import ball, flat_objects
-from xreset.physics import State
 from xreset.spec import GRAVITY
 
 _CASES = [(mu, degrees) for mu in (0.2, 0.5, 0.8, 1.2) for degrees in (0, 45)]  # noqa: XR002
@@ -24,20 +23,19 @@ def sliding_distance(bench: Bench) -> Measured:
     """Push boxes off at the speed v with which Coulomb friction stops them after v^2 / (2 mu g) = 0.2 m."""
     shapes = flat_objects()[:3]
     scene = replace(bench.scene, objects=shapes)
-    which = torch.arange(len(shapes)).repeat(len(_CASES))
+    which = [*range(len(shapes))] * len(_CASES)
     mu, direction = _cases(bench, len(shapes))
     speed = (2.0 * mu * GRAVITY * _DISTANCE).sqrt()
-    start = bench.placed(State.initial(scene, which))
+    start = bench.initial(scene, which)
     start = replace_fields(start, object_linvel=speed[:, None] * direction)
-    with bench.other(scene, len(which), which) as worlds:
+    with bench.other(scene, which) as worlds:
         worlds.set_parameter("friction", _pairs(bench, mu))
         end = worlds.advance(start, round(1.0 / scene.timestep))
     way = ((end.object_pos - start.object_pos) * direction).sum(-1)
     off = (way / _DISTANCE - 1.0).abs().view(len(_CASES), len(shapes))
     errors = {}
-    for (coefficient, degrees), row in zip(_CASES, off.tolist(), strict=True):
-        pairs = [(shape.name, error) for shape, error in zip(shapes, row, strict=True)]
-        errors[f"mu {coefficient}, {degrees} degrees"] = pairs
+    for (coefficient, degrees), row in zip(_CASES, off, strict=True):
+        errors[f"mu {coefficient}, {degrees} degrees"] = named([shape.name for shape in shapes], row)
     return errors
 
 
@@ -47,13 +45,13 @@ def slope(bench: Bench) -> Measured:
     scene = replace(bench.scene, objects=(box,))
     mu, direction = _cases(bench, 2)  # two worlds a case: one below the cone, one beyond it
     ratio = torch.tensor([0.95, 1.05]).repeat(len(_CASES))
-    which = torch.zeros(len(mu), dtype=torch.long)
+    which = [0] * len(mu)
     force = (ratio * mu * box.mass * GRAVITY)[:, None] * direction
     quarter = round(0.25 / scene.timestep)
     half = round(0.5 / scene.timestep)
-    with bench.other(scene, len(mu), which) as worlds:
+    with bench.other(scene, which) as worlds:
         worlds.set_parameter("friction", _pairs(bench, mu))
-        worlds.advance(bench.placed(State.initial(scene, which)), quarter)
+        worlds.advance(bench.initial(scene, which), quarter)
         worlds.push(force, torch.zeros(3))
         worlds.step(quarter)
         first = worlds.state()
@@ -100,10 +98,10 @@ def _spin_lost(bench: Bench, count: int, seconds: float, prepare: Callable[[Worl
     """[count] what balls on the table lose of their spin, as a share of what the scene's torsional friction takes."""
     thing = ball()
     scene = replace(bench.scene, objects=(thing,))
-    which = torch.zeros(count, dtype=torch.long)
-    start = replace_fields(bench.placed(State.initial(scene, which)), object_angvel=torch.tensor([0.0, 0.0, 10.0]))
+    which = [0] * count
+    start = replace_fields(bench.initial(scene, which), object_angvel=torch.tensor([0.0, 0.0, 10.0]))
     steps = round(seconds / scene.timestep)
-    with bench.other(scene, count, which) as worlds:
+    with bench.other(scene, which) as worlds:
         prepare(worlds)
         lost = 10.0 - worlds.advance(start, steps).object_angvel[:, 2]
     braking = scene.friction.torsional * thing.mass * GRAVITY / float(thing.inertia[2, 2])

@@ -122,13 +122,14 @@ class Bench:
         self.scene = scene
         self.own_robot = scene.robot.name == gripper().name
         self.kinematics = Kinematics(scene.robot)
-        self.object_index = torch.arange(self.NUM_WORLDS) % len(scene.objects)
+        self.which = [i % len(scene.objects) for i in range(self.NUM_WORLDS)]
+        """Index of the object of each shared world."""
         self._shared: Worlds | None = None
 
     @property
     def objects(self) -> list[ObjectSpec]:
         """The object of each shared world."""
-        return [self.scene.objects[i] for i in self.object_index.tolist()]
+        return [self.scene.objects[i] for i in self.which]
 
     @property
     def masses(self) -> Tensor:
@@ -144,7 +145,7 @@ class Bench:
     def backend(self) -> Backend:
         """The backend of the shared worlds."""
         if self._shared is None:
-            self._shared = Worlds(self._make(self.scene, self.NUM_WORLDS, object_index=self.object_index))
+            self._shared = Worlds(self._make(self.scene, self.NUM_WORLDS, object_index=torch.tensor(self.which)))
         return self._shared.backend
 
     def worlds(self) -> Worlds:
@@ -159,37 +160,42 @@ class Bench:
         return worlds
 
     @contextmanager
-    def other(self, scene: SceneSpec, num_worlds: int, object_index: Tensor | None = None) -> Iterator[Worlds]:
-        """Worlds of another scene, closed at the end of the block."""
-        backend = self._make(scene, num_worlds, object_index=object_index)
+    def other(self, scene: SceneSpec, which: Sequence[int] = (0,)) -> Iterator[Worlds]:
+        """Worlds of another scene with the given objects, closed at the end of the block."""
+        backend = self._make(scene, len(which), object_index=torch.tensor(which))
         try:
             yield Worlds(backend)
         finally:
             backend.close()
 
     @contextmanager
-    def reference(self, scene: SceneSpec, num_worlds: int, object_index: Tensor | None = None) -> Iterator[Worlds]:
+    def reference(self, scene: SceneSpec, which: Sequence[int]) -> Iterator[Worlds]:
         """The same worlds in the reference engine; finer steps of its own if the reference is what is tested."""
         status = backend_status(REFERENCE)
         if status.reason is not None:
             raise Skipped(f"it compares with the reference engine: {status.reason}")
         finer = REFINEMENT if self.backend.name == REFERENCE else 1
         scene = replace(scene, timestep=scene.timestep / finer)
-        with make_backend(REFERENCE, scene, num_worlds, object_index=object_index, workers=0) as backend:
+        with make_backend(REFERENCE, scene, len(which), object_index=torch.tensor(which), workers=0) as backend:
             yield Worlds(backend, finer)
 
     def start(self) -> State:
         """Return [N] initial states, the object resting where the robot is not."""
-        return self.placed(State.initial(self.scene, self.object_index))
+        return self.initial(self.scene, self.which)
+
+    def initial(self, scene: SceneSpec, which: Sequence[int]) -> State:
+        """Return initial states of worlds of a scene with the given objects, which rest where the robot is not."""
+        state = State.initial(scene, torch.tensor(which))
+        state.object_pos[:, :2] = torch.tensor(self.place)
+        return state
 
     def in_the_air(self) -> State:
         """Return [N] initial states with the object high above everything."""
         return replace_fields(self.start(), object_pos=torch.tensor([*self.place, 1.5]))
 
-    def placed(self, state: State) -> State:
-        """Return the states with the object moved to where the robot is not, at the same height."""
-        place = torch.tensor(self.place).expand(len(state.object_pos), 2)
-        return replace_fields(state, object_pos=torch.cat((place, state.object_pos[:, 2:]), dim=1))
+    def random_state(self, seed: int) -> State:
+        """Return [N] random states of the shared worlds."""
+        return random_state(self, self.scene, self.NUM_WORLDS, seed)
 
     @cached_property
     def place(self) -> tuple[float, float]:
@@ -306,7 +312,7 @@ def small_motion(kinematics: Kinematics) -> Tensor:
 
 
 def state_errors(found: State, expected: State, words: str = "") -> dict[str, Tensor]:
-    """Return the difference of each field, named with ``words`` before it; quaternions are the same with either sign."""
+    """Return the difference of each field, named with ``words`` before it; the sign of quaternions is ignored."""
     errors = {}
     for field in fields(State):
         a = getattr(found, field.name)
@@ -315,3 +321,8 @@ def state_errors(found: State, expected: State, words: str = "") -> dict[str, Te
             a = torch.where((a * b).sum(-1, keepdim=True) < 0, -a, a)
         errors[f"{words} {field.name}".strip()] = a - b
     return errors
+
+
+def named(names: Sequence[str], errors: Tensor | Sequence[float]) -> list[tuple[str, float]]:
+    """Return pairs of a name and an absolute error."""
+    return list(zip(names, torch.as_tensor(errors, dtype=torch.float64).abs().tolist(), strict=True))

@@ -12,7 +12,7 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, replace_fields, rotation_angle
+from xreset.backends.conformance.harness import Bench, Worlds, finite_limits, named, replace_fields, rotation_angle
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.conformance.scene import without_collisions
 from xreset.geometry.kinematics import Kinematics
@@ -51,7 +51,7 @@ def forward_kinematics(bench: Bench) -> Measured:
 
     pos, quat = links_of(bench.worlds())
     poses = bench.kinematics.link_poses(q, bench.scene.robot.tracked_links)
-    with bench.reference(bench.scene, bench.NUM_WORLDS, bench.object_index) as reference:
+    with bench.reference(bench.scene, bench.which) as reference:
         pos_there, quat_there = links_of(reference)
     return {
         "pos against the URDF": pos - poses[..., :3, 3],
@@ -126,7 +126,7 @@ def joint_tracking(bench: Bench) -> Measured:
 
 
 def effort_limit(bench: Bench) -> Measured:
-    """Step every joint with an effort limit of 30 % of what its drive asks for, and compare with the reference engine."""
+    """Step every joint with an effort limit of 30 % of what its drive asks for; compare with the reference engine."""
     scene = without_collisions(bench.scene)
     _, way = _alone(bench, scene)
     weak = []
@@ -147,7 +147,7 @@ def _alone(bench: Bench, scene: SceneSpec) -> tuple[State, Tensor]:
     way = torch.where(slides, _SLIDE_WAY, _WAY).double().minimum(0.3 * (upper - lower))
     home = torch.as_tensor(scene.robot.home)
     middle = torch.minimum(torch.maximum(home, lower + 1.5 * way), upper - 1.5 * way)
-    start = bench.placed(State.initial(scene, torch.zeros(len(slides), dtype=torch.long)))
+    start = bench.initial(scene, [0] * len(slides))
     start.joint_pos.diagonal().copy_(middle.float())
     return replace_fields(start, joint_target=start.joint_pos), way.float()
 
@@ -158,14 +158,14 @@ def _against_reference(bench: Bench, scene: SceneSpec, signals: dict[str, Tensor
     A slide's path counts in proportion to its way, as if that were 0.2 rad.
     """
     start, way = _alone(bench, scene)
-    which = torch.zeros(len(way), dtype=torch.long)
+    which = [0] * len(way)
 
     def paths(worlds: Worlds) -> list[Tensor]:
         return [_path(worlds, start, way, signal, scene.substeps) for signal in signals.values()]
 
-    with bench.other(scene, len(way), which) as worlds:
+    with bench.other(scene, which) as worlds:
         found = paths(worlds)
-    with bench.reference(scene, len(way), which) as reference:
+    with bench.reference(scene, which) as reference:
         expected = paths(reference)
     errors = {}
     for signal, path, path_there in zip(signals, found, expected, strict=True):
@@ -174,10 +174,8 @@ def _against_reference(bench: Bench, scene: SceneSpec, signals: dict[str, Tensor
             mine = [i for i, joint in enumerate(scene.robot.joints) if joint.group == group]
             if mine:
                 names = [scene.robot.joints[i].name for i in mine]
-                rms = off.square().mean(dim=0).sqrt()[mine].tolist()
-                peak = off.abs().amax(dim=0)[mine].tolist()
-                errors[f"{group}, {signal}, rms"] = zip(names, rms, strict=True)
-                errors[f"{group}, {signal}, peak"] = zip(names, peak, strict=True)
+                errors[f"{group}, {signal}, rms"] = named(names, off.square().mean(dim=0).sqrt()[mine])
+                errors[f"{group}, {signal}, peak"] = named(names, off.abs().amax(dim=0)[mine])
     return errors
 
 
@@ -233,9 +231,9 @@ def drive_scale(bench: Bench) -> Measured:
     scene = without_collisions(bench.scene)
     scales = torch.tensor(_DRIVE_SCALES)
     count = len(scales)
-    which = torch.zeros(count, dtype=torch.long)
+    which = [0] * count
     _, way = _alone(bench, scene)
-    start = bench.placed(State.initial(scene, which))
+    start = bench.initial(scene, which)
     limits = bench.kinematics
     target = (start.joint_pos + way).minimum(limits.upper.float()).maximum(limits.lower.float())
     factors = scales[:, :, None].expand(count, 3, len(scene.robot.joints))
@@ -257,9 +255,9 @@ def drive_scale(bench: Bench) -> Measured:
             scaled = replace(drive, kp=stiffness * drive.kp, kd=damping * drive.kd, effort=effort * drive.effort)
             joints.append(replace(joint, drive=scaled))
         built = replace(scene, robot=replace(scene.robot, joints=tuple(joints)))
-        with bench.other(built, 1, which[:1]) as worlds:
+        with bench.other(built) as worlds:
             expected.append(path(worlds, slice(i, i + 1)))
-    with bench.other(scene, count, which) as worlds:
+    with bench.other(scene, which) as worlds:
         worlds.set_parameter("drives", factors)
         at_once = path(worlds, slice(None))
         worlds.set_parameter("drives", factors.flip(0))
@@ -288,7 +286,7 @@ def joint_limits(bench: Bench) -> Measured:
     names = scene.robot.joint_names
     start, way = _alone(bench, scene)
     errors = {}
-    with bench.other(scene, len(way), torch.zeros(len(way), dtype=torch.long)) as worlds:
+    with bench.other(scene, [0] * len(way)) as worlds:
         for name, limit, side in (("upper", kinematics.upper.float(), 1.0), ("lower", kinematics.lower.float(), -1.0)):
             limited = limit.isfinite()
             if not limited.any():
@@ -300,7 +298,7 @@ def joint_limits(bench: Bench) -> Measured:
             sent.joint_target.diagonal().copy_(target)
             end = worlds.advance(sent, round(1.0 / scene.timestep)).joint_pos.diagonal()
             off = ((end - limit).abs() / way).where(limited, torch.tensor(0.0))
-            errors[f"way off the {name} limit"] = zip(names, off.tolist(), strict=True)
+            errors[f"way off the {name} limit"] = named(names, off)
     if not errors:
         raise Skipped("no joint of this robot has limits")
     return errors
@@ -317,10 +315,10 @@ def gravity_compensation(bench: Bench) -> Measured:
     q = lower + (upper - lower) * share
     q[0] = torch.as_tensor(scene.robot.home)
     start = replace_fields(bench.start(), joint_pos=q, joint_target=q)
-    with bench.other(scene, bench.NUM_WORLDS, bench.object_index) as worlds:
+    with bench.other(scene, bench.which) as worlds:
         end = worlds.advance(start, round(2.0 / scene.timestep))
     off = (end.joint_pos - start.joint_pos).abs().amax(dim=0)
-    return {"sag": zip(scene.robot.joint_names, off.tolist(), strict=True)}
+    return {"sag": named(scene.robot.joint_names, off)}
 
 
 def own_weight(bench: Bench) -> Measured:
@@ -331,7 +329,7 @@ def own_weight(bench: Bench) -> Measured:
     scene = without_collisions(replace(bench.scene, robot=replace(bench.scene.robot, gravity_compensated=False)))
     kinematics = bench.kinematics
     start = bench.start()
-    with bench.other(scene, bench.NUM_WORLDS, bench.object_index) as worlds:
+    with bench.other(scene, bench.which) as worlds:
         worlds.set_parameter("object_gravity", torch.tensor([0.0, 0.5, 1.0, 0.25]))
         q = worlds.advance(start, round(2.0 / scene.timestep)).joint_pos.double()
     links = [kinematics.tree.link(name) for name in kinematics.link_names]

@@ -27,7 +27,7 @@ def gripper() -> RobotSpec:
 
 @cache
 def objects() -> tuple[ObjectSpec, ...]:
-    """Return a brick (a box), a can (a cylinder) and a bracket (two hulls), with centres of mass off the mesh origin."""
+    """Return a brick (a box), a can (a cylinder) and a bracket (two hulls); no centre of mass is at the mesh origin."""
     brick = shape("box", (0.02, 0.03, 0.025), (0.01, 0.005, -0.004), yaw=0.3)
     can = shape("cylinder", (0.033, 0.05), (0.0, 0.0, 0.01))
     foot = shape("hull", (0.05, 0.02, 0.01), (0.0, 0.0, -0.02))

@@ -25,7 +25,7 @@ from xreset.spec import SceneSpec
 def state_round_trip(bench: Bench) -> Measured:
     """Set a random state in every world and read it back."""
     worlds = bench.worlds()
-    state = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=1)
+    state = bench.random_state(seed=1)
     worlds.set(state)
     return state_errors(worlds.state(), state)
 
@@ -33,7 +33,7 @@ def state_round_trip(bench: Bench) -> Measured:
 def links_after_set(bench: Bench) -> Measured:
     """Set a random state and compare the tracked links with the URDF's kinematics, without a step."""
     worlds = bench.worlds()
-    state = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=2)
+    state = bench.random_state(seed=2)
     worlds.set(state)
     return _link_errors(bench.kinematics, state, worlds.links())
 
@@ -51,7 +51,7 @@ def mimic_joints(bench: Bench) -> Measured:
     if not which:
         raise Skipped("no tracked link of this robot is moved by a mimic joint")
     worlds = bench.worlds()
-    state = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=10)
+    state = bench.random_state(seed=10)
     worlds.set(state)
     errors = {}
     for what, error in _link_errors(bench.kinematics, state, worlds.links(), which).items():
@@ -66,14 +66,14 @@ def joint_order(bench: Bench) -> Measured:
     scene = reorder_joints(bench.scene)
     kinematics = Kinematics(scene.robot)
     count = len(scene.robot.joints)
-    which = torch.zeros(count, dtype=torch.long)
-    with bench.other(scene, count, which) as worlds:
+    which = [0] * count
+    with bench.other(scene, which) as worlds:
         state = random_state(bench, scene, count, seed=3)
         worlds.set(state)
         links = _link_errors(kinematics, state, worlds.links())
         found = state_errors(worlds.state(), state)
 
-        start = bench.placed(State.initial(scene, which))
+        start = bench.initial(scene, which)
         motion = small_motion(kinematics)
         worlds.set(start)
         worlds.set_targets(start.joint_pos + torch.diag(motion))  # world i moves joint i

@@ -1,4 +1,4 @@
-"""Checks of worlds as such: nothing of the past stays, none influences another, the same input gives the same output."""
+"""Checks of worlds as such: nothing of the past stays, none influences another, and results repeat."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from torch import Tensor
 from xreset.backends.conformance.harness import (
     Bench,
     Worlds,
-    random_state,
     replace_fields,
     small_motion,
     state_errors,
@@ -20,7 +19,7 @@ from xreset.physics import Parameter, State
 
 
 def nothing_stays(bench: Bench) -> Measured:
-    """Disturb one world, then set it and a calm one with the same object to the same state: they must continue alike."""
+    """Disturb one world, then set it and a calm one with the same object to one state: both must continue alike."""
     worlds = bench.worlds()
     disturbed, calm = bench.twins
     start = bench.start()
@@ -40,9 +39,9 @@ def nothing_stays(bench: Bench) -> Measured:
 
 
 def selected_worlds(bench: Bench) -> Measured:
-    """Set two worlds, in descending order, during a motion: they have the new state, the others continue undisturbed."""
-    new = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=4)
-    start = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=5)
+    """Set two worlds, in descending order, during a motion: they have the new state, the others continue."""
+    new = bench.random_state(seed=4)
+    start = bench.random_state(seed=5)
     chosen = [3, 1]
     rest = [0, 2]
 
@@ -67,7 +66,7 @@ def selected_worlds(bench: Bench) -> Measured:
 def worlds_independent(bench: Bench) -> Measured:
     """Run twice, the second time with one world quite different: the others must not notice."""
     state = bench.start()
-    wild = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=6)
+    wild = bench.random_state(seed=6)
     others = [0, 2, 3]
     disturbed = bench.worlds().advance(state.with_rows([1], wild), 32)
     calm = bench.worlds().advance(state, 32)
@@ -85,9 +84,8 @@ def objects_in_a_batch(bench: Bench) -> Measured:
     together, forces = drop(bench.worlds(), bench.start())
     errors = {}
     for i, thing in enumerate(bench.scene.objects):
-        which = torch.tensor([i])
-        with bench.other(bench.scene, 1, which) as alone:
-            state, force = drop(alone, bench.placed(State.initial(bench.scene, which)))
+        with bench.other(bench.scene, [i]) as alone:
+            state, force = drop(alone, bench.initial(bench.scene, [i]))
         difference = state_errors(together[[i]], state)
         errors[f"pos of {thing.name}"] = difference["object_pos"]
         errors[f"quat of {thing.name}"] = difference["object_quat"]
@@ -107,13 +105,13 @@ def repeatable(bench: Bench) -> Measured:
 
     The shared worlds will not do: the masses that another check has put back in them are rounded to single precision.
     """
-    with bench.other(bench.scene, bench.NUM_WORLDS, bench.object_index) as worlds:
+    with bench.other(bench.scene, bench.which) as worlds:
         if worlds.backend.device.type != "cpu":
             raise Skipped("only CPUs add numbers in the same order every time")
         first = _busy(bench, worlds)
-        worlds.advance(random_state(bench, bench.scene, bench.NUM_WORLDS, seed=9), 30)
+        worlds.advance(bench.random_state(seed=9), 30)
         again = _busy(bench, worlds)
-    with bench.other(bench.scene, bench.NUM_WORLDS, bench.object_index) as new:
+    with bench.other(bench.scene, bench.which) as new:
         in_new_worlds = _busy(bench, new)
     return {**state_errors(again, first, "again,"), **state_errors(in_new_worlds, first, "newly built,")}
 
@@ -121,8 +119,8 @@ def repeatable(bench: Bench) -> Measured:
 def masked_set(bench: Bench) -> Measured:
     """Set state and parameters of the worlds of a mask during a motion: the same as with the single setters."""
     chosen = [3, 1]
-    start = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=12)
-    new = random_state(bench, bench.scene, bench.NUM_WORLDS, seed=11)
+    start = bench.random_state(seed=12)
+    new = bench.random_state(seed=11)
     scale = torch.tensor([2.0, 0.5, 1.5, 0.7])
     parameters: dict[Parameter, Tensor] = {
         "object_mass": bench.masses * scale,

@@ -1,13 +1,14 @@
-"""Write the ``robot.urdf`` of a built-in robot from the figures in its ``build.toml``: ``python -m xreset.robots.build FOLDER``.
+"""Write the ``robot.urdf`` of a built-in robot from the figures in its ``build.toml``: ``python -m xreset.robots.build
+FOLDER``.
 
 ``build.toml`` names its sources. Units are m, rad, kg, N and N m; quaternions are (w, x, y, z).
 
-- ``base`` and ``palm`` are links, ``arm`` and ``hand`` are links with the joint before them. Each link of the arm carries the next one,
-  the last one carries the palm.
-- ``inertia`` is about the center of mass: three principal moments, or ixx ixy ixz iyy iyz izz. ``inertia_rpy`` and ``inertia_quat`` turn
-  its axes.
-- ``rotor`` is added to the diagonal of each moving link of the hand. Makers state it as armature of the joint, or not at all; not every
-  engine has armature, but the inertia of a link means the same in all of them.
+- ``base`` and ``palm`` are links, ``arm`` and ``hand`` are links with the joint before them. Each link of the arm
+  carries the next one, the last one carries the palm.
+- ``inertia`` is about the center of mass: three principal moments, or ixx ixy ixz iyy iyz izz. ``inertia_rpy`` and
+  ``inertia_quat`` turn its axes.
+- ``rotor`` is added to the diagonal of each moving link of the hand. Makers state it as armature of the joint, or not
+  at all; not every engine has armature, but the inertia of a link means the same in all of them.
 - ``shapes`` are boxes (edge lengths, center) and cylinders and capsules (ends of the axis, radius).
 - ``frames`` are links without shapes.
 """

@@ -10,15 +10,16 @@ import torch
 class GraphRunner:
     """Calls functions that read and write fixed tensors; on a GPU each is captured once and replayed from then on.
 
-    Such a function takes no arguments, keeps every tensor that lives on between calls where it is (writes in place), never waits for the
-    GPU, and queues the same operations every time. On a CPU it is simply called.
+    Such a function takes no arguments, keeps every tensor that lives on between calls where it is (writes in place),
+    never waits for the GPU, and queues the same operations every time. On a CPU it is simply called.
     """
 
     WARM_UP = 2
     """Plain calls before a function is captured: libraries allocate and choose kernels at first."""
 
     def __init__(self, device: torch.device, generator: torch.Generator | None = None) -> None:
-        """Prepare for a device; the functions may draw from ``generator`` and from torch's own, which move on at every replay."""
+        """Prepare for a device; the functions may draw from ``generator`` and from torch's own, which move on at every
+        replay."""
         self.active = device.type == "cuda"
         self._generator = generator
         self._stream = torch.cuda.Stream(device) if self.active else None
@@ -34,7 +35,8 @@ class GraphRunner:
         if name not in self._graphs:
             self._calls[name] = self._calls.get(name, 0) + 1
             if self._calls[name] <= self.WARM_UP:
-                # on the stream that will be captured: there autograd's nodes that outlive a call expect to be called again
+                # on the stream that will be captured: there autograd's nodes that outlive a call expect
+                # to be called again
                 self._stream.wait_stream(torch.cuda.current_stream())
                 with torch.cuda.stream(self._stream):
                     function()

@@ -1,7 +1,7 @@
 """Typed dataclasses: rules for the values of their fields, and strict reading from JSON and TOML.
 
-A rule is part of a field's annotation, as in ``width: Positive[float] = 0.1``. A number that makes no sense is refused when a
-configuration is made, instead of turning into NaN some minutes later.
+A rule is part of a field's annotation, as in ``width: Positive[float] = 0.1``. A number that makes no sense is refused
+when a configuration is made, instead of turning into NaN some minutes later.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ class Only:
 
 
 class Checked:
-    """Base of dataclasses that obey the rules of their fields: making one that does not raises ``ValueError``, which names every field."""
+    """Base of dataclasses that obey the rules of their fields: making one that does not raises ``ValueError``, which
+    names every field."""
 
     def __post_init__(self) -> None:
         wrong = []
@@ -111,13 +112,14 @@ def _is_union(hint: Any) -> bool:
 
 
 def is_rigid(T: np.ndarray) -> bool:
-    """Return whether a matrix [4, 4] is a rotation and a translation: right-handed, without scale, to three digits as people write them."""
+    """Return whether a matrix [4, 4] is a rotation and a translation: right-handed, without scale, to three digits as
+    people write them."""
     R = T[:3, :3]
     is_orthogonal = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=2e-3)
     return bool(is_orthogonal and np.array_equal(T[3], (0, 0, 0, 1)) and np.linalg.det(R) > 0)
 
 
-# Reading from JSON and TOML --------------------------------------------------------------------------------------------------------------
+# Reading from JSON and TOML -------------------------------------------------------------------------------------------
 
 _LARGEST = 2**63 - 1
 
@@ -125,9 +127,9 @@ _LARGEST = 2**63 - 1
 def from_dict(cls: type[T], data: Any, where: str = "configuration") -> T:
     """Build a dataclass from nested dictionaries, as :func:`dataclasses.asdict` and JSON make them.
 
-    A missing entry takes its default, so files stay readable when a field is added: its default must be what was done before.
-    A class may list the fields that it no longer has, with the values that mean what is done now: ``REMOVED: ClassVar[dict[str, Any]]``.
-    Entries with these values are ignored.
+    A missing entry takes its default, so files stay readable when a field is added: its default must be what was done
+    before. A class may list the fields that it no longer has, with the values that mean what is done now: ``REMOVED:
+    ClassVar[dict[str, Any]]``. Entries with these values are ignored.
 
     Raises:
         FileFormatError: names every entry that is unknown, missing, of the wrong type or out of range.

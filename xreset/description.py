@@ -1,8 +1,9 @@
 """Reads the description of a robot, ``robot.toml``.
 
-A robot is a folder with a ``robot.toml`` and the URDF that it names. A package registers such a folder with an entry point of the group
-``xreset.robots`` whose value is the module in the folder: ``my-robot = "my_package.my_robot"``. The built-in robots are listed in
-``pyproject.toml`` in the same way, and their ``robot.toml`` are commented examples of the format.
+A robot is a folder with a ``robot.toml`` and the URDF that it names. A package registers such a folder with an entry
+point of the group ``xreset.robots`` whose value is the module in the folder: ``my-robot = "my_package.my_robot"``. The
+built-in robots are listed in ``pyproject.toml`` in the same way, and their ``robot.toml`` are commented examples of the
+format.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ def load_robot(name_or_folder: str | Path) -> RobotSpec:
         name_or_folder: a registered name, or a folder with a ``robot.toml``.
 
     Raises:
-        RobotError: the robot is unknown, or its description is wrong; the message lists everything that is wrong. Whether the URDF has the
-            named links and joints is found by :func:`xreset.robot_tools.check.check`.
+        RobotError: the robot is unknown, or its description is wrong; the message lists everything that is wrong.
+            Whether the URDF has the named links and joints is found by :func:`xreset.robot_tools.check.check`.
     """
     return read_description(robot_folder(name_or_folder) / DESCRIPTION)
 
@@ -62,7 +63,7 @@ def read_description(path: Path) -> RobotSpec:
     raise RobotError(f"{path} is wrong in {len(problems)} {noun}:{listed}")
 
 
-# The format ------------------------------------------------------------------------------------------------------------------------------
+# The format -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,7 +46,8 @@ class RunError(XResetError):
 
 @contextmanager
 def needs(package: str, extra: str, error: type[XResetError] = XResetError) -> Iterator[None]:
-    """Around the import of a package that not every installation has: where it fails, says which extra of xreset brings it."""
+    """Around the import of a package that not every installation has: where it fails, says which extra of xreset brings
+    it."""
     try:
         yield
     except ImportError as problem:

@@ -1,4 +1,5 @@
-"""Worlds that broke: what they were like before, what was asked of them and what came of it, so that it can be looked into."""
+"""Worlds that broke: what they were like before, what was asked of them and what came of it, so that it can be looked
+into."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from torch import Tensor
 
 
 class FaultRecorder:
-    """Keeps the last :attr:`CAPACITY` faults on the device; nothing waits for them, so that a GPU can replay it as part of a graph."""
+    """Keeps the last :attr:`CAPACITY` faults on the device; nothing waits for them, so that a GPU can replay it as part
+    of a graph."""
 
     CAPACITY = 256
 

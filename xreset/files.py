@@ -26,7 +26,8 @@ RAISE_LIMIT = "If it is what you expect, raise the limit: set XRESET_MAX_FILE_MB
 
 
 def max_bytes() -> int:
-    """Most memory that the arrays of a file may take: 1 GiB, or ``XRESET_MAX_FILE_MB``. Small files can unpack to any size."""
+    """Most memory that the arrays of a file may take: 1 GiB, or ``XRESET_MAX_FILE_MB``. Small files can unpack to any
+    size."""
     text = os.environ.get("XRESET_MAX_FILE_MB", "1024")
     if not text.isdecimal():
         raise XResetError(f"XRESET_MAX_FILE_MB is {text!r}, expected a whole number of megabytes.")
@@ -38,7 +39,8 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
     """Open a temporary file that replaces ``path`` when the block ends, and is removed if the block raises.
 
     Raises:
-        XResetError: the file cannot be written (no such folder, no permission, disk full); ``path`` is then as it was before.
+        XResetError: the file cannot be written (no such folder, no permission, disk full); ``path`` is then as it was
+            before.
     """
     path = Path(path)
     try:
@@ -111,7 +113,8 @@ def _remove(path: Path) -> None:
 
 @contextmanager
 def claim(path: str | Path) -> Iterator[None]:
-    """Reserve a file, or an existing folder, for this process while the block runs, and remove what killed processes have left there.
+    """Reserve a file, or an existing folder, for this process while the block runs, and remove what killed processes
+    have left there.
 
     Raises:
         XResetError: another command is writing it.
@@ -166,7 +169,8 @@ def is_claimed(folder: Path) -> bool:
 
 
 def _patient_lock(path: Path) -> int | None:
-    """Lock a folder, or a file that is made for this; try for a quarter of a second, because :func:`is_claimed` locks for a moment."""
+    """Lock a folder, or a file that is made for this; try for a quarter of a second, because :func:`is_claimed` locks
+    for a moment."""
     for _ in range(5):
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.is_dir():
@@ -227,7 +231,8 @@ def read_json(path: str | Path, schema: str | None = None) -> dict[str, Any]:
 def read_toml(
     path: Path, schema: str | None = None, *, error: type[XResetError] = FileFormatError, hint: str = ""
 ) -> dict[str, Any]:
-    """Read a TOML file; with ``schema``, its ``schema`` entry must be that. ``hint``: what to say where it cannot be read.
+    """Read a TOML file; with ``schema``, its ``schema`` entry must be that. ``hint``: what to say where it cannot be
+    read.
 
     Raises:
         XResetError: it cannot be read, is no TOML, or states another schema; of the kind ``error``.
@@ -247,7 +252,8 @@ def parse_json(text: str | bytes) -> dict[str, Any]:
     """A JSON object whose numbers are finite and whose texts can be printed.
 
     Raises:
-        ValueError: it is none, or nested too deeply, or holds a number of thousands of digits; says so in half a sentence.
+        ValueError: it is none, or nested too deeply, or holds a number of thousands of digits; says so in half a
+            sentence.
     """
     try:
         text = text.decode() if isinstance(text, bytes) else text
@@ -306,7 +312,8 @@ def check_schema(path: Path, found: Any, expected: str) -> None:
     name, _, version = expected.rpartition("/")
     if isinstance(found, str) and found.rpartition("/")[0] == name:
         raise FileFormatError(
-            f"{path} has schema version {shown(found)}; this xreset ({__version__}) reads {expected!r}. Make the file again."
+            f"{path} has schema version {shown(found)}; this xreset ({__version__}) reads {expected!r}. Make the file "
+            "again."
         )
     stated = f"states schema {shown(found)}" if found else "states no schema"
     raise FileFormatError(

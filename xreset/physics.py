@@ -1,7 +1,8 @@
 """The physics interface: state in, state out. No reward, no observation, no viewer.
 
-Shape letters: N worlds, M selected worlds, J actuated joints, E fingertips, K = 1 + E tracked links (the palm, then the fingertips).
-Tensors are float32 on the backend's device. World frame, SI units, quaternions (w, x, y, z), joint order of ``scene.robot.joints``.
+Shape letters: N worlds, M selected worlds, J actuated joints, E fingertips, K = 1 + E tracked links (the palm, then the
+fingertips). Tensors are float32 on the backend's device. World frame, SI units, quaternions (w, x, y, z), joint order
+of ``scene.robot.joints``.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ Parameter = Literal[
 ]
 """A physical parameter with a value per world, set by ``Backend.set_...``."""
 Capability = Literal[Parameter, "object_wrench", "overflow", "mass_properties"]
-"""What some backends cannot do: set a parameter per world, apply a wrench, count overflows, read back masses, centers of mass and inertias."""
+"""What some backends cannot do: set a parameter per world, apply a wrench, count overflows, read back masses, centers
+of mass and inertias."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +67,8 @@ class State(Tensors):
 
     @classmethod
     def initial(cls, scene: SceneSpec, object_index: Tensor) -> Self:
-        """Return the first state of worlds with these objects [N]: nothing moves, the robot at home, the object upright in the table's middle."""
+        """Return the first state of worlds with these objects [N]: nothing moves, the robot at home, the object upright
+        in the table's middle."""
         places = torch.tensor([(*scene.table.center, -lowest_point(spec.pieces)) for spec in scene.objects])
         home = torch.as_tensor(scene.robot.home).repeat(len(object_index), 1)
         upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(object_index), 1)
@@ -134,7 +137,8 @@ class Health(Tensors):
 
 @dataclass(frozen=True, kw_only=True)
 class MassProperties(Tensors):
-    """What the engine itself holds of the bodies that move: B of the robot (links fixed to one another are one), then the object.
+    """What the engine itself holds of the bodies that move: B of the robot (links fixed to one another are one), then
+    the object.
 
     The robot's bodies are in the order of :func:`xreset.backends.rigid.mechanism`, without the base.
     """
@@ -172,8 +176,10 @@ class Backend(ABC):
     Contracts that the conformance suite checks:
 
     - After :meth:`set_state`, :meth:`state` and :meth:`links` report it at once, without a step.
-    - Tensors that a getter returns are snapshots, or views that are valid until the next call that changes the worlds; they are read-only.
-    - A joint target stays until it is replaced. Drives, joint limits, dry friction and armature are as the robot spec says.
+    - Tensors that a getter returns are snapshots, or views that are valid until the next call that changes the worlds;
+      they are read-only.
+    - A joint target stays until it is replaced. Drives, joint limits, dry friction and armature are as the robot spec
+      says.
     - Mimic joints follow their source, and are set with it.
     - Worlds never influence one another.
     """
@@ -188,10 +194,12 @@ class Backend(ABC):
     def __init__(
         self, scene: SceneSpec, num_worlds: int, *, object_index: Tensor | None = None, device: str = "cpu"
     ) -> None:
-        """Build the worlds; every world starts with the robot at home and its object at rest height at the table's centre.
+        """Build the worlds; every world starts with the robot at home and its object at rest height at the table's
+        centre.
 
         Args:
-            object_index: [N] which of ``scene.objects`` each world holds; default: world i holds object i modulo their number.
+            object_index: [N] which of ``scene.objects`` each world holds; default: world i holds object i modulo their
+                number.
             device: ``cpu`` or ``cuda[:i]``.
         """
         if num_worlds < 1:
@@ -209,19 +217,20 @@ class Backend(ABC):
         ):
             raise ValueError(f"object_index must be [{num_worlds}] indices below {len(scene.objects)}")
 
-    # Availability ----------------------------------------------------------------------------------------------------------------
+    # Availability ----------------------------------------------------------------------------------------------------
 
     @classmethod
     @abstractmethod
     def engine_version(cls) -> str:
-        """Version of the engine; ``BackendUnavailableError`` with reason and remedy if it cannot be imported or used here."""
+        """Version of the engine; ``BackendUnavailableError`` with reason and remedy if it cannot be imported or used
+        here."""
 
     @classmethod
     def devices(cls) -> list[str]:
         """Kinds of devices that can be used here, the best first: ``cuda``, ``cpu``."""
         return ["cpu"]
 
-    # State -----------------------------------------------------------------------------------------------------------------------
+    # State -----------------------------------------------------------------------------------------------------------
 
     @abstractmethod
     def set_state(self, state: State, worlds: Tensor | None = None) -> None:
@@ -244,7 +253,7 @@ class Backend(ABC):
     def step(self, substeps: int | None = None) -> None:
         """Advance all worlds by that many physics steps (default: ``scene.substeps``, one control step)."""
 
-    # Readings --------------------------------------------------------------------------------------------------------------------
+    # Readings --------------------------------------------------------------------------------------------------------
 
     @abstractmethod
     def links(self) -> Links:
@@ -259,10 +268,11 @@ class Backend(ABC):
         """What went wrong since each world's state was last set."""
 
     def mass_properties(self) -> MassProperties:
-        """Masses, centres of mass and inertias read back from the engine; the present ones, of objects whose mass was set too."""
+        """Masses, centres of mass and inertias read back from the engine; the present ones, of objects whose mass was
+        set too."""
         raise CapabilityError(f"the backend {self.name!r} cannot read back mass properties: trust what the scene says.")
 
-    # Physical parameters: each stays through set_state, except the wrench; CapabilityError where the backend lacks it -----------------
+    # Physical parameters: each stays through set_state, except the wrench; CapabilityError where the backend lacks it
 
     def set_object_mass(self, mass: Tensor, worlds: Tensor | None = None) -> None:
         """Set the object's mass [M] kg; its inertia scales with it, its centre of mass stays."""
@@ -277,11 +287,13 @@ class Backend(ABC):
         self._set("torsional_friction", torsional, worlds)
 
     def set_object_inertia(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """Set the factor [M] on the object's inertia about its centre of mass, beside what its mass does; 1 is what the spec says."""
+        """Set the factor [M] on the object's inertia about its centre of mass, beside what its mass does; 1 is what the
+        spec says."""
         self._set("object_inertia", scale, worlds)
 
     def set_object_com(self, offset: Tensor, worlds: Tensor | None = None) -> None:
-        """Move the object's centre of mass by [M, 3] m from where its spec has it, in its mesh frame; its inertia about it stays.
+        """Move the object's centre of mass by [M, 3] m from where its spec has it, in its mesh frame; its inertia about
+        it stays.
 
         Of an object that moves, set the state anew.
         """
@@ -295,7 +307,8 @@ class Backend(ABC):
         self._set("object_gravity", fraction, worlds)
 
     def set_drives(self, scale: Tensor, worlds: Tensor | None = None) -> None:
-        """Set factors on the drives: [M, 3, J] of stiffness, damping and effort limit; 1 is what the robot spec says."""
+        """Set factors on the drives: [M, 3, J] of stiffness, damping and effort limit; 1 is what the robot spec
+        says."""
         self._set("drives", scale, worlds)
 
     @abstractmethod
@@ -305,13 +318,13 @@ class Backend(ABC):
         It stays until it is replaced, or the world's state is set.
         """
 
-    # Many worlds at once --------------------------------------------------------------------------------------------------------------
+    # Many worlds at once ---------------------------------------------------------------------------------------------
 
     def set_where(self, mask: Tensor, state: State, parameters: Parameters) -> None:
         """Set state and physical parameters of the worlds of a mask, as the single setters do.
 
-        Values are given for all worlds, and those outside the mask are ignored: a backend on a GPU overrides this so that nothing waits
-        for the number of worlds.
+        Values are given for all worlds, and those outside the mask are ignored: a backend on a GPU overrides this so
+        that nothing waits for the number of worlds.
 
         Args:
             mask: [N] bool.
@@ -325,7 +338,7 @@ class Backend(ABC):
             getattr(self, f"set_{name}")(value[worlds], worlds)
         self.set_state(state[worlds], worlds)
 
-    # The end ---------------------------------------------------------------------------------------------------------------------
+    # The end ---------------------------------------------------------------------------------------------------------
 
     @abstractmethod
     def close(self) -> None:
@@ -337,7 +350,7 @@ class Backend(ABC):
     def __exit__(self, *_) -> None:
         self.close()
 
-    # For implementers ------------------------------------------------------------------------------------------------------------
+    # For implementers ------------------------------------------------------------------------------------------------
 
     def _require(self, capability: Capability) -> None:
         """Raise the error that the contract asks for if a capability is missing."""

@@ -1,7 +1,8 @@
 """Plugins: which physics engines and robots there are, and which engines can be used here.
 
-A package makes an engine known with an entry point of the group :data:`ENGINES`, a robot with one of :data:`ROBOTS`; xreset's own are
-listed in ``pyproject.toml`` in the same way. A plugin that fails to load is named with its traceback, and harms no other.
+A package makes an engine known with an entry point of the group :data:`ENGINES`, a robot with one of :data:`ROBOTS`;
+xreset's own are listed in ``pyproject.toml`` in the same way. A plugin that fails to load is named with its traceback,
+and harms no other.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def known_plugins(group: str) -> str:
     return ", ".join(sorted(plugins(group))) or "none (is xreset installed? run: pip install -e .)"
 
 
-# Robots ----------------------------------------------------------------------------------------------------------------------------------
+# Robots ---------------------------------------------------------------------------------------------------------------
 
 
 def robot_names() -> list[str]:
@@ -87,7 +88,7 @@ def robot_folder(name_or_folder: str | Path) -> Path:
     return Path(module.__file__).resolve().parent
 
 
-# Engines ---------------------------------------------------------------------------------------------------------------------------------
+# Engines --------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """Arrays as files: npz with a schema and provenance, checked completely before use.
 
-Every file has ``schema`` (a name and version such as ``xreset-demos/1``) and, if xreset wrote it, ``meta``: a JSON text with the
-configuration that made it and the SHA-256 of its inputs. Arrays are never pickled. The same content gives the same bytes.
+Every file has ``schema`` (a name and version such as ``xreset-demos/1``) and, if xreset wrote it, ``meta``: a JSON text
+with the configuration that made it and the SHA-256 of its inputs. Arrays are never pickled. The same content gives the
+same bytes.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ class Field:
     """One array of a schema."""
 
     shape: tuple[str | int, ...]
-    """Shape letters (the same letter must have the same length in every field; ``"F+1"`` is one more than F) or fixed lengths."""
+    """Shape letters (the same letter must have the same length in every field; ``"F+1"`` is one more than F) or fixed
+    lengths."""
     kind: str
     """numpy kinds that are allowed: ``f`` float, ``i`` integer, ``b`` bool, ``U`` text."""
     required: bool = True
@@ -101,7 +103,8 @@ def read_npz(
         check: further check; returns a message if something is wrong.
 
     Returns:
-        The arrays of the schema by name (``meta`` too, as text array, if present): integers as int64, floats as native float32 or float64.
+        The arrays of the schema by name (``meta`` too, as text array, if present): integers as int64, floats as native
+        float32 or float64.
 
     Raises:
         FileFormatError: the file is damaged or does not match.
@@ -134,7 +137,8 @@ def read_npz(
 
 
 def read_arrays(path: str | Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read some arrays of numbers of a file that others made, which states no schema; sizes are checked before anything is unpacked.
+    """Read some arrays of numbers of a file that others made, which states no schema; sizes are checked before anything
+    is unpacked.
 
     Raises:
         FileFormatError: the file is damaged, too large, or lacks one of them.
@@ -299,7 +303,8 @@ def _wrong_value(arrays: Mapping[str, np.ndarray], schema: Schema) -> str | None
 
 
 def offsets_problem(arrays: Mapping[str, np.ndarray], frames: int) -> str | None:
-    """Return what is wrong with ``frame_offsets``, which say where each of the sequences ``sequence_name`` begins and ends; or with the names."""
+    """Return what is wrong with ``frame_offsets``, which say where each of the sequences ``sequence_name`` begins and
+    ends; or with the names."""
     offsets = arrays["frame_offsets"]
     names = arrays["sequence_name"]
     if not len(names):
@@ -321,12 +326,13 @@ def unique_problem(names: np.ndarray) -> str | None:
     return None
 
 
-# Dataclasses as files ---------------------------------------------------------------------------------------------------------------------
+# Dataclasses as files -------------------------------------------------------------------------------------------------
 
 
 @cache
 def schema_of(cls: type) -> Schema:
-    """Return the schema of a dataclass whose fields are annotated with what they are in the file: ``Annotated[np.ndarray, Field(...)]``.
+    """Return the schema of a dataclass whose fields are annotated with what they are in the file:
+    ``Annotated[np.ndarray, Field(...)]``.
 
     A field whose default is None may be missing.
     """
@@ -342,7 +348,8 @@ def schema_of(cls: type) -> Schema:
 
 
 def write_record(path: str | Path, schema_name: str, record: Any, **provenance: Any) -> None:
-    """Write a dataclass of :func:`schema_of`'s kind; fields that are None are left out. See :func:`write_npz` for ``provenance``."""
+    """Write a dataclass of :func:`schema_of`'s kind; fields that are None are left out. See :func:`write_npz` for
+    ``provenance``."""
     write_npz(path, schema_name, arrays_of(record), **provenance)
 
 

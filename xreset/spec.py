@@ -1,7 +1,7 @@
 """What a scene is made of: frozen data that says everything a physics engine needs, and nothing about any engine.
 
-SI units and radians. Quaternions are (w, x, y, z). ``T_a_b`` is the pose of b in a, a 4x4 matrix. The world frame has z up and the
-table's top at z = 0. Shape letters: J actuated joints, E fingertips.
+SI units and radians. Quaternions are (w, x, y, z). ``T_a_b`` is the pose of b in a, a 4x4 matrix. The world frame has z
+up and the table's top at z = 0. Shape letters: J actuated joints, E fingertips.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ GRAVITY = 9.81
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 KEYPOINTS = ("wrist", *(f"{finger}{i}" for finger in FINGERS for i in range(1, 5)))
-"""The 21 human hand keypoints in the order of the demonstrations: the wrist, then each finger from base (1) to tip (4)."""
+"""The 21 human hand keypoints in the order of the demonstrations: the wrist, then each finger from base (1) to tip
+(4)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +33,8 @@ class Geometry:
     kind: Literal["box", "sphere", "cylinder", "capsule", "hull"]
     """``hull`` is the convex hull of ``vertices``; cylinders and capsules lie along z."""
     size: tuple[float, ...] = ()
-    """box: the three half extents. sphere: radius. cylinder, capsule: radius, half length (of a capsule's cylindrical part)."""
+    """box: the three half extents. sphere: radius. cylinder, capsule: radius, half length (of a capsule's cylindrical
+    part)."""
     vertices: np.ndarray | None = None
     """[V, 3] hull vertices (``hull`` only)."""
     faces: np.ndarray | None = None
@@ -142,7 +144,8 @@ class RobotSpec:
     base_quat: tuple[float, float, float, float]
     """Orientation of the URDF's root link in the world (w, x, y, z)."""
     palm: str
-    """Link that stands for the hand: origin near the palm's centre, x towards the fingers, z out of the palm's inner side."""
+    """Link that stands for the hand: origin near the palm's centre, x towards the fingers, z out of the palm's inner
+    side."""
     fingertips: tuple[FingertipSpec, ...]
     """Fingertips, thumb first (length E)."""
     keypoints: tuple[KeypointSpec, ...]
@@ -164,7 +167,8 @@ class RobotSpec:
     meshes: tuple[Path, ...] = field(default=(), repr=False, compare=False)
     """Mesh files of the URDF's collision shapes."""
     like: str = field(default="", repr=False)
-    """Fingerprint of the robot that this one differs from in nothing but shapes, so that its policies play here; no part of its own."""
+    """Fingerprint of the robot that this one differs from in nothing but shapes, so that its policies play here; no
+    part of its own."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -198,10 +202,11 @@ class RobotSpec:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 over the description, the URDF and its meshes: equal where the robot is the same, wherever its files are.
+        """SHA-256 over the description, the URDF and its meshes: equal where the robot is the same, wherever its files
+        are.
 
-        Files hold it, so the text that is hashed must not change: a new field of a spec gets ``repr=False``, and enters the hash only
-        where it differs from its default.
+        Files hold it, so the text that is hashed must not change: a new field of a spec gets ``repr=False``, and enters
+        the hash only where it differs from its default.
         """
         description = repr(replace(self, urdf=Path(self.urdf.name)))
         digest = hashlib.sha256(description.encode() + self.urdf.read_bytes())

@@ -20,13 +20,15 @@ _REPR = _Repr()
 
 
 def shown(value: Any) -> str:
-    """A value as Python writes it, shortened: what a file holds may be of any size, or look small and unfold without end."""
+    """A value as Python writes it, shortened: what a file holds may be of any size, or look small and unfold without
+    end."""
     text = _REPR.repr(value)
     return text if len(text) <= 200 else f"{text[:160]}...{text[-30:]}"
 
 
 def is_plain(text: str) -> bool:
-    """Whether a text has only characters that can be seen, spaces and ends of lines; none that moves a cursor or turns a line round."""
+    """Whether a text has only characters that can be seen, spaces and ends of lines; none that moves a cursor or turns
+    a line round."""
     return text.isprintable() or all(c.isprintable() or c in "\n\t" for c in text)
 
 

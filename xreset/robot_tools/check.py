@@ -59,7 +59,8 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
     """Check everything that needs no engine.
 
     Returns:
-        The robot, or None if its description or its URDF cannot be read; and the findings, one ``ok`` for each topic without a problem.
+        The robot, or None if its description or its URDF cannot be read; and the findings, one ``ok`` for each topic
+        without a problem.
     """
     try:
         folder = robot_folder(name_or_folder)
@@ -100,7 +101,8 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
 
 
 def check_engine(spec: RobotSpec, backend: str) -> Finding:
-    """Build the robot in an engine, compare its link poses with xreset's own kinematics, and let it hold its home configuration."""
+    """Build the robot in an engine, compare its link poses with xreset's own kinematics, and let it hold its home
+    configuration."""
     topic = f"engine {backend}"
     try:
         with make_backend(backend, SceneSpec(robot=spec, objects=(_probe(),)), 1) as engine:
@@ -155,7 +157,7 @@ def _topic(topic: str, problems: Problems, otherwise: str) -> list[Finding]:
     return found or [Finding("ok", topic, otherwise)]
 
 
-# Description against URDF ----------------------------------------------------------------------------------------------------------------
+# Description against URDF ---------------------------------------------------------------------------------------------
 
 
 def _missing_meshes(urdf: Path) -> list[str]:
@@ -216,7 +218,8 @@ def _mimics(spec: RobotSpec, tree: RobotTree) -> Problems:
                 yield (
                     "error",
                     f"{mimic.joint!r} goes from {low:.4g} to {high:.4g} with {mimic.source!r}, beyond its own limits "
-                    f"{own.lower:.4g}..{own.upper:.4g}: the two would hold each other up. Widen its limits, or narrow those of the source.",
+                    f"{own.lower:.4g}..{own.upper:.4g}: the two would hold each other up. Widen its limits, or narrow "
+                    "those of the source.",
                 )
     for tag in tags.values():
         text = f"the URDF lets {tag.joint!r} mimic {tag.source!r}, but the description has no such entry in mimics."
@@ -268,7 +271,8 @@ def _inertias(tree: RobotTree) -> Problems:
     if at_joints:
         yield (
             "warning",
-            f"the centre of mass of {', '.join(at_joints)} lies in the joint, more than {1e3 * _OFF:.0f} mm from the middle of the link's "
+            f"the centre of mass of {', '.join(at_joints)} lies in the joint, more than {1e3 * _OFF:.0f} mm from the "
+            "middle of the link's "
             "shapes. Is it a placeholder?",
         )
     moved = {joint.child for joint in tree.joints if joint.type != "fixed"}
@@ -288,12 +292,14 @@ def _inertias(tree: RobotTree) -> Problems:
         elif moments[2] > (moments[0] + moments[1]) * (1 + _ROUNDING):
             yield (
                 "error",
-                f"{name!r} has the principal moments {listed} kg m^2: the largest exceeds the sum of the others, which no solid body has.",
+                f"{name!r} has the principal moments {listed} kg m^2: the largest exceeds the sum of the others, "
+                "which no solid body has.",
             )
         elif link.collisions and moments[2] > largest_moment(link):
             yield (
                 "warning",
-                f"{name!r} has a moment of {moments[2]:.3g} kg m^2; {link.mass:.3g} kg of its size can have {largest_moment(link):.2g} at "
+                f"{name!r} has a moment of {moments[2]:.3g} kg m^2; {link.mass:.3g} kg of its size can have "
+                f"{largest_moment(link):.2g} at "
                 "most. Is it a placeholder? `xreset robots import` replaces such.",
             )
 
@@ -304,7 +310,7 @@ def _off_middle(link: Link) -> float:
     return float(np.linalg.norm((vertices.min(axis=0) + vertices.max(axis=0)) / 2 - link.com))
 
 
-# Physics ---------------------------------------------------------------------------------------------------------------------------------
+# Physics --------------------------------------------------------------------------------------------------------------
 
 
 def _drives(spec: RobotSpec) -> Problems:
@@ -326,8 +332,10 @@ def _drives(spec: RobotSpec) -> Problems:
         if joint.drive.kd * step > inertia:
             yield (
                 "warning",
-                f"{joint.name!r}: kd = {joint.drive.kd:g} is too much for its inertia {inertia:.3g} at a step of 1/{1 / step:.0f} s; "
-                "engines that integrate drives explicitly become unstable. Lower kp and kd, or state the rotor as the joint's armature.",
+                f"{joint.name!r}: kd = {joint.drive.kd:g} is too much for its inertia {inertia:.3g} at a step of "
+                f"1/{1 / step:.0f} s; "
+                "engines that integrate drives explicitly become unstable. Lower kp and kd, or state the rotor as the "
+                "joint's armature.",
             )
 
 
@@ -347,7 +355,8 @@ def _frames(spec: RobotSpec) -> Problems:
 
 
 def _home(spec: RobotSpec) -> list[Finding]:
-    """Check home, and configurations spread around it as at the start of episodes, against the table and the robot itself."""
+    """Check home, and configurations spread around it as at the start of episodes, against the table and the robot
+    itself."""
     kinematics = Kinematics(spec)
     home = torch.tensor(spec.home)
     spread = torch.zeros_like(home)
@@ -395,7 +404,8 @@ def _free_of_itself(spec: RobotSpec, kinematics: Kinematics, q: torch.Tensor) ->
         if len(pairs) > _LISTED:
             often += f" and {len(pairs) - _LISTED} more pairs"
         text = (
-            f"{share:.0f} % of the spread around home touches itself: {often}; episodes that start so are pushed apart. "
+            f"{share:.0f} % of the spread around home touches itself: {often}; episodes that start so are pushed "
+            "apart. "
             "Move home away, spread less (home_std), or exclude what always meets."
         )
         found.append(Finding("warning", topic, text))
@@ -413,7 +423,8 @@ def _size(spec: RobotSpec) -> Finding:
         return Finding("skipped", "retargeting", str(error))
     balls = model.balls
     text = (
-        f"{len(balls.radii)} balls on {len(balls.links)} links of the hand, {len(balls.guards)} of them kept out of other links in"
+        f"{len(balls.radii)} balls on {len(balls.links)} links of the hand, {len(balls.guards)} of them kept out of "
+        "other links in"
         f" {len(balls.link_pairs) // 2} pairs of links; about {predicted_gigabytes(model):.1f} GB"
     )
     return Finding("ok", "retargeting", text)
@@ -455,4 +466,7 @@ def _does_not_hold(spec: RobotSpec, engine: Backend) -> str | None:
     if bool(torch.isfinite(away).all()) and float(away.max()) < _HOLD_TOLERANCE:
         return None
     joint = spec.joint_names[int(away.nan_to_num(torch.inf).argmax())]
-    return f"after {_HOLD_STEPS} control steps with home as the target {joint!r} is {float(away.max()):.3f} rad (m) away from it."
+    return (
+        f"after {_HOLD_STEPS} control steps with home as the target {joint!r} is {float(away.max()):.3f} rad (m) away "
+        "from it."
+    )

@@ -17,7 +17,8 @@ from xreset.geometry.urdf_writer import urdf_text, write_meshes
 from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
 
 _BASE = ((0.60, 1.00, 0.30), (0.7071068, 0.0, 0.0, -0.7071068))
-"""Where the arm stands until `robots place` finds better: behind the table, on the person's side, its x towards the table."""
+"""Where the arm stands until `robots place` finds better: behind the table, on the person's side, its x towards the
+table."""
 
 
 def moving(tree: RobotTree, mimics: Sequence[MimicSpec]) -> list[str]:

@@ -1,4 +1,5 @@
-"""Finds out from a hand's geometry which chain of links is which finger, where the palm looks, and which links follow which human keypoint."""
+"""Finds out from a hand's geometry which chain of links is which finger, where the palm looks, and which links follow
+which human keypoint."""
 
 from __future__ import annotations
 
@@ -19,9 +20,11 @@ _FINGERS = ("index", "middle", "ring", "little")
 _WORDS = {"index": ("index", "fore"), "middle": ("middle",), "ring": ("ring",), "little": ("little", "pinky")}
 """Words in the names of a finger's links and joints."""
 _HUMAN = (0.0, 0.45, 0.73)
-"""Positions of a human finger's joints between its first one and its tip: knuckle, middle joint, last joint (rounded averages)."""
+"""Positions of a human finger's joints between its first one and its tip: knuckle, middle joint, last joint (rounded
+averages)."""
 _BESIDE = 0.003
-"""[m] A joint's origin that is farther from the middle of the finger, along the joint's axis, gets a frame there for its keypoint."""
+"""[m] A joint's origin that is farther from the middle of the finger, along the joint's axis, gets a frame there for
+its keypoint."""
 _WRIST_BEHIND = 0.095
 """[m] The human wrist behind the knuckles."""
 _PALM_BEHIND = 0.04
@@ -52,7 +55,8 @@ def find_fingers(
     chains = _chains(tree, hand_root)
     if len(chains) < 2:
         raise RobotError(
-            f"below {hand_root!r} there are {len(chains)} chains of moving links, expected a thumb and at least one finger."
+            f"below {hand_root!r} there are {len(chains)} chains of moving links, expected a thumb and at least one "
+            "finger."
         )
     at = link_places(draft_spec(tree, mimics, hand_root, folder), {})
     bases = np.array([at[chain.links[0]][:3, 3] for chain in chains])
@@ -70,7 +74,8 @@ def find_fingers(
     else:
         first = _farthest_back(bases, ends)
         notes.append(
-            f"the thumb is the finger of {', '.join(chains[first].links)}: its base is farthest back (--thumb says another)"
+            f"the thumb is the finger of {', '.join(chains[first].links)}: its base is farthest back (--thumb says "
+            "another)"
         )
     others = [i for i in range(len(chains)) if i != first]
     named = {i: _finger_in(words[i]) for i in others}
@@ -125,7 +130,8 @@ def _finger_in(text: str) -> str:
 
 
 def _farthest_back(bases: np.ndarray, ends: np.ndarray) -> int:
-    """Return the index of the finger whose base is farthest behind the others', or of two the one that points elsewhere."""
+    """Return the index of the finger whose base is farthest behind the others', or of two the one that points
+    elsewhere."""
     directions = (ends - bases) / np.linalg.norm(ends - bases, axis=1, keepdims=True)
     scores = []
     for i in range(len(bases)):
@@ -140,7 +146,8 @@ def _farthest_back(bases: np.ndarray, ends: np.ndarray) -> int:
 def find_palm(
     tree: RobotTree, mimics: Sequence[MimicSpec], hand_root: str, fingers: list[Finger], folder: Path
 ) -> tuple[np.ndarray, Poses, dict[str, float]]:
-    """Return the palm's frame [4, 4] in the hand root's, poses of links with straight fingers, and how far each joint is bent at home [rad]."""
+    """Return the palm's frame [4, 4] in the hand root's, poses of links with straight fingers, and how far each joint
+    is bent at home [rad]."""
     spec = draft_spec(tree, mimics, hand_root, folder)
     straight = link_places(spec, {})
     bases = np.array([_on_axis(tree, finger.links[0], straight) for finger in fingers[1:]])
@@ -178,7 +185,8 @@ def find_palm(
 def with_frames(
     tree: RobotTree, hand_root: str, fingers: list[Finger], palm: np.ndarray, straight: Poses
 ) -> tuple[RobotTree, list[FingertipSpec], list[KeypointSpec]]:
-    """Return the tree with frames for palm, wrist and fingertips, the fingertips, and which link follows which human keypoint."""
+    """Return the tree with frames for palm, wrist and fingertips, the fingertips, and which link follows which human
+    keypoint."""
     wrist = palm.copy()
     wrist[:3, 3] -= (_WRIST_BEHIND - _PALM_BEHIND) * palm[:3, 0]
     frames = [("palm_frame", hand_root, palm), ("wrist_frame", hand_root, wrist)]
@@ -217,7 +225,8 @@ def with_frames(
 
 
 def _keypoint_joints(finger: Finger, joints: np.ndarray, end: np.ndarray) -> dict[str, int]:
-    """Return the index of the joint that is where a human finger's joint is, by keypoint; a joint serves once, and in order."""
+    """Return the index of the joint that is where a human finger's joint is, by keypoint; a joint serves once, and in
+    order."""
     steps = np.linalg.norm(np.diff([*joints, end], axis=0), axis=1)
     along = np.concatenate(([0.0], np.cumsum(steps)))
     share = along[:-1] / along[-1]
@@ -254,7 +263,8 @@ def _middle(points: np.ndarray) -> np.ndarray:
 
 
 def _end(tree: RobotTree, finger: Finger, at: Poses) -> np.ndarray:
-    """[3] the tip of a finger in the hand root's frame: a fixed link called so, or the point of its shapes farthest from its last joint."""
+    """[3] the tip of a finger in the hand root's frame: a fixed link called so, or the point of its shapes farthest
+    from its last joint."""
     last = finger.links[-1]
     for name in finger.rest:
         if "tip" in name.lower():
@@ -269,7 +279,8 @@ def _end(tree: RobotTree, finger: Finger, at: Poses) -> np.ndarray:
 
 
 def _on_axis(tree: RobotTree, link: str, at: Poses) -> np.ndarray:
-    """[3] the point of the axis before a link that is nearest to the middle of its shapes: makers put origins anywhere along an axis."""
+    """[3] the point of the axis before a link that is nearest to the middle of its shapes: makers put origins anywhere
+    along an axis."""
     cloud = _surface(tree, [link], at)
     if not len(cloud):
         return at[link][:3, 3]

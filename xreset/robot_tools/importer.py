@@ -1,8 +1,9 @@
-"""Makes a robot's folder from an arm and a hand as their makers publish them: ``robot.urdf``, its meshes and a commented ``robot.toml``.
+"""Makes a robot's folder from an arm and a hand as their makers publish them: ``robot.urdf``, its meshes and a
+commented ``robot.toml``.
 
-What the files do not say is guessed from the hand's geometry, and every guess is told: which chain of links is which finger, where the palm
-looks, which links follow which human keypoint, drives, home, and which links always touch. ``xreset robots check`` and a picture show
-whether the guesses are right.
+What the files do not say is guessed from the hand's geometry, and every guess is told: which chain of links is which
+finger, where the palm looks, which links follow which human keypoint, drives, home, and which links always touch.
+``xreset robots check`` and a picture show whether the guesses are right.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ from xreset.robot_tools.sources import Source, combined, read_source
 from xreset.spec import DriveSpec, RobotSpec, TableSpec
 
 _ROTOR = 1e-3
-"""[kg m^2] Rotor inertia on the diagonal of moving hand links where none is stated: finger links alone are too light for a step of
-1/240 s. The inertia of a link means the same in every engine, which armature does not (as in the built-in robots)."""
+"""[kg m^2] Rotor inertia on the diagonal of moving hand links where none is stated: finger links alone are too light
+for a step of 1/240 s. The inertia of a link means the same in every engine, which armature does not (as in the built-in
+robots)."""
 _ARMATURE = 0.1
 """[kg m^2] Rotor inertia of the arm's joints, as in the built-in robots."""
 _HAND_EFFORT = 1.0
@@ -77,8 +79,8 @@ def import_robot(
         out: folder to make; it appears whole or not at all.
         name: name of the robot; default: the folder's.
         flange: link of the arm that carries the hand; default: its last one.
-        offset: position of the hand's root link in the flange's frame [m]; default: the flange's origin, or as far along its z axis as
-            keeps the hand's body before the flange.
+        offset: position of the hand's root link in the flange's frame [m]; default: the flange's origin, or as far
+            along its z axis as keeps the hand's body before the flange.
         rpy: roll, pitch and yaw of the hand's root link about the flange's fixed axes [rad].
         thumb: a link or joint of the thumb, where names and geometry do not tell.
 
@@ -99,7 +101,8 @@ def import_robot(
     notes = list(whole.notes)
     if stand_off > 0:
         notes.append(
-            f"the hand's root lies {1e3 * stand_off:.0f} mm along z of {mount.parent!r}, so that its body begins there (--offset)"
+            f"the hand's root lies {1e3 * stand_off:.0f} mm along z of {mount.parent!r}, so that its body begins "
+            "there (--offset)"
         )
     hand_root = _carrier(whole.tree, mount.child)
     with atomic_folder(out) as work:
@@ -111,7 +114,8 @@ def import_robot(
 
 
 _TO_SAY = (
-    "whether each finger and the thumb are what they are called, and the palm looks where its z axis points (see the picture)",
+    "whether each finger and the thumb are what they are called, and the palm looks where its z axis points (see the "
+    "picture)",
     "efforts and gains of the drives, where the maker's figures are better than the rule",
     "where the base stands: xreset robots place FOLDER --demos DEMOS --write",
 )
@@ -202,7 +206,7 @@ def _with_rotors(source: Source, hand_root: str, notes: list[str]) -> RobotTree:
     return replace(source.tree, links=tuple(links))
 
 
-# Home, drives, collisions ----------------------------------------------------------------------------------------------------------------
+# Home, drives, collisions ---------------------------------------------------------------------------------------------
 
 
 def _with_arm_home(spec: RobotSpec, notes: list[str]) -> RobotSpec:
@@ -241,7 +245,8 @@ def _with_arm_home(spec: RobotSpec, notes: list[str]) -> RobotSpec:
     best = int(score.argmax())
     if not bool(reached[best]):
         notes.append(
-            "the arm does not reach over the table from where it stands: `xreset robots place` finds a better place and home"
+            "the arm does not reach over the table from where it stands: `xreset robots place` finds a better place "
+            "and home"
         )
     notes.append("home: the palm over the table, looking down; fingers bent a little")
     joints = []
@@ -281,7 +286,8 @@ def _with_drives(spec: RobotSpec, source: Source, notes: list[str]) -> RobotSpec
         damped.append(replace(joint, drive=replace(joint.drive, kd=float(f"{kd:.3g}"))))
     if without:
         notes.append(
-            f"no effort is stated for {', '.join(without)}; they get {_ARM_EFFORT:g} (arm) or {_HAND_EFFORT:g} N m (hand)"
+            f"no effort is stated for {', '.join(without)}; they get {_ARM_EFFORT:g} (arm) or {_HAND_EFFORT:g} N m "
+            "(hand)"
         )
     notes.append(
         "drives: kd = 1.8 sqrt(kp I) in the hand, critical in the arm, with the inertia I about the joint at home"

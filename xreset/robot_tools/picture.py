@@ -17,10 +17,11 @@ _PANEL = (480, 360)
 
 
 def robot_picture(robot: RobotSpec) -> np.ndarray:
-    """[720, 960, 3] uint8: above, the robot at its table, from the front and from the side; below, its hand from two sides.
+    """[720, 960, 3] uint8: above, the robot at its table, from the front and from the side; below, its hand from two
+    sides.
 
-    The wide views show the frames of the moving joints' links, the close ones those of the palm and the fingertips (left) and of the links
-    that follow the human's keypoints (right). x is red, y green, z blue.
+    The wide views show the frames of the moving joints' links, the close ones those of the palm and the fingertips
+    (left) and of the links that follow the human's keypoints (right). x is red, y green, z blue.
     """
     kinematics = Kinematics(robot)
     poses = kinematics.link_poses(torch.tensor(robot.home), robot.tracked_links).numpy()

@@ -1,9 +1,9 @@
 """Finds the base placement from which a robot's arm reaches most of what human hands did.
 
-Hand retargeting says where the hand root must be in every frame of some demonstrations. Candidates are drawn at random, then around the
-best of them (the cross-entropy method), and tried on single frames, from several starts: what the arm *can* reach. The few best, and the
-robot's own placement, then follow whole motions as in ``xreset retarget``, and the one that follows most wins. The number of processes
-does not change the result.
+Hand retargeting says where the hand root must be in every frame of some demonstrations. Candidates are drawn at random,
+then around the best of them (the cross-entropy method), and tried on single frames, from several starts: what the arm
+*can* reach. The few best, and the robot's own placement, then follow whole motions as in ``xreset retarget``, and the
+one that follows most wins. The number of processes does not change the result.
 
 Shape letters: F frames, n arm joints.
 """
@@ -181,7 +181,8 @@ def _mapper(trial: _Trial, processes: int) -> Iterator[Callable[..., Iterable[An
 def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: PlaceConfig, least: int = 0) -> Reach:
     """Return what the robot reaches of wrist poses [F, 1, ...] from a placement.
 
-    It is given up as soon as the first number of its rank must stay below ``least``; then all frames that were not tried count as reached.
+    It is given up as soon as the first number of its rank must stay below ``least``; then all frames that were not
+    tried count as reached.
     """
     model = ArmModel(_placed(robot, placement))
     thresholds = Thresholds(
@@ -208,7 +209,8 @@ def reach(robot: RobotSpec, placement: Placement, wrists: ArmTargets, config: Pl
 
 
 def single_frames(paths: list[ArmTargets], hand_error: float) -> ArmTargets:
-    """[F, 1, ...] the annotated frames of paths, each by itself, that hand retargeting follows within ``hand_error`` [m]."""
+    """[F, 1, ...] the annotated frames of paths, each by itself, that hand retargeting follows within ``hand_error``
+    [m]."""
     parts = [path[path.annotated & (path.hand_error <= hand_error)] for path in paths]
     return ArmTargets.cat(parts).map(lambda x: x[:, None])
 
@@ -249,14 +251,16 @@ def _candidates(
                 break
     if number == 0 and not candidates:
         raise RobotError(
-            f"robot {robot.name!r}: no place in the searched ranges is {config.clear:g} m away from all wrists and objects. "
+            f"robot {robot.name!r}: no place in the searched ranges is {config.clear:g} m away from all wrists and "
+            "objects. "
             "Lower --search.clear, or widen --search.x, --search.y or --search.z."
         )
     return candidates
 
 
 def _placement(parameters: np.ndarray) -> Placement:
-    """From (x, y, z, azimuth, tilt, spin): the base is spun about its z axis, which is tilted towards an azimuth; angles in degrees."""
+    """From (x, y, z, azimuth, tilt, spin): the base is spun about its z axis, which is tilted towards an azimuth;
+    angles in degrees."""
     turn = Rotation.from_euler("ZYZ", parameters[3:], degrees=True)
     quat = turn.as_quat(canonical=True, scalar_first=True)
     return Placement(pos=tuple(parameters[:3].tolist()), quat=tuple(quat.tolist()))
@@ -275,7 +279,8 @@ def _parameters(placement: Placement) -> np.ndarray:
 
 
 def _home(robot: RobotSpec, placement: Placement) -> np.ndarray | None:
-    """[n] arm joints near home, from a placement, that hold the hand where the robot's own placement and home hold it; or None."""
+    """[n] arm joints near home, from a placement, that hold the hand where the robot's own placement and home hold it;
+    or None."""
     own = ArmModel(robot)
     home = torch.as_tensor(robot.home)[None, None]
     root = own.kinematics.link_poses(home, [robot.hand_root])[..., 0, :, :]

@@ -1,4 +1,5 @@
-"""A robot's place in the world: what a search for it may vary, what it finds, and how that gets into the robot's description."""
+"""A robot's place in the world: what a search for it may vary, what it finds, and how that gets into the robot's
+description."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ class PlaceConfig:
     rounds: int = 5
     """Of candidates; 0 measures the description's own placement only."""
     elite: int = 5
-    """Best candidates: the next round is drawn around them, and in the end they and the description's own placement are the finalists."""
+    """Best candidates: the next round is drawn around them, and in the end they and the description's own placement are
+    the finalists."""
     position: float = 0.005
     """Largest distance of a reached hand root from its target [m]."""
     orientation: float = 5.0
@@ -61,7 +63,8 @@ class Reach:
     reached: float
     """Share of the frames within the tolerances, clear of table and self."""
     dexterity: float
-    """Mean over the reached frames of the smallest singular value of the hand root's Jacobian, lengths in units of 0.1 m; 0 is singular."""
+    """Mean over the reached frames of the smallest singular value of the hand root's Jacobian, lengths in units of 0.1
+    m; 0 is singular."""
 
     @property
     def rank(self) -> tuple[int, float]:
@@ -77,7 +80,8 @@ class Finalist:
     reach: Reach
     """On the final frames."""
     followed: float
-    """Share of all annotated frames that are valid when the arm follows the motions from frame to frame, as in ``xreset retarget``."""
+    """Share of all annotated frames that are valid when the arm follows the motions from frame to frame, as in ``xreset
+    retarget``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,17 +89,20 @@ class Search:
     """Result of :func:`xreset.robot_tools.place.place`."""
 
     best: Finalist
-    """The finalist that follows most. If possible, the arm can hold the hand from there where the description's home holds it."""
+    """The finalist that follows most. If possible, the arm can hold the hand from there where the description's home
+    holds it."""
     own: Finalist
     """The description's own placement."""
     home: np.ndarray | None
-    """[n] arm joints that hold the hand, from the best placement, where the description's home holds it; None: they cannot."""
+    """[n] arm joints that hold the hand, from the best placement, where the description's home holds it; None: they
+    cannot."""
     frames: int
     """Annotated frames of the motions."""
 
 
 def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) -> None:
-    """Put the placement found, its home configuration and its figures into a ``robot.toml``; all other lines stay as they are.
+    """Put the placement found, its home configuration and its figures into a ``robot.toml``; all other lines stay as
+    they are.
 
     Raises:
         RobotError: the file does not have the lines that would change, or there is no home to put there.
@@ -103,7 +110,8 @@ def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) 
     if search.home is None:
         raise RobotError(
             f"robot {robot.name!r}: from none of the best placements can the arm hold the hand where home holds it. "
-            f"Change the home of the arm's joints in {path}, look at it (xreset robots check --picture), and search again."
+            f"Change the home of the arm's joints in {path}, look at it (xreset robots check --picture), and search "
+            "again."
         )
     text = re.sub(r"^placement *=.*\n", "", path.read_text(), flags=re.MULTILINE)
     best = search.best

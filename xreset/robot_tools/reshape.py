@@ -1,4 +1,5 @@
-"""Gives a robot the collision shapes of another description of it: joints, masses, drives and frames stay as they are."""
+"""Gives a robot the collision shapes of another description of it: joints, masses, drives and frames stay as they
+are."""
 
 from __future__ import annotations
 
@@ -52,7 +53,8 @@ def reshape(robot: str, shapes: Path, out: Path) -> tuple[str, ...]:
     found = _shapes(tree, other, shapes)
     if apart := list(_apart(tree, other)):
         raise RobotError(
-            f"{shapes} is of another robot than {spec.name!r}: {'; '.join(apart)}. To make a robot of it: xreset robots import."
+            f"{shapes} is of another robot than {spec.name!r}: {'; '.join(apart)}. To make a robot of it: xreset "
+            "robots import."
         )
     links = [replace(link, collisions=found.get(link.name, link.collisions)) for link in tree.links]
     tree = replace(tree, links=tuple(links))
@@ -83,7 +85,8 @@ def reshape(robot: str, shapes: Path, out: Path) -> tuple[str, ...]:
 
 
 def _with_names_of(tree: RobotTree, other: RobotTree) -> RobotTree:
-    """Return the other tree with the names that an import has given its links: ``hand_`` before those of the arm's links.
+    """Return the other tree with the names that an import has given its links: ``hand_`` before those of the arm's
+    links.
 
     Such a link of the robot has the same child as in the other tree.
     """

@@ -1,4 +1,5 @@
-"""Reads what makers publish of a robot, URDF or MJCF, as one kind of plain data, and puts an arm and a hand together."""
+"""Reads what makers publish of a robot, URDF or MJCF, as one kind of plain data, and puts an arm and a hand
+together."""
 
 from __future__ import annotations
 
@@ -154,7 +155,8 @@ def _last_link(arm: RobotTree) -> str:
         return ends[0]
     before = [link for link in arm.link_names if set(ends) < set(below(arm, link))]
     raise RobotError(
-        f"the arm ends in {', '.join(ends)}, after {', '.join(before)}; say with --flange which of its links carries the hand;"
+        f"the arm ends in {', '.join(ends)}, after {', '.join(before)}; say with --flange which of its links carries "
+        "the hand;"
         " what hangs there is left out."
     )
 
@@ -215,7 +217,8 @@ def _with_limits(source: Source) -> Source:
 
 
 def _with_masses(source: Source) -> Source:
-    """Return the source with masses and inertias that a solid body can have: those of the shapes where the stated ones are impossible."""
+    """Return the source with masses and inertias that a solid body can have: those of the shapes where the stated ones
+    are impossible."""
     links = []
     replaced: dict[str, list[str]] = {}
     for link in source.tree.links:
@@ -257,7 +260,7 @@ def largest_moment(link: Link) -> float:
     return link.mass * (2 * float(np.linalg.norm(vertices - link.com, axis=1).max())) ** 2 + _ROTOR_AT_MOST
 
 
-# MJCF ------------------------------------------------------------------------------------------------------------------------------------
+# MJCF -----------------------------------------------------------------------------------------------------------------
 
 _LARGEST = {"hfield": ("nrow", "ncol"), "texture": ("width", "height"), "size": ("nkey",)}
 """Elements whose numbers decide how much memory MuJoCo takes."""

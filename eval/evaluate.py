@@ -17,7 +17,7 @@ from xreset.inputs import Data
 def evaluate(
     policy: str | Path | PolicySpec,
     demos: str | Path | Data,
-    engines: Sequence[str | Engine] = ("mujoco",),
+    engines: str | Sequence[str | Engine] = "mujoco",
     *,
     episodes: int = 5,
     seed: int = 0,
@@ -33,7 +33,7 @@ def evaluate(
     Args:
         policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`.
         demos: demonstrations or retargeted motion, or a file of them: starts and goals.
-        engines: names of physics engines.
+        engines: name of a physics engine, or several.
         episodes: episodes of each demonstration, each with another perturbation of robot and object.
         seed: seed of the perturbations.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.
@@ -54,6 +54,8 @@ def evaluate(
     if not isinstance(policy, PolicySpec):
         policy = load_policy(policy, robot=robot, seed=seed)
     policy.check_seed(seed)
+    if isinstance(engines, str):
+        engines = (engines,)
     chosen = [e if isinstance(e, Engine) else engine(e, device=device) for e in dict.fromkeys(engines)]
     trial = load_trial(policy, demos, objects=objects, seed=seed, num_envs=num_envs)
     folder = Path(out) if out else policy.folder

@@ -268,7 +268,11 @@ class _Recorder:
 
     def traces(self, names: tuple[str, ...]) -> list[Trace]:
         """One trace of each recorded world; ``names``: of the objects."""
+        if not self._worlds:
+            return []
         env = self._env
+        frames = {name: np.stack(rows) for name, rows in self._frames.items()}
+        targets = np.stack(self._targets)
         goal_pos = self._rows(env.goal_pos)
         goal_quat = self._rows(env.goal_quat)
         out = []
@@ -279,8 +283,8 @@ class _Recorder:
                 goal_pos=goal_pos[i],
                 goal_quat=goal_quat[i],
                 time=np.array(self._time),
-                joint_target=np.stack(self._targets)[:, i],
-                **{name: np.stack(frames)[:, i] for name, frames in self._frames.items()},
+                joint_target=targets[:, i],
+                **{name: values[:, i] for name, values in frames.items()},
             )
             out.append(trace)
         return out

@@ -278,18 +278,18 @@ class _Bench:
         start = State.initial(self.scene, torch.tensor(list(_WORLDS.values())))
         pos = start.object_pos
         for name, i in _AT.items():
-            match _WORLDS[name]:
-                case 0:
-                    pos[i] = torch.tensor([*self._place, _SLAB_HALF[2]])
-                case 1:
-                    point, normal, _ = self._presses[name]
-                    pos[i] = torch.as_tensor(point + (_SLAB_HALF[2] + 5e-4) * normal)
-                    start.object_quat[i] = torch.as_tensor(_z_to(normal))
-                case 2:
-                    pos[i] = torch.tensor([*self._place, 0.6])
-                case _:
-                    pos[i] = torch.tensor([*self._place, 0.0])
-                    start.object_angvel[i, 2] = self._spin
+            thing = _WORLDS[name]
+            if thing == _SLAB:
+                pos[i] = torch.tensor([*self._place, _SLAB_HALF[2]])
+            elif thing == _PADDLE:
+                point, normal, _ = self._presses[name]
+                pos[i] = torch.as_tensor(point + (_SLAB_HALF[2] + 5e-4) * normal)
+                start.object_quat[i] = torch.as_tensor(_z_to(normal))
+            elif thing == _THING:
+                pos[i] = torch.tensor([*self._place, 0.6])
+            else:
+                pos[i] = torch.tensor([*self._place, 0.0])
+                start.object_angvel[i, 2] = self._spin
         start.object_linvel[_AT["slide x"], 0] = _SPEED
         start.object_linvel[_AT["slide xy"], :2] = _SPEED * np.sqrt(0.5)
         return start

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from xreset.eval.engines.replay import EngineTrace, TraceResult
 from xreset.eval.plots import COLORS, figure_style, picture
 from xreset.eval.report.clips import camera_at, encode_mp4
+from xreset.eval.rollout import Progress
 from xreset.files import write_whole
 from xreset.pictures.render import Renderer, pose_matrix
 
@@ -18,8 +18,6 @@ SIZE = (320, 300)
 FRAMES_PER_SECOND = 20.0
 BANNER = 24
 """Height of an engine's name [pixels]."""
-
-Progress = Callable[[int, int], None]
 
 
 def write_strip(

@@ -121,7 +121,7 @@ class FrontierTest(unittest.TestCase):
 
     def test_the_command_refuses_what_cannot_go_on_from_a_state(self):
         for arguments, words in (
-            (("ik", "--robot", "ur7e-sharpa"), "cannot go on from a state"),
+            (("ik", "--robot", "ur7e-sharpa"), "cannot continue from a state"),
             (("zero", "--states", "0"), "expected a whole number from 1"),
         ):
             self.assertIn(words, xreset("frontier", *arguments, "--resets", self.resets)[2])

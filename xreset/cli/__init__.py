@@ -123,15 +123,16 @@ def _run(group: str, commands: dict[str, str], argv: list[str]) -> None:
     from xreset.cli._options import checked
 
     command = module.command_for(arguments) if hasattr(module, "command_for") else module.COMMAND
-    shown = {"prog": f"xreset{group} {name}", "description": commands[name]}
+    program = f"xreset{group} {name}"
+    about = commands[name]
     if isinstance(command, dict):
         verbs = {verb: checked(function) for verb, function in command.items()}
         two = " ".join(arguments[:2])
         if two in verbs:  # a verb may have two words
             arguments = [two, *arguments[2:]]
-        tyro.extras.subcommand_cli_from_dict(verbs, args=arguments, **shown)
+        tyro.extras.subcommand_cli_from_dict(verbs, prog=program, description=about, args=arguments)
     else:
-        tyro.cli(checked(command), args=arguments, **shown)
+        tyro.cli(checked(command), prog=program, description=about, args=arguments)
 
 
 _LOCK = RLock()

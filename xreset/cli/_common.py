@@ -13,6 +13,7 @@ from rich.console import Console
 
 from xreset.cli import INVOCATION
 from xreset.cli._terminal import Progress
+from xreset.eval import trial
 from xreset.plugins import backend_names, backend_status
 
 _T = TypeVar("_T")
@@ -32,6 +33,11 @@ def engine_bars(console: Console, names: Sequence[str]) -> Iterator[Callable[[st
     with Progress(console) as bar:
         counts = {name: bar.count(name) for name in names}
         yield lambda name, done, total: counts[name](done, total)
+
+
+def chosen_engines(names: Sequence[str], device: str) -> list[trial.Engine]:
+    """Return the engines of these names, each once; without names, MuJoCo."""
+    return [trial.engine(name, device=device) for name in dict.fromkeys(names or ("mujoco",))]
 
 
 def usable_engines(console: Console) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import degrees
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from rich.table import Table
 
@@ -37,8 +37,7 @@ def import_dexycb(
     """
     with _progress("reading DexYCB") as progress:
         demos = dexycb.read_dexycb(folder, objects=objects or None, sides=_sides(side), progress=progress)
-    archive.write_demos(out, demos, config={"dataset": "dexycb", "objects": list(objects), "side": side})
-    _print_summary(demos, out)
+    _save(demos, out, {"dataset": "dexycb", "objects": list(objects), "side": side})
 
 
 def import_ho3d(folder: Source, *, out: Path, fps: float, cameras: Path) -> None:
@@ -54,8 +53,7 @@ def import_ho3d(folder: Source, *, out: Path, fps: float, cameras: Path) -> None
     """
     with _progress("reading HO-3D") as progress:
         demos = ho3d.read_ho3d(folder, fps=fps, cameras=cameras, progress=progress)
-    archive.write_demos(out, demos, config={"dataset": "ho3d", "fps": fps})
-    _print_summary(demos, out)
+    _save(demos, out, {"dataset": "ho3d", "fps": fps})
 
 
 def import_keypoints(
@@ -105,8 +103,7 @@ def import_keypoints(
     with _progress("reading keypoints") as progress:
         demos = keypoints.read_keypoints(path, convention, progress=progress)
     config = {"dataset": "keypoints", **vars(convention), "table_from_camera": None if T is None else T.tolist()}
-    archive.write_demos(out, demos, config=config, inputs={"keypoints": file_hash(path)} if path.is_file() else {})
-    _print_summary(demos, out)
+    _save(demos, out, config, {"keypoints": file_hash(path)} if path.is_file() else {})
 
 
 def synthesize(
@@ -138,8 +135,7 @@ def synthesize(
             ]
         )
     config = {"objects": list(objects), "per_object": per_object, "seed": seed, "fps": fps, "side": side}
-    archive.write_demos(out, demos, config=config)
-    _print_summary(demos, out)
+    _save(demos, out, config)
 
 
 def reflect(
@@ -169,10 +165,7 @@ def reflect(
         )
     Console().print(table)
     result = mirror.mirrored(demos, symmetries, tolerance=tolerance)
-    archive.write_demos(
-        out, result, config={"mirrored": True, "tolerance": tolerance}, inputs={"demos": file_hash(file)}
-    )
-    _print_summary(result, out)
+    _save(result, out, {"mirrored": True, "tolerance": tolerance}, {"demos": file_hash(file)})
 
 
 def describe(file: Source, *, objects: Path | None = None) -> None:
@@ -201,6 +194,11 @@ def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
     with Progress(Console(stderr=True)) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total, name: bar.update(task, completed=done, total=total, description=f"{what}: {name}")
+
+
+def _save(demos: archive.Demos, out: Path, config: dict[str, Any], inputs: dict[str, str] | None = None) -> None:
+    archive.write_demos(out, demos, config=config, inputs=inputs)
+    _print_summary(demos, out)
 
 
 def _print_summary(demos: archive.Demos, path: Path, objects: dict[str, ObjectSpec] | None = None) -> None:

@@ -14,14 +14,13 @@ from xreset.eval.export import lerobot as dataset
 from xreset.eval.export import recorded
 
 Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
-Backends = Several
 
 
 def lerobot(
     folders: Folders,
     *,
     out: Path,
-    backend: Backends = (),
+    backend: Several = (),
     robot: str | None = None,
     objects: Path | None = None,
     task: str | None = None,
@@ -48,7 +47,7 @@ def lerobot(
 
 
 def npz(
-    folders: Folders, *, out: Path, backend: Backends = (), robot: str | None = None, task: str | None = None
+    folders: Folders, *, out: Path, backend: Several = (), robot: str | None = None, task: str | None = None
 ) -> None:
     """Write recorded evaluation episodes as plain arrays in one npz file (docs/rollouts.md has the schema).
 

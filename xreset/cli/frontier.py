@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 
-from xreset.cli._common import Flat, Name, Several, engine_bars
+from xreset.cli._common import Flat, Name, Several, chosen_engines, engine_bars
 from xreset.cli._terminal import Console
 from xreset.errors import PolicyError
 from xreset.eval import frontier as frontiers
@@ -36,7 +37,7 @@ def frontier(
     """
     if policy == "ik":
         raise PolicyError("The baseline ik cannot continue from a state. Give a policy, zero or random.")
-    engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
+    engines = chosen_engines(backend, setting.device)
     console = Console()
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "frontier"
@@ -51,16 +52,16 @@ def frontier(
     )
     for result in results:
         table.add_column(result["backend"], justify="right", no_wrap=True)
-    for (
-        stage
-    ) in frontiers.STAGES:  # (a state at the edge between two stages may count to another one in another engine)
-        rows = [next((row for row in result["stages"] if row["stage"] == stage), None) for result in results]
-        if any(rows):
-            table.add_row(
-                stage, *(f"{row['states']}: {row['reached']:.0%} / {row['stayed']:.0%}" if row else "-" for row in rows)
-            )
+    by_stage = [{row["stage"]: _shares(row) for row in result["stages"]} for result in results]  # noqa: XR002
+    for stage in frontiers.STAGES:  # a state between two stages may count to another one in another engine
+        if any(stage in shares for shares in by_stage):
+            table.add_row(stage, *(shares.get(stage, "-") for shares in by_stage))
     console.print(table)
     console.print(f"results in {folder}")
+
+
+def _shares(row: dict[str, Any]) -> str:
+    return f"{row['states']}: {row['reached']:.0%} / {row['stayed']:.0%}"
 
 
 COMMAND = frontier

@@ -91,9 +91,8 @@ def resets(
         console.print(_holding(held, backends))
         if len(backends) > 1:
             console.print(_alike(held, backends))
-    console.print(
-        f"{bank.num_states} states of {bank.num_states + len(bank.rejected_reason)} kept in {out}; counts in {accounts_path(out)}"
-    )
+    tried = bank.num_states + len(bank.rejected_reason)
+    console.print(f"{bank.num_states} states of {tried} kept in {out}; counts in {accounts_path(out)}")
 
 
 def _accepted(data: file.Retargeted, bank: banks.ResetBank, title: str) -> Table:

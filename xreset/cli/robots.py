@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,7 @@ from rich.text import Text
 
 from xreset import description
 from xreset.backends import workers
-from xreset.cli._common import Name
+from xreset.cli._common import Name, this_command
 from xreset.cli._terminal import Console, Progress
 from xreset.demos import archive
 from xreset.errors import RobotError
@@ -168,31 +166,16 @@ def place(
         reach = finalist.reach
         console.print(
             f"{title:12}  follows {finalist.followed:.1%}, reaches {reach.reached:.1%}, "
-            f"dexterity {reach.dexterity:.3f}: pos [{_digits(finalist.placement.pos)}], quat [{_digits(finalist.placement.quat)}]"
+            f"dexterity {reach.dexterity:.3f}: pos [{_digits(finalist.placement.pos)}], "
+            f"quat [{_digits(finalist.placement.quat)}]"
         )
     if found.home is not None:
         console.print(f"{'its home':12}  {', '.join(f'{v:.3f}' for v in found.home)}")
     console.print(f"of {found.frames} annotated frames of {chosen.num_sequences} sequences")
     if write:
-        given = [] if objects is None else ["--objects", objects.name]
-        command = [
-            "xreset",
-            "robots",
-            "place",
-            spec.name,
-            "--demos",
-            demos.name,
-            *given,
-            "--max-per-object",
-            str(max_per_object),
-        ]
-        for field in fields(search):
-            if (value := getattr(search, field.name)) != field.default:
-                command += [f"--search.{field.name}", *map(str, value if isinstance(value, tuple) else (value,))]
-        placement.write_placement(
-            description.robot_folder(robot) / description.DESCRIPTION, spec, found, shlex.join(command)
-        )
-        console.print(f"wrote {description.robot_folder(robot) / description.DESCRIPTION}")
+        file = description.robot_folder(robot) / description.DESCRIPTION
+        placement.write_placement(file, spec, found, this_command())
+        console.print(f"wrote {file}")
 
 
 def _digits(values: Sequence[float]) -> str:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 from rich.table import Table
 
-from xreset.cli._common import Flat, Several, Source
+from xreset.cli._common import Flat, Several, Source, chosen_engines
 from xreset.cli._terminal import Console
 from xreset.eval import select as selection
-from xreset.eval import trial
 from xreset.eval.setting import Setting
 
 
@@ -38,9 +37,7 @@ def select(
         setting: Robot, meshes, device and worlds; --seed is not used, see --starts.
         starts: Seed of the starts; default: one that evaluations do not use.
     """
-    engines = [
-        trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco", "pybullet", "sapien"))
-    ]
+    engines = chosen_engines(backend or ("mujoco", "pybullet", "sapien"), setting.device)
     console = Console()
 
     def say(name: str, engine: str, score: float | None) -> None:

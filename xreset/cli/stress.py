@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from xreset.cli._common import Flat, Name, Several, engine_bars
+from xreset.cli._common import Flat, Name, Several, chosen_engines, engine_bars
 from xreset.cli._terminal import Console
 from xreset.eval import policy_spec, trial
 from xreset.eval import stress as sweeps
@@ -37,7 +37,7 @@ def stress(
         out: Folder for the results; default: stress/ in the run folder or next to the policy.
     """
     properties = sweeps.chosen(property)
-    engines = [trial.engine(name, device=setting.device) for name in dict.fromkeys(backend or ("mujoco",))]
+    engines = chosen_engines(backend, setting.device)
     console = Console()
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "stress"
@@ -49,22 +49,19 @@ def stress(
     table.add_column("value", justify="right")
     for result in found:
         table.add_column(result.backend, justify="right", no_wrap=True)
+    by_option = [{curve.property: curve for curve in result.curves} for result in found]  # noqa: XR002
     for prop in properties:
-        curves = [next((c for c in result.curves if c.property == prop.option), None) for result in found]
         values = sorted({*prop.values, prop.nominal})
         for i, value in enumerate(values):
             cells = []
-            for curve in curves:
-                point = curve.points[i] if curve is not None else None
-                low, high = (100 * x for x in point.difference_ci95) if point else (0, 0)
-                change = (
-                    f" ({100 * point.difference:+.1f}; {low:+.1f} to {high:+.1f})"
-                    if point and value != prop.nominal
-                    else ""
-                )
-                cells.append(f"{100 * point.task_progress:.1f} %{change}" if point else "cannot be set")
-            named = prop.option if prop.unit == "x" else f"{prop.option} [{prop.unit}]"
-            amount = f"x {value:g}" if prop.unit == "x" else f"{value:g}"
+            for curves in by_option:
+                if prop.option in curves:
+                    cells.append(_cell(curves[prop.option].points[i], value == prop.nominal))
+                else:
+                    cells.append("cannot be set")
+            factor = prop.unit == "x"
+            named = prop.option if factor else f"{prop.option} [{prop.unit}]"
+            amount = f"x {value:g}" if factor else f"{value:g}"
             table.add_row("" if i else named, amount, *cells, end_section=i == len(values) - 1)
     console.print(table)
     for result in found:
@@ -72,6 +69,15 @@ def stress(
         if result.left_out:
             console.print(f"left out in {result.backend}, which cannot set them: {', '.join(result.left_out)}")
     console.print(f"results and picture in {folder}")
+
+
+def _cell(point: sweeps.Point, nominal: bool) -> str:
+    """Return task progress; beyond the nominal value also the difference to it, with its interval."""
+    text = f"{100 * point.task_progress:.1f} %"
+    if nominal:
+        return text
+    low, high = point.difference_ci95
+    return f"{text} ({100 * point.difference:+.1f}; {100 * low:+.1f} to {100 * high:+.1f})"
 
 
 COMMAND = stress

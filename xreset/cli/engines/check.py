@@ -67,12 +67,13 @@ def check(
             json, {"schema": conformance.SCHEMA, "xreset_version": __version__, "command": this_command(), "runs": runs}
         )
         console.print(f"wrote {json}")
-    failed = sum(result["verdict"] == "failed" for record in runs for result in record["checks"])
-    console.print(
-        f"{failed} checks failed" if failed else "no check failed", style="bold red" if failed else "bold green"
-    )
+    failed = 0
+    for record in runs:
+        failed += sum(result["verdict"] == "failed" for result in record["checks"])
     if failed:
+        console.print(f"{failed} checks failed", style="bold red")
         raise SystemExit(1)
+    console.print("no check failed", style="bold green")
 
 
 def _maker(name: str, device: str) -> conformance.MakeBackend:

@@ -69,23 +69,20 @@ def compare(
             json, result.as_dict() | {"xreset_version": __version__, "command": this_command(), "inputs": inputs}
         )
         console.print(f"wrote {json}")
-    missed = [
-        f"{tested.engine.name}: {metric.name}"
-        for tested in result.engines
-        for metric in tested.metrics
-        if not metric.ok
-    ]
-    console.print(
-        f"missed: {'; '.join(missed)}" if missed else "all targets met", style="bold red" if missed else "bold green"
-    )
+    missed = []
+    for tested in result.engines:
+        missed += [f"{tested.engine.name}: {metric.name}" for metric in tested.metrics if not metric.ok]
     if missed:
+        console.print(f"missed: {'; '.join(missed)}", style="bold red")
         raise SystemExit(1)
+    console.print("all targets met", style="bold green")
 
 
 def _table(result: agreement.Parity) -> Table:
     columns: tuple[agreement.EngineParity, ...] = (result.floor, *result.engines)
-    held = sum(sum(flags) for name, flags in result.reference.carried.items() if name != "closing")
-    tried = sum(len(flags) for name, flags in result.reference.carried.items() if name != "closing")
+    holds = [flags for name, flags in result.reference.carried.items() if name != "closing"]
+    held = sum(map(sum, holds))
+    tried = sum(map(len, holds))
     table = Table(
         "against " + result.reference.engine.name,
         "target",
@@ -93,9 +90,10 @@ def _table(result: agreement.Parity) -> Table:
         title=f"{result.robot.name}, {len(result.objects)} objects: {len(result.closing)} closings, {tried} holds, "
         f"of which {result.reference.engine.name} carries {sum(result.reference.carried['closing'])} and {held}",
     )
-    rows = {metric.name: metric for tested in columns for metric in tested.metrics}
+    by_name = [{metric.name: metric for metric in tested.metrics} for tested in columns]  # noqa: XR002
+    rows = {name: metric for metrics in by_name for name, metric in metrics.items()}  # noqa: XR002
     for name, row in rows.items():
-        cells = [next((_cell(m) for m in tested.metrics if m.name == name), "-") for tested in columns]
+        cells = [_cell(metrics[name]) if name in metrics else "-" for metrics in by_name]
         table.add_row(name, f"{row.sense} {_number(row.target, row.unit)}", *cells)
     return table
 

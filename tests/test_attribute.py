@@ -329,7 +329,7 @@ class CommandTest(unittest.TestCase):
         for message, policy, *more in (
             ("does not differ from itself|Choose two engines", "zero", "mujoco"),
             ("expected a whole number from 1", "zero", "sapien", "--episodes", "0"),
-            ("there is no backend 'havok'", "zero", "havok"),
+            ("Unknown backend 'havok'", "zero", "havok"),
             ("there is no none.npz", "zero", "sapien"),
             ("Unknown policy", "none", "sapien"),
         ):

@@ -232,7 +232,7 @@ class JsonTest(InFolder):
             ("\xff\xfe", "not valid JSON"),
             ('{"a": ' + "[" * 100_000, "nested too deeply"),
             ('{"a": ' + "1" * 5000 + "}", "not valid JSON"),
-            ('{"a": NaN}', "NaN is no number"),
+            ('{"a": NaN}', "NaN is not a number"),
             (r'{"a": ["\ud800"]}', "control a terminal"),
             (r'{"\u001b[31m": 1}', "control a terminal"),
         ):

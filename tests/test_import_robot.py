@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
 
 from tests.data import DEFAULT
 from xreset.cli import main
@@ -20,6 +21,7 @@ from xreset.description import load_robot
 from xreset.errors import PolicyError, RobotError
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import load_urdf
+from xreset.geometry.urdf_writer import urdf_text, write_meshes
 from xreset.policy import check_contract, policy_contract
 from xreset.robot_tools.check import check_description, check_engine
 from xreset.robot_tools.importer import import_robot
@@ -123,6 +125,23 @@ class Toy(WithFolder):
         self.assertEqual([path.name for path in self.folder.iterdir() if path.name.startswith(".")], [])
         keypoints = {point.keypoint: point.link for point in spec.keypoints}
         self.assertEqual([keypoints[f"index{i}"] for i in (1, 2, 4)], ["f1_a", "f1_b", "index_tip_frame"])
+
+    def test_links_with_similar_names_have_meshes_of_their_own(self):
+        joint = '<joint name="j" type="fixed"><parent link="f/1"/><child link="f_1"/></joint>'
+        links = ""
+        for name, size in (("f/1", 0.1), ("f_1", 0.2)):
+            trimesh.creation.icosphere(1, size).export(self.folder / f"{size}.stl")
+            links += (
+                f'<link name="{name}"><collision><geometry><mesh filename="{size}.stl"/></geometry></collision></link>'
+            )
+        tree = load_urdf(self.file("two.urdf", f'<robot name="x">{links}{joint}</robot>'))
+        (self.folder / "again").mkdir()
+        (self.folder / "again" / "robot.urdf").write_text(urdf_text(tree, {}))
+        write_meshes(tree, self.folder / "again")
+        again = load_urdf(self.folder / "again" / "robot.urdf")
+        for before, after in zip(tree.links, again.links, strict=True):
+            expected = before.collisions[0].geometry.vertices
+            np.testing.assert_allclose(after.collisions[0].geometry.vertices, expected, atol=1e-6)
 
     def test_home_is_within_the_limits_after_rounding(self):
         narrow = self.file("narrow.urdf", ARM.replace('lower="-2.9" upper="2.9"', 'lower="-0.123456" upper="0.123456"'))

@@ -499,7 +499,7 @@ class CommandTest(InFolder):
     def test_numbers_are_reported_even_where_no_clip_can_be_drawn(self):
         self.write(("mujoco",), robot="a-robot-that-is-not-installed")
         made = make_report(self.folder, self.folder / "elsewhere")
-        self.assertRegex(" ".join(made.notes), "no clips: there is no robot 'a-robot-that-is-not-installed'")
+        self.assertRegex(" ".join(made.notes), "no clips: Unknown robot 'a-robot-that-is-not-installed'")
         self.assertEqual(made.html, self.folder / "elsewhere" / "index.html")
         self.assertIn("There are no clips", made.html.read_text())
         self.assertTrue(made.overview.is_file())

@@ -340,7 +340,7 @@ class CommandTest(unittest.TestCase):
             ("there is no", missing),
             ("thresholds must be above 0", missing, "--force-threshold", "0"),
             ("expected a whole number from 0", missing, "--episode", "-1"),
-            ("there is no backend 'havok'", missing, "--backend", "havok"),
+            ("Unknown backend 'havok'", missing, "--backend", "havok"),
             ("expected 'xreset-demos/1'", wrong),
             ("Add --robot", wrong, "--policy", "ik"),
         ):

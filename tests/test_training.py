@@ -417,7 +417,7 @@ class TrainingTest(unittest.TestCase):
         for problem, options in (
             ("--num-envs is 0", {"num_envs": 0}),
             ("--minutes is 0", {"minutes": 0.0}),
-            ("no device 'quantum'", {"device": "quantum"}),
+            ("Unknown device 'quantum'", {"device": "quantum"}),
             ("'mujoco' does not run on 'cuda'", {"device": "cuda"}),
         ):
             with self.subTest(problem), self.assertRaisesRegex(XResetError, problem):

@@ -1,4 +1,4 @@
-"""Where frames and states go: how many are kept and why the others are lost, by object and phase of the demonstration.
+"""Counts what becomes of frames and states: how many are kept and why the others are lost, by object and phase of the demonstration.
 
 Nothing is lost without a reason: ``total == kept + sum(lost.values())`` in every account.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,8 +17,7 @@ from xreset.files import write_json
 
 SCHEMA = "xreset-accounts/1"
 
-Phase = Literal["pre-contact", "post-contact"]
-PHASES: tuple[Phase, ...] = ("pre-contact", "post-contact")
+Phase = Literal["pre-contact", "post-contact", "both"]
 """Before the human hand first touches the object, and from then on."""
 
 
@@ -28,31 +27,28 @@ class Account:
 
     object_name: str
     """``all`` in a sum over objects."""
-    phase: Phase | Literal["both"]
-    total: int
+    phase: Phase
     kept: int
     lost: dict[str, int]
     """Reason -> number, the most frequent first."""
 
     @property
+    def total(self) -> int:
+        """Number of frames or states, kept and lost."""
+        return self.kept + sum(self.lost.values())
+
+    @property
     def share(self) -> float:
-        """Kept of total; NaN if there was nothing."""
+        """Share that is kept; NaN if there was nothing."""
         return self.kept / self.total if self.total else float("nan")
 
     def without(self, reason: str) -> Account:
-        """The account of what was not lost for that reason."""
-        lost = {name: n for name, n in self.lost.items() if name != reason}
-        return Account(
-            object_name=self.object_name,
-            phase=self.phase,
-            total=self.kept + sum(lost.values()),
-            kept=self.kept,
-            lost=lost,
-        )
+        """Return the account of what was not lost for that reason."""
+        return replace(self, lost={name: n for name, n in self.lost.items() if name != reason})
 
 
 def accounts(object_name: np.ndarray, post_contact: np.ndarray, reason: np.ndarray) -> list[Account]:
-    """An account of every object and phase, objects in alphabetical order.
+    """Return an account of every object and phase, objects in alphabetical order.
 
     Args:
         object_name: [N] text.
@@ -60,53 +56,53 @@ def accounts(object_name: np.ndarray, post_contact: np.ndarray, reason: np.ndarr
         reason: [N] text: why it is lost, empty where it is kept.
     """
     rows = []
+    phases: tuple[Phase, ...] = ("pre-contact", "post-contact")
     for name in np.unique(object_name).tolist():
-        for phase, post in zip(PHASES, (False, True), strict=True):
-            mine = reason[(object_name == name) & (post_contact == post)]
-            lost = Counter(mine[mine != ""].tolist())
-            rows.append(
-                Account(
-                    object_name=name,
-                    phase=phase,
-                    total=len(mine),
-                    kept=len(mine) - lost.total(),
-                    lost=dict(lost.most_common()),
-                )
-            )
+        for is_post, phase in enumerate(phases):
+            chosen = (object_name == name) & (post_contact == is_post)
+            counts = Counter(reason[chosen].tolist())
+            kept = counts.pop("", 0)
+            rows.append(Account(object_name=name, phase=phase, kept=kept, lost=dict(counts.most_common())))
     return rows
 
 
-def summed(parts: Iterable[Account], object_name: str, phase: Phase | Literal["both"]) -> Account:
-    """The sum of accounts, under another name."""
-    parts = list(parts)
-    lost: Counter[str] = Counter()
-    for part in parts:
-        lost.update(part.lost)
-    return Account(
-        object_name=object_name,
-        phase=phase,
-        total=sum(p.total for p in parts),
-        kept=sum(p.kept for p in parts),
-        lost=dict(lost.most_common()),
-    )
-
-
 def with_totals(rows: Sequence[Account]) -> list[Account]:
-    """The accounts, then those of all objects: each phase, and both."""
-    phases = [summed((row for row in rows if row.phase == phase), "all", phase) for phase in PHASES]
-    return [*rows, *phases, summed(rows, "all", "both")]
+    """Return the accounts, then the sums over all objects: of each phase, and of both."""
+    before = _summed((row for row in rows if row.phase == "pre-contact"), "pre-contact")
+    after = _summed((row for row in rows if row.phase == "post-contact"), "post-contact")
+    return [*rows, before, after, _summed(rows, "both")]
+
+
+def _summed(rows: Iterable[Account], phase: Phase) -> Account:
+    kept = 0
+    lost: Counter[str] = Counter()
+    for row in rows:
+        kept += row.kept
+        lost.update(row.lost)
+    return Account(object_name="all", phase=phase, kept=kept, lost=dict(lost.most_common()))
 
 
 def described(lost: dict[str, int]) -> str:
-    """Such as ``arm jump 12, hand error 3``."""
+    """Return the reasons as text, such as ``arm jump 12, hand error 3``."""
     return ", ".join(f"{reason} {n}" for reason, n in lost.items())
 
 
 def accounts_path(path: Path) -> Path:
-    """Where the accounts of a file lie: beside it."""
+    """Return the path of a file's accounts, next to it."""
     return path.with_name(f"{path.stem}.accounts.json")
 
 
 def write_accounts(path: Path, *, of: str, rows: Sequence[Account], **more: Any) -> None:
     """Write accounts as JSON: ``of`` what (such as ``frames``), and ``more`` by name."""
-    write_json(path, {"schema": SCHEMA, "of": of, "rows": [asdict(row) for row in with_totals(rows)]} | more)
+    written = []
+    for row in with_totals(rows):
+        written.append(
+            {
+                "object_name": row.object_name,
+                "phase": row.phase,
+                "total": row.total,
+                "kept": row.kept,
+                "lost": row.lost,
+            }
+        )
+    write_json(path, {"schema": SCHEMA, "of": of, "rows": written} | more)

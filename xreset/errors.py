@@ -1,6 +1,6 @@
-"""What xreset raises when the user can mend the cause.
+"""Errors that a user can fix.
 
-The command line prints these without a traceback; anything else that is raised is a defect of xreset.
+The command line prints these without a traceback; any other exception is a defect of xreset.
 A message says what was found, what was expected, and what to do.
 """
 
@@ -9,15 +9,15 @@ from contextlib import contextmanager
 
 
 class XResetError(Exception):
-    """Base of every error that a user can mend."""
+    """Base of every error that a user can fix."""
 
 
 class FileFormatError(XResetError):
-    """A file is not what its reader needs: wrong schema, missing key, wrong shape or type, damaged, or bad values."""
+    """A file does not fit its reader: wrong schema, missing key, wrong shape or type, damaged, or bad values."""
 
 
 class RobotError(XResetError):
-    """A robot description is wrong or a robot is unknown."""
+    """A robot's description is wrong, or the robot is unknown."""
 
 
 class ObjectError(XResetError):
@@ -25,15 +25,15 @@ class ObjectError(XResetError):
 
 
 class DemoError(XResetError):
-    """Demonstrations cannot be read or do not hold what they must."""
+    """Demonstrations cannot be read, or lack something."""
 
 
 class BackendUnavailableError(XResetError):
-    """A physics engine cannot be used here: the message says why, and which command mends it."""
+    """A physics engine cannot be used here: the message says why, and which command fixes it."""
 
 
 class CapabilityError(XResetError):
-    """A backend cannot do what was asked: the message names the capability, the backend and a way out."""
+    """A backend cannot do what was asked: the message names the capability, the backend and an alternative."""
 
 
 class PolicyError(XResetError):
@@ -41,7 +41,7 @@ class PolicyError(XResetError):
 
 
 class RunError(XResetError):
-    """A training run or its folder is not in a state that allows what was asked."""
+    """A training run or its folder does not allow what was asked."""
 
 
 @contextmanager

@@ -1,5 +1,4 @@
-"""Worlds that broke: what they were like before, what was asked of them and what came of it, so that it can be looked
-into."""
+"""Records worlds that broke: their state before, their actions and the result."""
 
 from __future__ import annotations
 
@@ -12,8 +11,7 @@ from torch import Tensor
 
 
 class FaultRecorder:
-    """Keeps the last :attr:`CAPACITY` faults on the device; nothing waits for them, so that a GPU can replay it as part
-    of a graph."""
+    """Keeps the last :attr:`CAPACITY` faults on the device. Nothing waits for the GPU, so a captured graph can record."""
 
     CAPACITY = 256
 
@@ -21,7 +19,7 @@ class FaultRecorder:
         """Allocate room.
 
         Args:
-            shapes: name -> shape of what is kept of one world.
+            shapes: name -> shape of one world's values.
         """
         self._shapes = dict(shapes)
         width = sum(prod(shape) for shape in self._shapes.values())
@@ -29,11 +27,11 @@ class FaultRecorder:
         self._kept = torch.zeros((), dtype=torch.long, device=device)
 
     def record(self, faulty: Tensor, values: Mapping[str, Tensor]) -> None:
-        """Keep some worlds (of more than the capacity at once, the first ones).
+        """Keep the faulty worlds; the first ones, if there are more than the capacity.
 
         Args:
-            faulty: [N] bool: which worlds.
-            values: name -> [N, ...] of all worlds, shapes as announced; numbers of any kind, kept as float32.
+            faulty: [N] bool.
+            values: name -> [N, ...] values of all worlds, kept as float32.
         """
         row = torch.cat([values[name].reshape(len(faulty), -1).to(self._rows.dtype) for name in self._shapes], dim=1)
         number = faulty.long().cumsum(0) - 1
@@ -42,7 +40,7 @@ class FaultRecorder:
         self._kept += keep.sum()
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Name -> [F, ...] float32 of the F faults that are kept, the oldest first."""
+        """Return the values of the F faults that are kept, by name: [F, ...] float32, the oldest first."""
         kept = int(self._kept)
         order = np.arange(max(0, kept - self.CAPACITY), kept) % self.CAPACITY
         rows = self._rows.cpu().numpy()[order]

@@ -1,4 +1,4 @@
-"""Writing files whole or not at all, JSON, and which process may write what."""
+"""Writes files whole or not at all, reads JSON and TOML, and lets one process at a time write a file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from xreset.errors import FileFormatError, XResetError
 from xreset.text import is_plain, shown
 
 RAISE_LIMIT = "If it is what you expect, raise the limit: set XRESET_MAX_FILE_MB (default 1024)."
-"""What to do about a file that is too large."""
+"""Advice for a file that is too large."""
 
 
 def max_bytes() -> int:
@@ -214,10 +214,10 @@ def write_json(path: str | Path, data: Any) -> None:
 
 
 def read_json(path: str | Path, schema: str | None = None) -> dict[str, Any]:
-    """Read a JSON object; with ``schema``, its ``schema`` entry must be that, and is left out."""
+    """Read a JSON object; with ``schema``, its ``schema`` entry must be that, and is removed."""
     path = Path(path)
     must_exist(path, "JSON file")
-    if path.stat().st_size > max_bytes() // 16:  # what it becomes is about so many times as large
+    if path.stat().st_size > max_bytes() // 16:  # objects in memory are about that many times larger
         raise FileFormatError(f"{path} has {path.stat().st_size >> 20} MB, too many for JSON. {RAISE_LIMIT}")
     try:
         data = parse_json(path.read_bytes())
@@ -231,11 +231,11 @@ def read_json(path: str | Path, schema: str | None = None) -> dict[str, Any]:
 def read_toml(
     path: Path, schema: str | None = None, *, error: type[XResetError] = FileFormatError, hint: str = ""
 ) -> dict[str, Any]:
-    """Read a TOML file; with ``schema``, its ``schema`` entry must be that. ``hint``: what to say where it cannot be
-    read.
+    """Read a TOML file; with ``schema``, its ``schema`` entry must be that. ``hint`` ends the message if it cannot
+    be read.
 
     Raises:
-        XResetError: it cannot be read, is no TOML, or states another schema; of the kind ``error``.
+        XResetError: the file cannot be read, is not TOML, or states another schema; of class ``error``.
     """
     try:
         data = tomllib.loads(path.read_bytes().decode())
@@ -249,11 +249,10 @@ def read_toml(
 
 
 def parse_json(text: str | bytes) -> dict[str, Any]:
-    """A JSON object whose numbers are finite and whose texts can be printed.
+    """Return a JSON object whose numbers are finite and whose texts can be printed.
 
     Raises:
-        ValueError: it is none, or nested too deeply, or holds a number of thousands of digits; says so in half a
-            sentence.
+        ValueError: the text is not one; the message is half a sentence.
     """
     try:
         text = text.decode() if isinstance(text, bytes) else text
@@ -269,7 +268,7 @@ def parse_json(text: str | bytes) -> dict[str, Any]:
 
 
 def _no_constant(name: str) -> None:
-    raise ValueError(f"{name} is no number of JSON")
+    raise ValueError(f"{name} is not a number of JSON")
 
 
 def _check_texts(data: Any) -> None:
@@ -286,7 +285,7 @@ def _check_texts(data: Any) -> None:
 
 
 def file_hash(path: str | Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
+    """Return the SHA-256 of a file in hexadecimal."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

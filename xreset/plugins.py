@@ -1,8 +1,8 @@
-"""Plugins: which physics engines and robots there are, and which engines can be used here.
+"""Finds the physics engines and robots that are installed, and says which engines can be used here.
 
-A package makes an engine known with an entry point of the group :data:`ENGINES`, a robot with one of :data:`ROBOTS`;
+A package registers an engine with an entry point of the group :data:`ENGINES`, a robot with one of :data:`ROBOTS`;
 xreset's own are listed in ``pyproject.toml`` in the same way. A plugin that fails to load is named with its traceback,
-and harms no other.
+and does not affect the others.
 """
 
 from __future__ import annotations
@@ -32,31 +32,31 @@ _KINDS: Mapping[str, tuple[str, type[XResetError]]] = {
 
 
 def plugins(group: str) -> dict[str, EntryPoint]:
-    """Name -> entry point of a group, in order of registration. None of them is loaded."""
+    """Return the entry points of a group by name, in order of registration, without loading them."""
     return {entry.name: entry for entry in entry_points(group=group)}
 
 
 def load_plugin(group: str, name: str) -> Any:
-    """What a plugin's entry point names.
+    """Load a plugin and return what its entry point names.
 
     Raises:
-        BackendUnavailableError, RobotError: after the group: there is no plugin of that name, or it does not load.
+        BackendUnavailableError, RobotError: depending on the group: no plugin has that name, or it does not load.
     """
     noun, error_class = _KINDS[group]
     entries = plugins(group)
     if name not in entries:
-        raise error_class(f"there is no {noun} {name!r}; there are {known_plugins(group)}.")
+        raise error_class(f"Unknown {noun} {name!r}. Choose from: {known_plugins(group)}.")
     try:
         return entries[name].load()
     except XResetError:
         raise
-    except Exception as error:  # a plugin may fail in any way; it must be named, and harm nothing else
+    except Exception as error:  # a plugin may fail in any way; the others must still work
         trace = traceback.format_exc(limit=-2)
         raise error_class(f"the {noun} {name!r} ({entries[name].value}) does not load: {error}\n{trace}") from error
 
 
 def known_plugins(group: str) -> str:
-    """The names of a group for a message."""
+    """Return the names of a group for a message."""
     return ", ".join(sorted(plugins(group))) or "none (is xreset installed? run: pip install -e .)"
 
 
@@ -64,26 +64,26 @@ def known_plugins(group: str) -> str:
 
 
 def robot_names() -> list[str]:
-    """Names of all registered robots, in order of registration. None of them is loaded."""
+    """Return the names of all registered robots, in order of registration, without loading them."""
     return list(plugins(ROBOTS))
 
 
 def robot_folder(name_or_folder: str | Path) -> Path:
-    """The folder of a robot, by its registered name or by its own path.
+    """Return the folder of a robot, given its registered name or its path.
 
     Raises:
-        RobotError: there is neither such a robot nor such a folder, or its package does not load.
+        RobotError: no robot and no folder has that name, or its package does not load.
     """
     name = str(name_or_folder)
     if name not in plugins(ROBOTS):
         folder = Path(name_or_folder)
         if folder.is_dir():
             return folder.resolve()
-        raise RobotError(f"there is no robot {name!r}, and no folder of that name. Robots: {known_plugins(ROBOTS)}.")
+        raise RobotError(f"Unknown robot {name!r}, and no folder has that name. Choose from: {known_plugins(ROBOTS)}.")
     module = load_plugin(ROBOTS, name)
     if not isinstance(module, ModuleType) or not module.__file__:
         raise RobotError(
-            f"the robot {name!r}: {module!r} is no module with a file; put an __init__.py beside its robot.toml."
+            f"the robot {name!r}: {module!r} is not a module with a file; put an __init__.py next to its robot.toml."
         )
     return Path(module.__file__).resolve().parent
 
@@ -101,16 +101,16 @@ class BackendStatus:
     device: str
     """``cpu``, ``cuda`` or ``cuda, cpu``."""
     reason: str | None
-    """Why it is unavailable, and the command that mends it; None if available."""
+    """Why it is unavailable, and the command that fixes it; None if available."""
 
 
 def backend_names() -> list[str]:
-    """Names of all registered backends, in order of registration."""
+    """Return the names of all registered backends, in order of registration."""
     return list(plugins(ENGINES))
 
 
 def backend_class(name: str) -> type[Backend]:
-    """The class of a backend.
+    """Return the class of a backend.
 
     Raises:
         BackendUnavailableError: no backend of that name, or its plugin does not load.
@@ -129,12 +129,12 @@ def device_for(name: str, device: str) -> str:
     """Where a backend runs, if those that can run on ``device`` are to run there: on it, or else on the CPU.
 
     Raises:
-        BackendUnavailableError: no backend of that name, or nothing that could be a device.
+        BackendUnavailableError: no backend has that name, or the device is not one.
     """
     kind = device.partition(":")[0]
     if kind not in ("cpu", "cuda"):
         raise BackendUnavailableError(
-            f"there is no device {device!r}; expected cpu, cuda or one of several GPUs, such as cuda:1."
+            f"Unknown device {device!r}. Expected cpu, cuda or one of several GPUs, such as cuda:1."
         )
     return device if kind in backend_class(name).devices() else "cpu"
 
@@ -147,7 +147,7 @@ def make_backend(name: str, scene: SceneSpec, num_worlds: int, **options: Any) -
 
 
 def backend_status(name: str) -> BackendStatus:
-    """Whether the backend can be used here, without raising."""
+    """Return whether a backend can be used here; never raises."""
     try:
         cls = backend_class(name)
         version = cls.engine_version()

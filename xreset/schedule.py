@@ -1,4 +1,4 @@
-"""Sharing work among worlds: world i always holds the same object, so each world works through items of one object."""
+"""Shares work among worlds. A world always holds the same object, so it works through items of one object."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """Which world does which item in which round."""
+    """Which world processes which item in which round."""
 
     object_index: np.ndarray
     """[N] object of each world."""
     rounds: np.ndarray
-    """[R, N] item of each world and round. A world whose items have run out does its object's last item again."""
+    """[R, N] item of each world and round. A world without items left repeats its object's last item."""
     fresh: np.ndarray
-    """[R, N] bool: False where an item is only repeated to keep the world busy."""
+    """[R, N] bool: False where an item is repeated."""
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """The rounds: items [N], fresh [N]."""
+        """Iterate over the rounds: items [N], fresh [N]."""
         return iter(zip(self.rounds, self.fresh, strict=True))
 
 
 def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
-    """Spread items over worlds so that the fewest rounds are needed.
+    """Spread items over worlds in the fewest rounds.
 
     Args:
         item_object: [I] object index of each item.
-        max_worlds: worlds to use at most (more where there are more objects than that).
+        max_worlds: largest number of worlds; more are used if there are more objects.
     """
     objects, counts = np.unique(item_object, return_counts=True)
     worlds = np.ones_like(counts)
     for _ in range(min(max_worlds, len(item_object)) - len(objects)):
-        worlds[np.argmax(counts / worlds)] += 1  # to the object whose worlds have most to do
+        worlds[np.argmax(counts / worlds)] += 1  # the object whose worlds have most to do
     num_rounds = int(np.max(-(-counts // worlds)))
     columns, fresh = [], []
     for number, count, width in zip(objects, counts, worlds, strict=True):

@@ -1,4 +1,4 @@
-"""What a scene is made of: frozen data that says everything a physics engine needs, and nothing about any engine.
+"""Describes a scene: frozen data that holds everything a physics engine needs, and nothing about any engine.
 
 SI units and radians. Quaternions are (w, x, y, z). ``T_a_b`` is the pose of b in a, a 4x4 matrix. The world frame has z
 up and the table's top at z = 0. Shape letters: J actuated joints, E fingertips.

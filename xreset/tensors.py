@@ -1,4 +1,4 @@
-"""Bundles of tensors: frozen dataclasses that are indexed, moved and joined as one."""
+"""Bundles of tensors: frozen dataclasses that are indexed, moved and joined together."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _Batch = TypeVar("_Batch", bound="Tensor | Tensors")
 class Tensors:
     """Base of a dataclass whose tensors share their first dimension.
 
-    Fields of other kinds stay as they are, but for bundles inside, which move along to another device.
+    Fields of other kinds are unchanged, except that bundles inside move to another device too.
     """
 
     def map(self, function: Callable[..., Tensor], *others: Self) -> Self:
-        """A bundle of ``function(own, *the others')``, tensor by tensor."""
+        """Return a bundle of ``function(own tensor, *tensors of the others)``."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}
         mapped = {
             name: function(x, *(getattr(o, name) for o in others)) for name, x in own.items() if isinstance(x, Tensor)
@@ -29,11 +29,11 @@ class Tensors:
         return replace(self, **mapped)
 
     def __getitem__(self, rows: Any) -> Self:
-        """Some of them."""
+        """Select rows."""
         return self.map(lambda x: x[rows])
 
     def __setitem__(self, rows: Any, values: Self) -> None:
-        """Write some of them, in place."""
+        """Write rows in place."""
         self.map(lambda x, new: x.index_put_((rows,), new), values)
 
     def with_rows(self, rows: Sequence[int], other: Self) -> Self:
@@ -48,23 +48,23 @@ class Tensors:
         return self.map(replaced, other)
 
     def clone(self) -> Self:
-        """A copy."""
+        """Return a copy."""
         return self.map(torch.clone)
 
     def to(self, device: torch.device | str) -> Self:
-        """The same on another device."""
+        """Return the bundle on another device."""
         inside = {f.name: getattr(self, f.name) for f in fields(self)}
         moved = {name: x.to(device) for name, x in inside.items() if isinstance(x, Tensor | Tensors)}
         return replace(self, **moved)
 
     @classmethod
     def cat(cls, parts: Sequence[Self], dim: int = 0) -> Self:
-        """All of several, behind one another."""
+        """Concatenate bundles."""
         return parts[0].map(lambda *tensors: torch.cat(tensors, dim=dim), *parts[1:])
 
 
 def where(mask: Tensor, yes: _Batch, no: _Batch) -> _Batch:
-    """Row by row [B], one or the other."""
+    """Select each row from ``yes`` or ``no`` by a mask [B]."""
     if isinstance(yes, Tensor):
         return torch.where(mask.view(-1, *[1] * (yes.dim() - 1)), yes, no)  # pyright: ignore
     return yes.map(lambda a, b: where(mask, a, b), no)  # pyright: ignore

@@ -1,4 +1,4 @@
-"""Foreign text and values, safe to show: in messages, in tables, in a terminal."""
+"""Makes text and values of files safe to print."""
 
 from __future__ import annotations
 
@@ -20,23 +20,21 @@ _REPR = _Repr()
 
 
 def shown(value: Any) -> str:
-    """A value as Python writes it, shortened: what a file holds may be of any size, or look small and unfold without
-    end."""
+    """Return a value as Python writes it, shortened: the content of a file may have any size."""
     text = _REPR.repr(value)
     return text if len(text) <= 200 else f"{text[:160]}...{text[-30:]}"
 
 
 def is_plain(text: str) -> bool:
-    """Whether a text has only characters that can be seen, spaces and ends of lines; none that moves a cursor or turns
-    a line round."""
+    """Return whether a text has only printable characters and line ends, none that controls a terminal."""
     return text.isprintable() or all(c.isprintable() or c in "\n\t" for c in text)
 
 
 def plain(text: str) -> str:
-    """The text with every other character written as an escape."""
+    """Return the text with every character that :func:`is_plain` refuses as an escape."""
     return text if is_plain(text) else "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
 
 
 def short_name(name: str, gap: str = " ") -> str:
-    """``005_tomato_soup_can`` -> ``tomato soup can``, with another ``gap`` between its words for files."""
+    """Return ``tomato soup can`` for ``005_tomato_soup_can``, with ``gap`` between the words."""
     return re.sub(r"^\d+_(?=.)", "", name).replace("_", gap)

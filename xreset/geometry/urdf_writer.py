@@ -156,7 +156,8 @@ def write_meshes(tree: RobotTree, folder: Path) -> None:
 
 
 def _mesh_name(link: str, number: int) -> str:
-    return f"meshes/{link.replace('/', '_')}_{number}.obj"
+    file = link.replace("%", "%25").replace("/", "%2F")  # two links never share a file
+    return f"meshes/{file}_{number}.obj"
 
 
 def _add_link(robot: Element, link: Link) -> None:

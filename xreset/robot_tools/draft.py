@@ -1,4 +1,4 @@
-"""A robot as far as an import knows it: its links and joints, and in the end its commented ``robot.toml``."""
+"""Holds a robot during an import: its links and joints, and in the end its commented ``robot.toml``."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ table."""
 
 
 def moving(tree: RobotTree, mimics: Sequence[MimicSpec]) -> list[str]:
-    """Joints that need a drive, root first."""
+    """Return the joints that need a drive, root first."""
     followers = {mimic.joint for mimic in mimics}
     return [joint.name for joint in tree.joints if joint.type != "fixed" and joint.name not in followers]
 
 
 def below(tree: RobotTree, root: str) -> list[str]:
-    """The link ``root`` and all that it carries."""
+    """Return the link ``root`` and all links that it carries."""
     found = {root}
     for joint in tree.joints:
         if joint.parent in found:
@@ -46,7 +46,7 @@ def draft_spec(
     keypoints: Sequence[KeypointSpec] = (),
     home: dict[str, float] | None = None,
 ) -> RobotSpec:
-    """The robot as far as it is known, its URDF written."""
+    """Write the URDF, and return the robot as far as it is known."""
     (folder / "robot.urdf").write_text(urdf_text(tree, {}, mimics=mimics, comment="Written by xreset robots import."))
     write_meshes(tree, folder)
     inside = {joint.name for joint in tree.joints if joint.child in set(below(tree, hand_root)) - {hand_root}}

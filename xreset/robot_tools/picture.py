@@ -1,8 +1,6 @@
-"""A picture of a robot at home, with its frames, for whoever writes a description to look at."""
+"""Draws a robot at home with its frames, for whoever writes a description."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -12,7 +10,7 @@ from xreset.pictures.render import Camera, Renderer
 from xreset.spec import RobotSpec, SceneSpec
 
 _SIDES = ((0.9, -1.0, 0.7), (-0.5, -0.9, -0.9))
-"""Directions from which the hand is looked at closely: above its thumb's side, and below."""
+"""Directions of the close views of the hand: from above its thumb's side, and from below."""
 _PANEL = (480, 360)
 
 
@@ -20,25 +18,25 @@ def robot_picture(robot: RobotSpec) -> np.ndarray:
     """[720, 960, 3] uint8: above, the robot at its table, from the front and from the side; below, its hand from two
     sides.
 
-    The wide views show the frames of the moving joints' links, the close ones those of the palm and the fingertips
-    (left) and of the links that follow the human's keypoints (right). x is red, y green, z blue.
+    The wide views show the frames of the moving joints' links, the close views show the frames of the palm and the
+    fingertips (left) and of the links that follow the human's keypoints (right). x is red, y green, z blue.
     """
     kinematics = Kinematics(robot)
     poses = kinematics.link_poses(torch.tensor(robot.home), robot.tracked_links).numpy()
     points = poses[:, :3, 3]
-    middle, extent = points.mean(axis=0), float(np.ptp(points, axis=0).max())
+    middle = points.mean(axis=0)
+    distance = max(3.0 * float(np.ptp(points, axis=0).max()), 0.25)
     moving = [joint.child for joint in kinematics.tree.joints if joint.type != "fixed"]
     followed = list(dict.fromkeys(keypoint.link for keypoint in robot.keypoints))
-
-    def close(direction: Sequence[float]) -> Camera:
-        eye = middle + max(3.0 * extent, 0.25) * np.array(direction) / np.linalg.norm(direction)
-        return Camera(eye=tuple(eye), target=tuple(middle))
-
+    close = []
+    for side in _SIDES:
+        eye = middle + distance * np.array(side) / np.linalg.norm(side)
+        close.append(Camera(eye=tuple(eye), target=tuple(middle)))
     views = (
         (Camera(eye=(1.75, -0.65, 1.25), target=(0.55, 0.50, 0.38)), moving, 0.05),
         (Camera(eye=(-0.95, -0.35, 1.00), target=(0.55, 0.55, 0.40)), moving, 0.05),
-        (close(_SIDES[0]), list(robot.tracked_links), 0.02),
-        (close(_SIDES[1]), followed, 0.012),
+        (close[0], list(robot.tracked_links), 0.02),
+        (close[1], followed, 0.012),
     )
     scene = SceneSpec(robot=robot, objects=())
     panels = []

@@ -395,7 +395,8 @@ class _MjcfReader:
     def _joint(self, joint: Any, parent: str, child: str, T: np.ndarray) -> Joint:
         name = joint.name or f"joint{joint.id}"
         self.joint_names[joint.id] = name
-        lower, upper = -math.inf, math.inf
+        lower = -math.inf
+        upper = math.inf
         if self.model.jnt_limited[joint.id]:
             lower, upper = map(float, joint.range)
         is_slide = int(joint.type[0]) == int(self.mujoco.mjtJoint.mjJNT_SLIDE)

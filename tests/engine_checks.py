@@ -38,7 +38,7 @@ class EngineChecks:
     """Options with which the engine makes a single step per physics step, so that momentum can be balanced."""
 
     def make(self: unittest.TestCase, what: SceneSpec, num_worlds: int = 1, **options) -> PoolBackend:
-        backend = self.backend_class(what, num_worlds, workers=0, **options)  # pyright: ignore[reportAttributeAccessIssue]
+        backend = self.backend_class(what, num_worlds, workers=0, **options)  # pyright: ignore
         self.addCleanup(backend.close)
         return backend
 

@@ -72,7 +72,8 @@ class SapienTest(EngineChecks, unittest.TestCase):
             return SimpleNamespace(name=name, parent=parent)
 
         palm = link("palm", None)
-        first, second = link("first", palm), link("second", palm)
+        first = link("first", palm)
+        second = link("second", palm)
         joints = {"a": joint(first, link("a", first)), "b": joint(second, link("b", second))}
         with self.assertRaisesRegex(RobotError, "'b' mimics 'a', but neither lies below"):
             _couple(None, joints, MimicSpec(joint="b", source="a"))
@@ -104,7 +105,8 @@ class FrictionTest(unittest.TestCase):
         arms = rng.normal(size=(3, 3)) * 0.03
         normals = rng.normal(size=(3, 3))
         tangential = np.cross(normals, rng.normal(size=(3, 3)))
-        force, torque = tangential.sum(0), np.cross(arms, tangential).sum(0)
+        force = tangential.sum(0)
+        torque = np.cross(arms, tangential).sum(0)
         found = friction_forces(arms, normals, np.full(3, 0.8), force, torque)
         np.testing.assert_allclose(found, tangential, atol=1e-6)  # three contacts: six unknowns, six equations
 

@@ -1,4 +1,4 @@
-"""Every built-in engine that can be used here keeps the contracts, with the suite's own robot and with one from outside."""
+"""Every engine of the project keeps the contracts, with the suite's own robot and with another one."""
 
 from __future__ import annotations
 
@@ -29,12 +29,11 @@ def make_local(name: str):
 
 
 def explain(result: CheckResult) -> str:
-    wrong = "; ".join(
-        f"{m.what} {m.measured:.3g} > {m.tolerance:.3g} {m.unit} {m.where}"
-        for m in result.measures
-        if m.verdict == "failed"
-    )
-    return f"{result.name}: {result.check.statement}: {result.problem or wrong}"
+    wrong = []
+    for m in result.measures:
+        if m.verdict == "failed":
+            wrong.append(f"{m.what} {m.measured:.3g} > {m.tolerance:.3g} {m.unit} {m.where}")
+    return f"{result.name}: {result.check.statement}: {result.problem or '; '.join(wrong)}"
 
 
 @cache
@@ -42,45 +41,34 @@ def panda() -> RobotSpec:
     """The Franka Panda of the package ``pybullet_data``, standing beside the table, with critically damped drives."""
     import pybullet_data
 
-    home = (0.0, -0.6, 0.0, -2.2, 0.0, 1.6, 0.8)
-    stiffness, effort = (1500.0,) * 4 + (300.0,) * 3, (87.0,) * 4 + (12.0,) * 3
-    arm = [
-        JointSpec(
-            name=f"panda_joint{i + 1}", group="arm", home=q, drive=DriveSpec(kp=kp, kd=0.0, effort=limit, armature=0.1)
-        )
-        for i, (q, kp, limit) in enumerate(zip(home, stiffness, effort, strict=True))
-    ]
-    jaw = JointSpec(
-        name="panda_finger_joint1", group="hand", home=0.02, drive=DriveSpec(kp=1000.0, kd=0.0, effort=20.0)
-    )
+    joints = []
+    for i, q in enumerate((0.0, -0.6, 0.0, -2.2, 0.0, 1.6, 0.8), start=1):
+        strong = i <= 4
+        drive = DriveSpec(kp=1500.0 if strong else 300.0, kd=0.0, effort=87.0 if strong else 12.0, armature=0.1)
+        joints.append(JointSpec(name=f"panda_joint{i}", group="arm", home=q, drive=drive))
+    drive = DriveSpec(kp=1000.0, kd=0.0, effort=20.0)
+    joints.append(JointSpec(name="panda_finger_joint1", group="hand", home=0.02, drive=drive))
+    tips = []
+    for name, link in (("thumb", "panda_leftfinger"), ("index", "panda_rightfinger")):
+        tips.append(FingertipSpec(name=name, link=link, contact_links=(link,), keypoint=f"{name}4"))
     robot = RobotSpec(
         name="panda",
         urdf=Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf",
-        joints=(*arm, jaw),
+        joints=tuple(joints),
         mimics=(MimicSpec(joint="panda_finger_joint2", source="panda_finger_joint1"),),
         base_pos=(0.57, -0.35, 0.0),
         base_quat=(0.70710678, 0.0, 0.0, 0.70710678),
         palm="panda_grasptarget",
-        fingertips=(
-            FingertipSpec(
-                name="thumb", link="panda_leftfinger", contact_links=("panda_leftfinger",), keypoint="thumb4"
-            ),
-            FingertipSpec(
-                name="index", link="panda_rightfinger", contact_links=("panda_rightfinger",), keypoint="index4"
-            ),
-        ),
+        fingertips=tuple(tips),
         keypoints=(KeypointSpec(keypoint="wrist", link="panda_hand"),),
         hand_root="panda_hand",
         table_exclude=("panda_link0",),
     )
-    inertia = drive_inertia(robot, robot.home)
-    return replace(
-        robot,
-        joints=tuple(
-            replace(joint, drive=replace(joint.drive, kd=2.0 * float(np.sqrt(joint.drive.kp * felt))))
-            for joint, felt in zip(robot.joints, inertia, strict=True)
-        ),
-    )
+    damped = []
+    for joint, inertia in zip(robot.joints, drive_inertia(robot, robot.home), strict=True):
+        kd = 2.0 * float(np.sqrt(joint.drive.kp * inertia))
+        damped.append(replace(joint, drive=replace(joint.drive, kd=kd)))
+    return replace(robot, joints=tuple(damped))
 
 
 class EveryBackend(unittest.TestCase):
@@ -109,10 +97,11 @@ class EveryBackend(unittest.TestCase):
 
 
 class AnyProcessor(unittest.TestCase):
-    """OpenBLAS chooses its matrix kernels by the processor, and each rounds in its own way: no verdict may hang on that."""
+    """OpenBLAS chooses its matrix kernels by the processor, and each rounds in its own way: verdicts must not differ."""
 
     def test_set_as_built_with_the_kernels_of_several_processors(self):
-        if "openblas" not in np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"]:  # pyright: ignore[reportIndexIssue]
+        built = np.show_config(mode="dicts")["Build Dependencies"]  # pyright: ignore[reportIndexIssue]
+        if "openblas" not in built["blas"]["name"]:
             self.skipTest("numpy does not use OpenBLAS here, whose kernels this test chooses")
         if (reason := backend_status("pybullet").reason) is not None:
             self.skipTest(f"pybullet: {reason}")
@@ -127,9 +116,11 @@ class AnyProcessor(unittest.TestCase):
             "--check",
             "set_as_built",
         ]
-        for kernel in ("Haswell", *["SkylakeX"] * ("avx512f" in Path("/proc/cpuinfo").read_text())):
+        kernels = ["Haswell"]
+        if "avx512f" in Path("/proc/cpuinfo").read_text():
+            kernels.append("SkylakeX")
+        for kernel in kernels:
             with self.subTest(kernel=kernel):
-                done = subprocess.run(
-                    command, env=os.environ | {"OPENBLAS_CORETYPE": kernel}, capture_output=True, text=True, timeout=300
-                )
+                environment = os.environ | {"OPENBLAS_CORETYPE": kernel}
+                done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
                 self.assertEqual(done.returncode, 0, done.stdout + done.stderr)

@@ -38,14 +38,14 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 class ToyWorld(World):
-    """Joints jump to their targets; the object moves at its velocity plus force / mass; readings are simple functions of the state."""
+    """Joints jump to their targets; the object moves at its velocity plus force / mass; readings follow the state."""
 
     def __init__(self, scene: SceneSpec, object_index: int, *, gain: float = 1.0) -> None:
-        self.scene, self.object_index, self.gain = scene, object_index, gain
+        self.scene = scene
+        self.object_index = object_index
+        self.gain = gain
         self.mass = scene.objects[object_index].mass
         self.friction = np.zeros(3)
-        self.force = np.zeros(3)
-        self.contact = np.zeros(3)
         self.looks: list[str] = []
 
     def set_state(self, state):
@@ -73,13 +73,9 @@ class ToyWorld(World):
     def links(self):
         self.looks.append("links")
         k = len(self.scene.robot.tracked_links)
-        quat = np.tile([1.0, 0.0, 0.0, 0.0], (k, 1))
-        return (
-            np.full((k, 3), self.state["joint_pos"][0]),
-            quat,
-            np.full((k, 3), self.friction[0]),
-            np.full((k, 3), float(self.object_index)),
-        )
+        values = (self.state["joint_pos"][0], self.friction[0], float(self.object_index))
+        pos, linvel, angvel = (np.full((k, 3), value) for value in values)
+        return pos, np.tile([1.0, 0.0, 0.0, 0.0], (k, 1)), linvel, angvel
 
     def contacts(self):
         self.looks.append("contacts")
@@ -97,9 +93,6 @@ class ToyWorld(World):
     def set_object_gravity(self, fraction):
         raise NotImplementedError
 
-    def set_object_wrench(self, force, torque):
-        self.force = force
-
 
 class ToyBackend(PoolBackend):
     name = "toy"
@@ -112,23 +105,31 @@ class ToyBackend(PoolBackend):
 
 
 def toy_scene() -> SceneSpec:
-    joints = tuple(
-        JointSpec(name=f"j{i}", group="arm", drive=DriveSpec(kp=1.0, kd=0.1, effort=1.0), home=0.1 * (i + 1))
-        for i in range(2)
-    )
-    tips = tuple(FingertipSpec(name=n, link=n, contact_links=(n,), keypoint="thumb4") for n in ("thumb", "index"))
+    drive = DriveSpec(kp=1.0, kd=0.1, effort=1.0)
     robot = RobotSpec(
-        name="toy", urdf=Path("toy.urdf"), joints=joints, base_pos=(0, 0, 0), base_quat=(1, 0, 0, 0), palm="palm",
-        fingertips=tips, keypoints=(), hand_root="palm",
-    )  # fmt: skip
-    objects = tuple(
-        ObjectSpec(
-            name=f"o{i}", pieces=(Shape(geometry=Geometry(kind="sphere", size=(0.1 * (i + 1),))),), mass=1.0 + i, com=np.zeros(3),
-            inertia=np.eye(3), vertices=np.zeros((4, 3)), faces=np.zeros((1, 3), dtype=int),
+        name="toy",
+        urdf=Path("toy.urdf"),
+        joints=tuple(JointSpec(name=f"j{i}", group="arm", drive=drive, home=0.1 * i) for i in (1, 2)),
+        base_pos=(0, 0, 0),
+        base_quat=(1, 0, 0, 0),
+        palm="palm",
+        fingertips=tuple(FingertipSpec(name=n, link=n, contact_links=(n,), keypoint=n) for n in ("thumb", "index")),
+        keypoints=(),
+        hand_root="palm",
+    )
+    objects = []
+    for size in (1, 2):
+        ball = ObjectSpec(
+            name=f"ball {size}",
+            pieces=(Shape(geometry=Geometry(kind="sphere", size=(0.1 * size,))),),
+            mass=float(size),
+            com=np.zeros(3),
+            inertia=np.eye(3),
+            vertices=np.zeros((4, 3)),
+            faces=np.zeros((1, 3), dtype=int),
         )
-        for i in range(2)
-    )  # fmt: skip
-    return SceneSpec(robot=robot, objects=objects)
+        objects.append(ball)
+    return SceneSpec(robot=robot, objects=tuple(objects))
 
 
 def random_state(n: int, seed: int) -> State:
@@ -162,16 +163,17 @@ class PoolTest(unittest.TestCase):
 
     def test_state_round_trip_and_subset(self):
         for pool in self.each():
-            pool.set_state(random_state(2, 1), torch.tensor([4, 1]))
-            expected = {f.name: getattr(random_state(5, 0), f.name) for f in fields(State)}
-            for f in fields(State):
-                expected[f.name][[4, 1]] = getattr(random_state(2, 1), f.name)
-                torch.testing.assert_close(getattr(pool.state(), f.name), expected[f.name], rtol=0, atol=0)
+            expected = random_state(5, 0)
+            new = random_state(2, 1)
+            expected[torch.tensor([4, 1])] = new
+            pool.set_state(new, torch.tensor([4, 1]))
+            for name in STATE_FIELDS:
+                torch.testing.assert_close(getattr(pool.state(), name), getattr(expected, name), rtol=0, atol=0)
 
     def test_step_moves_each_world_by_its_own_inputs(self):
         for pool in self.each():
-            before = pool.state().to("cpu")
-            start, velocity = before.object_pos.clone(), before.object_linvel.clone()
+            before = pool.state().clone()
+            velocity = before.object_linvel.clone()
             targets = torch.arange(10.0).reshape(5, 2) / 100
             pool.set_joint_targets(targets)
             torch.testing.assert_close(pool.state().joint_target, targets)
@@ -185,7 +187,7 @@ class PoolTest(unittest.TestCase):
             torch.testing.assert_close(pool.links().angvel[:, 0, 0], torch.tensor([0.0, 1.0, 0.0, 1.0, 0.0]))
             velocity[2, 1] += 3 * 0.5 / 1.0
             torch.testing.assert_close(state.object_linvel, velocity)
-            torch.testing.assert_close(state.object_pos, start + 3 * velocity)
+            torch.testing.assert_close(state.object_pos, before.object_pos + 3 * velocity)
             torch.testing.assert_close(pool.contacts().tip_force[:, :, 2], torch.full((5, 2), 3.0))
             self.assertEqual(pool.contacts().tip_touch.tolist(), [[True, False]] * 5)
             pool.set_state(random_state(1, 2), torch.tensor([3]))
@@ -405,7 +407,7 @@ class RestHeightTest(unittest.TestCase):
         angles = np.linspace(0, 2 * np.pi, 2001)
         rim = np.stack([0.2 * np.cos(angles), 0.2 * np.sin(angles), np.zeros_like(angles)], axis=1)
         cylinder = np.concatenate([rim + np.array([0, 0, 0.3]), rim - np.array([0, 0, 0.3])])
-        corners = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.2, 0.2) for z in (-0.3, 0.3)])
+        corners = np.array(list(product((-0.1, 0.1), (-0.2, 0.2), (-0.3, 0.3))))
         cases = [
             (Geometry(kind="box", size=(0.1, 0.2, 0.3)), corners, 0.0),
             (Geometry(kind="cylinder", size=(0.2, 0.3)), cylinder, 0.0),

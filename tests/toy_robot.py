@@ -81,11 +81,15 @@ def toy_hand_arm(folder: Path) -> RobotSpec:
 
 
 def toy_motion(model: HandModel, generator: torch.Generator, *, margin: float, turn: float) -> HandState:
-    """Three motions of 12 frames: joints between two postures that keep a share ``margin`` of their range from the limits, the root along
-    a line and turning by ``turn`` [rad] about each axis."""
+    """Three motions of 12 frames: the joints move between two postures, the root along a line while it turns.
+
+    The postures keep a share ``margin`` of the joints' range from the limits. The root turns by ``turn`` [rad] about
+    each axis.
+    """
     from xreset.retarget.hand.model import HandState
 
-    low, high = model.kinematics.lower, model.kinematics.upper
+    low = model.kinematics.lower
+    high = model.kinematics.upper
     share = torch.linspace(0, 1, 12, dtype=low.dtype)[:, None]
     ends = low + (high - low) * (
         margin + (1.0 - 2.0 * margin) * torch.rand(2, 3, 1, len(low), dtype=low.dtype, generator=generator)

@@ -1,17 +1,40 @@
 # Sourced by the scripts beside it: makes .venv with everything the project needs, once, and puts it on the PATH.
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
-python=${PYTHON:-python3}
-stamp=.venv/.xreset-$("$python" -c 'import hashlib,sys; print(hashlib.sha256(open("pyproject.toml","rb").read()).hexdigest()[:16])')
+
+supported() { "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' 2> /dev/null; }
+
+if [ -n "${PYTHON:-}" ]; then
+  candidates=("$PYTHON")
+else
+  candidates=(python3.11 python3 python3.12 python3.13)  # 3.11 first: PyBullet has wheels for it only
+fi
+python=
+for candidate in "${candidates[@]}"; do
+  if supported "$candidate"; then
+    python=$candidate
+    break
+  fi
+done
+if [ -z "$python" ]; then
+  echo "xreset needs Python 3.11, 3.12 or 3.13; none of these is one: ${candidates[*]}. Set PYTHON=/path/to/python." >&2
+  exit 1
+fi
+
+stamp=.venv/.xreset-$("$python" -c '
+import hashlib, sys
+content = open("pyproject.toml", "rb").read() + str(sys.version_info[:2]).encode()
+print(hashlib.sha256(content).hexdigest()[:16])')
 if [ ! -e "$stamp" ]; then
-  "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
-    echo "xreset needs Python 3.11 or newer, found $("$python" --version 2>&1). Set PYTHON=/path/to/python3.11." >&2
-    exit 1
-  }
-  echo "== setting up .venv (once)"
+  echo "== setting up .venv with $("$python" --version) (once)"
+  version=$("$python" -c 'import sys; print(sys.version_info[:2])')
+  if [ -x .venv/bin/python ] && [ "$(.venv/bin/python -c 'import sys; print(sys.version_info[:2])')" != "$version" ]; then
+    rm -rf .venv  # it is of another version of Python
+  fi
   [ -x .venv/bin/python ] || "$python" -m venv .venv
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check torch==2.13.0  # first: a plain torch would bring CUDA along
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check -e '.[all,dev]'
+  install() { .venv/bin/python -m pip install --quiet --disable-pip-version-check --only-binary :all: "$@"; }
+  install torch==2.13.0  # first: what depends on torch then takes this build
+  install -e '.[all,dev]'
   rm -f .venv/.xreset-*
   touch "$stamp"
 fi

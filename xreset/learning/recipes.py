@@ -26,7 +26,9 @@ _MINUTES = TrainConfig(
         timestep=1 / 120,
         substeps=2,
         action=ActionConfig(hand="relative"),
-        observation=ObservationConfig(rotation="matrix", cloud_scale=5.0, contact_force_scale=0.03, joint_target=True),
+        observation=ObservationConfig(
+            cloud="paired", rotation="matrix", cloud_scale=5.0, contact_force_scale=0.03, joint_target=True
+        ),
         reward=RewardConfig(
             reach_width=0.4, reach_near=1.0, reach_distance="present", contact="opposing", raw_actions=True
         ),

@@ -25,6 +25,7 @@ def evaluate(
     objects: str | Path | None = None,
     num_envs: int = 64,
     device: str = "cpu",
+    settle: bool = False,
     out: str | Path | None = None,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> Evaluation:
@@ -40,6 +41,7 @@ def evaluate(
         objects: folder of object meshes; default: the folder of the policy's training.
         num_envs: worlds that run at the same time.
         device: where GPU engines run: cpu or cuda.
+        settle: whether objects come to rest before episodes begin, instead of starting as recorded.
         out: folder for the results; default: the folder of the policy.
         progress: called with (engine, control steps done, control steps in all).
 
@@ -57,7 +59,7 @@ def evaluate(
     if isinstance(engines, str):
         engines = (engines,)
     chosen = [e if isinstance(e, Engine) else engine(e, device=device) for e in dict.fromkeys(engines)]
-    trial = load_trial(policy, demos, objects=objects, seed=seed, num_envs=num_envs)
+    trial = load_trial(policy, demos, objects=objects, seed=seed, num_envs=num_envs, settle=settle)
     folder = Path(out) if out else policy.folder
     results = []
     tables = []

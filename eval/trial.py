@@ -22,6 +22,7 @@ from xreset.physics import Backend
 from xreset.plugins import backend_class, device_for, make_backend
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import ResetDistribution
+from xreset.resets.settle import settle_starts
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task.config import TaskConfig, evaluation_task
@@ -136,6 +137,7 @@ def load_trial(
     objects: str | Path | None = None,
     seed: int = 0,
     num_envs: int = 64,
+    settle: bool = False,
     accept: tuple[Kind, ...] = ("demos", "motion"),
 ) -> Trial:
     """Load what a policy is to play. For the baseline ``ik``, demonstrations are retargeted here.
@@ -146,6 +148,8 @@ def load_trial(
         objects: folder of object meshes; default: the folder of the policy's training.
         seed: seed of the perturbations.
         num_envs: worlds that run at the same time.
+        settle: whether objects come to rest before episodes begin (:mod:`xreset.resets.settle`), in MuJoCo for every
+            engine, so that all engines play the same starts. Default: the recorded poses, as in the paper.
         accept: the kinds of data that the caller can use.
     """
     folder = Path(objects) if objects else policy.objects_folder
@@ -153,11 +157,15 @@ def load_trial(
     hashes = {} if policy.hash is None else {"policy": policy.hash}
     if inputs.hash is not None:
         hashes["resets" if isinstance(inputs.data, ResetBank) else "demos"] = inputs.hash
-    used = [o for o in inputs.objects if o.name in inputs.bank.sequence_object]
+    bank = inputs.bank
+    used = [o for o in inputs.objects if o.name in bank.sequence_object]
+    if settle:
+        bank, _ = settle_starts(bank, policy.robot, used, num_envs=num_envs)
+        hashes["starts"] = "settled"
     return Trial(
         robot=policy.robot,
         objects=tuple(sorted(used, key=lambda o: o.name)),
-        bank=inputs.bank,
+        bank=bank,
         task=evaluation_task(policy.task),
         seed=seed,
         num_envs=num_envs,

@@ -17,6 +17,7 @@ def evaluate(
     backend: Several = (),
     demos: Path,
     episodes: int = 5,
+    settle: bool = False,
     setting: Flat[Setting] = Setting(),  # noqa: B008
     out: Path | None = None,
 ) -> None:
@@ -29,6 +30,8 @@ def evaluate(
         demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the
             path of ik.
         episodes: Episodes per demonstration, each with another perturbation of robot and object.
+        settle: Let objects come to rest before episodes begin. Default: the recorded poses, as in the paper; one in eight
+            of them tips or rolls before the hand arrives.
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: eval/ in the run folder or next to the policy, runs/NAME/eval for a policy
             that ships with xreset, runs/BASELINE-ROBOT/eval for a baseline.
@@ -38,7 +41,7 @@ def evaluate(
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     with engine_bars(console, engines) as progress:
         summaries = evaluation.evaluate(
-            spec, demos, engines, episodes=episodes, out=out, progress=progress, **vars(setting)
+            spec, demos, engines, episodes=episodes, settle=settle, out=out, progress=progress, **vars(setting)
         )
     console.print(table.results_table(summaries))
     if unseen := summaries[0].unseen:

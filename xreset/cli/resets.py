@@ -19,6 +19,7 @@ from xreset.objects import catalogue
 from xreset.resets import bank as banks
 from xreset.resets import filter as trying
 from xreset.resets import hold as holding
+from xreset.resets import settle as settling_starts
 from xreset.resets.config import ClosingConfig, SqueezeConfig
 from xreset.retarget import file
 
@@ -35,6 +36,7 @@ def resets(
     closing: ClosingConfig = ClosingConfig(),  # noqa: B008 (frozen)
     squeeze: SqueezeConfig = SqueezeConfig(),  # noqa: B008 (frozen)
     hold: bool = False,
+    settle: bool = False,
 ) -> None:
     """Try retargeted states in physics and keep the stable ones.
 
@@ -49,6 +51,8 @@ def resets(
         device: Where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
         closing: States between frames where the hand closes in.
         squeeze: Targets of states after contact that press.
+        settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
+            poses, as in the paper; one in eight objects tips or rolls before a hand arrives.
         hold: Also count, in every engine, which lifted states hold the object for a second at full gravity.
     """
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
@@ -62,13 +66,25 @@ def resets(
             data, spec, loaded, backends, num_envs=num_envs, device=device, closing=closing, squeeze=squeeze,
             progress=bar.count(f"states in {', '.join(backends)}"),
         )  # fmt: skip
+        settling = None
+        if settle:
+            bank, settling = settling_starts.settle_starts(
+                bank, spec, loaded, backends[0], num_envs=num_envs, device=device,
+                progress=bar.count("start poses come to rest"),
+            )  # fmt: skip
         held = []
         if hold:
             held = holding.hold_bank(
                 bank, spec, loaded, backends, num_envs=num_envs, device=device,
                 progress=bar.count("lifted states hold"),
             )  # fmt: skip
-    config = {"backends": backends, "num_envs": num_envs, "closing": asdict(closing), "squeeze": asdict(squeeze)}
+    config = {
+        "backends": backends,
+        "num_envs": num_envs,
+        "closing": asdict(closing),
+        "squeeze": asdict(squeeze),
+        "settle": settle,
+    }
     banks.write_bank(out, bank, config=config, inputs={"retargeted": file_hash(retargeted)})
     bands = bank.bands()
     write_accounts(
@@ -77,9 +93,12 @@ def resets(
         rows=bank.accounts(),
         bands=bands,
         pressing=bank.num_pressing,
+        **({} if settling is None else {"settled": settling.accounts()}),
         **({"hold": [asdict(row) for row in held]} if hold else {}),
     )
 
+    if settling is not None:
+        console.print(settling.summary())
     console.print(_accepted(data, bank, f"{spec.name}: states stable in {', '.join(backends)}"))
     if closing.spacing is not None:
         console.print(_closing(bands))

@@ -14,7 +14,7 @@ from xreset.schedule import schedule
 from xreset.spec import SceneSpec
 
 Judge = Callable[[Backend, State], Tensor]
-"""Verdicts [N] on the worlds of an engine, which began with the given states."""
+"""Verdicts [N] or [N, K] on the worlds of an engine, which began with the given states."""
 
 
 def probe(
@@ -30,7 +30,7 @@ def probe(
     device: str,
     progress: Callable[[int], None],
 ) -> np.ndarray:
-    """Return the verdicts [M] on states, of which an engine tries as many at a time as it has worlds.
+    """Return the verdicts [M] or [M, K] on states, of which an engine tries as many at a time as it has worlds.
 
     Args:
         engine: name of the engine.
@@ -54,7 +54,7 @@ def probe(
             settle(backend, start, gravity=gravity, steps=steps)
             found = judge(backend, start).cpu().numpy()
             if verdicts is None:
-                verdicts = np.empty(len(object_index), dtype=found.dtype)
+                verdicts = np.empty((len(object_index), *found.shape[1:]), dtype=found.dtype)
             verdicts[items[fresh]] = found[fresh]
             done += int(fresh.sum())
             progress(done)

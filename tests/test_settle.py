@@ -1,0 +1,83 @@
+"""Starts at rest: recorded start poses come to rest on the table before episodes begin there."""
+
+import unittest
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tests.toy_bank import SOUP, SPAM, toy_bank
+from xreset.demos.synth import synthesize
+from xreset.description import load_robot
+from xreset.eval.policy_spec import load_policy
+from xreset.eval.trial import load_trial
+from xreset.objects.catalogue import load_object
+from xreset.resets.settle import settle_starts
+
+
+def tilted(degrees: float) -> np.ndarray:
+    """Quaternion (w, x, y, z) of a turn about x."""
+    half = np.radians(degrees) / 2
+    return np.array([np.cos(half), np.sin(half), 0, 0], dtype=np.float32)
+
+
+class SettleTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.robot = load_robot("ur7e-sharpa")
+        cls.objects = [load_object(name) for name in (SOUP, SPAM)]
+        cls.height = -cls.objects[0].vertices[:, 2].min()
+
+    def settle(self, pos, quat):
+        bank = toy_bank(self.robot, start_pos=np.float32(pos), start_quat_wxyz=np.float32(quat))
+        return bank, *settle_starts(bank, self.robot, self.objects)
+
+    def test_objects_come_to_rest_on_the_table(self):
+        z = self.height
+        pos = [[0.5, 0.3, z + 0.01], [0.6, 0.2, 0.2], [0.55, 0.25, z + 0.005]]
+        bank, settled, settling = self.settle(pos, [tilted(0), tilted(0), tilted(6)])
+        self.assertTrue(settling.at_rest.all(), settling)
+        np.testing.assert_allclose(settled.start_pos[[0, 2], 2], z, atol=2e-3)
+        np.testing.assert_allclose(settling.distance[0], 0.01, atol=2e-3)
+        np.testing.assert_allclose(np.degrees(settling.angle[2]), 6, atol=1)
+        np.testing.assert_array_equal(settled.goal_pos, bank.goal_pos)
+        np.testing.assert_array_equal(settled.joint_pos, bank.joint_pos)
+
+    def test_an_object_at_rest_stays_where_it_is(self):
+        still = [[0.5, 0.3, self.height]] * 3
+        _, settled, _ = self.settle(still, [tilted(0)] * 3)
+        _, again, settling = self.settle(settled.start_pos, settled.start_quat_wxyz)
+        self.assertLess(settling.distance[0], 1e-3)
+        self.assertLess(np.degrees(settling.angle[0]), 0.5)
+        np.testing.assert_allclose(again.start_pos[0], settled.start_pos[0], atol=1e-3)
+
+    def test_an_object_that_leaves_the_table_starts_as_recorded(self):
+        z = self.height
+        pos = [[0.5, 0.3, z], [0.57, 2.0, 0.3], [0.5, 0.3, z]]
+        bank, settled, settling = self.settle(pos, [tilted(0)] * 3)
+        self.assertEqual(settling.at_rest.tolist(), [True, False, True])
+        np.testing.assert_array_equal(settled.start_pos[1], bank.start_pos[1])
+        self.assertIn("1 did not come to rest and start as recorded", settling.summary())
+        self.assertEqual([row["at_rest"] for row in settling.accounts()], [True, False, True])
+
+    def test_an_evaluation_says_that_its_starts_were_settled(self):
+        demos = synthesize([SOUP], 1, seed=0)
+        turn = Rotation.from_quat(tilted(6), scalar_first=True)
+        recorded = Rotation.from_quat(demos.object_quat_wxyz, scalar_first=True)
+        from_upright = turn * recorded * recorded[0].inv()
+        leaning = replace(demos, object_quat_wxyz=from_upright.as_quat(scalar_first=True))
+        policy = load_policy("zero", robot="ur7e-sharpa")
+        recorded = load_trial(policy, leaning)
+        settled = load_trial(policy, leaning, settle=True)
+        self.assertNotIn("starts", recorded.inputs)
+        self.assertEqual(settled.inputs["starts"], "settled")
+        lean = []
+        for trial in (recorded, settled):
+            axis = Rotation.from_quat(trial.bank.start_quat_wxyz[0], scalar_first=True).apply([0, 0, 1])
+            lean.append(np.degrees(np.arccos(axis[2])))
+        self.assertAlmostEqual(lean[0], 6, delta=0.1)
+        self.assertLess(lean[1], 1)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,19 +1,18 @@
-"""Demonstrations of other trackers: orders, units, frames, rates and conventions of poses; what cannot be known is refused."""
+"""Demonstrations of other trackers: orders, units, frames, rates, poses; unknown conventions are refused."""
 
-import contextlib
 import csv
-import io
+import itertools
 import re
 import tempfile
 import unittest
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.data import data_dir
-from xreset.cli import main
+from tests.data import InFolder, data_dir, run
 from xreset.demos.archive import read_demos
 from xreset.demos.keypoints import ORDERS, Convention, read_keypoints
 from xreset.demos.synth import synthesize
@@ -32,42 +31,36 @@ def written(points, order):
 
 
 def seen_from(T, demos):
-    """Keypoints, object positions and orientations of one sequence in a camera's frame; T: the camera's pose in the table frame."""
+    """Keypoints, object positions and orientations of one sequence in the frame of a camera at pose T."""
     turn = Rotation.from_matrix(T[:3, :3]).inv()
     points = (demos.hand_keypoints.astype(float) - T[:3, 3]) @ T[:3, :3]
     pos = (demos.object_pos.astype(float) - T[:3, 3]) @ T[:3, :3]
     return points, pos, turn * Rotation.from_quat(demos.object_quat_wxyz, scalar_first=True)
 
 
-def write_csv(path, points, pos, turn, scale=1.0, columns=(), quat="wxyz"):
-    """One row for each frame, as a tracker would; ``columns``: (name, value or values) to add."""
-    frames = len(points)
-    added = {name: [value] * frames if np.ndim(value) == 0 else value for name, value in columns}
-    names = (
-        [f"{axis}{k}" for k in range(21) for axis in "xyz"]
-        + [f"object_{a}" for a in "xyz"]
-        + [f"object_q{a}" for a in quat]
-    )
+def write_csv(path, points, pos, turn, scale=1.0, columns=MappingProxyType({}), quat="wxyz"):
+    """One row for each frame, as a tracker would; ``columns``: name -> value or values to add."""
+    names = [f"{axis}{k}" for k, axis in itertools.product(range(21), "xyz")]
+    names += ["object_x", "object_y", "object_z", *(f"object_q{axis}" for axis in quat)]
     quats = turn.as_quat(scalar_first=quat == "wxyz")
     with open(path, "w", newline="") as file:
         table = csv.writer(file)
-        table.writerow([*added, *names])
-        for i in range(frames):
-            numbers = np.concatenate((scale * points[i].ravel(), scale * pos[i]))
-            cells = ["" if np.isnan(x) else f"{x:.6f}" for x in numbers] + [f"{x:.9f}" for x in quats[i]]
-            table.writerow([*(values[i] for values in added.values()), *cells])
+        table.writerow([*columns, *names])
+        for i in range(len(points)):
+            numbers = np.concatenate((scale * points[i].ravel(), scale * pos[i], quats[i]))
+            cells = ["" if np.isnan(x) else f"{x:.9f}" for x in numbers]
+            table.writerow([*(np.broadcast_to(value, len(points))[i] for value in columns.values()), *cells])
 
 
-class Synthetic(unittest.TestCase):
+class Synthetic(InFolder):
     @classmethod
     def setUpClass(cls):
         cls.demos = synthesize(["soup"], per_object=1, seed=1, fps=10)
 
     def setUp(self):
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.folder = Path(folder.name)
+        super().setUp()
         self.points = self.demos.hand_keypoints.astype(float)
+        self.turn = Rotation.from_quat(self.demos.object_quat_wxyz, scalar_first=True)
         self.arrays = {
             "keypoints": self.points,
             "object_pos": self.demos.object_pos,
@@ -78,15 +71,15 @@ class Synthetic(unittest.TestCase):
 
     def npz(self, **changes):
         path = self.folder / "a.npz"
-        np.savez(path, **{name: value for name, value in (self.arrays | changes).items() if value is not None})  # pyright: ignore[reportArgumentType]
+        arrays = self.arrays | changes
+        np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
         return path
 
     def same(self, found, tolerance=2e-6):
         np.testing.assert_allclose(found.hand_keypoints, self.demos.hand_keypoints, atol=tolerance)
         np.testing.assert_allclose(found.object_pos, self.demos.object_pos, atol=tolerance)
         turn = Rotation.from_quat(found.object_quat_wxyz, scalar_first=True)
-        off = (turn.inv() * Rotation.from_quat(self.demos.object_quat_wxyz, scalar_first=True)).magnitude()
-        self.assertLess(off.max(), 1e-3)
+        self.assertLess((turn.inv() * self.turn).magnitude().max(), 1e-3)
         self.assertEqual(found.object_name.tolist(), self.demos.object_name.tolist())
 
     def refused(self, message, convention=PLAIN, **changes):
@@ -95,15 +88,15 @@ class Synthetic(unittest.TestCase):
 
     def test_every_order_unit_and_frame_arrives_the_same(self):
         points, pos, turn = seen_from(CAMERA, self.demos)
-        for order in ORDERS:
-            for units, scale in (("m", 1.0), ("mm", 1e3)):
-                pose = np.tile(np.eye(4), (len(pos), 1, 1))
-                pose[:, :3, :3], pose[:, :3, 3] = turn.as_matrix(), scale * pos
-                changes = {"object_pos": None, "object_quat_wxyz": None, "object_pose": pose}
-                path = self.npz(keypoints=scale * written(points, order), **changes)
-                convention = Convention(order=order, units=units, frame="camera", table_from_camera=CAMERA, fps=10.0)  # pyright: ignore[reportArgumentType]
-                with self.subTest(order=order, units=units):
-                    self.same(read_keypoints(path, convention))
+        pose = np.tile(np.eye(4), (len(pos), 1, 1))
+        pose[:, :3, :3] = turn.as_matrix()
+        for order, (units, scale) in itertools.product(ORDERS, (("m", 1.0), ("mm", 1e3))):
+            pose[:, :3, 3] = scale * pos
+            changes = {"object_pos": None, "object_quat_wxyz": None, "object_pose": pose}
+            path = self.npz(keypoints=scale * written(points, order), **changes)
+            convention = Convention(order=order, units=units, frame="camera", table_from_camera=CAMERA, fps=10.0)
+            with self.subTest(order=order, units=units):
+                self.same(read_keypoints(path, convention))
 
     def test_quaternions_say_their_order_or_must_be_told(self):
         wxyz = self.demos.object_quat_wxyz
@@ -200,9 +193,8 @@ class Synthetic(unittest.TestCase):
 
     def test_a_csv_of_several_sequences(self):
         path = self.folder / "two.csv"
-        turn = Rotation.from_quat(self.demos.object_quat_wxyz, scalar_first=True)
-        columns = [("object", str(self.demos.object_name[0])), ("side", "right"), ("confidence", 0.9)]
-        write_csv(path, self.points, self.demos.object_pos, turn, columns=[("sequence", "a"), *columns], quat="xyzw")
+        columns = {"sequence": "a", "object": str(self.demos.object_name[0]), "side": "right", "confidence": 0.9}
+        write_csv(path, self.points, self.demos.object_pos, self.turn, columns=columns, quat="xyzw")
         first = path.read_text()
         path.write_text(first + re.sub("(?m)^a,", "b,", first.split("\n", 1)[1]))
         with self.assertLogs("xreset.demos.keypoints", "WARNING") as log:
@@ -224,24 +216,22 @@ class Synthetic(unittest.TestCase):
             read_keypoints(path, PLAIN)
 
     def test_command(self):
-        turn = Rotation.from_quat(self.demos.object_quat_wxyz, scalar_first=True)
-        (self.folder / "in").mkdir()
+        source = self.folder / "in"
+        source.mkdir()
         for name in ("one", "two"):
-            write_csv(self.folder / "in" / f"{name}.csv", self.points, self.demos.object_pos, turn, scale=1e3)
-        out, err = io.StringIO(), io.StringIO()
+            write_csv(source / f"{name}.csv", self.points, self.demos.object_pos, self.turn, scale=1e3)
         np.savetxt(self.folder / "T.txt", np.eye(4))
-        words = (
-            f"--order mediapipe --units mm --coordinates camera --table-from-camera {self.folder / 'T.txt'} --fps 10"
-        )
-        words += f" --side right --object 005_tomato_soup_can --out {self.folder / 'out.npz'}"
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            main(["demos", "import", "keypoints", str(self.folder / "in"), *words.split()])
-        self.assertIn("2 sequences", out.getvalue())
-        self.assertEqual(read_demos(self.folder / "out.npz").sequence_name.tolist(), ["one", "two"])
-        with contextlib.redirect_stderr(err), self.assertRaises(SystemExit):
-            main(["demos", "import", "keypoints", str(self.folder / "in"), "--out", str(self.folder / "no.npz")])
-        self.assertIn("--order mano", err.getvalue())
-        self.assertFalse((self.folder / "no.npz").exists())
+        out = self.folder / "out.npz"
+        command = ["demos", "import", "keypoints", source, "--out", out]
+        code, said = run(*command)
+        self.assertEqual(code, 1)
+        self.assertIn("--order mano", said)
+        self.assertFalse(out.exists())
+        words = "--order mediapipe --units mm --coordinates camera --fps 10 --side right --object 005_tomato_soup_can"
+        code, said = run(*command, *words.split(), "--table-from-camera", self.folder / "T.txt")
+        self.assertEqual(code, 0, said)
+        self.assertIn("2 sequences", said)
+        self.assertEqual(read_demos(out).sequence_name.tolist(), ["one", "two"])
 
 
 class Real(unittest.TestCase):
@@ -250,11 +240,8 @@ class Real(unittest.TestCase):
         with tempfile.TemporaryDirectory() as folder:
             for i in range(3):
                 one = demos.select(indices=[i])
-                columns = [
-                    ("object", str(one.object_name[0])),
-                    ("side", "right"),
-                    ("time", np.arange(one.num_frames) / 30),
-                ]
+                time = np.arange(one.num_frames) / 30
+                columns = {"object": str(one.object_name[0]), "side": "right", "time": time}
                 points, pos, turn = seen_from(CAMERA, one)
                 points = written(points, "mediapipe")
                 path = Path(folder, f"{i}.csv")

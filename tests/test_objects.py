@@ -1,14 +1,10 @@
 """Objects: stand-ins, sampling, rest, and the import of meshes."""
 
-import contextlib
 import importlib.util
-import io
 import os
-import tempfile
 import unittest
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
@@ -18,8 +14,7 @@ import trimesh
 from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
 
-from tests.data import data_dir
-from xreset.cli import main
+from tests.data import InFolder, data_dir, run
 from xreset.errors import ObjectError, XResetError
 from xreset.geometry.shapes import half_spaces, hull, shape_mesh, shell_properties
 from xreset.objects.catalogue import canonical_name, load_object, load_objects, object_names
@@ -69,13 +64,11 @@ class StandIns(unittest.TestCase):
                     if piece.geometry.vertices is not None:
                         self.assertLessEqual(len(piece.geometry.vertices), 64)
 
-    def test_inertia_of_the_box_is_the_textbooks(self):
+    def test_inertia_of_box_and_can_is_the_textbooks(self):
         obj = load_object("cheez-its")
         a, b, c = 2 * np.array(obj.pieces[0].geometry.size)
         expected = obj.mass / 12 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b])
         np.testing.assert_allclose(obj.inertia, expected, rtol=1e-9, atol=1e-12)
-
-    def test_inertia_of_the_can_is_the_textbooks(self):
         obj = load_object("soup")
         radius, half = obj.pieces[0].geometry.size
         across = obj.mass * (3 * radius**2 + 4 * half**2) / 12
@@ -119,8 +112,8 @@ class Geometry(unittest.TestCase):
             hull(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]))
 
     def test_winding_number_counts_overlaps(self):
-        a, b = trimesh.creation.box((2, 2, 2)), trimesh.creation.box((2, 2, 2))
-        b.apply_translation((1, 0, 0))
+        a = trimesh.creation.box((2, 2, 2))
+        b = a.copy().apply_translation((1, 0, 0))
         both = trimesh.util.concatenate([a, b])
         points = np.array([[-0.5, 0.1, 0.2], [0.5, 0.1, 0.2], [2.5, 0.1, 0.2]])
         np.testing.assert_allclose(winding_number(points, both.vertices, both.faces), [1, 2, 0], atol=1e-9)
@@ -192,14 +185,10 @@ class Rest(unittest.TestCase):
         np.testing.assert_allclose(upside_down.apply(Z), -Z, atol=1e-9)
 
 
-class MeshImport(unittest.TestCase):
+class MeshImport(InFolder):
     def setUp(self):
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.folder = Path(folder.name)
-        patch = mock.patch.dict(os.environ, {"XRESET_CACHE": str(self.folder / "cache")})
-        patch.start()
-        self.addCleanup(patch.stop)
+        super().setUp()
+        self.enterContext(mock.patch.dict(os.environ, {"XRESET_CACHE": str(self.folder / "cache")}))
 
     def write(self, mesh, name="thing"):
         path = self.folder / f"{name}.obj"
@@ -209,14 +198,12 @@ class MeshImport(unittest.TestCase):
     def bracket(self):
         """An L of two bars, closed and concave."""
         outline = [(0, 0), (0.1, 0), (0.1, 0.03), (0.03, 0.03), (0.03, 0.1), (0, 0.1)]
-        n = len(outline)
-        vertices = [(x, y, z) for z in (0.0, 0.02) for x, y in outline]
-        cap = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)]
-        faces = [(c, b, a) for a, b, c in cap] + [(a + n, b + n, c + n) for a, b, c in cap]
-        for i in range(n):
-            j = (i + 1) % n
-            faces += [(i, j, j + n), (i, j + n, i + n)]
-        return trimesh.Trimesh(vertices, faces)
+        vertices = np.concatenate([np.insert(outline, 2, z, axis=1) for z in (0.0, 0.02)])
+        cap = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)])
+        i = np.arange(6)
+        j = (i + 1) % 6
+        sides = np.concatenate((np.stack((i, j, j + 6), axis=1), np.stack((i, j + 6, i + 6), axis=1)))
+        return trimesh.Trimesh(vertices, np.concatenate((cap[:, ::-1], cap + 6, sides)))
 
     def test_convex_mesh_is_one_hull_with_mass_by_density(self):
         path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)))
@@ -355,46 +342,30 @@ class MeshImport(unittest.TestCase):
             self.assertFalse(import_with_notes(path, "thing").cached)
 
     def test_the_command_puts_a_mesh_into_a_folder_and_draws_it(self):
-        path, out, png = (
-            self.write(trimesh.creation.box((100, 60, 40)), "a brick"),
-            self.folder / "objects",
-            self.folder / "a.png",
-        )
-        with contextlib.redirect_stdout(io.StringIO()) as said:
-            main(
-                [
-                    "objects",
-                    "import",
-                    str(path),
-                    "--out",
-                    str(out),
-                    "--name",
-                    "brick",
-                    "--scale",
-                    "0.001",
-                    "--mass",
-                    "0.2",
-                    "--png",
-                    str(png),
-                ]
-            )
-        self.assertIn("brick", said.getvalue())
+        path = self.write(trimesh.creation.box((100, 60, 40)), "a brick")
+        out = self.folder / "objects"
+        png = self.folder / "a.png"
+        into = ("--out", out, "--scale", 0.001)
+        code, said = run("objects", "import", path, *into, "--name", "brick", "--mass", 0.2, "--png", png)
+        self.assertEqual(code, 0, said)
+        self.assertIn("brick", said)
         self.assertTrue(png.read_bytes().startswith(b"\x89PNG"))
         self.assertEqual(load_object("brick", out).mass, 0.2)
-        for words, options in (
-            ("Add --out", []),
-            ("cannot be an object's name", ["--out", str(out), "--scale", "0.001"]),
-        ):
-            with self.subTest(words), contextlib.redirect_stderr(io.StringIO()) as said, self.assertRaises(SystemExit):
-                main(["objects", "import", str(path), *options])
-            self.assertIn(words, said.getvalue())
+        for words, options in (("Add --out", ()), ("cannot be an object's name", into)):
+            code, said = run("objects", "import", path, *options)
+            self.assertEqual(code, 1)
+            self.assertIn(words, said)
 
     def test_what_an_object_is_made_of_is_checked(self):
         path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)))
         for text, words in (
-            ("mass = -1", "mass is -1.0"), ("mass = 1\ndensity = 2", "one follows"), ("weight = 1", "unknown: weight"),
-            ("friction = 'high'", "friction is 'high'"), ("mass", "TOML"), ("mass = nan", "mass is nan"),
-        ):  # fmt: skip
+            ("mass = -1", "mass is -1.0"),
+            ("mass = 1\ndensity = 2", "one follows"),
+            ("weight = 1", "unknown: weight|Unknown.*weight"),
+            ("friction = 'high'", "friction is 'high'"),
+            ("mass", "TOML"),
+            ("mass = nan", "mass is nan"),
+        ):
             path.with_suffix(".toml").write_text(text)
             with self.subTest(text), self.assertRaisesRegex(XResetError, words):
                 import_with_notes(path, "thing")
@@ -432,10 +403,9 @@ class MeshImport(unittest.TestCase):
     def test_layouts(self):
         mesh = trimesh.creation.box((0.1, 0.1, 0.1))
         self.write(mesh, "011_banana")
-        for name, files in {"025_mug": ("textured.obj", "textured_simple.obj"), "024_bowl": ("textured.obj",)}.items():
-            (self.folder / name).mkdir()
-            for file in files:
-                mesh.export(self.folder / name / file)
+        for path in ("025_mug/textured.obj", "025_mug/textured_simple.obj", "024_bowl/textured.obj"):
+            (self.folder / path).parent.mkdir(exist_ok=True)
+            mesh.export(self.folder / path)
         found = {name: path.name for name, path in mesh_files(self.folder).items()}
         self.assertEqual(
             found, {"011_banana": "011_banana.obj", "024_bowl": "textured.obj", "025_mug": "textured_simple.obj"}
@@ -463,7 +433,7 @@ class ThinWalls(unittest.TestCase):
     """Pieces keep to the surface, measured here apart from the importer's own account."""
 
     def off(self, mesh, pieces):
-        """[m] Largest distance of points of the pieces outside the mesh from it, and of points of the mesh from the pieces."""
+        """Largest distance of the mesh from points of the pieces outside, and of the pieces from its points [m]."""
         own = trimesh.sample.sample_surface(mesh, 60000, seed=1)[0]
         faces = [trimesh.sample.sample_surface(shape_mesh(p), 400, seed=1)[0] for p in pieces.shapes]
         points = np.concatenate(faces)
@@ -506,7 +476,7 @@ class ThinWalls(unittest.TestCase):
                 self.assertLess(result.deviation, 0.002)
 
     def test_a_small_bridge_on_a_large_piece_is_seen(self):
-        """The middle of what covers a hollow is 4 mm from its walls; a few hundred points of the plate would miss it."""
+        """The middle of what covers a hollow is 4 mm from its walls; a few hundred points of the plate miss it."""
         hollow = trimesh.creation.box(
             (0.008, 0.008, 0.012), transform=trimesh.transformations.translation_matrix((0.05, 0.03, 0.01))
         )
@@ -536,7 +506,9 @@ class ThinWalls(unittest.TestCase):
 
     def test_cutting_stops_after_so_many_triangles_at_the_same_pieces(self):
         ring = trimesh.creation.annulus(0.03, 0.04, 0.05, sections=24)
-        whole, short, again = decompose(ring), *(decompose(ring, Settings(effort=5_000)) for _ in range(2))
+        whole = decompose(ring)
+        short = decompose(ring, Settings(effort=5_000))
+        again = decompose(ring, Settings(effort=5_000))
         self.assertEqual((whole.finished, short.finished), (True, False))
         self.assertLess(whole.deviation, 0.002)
         self.assertGreater(short.deviation, 0.002)

@@ -36,12 +36,12 @@ def at(x: float, y: float, z: float) -> np.ndarray:
 
 def pixel(camera: Camera, size: tuple[int, int], point) -> np.ndarray:
     """Where a world point appears, by the textbook: written apart from the module that is tested."""
-    eye, target = np.array(camera.eye), np.array(camera.target)
-    forward = (target - eye) / np.linalg.norm(target - eye)
+    forward = np.subtract(camera.target, camera.eye)
+    forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0, 0, 1])
     right /= np.linalg.norm(right)
     up = np.cross(right, forward)
-    away = np.array(point) - eye
+    away = np.subtract(point, camera.eye)
     scale = size[1] / 2 / np.tan(camera.fov / 2) / (away @ forward)
     return np.array([size[0] / 2 + scale * (away @ right), size[1] / 2 - scale * (away @ up)])
 
@@ -82,21 +82,20 @@ class Pictures(unittest.TestCase):
         self.assertGreater(self.changed(self.renderer.draw(self.home), self.renderer.draw(q)).sum(), 100)
 
     def test_a_near_object_hides_a_far_one_and_never_the_reverse(self):
-        eye, target = np.array(self.camera.eye), np.array(self.camera.target)
-        front = at(*(eye + 0.35 * (target - eye)))  # on the axis of view, before everything
+        eye = np.array(self.camera.eye)
+        along = np.array(self.camera.target) - eye
         centre = (self.size[1] // 2, self.size[0] // 2)
-        picture = self.renderer.draw(self.home, front)
-        self.assertGreater(int(picture[centre][0]), int(picture[centre][2]) + 40)  # orange
-        behind = at(*(eye + 3.0 * (target - eye)))
-        np.testing.assert_array_equal(
-            self.renderer.draw(self.home, behind)[centre], self.renderer.draw(self.home)[centre]
-        )
+        front = self.renderer.draw(self.home, at(*(eye + 0.35 * along)))[centre].astype(int)  # before everything
+        self.assertGreater(front[0], front[2] + 40)  # orange
+        behind = self.renderer.draw(self.home, at(*(eye + 3.0 * along)))[centre]
+        np.testing.assert_array_equal(behind, self.renderer.draw(self.home)[centre])
 
     def test_shadow_falls_on_the_table_away_from_the_light(self):
         above = np.array([0.35, 0.1, 0.25])
         ground = above - render._LIGHT * above[2] / render._LIGHT[2]
         x, y = pixel(self.camera, self.size, ground).astype(int)
-        lit, dark = self.renderer.draw(self.home)[y, x], self.renderer.draw(self.home, at(*above))[y, x]
+        lit = self.renderer.draw(self.home)[y, x]
+        dark = self.renderer.draw(self.home, at(*above))[y, x]
         self.assertLess(int(dark.max()), 0.75 * int(lit.max()))
 
     def test_the_table_is_lit_where_nothing_stands_in_the_light(self):
@@ -104,11 +103,13 @@ class Pictures(unittest.TestCase):
         self.assertGreater(int(self.renderer.draw(self.home)[y, x].min()), 150)
 
     def test_goal_is_translucent(self):
-        empty, T = self.renderer.draw(self.home), at(0.4, 0.1, 0.3)
+        T = at(0.4, 0.1, 0.3)
         x, y = pixel(self.camera, self.size, T[:3, 3]).astype(int)
-        goal, solid = self.renderer.draw(self.home, goal_pose=T)[y, x], self.renderer.draw(self.home, T)[y, x]
-        self.assertGreater(int(goal[1]), int(goal[0]))  # green
-        self.assertLess(np.abs(goal.astype(int) - empty[y, x]).sum(), np.abs(solid.astype(int) - empty[y, x]).sum())
+        empty = self.renderer.draw(self.home)[y, x].astype(int)
+        goal = self.renderer.draw(self.home, goal_pose=T)[y, x]
+        solid = self.renderer.draw(self.home, T)[y, x]
+        self.assertGreater(goal[1], goal[0])  # green
+        self.assertLess(np.abs(goal - empty).sum(), np.abs(solid - empty).sum())
 
     def test_points_are_drawn_over_everything_and_missing_ones_left_out(self):
         color = (1.0, 0.0, 1.0)
@@ -140,7 +141,7 @@ class Pictures(unittest.TestCase):
     def test_a_picture_may_have_its_own_camera(self):
         near = Camera(eye=(0.8, -0.1, 0.5), target=(0.4, 0.1, 0.1))
         T = at(0.4, 0.1, 0.04)
-        own = Renderer(self.renderer.scene, size=self.size, camera=near).draw(self.home, T)
+        own = Renderer(self.renderer.scene, size=self.size, camera=near).draw(self.home, T)  # the same, each time
         np.testing.assert_array_equal(self.renderer.draw(self.home, T, camera=near), own)
         self.assertGreater(self.changed(self.renderer.draw(self.home, T), own).mean(), 0.1)
 
@@ -151,18 +152,14 @@ class Pictures(unittest.TestCase):
         self.assertEqual(a.shape, b.shape)
         self.assertLess(np.abs(a - b).mean(), 3.0)
 
-    def test_same_state_same_picture(self):
-        T = at(0.4, 0.1, 0.04)
-        np.testing.assert_array_equal(self.renderer.draw(self.home, T), self.renderer.draw(self.home, T))
-
     def test_parts_are_told_apart_by_color(self):
         for name in ("openarm", "ur7e-sharpa"):
             robot = load(name)
             colors = dict(zip(Kinematics(robot).link_names, link_colors(robot), strict=True))
             self.assertEqual(colors[robot.hand_root], meshes.PALM_COLOR)
-            self.assertEqual(
-                {colors[link] for tip in robot.fingertips for link in tip.contact_links}, {meshes.TIP_COLOR}
-            )
+            for tip in robot.fingertips:
+                for link in tip.contact_links:
+                    self.assertEqual(colors[link], meshes.TIP_COLOR)
             self.assertEqual(colors[Kinematics(robot).link_names[0]], meshes.ARM_COLOR)
         self.assertEqual(colors["right_index_MP"], meshes.HAND_COLOR)
 

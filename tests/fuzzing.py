@@ -204,7 +204,7 @@ def readers() -> Iterator[dict[str, Reader]]:
             "text",
             ("hand_keypoints", "wrist_quat_wxyz"),
         )
-        write_csv(path, once.hand_keypoints, once.object_pos, turn, columns=[("object", SOUP), ("side", "right")])
+        write_csv(path, once.hand_keypoints, once.object_pos, turn, columns={"object": SOUP, "side": "right"})
         np.savetxt(add("camera, text", "camera.txt", read_transform, "text"), np.eye(4))
         np.save(add("camera, npy", "camera.npy", read_transform, "bytes"), np.eye(4))
 

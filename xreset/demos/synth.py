@@ -9,7 +9,7 @@ simulated.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.demos.archive import Demos, Progress, concatenate, no_progress, one_sequence
+from xreset.demos.archive import Demos, concatenate, no_progress, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, plan_contacts
 from xreset.demos.motion import clear_approach, object_path, place_hand, random_timing
 from xreset.errors import DemoError
@@ -64,7 +64,7 @@ def synthesize(
     fps: float = 30.0,
     side: Literal["right", "left"] = "right",
     meshes: str | Path | None = None,
-    progress: Progress = no_progress,
+    progress: Callable[[int, int, str], None] = no_progress,
 ) -> Demos:
     """Make synthetic demonstrations of the built-in stand-ins, or of the objects of a folder of meshes, which stand
     with z up.

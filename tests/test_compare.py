@@ -1,46 +1,33 @@
 """Several trainings side by side: what is read, what is taken together, what is unfair, and what is written."""
 
 import json
-import tempfile
 import unittest
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from tests.test_cli import run
-from tests.toy_results import toy_rollouts, toy_summary
+from tests.toy_results import ENGINES, InFolder, rollouts_with, toy_rollouts
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.plots import COLORS, figure_style
+from xreset.eval.report.curves import Fate, Line, amounts, fates, lift_of, line, processes, share_of_runs
 from xreset.eval.report.figures import draw_lines, draw_scores
-from xreset.eval.report.groups import grouped, score
-from xreset.eval.report.lifting import Fate, fates, lift_of, share_of_runs
+from xreset.eval.report.groups import Group, Score, grouped, scores
 from xreset.eval.report.make import choose_curves, compare
-from xreset.eval.report.progress import Line, amounts, line, processes
 from xreset.eval.report.read import Curve, read_curves, read_scalars, read_training, read_trainings
-from xreset.eval.results import write_results
-from xreset.eval.rollout import Rollouts
 from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95, wilson_ci95
 from xreset.eval.table import escape
 from xreset.learning.clock import Lift, LiftClock, Passing
 from xreset.learning.config import TrainConfig
 from xreset.learning.curves import CurveFile
-from xreset.learning.run import RunInfo, write_run
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
 
-ENGINES = ("mujoco", "mujoco-warp", "pybullet", "sapien")
 WORLDS, HORIZON = 64, 16
 STEPS = WORLDS * HORIZON
 """Environment steps of an iteration of one process."""
-
-
-def rollouts_with(*progress: float) -> Rollouts:
-    """The toy's four episodes with other task progress."""
-    base = toy_rollouts()
-    return replace(
-        base, episodes=tuple(replace(e, task_progress=p) for e, p in zip(base.episodes, progress, strict=True))
-    )
 
 
 def curves_of(
@@ -62,27 +49,7 @@ def curves_of(
     return {tag: curve(tag, values) for tag, values in tags.items()}
 
 
-class InFolder(unittest.TestCase):
-    def setUp(self):
-        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
-
-    def write_run(self, name: str, config: TrainConfig | None = None, **changes) -> Path:
-        info = {
-            "robot": "openarm", "resets": "resets.npz", "resets_hash": "ef" * 32, "objects": None, "backend": "mujoco-warp",
-            "backend_version": "4.0.0", "device": "cuda", "num_envs": WORLDS, "seed": 0, "config": config or TrainConfig(),
-            "contract": {"objects": ["005_tomato_soup_can"]},
-        }  # fmt: skip
-        write_run(self.folder / name, RunInfo(**(info | changes)))
-        return self.folder / name
-
-    def write_results(self, name: str, rollouts: Rollouts | None = None, engines=("mujoco",), **changes) -> Path:
-        rollouts = rollouts or toy_rollouts()
-        for engine in engines:
-            write_results(
-                self.folder / name / "eval", toy_summary(engine, rollouts, **changes), rollouts, ("a", "b", "c")
-            )
-        return self.folder / name
-
+class Compared(InFolder):
     def write_curves(self, name: str, curves: dict[str, Curve]) -> Path:
         from torch.utils.tensorboard import SummaryWriter
 
@@ -101,7 +68,7 @@ class InFolder(unittest.TestCase):
         return compare([str(self.folder / n) if "=" not in n else n for n in names], self.folder / "out", **options)
 
 
-class ReadTest(InFolder):
+class ReadTest(Compared):
     def test_labels(self):
         a, b = (str(self.write_results(name)) for name in ("a", "b"))
         self.assertEqual([t.label for t in read_trainings([a, f"X-RESET, 2={b}"])], ["a", "X-RESET, 2"])
@@ -145,7 +112,7 @@ class ReadTest(InFolder):
             (
                 "eval/mujoco.json",
                 whole["eval/mujoco.json"].replace('"episodes": 4', '"episodes": 5'),
-                "5 episodes, .* holds 4",
+                "states 5 episodes, .* holds 4",
             ),
         ):
             (a / name).write_text(text)
@@ -222,7 +189,7 @@ class ReadTest(InFolder):
         self.assertEqual(facts["task.randomization.friction"].text, "0.5, 1")
 
 
-class ProgressTest(InFolder):
+class ProgressTest(Compared):
     def setUp(self):
         super().setUp()
         self.write_run("a")
@@ -266,7 +233,7 @@ class ProgressTest(InFolder):
         np.testing.assert_allclose(found.x, [0.5, 1.0])
 
 
-class LiftTest(InFolder):
+class LiftTest(Compared):
     """Success from home is half of ``success`` in the toy's curves."""
 
     def lifted(self, name: str, end: float, *passed: tuple[float, float], seed: int = 0, **changes) -> str:
@@ -386,7 +353,7 @@ class LiftTest(InFolder):
             self.read("a")
 
 
-class GroupTest(InFolder):
+class GroupTest(Compared):
     def groups(self, *names: str) -> tuple[list[tuple[str, int]], str]:
         groups, notes = grouped([self.training(name) for name in names])
         return [(g.label, len(g.members)) for g in groups], " ".join(notes)
@@ -439,7 +406,7 @@ class GroupTest(InFolder):
             self.run_and_results(name, results, **changes)
             found, notes = self.groups("a", name)
             self.assertEqual(found, [("a", 1), (name, 1)])
-            self.assertRegex(notes, f"a, {name} have the same configuration and are not taken together: .*{reason}")
+            self.assertRegex(notes, f"a, {name} have the same configuration and are not grouped: .*{reason}")
 
     def test_another_number_of_gpus_is_another_training(self):
         self.run_and_results("a", seed=0)
@@ -450,7 +417,11 @@ class GroupTest(InFolder):
         self.assertIn("a was trained with 1 processes and b with 3", notes[0])
 
 
-class ScoreTest(InFolder):
+def score(group: Group, engine: str) -> Score:
+    return scores([group])[group.label][engine]
+
+
+class ScoreTest(Compared):
     def group(self, *progress: tuple[float, ...], engines=("mujoco",)):
         for i, values in enumerate(progress):
             self.write_run(f"s-{i}", seed=i)
@@ -461,7 +432,7 @@ class ScoreTest(InFolder):
 
     def test_one_training_has_the_figures_of_its_evaluation(self):
         group = self.group((1.0, 0.33, 0.66, 0.0), engines=ENGINES)
-        summary = group.members[0].summaries["pybullet"]
+        summary = group.members[0].results["pybullet"]
         found = score(group, "pybullet")
         self.assertEqual(found.task_progress, summary.task_progress.mean)
         np.testing.assert_allclose(found.ci95, summary.task_progress.ci95, atol=1e-6)
@@ -471,7 +442,7 @@ class ScoreTest(InFolder):
         ):  # fmt: skip
             self.assertEqual(ours, getattr(summary, theirs), theirs)
         self.assertEqual((found.nonfinite, found.overflow, found.episodes), (1, 1, 4))
-        self.assertIsNone(score(group, "other"))
+        self.assertEqual(list(scores([group])[group.label]), list(ENGINES))
 
     def test_seeds_widen_the_interval(self):
         alike = score(self.group((0.4, 0.6, 0.4, 0.6), (0.4, 0.6, 0.4, 0.6)), "mujoco")
@@ -486,7 +457,7 @@ class ScoreTest(InFolder):
 
     def test_a_seed_that_was_not_evaluated_is_left_out(self):
         group = self.group((1.0,) * 4, (0.0,) * 4)
-        bare = replace(group.members[1], summaries={}, episodes={})
+        bare = replace(group.members[1], results={}, episodes=pd.DataFrame())
         self.assertEqual(score(replace(group, members=(group.members[0], bare)), "mujoco").each, {"s-0": 1.0})
 
     def test_the_crossed_bootstrap_has_the_variance_of_its_design(self):
@@ -507,7 +478,7 @@ class ScoreTest(InFolder):
             crossed_bootstrap_ci95(values, np.array([0, 0, 0, 1]), demos)
 
 
-class FairnessTest(InFolder):
+class FairnessTest(Compared):
     def notes(self, *names: str) -> str:
         return "\n".join(self.compare(*names).notes)
 
@@ -610,7 +581,7 @@ class FairnessTest(InFolder):
         self.assertIn("No run.json, so its configuration is not known: a.", text)
 
 
-class WrittenTest(InFolder):
+class WrittenTest(Compared):
     def write_three(self):
         for name, seed, gravity, success in (("x-s0", 0, True, 0.2), ("x-s1", 1, True, 0.4), ("fixed", 0, False, 0.1)):
             self.write_run(name, TrainConfig(task=TaskConfig(reset=ResetConfig(random_gravity=gravity))), seed=seed)
@@ -713,7 +684,7 @@ class WrittenTest(InFolder):
 SPEED = ("speed/collect_seconds", "speed/learn_seconds")
 
 
-class DrawTest(InFolder):
+class DrawTest(Compared):
     def draw(self, function, *arguments, **options):
         with figure_style({}) as figure_class:
             ax = figure_class().subplots()
@@ -761,9 +732,7 @@ class DrawTest(InFolder):
 
         self.write_results("a", rollouts_with(1.0, 0.5, 0.5, 0.0), ("mujoco", "sapien"))
         self.write_results("b", rollouts_with(0.2, 0.2, 0.2, 0.2), ("sapien",))
-        found = {
-            n: {e: score(g, e) for e in g.members[0].episodes} for n in "ab" for g in grouped([self.training(n)])[0]
-        }
+        found = {n: scores(grouped([self.training(n)])[0])[n] for n in "ab"}
         ax = self.draw(draw_scores, found, ["a", "b"])
         np.testing.assert_allclose([bar.get_height() for bar in ax.patches], [50, 50, 20])
         self.assertEqual([label.get_text() for label in ax.get_xticklabels()], ["mujoco", "sapien"])
@@ -771,7 +740,7 @@ class DrawTest(InFolder):
         self.assertTrue(at[0] < 0 and at[1] < 1 < at[2])
 
 
-class CommandTest(InFolder):
+class CommandTest(Compared):
     def run_command(self, *arguments: str) -> tuple[int, str]:
         code, out, err = run("compare", *arguments)
         return code, out + err

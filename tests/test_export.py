@@ -47,12 +47,12 @@ class Episodes(Case):
     def test_states_with_the_action_that_is_in_force_before_the_next(self):
         recording = read_recorded([self.evaluate()])
         self.assertEqual(recording.fps, 20.0)
-        self.assertEqual([e.engine for e in recording.episodes], ["mujoco", "mujoco", "sapien", "sapien"])
+        self.assertEqual(list(recording.episodes["engine"]), ["mujoco", "mujoco", "sapien", "sapien"])
         np.testing.assert_array_equal(recording.offsets, [0, 5, 10, 15, 20])
-        steps = (recording.episodes[0].action - recording.robot.home)[:, 0] / 0.01  # 12 control steps between 5 states
+        steps = (recording.actions[0] - recording.robot.home)[:, 0] / 0.01  # 12 control steps between 5 states
         np.testing.assert_allclose(steps, [2, 5, 8, 11, 11], atol=1e-4)
-        self.assertEqual(recording.episodes[0].task, "Grasp the tomato soup can and bring it to the goal pose.")
-        self.assertEqual([e.episode.repetition for e in recording.episodes], [0] * 4)
+        self.assertEqual(recording.episodes["task"][0], "Grasp the tomato soup can and bring it to the goal pose.")
+        self.assertEqual(list(recording.episodes["repetition"]), [0] * 4)
 
     def test_only_some_engines_of_several_folders(self):
         folders = [self.evaluate("a"), self.evaluate("b")]
@@ -66,7 +66,7 @@ class Episodes(Case):
         with self.assertLogs("xreset.eval.export.recorded", "WARNING") as log:
             recording = read_recorded([self.evaluate(change=self.change_first(object_pos=broken))], backends=["mujoco"])
         self.assertIn("ends at 0.10 s", log.output[0])
-        self.assertEqual([len(e.action) for e in recording.episodes], [3, 5])
+        self.assertEqual(list(map(len, recording.actions)), [3, 5])
 
     def test_refusals(self):
         without = self.evaluate(
@@ -81,6 +81,9 @@ class Episodes(Case):
             read_recorded([self.evaluate(), slower])
         with self.assertRaisesRegex(RunError, "no folder"):
             read_recorded([self.folder / "nowhere"])
+        stray = self.evaluate("stray", change=self.change_first(sequence=1_000_000))
+        with self.assertRaisesRegex(FileFormatError, "a trace of demonstration 1000000, of which no episode is known"):
+            read_recorded([stray])
 
 
 class Arrays(Case):
@@ -96,7 +99,7 @@ class Arrays(Case):
         self.assertEqual(documented, set(arrays) - {"meta"})
         self.assertEqual(str(arrays["schema"]), "xreset-rollouts/1")
         self.assertEqual(arrays["joint_pos"].shape, (20, len(self.robot.joints)))
-        np.testing.assert_allclose(arrays["object_pos"][5:10], recording.episodes[1].trace.object_pos, atol=1e-7)
+        np.testing.assert_allclose(arrays["object_pos"][5:10], recording.traces[1].object_pos, atol=1e-7)
         self.assertEqual(arrays["engine"].tolist(), ["mujoco", "mujoco", "sapien", "sapien"])
         self.assertEqual(arrays["success"].tolist(), [True, False, True, False])
 
@@ -114,7 +117,7 @@ class LeRobot(Case):
         data = parquet.read_table(root / info["data_path"].format(chunk_index=0, file_index=0)).to_pydict()
         self.assertEqual(set(data), set(info["features"]))
         self.assertEqual(data["index"], list(range(20)))
-        np.testing.assert_allclose(data["action"][5], recording.episodes[1].action[0], rtol=1e-6)
+        np.testing.assert_allclose(data["action"][5], recording.actions[1][0], rtol=1e-6)
         np.testing.assert_allclose(
             data["observation.environment_state"][19][7:], [0.5, 0.35, 0.15, 1, 0, 0, 0], rtol=1e-6
         )
@@ -135,7 +138,7 @@ class LeRobot(Case):
         ):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
                 write_lerobot(options.pop("folder", self.folder / "set"), recording, **options)
-        lost = replace(recording, episodes=(replace(recording.episodes[0], objects=self.folder / "nowhere"),))
+        lost = replace(recording, meshes=(self.folder / "nowhere",) * 4)
         with self.assertRaisesRegex(XResetError, "no folder"):
             write_lerobot(self.folder / "set", lost)
         self.assertEqual([p.name for p in self.folder.iterdir()], ["eval"])
@@ -151,14 +154,13 @@ class LeRobot(Case):
         self.assertEqual((found.num_episodes, found.num_frames, found.fps), (2, 10, 20))
         for i in range(10):
             item, (episode, frame) = found[i], divmod(i, 5)
-            expected = recording.episodes[episode]
-            np.testing.assert_allclose(item["observation.state"], expected.trace.joint_pos[frame], atol=1e-6)
-            np.testing.assert_allclose(item["action"][0], expected.action[frame], atol=1e-6)
-            np.testing.assert_allclose(item["action"][1], expected.action[min(frame + 1, 4)], atol=1e-6)
+            np.testing.assert_allclose(item["observation.state"], recording.traces[episode].joint_pos[frame], atol=1e-6)
+            np.testing.assert_allclose(item["action"][0], recording.actions[episode][frame], atol=1e-6)
+            np.testing.assert_allclose(item["action"][1], recording.actions[episode][min(frame + 1, 4)], atol=1e-6)
             np.testing.assert_allclose(
-                item["observation.environment_state"][:3], expected.trace.object_pos[frame], atol=1e-6
+                item["observation.environment_state"][:3], recording.traces[episode].object_pos[frame], atol=1e-6
             )
-            self.assertEqual((item["task"], item["engine"]), (expected.task, "sapien"))
+            self.assertEqual((item["task"], item["engine"]), (recording.episodes["task"][episode], "sapien"))
             self.assertEqual(tuple(item["observation.images.front"].shape), (3, 48, 64))
         self.assertEqual(set(found.meta.stats), set(found.meta.features) - {"engine"})
 

@@ -3,18 +3,18 @@
 import io
 import re
 import subprocess
-import tempfile
 import unittest
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
+import pandas as pd
 
 from tests.test_cli import run
 from tests.toy_bank import SOUP, SPAM
-from tests.toy_results import toy_rollouts, toy_summary
+from tests.toy_results import ENGINES, InFolder, toy_rollouts, toy_summary
 from tests.toy_robot import toy_hand_arm
 from xreset import robots
 from xreset.errors import FileFormatError, RunError
@@ -35,42 +35,50 @@ from xreset.eval.report.film import make_film
 from xreset.eval.report.make import make_report
 from xreset.eval.report.page import headline, page
 from xreset.eval.report.read import Curve, collect, differences, read_curves
-from xreset.eval.results import EvalResult, TaskProgress, write_results
+from xreset.eval.results import EvalResult, TaskProgress, episode_table
+from xreset.eval.rollout import Episode
 from xreset.eval.table import results_table
 from xreset.files import claim_folder, write_json
 from xreset.learning.choice import Candidate, Choice, write_choice
 from xreset.learning.config import TrainConfig
-from xreset.learning.run import RunInfo, write_run
 from xreset.objects.catalogue import load_object
 
-ENGINES = ("mujoco", "mujoco-warp", "pybullet", "sapien")
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 
 
-class InFolder(unittest.TestCase):
+class Reported(InFolder):
+    """A run folder "soup" with results."""
+
     def setUp(self):
-        folder = tempfile.TemporaryDirectory()
-        self.addCleanup(folder.cleanup)
-        self.folder = Path(folder.name) / "soup"
+        super().setUp()
+        self.folder = self.folder / "soup"
 
-    def write(self, engines=ENGINES, folder: str = "eval", rollouts=None, joints=("a", "b", "c"), **changes):
-        rollouts = rollouts or toy_rollouts()
-        for engine in engines:
-            write_results(self.folder / folder, toy_summary(engine, rollouts, **changes), rollouts, joints)
+    def write(self, engines=ENGINES, rollouts=None, **changes):
+        self.write_results("", rollouts, engines, **changes)
 
-    def write_run(self, **changes):
-        info = {
-            "robot": "openarm", "resets": "resets.npz", "resets_hash": "ef", "objects": None, "backend": "mujoco-warp",
-            "backend_version": "4.0.0", "device": "cuda", "num_envs": 4096, "seed": 7,
-            "config": TrainConfig(iterations=500), "contract": CONTRACT,
-        }  # fmt: skip
-        write_run(self.folder, RunInfo(**(info | changes)))
+    def write_soup(self):
+        self.write_run("", TrainConfig(iterations=500), num_envs=4096, seed=7, contract=CONTRACT)
 
 
 CONTRACT = {
-    "schema": "xreset-policy/1", "robot": "openarm", "robot_fingerprint": "aa", "joint_names": ["a"], "fingertip_names": ["thumb"],
-    "objects": [SOUP], "observation_layout": {"policy": {"x": 1}, "proprio": {"y": 1}}, "control_dt": 1 / 60, "task": {},
-}  # fmt: skip
+    "schema": "xreset-policy/1",
+    "robot": "openarm",
+    "robot_fingerprint": "aa",
+    "joint_names": ["a"],
+    "fingertip_names": ["thumb"],
+    "objects": [SOUP],
+    "observation_layout": {"policy": {"x": 1}, "proprio": {"y": 1}},
+    "control_dt": 1 / 60,
+    "task": {},
+}
+
+
+def table_of(*episodes: Episode, engine: str = "mujoco") -> pd.DataFrame:
+    return episode_table(toy_summary(engine), episodes)
+
+
+def row_of(index: int) -> Any:
+    return list(table_of(*toy_rollouts().episodes).itertuples())[index]
 
 
 def with_progress(result: EvalResult, mean: float, margin: float = 0.0) -> EvalResult:
@@ -108,16 +116,16 @@ class Outline(HTMLParser):
         return [attributes for name, attributes in self.tags if name == tag]
 
 
-class CollectTest(InFolder):
+class CollectTest(Reported):
     def test_a_run_a_baseline_and_a_bare_folder(self):
         self.write()
         self.assertIsNone(collect(self.folder).run)
         self.assertEqual(collect(self.folder / "eval").engines, ENGINES)
         self.assertEqual(collect(self.folder / "eval").name, "soup")
-        self.write_run()
+        self.write_soup()
         data = collect(self.folder)
         self.assertEqual((data.name, data.run.num_envs, data.engines, data.notes), ("soup", 4096, ENGINES, ()))
-        self.assertEqual(data.episodes["sapien"], toy_rollouts().episodes)
+        self.assertEqual(list(data.episodes_in("sapien")["task_progress"]), [1.0, 0.33, 0.66, 0.0])
 
     def test_nothing_to_report(self):
         with self.assertRaisesRegex(RunError, "there is no folder"):
@@ -125,7 +133,7 @@ class CollectTest(InFolder):
         self.folder.mkdir()
         with self.assertRaisesRegex(RunError, "(?s)no evaluation results.*xreset eval POLICY.*--out"):
             collect(self.folder)
-        self.write_run()
+        self.write_soup()
         with self.assertRaisesRegex(RunError, f"(?s)no evaluation results.*xreset eval {self.folder} --backend"):
             collect(self.folder)
 
@@ -138,7 +146,7 @@ class CollectTest(InFolder):
 
     def test_results_outlive_the_description_of_their_training(self):
         self.write()
-        self.write_run()
+        self.write_soup()
         file = self.folder / "run.json"
         file.write_text(file.read_text().replace('"iterations"', '"cycles"'))
         data = collect(self.folder)
@@ -174,6 +182,7 @@ class CollectTest(InFolder):
             }
             card = {"backend": engine, "backend_version": "4", "episodes": 4, "task_progress": 0.8, "ci95": (0.7, 0.9)}
             card |= {"schema": "xreset-stress/1", "curves": [curve], "left_out": []}
+            card |= {"policy": "soup", "robot": "toy", "seed": 0, "inputs": policy}
             write_json(self.folder / "stress" / f"{engine}.json", card)
         tried = (
             Candidate(name="2.pt", task_progress={"mujoco": 0.5}),
@@ -193,7 +202,9 @@ class CollectTest(InFolder):
         ):
             self.assertIn(words, text)
         write_choice(self.folder, replace(choice, policy_hash="another"))
-        self.assertIsNone(collect(self.folder).choice)
+        self.write(inputs={"policy": "retrained"})
+        data = collect(self.folder)
+        self.assertEqual((data.choice, data.stress), (None, ()))
 
     def test_learning_curves(self):
         from torch.utils.tensorboard import SummaryWriter
@@ -211,32 +222,36 @@ class CollectTest(InFolder):
         np.testing.assert_allclose(curve.value, [0.1, 0.2, 0.3, 0.4], rtol=1e-6)
 
 
-class ClipTest(InFolder):
+class ClipTest(Reported):
     ROLLOUTS = toy_rollouts()
 
     def test_the_episode_that_went_best_over_all_engines_is_shown(self):
         traces = dict.fromkeys(ENGINES, self.ROLLOUTS.traces)
-        episodes = dict.fromkeys(ENGINES, self.ROLLOUTS.episodes)
-        self.assertEqual(choose_sequence(episodes, traces), 0)
-        worse = tuple(replace(e, task_progress=0.0) if e.sequence == 0 else e for e in self.ROLLOUTS.episodes)
-        self.assertEqual(choose_sequence(episodes | {"sapien": worse, "pybullet": worse}, traces), 1)
-        self.assertEqual(
-            choose_sequence(episodes, traces | {"sapien": self.ROLLOUTS.traces[1:]}), 1, "recorded in every engine"
-        )
-        self.assertIsNone(
-            choose_sequence(episodes, {"mujoco": self.ROLLOUTS.traces[:1], "sapien": self.ROLLOUTS.traces[1:]})
-        )
-        self.assertIsNone(choose_sequence({}, {}))
+        whole = self.ROLLOUTS.episodes
+        worse = tuple(replace(e, task_progress=0.0) if e.sequence == 0 else e for e in whole)
+        alike = pd.concat([table_of(*whole, engine=engine) for engine in ENGINES])
+        mixed = pd.concat([table_of(*(worse if e in ("sapien", "pybullet") else whole), engine=e) for e in ENGINES])
+        self.assertEqual(choose_sequence(alike, traces), 0)
+        self.assertEqual(choose_sequence(mixed, traces), 1)
+        first, second = self.ROLLOUTS.traces
+        self.assertEqual(choose_sequence(alike, traces | {"sapien": (second,)}), 1, "recorded in every engine")
+        self.assertIsNone(choose_sequence(alike, {"mujoco": (first,), "sapien": (second,)}))
+        unknown = (replace(first, sequence=1_000_000),)
+        self.assertIsNone(choose_sequence(alike, dict.fromkeys(ENGINES, unknown)), "of no episode that is known")
+        self.assertIsNone(choose_sequence(pd.DataFrame(), {}))
 
     def test_the_recorded_episode_is_the_first_repetition(self):
-        self.assertEqual(recorded_episode(self.ROLLOUTS.episodes[::-1], 1), self.ROLLOUTS.episodes[2])
+        table = table_of(*self.ROLLOUTS.episodes[::-1])
+        self.assertEqual(recorded_episode(table, "mujoco", 1).repetition, 0)
+        with self.assertRaisesRegex(FileFormatError, "mujoco.trace.npz has a trace of demonstration 1000000"):
+            recorded_episode(table, "mujoco", 1_000_000)
 
     def draw(self, **changes) -> Clip:
         self.folder.mkdir(exist_ok=True)
         robot = toy_hand_arm(self.folder)
         trace = toy_rollouts(robot.home).traces[0]
         trace = replace(trace, **{k: np.array(change(getattr(trace, k).copy())) for k, change in changes.items()})
-        return draw_clip("mujoco", self.ROLLOUTS.episodes[0], trace, robot, load_object(SOUP), camera_for([trace]))
+        return draw_clip("mujoco", row_of(0), trace, robot, load_object(SOUP), camera_for([trace]))
 
     def test_a_clip_shows_the_object_on_its_way_at_the_right_speed(self):
         clip = self.draw()
@@ -285,36 +300,37 @@ class ClipTest(InFolder):
                 "xreset.eval.report.film.encode_mp4", lambda frames, fps: repr((frames.shape, round(fps))).encode()
             ),
         ):
-            film = make_film(self.folder, out)
+            engines, objects = make_film(self.folder, out)
         names = tuple(sorted({trace.object for trace in rollouts.traces}))
-        self.assertEqual((set(film.engines), film.objects), (set(ENGINES), names))
+        self.assertEqual((set(engines), objects), (set(ENGINES), names))
         self.assertEqual(out.read_text(), repr(((3, 4 * 150, len(names) * 200, 3), 10)))
 
 
-class FailureTest(InFolder):
-    def episodes(self, *progress: float):
-        first = toy_rollouts().episodes[0]
-        return tuple(
-            replace(first, sequence=i, task_progress=p, reorient=p == 1.0, reorientation_progress=0.1 * i)
-            for i, p in enumerate(progress)
-        )
+class FailureTest(Reported):
+    def choose(self, progress: tuple[float, ...], objects: tuple[str, ...], count: int) -> list[int]:
+        rollouts = toy_rollouts()
+        episodes = []
+        traces = []
+        for i, (value, name) in enumerate(zip(progress, objects, strict=True)):
+            outcome = {"task_progress": value, "reorient": value == 1.0, "reorientation_progress": 0.1 * i}
+            episodes.append(replace(rollouts.episodes[0], sequence=i, object=name, **outcome))
+            traces.append(replace(rollouts.traces[0], sequence=i, object=name))
+        return [trace.sequence for _, trace in choose_failures(table_of(*episodes), traces, count)]
 
-    def traces(self, *objects: str):
-        return tuple(replace(toy_rollouts().traces[0], sequence=i, object=name) for i, name in enumerate(objects))
-
-    def test_the_worst_come_first_and_what_reached_its_goal_does_not_come(self):
-        chosen = choose_failures(self.episodes(0.66, 1.0, 0.33, 0.66), self.traces(*[SOUP] * 4), 3)
-        self.assertEqual([t.sequence for _, t in chosen], [2, 0, 3])
-        self.assertEqual(choose_failures(self.episodes(1.0), self.traces(SOUP), 3), [])
-
-    def test_objects_take_turns(self):
-        episodes, traces = self.episodes(0.0, 0.0, 0.0, 0.66), self.traces(SOUP, SOUP, SOUP, SPAM)
-        self.assertEqual([t.sequence for _, t in choose_failures(episodes, traces, 2)], [0, 3])
-        self.assertEqual([t.sequence for _, t in choose_failures(episodes, traces, 4)], [0, 1, 2, 3])
+    def test_the_worst_come_first_and_objects_take_turns(self):
+        mixed = (SOUP, SOUP, SOUP, SPAM)
+        for progress, objects, count, expected in (
+            ((0.66, 1.0, 0.33, 0.66), (SOUP,) * 4, 3, [2, 0, 3]),
+            ((1.0,), (SOUP,), 3, []),
+            ((0.0, 0.0, 0.0, 0.66), mixed, 2, [0, 3]),
+            ((0.0, 0.0, 0.0, 0.66), mixed, 4, [0, 1, 2, 3]),
+        ):
+            with self.subTest(progress=progress, count=count):
+                self.assertEqual(self.choose(progress, objects, count), expected)
 
     def test_every_episode_that_missed_its_goal_is_counted_once(self):
         at_goal, near, lifted, broken = toy_rollouts().episodes
-        counts = count_failures((at_goal, near, near, lifted, replace(at_goal, reorient=False), broken))
+        counts = count_failures(table_of(at_goal, near, near, lifted, replace(at_goal, reorient=False), broken))
         self.assertEqual(list(counts.values()), [1, 2, 1, 1])
 
     def test_a_strip_shows_the_object_rise_and_leaves_out_what_is_not_finite(self):
@@ -323,7 +339,7 @@ class FailureTest(InFolder):
         rollouts = toy_rollouts(robot.home)
         trace = replace(rollouts.traces[0], object_pos=rollouts.traces[0].object_pos.copy())
         trace.object_pos[-1] = np.nan
-        strip = draw_strip(rollouts.episodes[0], trace, robot, load_object(SOUP))
+        strip = draw_strip(row_of(0), trace, robot, load_object(SOUP))
         self.assertEqual(strip.picture.shape, (180, 6 * 240, 3))
         self.assertEqual(strip.times[0], 0.0)
         self.assertAlmostEqual(strip.times[-1], 0.2)
@@ -334,13 +350,10 @@ class FailureTest(InFolder):
 
 
 class PlotTest(unittest.TestCase):
-    def test_progress_by_object_weighs_demonstrations_by_their_episodes(self):
-        any_demo = toy_summary().per_demo[0]
-        rows = tuple(
-            replace(any_demo, object=name, task_progress=progress, episodes=episodes)
-            for name, progress, episodes in ((SOUP, 1.0, 3), (SOUP, 0.0, 1), (SPAM, 0.5, 2))
-        )
-        self.assertEqual(figures.object_progress(replace(toy_summary(), per_demo=rows)), {SOUP: 0.75, SPAM: 0.5})
+    def test_progress_by_object_is_the_mean_of_its_episodes(self):
+        table = pd.concat([table_of(*toy_rollouts().episodes, engine=engine) for engine in ("a", "b")])
+        progress = figures.object_progress(table)
+        self.assertEqual(progress.round(6).to_dict(), {engine: {SOUP: 0.665, SPAM: 0.33} for engine in "ab"})
 
     def test_bars_are_as_long_as_the_results(self):
         from matplotlib.figure import Figure
@@ -369,22 +382,22 @@ class PlotTest(unittest.TestCase):
         self.assertIn("engine-9", figures.figure_stages(many))
 
 
-class PageTest(InFolder):
+class PageTest(Reported):
     @classmethod
     def setUpClass(cls):
         frames = np.zeros((2, 48, 64, 3), dtype=np.uint8)
-        episode = toy_rollouts().episodes[0]
+        episode = row_of(0)
         cls.clips = [
             Clip(engine=name, episode=episode, frames=frames, fps=10.0, finite=name != "sapien") for name in ENGINES
         ]
-        missed = toy_rollouts().episodes[2]
+        missed = row_of(2)
         cls.strips = [
             Strip(episode=missed, picture=np.zeros((18, 144, 3), dtype=np.uint8), times=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))
         ]
 
     def data(self, **changes):
         self.write()
-        self.write_run()
+        self.write_soup()
         curves = (Curve(label="episode return", iteration=np.array([1, 50]), value=np.array([0.5, 2.0])),)
         return replace(collect(self.folder), curves=curves, **changes)
 
@@ -461,22 +474,22 @@ class PageTest(InFolder):
 
     def test_the_headline_names_best_and_worst(self):
         data = self.data()
-        made = [with_progress(s, m) for s, m in zip(data.summaries, (0.4, 0.9, 0.1, 0.5), strict=True)]
-        text = headline(replace(data, summaries=tuple(made)))
+        made = [with_progress(s, m) for s, m in zip(data.results, (0.4, 0.9, 0.1, 0.5), strict=True)]
+        text = headline(replace(data, results=tuple(made)))
         self.assertIn("90% in mujoco-warp and 10% in pybullet, the best and the worst of 4 engines", text)
         self.assertIn("trained in mujoco-warp", text)
         self.assertIn("25%", text)
-        self.assertNotIn("worst", headline(replace(data, summaries=tuple(made[:1]))))
+        self.assertNotIn("worst", headline(replace(data, results=tuple(made[:1]))))
         self.assertIn(
             "40% in each of the 4 engines",
-            headline(replace(data, summaries=tuple(replace(made[0], backend=n) for n in ENGINES))),
+            headline(replace(data, results=tuple(replace(made[0], backend=n) for n in ENGINES))),
         )
 
     def test_the_same_results_give_the_same_page(self):
         self.assertEqual(page(self.data(), self.clips, self.strips), page(self.data(), self.clips, self.strips))
 
 
-class CommandTest(InFolder):
+class CommandTest(Reported):
     def run_command(self, *arguments: str) -> tuple[int, str]:
         code, out, err = run("report", *arguments)
         return code, out + err

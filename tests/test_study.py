@@ -20,7 +20,7 @@ import numpy as np
 from tests.test_cli import run
 from tests.toy_bank import SOUP
 from tests.toy_results import toy_rollouts, toy_summary
-from tests.toy_study import ShellStep
+from tests.toy_study import shell_step
 from xreset.cli import main
 from xreset.demos.archive import write_demos
 from xreset.demos.synth import synthesize
@@ -29,9 +29,9 @@ from xreset.eval.results import write_results
 from xreset.eval.study.file import COMMAND_FLAGS, SHIPPED, read_study, study_path
 from xreset.eval.study.launch import Places, launch
 from xreset.eval.study.paper import ALL, paper_tables
-from xreset.eval.study.plan import EvalStep, Plan, TrainStep, flags, make_plan
+from xreset.eval.study.plan import Plan, Step, config_flags, make_plan
 from xreset.eval.study.report import write_page
-from xreset.eval.study.tables import as_rows, fill
+from xreset.eval.study.tables import fill
 from xreset.files import claim
 from xreset.learning.recipes import RECIPES
 from xreset.learning.run import checkpoints, latest_checkpoint
@@ -167,8 +167,9 @@ class PaperTest(unittest.TestCase):
             row for table in tables.values() for row in (*table.values.values(), *table.standard_error.values())
         ):
             self.assertTrue(all(0 <= value <= 100 for value in row))
-        self.assertEqual(tables["III"].figure("80", SOUP, "grasp"), 100.0)
-        self.assertIsNone(tables["IV"].figure("80", SOUP, "grasp"))
+        self.assertEqual(tables["III"].figure("80", SOUP, "grasp"), (100.0, None))
+        self.assertEqual(tables["IV"].figure("80", SOUP, "grasp"), (None, None))
+        self.assertEqual(tables["I"].figure("Ours", SOUP, "task_progress"), (90.8, 1.5))
 
 
 class PlanTest(InFolder):
@@ -192,7 +193,7 @@ class PlanTest(InFolder):
     def test_changes_of_the_recipe_are_flags(self):
         changes = "task.reset = { random_gravity = false, demo_probability = 0.25 }\nmodel.pointnet = [8, 6]\ntask.action.hand_zero = 'middle'\n"
         plan = self.plan(HEAD + DATA + RUN + "[runs.a]\nsteps = 1e6\nnum_envs = 64\n[runs.a.config]\n" + changes)
-        (train,) = (s for s in plan.steps.values() if isinstance(s, TrainStep))
+        (train,) = (s for s in plan.steps.values() if s.kind == "train")
         base = RECIPES["minutes"].config
         self.assertEqual(train.run.config.iterations, 977)
         self.assertEqual(
@@ -204,7 +205,7 @@ class PlanTest(InFolder):
             main(command[3:])
         config = replace(start.call_args.kwargs["config"], iterations=start.call_args.kwargs["iterations"])
         self.assertEqual(config, train.run.config)
-        self.assertEqual(list(flags({"a": {"b_c": True}})), ["--config.a.b-c"])
+        self.assertEqual(list(config_flags({"a": {"b_c": True}})), ["--config.a.b-c"])
 
     def test_several_gpus_are_torchrun(self):
         plan = self.plan(HEAD + DATA + RUN + "[runs.a]\ndevice = 'cuda'\ngpus = 4\nminutes = 8\n")
@@ -262,15 +263,13 @@ class PlacesTest(unittest.TestCase):
 
 
 class LaunchTest(InFolder):
-    def launch(self, *steps: ShellStep, **options) -> tuple[list[str], list[str]]:
+    def launch(self, *steps: Step, **options) -> tuple[list[str], list[str]]:
         plan = mock.Mock(spec=Plan, out=self.out, steps={s.name: s for s in steps})
         said: list[str] = []
         return launch(plan, steps, cluster="local", say=said.append, **options), said
 
-    def step(self, name: str, command: str, *needs: str, gpus: int = 0) -> ShellStep:
-        return ShellStep(
-            name=name, needs=needs, writes=self.folder / name.replace(" ", "-"), kind="data", gpus=gpus, command=command
-        )
+    def step(self, name: str, command: str, *needs: str, gpus: int = 0) -> Step:
+        return shell_step(name, self.folder / name, command, *needs, gpus=gpus)
 
     def test_submitit_that_is_missing(self):
         with (
@@ -290,9 +289,9 @@ class LaunchTest(InFolder):
         )
         self.assertTrue((self.folder / "b" / "done").exists())
         self.assertLess(said.index("a: done"), said.index("b: done"))
-        self.assertRegex(problems[0], "^e could not begin: it needs 64 GPUs, and here is")
-        self.assertRegex(problems[1], r"^c: it is broken\. What it printed: .*c\.log$")
-        self.assertRegex(problems[2], "^d could not begin: c is not done")
+        self.assertRegex(problems[0], "^e cannot start: it needs 64 GPUs, this machine has")
+        self.assertRegex(problems[1], r"^c: it is broken\. Its output: .*c\.log$")
+        self.assertRegex(problems[2], "^d cannot start: c is not done")
         self.assertEqual(len(problems), 3)
 
     @SUBMITIT
@@ -329,7 +328,7 @@ class LaunchTest(InFolder):
         problems = launch(
             mock.Mock(spec=Plan, out=self.out, steps={"a": step}), [step], cluster="local", say=said.append
         )
-        self.assertEqual((problems, said), ([], ["a: another command is at it; waiting for its end"]))
+        self.assertEqual((problems, said), ([], ["a: in progress in another process; waiting for its end"]))
 
     @SUBMITIT
     def test_ctrl_c_asks_the_command_to_end(self):
@@ -374,14 +373,14 @@ class TablesTest(InFolder):
         self.write("ik", 0.33, 0.33, 0.33, 0.33)
         plan = self.plan(self.TEXT)
         table, grasps = (fill(plan, t) for t in plan.study.tables)
-        rows = as_rows(table, "mujoco")
+        rows = table.as_rows("mujoco")
         self.assertEqual(rows.head, ("%", "IK Oracle", "X-Sim", "Ours"))
         self.assertEqual([r[0] for r in rows.body], ["tomato soup can", "potted meat can", "all of them"])
         soup, _, everything = (dict(zip(rows.head, r, strict=True)) for r in rows.body)
         self.assertEqual(soup["X-Sim"], "-, paper 35.0 \N{PLUS-MINUS SIGN} 0.8")
         self.assertRegex(soup["Ours"], r"^83\.0 \(66-100\), paper 90\.8 . 1\.5$", "the interval is over the seeds, too")
         self.assertRegex(everything["Ours"], r"^58\.0 \(33-100\), paper 78\.2$")
-        self.assertEqual(as_rows(grasps, "mujoco").body[0][0], "X-RESET")
+        self.assertEqual(grasps.as_rows("mujoco").body[0][0], "X-RESET")
         page = write_page(plan, self.folder / "page")
         text = page.path.read_text()
         self.assertIn("![Table I", text)
@@ -404,7 +403,7 @@ class TablesTest(InFolder):
             ("a", "b", "c"),
         )
         plan = self.plan(self.TEXT.replace("[runs.ours]\n", "[runs.ours]\nalone = true\n"))
-        rows = as_rows(fill(plan, plan.study.tables[0]), "mujoco")
+        rows = fill(plan, plan.study.tables[0]).as_rows("mujoco")
         self.assertRegex(rows.body[0][3], r"^66\.5 ")
         self.assertEqual([r[3][0] for r in rows.body[1:]], ["-", "-"])
 
@@ -484,13 +483,12 @@ class WholeTest(unittest.TestCase):
     def test_a_policy_that_has_changed_is_evaluated_again(self):
         plan = self.plan()
         step = plan.steps["eval x-reset-seed0"]
-        assert isinstance(step, EvalStep)
-        self.assertEqual(step.missing(), [])
+        self.assertEqual(step.left(), "")
         policy = self.out / "x-reset-seed0" / "policy.onnx"
         content = policy.read_bytes()
         self.addCleanup(policy.write_bytes, content)
         policy.write_bytes(content + b" ")
-        self.assertEqual(step.missing(), ["mujoco"])
+        self.assertEqual(step.left(), "in mujoco")
 
     def test_a_policy_that_was_brought_without_checkpoints_counts(self):
         plan = self.plan()

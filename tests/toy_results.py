@@ -1,16 +1,23 @@
-"""Evaluation results for tests: two demonstrations, two episodes each, of known outcome."""
+"""Evaluation results for tests: two demonstrations, two episodes each, of known outcome; and folders of runs."""
 
 from __future__ import annotations
 
+import tempfile
+import unittest
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tests.toy_bank import SOUP, SPAM
-from xreset.eval.results import EvalResult, summarize
+from xreset.eval.results import EvalResult, summarize, write_results
 from xreset.eval.rollout import Episode, Rollouts, Trace
+from xreset.learning.config import TrainConfig
+from xreset.learning.run import RunInfo, write_run
 
 OBJECTS = (SOUP, SPAM)
+ENGINES = ("mujoco", "mujoco-warp", "pybullet", "sapien")
 
 
 def toy_episode(sequence: int, repetition: int, *reached: str, thing: str = "", **changes: Any) -> Episode:
@@ -37,28 +44,27 @@ def episodes(scores: list[float]) -> tuple[Episode, ...]:
 
 
 def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
-    """Demonstration 0 (soup) reaches the goal once and the approach once, demonstration 1 (spam) a grasp and nothing.
+    """Return rollouts in which demonstration 0 (soup) reaches the goal once and the approach once, demonstration 1 (spam) a grasp and nothing.
 
     Args:
-        joint_pos: [J] where the robot of the traces stands; default: three joints at 0.
+        joint_pos: [J] joint positions of the traces; default: three joints at 0.
     """
     joints = np.zeros(3) if joint_pos is None else joint_pos
-
-    def trace(sequence: int) -> Trace:
-        time = np.arange(5) * 0.05
-        path = np.array([0.5, 0.3, 0.05]) + np.outer(np.linspace(0, 1, 5), [0.0, 0.05, 0.1])
-        return Trace(
+    time = np.arange(5) * 0.05
+    traces = []
+    for sequence, name in enumerate(OBJECTS):
+        trace = Trace(
             sequence=sequence,
-            object=OBJECTS[sequence],
+            object=name,
             goal_pos=np.array([0.5, 0.35, 0.15]),
             goal_quat=np.array([1.0, 0, 0, 0]),
             time=time,
             joint_pos=joints + 0.01 * sequence * time[:, None],
-            object_pos=path,
+            object_pos=np.array([0.5, 0.3, 0.05]) + np.outer(np.linspace(0, 1, 5), [0.0, 0.05, 0.1]),
             object_quat=np.tile([1.0, 0, 0, 0], (5, 1)),
             joint_target=joints + 0.01 * np.arange(12)[:, None],
         )
-
+        traces.append(trace)
     lifted = ("approach", "grasp")
     done = ("reorient", "reorient_once")
     episodes = (
@@ -67,11 +73,18 @@ def toy_rollouts(joint_pos: np.ndarray | None = None) -> Rollouts:
         toy_episode(1, 0, *lifted, "out_of_bounds", reorientation_progress=0.5, task_progress=0.66),
         toy_episode(1, 1, "nonfinite"),
     )
-    return Rollouts(episodes=episodes, traces=(trace(0), trace(1)), control_steps_per_second=1234.56)
+    return Rollouts(episodes=episodes, traces=tuple(traces), control_steps_per_second=1234.56)
+
+
+def rollouts_with(*progress: float) -> Rollouts:
+    """Return the toy's four episodes with other task progress."""
+    rollouts = toy_rollouts()
+    episodes = [replace(e, task_progress=p) for e, p in zip(rollouts.episodes, progress, strict=True)]
+    return replace(rollouts, episodes=tuple(episodes))
 
 
 def toy_summary(backend: str = "mujoco", rollouts: Rollouts | None = None, **changes: Any) -> EvalResult:
-    """``BACKEND.json`` of the rollouts; ``changes`` replace arguments of :func:`xreset.eval.results.summarize`."""
+    """Return ``BACKEND.json`` of the rollouts; ``changes`` replace arguments of :func:`xreset.eval.results.summarize`."""
     arguments: dict[str, Any] = {
         "backend_version": "4.0.0",
         "robot": "toy",
@@ -81,3 +94,35 @@ def toy_summary(backend: str = "mujoco", rollouts: Rollouts | None = None, **cha
         "objects_folder": None,
     }
     return summarize(rollouts or toy_rollouts(), backend=backend, **(arguments | changes))
+
+
+class InFolder(unittest.TestCase):
+    """A test with a folder of runs and results."""
+
+    def setUp(self):
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+
+    def write_results(
+        self, name: str, rollouts: Rollouts | None = None, engines=("mujoco",), joints=("a", "b", "c"), **changes: Any
+    ) -> Path:
+        rollouts = rollouts or toy_rollouts()
+        for engine in engines:
+            write_results(self.folder / name / "eval", toy_summary(engine, rollouts, **changes), rollouts, joints)
+        return self.folder / name
+
+    def write_run(self, name: str, config: TrainConfig | None = None, **changes: Any) -> Path:
+        info = {
+            "robot": "openarm",
+            "resets": "resets.npz",
+            "resets_hash": "ef" * 32,
+            "objects": None,
+            "backend": "mujoco-warp",
+            "backend_version": "4.0.0",
+            "device": "cuda",
+            "num_envs": 64,
+            "seed": 0,
+            "config": config or TrainConfig(),
+            "contract": {"objects": [SOUP]},
+        }
+        write_run(self.folder / name, RunInfo(**(info | changes)))
+        return self.folder / name

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from pathlib import Path
 
 from xreset.eval.study.plan import Step
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShellStep(Step):
-    """Done when its folder holds ``done``."""
-
-    command: str
-
-    def done(self) -> bool:
-        return (self.writes / "done").exists()
-
-    def commands(self) -> list[list[str]]:
-        return [["sh", "-c", f"mkdir -p {self.writes} && cd {self.writes} && {self.command}"]]
+def shell_step(name: str, writes: Path, command: str, *needs: str, gpus: int = 0) -> Step:
+    """Return a step that is done when its folder holds ``done``."""
+    return Step(
+        name=name,
+        kind="data",
+        writes=writes,
+        left=lambda: "" if (writes / "done").exists() else "to do",
+        commands=lambda: [["sh", "-c", f"mkdir -p {writes} && cd {writes} && {command}"]],
+        needs=needs,
+        gpus=gpus,
+    )

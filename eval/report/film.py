@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +16,6 @@ from xreset.files import write_whole
 from xreset.objects.catalogue import load_object
 
 
-@dataclass(frozen=True, kw_only=True)
-class Film:
-    """What a film shows."""
-
-    engines: tuple[str, ...]
-    """From above."""
-    objects: tuple[str, ...]
-    """From the left."""
-
-
 def make_film(
     folder: Path,
     out: Path,
@@ -34,14 +23,17 @@ def make_film(
     robot: str | None = None,
     objects: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Film:
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Write an mp4 with the episode of each object that went best over all engines, all at their own speed.
 
     Args:
         folder: a run folder, or a folder of results.
-        robot: name or folder of the robot; default: as the run and the results name it.
+        robot: name or folder of the robot; default: as the results name it.
         objects: folder of meshes; default: as the results name it.
-        progress: called with (clips drawn, all of them).
+        progress: called with (clips drawn, clips in all).
+
+    Returns:
+        The engines, from above, and the objects, from the left.
 
     Raises:
         RunError: there are no results, or no object was recorded in every engine.
@@ -49,33 +41,35 @@ def make_film(
         XResetError: the film cannot be encoded or written.
     """
     data = collect(folder)
-    first = data.summaries[0]
-    spec = load_robot(robot or (data.run.robot if data.run is not None else first.robot))
-    recorded = {engine: read_traces(data.results, engine, spec.joint_names) for engine in data.engines}
-    meshes, columns, rate = mesh_folder(objects, first.objects_folder), {}, 0.0
-    names = sorted({trace.object for found in recorded.values() for trace in found})
+    spec = load_robot(robot or data.robot)
+    traces = {engine: read_traces(data.folder, engine, spec.joint_names) for engine in data.engines}
+    meshes = mesh_folder(objects, data.results[0].objects_folder)
+    names = sorted({trace.object for found in traces.values() for trace in found})
+    columns = {}
+    rate = 0.0
     for number, name in enumerate(names):
-        traces = {engine: tuple(t for t in found if t.object == name) for engine, found in recorded.items()}
-        sequence = choose_sequence(data.episodes, traces)
+        own = {engine: [t for t in found if t.object == name] for engine, found in traces.items()}
+        sequence = choose_sequence(data.episodes, own)
         if sequence is None:
             continue
-        shown = {engine: next(t for t in found if t.sequence == sequence) for engine, found in traces.items()}
-        camera, thing = camera_for(list(shown.values())), load_object(name, meshes)
+        shown = {engine: next(t for t in found if t.sequence == sequence) for engine, found in own.items()}
+        camera = camera_for(list(shown.values()))
+        obj = load_object(name, meshes)
         columns[name] = []
         for row, (engine, trace) in enumerate(shown.items()):
             progress(number * len(shown) + row, len(names) * len(shown))
-            clip = draw_clip(engine, recorded_episode(data.episodes[engine], sequence), trace, spec, thing, camera)
+            episode = recorded_episode(data.episodes, engine, sequence)
+            clip = draw_clip(engine, episode, trace, spec, obj, camera)
             columns[name].append(clip.frames[:, ::2, ::2])
             rate = clip.fps
     if not columns:
         raise RunError(
-            f"no demonstration in {data.results} was recorded in every engine. Evaluate all engines in one command."
+            f"no demonstration in {data.folder} was recorded in every engine. Evaluate all engines in one command."
         )
     length = max(len(frames) for column in columns.values() for frames in column)
-    whole = [
-        np.concatenate([frames[np.minimum(np.arange(length), len(frames) - 1)] for frames in column], axis=1)
-        for column in columns.values()
-    ]
-    film = encode_mp4(np.concatenate(whole, axis=2), rate)
-    write_whole(out, film)
-    return Film(engines=data.engines, objects=tuple(columns))
+    films = []
+    for column in columns.values():
+        lasting = [frames[np.minimum(np.arange(length), len(frames) - 1)] for frames in column]
+        films.append(np.concatenate(lasting, axis=1))
+    write_whole(out, encode_mp4(np.concatenate(films, axis=2), rate))
+    return data.engines, tuple(columns)

@@ -1,11 +1,12 @@
-"""The report as one HTML page that needs nothing else: no network, no files beside it."""
+"""The report as one HTML page that needs nothing else: no network, no other files."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from html import escape
+from typing import Any
 
 from xreset import __version__
 from xreset.eval.pages import percent, render
@@ -13,39 +14,59 @@ from xreset.eval.plots import COLORS
 from xreset.eval.report import figures
 from xreset.eval.report.clips import Clip, Strip, count_failures, encode_mp4
 from xreset.eval.report.read import ReportData
-from xreset.eval.rollout import Episode
+from xreset.eval.results import EvalResult
 from xreset.eval.table import FIGURES
 from xreset.pictures.render import encode_png
 from xreset.text import short_name
 
 
 def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) -> str:
-    """The whole page; clips and strips (of the first engine's failures) may be empty. It runs no script but its own."""
-    s, script = data.summaries[0], render("report.js")
-    found = [{row.sequence: row for row in s.per_demo} for s in data.summaries]
+    """Return the whole page; clips, and strips of failures, may be empty. The page runs no script but its own."""
+    script = render("report.js")
+    first = data.engines[0]
+    failures = count_failures(data.episodes_in(first))
+    demonstrations: dict[str, list[Any]] = {}
+    stressed: dict[str, list[Any]] = {}
+    for i, result in enumerate(data.results):
+        for row in result.per_demo:
+            demonstrations.setdefault(row.sequence, [None] * len(data.results))[i] = row
+    for i, card in enumerate(data.stress):
+        for curve in card.curves:
+            stressed.setdefault(curve.property, [None] * len(data.stress))[i] = curve
     return render(
         "report.html.j2",
-        data=data, figures=FIGURES, title=f"{s.policy} on {s.robot}", headline=headline(data), facts=_facts(data), colors=COLORS,
-        script=script, script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        clips=clips, strips=strips, outcome_of=outcome_of,
-        mp4=lambda clip: base64.b64encode(encode_mp4(clip.frames, clip.fps)).decode(),
-        png=lambda strip: base64.b64encode(encode_png(strip.picture)).decode(),
-        failures={what: count for what, count in count_failures(data.episodes[data.engines[0]]).items() if count},
+        data=data,
+        figures=FIGURES,
+        title=data.title,
+        headline=headline(data),
+        facts=_facts(data),
+        colors=COLORS,
+        script=script,
+        script_hash=_base64(hashlib.sha256(script.encode()).digest()),
+        clips=clips,
+        strips=strips,
+        outcome_of=outcome_of,
+        mp4=lambda clip: _base64(encode_mp4(clip.frames, clip.fps)),
+        png=lambda strip: _base64(encode_png(strip.picture)),
+        failures={what: count for what, count in failures.items() if count},
         charts=_charts(data),
-        stressed={
-            name: [next((c for c in card.curves if c.property == name), None) for card in data.stress]
-            for name in dict.fromkeys(curve.property for card in data.stress for curve in card.curves)
-        },
-        demonstrations={name: [of.get(name) for of in found] for name in dict.fromkeys(name for of in found for name in of)},
+        stressed=stressed,
+        demonstrations=demonstrations,
         inputs=_inputs(data),
-    )  # fmt: skip
+    )
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()
 
 
 def headline(data: ReportData) -> str:
-    """The result in one or two sentences."""
-    ranked = sorted(data.summaries, key=lambda s: -s.task_progress.mean)
-    best, worst = ranked[0], ranked[-1]
-    high, low = (percent(x.task_progress.mean) for x in (best, worst))
+    """Return the result in one or two sentences."""
+    ranked = sorted(data.results, key=lambda s: -s.task_progress.mean)
+    best = ranked[0]
+    worst = ranked[-1]
+    high = percent(best.task_progress.mean)
+    low = percent(worst.task_progress.mean)
     if len(ranked) == 1:
         text = f"Task progress is {high} in {best.backend}"
     elif high == low:
@@ -53,25 +74,27 @@ def headline(data: ReportData) -> str:
     else:
         number = f"{len(ranked)} engines" if len(ranked) > 2 else "the two engines"
         text = f"Task progress is {high} in {best.backend} and {low} in {worst.backend}, the best and the worst of {number}"
-    text += f". The object is grasped in {_between([s.grasp_rate for s in ranked])} of the episodes and at its goal at the end of "
-    text += f"{_between([s.reorient_rate for s in ranked])}."
-    trained = data.run and next((s for s in ranked if s.backend == data.run.backend), None)
-    if trained and len(ranked) > 1:
-        text += f" The policy was trained in {trained.backend}."
+    grasped = _between([s.grasp_rate for s in ranked])
+    at_goal = _between([s.reorient_rate for s in ranked])
+    text += f". The object is grasped in {grasped} of the episodes and at its goal at the end of {at_goal}."
+    if data.run is not None and data.run.backend in data.engines and len(ranked) > 1:
+        text += f" The policy was trained in {data.run.backend}."
     return text
 
 
 def _facts(data: ReportData) -> dict[str, str]:
-    """What was evaluated, where and how it was trained."""
-    s, run = data.summaries[0], data.run
-    demos, each = len(s.per_demo), s.episodes_per_demo
+    """Return what was evaluated, where and how it was trained."""
+    s = data.results[0]
+    run = data.run
+    demos = len(s.per_demo)
+    starts = s.episodes_per_demo
+    meshes = "meshes" if s.objects_folder else "built-in stand-ins"
     facts = {
         "Robot": s.robot,
         "Policy": s.policy,
-        "Engines": ", ".join(f"{x.backend} {x.backend_version}" for x in data.summaries),
-        "Objects": ", ".join(map(short_name, s.objects))
-        + (" (meshes)" if s.objects_folder else " (built-in stand-ins)"),
-        "Episodes": f"{s.episodes} in each engine: {demos} demonstration{'s' * (demos != 1)}, {each} start{'s' * (each != 1)} each",
+        "Engines": ", ".join(f"{x.backend} {x.backend_version}" for x in data.results),
+        "Objects": f"{', '.join(map(short_name, s.objects))} ({meshes})",
+        "Episodes": f"{s.episodes} in each engine: {demos} demonstration{'s' * (demos != 1)}, {starts} start{'s' * (starts != 1)} each",
         "Seed": str(s.seed),
     }
     if run is not None:
@@ -83,61 +106,69 @@ def _facts(data: ReportData) -> dict[str, str]:
     return facts | {"Report by": f"xreset {__version__}"}
 
 
-def outcome_of(e: Episode) -> str:
-    """What an episode reached, in words."""
-    stage = (
-        "object at its goal"
-        if e.reorient
-        else "grasped and lifted"
-        if e.grasp
-        else "approached"
-        if e.approach
-        else "no stage reached"
-    )
-    return f"{stage}, {e.reorientation_progress:.0%} of the way to the goal"
+def outcome_of(episode: Any) -> str:
+    """Return what an episode reached, in words."""
+    stage = "no stage reached"
+    if episode.reorient:
+        stage = "object at its goal"
+    elif episode.grasp:
+        stage = "grasped and lifted"
+    elif episode.approach:
+        stage = "approached"
+    return f"{stage}, {episode.reorientation_progress:.0%} of the way to the goal"
 
 
 def _charts(data: ReportData) -> dict[str, str]:
-    """SVG by name, each with what it shows in words."""
-    s = data.summaries
+    """Return SVG by name, each with its content in words."""
+    results = data.results
 
-    def listing(text) -> str:
-        return "; ".join(f"{x.backend}{text(x)}" for x in s)
+    def listing(text: Callable[[EvalResult], str]) -> str:
+        return "; ".join(s.backend + text(s) for s in results)
 
-    stages = listing(lambda x: " " + ", ".join(f"{label} {percent(getattr(x, key))}" for key, label in figures.STAGES))
+    def stages(s: EvalResult) -> str:
+        return " " + ", ".join(f"{label} {percent(getattr(s, key))}" for key, label in figures.STAGES.items())
+
     charts = {
         "progress": (
-            figures.figure_progress(s),
-            f"Bar chart of task progress. {listing(lambda x: ' ' + percent(x.task_progress.mean))}.",
+            figures.figure_progress(results),
+            f"Bar chart of task progress. {listing(lambda s: ' ' + percent(s.task_progress.mean))}.",
         ),
-        "stages": (figures.figure_stages(s), f"Bar chart of stage rates. {stages}."),
+        "stages": (figures.figure_stages(results), f"Bar chart of stage rates. {listing(stages)}."),
     }
-    if len(s[0].objects) > 1:
-        by_object = listing(
-            lambda x: ": " + ", ".join(f"{short_name(o)} {percent(p)}" for o, p in figures.object_progress(x).items())
-        )
-        charts["objects"] = figures.figure_objects(s), f"Dot chart of task progress by object. {by_object}."
+    if len(results[0].objects) > 1:
+        progress = figures.object_progress(data.episodes)
+
+        def objects(s: EvalResult) -> str:
+            known = progress[s.backend].dropna()
+            return ": " + ", ".join(f"{short_name(name)} {percent(value)}" for name, value in known.items())
+
+        text = f"Dot chart of task progress by object. {listing(objects)}."
+        charts["objects"] = (figures.figure_objects(progress), text)
     if data.curves:
-        ends = "; ".join(
-            f"{c.label} from {c.value[0]:.3g} to {c.value[-1]:.3g} at iteration {c.iteration[-1]}" for c in data.curves
-        )
-        charts["curves"] = figures.figure_curves(data.curves), f"Line charts: {ends}."
-    return {
-        name: svg.replace("<svg", f'<svg role="img" aria-label="{escape(alt)}"', 1)
-        for name, (svg, alt) in charts.items()
-    }
+        ends = []
+        for c in data.curves:
+            ends.append(f"{c.label} from {c.value[0]:.3g} to {c.value[-1]:.3g} at iteration {c.iteration[-1]}")
+        charts["curves"] = (figures.figure_curves(data.curves), f"Line charts: {'; '.join(ends)}.")
+    labeled = {}
+    for name, (svg, text) in charts.items():
+        labeled[name] = svg.replace("<svg", f'<svg role="img" aria-label="{escape(text)}"', 1)
+    return labeled
 
 
 def _inputs(data: ReportData) -> dict[str, str]:
-    """Files and their hashes."""
-    lines = {f"SHA-256 of the {name}": value for name, value in data.summaries[0].inputs.items()}
-    if data.run is not None:
-        lines |= {"Reset bank": data.run.resets, "SHA-256 of the reset bank": data.run.resets_hash}
-        if data.run.weights is not None:
-            lines |= {"Networks at the beginning": data.run.weights, "SHA-256 of these": str(data.run.weights_hash)}
+    """Return files and their hashes."""
+    lines = {f"SHA-256 of the {name}": value for name, value in data.results[0].inputs.items()}
+    run = data.run
+    if run is not None:
+        lines["Reset bank"] = run.resets
+        lines["SHA-256 of the reset bank"] = run.resets_hash
+        if run.weights is not None:
+            lines["Networks at the beginning"] = run.weights
+            lines["SHA-256 of these"] = str(run.weights_hash)
     return lines
 
 
 def _between(values: Sequence[float]) -> str:
-    low, high = percent(min(values)), percent(max(values))
+    low = percent(min(values))
+    high = percent(max(values))
     return low if low == high else f"{low} to {high}"

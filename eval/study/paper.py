@@ -1,4 +1,4 @@
-"""The paper's figures, from ``paper.toml``, where they stand once."""
+"""The paper's figures, from ``paper.toml``."""
 
 from __future__ import annotations
 
@@ -20,9 +20,11 @@ METRICS = {
     "reorient_once": "at the goal at any time",
     "reorientation_progress": "reorientation progress",
 }
-"""Field of an episode -> what tables call it."""
+"""Column of the table of episodes -> its name in tables."""
 ALL = "all"
 """In place of an object: the mean over all of them."""
+
+Axis = Literal["object", "method", "metric"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,68 +32,65 @@ class PaperTable:
     """A table of the paper."""
 
     title: str
-    rows: Literal["object", "method", "metric"]
-    columns: Literal["object", "method", "metric"]
+    rows: Axis
+    columns: Axis
     names: tuple[str, ...]
-    """Of the columns."""
+    """Names of the columns."""
     values: dict[str, tuple[float, ...]]
     """Row -> a figure for each column, percent."""
     standard_error: dict[str, tuple[float, ...]]
-    """The same for those rows that have one; not an interval: 1.96 of it on either side is."""
+    """Row -> standard errors, for the rows that have them; 1.96 of it on either side is the 95 % interval."""
     object: str | None = None
-    """Where objects are no axis: which one; None: all."""
+    """The object of all figures, where objects are not an axis; None: all objects."""
     metric: str | None = None
-    """Where metrics are no axis: which one."""
+    """The metric of all figures, where metrics are not an axis."""
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """What the paper compares, in its order."""
+        """The methods that the paper compares, in its order."""
         return tuple(self.values) if self.rows == "method" else self.names
 
-    def figure(self, method: str, thing: str, metric: str) -> float | None:
-        """What the paper reports, percent; None where it does not.
+    def figure(self, method: str, object_name: str, metric: str) -> tuple[float | None, float | None]:
+        """Return the figure that the paper reports and its standard error, percent; None where it reports none.
 
         Args:
-            method: as the paper calls it.
-            thing: official name of the object, or :data:`ALL`.
-            metric: of :data:`METRICS`.
+            method: the paper's name of the method.
+            object_name: official name of the object, or :data:`ALL`.
+            metric: one of :data:`METRICS`.
         """
-        if self.metric not in (None, metric) or (
-            "object" not in (self.rows, self.columns) and (self.object or ALL) != thing
-        ):
-            return None
-        key = {"method": method, "object": thing, "metric": metric}
-        if key[self.rows] not in self.values or key[self.columns] not in self.names:
-            return None
-        return self.values[key[self.rows]][self.names.index(key[self.columns])]
+        key = {"method": method, "object": object_name, "metric": metric}
+        row = key[self.rows]
+        column = key[self.columns]
+        same_metric = self.metric in (None, metric)
+        same_object = "object" in (self.rows, self.columns) or (self.object or ALL) == object_name
+        if not (same_metric and same_object and row in self.values and column in self.names):
+            return None, None
+        index = self.names.index(column)
+        error = self.standard_error[row][index] if row in self.standard_error else None
+        return self.values[row][index], error
 
 
 @cache
 def paper_tables() -> dict[str, PaperTable]:
-    """Number -> table."""
-    raw = tomllib.loads(FILE.read_text())["tables"]
-    return {
-        number: _official(from_dict(PaperTable, {"standard_error": {}} | table, f"{FILE}: {number}"))
-        for number, table in raw.items()
-    }
+    """Return the paper's tables by number, with the official names of the objects."""
+    tables = {}
+    for number, content in tomllib.loads(FILE.read_text())["tables"].items():
+        table = from_dict(PaperTable, {"standard_error": {}} | content, f"{FILE}: {number}")
+        tables[number] = replace(
+            table,
+            names=tuple(_official(table.columns, name) for name in table.names),
+            values={_official(table.rows, name): figures for name, figures in table.values.items()},
+            standard_error={_official(table.rows, name): errors for name, errors in table.standard_error.items()},
+            object=canonical_name(table.object) if table.object else None,
+        )
+    return tables
+
+
+def _official(axis: Axis, name: str) -> str:
+    return canonical_name(name) if axis == "object" and name != ALL else name
 
 
 @cache
 def paper_training() -> str:
-    """How long the paper's policies were trained, as it says."""
+    """Return how long the paper's policies were trained, in the paper's words."""
     return tomllib.loads(FILE.read_text())["training"]
-
-
-def _official(table: PaperTable) -> PaperTable:
-    """With the official names of the objects."""
-
-    def name(axis: str, text: str) -> str:
-        return canonical_name(text) if axis == "object" and text != ALL else text
-
-    return replace(
-        table,
-        names=tuple(name(table.columns, n) for n in table.names),
-        values={name(table.rows, n): v for n, v in table.values.items()},
-        standard_error={name(table.rows, n): v for n, v in table.standard_error.items()},
-        object=canonical_name(table.object) if table.object else None,
-    )

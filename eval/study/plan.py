@@ -1,18 +1,19 @@
-"""What a study consists of: trainings by object and seed, and the steps that make them; each knows whether it is done.
+"""The runs and steps of a study: a step has a name, the steps it needs, what is left to do, and the commands that do it.
 
-    OUT/data/SUBSET/demos.npz               demonstrations of a subset of the data, and of what it was made (subset.json)
-    OUT/data/SUBSET/ROBOT/resets.npz        what xreset retarget and xreset resets made of them
-    OUT/RUN/                                the run folder of xreset train; eval/ and eval-NAME/ are its evaluations
-    OUT/logs/STEP.log                       what the commands of a step printed
+    OUT/data/SUBSET/demos.npz               demonstrations of a subset of the data, and its definition (subset.json)
+    OUT/data/SUBSET/ROBOT/resets.npz        reset bank, made by xreset retarget and xreset resets
+    OUT/RUN/                                run folder of xreset train; eval/ and eval-NAME/ are its evaluations
+    OUT/logs/STEP.log                       output of the commands of a step
 
-Studies that share OUT share what is in it: a run of the same name and configuration is trained once.
+Studies with the same OUT share its content: a run of the same name and configuration is trained once.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -33,9 +34,8 @@ from xreset.text import short_name, shown
 if TYPE_CHECKING:
     from xreset.eval.results import EvalResult
 
-Kind = Literal["data", "train", "eval"]
 _ENOUGH = 0.97
-"""Share of the minutes from which a training counts as done: what is left would cost more to start than it is."""
+"""Share of the minutes from which a training counts as done: to start again would cost more than what is left."""
 _XRESET = [sys.executable, "-m", "xreset"]
 
 
@@ -44,7 +44,7 @@ class Run:
     """One training, or one baseline."""
 
     group: str
-    """Its name in the study, shared with those of other seeds and objects."""
+    """Name of the run in the study; trainings with other seeds and objects share it."""
     runs: Runs
     seed: int
     objects: tuple[str, ...]
@@ -56,21 +56,21 @@ class Run:
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of the run's folder."""
         return self.folder.name
 
     @property
     def bank(self) -> Path:
-        """Its reset bank."""
+        """The run's reset bank."""
         return self.subset.folder / Path(self.runs.robot).name / "resets.npz"
 
     @property
     def begun(self) -> bool:
-        """Whether there is anything of the training; a policy that was brought here without its checkpoints is."""
+        """Whether the training has a checkpoint, or a policy that was copied here without checkpoints."""
         return bool(checkpoints(self.folder)) or (self.folder / "policy.onnx").is_file()
 
     def trained(self) -> Lift:
-        """How far it has come: what its newest checkpoint says, or else its lift clock."""
+        """Return how far the training has come: from its newest checkpoint, or else its lift clock."""
         if not checkpoints(self.folder):
             return read_lift(self.folder)
         from xreset.learning.checkpoint import read_checkpoint
@@ -82,131 +82,250 @@ class Run:
             minutes=float(content["elapsed"]) / 60,
         )
 
+    def left(self) -> str:
+        """Return how far an unfinished training has come, in words; empty if it is finished."""
+        assert self.config is not None
+        now = self.trained()
+        minutes = self.runs.minutes
+        if now.iteration >= self.config.iterations or (minutes is not None and now.minutes >= _ENOUGH * minutes):
+            return ""
+        if not now.iteration:
+            return "not begun"
+        text = f"{now.iteration} of {self.config.iterations} iterations"
+        return text if minutes is None else f"{text}, {now.minutes:.1f} of {minutes:g} minutes"
+
     def check(self) -> None:
-        """Refuse a folder with a run of another configuration. Its length is no part of that: it can go on."""
+        """Refuse a folder with a run of another configuration. The length may differ: a run can be continued."""
         if self.config is None or not self.begun:
             return
         info = read_run(self.folder)
-        both = {  # there, and wanted
-            "robot": (info.robot, self.runs.robot),
-            "backend": (info.backend, self.runs.backend),
-            "num_envs": (info.num_envs, self.runs.num_envs),
-            "seed": (info.seed, self.seed),
-            "stand-ins": (info.objects is None, self.subset.data.meshes is None),
-            "other networks to begin with": (info.weights is not None, self.weights is not None),
-            "config": (_lasting(info.config), _lasting(self.config)),
+        found = {
+            "robot": info.robot,
+            "backend": info.backend,
+            "num_envs": info.num_envs,
+            "seed": info.seed,
+            "stand-ins": info.objects is None,
+            "other networks to begin with": info.weights is not None,
+            "config": _without_length(info.config),
+        }
+        wanted = {
+            "robot": self.runs.robot,
+            "backend": self.runs.backend,
+            "num_envs": self.runs.num_envs,
+            "seed": self.seed,
+            "stand-ins": self.subset.data.meshes is None,
+            "other networks to begin with": self.weights is not None,
+            "config": _without_length(self.config),
         }
         if self.bank.is_file():
-            both["reset bank"] = info.resets_hash[:12], file_hash(self.bank)[:12]
-        there, wanted = ({name: values[i] for name, values in both.items()} for i in (0, 1))
-        refuse_other(f"{self.folder} holds a run of another configuration", "runs", there, wanted)
+            found["reset bank"] = info.resets_hash[:12]
+            wanted["reset bank"] = file_hash(self.bank)[:12]
+        refuse_other(f"{self.folder} holds a run of another configuration", "runs", found, wanted)
 
 
-def _lasting(config: TrainConfig) -> dict[str, Any]:
+def _without_length(config: TrainConfig) -> dict[str, Any]:
     return asdict(replace(config, iterations=1, save_interval=1))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """Something that commands of ``xreset`` make."""
+    """A part of a study that commands of ``xreset`` do."""
 
     name: str
-    needs: tuple[str, ...]
-    """Names of the steps before it."""
+    kind: Literal["data", "train", "eval"]
     writes: Path
-    """Folder that its commands keep to themselves meanwhile."""
-    kind: Kind
+    """Folder that the commands write."""
+    left: Callable[[], str]
+    """Returns what is left to do, in words; empty if the step is done."""
+    commands: Callable[[], list[list[str]]]
+    """Returns the commands to run next, in order."""
+    needs: tuple[str, ...] = ()
+    """Names of the steps before it."""
     gpus: int = 0
+    run: Run | None = None
+    """The run that is trained or evaluated."""
+    objects: tuple[str, ...] = ()
+    """Objects of an evaluation."""
 
     def done(self) -> bool:
-        """Whether there is nothing to do."""
-        raise NotImplementedError
-
-    def commands(self) -> list[list[str]]:
-        """What is to be done now, in order."""
-        raise NotImplementedError
+        """Return whether nothing is left to do."""
+        return not self.left()
 
     def busy(self) -> bool:
         """Return whether another process is writing this step's folder."""
         return is_claimed(self.writes)
 
 
-@dataclass(frozen=True, kw_only=True)
-class BankStep(Step):
-    """Demonstrations to reset bank, for one robot."""
-
-    subset: Subset
-    robot: str
-
-    def done(self) -> bool:
-        return (self.writes / "resets.npz").is_file()
-
-    def commands(self) -> list[list[str]]:
-        retargeted, data = self.writes / "retargeted.npz", self.subset.data
-        retarget = [*_XRESET, "retarget", str(self.subset.demos), "--robot", self.robot, "--out", str(retargeted)]
-        resets = [*_XRESET, "resets", str(retargeted), "--out", str(self.writes / "resets.npz")]
-        if Path(self.robot).is_dir():
-            resets += ["--robot", self.robot]
-        found = [] if retargeted.is_file() else [[*retarget, *self.subset.meshes, *data.retarget]]
-        return [*found, [*resets, *self.subset.meshes, *data.resets]]
+# Steps ------------------------------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrainStep(Step):
-    """A training, from the beginning or from where it was."""
+def bank_step(subset: Subset, robot: str) -> Step:
+    """Return the step from demonstrations to a reset bank for one robot."""
+    folder = subset.folder / Path(robot).name
+    return Step(
+        name=f"data {subset.folder.name} {folder.name}",
+        kind="data",
+        writes=folder,
+        left=lambda: "" if (folder / "resets.npz").is_file() else "to do",
+        commands=partial(_bank_commands, subset, robot, folder),
+    )
 
-    run: Run
 
-    def done(self) -> bool:
-        run = self.run
-        assert run.config is not None
-        now = run.trained()
-        return now.iteration >= run.config.iterations or (
-            run.runs.minutes is not None and now.minutes >= _ENOUGH * run.runs.minutes
-        )
+def _bank_commands(subset: Subset, robot: str, folder: Path) -> list[list[str]]:
+    motion = folder / "retargeted.npz"
+    commands = []
+    if not motion.is_file():
+        retarget = [*_XRESET, "retarget", str(subset.demos), "--robot", robot, "--out", str(motion)]
+        commands.append([*retarget, *subset.mesh_options, *subset.data.retarget])
+    resets = [*_XRESET, "resets", str(motion), "--out", str(folder / "resets.npz")]
+    if Path(robot).is_dir():
+        resets += ["--robot", robot]
+    return [*commands, [*resets, *subset.mesh_options, *subset.data.resets]]
 
-    def commands(self) -> list[list[str]]:
-        run, spec = self.run, self.run.runs
-        assert run.config is not None
-        command = [*_XRESET, "train", "--out", str(run.folder), "--iterations", str(run.config.iterations)]
-        if spec.gpus > 1:
-            processes = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(spec.gpus)]
-            command = [sys.executable, *processes, *command[1:]]
-        if spec.minutes is not None:
-            command += ["--minutes", f"{spec.minutes - run.trained().minutes:.4g}"]
-        if checkpoints(run.folder):
-            return [[*command, "--resume"]]
+
+def train_step(run: Run, needs: tuple[str, ...]) -> Step:
+    """Return the step of a training, from the beginning or from its newest checkpoint."""
+    return Step(
+        name=f"train {run.name}",
+        kind="train",
+        writes=run.folder,
+        left=run.left,
+        commands=partial(_train_commands, run),
+        needs=needs,
+        gpus=run.runs.gpus if run.runs.device == "cuda" else 0,
+        run=run,
+    )
+
+
+def _train_commands(run: Run) -> list[list[str]]:
+    spec = run.runs
+    assert run.config is not None
+    options = {"out": run.folder, "iterations": run.config.iterations}
+    if spec.minutes is not None:
+        options["minutes"] = f"{spec.minutes - run.trained().minutes:.4g}"
+    more = ["--resume"]
+    if not checkpoints(run.folder):
         if run.begun:
             raise RunError(
-                f"{run.folder} cannot go on: it has a policy and no checkpoint. Bring its checkpoints, or choose another --out."
+                f"{run.folder} cannot be continued: it has a policy and no checkpoint. Bring its checkpoints, or choose another --out."
             )
-        command += ["--robot", spec.robot, "--resets", str(run.bank), *run.subset.meshes, "--backend", spec.backend]
-        command += [
-            "--device",
-            spec.device,
-            "--num-envs",
-            str(spec.num_envs),
-            "--seed",
-            str(run.seed),
-            "--like",
-            spec.recipe,
-        ]
+        options |= {
+            "robot": spec.robot,
+            "resets": run.bank,
+            "backend": spec.backend,
+            "device": spec.device,
+            "num-envs": spec.num_envs,
+            "seed": run.seed,
+            "like": spec.recipe,
+        }
         if run.weights is not None:
-            command += ["--weights", str(run.weights)]
-        return [command + list(flags(spec.config))]
+            options["weights"] = run.weights
+        more = [*run.subset.mesh_options, *config_flags(spec.config)]
+    start = _XRESET
+    if spec.gpus > 1:
+        processes = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(spec.gpus)]
+        start = [sys.executable, *processes, *_XRESET[1:]]
+    return [[*start, "train", *_options(options), *more]]
 
 
-def flags(changes: dict[str, Any], prefix: str = "--config.") -> Iterator[str]:
-    """Changes of a configuration as ``xreset train`` takes them."""
+def _options(values: dict[str, Any]) -> list[str]:
+    """Return ``--NAME VALUE`` for each option."""
+    options = []
+    for name, value in values.items():
+        options += [f"--{name}", str(value)]
+    return options
+
+
+def config_flags(changes: dict[str, Any], prefix: str = "--config.") -> Iterator[str]:
+    """Yield changes of a configuration as options of ``xreset train``."""
     for name, value in changes.items():
         flag = name.replace("_", "-")
         if isinstance(value, dict):
-            yield from flags(value, f"{prefix}{flag}.")
+            yield from config_flags(value, f"{prefix}{flag}.")
         elif isinstance(value, bool):
             yield f"{prefix}{flag}" if value else f"{prefix}no-{flag}"
         else:
             yield prefix + flag
             yield from map(str, value if isinstance(value, list | tuple) else [value])
+
+
+def eval_step(
+    run: Run, key: str, evaluation: Evaluation, subset: Subset, engines: tuple[str, ...], needs: tuple[str, ...]
+) -> Step:
+    """Return the step of one evaluation of one run.
+
+    Args:
+        key: name of the evaluation.
+        engines: engines of the evaluation that are installed.
+
+    Raises:
+        RunError: there are results of another evaluation under this name.
+    """
+    demos = subset.demos
+    if run.runs.policy == "ik":
+        demos = subset.folder / Path(run.runs.robot).name / "retargeted.npz"
+    folder = run.folder / key
+    for engine in evaluation.engines:
+        result = _result(folder, engine)
+        if result is not None:
+            found = {
+                "robot": result.robot,
+                "seed": result.seed,
+                "episodes_per_demo": result.episodes_per_demo,
+            }
+            wanted = {
+                "robot": Path(run.runs.robot).name,
+                "seed": evaluation.seed,
+                "episodes_per_demo": evaluation.episodes,
+            }
+            if demos.is_file():
+                found["demos"] = result.inputs.get("demos", "")[:12]
+                wanted["demos"] = file_hash(demos)[:12]
+            refuse_other(f"{folder / engine}.json is an evaluation of another kind", "evaluation", found, wanted)
+
+    def missing() -> list[str]:
+        """Return the engines without a result of this policy."""
+        policy = run.folder / "policy.onnx"
+        digest = file_hash(policy) if run.config is not None and policy.is_file() else None
+        engines_left = []
+        for engine in engines:
+            result = _result(folder, engine)
+            if result is None or result.inputs.get("policy") != digest:
+                engines_left.append(engine)
+        return engines_left
+
+    def commands() -> list[list[str]]:
+        policy = [str(run.folder)]
+        if run.runs.policy:
+            policy = [run.runs.policy, "--robot", run.runs.robot]
+        elif run.begun and not checkpoints(run.folder):
+            policy = [str(run.folder / "policy.onnx")]
+        options = {
+            "demos": demos,
+            "episodes": evaluation.episodes,
+            "seed": evaluation.seed,
+            "num-envs": evaluation.num_envs,
+            "out": folder,
+        }
+        command = [*_XRESET, "eval", *policy, *_options(options), *subset.mesh_options]
+        for engine in missing():
+            command += ["--backend", engine]
+        return [command]
+
+    def left() -> str:
+        engines_left = missing()
+        return f"in {', '.join(engines_left)}" if engines_left else ""
+
+    return Step(
+        name=f"{key} {run.name}",
+        kind="eval",
+        writes=folder,
+        left=left,
+        commands=commands,
+        needs=needs,
+        run=run,
+        objects=subset.objects or run.objects,
+    )
 
 
 def _result(folder: Path, engine: str) -> EvalResult | None:
@@ -216,244 +335,171 @@ def _result(folder: Path, engine: str) -> EvalResult | None:
     return read_result(file) if file.is_file() else None
 
 
-@dataclass(frozen=True, kw_only=True)
-class EvalStep(Step):
-    """An evaluation of one run in the engines that are there."""
-
-    run: Run
-    evaluation: Evaluation
-    subset: Subset
-    engines: tuple[str, ...]
-    """Those that can be used here."""
-
-    @property
-    def demos(self) -> Path:
-        """Starts and goals; for ik, the trajectories too."""
-        folder = self.subset.folder
-        return (
-            folder / Path(self.run.runs.robot).name / "retargeted.npz"
-            if self.run.runs.policy == "ik"
-            else self.subset.demos
-        )
-
-    def check(self) -> None:
-        """Refuse results of other episodes under this name."""
-        for engine in self.evaluation.engines:
-            if (result := _result(self.writes, engine)) is None:
-                continue
-            settings: dict[str, Any] = {
-                "robot": result.robot,
-                "seed": result.seed,
-                "episodes_per_demo": result.episodes_per_demo,
-            }
-            wanted: dict[str, Any] = {
-                "robot": Path(self.run.runs.robot).name, "seed": self.evaluation.seed, "episodes_per_demo": self.evaluation.episodes,
-            }  # fmt: skip
-            if self.demos.is_file():
-                settings["demos"], wanted["demos"] = result.inputs.get("demos", "")[:12], file_hash(self.demos)[:12]
-            refuse_other(
-                f"{self.writes / engine}.json is an evaluation of another kind", "evaluation", settings, wanted
-            )
-
-    def missing(self) -> list[str]:
-        """Engines that are there and have no result of this policy."""
-        policy = self.run.folder / "policy.onnx"
-        digest = file_hash(policy) if self.run.config is not None and policy.is_file() else None
-        found = {engine: _result(self.writes, engine) for engine in self.engines}
-        return [e for e, result in found.items() if result is None or result.inputs.get("policy") != digest]
-
-    def done(self) -> bool:
-        return not self.missing()
-
-    def commands(self) -> list[list[str]]:
-        run, e = self.run, self.evaluation
-        policy = run.folder / "policy.onnx" if run.begun and not checkpoints(run.folder) else run.folder
-        command = [
-            *_XRESET,
-            "eval",
-            *([run.runs.policy, "--robot", run.runs.robot] if run.runs.policy else [str(policy)]),
-        ]
-        command += [
-            "--demos",
-            str(self.demos),
-            "--episodes",
-            str(e.episodes),
-            "--seed",
-            str(e.seed),
-            "--num-envs",
-            str(e.num_envs),
-        ]
-        for engine in self.missing():
-            command += ["--backend", engine]
-        return [[*command, *self.subset.meshes, "--out", str(self.writes)]]
+# The plan ---------------------------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Plan:
     """A study's runs and steps."""
 
     study: Study
     name: str
+    given: Path
+    """Folder that the study's data are relative to."""
     out: Path
-    runs: tuple[Run, ...]
-    steps: dict[str, Step]
-    """By name, in the order in which they can be done."""
-    subsets: tuple[Subset, ...]
+    objects: dict[str, tuple[str, ...]]
+    """Data -> names of its objects."""
     unavailable: dict[str, str]
-    """Engines that the study asks for and that are not there -> why not."""
+    """Engines that the study asks for and that cannot be used here -> why."""
+    runs: list[Run] = field(default_factory=list)
+    steps: dict[str, Step] = field(default_factory=dict)
+    """Steps by name, in an order in which they can be done."""
+    subsets: dict[Path, Subset] = field(default_factory=dict)
+
+    def subset(self, name: str, objects: Iterable[str], per_object: int | None) -> Subset:
+        """Return the subset with the given objects; equal ones are the same."""
+        data = self.study.data[name]
+        chosen = tuple(sorted(objects))
+        if data.demos is not None and chosen == self.objects[name]:
+            chosen = ()
+        made = Subset(name=name, data=data, given=self.given, out=self.out, objects=chosen, per_object=per_object)
+        return self.subsets.setdefault(made.folder, made)
+
+    def add(self, step: Step) -> str:
+        """Add a step, unless there is one of its name, and return the name."""
+        return self.steps.setdefault(step.name, step).name
 
 
 def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable[str] = ()) -> Plan:
-    """Find out what a study consists of, and refuse what does not fit what is there.
+    """Find the runs and steps of a study, and refuse what does not fit the files in ``out``.
 
     Args:
         given: folder that the study's data are relative to.
-        only: names of runs; none: all.
+        only: names of runs; empty: all.
 
     Raises:
-        RunError: there is no such run, or what is there under a run's name, or an evaluation's, is of another configuration.
+        RunError: a run is unknown, or the folder of a run or an evaluation has another configuration.
         FileFormatError: a file of the data is missing or damaged, or a change of the recipe names an unknown key.
         DemoError: the data do not have an object.
     """
-    if unknown := sorted(set(only) - set(study.runs)):
+    unknown = sorted(set(only) - set(study.runs))
+    if unknown:
         raise RunError(f"the study has no runs {', '.join(unknown)}; it has {', '.join(study.runs)}.")
-    there = {name: _objects_of(name, data, given) for name, data in study.data.items()}
-    subsets: dict[Path, Subset] = {}
-
-    def subset(name: str, objects: Iterable[str], per_object: int | None) -> Subset:
-        chosen = tuple(sorted(objects))
-        whole = chosen == there[name] and study.data[name].demos is not None
-        made = Subset(
-            name=name, data=study.data[name], given=given, out=out, objects=() if whole else chosen, per_object=per_object,
-        )  # fmt: skip
-        return subsets.setdefault(made.folder, made)
-
-    runs = tuple(
-        run
-        for group, spec in study.runs.items()
-        if not only or group in only
-        for run in _runs(study, group, spec, _named(f"runs.{group}", spec.objects, there[spec.data]), out, subset)
-    )
-    available, unavailable = _engines(engine for e in study.evaluations.values() for engine in e.engines)
-    steps: dict[str, Step] = {}
-
-    def add(step: Step) -> str:
-        return steps.setdefault(step.name, step).name
-
-    def bank(of: Subset, robot: str) -> str:
-        writes = of.folder / Path(robot).name
-        return add(
-            BankStep(
-                name=f"data {of.folder.name} {writes.name}",
-                needs=(),
-                writes=writes,
-                kind="data",
-                subset=of,
-                robot=robot,
-            )
-        )
-
-    evaluations = []
-    trained = {run.folder: f"train {run.name}" for run in runs if run.config is not None}
-    for run in sorted(runs, key=lambda run: run.weights is not None):
-        run.check()
-        if run.config is not None:
-            needs = (bank(run.subset, run.runs.robot), *([trained[run.weights]] if run.weights in trained else []))
-            gpus = run.runs.gpus if run.runs.device == "cuda" else 0
-            add(TrainStep(name=f"train {run.name}", needs=needs, writes=run.folder, kind="train", gpus=gpus, run=run))
-    for run in runs:
-        for key in run.runs.evaluations or study.evaluations:
-            evaluation = study.evaluations[key]
-            data = evaluation.data or run.runs.data
-            wanted = _named(f"evaluations.{key}", evaluation.objects, there[data])
-            objects = [name for name in run.objects if name in wanted]
-            if not objects:
-                continue
-            own = data == run.runs.data
-            of = subset(data, objects, evaluation.per_object or (run.runs.per_object if own else None))
-            needs = (
-                (bank(of, run.runs.robot),)
-                if run.runs.policy == "ik"
-                else (trained[run.folder],)
-                if run.config is not None
-                else ()
-            )
-            step = EvalStep(
-                name=f"{key} {run.name}", needs=needs, writes=run.folder / key, kind="eval", run=run, evaluation=evaluation, subset=of,
-                engines=tuple(e for e in evaluation.engines if e in available),
-            )  # fmt: skip
-            evaluations.append(step)
-    for step in evaluations:
-        step.check()
-        if step.engines:
-            add(step)
-    for made in subsets.values():
-        made.check()
-    return Plan(
+    engines = {engine for e in study.evaluations.values() for engine in e.engines}
+    reasons = {engine: backend_status(engine).reason for engine in sorted(engines)}
+    plan = Plan(
         study=study,
         name=name,
+        given=given,
         out=out,
-        runs=runs,
-        steps=steps,
-        subsets=tuple(subsets.values()),
-        unavailable=unavailable,
+        objects={key: _objects_of(key, data, given) for key, data in study.data.items()},
+        unavailable={engine: reason for engine, reason in reasons.items() if reason is not None},
     )
+    for group in study.runs:
+        if not only or group in only:
+            plan.runs += _runs(plan, group)
+    trained = {run.folder: f"train {run.name}" for run in plan.runs if run.config is not None}
+    for run in sorted(plan.runs, key=lambda run: run.weights is not None):
+        run.check()
+        if run.config is not None:
+            needs = [plan.add(bank_step(run.subset, run.runs.robot))]
+            if run.weights in trained:
+                needs.append(trained[run.weights])
+            plan.add(train_step(run, tuple(needs)))
+    for run in plan.runs:
+        for key in run.runs.evaluations or study.evaluations:
+            _add_evaluation(plan, run, key, trained.get(run.folder))
+    for subset in plan.subsets.values():
+        subset.check()
+    return plan
+
+
+def _add_evaluation(plan: Plan, run: Run, key: str, training: str | None) -> None:
+    """Add the step of an evaluation, if the run has objects of it and an engine is installed."""
+    evaluation = plan.study.evaluations[key]
+    data = evaluation.data or run.runs.data
+    wanted = _official_names(f"evaluations.{key}", evaluation.objects, plan.objects[data])
+    objects = [name for name in run.objects if name in wanted]
+    if not objects:
+        return
+    per_object = evaluation.per_object
+    if per_object is None and data == run.runs.data:
+        per_object = run.runs.per_object
+    subset = plan.subset(data, objects, per_object)
+    needs = [training] if training else []
+    if run.runs.policy == "ik":
+        needs = [plan.add(bank_step(subset, run.runs.robot))]
+    engines = tuple(engine for engine in evaluation.engines if engine not in plan.unavailable)
+    step = eval_step(run, key, evaluation, subset, engines, tuple(needs))
+    if engines:
+        plan.add(step)
 
 
 def _objects_of(name: str, data: Data, given: Path) -> tuple[str, ...]:
+    """Return the names of the objects of the data."""
     if data.demos is None:
         return object_names()
-    for what, file in (("demos", data.demos), ("meshes", data.meshes)):
+    for key, file in (("demos", data.demos), ("meshes", data.meshes)):
         if file is not None and not (given / file).exists():
             raise FileFormatError(
-                f"there is no {given / file} (data.{name}.{what}). Put it there, or say with --data where it is."
+                f"there is no {given / file} (data.{name}.{key}). Put it there, or give its folder with --data."
             )
-    names = tuple(sorted(set(read_demos(given / data.demos).object_name.tolist())))
+    names = sorted(set(read_demos(given / data.demos).object_name.tolist()))
     for object_name in names:
         if "/" in object_name:
             raise FileFormatError(
                 f"{given / data.demos} (data.{name}.demos) has the object {shown(object_name)}: "
                 "a name with a slash cannot become the name of a folder. Rename the object."
             )
-    return names
+    return tuple(names)
 
 
-def _named(where: str, objects: tuple[str, ...], there: tuple[str, ...]) -> tuple[str, ...]:
+def _official_names(where: str, objects: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the official names of objects; all known ones if none is given."""
     try:
-        return tuple(canonical_name(name, there) for name in objects) or there
+        return tuple(canonical_name(name, known) for name in objects) or known
     except XResetError as error:
         raise DemoError(f"{where}.objects: {error}") from None
 
 
-def _runs(study: Study, group: str, spec: Runs, objects: tuple[str, ...], out: Path, subset: Any) -> Iterator[Run]:
-    """The runs of a group."""
-    config, seeds = None, (0,)
-    if spec.policy is None:
-        base = asdict(starting_config(spec.recipe))
-        config, seeds = from_dict(TrainConfig, merged(base, spec.config), f"runs.{group}.config"), spec.seeds
-        if spec.steps is not None:
-            config = replace(
-                config, iterations=max(1, round(spec.steps / (spec.num_envs * spec.gpus * config.ppo.horizon)))
-            )
-    weights = study.runs[spec.weights] if spec.weights and config else None
-    for chosen in [(name,) for name in objects] if spec.alone and config else [objects]:
-        for seed in seeds:
+def _runs(plan: Plan, group: str) -> Iterator[Run]:
+    """Yield the runs of a group."""
+    spec = plan.study.runs[group]
+    objects = _official_names(f"runs.{group}", spec.objects, plan.objects[spec.data])
+    if spec.policy is not None:
+        subset = plan.subset(spec.data, objects, spec.per_object)
+        yield Run(
+            group=group,
+            runs=spec,
+            seed=0,
+            objects=objects,
+            folder=plan.out / group,
+            subset=subset,
+            config=None,
+            weights=None,
+        )
+        return
+    changed = merged(asdict(starting_config(spec.recipe)), spec.config)
+    config = from_dict(TrainConfig, changed, f"runs.{group}.config")
+    if spec.steps is not None:
+        iterations = round(spec.steps / (spec.num_envs * spec.gpus * config.ppo.horizon))
+        config = replace(config, iterations=max(1, iterations))
+    for chosen in [(name,) for name in objects] if spec.alone else [objects]:
+        for seed in spec.seeds:
             yield Run(
                 group=group,
                 runs=spec,
                 seed=seed,
                 objects=chosen,
-                folder=_folder(out, group, spec, chosen, seed) if config else out / group,
-                subset=subset(spec.data, chosen, spec.per_object),
+                folder=_folder(plan, group, chosen, seed),
+                subset=plan.subset(spec.data, chosen, spec.per_object),
                 config=config,
-                weights=_folder(out, str(spec.weights), weights, chosen, seed) if weights else None,
+                weights=_folder(plan, spec.weights, chosen, seed) if spec.weights else None,
             )
 
 
-def _folder(out: Path, group: str, spec: Runs, objects: tuple[str, ...], seed: int) -> Path:
-    return out / "-".join([group, *(short_name(name, "_") for name in (objects if spec.alone else ())), f"seed{seed}"])
-
-
-def _engines(wanted: Iterable[str]) -> tuple[list[str], dict[str, str]]:
-    statuses = [backend_status(name) for name in dict.fromkeys(wanted)]
-    return [s.name for s in statuses if s.reason is None], {s.name: s.reason for s in statuses if s.reason is not None}
+def _folder(plan: Plan, group: str, objects: tuple[str, ...], seed: int) -> Path:
+    parts = [group]
+    if plan.study.runs[group].alone:
+        parts += [short_name(name, "_") for name in objects]
+    return plan.out / "-".join([*parts, f"seed{seed}"])

@@ -1,4 +1,4 @@
-"""The demonstrations that a study's runs are trained with: some objects of its data, and what was made of them."""
+"""The demonstrations with which a study's runs are trained: some objects of its data."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from xreset.demos.archive import Demos, read_demos, write_demos
+from xreset.demos.archive import read_demos, write_demos
 from xreset.demos.synth import synthesize
 from xreset.errors import RunError
 from xreset.eval.study.file import Data
@@ -22,18 +22,18 @@ class Subset:
     """Demonstrations of some objects of a study's data."""
 
     name: str
-    """Of the data."""
+    """Name of the data."""
     data: Data
     given: Path
     """Folder that the data's files are relative to."""
     out: Path
     objects: tuple[str, ...]
-    """Empty: all."""
+    """Empty: all objects."""
     per_object: int | None
 
     @property
     def folder(self) -> Path:
-        """Named after what it holds."""
+        """Folder of the subset, named after its content."""
         parts = [self.name, "+".join(short_name(name, "_") for name in self.objects), str(self.per_object or "")]
         return self.out / "data" / "-".join(filter(None, parts))
 
@@ -43,60 +43,61 @@ class Subset:
         return self.folder / "demos.npz"
 
     @property
-    def meshes(self) -> list[str]:
-        """``--objects``."""
+    def mesh_options(self) -> list[str]:
+        """The option ``--objects`` of commands, if there are meshes."""
         return ["--objects", str(self.given / self.data.meshes)] if self.data.meshes else []
 
     @cached_property
     def definition(self) -> dict[str, Any]:
-        """All that its files depend on."""
-        source = (
-            {"demos": file_hash(self.given / self.data.demos)}
-            if self.data.demos
-            else {"synthetic_per_object": self.data.synthetic_per_object, "synthetic_seed": self.data.synthetic_seed}
-        )
-        options = {name: list(getattr(self.data, name)) for name in ("retarget", "resets")}
-        return (
-            source
-            | options
-            | {"objects": list(self.objects), "per_object": self.per_object, "meshes": self.data.meshes}
-        )
+        """Everything that the subset's files depend on."""
+        data = self.data
+        if data.demos:
+            source: dict[str, Any] = {"demos": file_hash(self.given / data.demos)}
+        else:
+            source = {"synthetic_per_object": data.synthetic_per_object, "synthetic_seed": data.synthetic_seed}
+        return source | {
+            "retarget": list(data.retarget),
+            "resets": list(data.resets),
+            "objects": list(self.objects),
+            "per_object": self.per_object,
+            "meshes": data.meshes,
+        }
 
     def check(self) -> None:
-        """Refuse files that were made of something else."""
+        """Refuse files of another definition."""
         file = self.folder / "subset.json"
-        if not file.is_file():
-            return
-        made = read_json(file, SUBSET_SCHEMA)
-        names = sorted({*made, *self.definition})
-        there, wanted = ({k: of.get(k) for k in names} for of in (made, self.definition))
-        refuse_other(f"{self.folder} was made otherwise", "data", there, wanted)
+        if file.is_file():
+            made = read_json(file, SUBSET_SCHEMA)
+            made.pop("schema", None)
+            refuse_other(f"{self.folder} was made otherwise", "data", made, self.definition)
 
     def make(self) -> None:
-        """Write the archive, if it is not there."""
+        """Write the archive, unless it exists."""
         if self.demos.is_file() and (self.folder / "subset.json").is_file():
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        demos = source_demos(self.data, self.given, self.objects)
+        if self.data.demos:
+            demos = read_demos(self.given / self.data.demos)
+        else:
+            demos = synthesize(self.objects or None, self.data.synthetic_per_object, self.data.synthetic_seed)
         chosen = demos.select(objects=self.objects or None, max_per_object=self.per_object)
         write_demos(self.demos, chosen, config=self.definition)
         write_json(self.folder / "subset.json", {"schema": SUBSET_SCHEMA} | self.definition)
 
 
-def source_demos(data: Data, given: Path, objects: tuple[str, ...]) -> Demos:
-    """All demonstrations of the data, or the synthetic ones of some objects."""
-    if data.demos:
-        return read_demos(given / data.demos)
-    return synthesize(objects or None, data.synthetic_per_object, data.synthetic_seed)
+def refuse_other(problem: str, what: str, found: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> None:
+    """Refuse what has the study's name if it is not what the study describes.
 
-
-def refuse_other(problem: str, what: str, there: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> None:
-    """Refuse what is there under a name of the study, if it is not what the study wants."""
-    for name, here in wanted.items():
-        if isinstance(here, dict) and isinstance(there[name], dict):
-            refuse_other(problem, what, there[name], here, f"{prefix}{name}.")
-        elif there[name] != here:
+    Raises:
+        RunError: an entry differs; the message names it.
+    """
+    for name in sorted({*found, *wanted}):
+        old = found.get(name)
+        new = wanted.get(name)
+        if isinstance(old, dict) and isinstance(new, dict):
+            refuse_other(problem, what, old, new, f"{prefix}{name}.")
+        elif old != new:
             raise RunError(
-                f"{problem}: {prefix}{name} is {shown(there[name])} there and {shown(here)} in the study. "
+                f"{problem}: {prefix}{name} is {shown(old)} there and {shown(new)} in the study. "
                 f"Nothing was changed; give the {what} another name, or choose another --out."
             )

@@ -1,4 +1,4 @@
-"""A study's tables: what its runs reach, by engine, beside the paper's figures."""
+"""A study's tables: what its runs reach, by engine, next to the paper's figures."""
 
 from __future__ import annotations
 
@@ -7,17 +7,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
-from xreset.eval.plots import COLORS, INK, percent_axis, picture
+from xreset.eval.plots import INK, percent_axis, picture
+from xreset.eval.report.figures import color
 from xreset.eval.report.groups import Group, Scores, estimate, scores
 from xreset.eval.report.read import Training, read_training
-from xreset.eval.rollout import Episode
 from xreset.eval.study.file import Table
 from xreset.eval.study.paper import ALL, METRICS, PaperTable, paper_tables
 from xreset.eval.study.plan import Plan
 from xreset.eval.table import Rows
 from xreset.objects.catalogue import canonical_name
 from xreset.text import short_name
+
+Axis = tuple[str, list[str]]
+"""What the rows or columns are (method, object or metric), and their names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,31 +31,59 @@ class Cell:
     mean: float | None
     """None: not evaluated."""
     ci95: tuple[float, float]
-    """Over demonstrations, and with several seeds over these, too (:func:`xreset.eval.stats.crossed_bootstrap_ci95`)."""
-    seeds: int
+    """95 % interval, as :func:`~xreset.eval.report.groups.estimate` gives it."""
     paper: float | None
-    """What the paper reports, percent."""
+    """The paper's figure, percent."""
     paper_error: float | None = None
-    """Its standard error, percent."""
+    """Standard error of the paper's figure, percent."""
+
+    @property
+    def text(self) -> str:
+        """``93.2 (88-98), paper 90.8 ± 1.5``."""
+        text = "-"
+        if self.mean is not None:
+            text = f"{100 * self.mean:.1f} ({100 * self.ci95[0]:.0f}-{100 * self.ci95[1]:.0f})"
+        if self.paper is not None:
+            text += f", paper {self.paper:.1f}"
+        if self.paper_error is not None:
+            text += f" \N{PLUS-MINUS SIGN} {self.paper_error:.1f}"
+        return text
 
 
 @dataclass(frozen=True, kw_only=True)
-class Made:
-    """A table, filled."""
+class FilledTable:
+    """A table of the study with its figures."""
 
     title: str
     rows: tuple[str, ...]
-    """As shown; like ``columns``."""
+    """Names of the rows, as they are shown."""
     columns: tuple[str, ...]
-    cells: dict[str, tuple[tuple[Cell, ...], ...]]
+    """Names of the columns, as they are shown."""
+    cells: dict[str, list[list[Cell]]]
     """Engine -> row -> column."""
     members: dict[str, tuple[Training, ...]]
     """Run of the study -> its seeds."""
     paper: bool
     """Whether it has figures of the paper."""
 
+    def as_rows(self, engine: str) -> Rows:
+        """Return the table of one engine."""
+        body = []
+        for name, cells in zip(self.rows, self.cells[engine], strict=True):
+            body.append((name, *(cell.text for cell in cells)))
+        return Rows(head=("%", *self.columns), body=tuple(body))
 
-def fill(plan: Plan, table: Table) -> Made:
+    def versions(self, engine: str) -> str:
+        """Return the engine's versions in which the runs were evaluated."""
+        trainings = [t for members in self.members.values() for t in members if engine in t.results]
+        return ", ".join(sorted({t.results[engine].backend_version for t in trainings}))
+
+    def scores(self) -> Scores:
+        """Return the scores of the runs, which count the episodes in which an engine broke down."""
+        return scores(Group(label=name, members=members) for name, members in self.members.items())
+
+
+def fill(plan: Plan, table: Table) -> FilledTable:
     """Fill a table with what has been evaluated so far.
 
     Raises:
@@ -59,167 +91,142 @@ def fill(plan: Plan, table: Table) -> Made:
     """
     members = {name: seeds_of(plan, name, table.evaluation) for name in table.runs}
     paper = paper_tables()[table.paper] if table.paper else None
-    axes = _axes(plan, table, paper)
-    engines = sorted({engine for trainings in members.values() for t in trainings for engine in t.episodes})
+    (row_axis, row_names), (column_axis, column_names), fixed = _axes(plan, table, paper)
     run_of = {shown: name for name, shown in table.runs.items()}
 
     def cell(engine: str, key: Mapping[str, str]) -> Cell:
-        expected = set(objects_of(plan, run_of[key["method"]], table)) if key["object"] == ALL else {key["object"]}
-        found = [
-            chosen for t in members[run_of[key["method"]]] if (chosen := _of(t.episodes.get(engine, ()), expected))
-        ]
-        mean, ci95 = estimate(found, key["metric"]) if found else (None, (0.0, 0.0))
-        figure = paper.figure(key["method"], key["object"], key["metric"]) if paper else None
-        return Cell(mean=mean, ci95=ci95, seeds=len(found), paper=figure, paper_error=_paper_error(paper, key))
+        run = run_of[key["method"]]
+        objects = {key["object"]}
+        if key["object"] == ALL:
+            objects = set(objects_of(plan, run, table))
+        mean = None
+        ci95 = (0.0, 0.0)
+        episodes = _episodes_with(members[run], engine, objects)
+        if len(episodes):
+            mean, ci95 = estimate(episodes, key["metric"])
+        figure, error = paper.figure(key["method"], key["object"], key["metric"]) if paper else (None, None)
+        return Cell(mean=mean, ci95=ci95, paper=figure, paper_error=error)
 
-    (row_axis, row_names), (column_axis, column_names), fixed = axes
-    return Made(
+    engines = {engine for trainings in members.values() for t in trainings for engine in t.results}
+    cells: dict[str, list[list[Cell]]] = {}
+    for engine in sorted(engines):
+        cells[engine] = []
+        for row in row_names:
+            keys = [fixed | {row_axis: row, column_axis: column} for column in column_names]
+            cells[engine].append([cell(engine, key) for key in keys])
+    return FilledTable(
         title=table.title or (paper.title if paper else METRICS[table.metric]),
         rows=tuple(_shown(row_axis, name) for name in row_names),
         columns=tuple(_shown(column_axis, name) for name in column_names),
-        cells={
-            engine: tuple(
-                tuple(cell(engine, fixed | {row_axis: row, column_axis: column}) for column in column_names)
-                for row in row_names
-            )
-            for engine in engines
-        },
+        cells=cells,
         members=members,
         paper=paper is not None,
     )
 
 
 def seeds_of(plan: Plan, group: str, evaluation: str) -> tuple[Training, ...]:
-    """The evaluated trainings of a run of the study; those of one seed, for each object alone, are taken as one."""
-    found: dict[int, list[Training]] = {}
+    """Return the evaluated trainings of a run of the study. Trainings of one seed, one for each object alone, are joined."""
+    by_seed: dict[int, list[Training]] = {}
     for run in plan.runs:
         folder = run.folder / evaluation
-        if run.group == group and folder.is_dir() and any(folder.glob("*.episodes.json")):
-            found.setdefault(run.seed, []).append(read_training(run.name, run.folder, folder))
-    return tuple(_joined(f"{group}-seed{seed}", parts) for seed, parts in found.items())
+        if run.group == group and any(folder.glob("*.episodes.json")):
+            by_seed.setdefault(run.seed, []).append(read_training(run.name, run.folder, folder))
+    return tuple(_joined(f"{group}-seed{seed}", parts) for seed, parts in by_seed.items())
 
 
 def _joined(label: str, parts: Sequence[Training]) -> Training:
-    """One training of several, whose demonstrations are numbered through."""
+    """Join trainings to one, and number their demonstrations consecutively."""
     if len(parts) == 1:
         return parts[0]
-    names = sorted({(e.object, e.sequence_name) for t in parts for episodes in t.episodes.values() for e in episodes})
-    number = {name: i for i, name in enumerate(names)}
-    engines = sorted({engine for t in parts for engine in t.episodes})
-    episodes = {
-        engine: tuple(
-            replace(e, sequence=number[e.object, e.sequence_name]) for t in parts for e in t.episodes.get(engine, ())
-        )
-        for engine in engines
-    }
-    summaries = {}
-    for engine in engines:
-        mine = [t.summaries[engine] for t in parts if engine in t.summaries]
+    episodes = pd.concat([t.episodes for t in parts], ignore_index=True)
+    numbers = episodes.groupby(["object", "sequence_name"]).ngroup()
+    episodes = episodes.assign(run=label, sequence=numbers)
+    results = {}
+    for engine, own in episodes.groupby("engine"):
+        mine = [t.results[str(engine)] for t in parts if engine in t.results]
         demos = "+".join(sorted({s.inputs.get("demos", "")[:12] for s in mine}))
-        summaries[engine] = replace(mine[0], policy=label, episodes=len(episodes[engine]), inputs={"demos": demos})
-    return Training(
-        label=label, folder=parts[0].folder, facts=parts[0].facts, scalars={}, summaries=summaries, episodes=episodes
-    )
+        results[str(engine)] = replace(mine[0], policy=label, episodes=len(own), inputs={"demos": demos})
+    return replace(parts[0], label=label, scalars={}, results=results, episodes=episodes, lift=None)
 
 
-def _of(episodes: Sequence[Episode], objects: set[str]) -> list[Episode]:
-    """Those with the objects; none if one of these is missing, for the mean over some is not that over all."""
-    chosen = [e for e in episodes if e.object in objects]
-    return chosen if {e.object for e in chosen} == objects else []
+def _episodes_with(members: Sequence[Training], engine: str, objects: set[str]) -> pd.DataFrame:
+    """Return the episodes of the given objects in an engine.
+
+    Seeds that miss one of the objects are left out, because a mean over some of the objects is not comparable.
+    """
+    tables = [pd.DataFrame()]
+    for member in members:
+        own = member.episodes
+        own = own[(own["engine"] == engine) & own["object"].isin(objects)]
+        if set(own["object"]) == objects:
+            tables.append(own)
+    return pd.concat(tables[1:]) if len(tables) > 1 else tables[0]
 
 
 def objects_of(plan: Plan, group: str, table: Table) -> tuple[str, ...]:
-    """The objects that a run of the study is to be evaluated with."""
-    steps = (step for name, step in plan.steps.items() if name.startswith(f"{table.evaluation} "))
-    return tuple(sorted({o for s in steps if s.run.group == group for o in (s.subset.objects or s.run.objects)}))  # pyright: ignore[reportAttributeAccessIssue]
+    """Return the objects with which a run of the study is evaluated."""
+    objects = set()
+    for step in plan.steps.values():
+        if step.run is not None and step.run.group == group and step.name.startswith(f"{table.evaluation} "):
+            objects.update(step.objects)
+    return tuple(sorted(objects))
 
 
-def _axes(
-    plan: Plan, table: Table, paper: PaperTable | None
-) -> tuple[tuple[str, list[str]], tuple[str, list[str]], dict[str, str]]:
-    """Rows, columns, and what is the same in all cells."""
-    there = sorted({o for name in table.runs for o in objects_of(plan, name, table)})
-    methods, metrics = list(table.runs.values()), list(METRICS)
+def _axes(plan: Plan, table: Table, paper: PaperTable | None) -> tuple[Axis, Axis, dict[str, str]]:
+    """Return rows, columns, and what is the same in all cells."""
+    known = sorted({name for run in table.runs for name in objects_of(plan, run, table)})
+    methods = list(table.runs.values())
     if paper is not None:
-        names: dict[str, list[str]] = {"method": methods, "metric": metrics, "object": [*there, ALL]}
-        listed: dict[str, list[str]] = {paper.rows: list(paper.values), paper.columns: list(paper.names)}
-        rows, columns = ((axis, [name for name in of if name in names[axis]]) for axis, of in listed.items())
-        return rows, columns, {"object": paper.object or ALL, "metric": paper.metric or "task_progress"}
-    things = [canonical_name(table.object, there)] if table.object else [*there, ALL] if there[1:] else there
+        names = {"method": methods, "metric": list(METRICS), "object": [*known, ALL]}
+        rows = [name for name in paper.values if name in names[paper.rows]]
+        columns = [name for name in paper.names if name in names[paper.columns]]
+        fixed = {"object": paper.object or ALL, "metric": paper.metric or "task_progress"}
+        return (paper.rows, rows), (paper.columns, columns), fixed
+    objects = known
+    if table.object:
+        objects = [canonical_name(table.object, known)]
+    elif len(known) > 1:
+        objects = [*known, ALL]
+    fixed = {"metric": table.metric}
     if table.rows == "run":
-        return ("method", methods), ("object", things), {"metric": table.metric}
-    return ("object", things), ("method", methods), {"metric": table.metric}
-
-
-def _paper_error(paper: PaperTable | None, key: Mapping[str, str]) -> float | None:
-    if (
-        paper is None
-        or key[paper.rows] not in paper.standard_error
-        or paper.figure(key["method"], key["object"], key["metric"]) is None
-    ):
-        return None
-    return paper.standard_error[key[paper.rows]][paper.names.index(key[paper.columns])]
+        return ("method", methods), ("object", objects), fixed
+    return ("object", objects), ("method", methods), fixed
 
 
 def _shown(axis: str, name: str) -> str:
-    if axis == "object":
-        return "all of them" if name == ALL else short_name(name)
-    return METRICS[name] if axis == "metric" else name
+    if axis == "metric":
+        return METRICS[name]
+    if axis == "method":
+        return name
+    return "all of them" if name == ALL else short_name(name)
 
 
-def as_rows(made: Made, engine: str) -> Rows:
-    """One engine's table."""
-    body = [(name, *map(cell_text, cells)) for name, cells in zip(made.rows, made.cells[engine], strict=True)]
-    return Rows(head=("%", *made.columns), body=tuple(body))
-
-
-def cell_text(cell: Cell) -> str:
-    """``93.2 (88-98), paper 90.8 ± 1.5``."""
-    ours = "-" if cell.mean is None else f"{100 * cell.mean:.1f} ({100 * cell.ci95[0]:.0f}-{100 * cell.ci95[1]:.0f})"
-    if cell.paper is None:
-        return ours
-    return f"{ours}, paper {cell.paper:.1f}" + (
-        f" \N{PLUS-MINUS SIGN} {cell.paper_error:.1f}" if cell.paper_error is not None else ""
-    )
-
-
-def draw(path: Path, made: Made) -> None:
-    """Bars with intervals, a panel for each engine; the paper's figures are black lines across them."""
-    engines = list(made.cells)
-    size = (max(7.0, 1.1 * len(made.rows) + 2), 2.6 * len(engines) + 0.4)
+def draw(path: Path, table: FilledTable) -> None:
+    """Draw bars with intervals, a panel for each engine; the paper's figures are black lines across them."""
+    size = (max(7.0, 1.1 * len(table.rows) + 2), 2.6 * len(table.cells) + 0.4)
+    width = 0.8 / len(table.columns)
     with picture(path, size, text_parse_math=False) as figure:
-        for ax, engine in zip(figure.subplots(len(engines), 1, squeeze=False)[:, 0], engines, strict=True):
-            width = 0.8 / len(made.columns)
-            for j, column in enumerate(made.columns):
-                color = COLORS[j % len(COLORS)]
-                for i, cells in enumerate(made.cells[engine]):
-                    cell, at = cells[j], i + width * (j + 0.5) - 0.4
+        panels = figure.subplots(len(table.cells), 1, squeeze=False)[:, 0]
+        for ax, (engine, rows) in zip(panels, table.cells.items(), strict=True):
+            for j, column in enumerate(table.columns):
+                ax.bar(0, 0, color=color(j), label=" " + column)
+            for i, cells in enumerate(rows):
+                for j, cell in enumerate(cells):
+                    at = i + width * (j + 0.5) - 0.4
                     if cell.mean is not None:
-                        error = 100 * np.maximum([[cell.mean - cell.ci95[0]], [cell.ci95[1] - cell.mean]], 0)
-                        ax.bar(at, 100 * cell.mean, width=0.9 * width, color=color)
+                        low, high = cell.ci95
+                        error = 100 * np.maximum([[cell.mean - low], [high - cell.mean]], 0)
+                        ax.bar(at, 100 * cell.mean, width=0.9 * width, color=color(j))
                         ax.errorbar(at, 100 * cell.mean, yerr=error, fmt="none", ecolor=INK, capsize=2, linewidth=0.8)
                     if cell.paper is not None:
-                        ax.plot([at - 0.45 * width, at + 0.45 * width], [cell.paper] * 2, color="black", linewidth=2)
-                ax.bar(0, 0, color=color, label=" " + column)
-            ax.set_xticks(range(len(made.rows)), made.rows, fontsize="small")
+                        ends = [at - 0.45 * width, at + 0.45 * width]
+                        ax.plot(ends, [cell.paper] * 2, color="black", linewidth=2)
+            ax.set_xticks(range(len(table.rows)), table.rows, fontsize="small")
             percent_axis(ax, "y")
             ax.set_ylim(0, 105)
             ax.set_title(engine, fontsize="medium", loc="left")
-        if made.paper:
-            ax.plot([], [], color="black", linewidth=2, label=" the paper")
-        handles, labels = ax.get_legend_handles_labels()
+        last = panels[-1]
+        if table.paper:
+            last.plot([], [], color="black", linewidth=2, label=" the paper")
+        handles, labels = last.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 5), frameon=False)
-
-
-def versions(made: Made, engine: str) -> str:
-    """Those that a table's runs were evaluated in."""
-    return ", ".join(
-        sorted(
-            {t.summaries[engine].backend_version for ts in made.members.values() for t in ts if engine in t.summaries}
-        )
-    )
-
-
-def broken(made: Made) -> Scores:
-    """Scores of the runs, which tell of episodes in which an engine broke down."""
-    return scores([Group(label=name, members=members) for name, members in made.members.items() if members])

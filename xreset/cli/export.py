@@ -72,7 +72,7 @@ def _recording(
 
 
 def _say(recording: recorded.Recording, out: Path) -> None:
-    engines = ", ".join(dict.fromkeys(e.engine for e in recording.episodes))
+    engines = ", ".join(recording.episodes["engine"].unique())
     Console().print(
         f"{out}: {len(recording.episodes)} episodes of {recording.robot.name} in {engines},"
         f" {recording.offsets[-1]} frames at {recording.fps:g} per second"

@@ -36,15 +36,17 @@ def report(
     console = Console()
     with Progress(console) as bar:
         made = make.make_report(run, out, robot=robot, objects=objects, progress=bar.count("drawing clips"))
-    console.print(table.results_table(made.summaries))
+    console.print(table.results_table(made.results))
     console.print(made.headline)
     for note in made.notes:
         console.print(f"note: {note}", style="yellow")
     if film is not None:
         with Progress(console) as bar:
-            shown = films.make_film(run, film, robot=robot, objects=objects, progress=bar.count("drawing the film"))
-        rows = ", ".join(shown.engines)
-        columns = ", ".join(map(short_name, shown.objects))
+            engines, shown = films.make_film(
+                run, film, robot=robot, objects=objects, progress=bar.count("drawing the film")
+            )
+        rows = ", ".join(engines)
+        columns = ", ".join(map(short_name, shown))
         console.print(f"film:    {film}\n         from the top: {rows}; from the left: {columns}")
     console.print(f"page:    {made.html}\npicture: {made.overview}")
 

@@ -64,7 +64,7 @@ def study(
         return
     problems = []
     if only != "tables":
-        for subset in todo.subsets:
+        for subset in todo.subsets.values():
             subset.make()
         problems = launch.launch(
             todo, [step for step in wanted if not step.done()], cluster=cluster, per_gpu=per_gpu, options=options,

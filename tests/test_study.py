@@ -66,17 +66,17 @@ class FileTest(InFolder):
                 HEAD + DATA + RUN + run + "minuets = 3\n",
                 r"runs\.a does not fit Runs \(unknown: minuets \(minutes\?\)\)",
             ),
-            (HEAD + DATA + RUN + "[runs.a]\nseeds = [0, 0]\n", r"runs\.a: seeds is \(0, 0\), expected one or more"),
-            (HEAD + DATA + RUN + "[runs.a]\nminutes = 0\n", r"runs\.a: minutes is 0"),
+            (HEAD + DATA + RUN + "[runs.a]\nseeds = [0, 0]\n", r"runs\.a\.seeds is \[0, 0\], expected one or more"),
+            (HEAD + DATA + RUN + "[runs.a]\nminutes = 0\n", r"runs\.a\.minutes is 0"),
             (HEAD + DATA + RUN + "[runs.a]\npolicy = 'best'\n", r"runs\.a\.policy is 'best'"),
             (HEAD + DATA + RUN + "[runs.a]\ndata = 'real'\n", r"runs\.a\.data is 'real', expected one of 'toy'"),
             (HEAD + DATA + RUN + "[runs.a]\nweights = 'a'\n", r"runs\.a\.weights is 'a', expected one of none"),
-            (HEAD + DATA + RUN + "[runs.a]\nminutes = inf\n", r"runs\.a: minutes is inf"),
-            (HEAD + DATA + RUN + "[runs.a]\ngpus = -1\n", r"runs\.a: gpus is -1"),
-            (HEAD + DATA + RUN + "[runs.a]\nnum_envs = 0\n", r"runs\.a: num_envs is 0"),
-            (HEAD + DATA + RUN + "[runs.a]\nseeds = [99999999999999]\n", r"runs\.a: seeds is \(99999999999999,\)"),
+            (HEAD + DATA + RUN + "[runs.a]\nminutes = inf\n", r"runs\.a\.minutes is inf"),
+            (HEAD + DATA + RUN + "[runs.a]\ngpus = -1\n", r"runs\.a\.gpus is -1"),
+            (HEAD + DATA + RUN + "[runs.a]\nnum_envs = 0\n", r"runs\.a\.num_envs is 0"),
+            (HEAD + DATA + RUN + "[runs.a]\nseeds = [99999999999999]\n", r"runs\.a\.seeds is \[99999999999999\]"),
             (HEAD + DATA + RUN + "[runs.a]\nrobot = '..'\n", r"runs\.a: robot is '\.\.', expected the name"),
-            (HEAD + DATA + RUN + run + "[evaluations.eval]\nper_object = -1\n", r"evaluations\.eval: per_object is -1"),
+            (HEAD + DATA + RUN + run + "[evaluations.eval]\nper_object = -1\n", r"evaluations\.eval\.per_object is -1"),
             (
                 HEAD + DATA + RUN + "[runs.a]\nweights = 'b'\n[runs.b]\nweights = 'a'\n",
                 r"runs\.a\.weights lead back to themselves: a -> b -> a",
@@ -230,7 +230,7 @@ class PlanTest(InFolder):
             (
                 HEAD + DATA + RUN + "[runs.a]\nobjects = ['cup']\n",
                 DemoError,
-                r"runs\.a\.objects: there is no object 'cup'",
+                r"runs\.a\.objects: Unknown object 'cup'",
             ),
         ):
             with self.subTest(message), self.assertRaisesRegex(error, message):

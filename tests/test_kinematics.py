@@ -15,7 +15,9 @@ from xreset.backends.conformance.scene import gripper
 from xreset.errors import RobotError
 from xreset.geometry.dynamics import drive_shares, mass_matrix
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.urdf import load_urdf
+from xreset.geometry.shapes import hull
+from xreset.geometry.urdf import RobotTree, load_urdf
+from xreset.geometry.urdf_writer import fixed, frame, pose, urdf_text, write_meshes
 from xreset.spec import DriveSpec, JointSpec, MimicSpec
 
 assert_close = torch.testing.assert_close
@@ -84,6 +86,34 @@ class UrdfTest(unittest.TestCase):
         self.assertEqual((joint.type, joint.lower, joint.upper), ("revolute", -np.inf, np.inf))
         np.testing.assert_array_equal(joint.axis, (1, 0, 0))
         self.assertEqual(tree.link("end").mass, 0)
+
+    def test_what_is_written_reads_back(self):
+        """Also links whose names differ in a slash only, and a comment with two hyphens."""
+        shapes = [hull(size * np.vstack((np.zeros(3), np.eye(3)))) for size in (0.1, 0.2)]
+        links = [frame("base")]
+        for name, shape in zip(("f/1", "f_1"), shapes, strict=True):
+            links.append(dataclasses.replace(frame(name), collisions=(shape,)))
+        joints = [fixed("base", link.name, pose((1, 2, 3), rpy=(0.1, 0.2, 0.3))) for link in links[1:]]
+        tree = RobotTree(name="toy", root="base", links=tuple(links), joints=tuple(joints))
+        path = self.folder / "robot.urdf"
+        path.write_text(urdf_text(tree, {}, comment="made by --hand"))
+        write_meshes(tree, self.folder)
+        read = load_urdf(path)
+        self.assertEqual(read.link_names, tree.link_names)
+        np.testing.assert_allclose(read.joints[0].T_parent_joint, joints[0].T_parent_joint, atol=1e-8)
+        for link, shape in zip(read.links[1:], shapes, strict=True):
+            corners = np.asarray(link.collisions[0].geometry.vertices)
+            np.testing.assert_allclose(corners.max(axis=0), np.asarray(shape.geometry.vertices).max(axis=0))
+
+    def test_meshes_that_are_archives_and_other_files_are_refused(self):
+        (self.folder / "box.zip").write_bytes(b"PK")
+        shape = '<collision><geometry><mesh filename="box.zip"/></geometry></collision>'
+        path = self.urdf(f'<link name="end">{shape}</link>', FIXED.format(name="j", child="end"))
+        with self.assertRaisesRegex(RobotError, "is an archive. Unpack it"):
+            load_urdf(path)
+        path.write_text("<mujocoinclude/>")
+        with self.assertRaisesRegex(RobotError, "starts with <mujocoinclude>.*Expected <robot>"):
+            load_urdf(path)
 
     def test_what_is_no_tree_of_links_is_refused(self):
         link = '<link name="end"/>'

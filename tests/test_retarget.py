@@ -123,7 +123,11 @@ class HandTest(unittest.TestCase):
         turn = quat_from_axis_angle(torch.tensor([0.4, 0.2, -1.0], dtype=FLOAT))
         shift = torch.tensor([0.3, -0.1, 0.2], dtype=FLOAT)
         above = self.keypoints + torch.tensor([0.0, 0.0, 2.0], dtype=FLOAT)
-        points = {"keypoints": above, "contact_points": above + 0.02, "object_pos": above[:, :, self.tip] + 0.03}
+        points: dict[str, Any] = {
+            "keypoints": above,
+            "contact_points": above + 0.02,
+            "object_pos": above[:, :, self.tip] + 0.03,
+        }
         turned = {name: quat_rotate(turn, x) + shift for name, x in points.items()}
         quat = turn.expand(*above.shape[:2], 4)
         still = self.solve(in_contact=self.touching, **points)

@@ -5,7 +5,9 @@ Lengths in meters, coordinates in the object's mesh frame.
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,13 +15,18 @@ from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, QhullError
 
 from xreset.errors import ObjectError
+from xreset.files import max_bytes
 from xreset.spec import Geometry, Shape
+from xreset.text import shown
 
 if TYPE_CHECKING:
     import trimesh
 
 _MOST_HULL_POINTS = 300
 """Number of points in a hull that every engine accepts."""
+_ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz")
+_UNPACKED = 16
+"""Bytes of memory per byte of a zipped mesh format, such as 3MF."""
 CYLINDER_SECTIONS = 48
 """Sides of the prism that stands for a cylinder in a surface mesh."""
 
@@ -86,6 +93,39 @@ def _outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
         if not len(missing):
             return points[chosen]
         chosen = np.union1d(chosen, missing)
+
+
+def load_mesh(path: Path) -> trimesh.Trimesh:
+    """Read the triangles of a file as they are, in the file's units.
+
+    Args:
+        path: file of any format that trimesh reads, but not an archive.
+
+    Raises:
+        ObjectError: the file is missing, damaged, too large, or has no triangles.
+    """
+    import trimesh
+
+    if not path.is_file():
+        raise ObjectError(f"There is no mesh at {path}.")
+    if path.suffix.lower() in _ARCHIVES:
+        raise ObjectError(f"{path} is an archive. Unpack it, and give the mesh.")
+    try:
+        size = path.stat().st_size
+        if zipfile.is_zipfile(path):  # the archive states the sizes, and zipfile reads no more than these
+            with zipfile.ZipFile(path) as archive:
+                size = _UNPACKED * sum(member.file_size for member in archive.infolist())
+        if size > max_bytes():
+            raise ObjectError(f"{path} takes {size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
+        # Processing would drop damaged vertices silently.
+        mesh = trimesh.load(path, force="mesh", skip_materials=True, process=False)
+    except ObjectError:
+        raise
+    except Exception as error:  # trimesh's parsers raise any kind of error
+        raise ObjectError(f"{path} cannot be read as a mesh: {shown(str(error))}") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not len(mesh.vertices):
+        raise ObjectError(f"{path} contains no triangles. It is empty or damaged.")
+    return mesh
 
 
 def loft(sections: Iterable[np.ndarray]) -> Shape:

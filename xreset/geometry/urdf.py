@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,9 +18,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from xreset.errors import RobotError
+from xreset.errors import ObjectError, RobotError
 from xreset.files import max_bytes
-from xreset.geometry.shapes import hull
+from xreset.geometry.shapes import hull, load_mesh
 from xreset.spec import Geometry, RobotSpec, Shape
 from xreset.text import is_plain, shown
 
@@ -127,13 +128,12 @@ def load_urdf(path: str | Path) -> RobotTree:
     path = Path(path).resolve()
     if not path.is_file():
         raise RobotError(f"{path} is not a file. Expected a URDF there.")
-    status = path.stat()
-    if status.st_size > max_bytes() // 16:
-        raise RobotError(f"{path} has {status.st_size >> 20} MB, which is too large for a URDF.")
-    tree, meshes = _load(path, status.st_mtime_ns)
-    if any(_modified(mesh) != time for mesh, time in meshes):
+    if path.stat().st_size > max_bytes() // 16:
+        raise RobotError(f"{path} has {path.stat().st_size >> 20} MB, which is too large for a URDF.")
+    tree, files = _load(path)
+    if files != _modified(files):
         _load.cache_clear()
-        tree, _ = _load(path, status.st_mtime_ns)
+        tree, _ = _load(path)
     return tree
 
 
@@ -149,26 +149,29 @@ def parse_xml(path: Path) -> Element:
         raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
 
 
-def _modified(mesh: Path) -> int:
-    """Return the time of a mesh's last change [ns]; -1 if the file is gone."""
-    try:
-        return mesh.stat().st_mtime_ns
-    except OSError:
-        return -1
+def _modified(files: Iterable[Path]) -> dict[Path, int]:
+    """Return the time of each file's last change [ns]; -1 if it is gone."""
+    return {file: file.stat().st_mtime_ns if file.exists() else -1 for file in files}
 
 
 @lru_cache(maxsize=16)
-def _load(path: Path, _modified_ns: int) -> tuple[RobotTree, list[tuple[Path, int]]]:
-    """Read a URDF; return its tree, and its mesh files with the times of their last change."""
+def _load(path: Path) -> tuple[RobotTree, dict[Path, int]]:
+    """Read a URDF; return its tree, and the times of the last change of the file and its meshes."""
+    files = _modified([path])
     xml = parse_xml(path)
     if xml.tag == "mujoco":
         raise RobotError(f"{path} is MJCF, not URDF; `xreset robots import` makes a robot of it.")
-    meshes: list[tuple[Path, int]] = []
+    if xml.tag != "robot":
+        raise RobotError(f"{path} starts with <{shown(xml.tag)[1:-1]}>, which is not a URDF. Expected <robot>.")
     try:
+        for mesh in xml.iterfind("link/collision/geometry/mesh"):
+            file = find_mesh(mesh.attrib["filename"], path)
+            if file is not None:
+                files |= _modified([file])
         with np.errstate(invalid="ignore"):  # check_tree refuses what is not finite
             links = {}
             for element in xml.findall("link"):
-                link = _link(element, path, meshes)
+                link = _link(element, path)
                 if link.name in links:
                     raise RobotError(f"{path}: the link name {shown(link.name)} occurs twice.")
                 links[link.name] = link
@@ -182,7 +185,7 @@ def _load(path: Path, _modified_ns: int) -> tuple[RobotTree, list[tuple[Path, in
     except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
         raise RobotError(f"{path} cannot be read as a URDF: {shown(f'{type(error).__name__}: {error}')}") from error
     check_tree(tree, path)
-    return tree, meshes
+    return tree, files
 
 
 def _ordered(name: str, links: dict[str, Link], joints: dict[str, Joint], path: Path) -> RobotTree:
@@ -263,11 +266,11 @@ def _origin(element: Element) -> np.ndarray:
     return compose_matrix(translate=xyz, angles=rpy)
 
 
-def _link(element: Element, path: Path, meshes: list[tuple[Path, int]]) -> Link:
+def _link(element: Element, path: Path) -> Link:
     name = _name(element, path)
     mass = 0.0
     com = np.zeros(3)
-    matrix = np.zeros((3, 3))
+    inertia = np.zeros((3, 3))
     inertial = element.find("inertial")
     if inertial is not None:
         given = inertial.find("mass")
@@ -275,40 +278,37 @@ def _link(element: Element, path: Path, meshes: list[tuple[Path, int]]) -> Link:
     if inertial is not None and mass:
         origin = _origin(inertial)
         com = origin[:3, 3]
-        about = inertial.find("inertia")
-        if about is not None:
-            for row, key in enumerate("xyz"):
-                for column, other in enumerate("xyz"):
-                    default = 1.0 if row == column else 0.0
-                    matrix[row, column] = float(about.get("i" + "".join(sorted(key + other)), default))
-        matrix = origin[:3, :3] @ matrix @ origin[:3, :3].T
+        given = inertial.find("inertia")
+        if given is not None:
+            diagonal = [float(given.get(key, 1.0)) for key in ("ixx", "iyy", "izz")]
+            ixy, ixz, iyz = [float(given.get(key, 0.0)) for key in ("ixy", "ixz", "iyz")]
+            inertia = np.array([[0.0, ixy, ixz], [ixy, 0.0, iyz], [ixz, iyz, 0.0]])
+            np.fill_diagonal(inertia, diagonal)
+        inertia = origin[:3, :3] @ inertia @ origin[:3, :3].T
     shapes = []
     for collision in element.findall("collision"):
         geometry = collision.find("geometry")
         if geometry is None or not len(geometry):
             raise RobotError(f"{path}: link {name!r} has a collision without a geometry.")
-        shapes.append(Shape(geometry=_geometry(geometry[0], name, path, meshes), T_body_shape=_origin(collision)))
-    return Link(name=name, mass=mass, com=com, inertia=matrix, collisions=tuple(shapes))
+        shapes.append(Shape(geometry=_geometry(geometry[0], name, path), T_body_shape=_origin(collision)))
+    return Link(name=name, mass=mass, com=com, inertia=inertia, collisions=tuple(shapes))
 
 
-def _geometry(shape: Element, link: str, path: Path, meshes: list[tuple[Path, int]]) -> Geometry:
+def _geometry(shape: Element, link: str, path: Path) -> Geometry:
     if shape.tag == "box":
         size = _vector(shape.attrib["size"], 3) / 2
         return Geometry(kind="box", size=tuple(size.tolist()))
     if shape.tag == "sphere":
         return Geometry(kind="sphere", size=(float(shape.attrib["radius"]),))
     if shape.tag == "mesh":
-        return _mesh_hull(shape, link, path, meshes)
+        return _mesh_hull(shape, link, path)
     if shape.tag not in ("cylinder", "capsule"):
         raise RobotError(f"{path}: link {link!r} has a collision shape {shown(shape.tag)}, which is not supported.")
     size = (float(shape.attrib["radius"]), float(shape.attrib["length"]) / 2)
     return Geometry(kind="capsule" if shape.tag == "capsule" else "cylinder", size=size)
 
 
-def _mesh_hull(mesh: Element, link: str, path: Path, meshes: list[tuple[Path, int]]) -> Geometry:
-    """Return the hull of a mesh file, and add the file to ``meshes``."""
-    import trimesh
-
+def _mesh_hull(mesh: Element, link: str, path: Path) -> Geometry:
     name = mesh.attrib["filename"]
     file = find_mesh(name, path)
     if file is None:
@@ -316,17 +316,12 @@ def _mesh_hull(mesh: Element, link: str, path: Path, meshes: list[tuple[Path, in
             f"{path}: link {link!r} uses the mesh {shown(name)}, which is not in its folders. Put it there."
         )
     try:
-        meshes.append((file, _modified(file)))
-        if file.stat().st_size > max_bytes():
-            raise ValueError(f"it has {file.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows")
-        loaded = trimesh.load(file, force="mesh", process=False)
-        if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.vertices):
-            raise ValueError("it contains no triangles")
-        if not (np.abs(loaded.vertices) < _LARGEST).all():
-            raise ValueError("a vertex is not finite, or too far away")
+        vertices = np.asarray(load_mesh(file).vertices)
+        if not (np.abs(vertices) < _LARGEST).all():
+            raise ObjectError("a vertex is not finite, or too far away")
         scale = np.array(mesh.get("scale", "1").replace(",", " ").split(), dtype=float)
-        return hull(np.asarray(loaded.vertices) * np.broadcast_to(scale, 3), HULL_TOLERANCE).geometry
-    except Exception as error:  # trimesh and qhull raise many kinds of errors
+        return hull(vertices * np.broadcast_to(scale, 3), HULL_TOLERANCE).geometry
+    except (ObjectError, ValueError) as error:
         raise RobotError(
             f"{path}: link {link!r} uses the mesh {name!r}, which cannot be read: {shown(str(error))}"
         ) from error

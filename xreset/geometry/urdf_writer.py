@@ -137,6 +137,7 @@ def urdf_text(
         if mimic := by_joint.get(joint.name):
             _add(element, "mimic", joint=mimic.source, multiplier=mimic.multiplier, offset=mimic.offset)
     ElementTree.indent(robot)
+    comment = comment.replace("--", "- -")  # XML allows no -- in a comment
     head = "".join(f"  {line}\n" for line in comment.splitlines())
     return f'<?xml version="1.0"?>\n<!--\n{head}-->\n{ElementTree.tostring(robot, encoding="unicode")}\n'
 

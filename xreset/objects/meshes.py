@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import tempfile
 import time
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +13,8 @@ import numpy as np
 from scipy.spatial import QhullError
 
 from xreset.errors import ObjectError
-from xreset.files import file_hash, max_bytes, write_whole
-from xreset.geometry.shapes import shell_properties
+from xreset.files import file_hash, write_whole
+from xreset.geometry.shapes import load_mesh, shell_properties
 from xreset.objects.cache import cached_pieces
 from xreset.objects.decompose import Progress, Settings
 from xreset.objects.properties import Properties, properties_of
@@ -37,9 +36,6 @@ _HOLLOW = 120.0
 """A solid mesh of a lower density stands for a shell [kg/m^3]."""
 _FEW_MM = 0.002
 """Pieces that deviate more from the surface are worth a note [m]."""
-_ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz")
-_UNPACKED = 16
-"""Memory that a byte of a zipped mesh format, such as 3MF, becomes."""
 
 _log = logging.getLogger(__name__)
 
@@ -215,35 +211,19 @@ def read_mesh(path: Path, *, scale: float = 1.0) -> trimesh.Trimesh:
     Raises:
         ObjectError: the file is missing, damaged, too large, empty or flat, or not in metres once scaled.
     """
-    import trimesh
 
-    if not path.is_file():
-        raise ObjectError(f"There is no mesh at {path}.")
-    if path.suffix.lower() in _ARCHIVES:
-        raise ObjectError(f"{path} is an archive. Unpack it, and give the mesh.")
+    mesh = load_mesh(path)
     try:
-        size = path.stat().st_size
-        if zipfile.is_zipfile(path):  # the archive states the sizes, and zipfile reads no more than these
-            with zipfile.ZipFile(path) as archive:
-                size = _UNPACKED * sum(member.file_size for member in archive.infolist())
-        if size > max_bytes():
-            raise ObjectError(f"{path} takes {size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
-        # processing would drop damaged vertices silently
-        mesh = trimesh.load(path, force="mesh", skip_materials=True, process=False)
-        if isinstance(mesh, trimesh.Trimesh) and scale != 1.0:
+        if scale != 1.0:
             mesh.apply_scale(scale)
         return _checked(mesh, path)
     except ObjectError:
         raise
-    except Exception as error:  # trimesh's parsers raise any kind of error
+    except Exception as error:  # trimesh raises any kind of error
         raise ObjectError(f"{path} cannot be read as a mesh: {shown(str(error))}") from error
 
 
-def _checked(mesh: object, path: Path) -> trimesh.Trimesh:
-    import trimesh
-
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not len(mesh.vertices):
-        raise ObjectError(f"{path} holds no triangles; it is empty or damaged.")
+def _checked(mesh: trimesh.Trimesh, path: Path) -> trimesh.Trimesh:
     if not np.isfinite(mesh.vertices).all():
         raise ObjectError(f"{path} has a vertex that is not finite; it is damaged.")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):

@@ -198,13 +198,21 @@ class SelfCollision:
                 arguments = []
                 for shape in self._pairs[pair]:
                     pose = T[b, shape] @ self._T_link_shape[shape]
-                    arguments += [self._geometry[shape], self._coal.Transform3s(pose[:3, :3], pose[:3, 3])]
+                    arguments += [
+                        self._geometry[shape],
+                        self._coal.Transform3s(pose[:3, :3], pose[:3, 3]),
+                    ]
                 result.clear()
                 distance = self._coal.distance(*arguments, request, result)
                 if distance < margin:
                     i, j = self._pairs[pair]
                     rows.append((begin + b, self._link[i], self._link[j], distance))
-                    points.append((np.array(result.getNearestPoint1()), np.array(result.getNearestPoint2())))
+                    points.append(
+                        (
+                            np.array(result.getNearestPoint1()),
+                            np.array(result.getNearestPoint2()),
+                        )
+                    )
                     normals.append(np.array(result.normal))
         table = np.array(rows).reshape(-1, 4)
         return Approaches(

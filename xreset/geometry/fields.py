@@ -36,7 +36,11 @@ class DistanceFields(Tensors):
 
     @staticmethod
     def on_grid(
-        values: np.ndarray, origin: np.ndarray, spacing: float, low: np.ndarray, high: np.ndarray
+        values: np.ndarray,
+        origin: np.ndarray,
+        spacing: float,
+        low: np.ndarray,
+        high: np.ndarray,
     ) -> DistanceFields:
         """Return the field of one object from its values [X, Y, Z] and the corners [3] of grid and bounding box."""
         return DistanceFields(

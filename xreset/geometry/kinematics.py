@@ -130,7 +130,8 @@ class Kinematics:
         lower = np.full(len(self.joint_names), -np.inf)
         upper = np.full(len(self.joint_names), np.inf)
         for row, joint in enumerate(moving):
-            mimic = mimics.get(joint.name, MimicSpec(joint=joint.name, source=joint.name, multiplier=1.0, offset=0.0))
+            itself = MimicSpec(joint=joint.name, source=joint.name, multiplier=1.0, offset=0.0)
+            mimic = mimics.get(joint.name, itself)
             source = self.joint_names.index(mimic.source)
             coupling[row, source] = mimic.multiplier
             constant[row] = mimic.offset
@@ -190,7 +191,13 @@ class Kinematics:
             )
         return self._link_index[name]
 
-    def link_poses(self, q: Tensor, links: Sequence[str] | None = None, *, base: Tensor | None = None) -> Tensor:
+    def link_poses(
+        self,
+        q: Tensor,
+        links: Sequence[str] | None = None,
+        *,
+        base: Tensor | None = None,
+    ) -> Tensor:
         """Compute poses of links.
 
         Args:
@@ -212,7 +219,12 @@ class Kinematics:
         return poses
 
     def points(
-        self, q: Tensor, links: Sequence[str], offsets: Tensor | None = None, *, base: Tensor | None = None
+        self,
+        q: Tensor,
+        links: Sequence[str],
+        offsets: Tensor | None = None,
+        *,
+        base: Tensor | None = None,
     ) -> Tensor:
         """[..., P, 3] positions of points on links.
 
@@ -227,7 +239,12 @@ class Kinematics:
         return points if offsets is None else points + matvec(poses[..., :3, :3], offsets)
 
     def jacobian(
-        self, q: Tensor, links: Sequence[str], offsets: Tensor | None = None, *, base: Tensor | None = None
+        self,
+        q: Tensor,
+        links: Sequence[str],
+        offsets: Tensor | None = None,
+        *,
+        base: Tensor | None = None,
     ) -> PointJacobian:
         """Compute points on links and their geometric Jacobian; arguments as in :meth:`points`.
 

@@ -39,7 +39,10 @@ def box(center: ArrayLike, size: Sequence[float]) -> Shape:
 
 def cylinder(center: ArrayLike, radius: float, height: float) -> Shape:
     """Make a cylinder along z."""
-    return _placed(Geometry(kind="cylinder", size=(float(radius), float(height) / 2)), center)
+    return _placed(
+        Geometry(kind="cylinder", size=(float(radius), float(height) / 2)),
+        center,
+    )
 
 
 def _placed(geometry: Geometry, center: ArrayLike) -> Shape:
@@ -73,7 +76,13 @@ def hull(points: np.ndarray, tolerance: float = 0.0) -> Shape:
     inward = (normals * convex.equations[:, :3]).sum(axis=1) < 0  # qhull's triangles have no consistent winding
     faces = convex.simplices.copy()
     faces[inward] = faces[inward][:, ::-1]
-    return Shape(geometry=Geometry(kind="hull", vertices=points[convex.vertices], faces=index[faces].astype(np.int64)))
+    return Shape(
+        geometry=Geometry(
+            kind="hull",
+            vertices=points[convex.vertices],
+            faces=index[faces].astype(np.int64),
+        )
+    )
 
 
 def _outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
@@ -134,7 +143,12 @@ def loft(sections: Iterable[np.ndarray]) -> Shape:
 
 
 def section(
-    center: ArrayLike, half_u: ArrayLike, half_v: ArrayLike, *, power: float = 2.0, count: int = 16
+    center: ArrayLike,
+    half_u: ArrayLike,
+    half_v: ArrayLike,
+    *,
+    power: float = 2.0,
+    count: int = 16,
 ) -> np.ndarray:
     """[count, 3] points of a superellipse |u|^power + |v|^power = 1 with half axes ``half_u`` and ``half_v`` (vectors).
 

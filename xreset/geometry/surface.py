@@ -114,7 +114,11 @@ def _nodes_inside(pieces: Sequence[Shape], nodes: np.ndarray) -> np.ndarray:
 
 
 def keypoint_contacts(
-    surface: Surface, keypoints: np.ndarray, object_pos: np.ndarray, object_quat: np.ndarray, distance: float
+    surface: Surface,
+    keypoints: np.ndarray,
+    object_pos: np.ndarray,
+    object_quat: np.ndarray,
+    distance: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the contacts of keypoints with an object.
 

@@ -145,7 +145,12 @@ def parse_xml(path: Path) -> Element:
     """
     try:
         return ElementTree.parse(path).getroot()
-    except (OSError, ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: encodings
+    except (
+        OSError,
+        ElementTree.ParseError,
+        ValueError,
+        LookupError,
+    ) as error:  # the last two: encodings
         raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
 
 
@@ -182,7 +187,13 @@ def _load(path: Path) -> tuple[RobotTree, dict[Path, int]]:
                     raise RobotError(f"{path}: link {joint.child!r} is the child of two joints, expected one.")
                 joints[joint.child] = joint
             tree = _ordered(xml.get("name") or path.stem, links, joints, path)
-    except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
+    except (
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        IndexError,
+    ) as error:
         raise RobotError(f"{path} cannot be read as a URDF: {shown(f'{type(error).__name__}: {error}')}") from error
     check_tree(tree, path)
     return tree, files
@@ -220,7 +231,10 @@ def check_tree(tree: RobotTree, path: Path) -> None:
     for link in tree.links:
         parts = [link.com, link.inertia, np.array([link.mass])]
         for shape in link.collisions:
-            parts += [shape.T_body_shape, np.asarray(shape.geometry.size or 0.0)]
+            parts += [
+                shape.T_body_shape,
+                np.asarray(shape.geometry.size or 0.0),
+            ]
             if shape.geometry.vertices is not None:
                 parts.append(shape.geometry.vertices)
         if not all((np.abs(part) < _LARGEST).all() for part in parts):
@@ -290,7 +304,12 @@ def _link(element: Element, path: Path) -> Link:
         geometry = collision.find("geometry")
         if geometry is None or not len(geometry):
             raise RobotError(f"{path}: link {name!r} has a collision without a geometry.")
-        shapes.append(Shape(geometry=_geometry(geometry[0], name, path), T_body_shape=_origin(collision)))
+        shapes.append(
+            Shape(
+                geometry=_geometry(geometry[0], name, path),
+                T_body_shape=_origin(collision),
+            )
+        )
     return Link(name=name, mass=mass, com=com, inertia=inertia, collisions=tuple(shapes))
 
 

@@ -28,7 +28,10 @@ FRAME_INERTIA = 1e-7
 
 
 def pose(
-    xyz: Sequence[float] = (0, 0, 0), *, rpy: Sequence[float] = (0, 0, 0), quat: Sequence[float] | None = None
+    xyz: Sequence[float] = (0, 0, 0),
+    *,
+    rpy: Sequence[float] = (0, 0, 0),
+    quat: Sequence[float] | None = None,
 ) -> np.ndarray:
     """[4, 4] pose from a position [m] and roll, pitch, yaw about fixed axes [rad], or a quaternion (w, x, y, z) of any
     length."""
@@ -70,7 +73,10 @@ def cylinder(start: Sequence[float], end: Sequence[float], radius: float) -> Sha
 
 
 def _between(
-    kind: Literal["capsule", "cylinder"], start: Sequence[float], end: Sequence[float], radius: float
+    kind: Literal["capsule", "cylinder"],
+    start: Sequence[float],
+    end: Sequence[float],
+    radius: float,
 ) -> Shape:
     a = np.array(start, dtype=float)
     b = np.array(end, dtype=float)
@@ -87,7 +93,13 @@ def _between(
 
 def frame(name: str) -> Link:
     """Make a link that is only a frame: no shape, and a mass too small to matter."""
-    return Link(name=name, mass=FRAME_MASS, com=np.zeros(3), inertia=np.eye(3) * FRAME_INERTIA, collisions=())
+    return Link(
+        name=name,
+        mass=FRAME_MASS,
+        com=np.zeros(3),
+        inertia=np.eye(3) * FRAME_INERTIA,
+        collisions=(),
+    )
 
 
 def fixed(parent: str, child: str, T_parent_child: np.ndarray) -> Joint:
@@ -106,7 +118,11 @@ def fixed(parent: str, child: str, T_parent_child: np.ndarray) -> Joint:
 
 
 def urdf_text(
-    tree: RobotTree, effort: Mapping[str, float], *, mimics: Sequence[MimicSpec] = (), comment: str = ""
+    tree: RobotTree,
+    effort: Mapping[str, float],
+    *,
+    mimics: Sequence[MimicSpec] = (),
+    comment: str = "",
 ) -> str:
     """Return the text of a tree's URDF.
 
@@ -133,9 +149,22 @@ def urdf_text(
             continue
         _add(element, "axis", xyz=joint.axis)
         drive = effort.get(joint.name, 0.0)
-        _add(element, "limit", lower=joint.lower, upper=joint.upper, effort=drive, velocity=joint.velocity)
+        _add(
+            element,
+            "limit",
+            lower=joint.lower,
+            upper=joint.upper,
+            effort=drive,
+            velocity=joint.velocity,
+        )
         if mimic := by_joint.get(joint.name):
-            _add(element, "mimic", joint=mimic.source, multiplier=mimic.multiplier, offset=mimic.offset)
+            _add(
+                element,
+                "mimic",
+                joint=mimic.source,
+                multiplier=mimic.multiplier,
+                offset=mimic.offset,
+            )
     ElementTree.indent(robot)
     comment = comment.replace("--", "- -")  # XML allows no -- in a comment
     head = "".join(f"  {line}\n" for line in comment.splitlines())
@@ -167,7 +196,16 @@ def _add_link(robot: Element, link: Link) -> None:
     _add(inertial, "origin", xyz=link.com)
     _add(inertial, "mass", value=link.mass)
     (ixx, ixy, ixz), (_, iyy, iyz), (_, _, izz) = link.inertia
-    _add(inertial, "inertia", ixx=ixx, ixy=ixy, ixz=ixz, iyy=iyy, iyz=iyz, izz=izz)
+    _add(
+        inertial,
+        "inertia",
+        ixx=ixx,
+        ixy=ixy,
+        ixz=ixz,
+        iyy=iyy,
+        iyz=iyz,
+        izz=izz,
+    )
     for number, shape in enumerate(link.collisions):
         collision = SubElement(element, "collision")
         _add_origin(collision, shape.T_body_shape)

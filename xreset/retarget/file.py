@@ -14,22 +14,37 @@ import numpy as np
 
 from xreset.accounts import Account, accounts
 from xreset.demos.archive import SIDES, ObjectMotions
-from xreset.records import JOINT, POSITION, RATE, Field, offsets_problem, read_record, write_record
+from xreset.records import (
+    JOINT,
+    POSITION,
+    RATE,
+    Field,
+    offsets_problem,
+    read_record,
+    write_record,
+)
 from xreset.text import shown
 
 SCHEMA = "xreset-retargeted/1"
+
+Text = Annotated[str, Field((), "U")]
+SequenceTexts = Annotated[np.ndarray, Field(("S",), "U")]
+FrameFlags = Annotated[np.ndarray, Field(("F",), "b")]
+FramePositions = Annotated[np.ndarray, Field(("F", 3), "f", within=POSITION)]
+FrameQuaternions = Annotated[np.ndarray, Field(("F", 4), "f", unit=True)]
+FrameDistances = Annotated[np.ndarray, Field(("F",), "f", within=None)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Retargeted(ObjectMotions):
     """Robot trajectories of demonstrations, in the table frame."""
 
-    robot: Annotated[str, Field((), "U")]
-    robot_fingerprint: Annotated[str, Field((), "U")]
+    robot: Text
+    robot_fingerprint: Text
     """:attr:`xreset.spec.RobotSpec.fingerprint` of the robot."""
-    sequence_name: Annotated[np.ndarray, Field(("S",), "U")]
-    object_name: Annotated[np.ndarray, Field(("S",), "U")]
-    hand_side: Annotated[np.ndarray, Field(("S",), "U")]
+    sequence_name: SequenceTexts
+    object_name: SequenceTexts
+    hand_side: SequenceTexts
     """Side of the human hand: ``right`` or ``left``."""
     frame_offsets: Annotated[np.ndarray, Field(("S+1",), "i")]
     """Sequence i owns frames ``frame_offsets[i] : frame_offsets[i + 1]``."""
@@ -38,30 +53,30 @@ class Retargeted(ObjectMotions):
     joint_names: Annotated[tuple[str, ...], Field(("J",), "U")]
     joint_pos: Annotated[np.ndarray, Field(("F", "J"), "f", within=JOINT)]
     """[F, J] within the joint limits; meaningful where ``valid``."""
-    palm_pos: Annotated[np.ndarray, Field(("F", 3), "f", within=POSITION)]
-    palm_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", unit=True)]
+    palm_pos: FramePositions
+    palm_quat_wxyz: FrameQuaternions
     fingertip_names: Annotated[tuple[str, ...], Field(("E",), "U")]
     fingertip_pos: Annotated[np.ndarray, Field(("F", "E", 3), "f", within=POSITION)]
-    object_pos: Annotated[np.ndarray, Field(("F", 3), "f", within=POSITION)]
+    object_pos: FramePositions
     """[F, 3] object position of the demonstration, put onto the table; meaningful in every frame, valid or not."""
-    object_quat_wxyz: Annotated[np.ndarray, Field(("F", 4), "f", unit=True)]
+    object_quat_wxyz: FrameQuaternions
     goal_pos: Annotated[np.ndarray, Field(("S", 3), "f", within=POSITION)]
     """[S, 3] object position in the last frame."""
     goal_quat_wxyz: Annotated[np.ndarray, Field(("S", 4), "f", unit=True)]
-    annotated: Annotated[np.ndarray, Field(("F",), "b")]
+    annotated: FrameFlags
     """[F] whether the human hand was annotated."""
-    valid: Annotated[np.ndarray, Field(("F",), "b")]
+    valid: FrameFlags
     """[F] whether the frame may be used as a reset."""
     reason: Annotated[np.ndarray, Field(("F",), "i")]
     """[F] index into ``reason_names``; 0 where valid."""
     reason_names: Annotated[tuple[str, ...], Field(("R",), "U")]
-    contact: Annotated[np.ndarray, Field(("F",), "b")]
+    contact: FrameFlags
     """[F] whether a human keypoint touches the object."""
     first_contact: Annotated[np.ndarray, Field(("S",), "i")]
     """[S] frame within the sequence in which the human first touches the object; -1 if never."""
-    hand_error: Annotated[np.ndarray, Field(("F",), "f", within=None)]
+    hand_error: FrameDistances
     """[F] mean distance of the robot's fingertips from the human's [m]; infinite where not annotated."""
-    wrist_error: Annotated[np.ndarray, Field(("F",), "f", within=None)]
+    wrist_error: FrameDistances
     """[F] distance of the hand root from its target of hand retargeting [m]; infinite where not annotated."""
 
     @property
@@ -74,11 +89,19 @@ class Retargeted(ObjectMotions):
     def accounts(self) -> list[Account]:
         """Count valid frames and the reasons of invalid ones, by object and phase."""
         reason = np.where(self.valid, "", np.asarray(self.reason_names)[self.reason])
-        return accounts(np.asarray(self.object_name)[self.sequence_of_frame], self.post_contact, reason)
+        return accounts(
+            np.asarray(self.object_name)[self.sequence_of_frame],
+            self.post_contact,
+            reason,
+        )
 
 
 def write_retargeted(
-    path: str | Path, retargeted: Retargeted, *, config: Mapping[str, Any], inputs: Mapping[str, str]
+    path: str | Path,
+    retargeted: Retargeted,
+    *,
+    config: Mapping[str, Any],
+    inputs: Mapping[str, str],
 ) -> None:
     """Write trajectories; see :func:`xreset.records.write_record` for ``config`` and ``inputs``."""
     write_record(path, SCHEMA, retargeted, config=config, inputs=inputs)

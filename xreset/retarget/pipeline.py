@@ -99,10 +99,19 @@ def retarget_demos(
     for sequences, report in work.batches(progress):
         targets = work.hand_targets(hand, sequences)
         with one_thread():
-            motion = retarget_hand(hand, targets, config.hand, lambda share, report=report: report(0.5 * share))
+            motion = retarget_hand(
+                hand,
+                targets,
+                config.hand,
+                lambda share, report=report: report(0.5 * share),
+            )
             path = _arm_targets(hand, arm, targets, motion)
             joints, measures = track(
-                arm, path, config.thresholds, config.arm, lambda share, report=report: report(0.5 + 0.5 * share)
+                arm,
+                path,
+                config.thresholds,
+                config.arm,
+                lambda share, report=report: report(0.5 + 0.5 * share),
             )
         full = arm.full(joints, path.hand_joints)
         reasons = classify(measures, config.thresholds)
@@ -204,7 +213,12 @@ def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpe
 class _Work:
     """Demonstrations on the table, the contacts of their hands, and the batches in which they are retargeted."""
 
-    def __init__(self, demos: Demos, objects: Sequence[ObjectSpec], config: RetargetConfig) -> None:
+    def __init__(
+        self,
+        demos: Demos,
+        objects: Sequence[ObjectSpec],
+        config: RetargetConfig,
+    ) -> None:
         surfaces = {name: Surface(spec) for name, spec in _by_name(demos, objects).items()}
         self._objects = list(surfaces)
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
@@ -218,7 +232,13 @@ class _Work:
             rows = demos.frames(sequence)
             pos = demos.object_pos[rows].astype(np.float64)
             quat = demos.object_quat_wxyz[rows].astype(np.float64)
-            contacts = keypoint_contacts(surfaces[name], keypoints[rows], pos, quat, config.contact_distance)
+            contacts = keypoint_contacts(
+                surfaces[name],
+                keypoints[rows],
+                pos,
+                quat,
+                config.contact_distance,
+            )
             touched[rows], self.touching[rows] = contacts
         self._per_keypoint = {
             "keypoints": np.where(demos.hand_valid[:, None, None], keypoints, 0.0),

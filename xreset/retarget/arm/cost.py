@@ -17,7 +17,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from xreset.geometry.rotations import matrix_to_quat, matvec, quat_conjugate, quat_multiply, quat_to_axis_angle
+from xreset.geometry.rotations import (
+    matrix_to_quat,
+    matvec,
+    quat_conjugate,
+    quat_multiply,
+    quat_to_axis_angle,
+)
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel
 from xreset.retarget.least_squares import free_to_move, minimize
@@ -55,7 +61,13 @@ class ArmSystem(Tensors):
 
 
 def solve(
-    model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, iterations: int, *, self_collision: bool
+    model: ArmModel,
+    frame: Frame,
+    q: Tensor,
+    config: ArmConfig,
+    iterations: int,
+    *,
+    self_collision: bool,
 ) -> Tensor:
     """[B, n] minimizer of one frame's cost, from ``q``: Levenberg-Marquardt, each element of the batch with its own
     damping.
@@ -79,7 +91,14 @@ def solve(
     return minimize(q, evaluate, step, done, iterations, damping_range=(1e-9, 1e9))[0]
 
 
-def system(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, *, self_collision: bool) -> ArmSystem:
+def system(
+    model: ArmModel,
+    frame: Frame,
+    q: Tensor,
+    config: ArmConfig,
+    *,
+    self_collision: bool,
+) -> ArmSystem:
     """Compute the cost of one frame and its Gauss-Newton approximation at ``q`` [B, n]."""
     full = model.full(q, frame.hand_joints)
     origins, rot, linear, angular = model.kinematics.jacobian(full, model.carriers)
@@ -93,8 +112,14 @@ def system(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, *, self_
     position_scale = config.position_weight**0.5
     orientation_scale = config.orientation_weight**0.5
     turn = quat_to_axis_angle(quat_multiply(matrix_to_quat(rot[:, 0]), quat_conjugate(frame.quat)))
-    residuals = [position_scale * (origins[:, 0] - frame.pos), orientation_scale * turn]
-    jacobians = [position_scale * linear[:, 0], orientation_scale * angular[:, 0]]
+    residuals = [
+        position_scale * (origins[:, 0] - frame.pos),
+        orientation_scale * turn,
+    ]
+    jacobians = [
+        position_scale * linear[:, 0],
+        orientation_scale * angular[:, 0],
+    ]
     if frame.previous is not None:
         scale = config.smoothness_weight**0.5
         residuals.append(scale * (q - frame.previous))
@@ -120,7 +145,11 @@ def system(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig, *, self_
             carrier = model.carrier_of[torch.as_tensor(near.links[:, side])]
             reach = torch.as_tensor(near.points[:, side]) - origins[batch, carrier]
             approach += sign * (normal @ velocity(batch, carrier, reach))[:, 0]
-        value, slope = _intrusion(torch.as_tensor(near.distance), config.self_margin, config.collision_weight)
+        value, slope = _intrusion(
+            torch.as_tensor(near.distance),
+            config.self_margin,
+            config.collision_weight,
+        )
         rows = slope[:, None] * approach
         cost = cost.index_add(0, batch, value.square())
         hessian = hessian.index_add(0, batch, rows[:, :, None] * rows[:, None, :])

@@ -14,7 +14,11 @@ from torch import Tensor
 
 from xreset.errors import RobotError
 from xreset.geometry.balls import Spans, bounding_balls
-from xreset.geometry.collision import SelfCollision, height_above_table, table_points
+from xreset.geometry.collision import (
+    SelfCollision,
+    height_above_table,
+    table_points,
+)
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, matvec, quat_angle
 from xreset.retarget.validity import Measures
@@ -90,7 +94,10 @@ class ArmModel:
         self.upper = self.kinematics.upper[self.arm]
         in_hand = self.hand.link_names
         names = self.kinematics.link_names
-        self.carriers: tuple[str, ...] = (robot.hand_root, *(link for link in names if link not in in_hand))
+        self.carriers: tuple[str, ...] = (
+            robot.hand_root,
+            *(link for link in names if link not in in_hand),
+        )
         """Links whose motion the arm's joints determine: the hand root, which carries the hand, then the arm's
         links."""
         carrier_of = {link: 0 if link in in_hand else self.carriers.index(link) for link in names}
@@ -139,7 +146,14 @@ class ArmModel:
         height = pos[:, self._carrier, 2] + (rot[:, self._carrier, 2] * middle).sum(-1)
         frame, link = (height - self._reach < below).nonzero(as_tuple=True)
         none = frame.new_zeros(0)
-        found = [LowPoints(frame=none, carrier=none, height=pos.new_zeros(0), lever=pos.new_zeros(0, 3))]
+        found = [
+            LowPoints(
+                frame=none,
+                carrier=none,
+                height=pos.new_zeros(0),
+                lever=pos.new_zeros(0, 3),
+            )
+        ]
         for position, point in self._spans.members(link):
             row = frame[position]
             own = link[position]

@@ -64,7 +64,11 @@ class ArmProblem:
 
     def reversed(self) -> ArmProblem:
         """Return the problem from the last frame to the first."""
-        return replace(self, targets=self.targets.reversed(), hand_poses=self.hand_poses.flip(1))
+        return replace(
+            self,
+            targets=self.targets.reversed(),
+            hand_poses=self.hand_poses.flip(1),
+        )
 
     def reasons(self, joints: Tensor) -> Tensor:
         """[S, T] reason of each frame of the paths [S, T, n], 0 where valid: see
@@ -73,7 +77,11 @@ class ArmProblem:
 
     def examined(self, joints: Tensor) -> Paths:
         """Return the paths [S, K, T, n], with a check of their frames."""
-        measures = measure(self.model, self.repeated(joints.shape[1]).targets, joints.flatten(0, 1))
+        measures = measure(
+            self.model,
+            self.repeated(joints.shape[1]).targets,
+            joints.flatten(0, 1),
+        )
         no_jumps = replace(measures, arm_jump=torch.zeros_like(measures.arm_jump))
         sound = classify(no_jumps, self.thresholds) == 0
         return Paths(joints=joints, sound=sound.view(joints.shape[:3]))
@@ -89,17 +97,41 @@ class ArmProblem:
         )
 
 
-def follow(problem: ArmProblem, start: Tensor, progress: Progress, *, self_collision: bool = False) -> Tensor:
+def follow(
+    problem: ArmProblem,
+    start: Tensor,
+    progress: Progress,
+    *,
+    self_collision: bool = False,
+) -> Tensor:
     """[S, T, n] joints along the path, every frame started from the one before; the first from ``start`` [S, n]."""
     model = problem.model
     config = problem.config
     frames = problem.hand_poses.shape[1]
     frame = problem.frame(0, None)
-    path = [solve(model, frame, start, config, config.first_iterations, self_collision=self_collision)]
+    path = [
+        solve(
+            model,
+            frame,
+            start,
+            config,
+            config.first_iterations,
+            self_collision=self_collision,
+        )
+    ]
     progress(1 / frames)
     for t in range(1, frames):
         frame = problem.frame(t, path[-1])
-        path.append(solve(model, frame, path[-1], config, config.iterations, self_collision=self_collision))
+        path.append(
+            solve(
+                model,
+                frame,
+                path[-1],
+                config,
+                config.iterations,
+                self_collision=self_collision,
+            )
+        )
         progress((t + 1) / frames)
     return torch.stack(path, dim=1)
 
@@ -170,7 +202,11 @@ def _reseeded(problem: ArmProblem, missed: Tensor, progress: Progress) -> tuple[
         return owner, paths
     steps = torch.arange(int(torch.maximum(seed, frames - 1 - seed).max()) + 1)
     both_ways = torch.cat((seed[:, None] + steps, seed[:, None] - steps)).clamp(0, frames - 1)  # [2B, N] frames
-    followed = follow(problem.select(owner.repeat(2)[:, None], both_ways), start.repeat(2, 1), progress)
+    followed = follow(
+        problem.select(owner.repeat(2)[:, None], both_ways),
+        start.repeat(2, 1),
+        progress,
+    )
     row = torch.arange(len(owner)).repeat(2)
     for step in reversed(steps.tolist()):  # the first visit of a frame is the one that stays
         paths[row, both_ways[:, step]] = followed[:, step]
@@ -189,10 +225,21 @@ def _first_frames(problem: ArmProblem) -> Tensor:
     spread[0] = 0.0
     lower = torch.maximum(model.lower, home - torch.pi)
     upper = torch.minimum(model.upper, home + torch.pi)
-    start = torch.where(spread < 0, home + spread * (home - lower), home + spread * (upper - home))
+    start = torch.where(
+        spread < 0,
+        home + spread * (home - lower),
+        home + spread * (upper - home),
+    )
     frame = problem.repeated(config.restarts).frame(0, None)
     start = start.repeat(sequences, 1)
-    solved = solve(model, frame, start, config, config.first_iterations, self_collision=False)
+    solved = solve(
+        model,
+        frame,
+        start,
+        config,
+        config.first_iterations,
+        self_collision=False,
+    )
     cost = system(model, frame, solved, config, self_collision=False).cost
     shape = (sequences, config.restarts)
     solved = solved.unflatten(0, shape)
@@ -209,7 +256,15 @@ def _first_frames(problem: ArmProblem) -> Tensor:
     return torch.stack(chosen) if chosen else home.new_zeros(0, number, len(home))
 
 
-def splice(paths: Tensor, *, worth: Tensor, cost: Tensor, annotated: Tensor, jump: float, switch_cost: float) -> Tensor:
+def splice(
+    paths: Tensor,
+    *,
+    worth: Tensor,
+    cost: Tensor,
+    annotated: Tensor,
+    jump: float,
+    switch_cost: float,
+) -> Tensor:
     """Return the best path that follows one of the given ones in every frame, by dynamic programming over the frames.
 
         maximize sum_t worth[k_t, t] [not a jump at t] - cost[k_t, t] - switch_cost [k_t != k_{t-1}]

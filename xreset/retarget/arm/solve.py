@@ -25,7 +25,15 @@ from torch import Tensor
 
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets, measure
-from xreset.retarget.arm.paths import ArmProblem, Paths, Progress, best, branches, follow, mend
+from xreset.retarget.arm.paths import (
+    ArmProblem,
+    Paths,
+    Progress,
+    best,
+    branches,
+    follow,
+    mend,
+)
 from xreset.retarget.validity import REASONS, Measures, Thresholds
 
 _WRIST_MISSED = ("joint limit", "wrist position", "wrist orientation")
@@ -68,7 +76,13 @@ def track(
     return joints, measure(model, targets, joints)
 
 
-def _rescued(problem: ArmProblem, forwards: Paths, joints: Tensor, worth: Tensor, progress: Progress) -> Tensor:
+def _rescued(
+    problem: ArmProblem,
+    forwards: Paths,
+    joints: Tensor,
+    worth: Tensor,
+    progress: Progress,
+) -> Tensor:
     """[S, T, n] better paths than ``joints`` [S, T, n], where there are any, for sequences with frames that fail.
 
     Args:
@@ -87,7 +101,12 @@ def _rescued(problem: ArmProblem, forwards: Paths, joints: Tensor, worth: Tensor
         paths = Paths.cat((forwards, backwards.reversed()), dim=1)
 
     def without_collision(part: ArmProblem, rows: Tensor, _: Tensor) -> Tensor:
-        return follow(part, joints[rows, 0], lambda done: progress(0.6 + 0.1 * done), self_collision=True)
+        return follow(
+            part,
+            joints[rows, 0],
+            lambda done: progress(0.6 + 0.1 * done),
+            self_collision=True,
+        )
 
     def mended(part: ArmProblem, rows: Tensor, missed: Tensor) -> Tensor:
         present = part.examined(joints[rows, None])  # it may have been followed again

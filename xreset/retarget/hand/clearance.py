@@ -68,7 +68,12 @@ class Objects(NamedTuple):
 
 
 def too_near(
-    model: HandModel, bodies: Bodies, objects: Objects, considered: Tensor, object_clearance: float, self_depth: float
+    model: HandModel,
+    bodies: Bodies,
+    objects: Objects,
+    considered: Tensor,
+    object_clearance: float,
+    self_depth: float,
 ) -> Distances:
     """Find balls too near to the object, below the table's top, or too deep in each other.
 
@@ -115,7 +120,12 @@ def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: T
 
 
 def _in_object(
-    model: HandModel, bodies: Bodies, bounds: Tensor, objects: Objects, considered: Tensor, object_clearance: float
+    model: HandModel,
+    bodies: Bodies,
+    bounds: Tensor,
+    objects: Objects,
+    considered: Tensor,
+    object_clearance: float,
 ) -> Iterator[Distances]:
     def near_object(centers: Tensor, frame: Tensor, limit: Tensor) -> Tensor:
         return objects.nearer(centers, frame, limit)[0]
@@ -133,7 +143,12 @@ def _in_object(
         ball = ball[near]
         slope = model.point_slope(bodies, frame, balls.link[ball], centers[near], direction)
         value = distance - balls.radii[ball] - object_clearance
-        yield Distances(frame=frame, value=value, slope=slope, number=len(balls.radii) + ball)
+        yield Distances(
+            frame=frame,
+            value=value,
+            slope=slope,
+            number=len(balls.radii) + ball,
+        )
 
 
 def _near_balls(
@@ -163,7 +178,11 @@ def _near_balls(
 
 
 def _in_each_other(
-    model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor, self_depth: float
+    model: HandModel,
+    bodies: Bodies,
+    bounds: Tensor,
+    considered: Tensor,
+    self_depth: float,
 ) -> Iterator[Distances]:
     balls = model.balls
     fields = balls.fields

@@ -8,7 +8,13 @@ from typing import Annotated
 
 from xreset.checks import Checked, Finite, NotNegative, Positive, Rule
 
-Shares = Annotated[tuple[float, ...], Rule("finite numbers, 0 or more", lambda x: all(0 <= share < inf for share in x))]
+Shares = Annotated[
+    tuple[float, ...],
+    Rule(
+        "finite numbers, 0 or more",
+        lambda x: all(0 <= share < inf for share in x),
+    ),
+]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,9 +14,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.geometry.rotations import matvec, quat_conjugate, quat_multiply, quat_to_axis_angle
+from xreset.geometry.rotations import (
+    matvec,
+    quat_conjugate,
+    quat_multiply,
+    quat_to_axis_angle,
+)
 from xreset.retarget.hand import terms
-from xreset.retarget.hand.clearance import Distances, Objects, pad_distances, too_near
+from xreset.retarget.hand.clearance import (
+    Distances,
+    Objects,
+    pad_distances,
+    too_near,
+)
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.model import Bodies, HandModel, HandState, HandTargets
 from xreset.tensors import Tensors
@@ -61,7 +71,10 @@ def system(model: HandModel, targets: HandTargets, config: HandConfig, state: Ha
     gradient[:, 1:] += change.gradient
     gradient[:, :-1] -= change.gradient
     return HandSystem(
-        cost=cost.sum(1) + change.cost.sum(1), diagonal=diagonal, coupling=-change.curvature, gradient=gradient
+        cost=cost.sum(1) + change.cost.sum(1),
+        diagonal=diagonal,
+        coupling=-change.curvature,
+        gradient=gradient,
     )
 
 
@@ -81,7 +94,14 @@ def _frames(
         targets.object_index.repeat_interleave(frames),
         targets.fields,
     )
-    near = too_near(model, bodies, objects, annotated, config.object_clearance, config.self_depth)
+    near = too_near(
+        model,
+        bodies,
+        objects,
+        annotated,
+        config.object_clearance,
+        config.self_depth,
+    )
     value, slope = _by_frame(near, len(annotated))
     value = value / scale
     slope = slope / scale
@@ -94,7 +114,11 @@ def _frames(
         value, slope = pad_distances(model, bodies, objects, held)
         value = (value - config.object_clearance) / scale
         slope = slope / scale
-        pads = terms.attraction(value, config.pad_weight * model.pad_shares, config.pad_reach / scale)
+        pads = terms.attraction(
+            value,
+            config.pad_weight * model.pad_shares,
+            config.pad_reach / scale,
+        )
         cost[held] += pads.cost
         gradient[held] += matvec(slope.mT, pads.gradient)
         hessian[held] += (slope.mT * pads.curvature[:, None]) @ slope
@@ -118,7 +142,13 @@ def _keypoint_terms(
     on_bones = terms.difference(bones, human_bones, local) + terms.direction(bones, human_bones, local)
     alignment = on * config.global_weight * torch.where(model.is_tip, config.tip_factor, 1.0).to(x.dtype)
     in_contact = on * config.contact_weight * targets.in_contact.flatten(0, 1)
-    contact = terms.contact(x, touched, in_contact, config.contact_margin / scale, config.contact_knee / scale)
+    contact = terms.contact(
+        x,
+        touched,
+        in_contact,
+        config.contact_margin / scale,
+        config.contact_knee / scale,
+    )
     on_points = terms.difference(x, human, alignment) + contact
 
     moves = torch.cat((J[:, b] - J[:, a], J), dim=1)  # [B, C + P, 3, n]

@@ -140,7 +140,11 @@ class HandModel:
         """[G] index among the bodies of each link with balls."""
 
     def _body_indices(self, links: Sequence[str]) -> Tensor:
-        return torch.tensor([self._bodies.index(link) for link in links], dtype=torch.long, device=self.device)
+        return torch.tensor(
+            [self._bodies.index(link) for link in links],
+            dtype=torch.long,
+            device=self.device,
+        )
 
     def _pads(self) -> list[Tensor]:
         """Return the balls of the two pads of a jaw, a hand whose one joint moves two fingers: where these face each
@@ -206,7 +210,14 @@ class HandModel:
         body = self.group_body[group]
         return bodies.pos[frame, body] + matvec(bodies.rot[frame, body], points)
 
-    def point_slope(self, bodies: Bodies, frame: Tensor, group: Tensor, point: Tensor, direction: Tensor) -> Tensor:
+    def point_slope(
+        self,
+        bodies: Bodies,
+        frame: Tensor,
+        group: Tensor,
+        point: Tensor,
+        direction: Tensor,
+    ) -> Tensor:
         """[A, n] derivative of a link's point along a direction: n . (v + w x r) = n . v + (r x n) . w.
 
         Args:

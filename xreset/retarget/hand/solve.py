@@ -17,7 +17,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from xreset.geometry.rotations import matrix_to_quat, matvec, quat_from_axis_angle, quat_multiply, quat_normalize
+from xreset.geometry.rotations import (
+    matrix_to_quat,
+    matvec,
+    quat_from_axis_angle,
+    quat_multiply,
+    quat_normalize,
+)
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.cost import HandSystem, system
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
@@ -61,19 +67,35 @@ def retarget_hand(
     if config.clearance_weight:
         for share in config.clearance_growth:
             weight = share * config.clearance_weight
-            stages.append(replace(config, clearance_weight=weight, iterations=config.growth_iterations))
+            stages.append(
+                replace(
+                    config,
+                    clearance_weight=weight,
+                    iterations=config.growth_iterations,
+                )
+            )
     stages.append(config)
     steps = sum(stage.iterations for stage in stages)
     cost = root_pos.new_zeros(len(root_pos))
     before = 0
     for stage in stages:
-        state, cost = _minimize(model, targets, stage, state, lambda n, done=before: progress((done + n) / steps))
+        state, cost = _minimize(
+            model,
+            targets,
+            stage,
+            state,
+            lambda n, done=before: progress((done + n) / steps),
+        )
         before += stage.iterations
     return HandMotion(**vars(state), keypoints=model.keypoints(**vars(state)), cost=cost).to(home)
 
 
 def _minimize(
-    model: HandModel, targets: HandTargets, config: HandConfig, start: HandState, progress: Callable[[int], None]
+    model: HandModel,
+    targets: HandTargets,
+    config: HandConfig,
+    start: HandState,
+    progress: Callable[[int], None],
 ) -> tuple[HandState, Tensor]:
     """Return the best state that is found from a first guess, and its cost [S]."""
 
@@ -83,7 +105,13 @@ def _minimize(
     def step(state: HandState, here: HandSystem, damping: Tensor) -> HandState:
         return _moved(model, state, _limited_step(model, state, here, damping))
 
-    def done(_before: HandState, _after: HandState, cost: Tensor, tried: Tensor, damping: Tensor) -> Tensor:
+    def done(
+        _before: HandState,
+        _after: HandState,
+        cost: Tensor,
+        tried: Tensor,
+        damping: Tensor,
+    ) -> Tensor:
         gain = (cost - tried) / cost.clamp_min(1e-12)
         return ((tried < cost) & (gain < config.tolerance)) | (damping > 1e6)
 

@@ -43,7 +43,11 @@ def difference(x: Tensor, target: Tensor, weight: Tensor) -> Term:
     off = x - target
     w = weight[..., None]
     identity = torch.eye(3, dtype=x.dtype, device=x.device)
-    return Term((weight * off.square().sum(-1)).sum(-1), w * off, w[..., None] * identity)
+    return Term(
+        (weight * off.square().sum(-1)).sum(-1),
+        w * off,
+        w[..., None] * identity,
+    )
 
 
 def direction(x: Tensor, target: Tensor, weight: Tensor) -> Term:
@@ -57,7 +61,11 @@ def direction(x: Tensor, target: Tensor, weight: Tensor) -> Term:
     w = weight[..., None]
     across = torch.eye(3, dtype=x.dtype, device=x.device) - u[..., :, None] * u[..., None, :]
     gradient = w / length * (u * (u * v).sum(-1, keepdim=True) - v)
-    return Term((weight * (u - v).square().sum(-1)).sum(-1), gradient, (w / length.square())[..., None] * across)
+    return Term(
+        (weight * (u - v).square().sum(-1)).sum(-1),
+        gradient,
+        (w / length.square())[..., None] * across,
+    )
 
 
 def contact(x: Tensor, contact_point: Tensor, weight: Tensor, margin: float, knee: float) -> Term:

@@ -5,7 +5,7 @@ Shape letters: F frames of all sequences, S sequences of a batch padded to T fra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -59,6 +59,30 @@ def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
         DemoError: an object of the demonstrations is not among ``objects``.
     """
     return grounded(levelled(demos), _by_name(demos, objects))
+
+
+def human_contacts(demos: Demos, surfaces: Mapping[str, Surface], distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find where human hands touch the objects.
+
+    Args:
+        demos: demonstrations over the table.
+        surfaces: surface of every object that the demonstrations name.
+        distance: a keypoint nearer to the surface than this touches it [m].
+
+    Returns:
+        Contact points [F, 21, 3] in the world, zero where there is no contact, and whether there is one [F, 21].
+    """
+    keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan)
+    object_pos = demos.object_pos.astype(np.float64)
+    object_quat = demos.object_quat_wxyz.astype(np.float64)
+    points = np.zeros_like(keypoints)
+    touching = np.zeros(keypoints.shape[:2], dtype=bool)
+    object_name = demos.object_name[demos.sequence_of_frame]
+    for name in np.unique(object_name).tolist():
+        rows = object_name == name
+        contacts = keypoint_contacts(surfaces[name], keypoints[rows], object_pos[rows], object_quat[rows], distance)
+        points[rows], touching[rows] = contacts
+    return points, touching
 
 
 def retarget_demos(
@@ -223,26 +247,12 @@ class _Work:
         self._objects = list(surfaces)
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
         self.demos = demos = rest_on_table(demos, objects)
-        keypoints = demos.hand_keypoints.astype(np.float64)
-        keypoints[~demos.hand_valid] = np.nan
-        self.touching = np.zeros(keypoints.shape[:2], dtype=bool)
-        """[F, 21] whether each human keypoint touches the object."""
-        touched = np.zeros_like(keypoints)
-        for sequence, name in enumerate(demos.object_name.tolist()):
-            rows = demos.frames(sequence)
-            pos = demos.object_pos[rows].astype(np.float64)
-            quat = demos.object_quat_wxyz[rows].astype(np.float64)
-            contacts = keypoint_contacts(
-                surfaces[name],
-                keypoints[rows],
-                pos,
-                quat,
-                config.contact_distance,
-            )
-            touched[rows], self.touching[rows] = contacts
+        points, self.touching = human_contacts(demos, surfaces, config.contact_distance)
+        """Contact points [F, 21, 3] of the human keypoints, and which of them [F, 21] touch the object."""
+        keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0)
         self._per_keypoint = {
-            "keypoints": np.where(demos.hand_valid[:, None, None], keypoints, 0.0),
-            "contact_points": touched,
+            "keypoints": keypoints.astype(np.float64),
+            "contact_points": points,
             "in_contact": self.touching,
         }
         self._per_frame = {

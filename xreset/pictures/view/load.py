@@ -11,13 +11,13 @@ import numpy as np
 
 from xreset.demos.archive import Demos, ObjectMotions, read_demos
 from xreset.errors import XResetError
-from xreset.geometry.surface import Surface, keypoint_contacts
+from xreset.geometry.surface import Surface
 from xreset.inputs import Inputs, load_inputs
 from xreset.objects.catalogue import canonical_name
 from xreset.pictures.view.data import Human, View
 from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted, read_retargeted
-from xreset.retarget.pipeline import RetargetConfig, rest_on_table
+from xreset.retarget.pipeline import RetargetConfig, human_contacts, rest_on_table
 from xreset.spec import ObjectSpec
 
 _BANK_RATE = 5.0
@@ -189,18 +189,9 @@ def _human(demos: Demos, objects: Sequence[ObjectSpec]) -> tuple[Demos, Human]:
     contacts."""
     demos = rest_on_table(demos, objects)
     keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints.astype(np.float64), np.nan)
-    touching = np.zeros(keypoints.shape[:2], dtype=bool)
-    contacts = np.full_like(keypoints, np.nan)
-    index = _object_index(demos.object_name, objects)[demos.sequence_of_frame]
-    for number, spec in enumerate(objects):
-        rows = index == number
-        if rows.any():
-            pos = demos.object_pos[rows].astype(np.float64)
-            quat = demos.object_quat_wxyz[rows].astype(np.float64)
-            distance = RetargetConfig().contact_distance
-            points, near = keypoint_contacts(Surface(spec), keypoints[rows], pos, quat, distance)
-            touching[rows] = near
-            contacts[rows] = np.where(near[..., None], points, np.nan)
+    surfaces = {spec.name: Surface(spec) for spec in objects if spec.name in demos.object_name}
+    points, touching = human_contacts(demos, surfaces, RetargetConfig().contact_distance)
+    contacts = np.where(touching[..., None], points, np.nan)
     return demos, Human(keypoints=keypoints, touching=touching, contacts=contacts)
 
 

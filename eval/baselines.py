@@ -44,7 +44,8 @@ class KinematicRetargeting:
         blend = ((torch.arange(len(time)) + 1) / lead).clamp(0, 1)[:, None]
         plans = []
         for world, sequence in enumerate(env.sequence.tolist()):
-            path = torch.as_tensor(motion.joint_pos[motion.frames(sequence)], dtype=torch.float32)
+            first, last = motion.frame_offsets[sequence : sequence + 2]
+            path = torch.as_tensor(motion.joint_pos[first:last], dtype=torch.float32)
             position = ((time - lead * dt) * float(motion.fps)).clamp(0, len(path) - 1)
             low = position.floor().long().clamp_max(max(len(path) - 2, 0))
             share = (position - low)[:, None]

@@ -7,6 +7,7 @@ policy learns them in about that order, so training has to discover the first st
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -14,10 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from xreset.env import ManipulationEnv
 from xreset.errors import DemoError
 from xreset.eval.policy_spec import PolicySpec
-from xreset.eval.rollout import Progress, Run, play_all
+from xreset.eval.rollout import Progress, play_rounds
 from xreset.eval.trial import Engine, Trial
 from xreset.files import write_json
 from xreset.policy import Policy
@@ -83,27 +83,25 @@ def try_policy(
         progress: called with (control steps done, control steps in all).
     """
     bank = trial.bank
-    found: dict[int, Tried] = {}
-
-    def visit(env: ManipulationEnv, items: np.ndarray, fresh: np.ndarray, run: Run) -> None:
-        chosen = rows[items]
-        lift = bank.object_pos[chosen, 2] - bank.start_pos[bank.sequence_index[chosen], 2]
-        stage = stage_of(env.reading().tip_distance.amin(dim=-1).cpu().numpy(), lift)
-        result, _ = run(lambda step, reading: None)
-        for world in fresh.tolist():
-            row = int(chosen[world])
-            found[row] = Tried(
-                state=row,
-                sequence_name=str(bank.sequence_name[bank.sequence_index[row]]),
-                frame=int(bank.frame_index[row]),
-                object=str(bank.object_name[row]),
-                stage=STAGES[stage[world]],
-                reached=bool(result.reorient_once[world]),
-                stayed=bool(result.reorient[world]),
-            )
-
     objects = [trial.names.index(name) for name in bank.object_name[rows]]
-    play_all(policy, engine, trial, objects, lambda items: bank_starts(bank, rows[items]), visit, progress)
+    found: dict[int, Tried] = {}
+    with closing(play_rounds(engine, trial, objects, lambda items: bank_starts(bank, rows[items]))) as rounds:
+        for r in rounds:
+            chosen = rows[r.items]
+            lift = bank.object_pos[chosen, 2] - bank.start_pos[bank.sequence_index[chosen], 2]
+            stage = stage_of(r.env.reading().tip_distance.amin(dim=-1).cpu().numpy(), lift)
+            result, _ = r.play(policy, lambda step, reading: None, progress)
+            for world in r.fresh:
+                row = int(chosen[world])
+                found[row] = Tried(
+                    state=row,
+                    sequence_name=str(bank.sequence_name[bank.sequence_index[row]]),
+                    frame=int(bank.frame_index[row]),
+                    object=str(bank.object_name[row]),
+                    stage=STAGES[stage[world]],
+                    reached=bool(result.reorient_once[world]),
+                    stayed=bool(result.reorient[world]),
+                )
     return [found[row] for row in sorted(found)]
 
 

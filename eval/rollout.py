@@ -6,7 +6,8 @@ Shape letters: N worlds, T recorded states, C control steps, J joints.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,32 +110,26 @@ def roll_out(
     chosen = np.arange(len(bank.sequence_name)) if only is None else np.asarray(only)
     sequences = np.repeat(chosen, repetitions)
     repetition = np.tile(np.arange(repetitions), len(chosen))
+    objects = [trial.names.index(name) for name in bank.sequence_object[sequences]]
     starts = trial.starts()
     found: dict[int, Episode] = {}
     traces: list[Trace] = []
     steps = 0
     seconds = 0.0
 
-    def visit(env: ManipulationEnv, items: np.ndarray, fresh: np.ndarray, run: Run) -> None:
-        nonlocal steps, seconds
-        recorder = _Recorder(env, [world for world in fresh.tolist() if repetition[items[world]] == 0])
-        result, spent = run(recorder.look)
-        steps += env.max_episode_length * env.num_envs
-        seconds += spent
-        traces.extend(recorder.traces(trial.names))
-        for world in fresh.tolist():
-            item = int(items[world])
-            found[item] = _episode(result, world, bank, int(sequences[item]), int(repetition[item]))
+    def start(items: np.ndarray) -> Reset:
+        return episode_starts(starts, sequences[items], repetition[items], trial.seed)
 
-    play_all(
-        policy,
-        engine,
-        trial,
-        [trial.names.index(name) for name in bank.sequence_object[sequences]],
-        lambda items: episode_starts(starts, sequences[items], repetition[items], trial.seed),
-        visit,
-        progress,
-    )
+    with closing(play_rounds(engine, trial, objects, start)) as rounds:
+        for r in rounds:
+            recorder = _Recorder(r.env, [world for world in r.fresh if repetition[r.items[world]] == 0])
+            result, spent = r.play(policy, recorder.look, progress)
+            steps += r.env.max_episode_length * r.env.num_envs
+            seconds += spent
+            traces += recorder.traces(trial.names)
+            for world in r.fresh:
+                item = int(r.items[world])
+                found[item] = _episode(result, world, bank, int(sequences[item]), int(repetition[item]))
     return Rollouts(
         episodes=tuple(found[i] for i in sorted(found)),
         traces=tuple(sorted(traces, key=lambda t: t.sequence)),
@@ -142,47 +137,50 @@ def roll_out(
     )
 
 
-Run = Callable[[Look], tuple[EpisodeMetrics, float]]
-"""Plays one episode in every world; see :func:`play`."""
+@dataclass(frozen=True, kw_only=True)
+class Round:
+    """Worlds that were just reset, each to play one item."""
+
+    env: ManipulationEnv
+    points: torch.Tensor
+    """[N, 4, 3] keypoints of the objects, in their frames."""
+    items: np.ndarray
+    """[N] item of each world."""
+    fresh: list[int]
+    """Worlds whose item was not played before; the others only keep busy."""
+    number: int
+    total: int
+    """Number of rounds."""
+
+    def play(self, policy: Policy, look: Look, progress: Progress) -> tuple[EpisodeMetrics, float]:
+        """Play one episode in every world; see :func:`play`."""
+        length = self.env.max_episode_length
+
+        def watch(step: int, reading: Reading) -> None:
+            look(step, reading)
+            if step:
+                progress(self.number * length + step, self.total * length)
+
+        return play(policy, self.env, self.points, watch)
 
 
-def play_all(
-    policy: Policy,
-    engine: Engine,
-    trial: Trial,
-    object_index: list[int],
-    start: Callable[[np.ndarray], Reset],
-    visit: Callable[[ManipulationEnv, np.ndarray, np.ndarray, Run], None],
-    progress: Progress,
-) -> None:
-    """Play one episode for each of some items, in as many rounds as the worlds need.
+def play_rounds(
+    engine: Engine, trial: Trial, object_index: list[int], start: Callable[[np.ndarray], Reset]
+) -> Generator[Round]:
+    """Open an engine, and yield as many rounds as its worlds need to play one episode for each of some items.
 
     Args:
-        policy: what acts.
-        engine: where it acts.
-        trial: what it plays.
+        engine: where to play.
+        trial: what to play.
         object_index: index of each item's object.
         start: makes the starts [N] of items [N].
-        visit: called in every round with the environment, which was just reset, the item [N] of each world, the worlds
-            whose item no earlier world has played, and the function that plays the episodes.
-        progress: called with (control steps done, control steps in all).
     """
     plan = schedule(np.array(object_index), trial.num_envs)
     with trial.worlds(engine, torch.as_tensor(plan.object_index)) as (env, points):
-        total = len(plan.rounds) * env.max_episode_length
         for number, (items, fresh) in enumerate(plan):
-            before = number * env.max_episode_length
-
-            def run(look: Look, before: int = before) -> tuple[EpisodeMetrics, float]:
-                def watch(step: int, reading: Reading) -> None:
-                    look(step, reading)
-                    if step:
-                        progress(before + step, total)
-
-                return play(policy, env, points, watch)
-
             env.reset(start=start(items).to(env.device))
-            visit(env, items, np.flatnonzero(fresh), run)
+            worlds = np.flatnonzero(fresh).tolist()
+            yield Round(env=env, points=points, items=items, fresh=worlds, number=number, total=len(plan.rounds))
 
 
 def play(policy: Policy, env: ManipulationEnv, points: torch.Tensor, look: Look) -> tuple[EpisodeMetrics, float]:

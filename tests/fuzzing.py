@@ -84,7 +84,8 @@ def readers() -> Iterator[dict[str, Reader]]:
     logging.disable(logging.WARNING)  # what is left aside of a file is said; here it would be said ten thousand times
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        robot, openarm = toy_hand_arm(folder), load_robot("openarm")
+        robot = toy_hand_arm(folder)
+        openarm = load_robot("openarm")
         found: dict[str, Reader] = {}
 
         def add(what: str, file: str, read: Callable[[Path], Any], kind: str, may_hold: tuple[str, ...] = ()) -> Path:

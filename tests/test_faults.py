@@ -150,7 +150,9 @@ class Environment(WithEnv):
         action = torch.full((N, 7), 0.3)
         for _ in range(2):
             env.step(action)
-        before, gravity, sequence = env.backend.state(), env.gravity_fraction.clone(), env.sequence.clone()
+        before = env.backend.state()
+        gravity = env.gravity_fraction.clone()
+        sequence = env.sequence.clone()
         before = replace(before, joint_pos=before.joint_pos.clone(), object_pos=before.object_pos.clone())
         *_, extras = env.step(action)
         self.assertEqual(extras["faulty"].tolist(), [False, False, True, False])
@@ -186,7 +188,9 @@ class Learning(unittest.TestCase):
         """Weights after one update in which world 1's step 2 had that reward, and was the last of its episode."""
 
         class Nothing:
-            num_envs, num_actions, device = N, 3, "cpu"
+            num_envs = N
+            num_actions = 3
+            device = "cpu"
 
         def observations(seed: int) -> TensorDict:
             g = torch.Generator().manual_seed(seed)
@@ -200,9 +204,13 @@ class Learning(unittest.TestCase):
         with torch.no_grad():
             for t in range(8):
                 alg.act(observations(t))
-                reward, done, faulty = torch.linspace(-1, 1, N), torch.zeros(N), torch.zeros(N, dtype=torch.bool)
+                reward = torch.linspace(-1, 1, N)
+                done = torch.zeros(N)
+                faulty = torch.zeros(N, dtype=torch.bool)
                 if t == 2:
-                    reward[1], done[1], faulty[1] = faulty_reward, 1.0, marked
+                    reward[1] = faulty_reward
+                    done[1] = 1.0
+                    faulty[1] = marked
                 alg.process_env_step(observations(t + 1), reward, done, {"time_outs": done * 0, "faulty": faulty})
             alg.compute_returns(observations(8))
         torch.manual_seed(1)
@@ -210,12 +218,14 @@ class Learning(unittest.TestCase):
         return alg.actor.state_dict() | {f"critic.{k}": v for k, v in alg.critic.state_dict().items()}
 
     def test_nothing_is_learned_from_a_faulty_step(self):
-        one, two = self.updated(0.0, marked=True), self.updated(1000.0, marked=True)
+        one = self.updated(0.0, marked=True)
+        two = self.updated(1000.0, marked=True)
         for name, value in one.items():
             torch.testing.assert_close(value, two[name], rtol=0, atol=0, msg=name)
 
     def test_without_the_mark_it_would_be(self):
-        one, two = self.updated(0.0, marked=False), self.updated(1000.0, marked=False)
+        one = self.updated(0.0, marked=False)
+        two = self.updated(1000.0, marked=False)
         self.assertTrue(any(not torch.equal(value, two[name]) for name, value in one.items()))
 
 

@@ -144,6 +144,8 @@ class AtomicFolderTest(InFolder):
             (part / "a").write_text("1")
             raise ValueError("half")
         self.assertEqual(list(made.parent.iterdir()), [])
+        with self.refused(f"^{made / 'a'} is wrong$"), atomic_folder(made) as part:
+            raise FileFormatError(f"{part / 'a'} is wrong")
         made.mkdir()  # an empty one makes room
         with atomic_folder(made) as part:
             (part / "a").write_text("1")
@@ -492,7 +494,8 @@ class BankTest(InFolder):
     def test_round_trip(self):
         for changes in ({}, {"rejected_reason": np.zeros(3, dtype=np.int32)}):
             self.write(**changes)
-            found, made = read_bank(self.file, robot=self.robot), toy_bank(self.robot, **changes)
+            found = read_bank(self.file, robot=self.robot)
+            made = toy_bank(self.robot, **changes)
             for name, value in vars(made).items():
                 self.assertEqual(type(getattr(found, name)), type(value), name)
                 np.testing.assert_array_equal(getattr(found, name), value, name)

@@ -72,7 +72,8 @@ class BuiltIn(unittest.TestCase):
     def test_sharpa_is_a_right_hand_held_palm_down(self):
         robot = load("ur7e-sharpa")
         palm, *tips = Kinematics(robot).link_poses(torch.tensor(robot.home), robot.tracked_links).numpy()
-        thumb, fingers = tips[0][:3, 3], np.array([tip[:3, 3] for tip in tips[1:]])
+        thumb = tips[0][:3, 3]
+        fingers = np.array([tip[:3, 3] for tip in tips[1:]])
         self.assertLess(palm[2, 2], -0.8)  # the palm looks down
         self.assertLess(palm[1, 0], -0.8)  # fingers away from the person, who stands at +y
         self.assertTrue(
@@ -84,7 +85,8 @@ class BuiltIn(unittest.TestCase):
         robot = load("ur7e-sharpa")
         kinematics = Kinematics(robot)
         generator = torch.Generator().manual_seed(0)
-        lower, upper = kinematics.lower, kinematics.upper
+        lower = kinematics.lower
+        upper = kinematics.upper
         q = lower + (upper - lower) * torch.rand(20000, len(lower), generator=generator, dtype=torch.float64)
         thumb, index = kinematics.points(q, ["thumb_tip", "index_tip"]).unbind(-2)
         self.assertLess(float((thumb - index).norm(dim=-1).min()), 0.02)
@@ -165,7 +167,9 @@ class Dynamics(unittest.TestCase):
         robot = load("openarm")
         kinematics = Kinematics(robot)
         rng = np.random.default_rng(0)
-        q, v, h = robot.home, rng.normal(size=8) * 0.5, 1e-6
+        q = robot.home
+        v = rng.normal(size=8) * 0.5
+        h = 1e-6
         before, after = (kinematics.link_poses(torch.tensor(q + s * h * v)).numpy() for s in (-1, 1))
         energy = 0.0
         for name, a, b in zip(kinematics.link_names, before, after, strict=True):

@@ -46,7 +46,8 @@ class ScheduleTest(unittest.TestCase):
             with self.subTest(name):
                 plan = schedule(np.array(items), worlds)
                 self.assertTrue(plan.fresh.any(axis=1).all())
-                counts, fewer = np.bincount(items), len(plan.rounds) - 1
+                counts = np.bincount(items)
+                fewer = len(plan.rounds) - 1
                 if fewer:
                     needed = sum(-(-count // fewer) for count in counts)
                     self.assertGreater(needed, len(plan.object_index), "one round fewer would have been possible")

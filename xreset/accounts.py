@@ -1,4 +1,4 @@
-"""Counts what becomes of frames and states: how many are kept and why the others are lost, by object and phase of the demonstration.
+"""Counts frames and states: how many are kept and why the others are lost, by object and phase of the demonstration.
 
 Nothing is lost without a reason: ``total == kept + sum(lost.values())`` in every account.
 """

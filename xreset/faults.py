@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 class FaultRecorder:
-    """Keeps the last :attr:`CAPACITY` faults on the device. Nothing waits for the GPU, so a captured graph can record."""
+    """Keeps the last :attr:`CAPACITY` faults on the device. Nothing waits for it, so a captured graph can record."""
 
     CAPACITY = 256
 

@@ -70,7 +70,10 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """
     with _temporary(path.parent, Path.mkdir) as temporary:
         remove_leftovers(path.parent)
-        yield temporary
+        try:
+            yield temporary
+        except XResetError as error:  # the user knows only the folder's own name
+            raise type(error)(str(error).replace(str(temporary), str(path))) from error
         temporary.replace(path)
 
 

@@ -36,7 +36,8 @@ def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
     for _ in range(min(max_worlds, len(item_object)) - len(objects)):
         worlds[np.argmax(counts / worlds)] += 1  # the object whose worlds have most to do
     num_rounds = int(np.max(-(-counts // worlds)))
-    columns, fresh = [], []
+    columns = []
+    fresh = []
     for number, count, width in zip(objects, counts, worlds, strict=True):
         queue = np.flatnonzero(item_object == number)
         position = np.arange(num_rounds * width).reshape(num_rounds, width)

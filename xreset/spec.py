@@ -21,7 +21,7 @@ GRAVITY = 9.81
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 
-KEYPOINTS = ("wrist", *(f"{finger}{i}" for finger in FINGERS for i in range(1, 5)))
+KEYPOINTS = ("wrist", *(f"{finger}{i}" for finger in FINGERS for i in range(1, 5)))  # noqa: XR002
 """The 21 human hand keypoints in the order of the demonstrations: the wrist, then each finger from base (1) to tip
 (4)."""
 
@@ -129,7 +129,7 @@ class PlacementSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSpec:
-    """A robot: a URDF and one small typed description. See :func:`xreset.robots.load`."""
+    """A robot: a URDF and one small typed description. See :func:`xreset.load_robot`."""
 
     name: str
     """Such as ``ur7e-sharpa``."""
@@ -294,7 +294,8 @@ def lowest_point(shapes: Sequence[Shape]) -> float:
 
 
 def _lowest(shape: Shape) -> float:
-    geometry, z = shape.geometry, shape.T_body_shape[2, 3]
+    geometry = shape.geometry
+    z = shape.T_body_shape[2, 3]
     row = shape.T_body_shape[2, :3]  # height of a point p of the shape's own frame: z + row . p
     if geometry.kind == "hull":
         return float(z + (geometry.vertices @ row).min())

@@ -22,10 +22,11 @@ class Tensors:
 
     def map(self, function: Callable[..., Tensor], *others: Self) -> Self:
         """Return a bundle of ``function(own tensor, *tensors of the others)``."""
-        own = {f.name: getattr(self, f.name) for f in fields(self)}
-        mapped = {
-            name: function(x, *(getattr(o, name) for o in others)) for name, x in own.items() if isinstance(x, Tensor)
-        }
+        mapped = {}
+        for f in fields(self):
+            tensor = getattr(self, f.name)
+            if isinstance(tensor, Tensor):
+                mapped[f.name] = function(tensor, *(getattr(other, f.name) for other in others))
         return replace(self, **mapped)
 
     def __getitem__(self, rows: Any) -> Self:
@@ -53,8 +54,11 @@ class Tensors:
 
     def to(self, device: torch.device | str) -> Self:
         """Return the bundle on another device."""
-        inside = {f.name: getattr(self, f.name) for f in fields(self)}
-        moved = {name: x.to(device) for name, x in inside.items() if isinstance(x, Tensor | Tensors)}
+        moved = {}
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, Tensor | Tensors):
+                moved[f.name] = value.to(device)
         return replace(self, **moved)
 
     @classmethod

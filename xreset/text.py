@@ -10,7 +10,10 @@ from typing import Any
 class _Repr(reprlib.Repr):
     def __init__(self) -> None:
         super().__init__()
-        self.maxlevel, self.maxdict, self.maxstring, self.maxother = 2, 4, 80, 80
+        self.maxlevel = 2
+        self.maxdict = 4
+        self.maxstring = 80
+        self.maxother = 80
 
     def repr_int(self, x: int, level: int) -> str:
         return super().repr_int(x, level) if x.bit_length() < 10_000 else f"an integer of {x.bit_length()} bits"

@@ -12,7 +12,7 @@ import torch
 
 from tests import toy_grasp
 from tests.test_cli import run
-from tests.toy_bank import toy_bank
+from tests.toy_bank import toy_bank, toy_retargeted
 from xreset.accounts import accounts_path
 from xreset.geometry.kinematics import Kinematics
 from xreset.physics import Health
@@ -32,39 +32,17 @@ WIDE = toy_grasp.OPEN + 0.03
 
 
 def retargeted(joint_pos: np.ndarray, object_pos: np.ndarray, offsets=None, **changes) -> Retargeted:
-    """Trajectories of the gripper and the brick, given by joints [F, J] and the brick's positions [F, 3]; every frame is valid."""
-    frames, quat = len(joint_pos), toy_grasp.brick_pose()[1]
-    offsets = np.array(offsets or [0, frames])
+    """Trajectories of the gripper and the brick, given by joints [F, J] and the brick's positions [F, 3]."""
+    frames = len(joint_pos)
+    offsets = offsets or [0, frames]
     tips = Kinematics(ROBOT).points(torch.as_tensor(joint_pos), [tip.link for tip in ROBOT.fingertips]).numpy()
-    count = len(offsets) - 1
     values = {
-        "robot": ROBOT.name,
-        "robot_fingerprint": ROBOT.fingerprint,
-        "sequence_name": np.array([f"demo{i}" for i in range(count)]),
-        "object_name": np.array(["brick"] * count),
-        "hand_side": np.array(["right"] * count),
-        "frame_offsets": offsets,
-        "fps": 30.0,
-        "joint_names": ROBOT.joint_names,
         "joint_pos": joint_pos,
-        "palm_pos": np.zeros((frames, 3)),
-        "palm_quat_wxyz": np.tile([1.0, 0, 0, 0], (frames, 1)),
-        "fingertip_names": ROBOT.fingertip_names,
         "fingertip_pos": tips,
         "object_pos": object_pos,
-        "object_quat_wxyz": np.tile(quat, (frames, 1)),
-        "goal_pos": object_pos[offsets[1:] - 1],
-        "goal_quat_wxyz": np.tile(quat, (count, 1)),
-        "annotated": np.ones(frames, dtype=bool),
-        "valid": np.ones(frames, dtype=bool),
-        "reason": np.zeros(frames, dtype=np.int64),
-        "reason_names": ("valid", "other"),
-        "contact": np.zeros(frames, dtype=bool),
-        "first_contact": np.full(count, -1),
-        "hand_error": np.zeros(frames),
-        "wrist_error": np.zeros(frames),
+        "object_quat_wxyz": np.tile(toy_grasp.brick_pose()[1], (frames, 1)),
     }
-    return Retargeted(**(values | changes))
+    return toy_retargeted(ROBOT, ["brick"] * (len(offsets) - 1), offsets, **(values | changes))
 
 
 def grasp_and_lift() -> Retargeted:
@@ -129,16 +107,8 @@ class ClosingTest(unittest.TestCase):
         dense, frame, part = self.dense()
         here = part == 0
         self.assertEqual(frame[here].tolist(), list(range(10)))
-        for name in (
-            "joint_pos",
-            "palm_pos",
-            "palm_quat_wxyz",
-            "fingertip_pos",
-            "object_pos",
-            "object_quat_wxyz",
-            "hand_error",
-            "contact",
-        ):
+        poses = ("palm_pos", "palm_quat_wxyz", "object_pos", "object_quat_wxyz")
+        for name in (*poses, "joint_pos", "fingertip_pos", "hand_error", "contact"):
             self.assertEqual(getattr(dense, name)[here].tobytes(), getattr(self.data, name).tobytes(), name)
         self.assertEqual((dense.goal_pos.tobytes(), dense.fps), (self.data.goal_pos.tobytes(), 30.0))
 
@@ -234,12 +204,9 @@ class FingersTest(unittest.TestCase):
 
     def test_a_squeeze_is_within_the_drives_torque(self):
         fingers, joints = self.fingers(0.0201)
-        weak = replace(
-            ROBOT,
-            joints=tuple(
-                replace(j, drive=replace(j.drive, effort=0.8)) if j.name == "jaw_a_slide" else j for j in ROBOT.joints
-            ),
-        )
+        joints_of_weak = list(ROBOT.joints)
+        joints_of_weak[JAW] = replace(ROBOT.joints[JAW], drive=replace(ROBOT.joints[JAW].drive, effort=0.8))
+        weak = replace(ROBOT, joints=tuple(joints_of_weak))
         target = squeeze_targets(weak, fingers, joints, SqueezeConfig(force=50.0))
         self.assertAlmostEqual(target[0, JAW] - joints[0, JAW], -0.8 / 800, places=9)
 
@@ -282,10 +249,8 @@ class TargetsTest(unittest.TestCase):
 class Held(unittest.TestCase):
     def test_engines_are_told_apart_state_by_state(self):
         """As many held does not mean alike."""
-        bank, drops = (
-            toy_bank(ROBOT),
-            {"a": [0, 1], "b": [0, 2], "c": [0, 1]},
-        )  # three states are lifted: soup, spam, soup
+        bank = toy_bank(ROBOT)  # three states are lifted: soup, spam, soup
+        drops = {"a": [0, 1], "b": [0, 2], "c": [0, 1]}
 
         def probe(name, scene, index, start, judge, **_):
             end = start.object_pos.clone()
@@ -297,13 +262,11 @@ class Held(unittest.TestCase):
             return judge(backend, start).numpy()
 
         with mock.patch("xreset.resets.hold.probe", probe):
-            rows = hold_bank(
-                bank, ROBOT, [replace(toy_grasp.brick(), name=name) for name in bank.object_names], list(drops)
-            )
+            objects = [replace(toy_grasp.brick(), name=name) for name in bank.object_names]
+            rows = hold_bank(bank, ROBOT, objects, list(drops))
         found = {row.backend: (row.held, row.lifted, row.alike) for row in rows if row.object_name == "all"}
-        self.assertEqual(
-            found, {"a": (1, 3, {"b": 1, "c": 3}), "b": (1, 3, {"a": 1, "c": 1}), "c": (1, 3, {"a": 3, "b": 1})}
-        )
+        alike = {"a": {"b": 1, "c": 3}, "b": {"a": 1, "c": 1}, "c": {"a": 3, "b": 1}}
+        self.assertEqual(found, {name: (1, 3, others) for name, others in alike.items()})
 
 
 class CommandTest(unittest.TestCase):
@@ -330,21 +293,12 @@ class CommandTest(unittest.TestCase):
         np.testing.assert_allclose(bank.frame_part * 6, [0, 1, 2, 3, 4, 5, 0, 0], atol=1e-5)
         self.assertEqual(bank.frame_index.tolist(), [0] * 6 + [1, 2])
         self.assertEqual((bank.targets != bank.joint_pos).any(axis=1).tolist(), [False] * 6 + [True] * 2)
-        counts = [
-            (band["nearer"], band["tried"], band["kept"], band["added"], band["added_kept"])
-            for band in account["bands"]
-        ]
+        names = ("nearer", "tried", "kept", "added", "added_kept")
         self.assertEqual(
-            counts,
-            [
-                (None, 0, 0, 0, 0),
-                (0.1, 0, 0, 0, 0),
-                (0.05, 1, 1, 2, 2),
-                (0.02, 0, 0, 2, 2),
-                (0.01, 0, 0, 1, 1),
-                (0.001, 2, 2, 0, 0),
-            ],
-        )
+            [[band[name] for name in names] for band in account["bands"]],  # noqa: XR002
+            [[None, 0, 0, 0, 0], [0.1, 0, 0, 0, 0], [0.05, 1, 1, 2, 2], [0.02, 0, 0, 2, 2], [0.01, 0, 0, 1, 1],
+             [0.001, 2, 2, 0, 0]],
+        )  # fmt: skip
         self.assertEqual(sum(row["total"] for row in account["rows"] if row["phase"] == "both"), 3, "frames only")
         self.assertEqual(account["pressing"], 2)
         self.assertEqual(

@@ -25,11 +25,11 @@ except ImportError as error:
     raise unittest.SkipTest(str(error)) from error
 
 ROOT = Path(__file__).resolve().parents[1]
-SMALL = [
-    "--config.task.observation.cloud-points", "16", "--config.task.distance-points", "64", "--config.model.pointnet", "8", "6",
-    "--config.model.lstm", "12", "--config.model.mlp", "16", "--config.ppo.horizon", "8", "--config.ppo.mini-epochs", "2",
-    "--config.ppo.minibatch-size", "32", "--config.save-interval", "1",
-]  # fmt: skip
+SMALL = (
+    "--config.task.observation.cloud-points 16 --config.task.distance-points 64 --config.model.pointnet 8 6 "
+    "--config.model.lstm 12 --config.model.mlp 16 --config.ppo.horizon 8 --config.ppo.mini-epochs 2 "
+    "--config.ppo.minibatch-size 32 --config.save-interval 1"
+)
 
 
 class TwoProcesses(unittest.TestCase):
@@ -38,49 +38,21 @@ class TwoProcesses(unittest.TestCase):
         cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         robot = robots.load("openarm")
         cls.bank = cls.folder / "bank.npz"
-        write_bank(
-            cls.bank, toy_bank(robot, joint_pos=np.tile(robot.home, (6, 1)).astype(np.float32)), config={}, inputs={}
-        )
+        home = np.tile(robot.home, (6, 1)).astype(np.float32)
+        write_bank(cls.bank, toy_bank(robot, joint_pos=home), config={}, inputs={})
         cls.out = cls.folder / "run"
-        new = [
-            "--robot",
-            "openarm",
-            "--resets",
-            cls.bank,
-            "--backend",
-            "mujoco",
-            "--device",
-            "cpu",
-            "--num-envs",
-            "8",
-            "--seed",
-            "3",
-        ]
-        cls.first = cls.train("--out", cls.out, "--iterations", "2", *new, *SMALL)
+        new = f"--robot openarm --resets {cls.bank} --backend mujoco --device cpu --num-envs 8 --seed 3"
+        cls.first = cls.train(f"--out {cls.out} --iterations 2 {new} {SMALL}")
         cls.made = sorted(path.name for path in cls.out.rglob("*") if path.is_file())
-        cls.second = cls.train("--out", cls.out, "--iterations", "3", "--resume")
+        cls.second = cls.train(f"--out {cls.out} --iterations 3 --resume")
 
     @classmethod
-    def train(cls, *arguments) -> list[dict]:
+    def train(cls, arguments: str) -> list[dict]:
         """What the two processes end with."""
-        command = [
-            sys.executable,
-            "-m",
-            "torch.distributed.run",
-            "--standalone",
-            "--nproc-per-node",
-            "2",
-            "tests/train_worker.py",
-        ]
+        torchrun = "-m torch.distributed.run --standalone --nproc-per-node 2 tests/train_worker.py"
+        command = [sys.executable, *torchrun.split(), str(cls.folder), *arguments.split()]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-        done = subprocess.run(
-            [*command, str(cls.folder), *map(str, arguments)],
-            cwd=ROOT,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=300,
-        )
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
         if done.returncode:
             raise AssertionError(f"torchrun ended with {done.returncode}:\n{done.stdout}\n{done.stderr}")
         cls.output = done.stdout

@@ -17,7 +17,7 @@ from xreset.env import ManipulationEnv, make_scene
 from xreset.errors import RunError
 from xreset.faults import FaultRecorder
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig, rsl_rl_config
-from xreset.learning.faults import MAX_SHARE, WINDOW, FaultBudget, FaultCounts
+from xreset.learning.faults import MAX_SHARE, WINDOW, FaultBudget
 from xreset.learning.ppo import SequencePpo
 from xreset.learning.run import checkpoints
 from xreset.learning.runner import TrainingRunner
@@ -112,17 +112,15 @@ class Budget(unittest.TestCase):
     def test_the_share_of_a_window(self):
         budget = FaultBudget(1000)
         self.assertAlmostEqual(budget.allowed, MAX_SHARE * WINDOW * 1000)
-        self.assertIsNone(budget.add(FaultCounts(nonfinite=150, overflow=50)))
-        self.assertRegex(
-            budget.add(FaultCounts(nonfinite=1, overflow=0)) or "", "151 worlds were not finite and 50 dropped .* 0.1%"
-        )
+        self.assertIsNone(budget.add(150, 50))
+        self.assertRegex(budget.add(1, 0) or "", "151 worlds were not finite and 50 dropped .* 0.1%")
 
     def test_old_faults_are_forgotten(self):
         budget = FaultBudget(1000)
-        budget.add(FaultCounts(nonfinite=200, overflow=0))
+        budget.add(200, 0)
         for _ in range(WINDOW - 1):
-            self.assertIsNone(budget.add(FaultCounts(nonfinite=0, overflow=0)))
-        self.assertIsNone(budget.add(FaultCounts(nonfinite=0, overflow=200)))
+            self.assertIsNone(budget.add(0, 0))
+        self.assertIsNone(budget.add(0, 200))
 
 
 class WithEnv(unittest.TestCase):

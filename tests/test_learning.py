@@ -13,7 +13,7 @@ from tensordict import TensorDict
 
 from xreset import robots
 from xreset.checks import from_dict
-from xreset.errors import FileFormatError, PolicyError, RunError
+from xreset.errors import FileFormatError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig, rsl_rl_config
 from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel, ReturnCritic, embed_sequences
@@ -38,6 +38,14 @@ def make_model(kind: str = "actor") -> PointNetLstmModel:
     return PointNetLstmModel(
         observations(N), GROUPS, kind, A if kind == "actor" else 1, distribution_cfg=gaussian, **SMALL
     )
+
+
+def firsts(*steps: tuple[int, int]) -> torch.Tensor:
+    """[T, N] bool: True in given (step, world), which are the first of an episode."""
+    first = torch.zeros(T, N, dtype=torch.bool)
+    for step, world in steps:
+        first[step, world] = True
+    return first
 
 
 def with_real_history(obs: TensorDict, first: torch.Tensor) -> TensorDict:
@@ -66,10 +74,8 @@ class ModelTest(unittest.TestCase):
 
     def test_update_sees_what_the_rollout_saw(self):
         """Step by step with resets at episode ends gives the same outputs as one sequence with masks."""
-        dones = torch.zeros(T, N, dtype=torch.bool)
-        dones[2, 0] = dones[5, 2] = True
-        first = torch.zeros_like(dones)
-        first[1:] = dones[:-1]
+        first = firsts((3, 0), (6, 2))
+        dones = first.roll(-1, dims=0)
         model, obs = make_model(), with_real_history(observations(T, N), first)
         stepwise = []
         for t in range(T):
@@ -84,8 +90,7 @@ class ModelTest(unittest.TestCase):
 
     def test_pieces_begin_with_their_own_states(self):
         """Two pieces in one call give what two calls give, and no gradient crosses from one to the other."""
-        first = torch.zeros(T, N, dtype=torch.bool)
-        first[2, 1] = first[6, 0] = True
+        first = firsts((2, 1), (6, 0))
         model, obs = make_model(), with_real_history(observations(T, N), first)
         g = torch.Generator().manual_seed(3)
         h, c = (torch.randn(2, N, SMALL["lstm_dim"], generator=g) for _ in range(2))
@@ -108,8 +113,7 @@ class ModelTest(unittest.TestCase):
             c = f.sigmoid() * c + i.sigmoid() * g.tanh()
             return o.sigmoid() * c.tanh(), c, None
 
-        first = torch.zeros(T, N, dtype=torch.bool)
-        first[2, 1] = first[6, 0] = True
+        first = firsts((2, 1), (6, 0))
         states = tuple(
             torch.randn(1, 2 * N, SMALL["lstm_dim"], generator=torch.Generator().manual_seed(i)) for i in range(2)
         )
@@ -135,10 +139,8 @@ class ModelTest(unittest.TestCase):
             self.assertGreater(float((found - expected).norm()), 0.0)
 
     def test_reused_embeddings_are_those_of_the_whole_history(self):
-        dones = torch.zeros(T, N, dtype=torch.bool)
-        dones[2, 0] = dones[5, 2] = True
-        first = torch.zeros_like(dones)
-        first[1:] = dones[:-1]
+        first = firsts((3, 0), (6, 2))
+        dones = first.roll(-1, dims=0)
         plain, reusing, obs = make_model(), make_model(), with_real_history(observations(T, N), first)
         reusing.reuse_embeddings = True
         for t in range(T):
@@ -156,8 +158,7 @@ class ModelTest(unittest.TestCase):
     def test_gradients_do_not_cross_an_episode_end(self):
         model, obs = make_model(), observations(T, N)
         obs["policy"].requires_grad_(True)
-        first = torch.zeros(T, N, dtype=torch.bool)
-        first[3] = True
+        first = firsts((3, 0), (3, 1), (3, 2))
         zero = torch.zeros(1, N, SMALL["lstm_dim"])
         model(obs, masks=first, hidden_state=(zero, zero))[3:].sum().backward()
         self.assertEqual(float(obs["policy"].grad[:3].abs().max()), 0.0)
@@ -282,14 +283,8 @@ class StorageTest(unittest.TestCase):
     def test_a_captured_update_learns_what_a_plain_one_does(self):
         # Adam moves a weight by about the rate whatever its gradient's size, so that one whose sign hangs on the last bits of a kernel may
         # end 60 steps x 3e-4 away: 0.018. An adaptive rate multiplies that: a step more or less of it is a factor of 1.5.
-        for tolerance, options in (
-            (1e-2, {"schedule": "fixed", "learning_rate": 3e-4}),
-            (
-                1e-2,
-                {"schedule": "fixed", "learning_rate": 3e-4, "normalize_returns": True},
-            ),
-            (5e-2, {}),
-        ):
+        fixed = {"schedule": "fixed", "learning_rate": 3e-4}
+        for tolerance, options in ((1e-2, fixed), (1e-2, fixed | {"normalize_returns": True}), (5e-2, {})):
             (one, before, plain), (two, _, captured) = (
                 self.bandit(iterations=3, device="cuda", capture=on, **options) for on in (False, True)
             )
@@ -373,13 +368,15 @@ class ExportTest(unittest.TestCase):
         cls.file = Path(folder.name) / "policy.onnx"
         cls.model = make_model()
         cls.model.update_normalization(observations(50, seed=9))
-        task = TaskConfig(observation=ObservationConfig(cloud_points=10))
-        widths = {"policy": {"all": 7}, "proprio": {"all": 9}, "perception": {"cloud": 5 * 10 * 3}}  # of observations()
-        contract = policy_contract(robots.load("openarm"), task, ()) | {
-            "observation_layout": widths,
-            "joint_names": list("abcde"),
-        }
-        export_onnx(cls.model, cls.file, contract)
+        cls.export(cls.model, cls.file, {"cloud": 5 * 10 * 3})
+
+    @classmethod
+    def export(cls, model: PointNetLstmModel, file: Path, perception: dict[str, int], **options) -> None:
+        """Export a model for :func:`observations`."""
+        task = TaskConfig(observation=ObservationConfig(cloud_points=10, **options))
+        layout = {"policy": {"all": 7}, "proprio": {"all": 9}, "perception": perception}
+        contract = policy_contract(robots.load("openarm"), task, ())
+        export_onnx(model, file, contract | {"observation_layout": layout, "joint_names": list("abcde")})
 
     def test_exported_equals_eager_over_50_steps(self):
         policy = OnnxPolicy(self.file)
@@ -394,14 +391,8 @@ class ExportTest(unittest.TestCase):
         obs["perception"] = torch.randn(4, 1, 10, 9, generator=torch.Generator().manual_seed(1))
         gaussian = {"class_name": "GaussianDistribution", "std_type": "log"}
         model = PointNetLstmModel(obs, GROUPS, "actor", A, distribution_cfg=gaussian, **SMALL)
-        task = TaskConfig(observation=ObservationConfig(cloud="paired", cloud_points=10))
-        widths = {"policy": {"all": 7}, "proprio": {"all": 9}, "perception": {"paired_cloud": 10 * 9}}
-        contract = policy_contract(robots.load("openarm"), task, ()) | {
-            "observation_layout": widths,
-            "joint_names": list("abcde"),
-        }
         file = self.file.with_name("paired.onnx")
-        export_onnx(model, file, contract)
+        self.export(model, file, {"paired_cloud": 10 * 9}, cloud="paired")
         with torch.no_grad():
             torch.testing.assert_close(OnnxPolicy(file).act(obs), model(obs).clamp(-1, 1), atol=1e-5, rtol=0)
 
@@ -413,26 +404,11 @@ class ExportTest(unittest.TestCase):
         policy.begin(None)
         torch.testing.assert_close(policy.act(obs), fresh)
 
-    def test_a_foreign_or_damaged_file_is_refused(self):
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "broken.onnx"
-            file.write_bytes(self.file.read_bytes()[:200])
-            with self.assertRaisesRegex(PolicyError, "cannot be read"):
-                OnnxPolicy(file)
-            with self.assertRaisesRegex(PolicyError, "no policy file"):
-                OnnxPolicy(Path(folder) / "none.onnx")
-
 
 class ConfigTest(unittest.TestCase):
     def test_round_trip_through_json(self):
         config = TrainConfig(task=TaskConfig(observation=ObservationConfig(cloud_history=3)), iterations=7)
         self.assertEqual(from_dict(TrainConfig, json.loads(json.dumps(asdict(config)))), config)
-
-    def test_an_unknown_entry_is_an_error(self):
-        data = asdict(TrainConfig())
-        data["task"]["reward"]["bonus"] = 1.0
-        with self.assertRaisesRegex(FileFormatError, r"task\.reward.*unknown: bonus"):
-            from_dict(TrainConfig, data)
 
     def test_table_viii(self):
         cfg = rsl_rl_config(TrainConfig(), 4096)
@@ -466,17 +442,15 @@ class ConfigTest(unittest.TestCase):
             with self.subTest(problem), self.assertRaisesRegex(ValueError, problem):
                 make()
 
-    def test_a_file_with_such_a_number_names_it(self):
+    def test_removed_options_are_ignored_where_they_were_off(self):
+        """Files of earlier versions hold them."""
         data = asdict(TrainConfig())
-        data["task"]["reset"]["demo_probability"] = 50.0
-        with self.assertRaisesRegex(FileFormatError, r"task\.reset.*demo_probability is 50.0"):
+        data["model"] |= {"initial_hand_std": None, "synergy_std": None}
+        data["ppo"]["critic_learning_rate"] = None
+        self.assertEqual(from_dict(TrainConfig, data), TrainConfig())
+        data["model"]["synergy_std"] = 0.4
+        with self.assertRaisesRegex(FileFormatError, r"model\.synergy_std is 0\.4\. This option was removed"):
             from_dict(TrainConfig, data)
-
-    def test_a_folder_without_a_run(self):
-        from xreset.learning.run import read_run
-
-        with tempfile.TemporaryDirectory() as folder, self.assertRaisesRegex(RunError, "not a run folder"):
-            read_run(folder)
 
 
 if __name__ == "__main__":

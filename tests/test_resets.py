@@ -7,6 +7,7 @@ from unittest import mock
 import numpy as np
 import torch
 
+from tests.toy_bank import SOUP, SPAM, toy_retargeted
 from xreset import robots
 from xreset.errors import DemoError
 from xreset.objects.catalogue import load_objects
@@ -23,7 +24,6 @@ try:
 except ImportError as error:
     raise unittest.SkipTest(str(error)) from error
 
-SOUP, SPAM = "005_tomato_soup_can", "010_potted_meat_can"
 UPRIGHT = np.array([1.0, 0, 0, 0])
 
 
@@ -77,53 +77,20 @@ class FilterTest(unittest.TestCase):
         spam_height = float(rest_height(self.objects[1], UPRIGHT))
         heights = [self.height, self.height - 0.02, self.height, spam_height, spam_height, spam_height]
         pos = np.array([[0.45 + 0.02 * i, 0.3, z] for i, z in enumerate(heights)])
-        quat = np.tile(UPRIGHT, (6, 1))
         reason = np.array([0, 0, 0, 1, 0, 0])
-        values = {
-            "robot": self.robot.name,
-            "robot_fingerprint": self.robot.fingerprint,
-            "sequence_name": np.array(["a", "b"]),
-            "object_name": np.array([SOUP, SPAM]),
-            "hand_side": np.array(["right", "right"]),
-            "frame_offsets": np.array([0, 3, 6]),
-            "fps": 30.0,
-            "joint_names": self.robot.joint_names,
-            "joint_pos": np.tile(self.robot.home, (6, 1)),
-            "palm_pos": np.zeros((6, 3)),
-            "palm_quat_wxyz": quat,
-            "fingertip_names": self.robot.fingertip_names,
-            "fingertip_pos": np.zeros((6, 2, 3)),
-            "object_pos": pos,
-            "object_quat_wxyz": quat,
-            "goal_pos": pos[[2, 5]],
-            "goal_quat_wxyz": quat[[2, 5]],
-            "annotated": np.ones(6, dtype=bool),
-            "valid": reason == 0,
-            "reason": reason,
-            "reason_names": ("valid", "not annotated"),
-            "contact": np.zeros(6, dtype=bool),
-            "first_contact": np.array([2, -1]),
-            "hand_error": np.zeros(6),
-            "wrist_error": np.zeros(6),
-        }
-        return Retargeted(**(values | changes))
+        values = {"object_pos": pos, "valid": reason == 0, "reason": reason, "first_contact": np.array([2, -1])}
+        return toy_retargeted(self.robot, [SOUP, SPAM], [0, 3, 6], **(values | changes))
+
+    def bank(self, engine="mujoco", **options):
+        return make_bank(self.retargeted(), self.robot, self.objects, engine, **options)
 
     def test_the_bank_holds_what_was_accepted_and_why_the_rest_was_not(self):
         calls = []
-        bank = make_bank(
-            self.retargeted(),
-            self.robot,
-            self.objects,
-            ["mujoco"],
-            num_envs=2,
-            progress=lambda done, total: calls.append((done, total)),
-        )
-        self.assertEqual(
-            list(zip(bank.sequence_index.tolist(), bank.frame_index.tolist())), [(0, 0), (0, 2), (1, 1), (1, 2)]
-        )
-        self.assertEqual(
-            bank.post_contact.tolist(), [False, True, False, False]
-        )  # -1: the hand never touches the object
+        bank = self.bank(num_envs=2, progress=lambda done, total: calls.append((done, total)))
+        self.assertEqual(bank.sequence_index.tolist(), [0, 0, 1, 1])
+        self.assertEqual(bank.frame_index.tolist(), [0, 2, 1, 2])
+        # first_contact is -1 where the hand never touches the object
+        self.assertEqual(bank.post_contact.tolist(), [False, True, False, False])
         self.assertEqual(bank.object_name.tolist(), [SOUP, SOUP, SPAM, SPAM])
         self.assertEqual([REASONS[r] for r in bank.rejected_reason], ["object linear velocity"])
         self.assertEqual((bank.rejected_sequence_index.tolist(), bank.rejected_frame_index.tolist()), ([0], [1]))
@@ -134,12 +101,12 @@ class FilterTest(unittest.TestCase):
         self.assertEqual(calls[-1], (5, 5))
 
     def test_number_of_worlds_changes_nothing(self):
-        few, many = (make_bank(self.retargeted(), self.robot, self.objects, ["mujoco"], num_envs=n) for n in (1, 8))
+        few, many = (self.bank(num_envs=n) for n in (1, 8))
         np.testing.assert_array_equal(few.frame_index, many.frame_index)
         np.testing.assert_array_equal(few.rejected_reason, many.rejected_reason)
 
     def test_accounts_by_object_and_phase(self):
-        bank = make_bank(self.retargeted(), self.robot, self.objects, ["mujoco"], num_envs=4)
+        bank = self.bank(num_envs=4)
         found = [(a.object_name, a.phase, a.kept, a.total, a.lost) for a in bank.accounts()]
         self.assertEqual(
             found,
@@ -152,7 +119,7 @@ class FilterTest(unittest.TestCase):
         )
 
     def test_a_gpu_is_for_engines_that_can_use_one(self):
-        bank = make_bank(self.retargeted(), self.robot, self.objects, ["mujoco"], num_envs=4, device="cuda:0")
+        bank = self.bank(num_envs=4, device="cuda:0")
         self.assertEqual(bank.num_states, 4)
 
     def test_several_engines_keep_what_all_accept(self):
@@ -174,7 +141,7 @@ class FilterTest(unittest.TestCase):
             mock.patch("xreset.resets.probe.make_backend", made),
             mock.patch("xreset.resets.probe.device_for", lambda name, device: device),
         ):
-            bank = make_bank(self.retargeted(), self.robot, self.objects, ["mujoco", "moves"], num_envs=2)
+            bank = self.bank(["mujoco", "moves"], num_envs=2)
         self.assertEqual(bank.backends, ("mujoco", "moves"))
         self.assertEqual(list(zip(bank.sequence_index.tolist(), bank.frame_index.tolist())), [(0, 0), (0, 2), (1, 2)])
         rejected = list(zip(bank.rejected_frame_index.tolist(), (REASONS[r] for r in bank.rejected_reason)))

@@ -1,4 +1,4 @@
-"""A small reset bank for tests: soup and spam, three demonstrations, six states; every number can be told from every other."""
+"""A small reset bank for tests, with soup and spam, three demonstrations and six states, all numbers distinct; and trajectories."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from xreset.resets.bank import ResetBank
+from xreset.retarget.file import Retargeted
 from xreset.spec import RobotSpec
 
 SOUP, SPAM = "005_tomato_soup_can", "010_potted_meat_can"
@@ -50,3 +51,43 @@ def toy_bank(robot: RobotSpec, **changes: Any) -> ResetBank:
         "reason_names": ("out of bounds", "object linear velocity"),
     }
     return ResetBank(**(fields | changes))
+
+
+def toy_retargeted(robot: RobotSpec, objects: list[str], offsets: list[int], **changes: Any) -> Retargeted:
+    """Trajectories of demonstrations with these objects; ``changes`` replace fields.
+
+    Every frame is valid. The robot is at home, and an object stays at the origin, upright.
+    """
+    frames = offsets[-1]
+    last = np.array(offsets[1:]) - 1
+    upright = np.tile([1.0, 0, 0, 0], (frames, 1))
+    object_pos = changes.get("object_pos", np.zeros((frames, 3)))
+    object_quat = changes.get("object_quat_wxyz", upright)
+    fields: dict[str, Any] = {
+        "robot": robot.name,
+        "robot_fingerprint": robot.fingerprint,
+        "sequence_name": np.array([f"demo{i}" for i in range(len(objects))]),
+        "object_name": np.array(objects),
+        "hand_side": np.array(["right"] * len(objects)),
+        "frame_offsets": np.array(offsets),
+        "fps": 30.0,
+        "joint_names": robot.joint_names,
+        "joint_pos": np.tile(robot.home, (frames, 1)),
+        "palm_pos": np.zeros((frames, 3)),
+        "palm_quat_wxyz": upright,
+        "fingertip_names": robot.fingertip_names,
+        "fingertip_pos": np.zeros((frames, len(robot.fingertips), 3)),
+        "object_pos": object_pos,
+        "object_quat_wxyz": object_quat,
+        "goal_pos": object_pos[last],
+        "goal_quat_wxyz": object_quat[last],
+        "annotated": np.ones(frames, dtype=bool),
+        "valid": np.ones(frames, dtype=bool),
+        "reason": np.zeros(frames, dtype=np.int64),
+        "reason_names": ("valid", "other"),
+        "contact": np.zeros(frames, dtype=bool),
+        "first_contact": np.full(len(objects), -1),
+        "hand_error": np.zeros(frames),
+        "wrist_error": np.zeros(frames),
+    }
+    return Retargeted(**(fields | changes))

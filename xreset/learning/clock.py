@@ -21,7 +21,7 @@ SHARES = (0.01, 0.1, 0.5)
 
 @dataclass(frozen=True, kw_only=True)
 class Passing:
-    """The first iteration in which at least ``share`` of the steps of worlds that began at home were at the goal."""
+    """The first iteration in which at least ``share`` of the steps of worlds that started at home were at the goal."""
 
     share: Share[float]
     iteration: NotNegative[int]

@@ -31,8 +31,8 @@ class ModelConfig(Checked):
     (:class:`xreset.learning.model.ReturnCritic`), as the paper's library can. It changes the meaning of
     ``clip_values``: returns of trained policies are between 0 and 20."""
     normalize_observations: bool = True
-    """Running normalisation of the flat observations (not of the clouds). Not in the paper; its library's usual
-    setting."""
+    """Whether flat observations (not clouds) are normalized by running means. Not in the paper; usual in its
+    library."""
 
     @property
     def layers(self) -> dict[str, Any]:
@@ -43,7 +43,7 @@ class ModelConfig(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class PpoConfig(Checked):
-    """Proximal policy optimisation."""
+    """Proximal policy optimization."""
 
     REMOVED: ClassVar[dict[str, Any]] = {"critic_learning_rate": None}
 

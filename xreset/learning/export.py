@@ -108,8 +108,8 @@ def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
 def ensure_policy(out: Path) -> Path:
     """Return the run's ``policy.onnx``, exported if it is missing or old.
 
-    It is the policy of the checkpoint that ``xreset select`` chose, if there is none newer, else of the newest one. A run
-    that was copied without its checkpoints keeps its policy.
+    It is the policy of the checkpoint that ``xreset select`` chose, if there is none newer, else of the newest one. A
+    run that was copied without its checkpoints keeps its policy.
     """
     policy = out / "policy.onnx"
     if policy.exists() and not checkpoints(out):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +21,6 @@ WINDOW = 200
 SCHEMA = "xreset-faults/1"
 
 
-@dataclass(frozen=True, kw_only=True)
-class FaultCounts:
-    """Number of worlds that were ended in some steps."""
-
-    nonfinite: int
-    """Ended because a position or velocity was not finite."""
-    overflow: int
-    """Ended because contacts or constraints were dropped: a buffer was full."""
-
-
 class FaultBudget:
     """The faults of the last :data:`WINDOW` iterations."""
 
@@ -38,13 +28,18 @@ class FaultBudget:
         """Start with none; ``steps_per_iteration`` is the number of world-steps of an iteration, over all processes."""
         self.allowed = MAX_SHARE * WINDOW * steps_per_iteration
         self._window_steps = WINDOW * steps_per_iteration
-        self._recent: deque[FaultCounts] = deque(maxlen=WINDOW)
+        self._recent: deque[tuple[int, int]] = deque(maxlen=WINDOW)
 
-    def add(self, counts: FaultCounts) -> str | None:
-        """Add an iteration's faults; return a message if there are too many."""
-        self._recent.append(counts)
-        nonfinite = sum(counts.nonfinite for counts in self._recent)
-        overflow = sum(counts.overflow for counts in self._recent)
+    def add(self, nonfinite: int, overflow: int) -> str | None:
+        """Add an iteration's faults; return a message if there are too many.
+
+        Args:
+            nonfinite: number of worlds that were ended because a position or velocity was not finite.
+            overflow: number of worlds that were ended because contacts or constraints were dropped.
+        """
+        self._recent.append((nonfinite, overflow))
+        nonfinite = sum(counts[0] for counts in self._recent)
+        overflow = sum(counts[1] for counts in self._recent)
         if nonfinite + overflow <= self.allowed:
             return None
         return (

@@ -119,7 +119,7 @@ class Trunk(nn.Module):
         activation: str,
         normalizer: nn.Module,
     ) -> None:
-        """Build normaliser, PointNet, LSTM and layer norm for clouds of shape (H, P, K)."""
+        """Build normalizer, PointNet, LSTM and layer norm for clouds of shape (H, P, K)."""
         super().__init__()
         history, _, point_width = cloud_shape
         self.normalizer = normalizer

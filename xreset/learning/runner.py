@@ -20,7 +20,7 @@ from xreset.errors import RunError
 from xreset.learning.checkpoint import must_fit, read_checkpoint, read_state, write_state
 from xreset.learning.config import TrainConfig, rsl_rl_config
 from xreset.learning.distributed import Processes
-from xreset.learning.faults import FaultBudget, FaultCounts, dump_faults, too_many_faults
+from xreset.learning.faults import FaultBudget, dump_faults, too_many_faults
 from xreset.learning.log import TrainingLog
 from xreset.learning.schedules import value_at
 
@@ -245,7 +245,7 @@ class TrainingRunner(OnPolicyRunner):
         total = torch.stack((env.nonfinite_count, env.overflow_count))
         nonfinite, overflow = self.processes.sum(total - self._faults_before).tolist()
         self._faults_before = total
-        if problem := budget.add(FaultCounts(nonfinite=nonfinite, overflow=overflow)):
+        if problem := budget.add(nonfinite, overflow):
             path = self.folder / (f"faults-{self.processes.rank}.npz" if self.is_distributed else "faults.npz")
             dump_faults(path, env, self.train_config, iteration=self.iteration)
             raise too_many_faults(problem, path, self.folder)

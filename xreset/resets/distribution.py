@@ -94,7 +94,8 @@ class _Grouped:
 
 
 class ResetDistribution:
-    """Draws resets for worlds of given objects from a bank. All tensors live on one device; a draw copies nothing to it.
+    """Draws resets for worlds of given objects from a bank. All tensors live on one device; a draw copies nothing to
+    it.
 
     Attributes:
         demo_probability: [] share of resets from the bank; a training's schedule writes into it.

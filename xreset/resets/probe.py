@@ -14,7 +14,7 @@ from xreset.schedule import schedule
 from xreset.spec import SceneSpec
 
 Judge = Callable[[Backend, State], Tensor]
-"""Verdicts [N] or [N, K] on the worlds of an engine, which began with the given states."""
+"""Function that returns verdicts [N] or [N, K] on the worlds of an engine, given the states with which they started."""
 
 
 def probe(

@@ -42,7 +42,7 @@ STAGES = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tried:
+class StateOutcome:
     """Outcome of one demonstrated state."""
 
     state: int
@@ -72,7 +72,7 @@ def stage_of(tip_distance: np.ndarray, lift: np.ndarray) -> np.ndarray:
 
 def try_policy(
     policy: Policy, engine: Engine, trial: Trial, rows: np.ndarray, progress: Progress = lambda done, total: None
-) -> list[Tried]:
+) -> list[StateOutcome]:
     """Let a policy continue from states of a bank, at rest and at full gravity, for one episode each.
 
     Args:
@@ -84,7 +84,7 @@ def try_policy(
     """
     bank = trial.bank
     objects = [trial.names.index(name) for name in bank.object_name[rows]]
-    found: dict[int, Tried] = {}
+    found: dict[int, StateOutcome] = {}
     with closing(play_rounds(engine, trial, objects, lambda items: bank_starts(bank, rows[items]))) as rounds:
         for r in rounds:
             chosen = rows[r.items]
@@ -93,7 +93,7 @@ def try_policy(
             result, _ = r.play(policy, lambda step, reading: None, progress)
             for world in r.fresh:
                 row = int(chosen[world])
-                found[row] = Tried(
+                found[row] = StateOutcome(
                     state=row,
                     sequence_name=str(bank.sequence_name[bank.sequence_index[row]]),
                     frame=int(bank.frame_index[row]),
@@ -105,7 +105,7 @@ def try_policy(
     return [found[row] for row in sorted(found)]
 
 
-def by_stage(tried: list[Tried]) -> list[dict[str, Any]]:
+def by_stage(tried: list[StateOutcome]) -> list[dict[str, Any]]:
     """Return an entry for each stage with states: their number, and the shares that reached the goal and stayed."""
     out = []
     for stage in STAGES:

@@ -12,7 +12,7 @@ from tests.command import xreset
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.errors import DemoError
-from xreset.eval.frontier import STAGES, Tried, by_stage, frontier, stage_of
+from xreset.eval.frontier import STAGES, StateOutcome, by_stage, frontier, stage_of
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.trial import engine, load_trial
 from xreset.objects.catalogue import load_objects
@@ -34,8 +34,10 @@ class StageTest(unittest.TestCase):
         self.assertEqual(stage_of(distance, lift).tolist(), [0, 1, 1, 2, 2, 3, 3, 4, 5])
 
     def test_shares_of_each_stage_that_occurs(self):
-        def tried(stage: str, reached: bool, stayed: bool) -> Tried:
-            return Tried(state=0, sequence_name="a", frame=0, object=SOUP, stage=stage, reached=reached, stayed=stayed)
+        def tried(stage: str, reached: bool, stayed: bool) -> StateOutcome:
+            return StateOutcome(
+                state=0, sequence_name="a", frame=0, object=SOUP, stage=stage, reached=reached, stayed=stayed
+            )
 
         found = by_stage([tried(STAGES[4], True, False), tried(STAGES[0], False, False), tried(STAGES[4], True, True)])
         self.assertEqual(

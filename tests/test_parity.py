@@ -27,7 +27,7 @@ from xreset.eval.engines.agreement import (
     press_metrics,
 )
 from xreset.eval.engines.episodes import (
-    Motion,
+    GraspMotion,
     carried_palm,
     closing_episode,
     lifting_episode,
@@ -49,7 +49,7 @@ from xreset.retarget.file import Retargeted, write_retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
 DT = 1 / 60
-BRISK = Motion(squeeze=16.0, settle=0.1, close=0.3, hold=0.2, lift=0.5, shake=0.4)
+BRISK = GraspMotion(squeeze=16.0, settle=0.1, close=0.3, hold=0.2, lift=0.5, shake=0.4)
 CONFIG = ParityConfig(motion=BRISK, path_time=0.3)
 OFFSETS = ((0.0, 0.0), (0.02, 0.0), (0.0, 0.01), (-0.015, -0.005), (0.03, 0.0))
 """The open hand starts with fingers up to 17 mm inside the can, which every engine resolves in its own way: for MuJoCo against itself."""
@@ -161,7 +161,7 @@ class Episodes(unittest.TestCase):
         self.assertTrue(bool(((q >= self.kinematics.lower) & (q <= self.kinematics.upper)).all()))
 
     def test_the_squeeze_is_a_force(self):
-        motion = Motion(squeeze=4.0)
+        motion = GraspMotion(squeeze=4.0)
         held = moved_fingertips(self.kinematics, self.home, motion.reach)
         target = squeezed(self.kinematics, self.home, motion)
         kp = torch.tensor([joint.drive.kp for joint in self.robot.joints], dtype=torch.float64)

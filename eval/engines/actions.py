@@ -18,7 +18,7 @@ import torch
 
 from xreset.description import load_robot
 from xreset.errors import FileFormatError
-from xreset.eval.engines.episodes import Motion, closing_episode
+from xreset.eval.engines.episodes import GraspMotion, closing_episode
 from xreset.eval.engines.grasps import Grasps
 from xreset.eval.rollout import Progress, Trace, episode_starts, play
 from xreset.eval.trial import Engine, Trial, nominal_scene
@@ -90,7 +90,7 @@ class Actions:
 
 def grasp_and_lift(robot: RobotSpec, thing: ObjectSpec, grasps: Grasps, number: int = 0) -> Actions:
     """Return the open-loop try of a grasp: the hand, open around the object at rest, closes, lifts and shakes."""
-    motion = Motion()
+    motion = GraspMotion()
     scene = SceneSpec(robot=robot, objects=(thing,))
     dt = scene.control_dt
     one = slice(number, number + 1)

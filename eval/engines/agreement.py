@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from xreset.eval.engines.grasps import Frames, Grasps, find_grasps
-from xreset.eval.engines.recording import Episode, Recording, record
+from xreset.eval.engines.recording import OpenLoopEpisode, Recording, record
 from xreset.eval.engines.trials import CommonStates, ParityConfig, common_states, try_closings, try_holds
 from xreset.eval.trial import Engine, engine
 from xreset.objects.sampling import surface_points
@@ -234,7 +234,7 @@ def compare(
     if len(stepwise) > 1 and bool(firm.any()):
         held = common[firm.nonzero()[: config.path_grasps, 0]]
         steps = round(config.path_time / scene.control_dt)
-        still = Episode(start=held.start, targets=held.start.joint_target.expand(steps, -1, -1))
+        still = OpenLoopEpisode(start=held.start, targets=held.start.joint_target.expand(steps, -1, -1))
         for done, e in enumerate(stepwise, 2 * len(whole)):
             progress(f"{e.name}: following {len(held.label)} objects", done, total)
             tries[e.name].path = record(e, scene, held.object_index, still)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.eval.engines.recording import Episode
+from xreset.eval.engines.recording import OpenLoopEpisode
 from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
 from xreset.spec import RobotSpec
@@ -29,7 +29,7 @@ _TURN_LENGTH = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motion:
+class GraspMotion:
     """How a grasp is tried. Durations in seconds."""
 
     opening: float = 0.025
@@ -66,8 +66,8 @@ def closing_episode(
     object_pos: Tensor,
     object_quat: Tensor,
     dt: float,
-    motion: Motion | None = None,
-) -> Episode:
+    motion: GraspMotion | None = None,
+) -> OpenLoopEpisode:
     """Return a whole try: the open hand around an object at rest closes, lifts and shakes.
 
     Args:
@@ -78,7 +78,7 @@ def closing_episode(
         dt: control step [s].
         motion: how the grasp is tried.
     """
-    motion = motion or Motion()
+    motion = motion or GraspMotion()
     kinematics = Kinematics(robot)
     held = joint_pos.double()
     opened = moved_fingertips(kinematics, held, -motion.opening)
@@ -90,22 +90,24 @@ def closing_episode(
     )
     closing = opened + torch.cat(parts)[:, None, None] * (closed - opened)
     targets = torch.cat((closing, _carried(kinematics, closed, motion, dt)))
-    return Episode(start=State.at_rest(opened, object_pos, object_quat), targets=targets.float())
+    return OpenLoopEpisode(start=State.at_rest(opened, object_pos, object_quat), targets=targets.float())
 
 
-def lifting_episode(robot: RobotSpec, start: State, dt: float, motion: Motion | None = None) -> Episode:
+def lifting_episode(robot: RobotSpec, start: State, dt: float, motion: GraspMotion | None = None) -> OpenLoopEpisode:
     """Lift and shake what the hand holds in states [G, ...], with the targets of each state; dt: control step [s]."""
-    motion = motion or Motion()
+    motion = motion or GraspMotion()
     targets = start.joint_target.double().cpu()
     still = targets.expand(round(motion.hold / dt), *targets.shape)
-    return Episode(start=start, targets=torch.cat((still, _carried(Kinematics(robot), targets, motion, dt))).float())
+    return OpenLoopEpisode(
+        start=start, targets=torch.cat((still, _carried(Kinematics(robot), targets, motion, dt))).float()
+    )
 
 
 def squeezing_state(
-    robot: RobotSpec, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, motion: Motion | None = None
+    robot: RobotSpec, joint_pos: Tensor, object_pos: Tensor, object_quat: Tensor, motion: GraspMotion | None = None
 ) -> State:
     """Return states [G] at rest in which the drives already squeeze; arguments as for :func:`closing_episode`."""
-    closed = squeezed(Kinematics(robot), joint_pos.double(), motion or Motion())
+    closed = squeezed(Kinematics(robot), joint_pos.double(), motion or GraspMotion())
     return State.at_rest(joint_pos, object_pos, object_quat, closed)
 
 
@@ -129,7 +131,7 @@ def moved_fingertips(kinematics: Kinematics, joint_pos: Tensor, distance: float)
     return q
 
 
-def squeezed(kinematics: Kinematics, joint_pos: Tensor, motion: Motion) -> Tensor:
+def squeezed(kinematics: Kinematics, joint_pos: Tensor, motion: GraspMotion) -> Tensor:
     """Return joint targets [G, J] with which the hand reaches and squeezes.
 
     Held where the reach ends, each joint's drive gives the torque J^T f of the fingertip forces f, because its target
@@ -200,7 +202,7 @@ def _least_squares(jacobian: Tensor, step: Tensor, damping: float) -> Tensor:
     return (jacobian.mT @ torch.linalg.solve(square, step[..., None]))[..., 0]
 
 
-def _carried(kinematics: Kinematics, closed: Tensor, motion: Motion, dt: float) -> Tensor:
+def _carried(kinematics: Kinematics, closed: Tensor, motion: GraspMotion, dt: float) -> Tensor:
     """[T, G, J] targets that lift, hold and shake the object in the closed hand [G, J]."""
     t = torch.linspace(0, 1, round(motion.lift / dt) + 1)[1:]
     up = torch.zeros(len(t) + round(motion.hold / dt), 3)

@@ -18,7 +18,7 @@ from xreset.spec import SceneSpec
 
 
 @dataclass(frozen=True, kw_only=True)
-class Episode:
+class OpenLoopEpisode:
     """The starts of G worlds, and the targets of their drives."""
 
     start: State
@@ -69,7 +69,7 @@ class Recording:
         return quat_rotate_inverse(self.palm_quat[step][:, None], world - self.palm_pos[step][:, None])
 
 
-def play(backend: Backend, episode: Episode) -> Recording:
+def play(backend: Backend, episode: OpenLoopEpisode) -> Recording:
     """Set each world to its start and give the drives the episode's targets."""
     backend.set_state(episode.start.to(backend.device))
     frames: dict[str, list[Tensor]] = defaultdict(list)
@@ -99,7 +99,7 @@ def play(backend: Backend, episode: Episode) -> Recording:
     )
 
 
-def record(engine: Engine, scene: SceneSpec, object_index: Tensor, episode: Episode) -> Recording:
+def record(engine: Engine, scene: SceneSpec, object_index: Tensor, episode: OpenLoopEpisode) -> Recording:
     """Play an episode in new worlds of an engine; ``object_index``: [G] index of the object in each world."""
     with engine.make(scene, len(object_index), object_index) as backend:
         return play(backend, episode)

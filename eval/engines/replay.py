@@ -14,7 +14,7 @@ import torch
 from xreset.errors import XResetError
 from xreset.eval.engines.actions import Actions
 from xreset.eval.engines.divergence import Differences, Parting, Thresholds, differences, first_of, partings, worst
-from xreset.eval.engines.recording import Episode, Recording, record
+from xreset.eval.engines.recording import OpenLoopEpisode, Recording, record
 from xreset.eval.trial import Engine
 from xreset.files import write_json
 from xreset.physics import State
@@ -157,7 +157,7 @@ def trace(
         progress(engine.name)
         worlds = len(start.joint_pos)
         targets = actions.joint_target[:, None].expand(-1, worlds, -1).contiguous()
-        episode = Episode(start=start, targets=targets)
+        episode = OpenLoopEpisode(start=start, targets=targets)
         return record(engine, actions.scene, torch.zeros(worlds, dtype=torch.long), episode)
 
     def compared(engine: Engine, recording: Recording) -> EngineTrace:

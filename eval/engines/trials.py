@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from xreset.eval.engines.episodes import Motion, closing_episode, lifting_episode, squeezing_state
+from xreset.eval.engines.episodes import GraspMotion, closing_episode, lifting_episode, squeezing_state
 from xreset.eval.engines.grasps import Grasps
-from xreset.eval.engines.recording import Episode, Recording, play
+from xreset.eval.engines.recording import OpenLoopEpisode, Recording, play
 from xreset.eval.trial import Engine
 from xreset.physics import State
 from xreset.spec import RobotSpec, SceneSpec
@@ -23,7 +23,7 @@ from xreset.spec import RobotSpec, SceneSpec
 class ParityConfig:
     """What is tried."""
 
-    motion: Motion = field(default_factory=Motion)
+    motion: GraspMotion = field(default_factory=GraspMotion)
     frictions: tuple[float, ...] = (0.5, 0.8)
     """Pair frictions of hand and object in the holds."""
     in_air: float = 1 / 3
@@ -64,7 +64,7 @@ def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps, config: Parit
     """
     dt = scene.control_dt
     episode = closing_episode(scene.robot, grasps.joint_pos, grasps.object_pos, grasps.object_quat, dt, config.motion)
-    closing = Episode(start=episode.start, targets=episode.targets[: config.motion.closing_steps(dt)])
+    closing = OpenLoopEpisode(start=episode.start, targets=episode.targets[: config.motion.closing_steps(dt)])
     with tested.make(scene, len(grasps), grasps.object_index) as backend:
         whole = play(backend, episode)
         mass = torch.tensor([scene.objects[i].mass for i in grasps.object_index.tolist()], device=backend.device)

@@ -151,6 +151,22 @@ class Toy(WithFolder):
         self.assertLessEqual(np.abs(arm).max(), 0.123456)
         self.assertEqual(np.abs(arm).max(), 0.1234)
 
+    def test_names_of_the_shadow_hand(self):
+        shadow = HAND
+        for old, new in (("f1", "rh_LF"), ("f2", "rh_MF"), ("f3", "rh_TH"), ("f4", "rh_FF")):
+            shadow = shadow.replace(f"{old}_a", f"{new}proximal").replace(f"{old}_b", f"{new}middle")
+        spec = load_robot(import_robot(self.arm, self.file("sh.urdf", shadow), self.folder / "mine").folder)
+        links = {tip.name: tip.contact_links for tip in spec.fingertips}
+        self.assertEqual(
+            links,
+            {
+                "thumb": ("rh_THmiddle",),
+                "index": ("rh_FFmiddle",),
+                "middle": ("rh_MFmiddle",),
+                "little": ("rh_LFmiddle",),
+            },
+        )
+
     def test_centres_of_mass_that_lie_in_the_joints_are_doubted(self):
         at_joint = HAND.replace(
             '<mass value="0.05"/><origin xyz="0.02 0 0"/>', '<mass value="0.05"/><origin xyz="0 0 0"/>'

@@ -3,6 +3,7 @@ which human keypoint."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,8 +18,17 @@ from xreset.robot_tools.draft import below, draft_spec, link_places
 from xreset.spec import FingertipSpec, KeypointSpec, MimicSpec
 
 _FINGERS = ("index", "middle", "ring", "little")
-_WORDS = {"index": ("index", "fore"), "middle": ("middle",), "ring": ("ring",), "little": ("little", "pinky")}
+_WORDS = {
+    "thumb": ("thumb",),
+    "index": ("index", "fore"),
+    "middle": ("middle",),
+    "ring": ("ring",),
+    "little": ("little", "pinky"),
+}
 """Words in the names of a finger's links and joints."""
+_CODES = {"th": "thumb", "ff": "index", "mf": "middle", "rf": "ring", "lf": "little"}
+"""Fingers in names such as ``rh_FFdistal`` and ``THJ5``, as the Shadow hand has them."""
+_CODE = re.compile(r"(?<![a-z])(th|ff|mf|rf|lf)(?=j\d|base|hub|knuckle|metacarpal|proximal|middle|distal|tip)")
 _HUMAN = (0.0, 0.45, 0.73)
 """Positions of a human finger's joints between its first one and its tip: knuckle, middle joint, last joint (rounded
 averages)."""
@@ -61,9 +71,9 @@ def find_fingers(
     at = link_places(draft_spec(tree, mimics, hand_root, folder), {})
     bases = np.array([at[chain.links[0]][:3, 3] for chain in chains])
     ends = np.array([_end(tree, chain, at) for chain in chains])
-    words = [_words(tree, chain) for chain in chains]
+    stated = [_stated_finger(tree, chain) for chain in chains]
     if thumb is None:
-        marked = [i for i, text in enumerate(words) if "thumb" in text]
+        marked = [i for i, name in enumerate(stated) if name == "thumb"]
     else:
         marked = [i for i, chain in enumerate(chains) if thumb in (*chain.links, *chain.joints, *chain.rest)]
         if len(marked) != 1:
@@ -78,8 +88,8 @@ def find_fingers(
             "another)"
         )
     others = [i for i in range(len(chains)) if i != first]
-    named = {i: _finger_in(words[i]) for i in others}
-    if "" in named.values() or len(set(named.values())) < len(others):
+    named = {i: stated[i] for i in others}
+    if not set(named.values()) <= set(_FINGERS) or len(set(named.values())) < len(others):
         if len(others) > len(_FINGERS):
             raise RobotError(
                 f"the hand has {len(others)} fingers beside the thumb; xreset knows {', '.join(_FINGERS)}."
@@ -116,13 +126,12 @@ def _chains(tree: RobotTree, hand_root: str) -> list[Finger]:
     return chains
 
 
-def _words(tree: RobotTree, chain: Finger) -> str:
-    """All names of a chain."""
+def _stated_finger(tree: RobotTree, chain: Finger) -> str:
+    """Return the finger that the names of a chain state, or an empty text."""
     fixed_joints = [joint.name for joint in tree.joints if joint.child in chain.rest]
-    return " ".join((*chain.links, *chain.joints, *chain.rest, *fixed_joints)).lower()
-
-
-def _finger_in(text: str) -> str:
+    text = " ".join((*chain.links, *chain.joints, *chain.rest, *fixed_joints)).lower()
+    if code := _CODE.search(text):
+        return _CODES[code[1]]
     for finger, words in _WORDS.items():
         if any(word in text for word in words):
             return finger

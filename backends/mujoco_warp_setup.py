@@ -94,7 +94,7 @@ def existing_device(name: str) -> str:
 
 
 def contact_room(pieces: int) -> tuple[int, int, int]:
-    """Return contacts, convex contacts and rows of constraints that a world of an object of so many pieces needs.
+    """Return contacts, convex contacts and rows of constraints that a world needs for an object of n pieces.
 
     One piece never passed 89 rows under a trained policy. Scissors of 27 pieces reached 278: with the room for one
     piece, 0.17 % of a trained policy's world-steps overflowed (a power drill: 0.06 %), and 52,000 of 70 million in

@@ -97,7 +97,7 @@ class EveryBackend(unittest.TestCase):
 
 
 class AnyProcessor(unittest.TestCase):
-    """OpenBLAS chooses its matrix kernels by the processor, and each rounds in its own way: verdicts must not differ."""
+    """OpenBLAS chooses its matrix kernels by the processor, and each rounds differently: verdicts must not differ."""
 
     def test_set_as_built_with_the_kernels_of_several_processors(self):
         built = np.show_config(mode="dicts")["Build Dependencies"]  # pyright: ignore[reportIndexIssue]

@@ -1,4 +1,4 @@
-"""Numbers that are not finite in a world of every engine: that world reports them, and no other notices, bit for bit."""
+"""Numbers that are not finite in a world of every engine: that world reports them, and no other changes by a bit."""
 
 from __future__ import annotations
 

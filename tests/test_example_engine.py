@@ -87,7 +87,8 @@ class PluginTest(unittest.TestCase):
 
     def test_a_plugin_that_says_what_to_install_is_quoted(self):
         self.plugin(
-            "from xreset.errors import BackendUnavailableError\nraise BackendUnavailableError('pip install their-engine')\n"
+            "from xreset.errors import BackendUnavailableError\n"
+            "raise BackendUnavailableError('pip install their-engine')\n"
         )
         self.assert_unavailable("^pip install their-engine$")
 

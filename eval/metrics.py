@@ -38,12 +38,12 @@ class MetricsConfig:
 
 
 class EpisodeMetrics:
-    """Accumulates one episode in N worlds; a world that has ended is no longer looked at."""
+    """Metrics of one episode in N worlds, accumulated step by step; a world that has ended no longer changes them."""
 
     def __init__(
         self, start: Reading, goal_pos: Tensor, goal_quat: Tensor, keypoints: Tensor, config: MetricsConfig
     ) -> None:
-        """Begin.
+        """Start with the first reading.
 
         Args:
             start: reading before the first step.
@@ -51,19 +51,26 @@ class EpisodeMetrics:
             goal_quat: [N, 4]
             keypoints: [N, 4, 3] in the object frame.
         """
-        self._config, self._keypoints = config, keypoints
-        self._goal_pos, self._goal_quat = goal_pos.clone(), goal_quat.clone()
+        self._config = config
+        self._keypoints = keypoints
+        self._goal_pos = goal_pos.clone()
+        self._goal_quat = goal_quat.clone()
         self._start_height = start.state.object_pos[:, 2].clone()
         self._start_distance = self._distance(start)
         self._best = self._start_distance.clone()
         no = torch.zeros_like(self._best, dtype=torch.bool)
-        self.approach, self.grasp, self.reorient, self.reorient_once = no.clone(), no.clone(), no.clone(), no.clone()
-        self.nonfinite, self.overflow, self.out_of_bounds = no.clone(), no.clone(), no.clone()
+        self.approach = no.clone()
+        self.grasp = no.clone()
+        self.reorient = no.clone()
+        self.reorient_once = no.clone()
+        self.nonfinite = no.clone()
+        self.overflow = no.clone()
+        self.out_of_bounds = no.clone()
         self._ended = no.clone()
         self._look(start)
 
     def update(self, reading: Reading, out_of_bounds: Tensor) -> None:
-        """Take in the reading after a step; out_of_bounds [N] bool ends a world, as does a number that is not finite."""
+        """Add the reading after a step; out_of_bounds [N] bool ends a world, and so does a number that is not finite."""
         self.nonfinite |= reading.health.nonfinite & ~self._ended
         self.overflow |= reading.health.overflow & ~self._ended
         self.out_of_bounds |= out_of_bounds & ~self._ended & ~self.nonfinite
@@ -82,13 +89,15 @@ class EpisodeMetrics:
         return torch.tensor(STAGE_SCORES, device=stage.device)[stage]
 
     def _look(self, reading: Reading) -> None:
-        c, state, live = self._config, reading.state, ~self._ended
+        c = self._config
+        state = reading.state
+        live = ~self._ended
         self.approach |= live & (reading.tip_distance.amin(dim=-1) <= c.approach_distance)
         lifted = state.object_pos[:, 2] - self._start_height >= c.lift
         self.grasp |= live & lifted & contact_gate(reading.contacts.tip_force, c.contact_force)
         near = (state.object_pos - self._goal_pos).norm(dim=-1) <= c.goal_distance
         at_goal = live & near & (quat_angle(state.object_quat, self._goal_quat) <= c.goal_angle)
-        self.reorient = at_goal  # only the last look counts; a world that has ended early is not at its goal
+        self.reorient = at_goal  # only the last reading counts; a world that ended early is not at its goal
         self.reorient_once |= at_goal
         self._best = torch.where(live, torch.minimum(self._best, self._distance(reading)), self._best)
 

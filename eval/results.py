@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -46,6 +47,12 @@ _STACKED = {
 """Field of :class:`~xreset.eval.rollout.Trace` -> array in the file."""
 _LARGEST_STATE = 1e6
 """[m, rad] An object may fall for a while and a joint may run away, but not further."""
+
+
+if TYPE_CHECKING:
+    Table = Any  # pandas' own types do not tell the rows of a table from one of its columns
+else:
+    Table = pd.DataFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,12 +130,12 @@ class EvalResult(Checked):
 class Evaluation(list[EvalResult]):
     """Results of one policy, one for each engine. It prints as a table; :meth:`to_frame` gives every episode."""
 
-    def __init__(self, results: Iterable[EvalResult], episodes: Sequence[pd.DataFrame]) -> None:
+    def __init__(self, results: Iterable[EvalResult], episodes: Sequence[Table]) -> None:
         """Join the tables of the engines."""
         super().__init__(results)
         self._episodes = pd.concat(episodes, ignore_index=True) if episodes else pd.DataFrame()
 
-    def to_frame(self) -> pd.DataFrame:
+    def to_frame(self) -> Table:
         """Return the table of episodes; see :func:`episode_table`."""
         return self._episodes
 
@@ -139,14 +146,14 @@ class Evaluation(list[EvalResult]):
 # Episodes as a table ----------------------------------------------------------------------------------------------------------------------
 
 
-def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = "") -> pd.DataFrame:
+def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = "") -> Table:
     """Return a table with one row for each episode.
 
     Columns: run, policy, engine, robot and seed, then the fields of :class:`~xreset.eval.rollout.Episode`: sequence (index of the
     demonstration), sequence_name, object, repetition, approach, grasp, reorient, reorient_once, reorientation_progress, task_progress,
     out_of_bounds, nonfinite, overflow.
     """
-    table = pd.DataFrame([asdict(e) for e in episodes], columns=[f.name for f in fields(Episode)])
+    table: Table = pd.DataFrame([asdict(e) for e in episodes], columns=[f.name for f in fields(Episode)])
     about = {
         "run": run or result.policy,
         "policy": result.policy,
@@ -159,7 +166,7 @@ def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = ""
     return table
 
 
-def mean(episodes: pd.DataFrame, metric: str) -> float:
+def mean(episodes: Table, metric: str) -> float:
     """Return the mean of one metric over episodes, rounded to six digits."""
     return round(float(episodes[metric].to_numpy(float).mean()), 6)
 
@@ -177,7 +184,7 @@ def summarize(
     unseen: tuple[str, ...] = (),
 ) -> EvalResult:
     """Return the means, intervals and faults of the episodes of one engine."""
-    episodes = pd.DataFrame([asdict(e) for e in rollouts.episodes])
+    episodes: Table = pd.DataFrame([asdict(e) for e in rollouts.episodes])
     low, high = bootstrap_ci95(episodes["task_progress"].to_numpy(float), episodes["sequence"].to_numpy())
     per_demo = []
     for _, own in episodes.groupby("sequence", sort=False):
@@ -212,7 +219,7 @@ def summarize(
     )
 
 
-def _rates(episodes: pd.DataFrame) -> dict[str, float]:
+def _rates(episodes: Table) -> dict[str, float]:
     rates = {f"{stage}_rate": mean(episodes, stage) for stage in ("approach", "grasp", "reorient")}
     rates["reorientation_progress"] = mean(episodes, "reorientation_progress")
     return rates
@@ -264,7 +271,7 @@ def read_evaluation(folder: Path, run: str = "") -> Evaluation:
     return Evaluation(results, tables)
 
 
-def _read_table(folder: Path, result: EvalResult, run: str) -> pd.DataFrame:
+def _read_table(folder: Path, result: EvalResult, run: str) -> Table:
     """Read the table of episodes of one engine."""
     episodes = read_episodes(folder, result.backend)
     if len(episodes) != result.episodes:

@@ -1,12 +1,11 @@
-"""Choosing among a training's checkpoints: the one that does best in the engine in which it does worst.
+"""Select one of a training's checkpoints: the one whose score in its worst engine is highest.
 
-A policy that was picked by one engine's score has been fitted to that engine's habits. The episodes that decide are not those that are
-reported: they begin with other starts, and ``xreset eval`` refuses the seed that they were drawn with.
+A policy that is selected by the score in one engine is fitted to that engine. The selection plays other starts than evaluations do, and
+``xreset eval`` refuses the seed of the selection.
 """
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -20,19 +19,19 @@ from xreset.eval.results import mesh_folder
 from xreset.eval.rollout import roll_out
 from xreset.eval.setting import Setting
 from xreset.eval.trial import Engine, load_trial
-from xreset.files import atomic_write, file_hash
+from xreset.files import file_hash, write_whole
 from xreset.learning.choice import Candidate, Choice, write_choice
 from xreset.learning.run import checkpoints, read_run
 
 SEED = 1_000_003
-"""Of the starts that decide; evaluations use 0 unless they are told otherwise."""
+"""Seed of the starts that decide; evaluations use 0 by default."""
 
 
 def candidates_in(folder: Path, most: int) -> list[Path]:
-    """Checkpoints of a run folder, or exported policies of another folder, the newest first.
+    """Return checkpoints of a run folder, or exported policies of another folder, the newest first.
 
     Args:
-        most: how many at most, spread evenly over all; the newest is among them.
+        most: largest number, spread evenly over all; the newest is among them.
 
     Raises:
         RunError: there is none.
@@ -58,8 +57,8 @@ def select(
 ) -> Choice:
     """Play the checkpoints and write ``FOLDER/choice.json``; a run's ``policy.onnx`` becomes the chosen one.
 
-    The newest is played in all engines. Another is given up as soon as one engine puts it below the best so far, for its worst can only
-    become worse; and the engine in which the best does worst comes first.
+    The newest is played in all engines. Another is given up as soon as its score in one engine is below the best so far, because its worst
+    score can only become lower. The engine in which the best does worst comes first.
 
     Args:
         folder: run folder, or a folder of exported policies.
@@ -71,7 +70,8 @@ def select(
     Raises:
         RunError: there is nothing to choose from.
     """
-    found, is_run = candidates_in(folder, most), (folder / "run.json").is_file()
+    found = candidates_in(folder, most)
+    is_run = (folder / "run.json").is_file()
     if is_run:
         setting = replace(setting, objects=mesh_folder(setting.objects, read_run(folder).objects))
     played: list[Candidate] = []
@@ -94,7 +94,7 @@ def select(
                 rollouts = roll_out(policy.start(None), engine, trial, repetitions=episodes)
                 scores[engine.name] = float(np.mean([e.task_progress for e in rollouts.episodes]))
                 progress(path.name, engine.name, scores[engine.name])
-                if scores[engine.name] <= bar:  # of two that are equal, the newer one
+                if scores[engine.name] <= bar:  # the newer of two equal ones wins
                     break
             candidate = Candidate(name=path.name, task_progress=scores)
             played.append(candidate)
@@ -110,8 +110,8 @@ def select(
             episodes_per_demo=episodes,
             demos=file_hash(demos),
         )
-        if is_run:
-            with atomic_write(folder / "policy.onnx") as out, open(files[best.name], "rb") as chosen:
-                shutil.copyfileobj(chosen, out)
+        # In this order: a run whose policy is not the chosen checkpoint's exports it again, so a kill in between does no harm.
         write_choice(folder, choice)
+        if is_run:
+            write_whole(folder / "policy.onnx", files[best.name].read_bytes())
     return choice

@@ -8,7 +8,7 @@ import numpy as np
 def bootstrap_ci95(
     values: np.ndarray, groups: np.ndarray | None = None, *, draws: int = 2000, seed: int = 0
 ) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of the mean.
+    """Return the 95 % percentile bootstrap interval of the mean.
 
     Args:
         values: [E] one value per episode.
@@ -25,7 +25,8 @@ def bootstrap_ci95(
         means = values[rng.integers(len(values), size=(draws, len(values)))].mean(axis=1)
     else:
         _, number = np.unique(groups, return_inverse=True)
-        sums, counts = np.bincount(number, values), np.bincount(number)
+        sums = np.bincount(number, values)
+        counts = np.bincount(number)
         picks = rng.integers(len(sums), size=(draws, len(sums)))
         means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
@@ -33,14 +34,15 @@ def bootstrap_ci95(
 
 
 def wilson_ci95(hits: float, count: int) -> tuple[float, float]:
-    """95 % interval of a share of which ``hits`` of ``count`` were seen (Wilson, J. Am. Stat. Assoc. 22, 1927); all of it for none.
+    """Return the 95 % interval of a share, of which ``hits`` of ``count`` were observed (Wilson, J. Am. Stat. Assoc. 22, 1927).
 
-    Unlike a bootstrap it says something of few, and of none or all of them.
+    Unlike a bootstrap, it holds for small counts, and for a share of 0 or 1. Without observations it is all of [0, 1].
     """
     if not count:
         return 0.0, 1.0
     z2 = 1.959963984540054**2
-    share, weight = hits / count, 1.0 / (1.0 + z2 / count)
+    share = hits / count
+    weight = 1.0 / (1.0 + z2 / count)
     middle = weight * (share + z2 / (2 * count))
     half = weight * float(np.sqrt(z2 * (share * (1.0 - share) / count + z2 / (4 * count**2))))
     return max(middle - half, 0.0), min(middle + half, 1.0)
@@ -49,13 +51,13 @@ def wilson_ci95(hits: float, count: int) -> tuple[float, float]:
 def crossed_bootstrap_ci95(
     values: np.ndarray, runs: np.ndarray, groups: np.ndarray, *, draws: int = 2000, seed: int = 0
 ) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of the mean over trainings that were evaluated on the same demonstrations.
+    """Return the 95 % percentile bootstrap interval of the mean over trainings that were evaluated on the same demonstrations.
 
-    Trainings and demonstrations are both drawn with replacement, each without regard to the other, and an episode counts as often as its
-    training was drawn times as often as its demonstration was (the "pigeonhole bootstrap" of Owen, Annals of Applied Statistics 1, 2007).
-    It is thus about what another training seed and other demonstrations would give. Like every bootstrap over few, it is too narrow if
-    there are few trainings: the spread between n of them appears smaller by sqrt((n - 1) / n), 0.71 for two and 0.82 for three. With a
-    single one it is :func:`bootstrap_ci95`, which cannot know of other seeds.
+    Trainings and demonstrations are drawn with replacement, independently of each other. The weight of an episode is the number of draws
+    of its training times the number of draws of its demonstration (the "pigeonhole bootstrap" of Owen, Annals of Applied Statistics 1,
+    2007). The interval thus covers other training seeds and other demonstrations. It is too narrow for few trainings: the spread between
+    n trainings appears smaller by sqrt((n - 1) / n), 0.71 for two and 0.82 for three. For a single training it is
+    :func:`bootstrap_ci95`, which does not cover other seeds.
 
     Args:
         values: [E] one value per episode.

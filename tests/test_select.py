@@ -109,6 +109,22 @@ class SelectTest(unittest.TestCase):
         policy.check_seed(0)
         replace(policy, hash="another").check_seed(SEED)
 
+    def test_the_choice_is_recorded_before_the_policy_is_replaced(self):
+        (self.folder / "run.json").write_text("{}")
+        policy = self.folder / "policy.onnx"
+        policy.write_bytes(b"of the newest")
+        export = mock.Mock(side_effect=lambda folder, path, file: file.write_bytes(path.read_bytes()))
+        with (
+            mock.patch("xreset.eval.select.read_run", return_value=SimpleNamespace(objects=None)),
+            mock.patch("xreset.eval.select.checkpoints", return_value=sorted(self.folder.glob("*0.onnx"))),
+            mock.patch("xreset.learning.export.export_checkpoint", export),
+            mock.patch("xreset.eval.select.write_whole", side_effect=KeyboardInterrupt),
+            self.assertRaises(KeyboardInterrupt),
+        ):
+            self.choose()
+        self.assertEqual(read_choice(self.folder).chosen, "200.onnx")
+        self.assertEqual(policy.read_bytes(), b"of the newest")
+
     def test_a_damaged_choice_is_refused(self):
         self.choose()
         file = self.folder / "choice.json"

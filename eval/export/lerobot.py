@@ -24,7 +24,7 @@ from xreset.spec import SceneSpec
 VERSION = "v3.0"
 VIDEO = "observation.images.front"
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
-_ENVIRONMENT = [f"{what}.{axis}" for what in ("object", "goal") for axis in _POSE]
+_ENVIRONMENT = [f"object.{axis}" for axis in _POSE] + [f"goal.{axis}" for axis in _POSE]
 _INDICES = ("frame_index", "episode_index", "index", "task_index")
 _CHUNK = 1000
 """Files of a folder."""

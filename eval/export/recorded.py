@@ -17,7 +17,7 @@ from xreset.description import load_robot
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.report.clips import finite_states, recorded_episode
 from xreset.eval.report.read import results_in
-from xreset.eval.results import mesh_folder, read_evaluation, read_traces
+from xreset.eval.results import Table, mesh_folder, read_evaluation, read_traces
 from xreset.eval.rollout import Trace
 from xreset.records import write_npz
 from xreset.spec import RobotSpec
@@ -45,7 +45,7 @@ class Recording:
     robot: RobotSpec
     fps: float
     """Frames per second."""
-    episodes: pd.DataFrame
+    episodes: Table
     """One row for each recorded episode (:func:`xreset.eval.results.episode_table`), with the task in words in the column ``task``."""
     traces: tuple[Trace, ...]
     """Finite states [T] of each episode. Joint positions in rad (prismatic: m), poses in the world frame (z up, table top at z = 0),

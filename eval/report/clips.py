@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from xreset.errors import FileFormatError, XResetError, needs
+from xreset.eval.results import Table
 from xreset.eval.rollout import Trace
 from xreset.pictures.render import Camera, Renderer, pose_matrix
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
@@ -55,13 +55,13 @@ class Strip:
 # Which episodes ---------------------------------------------------------------------------------------------------------------------------
 
 
-def recorded(episodes: pd.DataFrame, sequences: Iterable[int]) -> pd.DataFrame:
+def recorded(episodes: Table, sequences: Iterable[int]) -> Table:
     """Return the episodes that the traces of demonstrations show: the first repetition of each, in every engine."""
     own = episodes[episodes["sequence"].isin(list(sequences))]
     return own.sort_values("repetition", kind="stable").drop_duplicates(["engine", "sequence"])
 
 
-def recorded_episode(episodes: pd.DataFrame, engine: str, sequence: int) -> Any:
+def recorded_episode(episodes: Table, engine: str, sequence: int) -> Any:
     """Return the row of the episode that a trace shows.
 
     Raises:
@@ -74,14 +74,20 @@ def recorded_episode(episodes: pd.DataFrame, engine: str, sequence: int) -> Any:
     )
 
 
-def choose_sequence(episodes: pd.DataFrame, traces: Mapping[str, Sequence[Trace]]) -> int | None:
+def trace_of(traces: Sequence[Trace], sequence: int) -> Trace:
+    """Return the trace of a demonstration."""
+    return next(trace for trace in traces if trace.sequence == sequence)
+
+
+def choose_sequence(episodes: Table, traces: Mapping[str, Sequence[Trace]]) -> int | None:
     """Return the demonstration with the best recorded episodes; None if no demonstration was recorded in every engine.
 
     Best is the highest mean task progress over all engines, then the highest mean reorientation progress, then the lowest index.
     """
     if not traces:
         return None
-    common = set.intersection(*({t.sequence for t in found} for found in traces.values()))
+    sequences = [{trace.sequence for trace in found} for found in traces.values()]  # noqa: XR002
+    common = set.intersection(*sequences)
     shown = recorded(episodes[episodes["engine"].isin(list(traces))], common)
     if shown.empty:
         return None
@@ -90,7 +96,7 @@ def choose_sequence(episodes: pd.DataFrame, traces: Mapping[str, Sequence[Trace]
     return int(quality.index[0])
 
 
-def choose_failures(episodes: pd.DataFrame, traces: Sequence[Trace], count: int) -> list[tuple[Any, Trace]]:
+def choose_failures(episodes: Table, traces: Sequence[Trace], count: int) -> list[tuple[Any, Trace]]:
     """Return the recorded episodes of one engine that missed the goal, worst first, at most ``count``.
 
     Worst is the lowest stage, then the least reorientation progress, then the lowest index of the demonstration. Objects take turns, so
@@ -106,7 +112,7 @@ def choose_failures(episodes: pd.DataFrame, traces: Sequence[Trace], count: int)
     return [(row, by_sequence[row.sequence]) for row in chosen.itertuples()]
 
 
-def count_failures(episodes: pd.DataFrame) -> dict[str, int]:
+def count_failures(episodes: Table) -> dict[str, int]:
     """Return the number of episodes that ended below each stage, by what was missing."""
     missed = {
         "never near the object": ~episodes["approach"],
@@ -143,7 +149,8 @@ def camera_at(center: np.ndarray, distance: float) -> Camera:
 
 def finite_states(trace: Trace) -> np.ndarray:
     """Return which states [T] of a trace are finite."""
-    return np.isfinite(np.concatenate((trace.joint_pos, trace.object_pos, trace.object_quat), axis=1)).all(axis=1)
+    state = np.concatenate((trace.joint_pos, trace.object_pos, trace.object_quat), axis=1)
+    return np.asarray(np.isfinite(state).all(axis=1))
 
 
 def draw_state(renderer: Renderer, trace: Trace, row: int) -> np.ndarray:

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from xreset.eval.report.groups import Group, Scores
+from xreset.eval.report.groups import Group, Scores, members_of
 from xreset.eval.report.read import Training, conditions, differences
+from xreset.eval.results import Table
 from xreset.text import short_name
 
 _PLAYED_TASK = ("task.termination.", "task.reset.spawn_", "task.reset.home_noise", "task.timestep")
@@ -51,7 +52,7 @@ def notes(trainings: Sequence[Training]) -> tuple[str, ...]:
     return (*found, *_task_notes(evaluated))
 
 
-def _condition_table(trainings: Sequence[Training]) -> pd.DataFrame:
+def _condition_table(trainings: Sequence[Training]) -> Table:
     """Return one row for each training and engine: how the training was evaluated there."""
     rows = []
     for training in trainings:
@@ -100,7 +101,8 @@ def health(found: Scores) -> tuple[str, ...]:
     sentences = []
     for label, row in found.items():
         for engine, s in row.items():
-            for count, what in ((s.nonfinite, "stopped being finite"), (s.overflow, "dropped contacts")):
+            faults = {"stopped being finite": s.nonfinite, "dropped contacts": s.overflow}
+            for what, count in faults.items():
                 if count:
                     sentences.append(
                         f"{count} of {s.episodes} episodes of {label} in {engine} {what}: that figure means little."
@@ -110,7 +112,7 @@ def health(found: Scores) -> tuple[str, ...]:
 
 def missing(groups: Sequence[Group], tags: Sequence[str]) -> tuple[str, ...]:
     """Return what some of the trainings lack."""
-    members = [m for group in groups for m in group.members]
+    members = members_of(groups)
     with_curves = [m for m in members if m.scalars]
     evaluated = [m for m in members if m.results]
     lacking = {
@@ -120,13 +122,17 @@ def missing(groups: Sequence[Group], tags: Sequence[str]) -> tuple[str, ...]:
     }
     for tag in tags:
         lacking[f"No curve {tag}"] = [m for m in with_curves if tag not in m.scalars]
-    engines = {engine for m in members for engine in m.results}
-    for engine in sorted(engines):
+    for engine in sorted(set().union(*(m.results for m in members))):
         lacking[f"Not evaluated in {engine}"] = [m for m in evaluated if engine not in m.results]
-    return tuple(f"{what}: {', '.join(m.label for m in without)}." for what, without in lacking.items() if without)
+    sentences = []
+    for what, without in lacking.items():
+        if without:
+            labels = ", ".join(m.label for m in without)
+            sentences.append(f"{what}: {labels}.")
+    return tuple(sentences)
 
 
-def _listing(table: pd.DataFrame, column: str) -> str:
+def _listing(table: Table, column: str) -> str:
     """Return ``value: who has it; ...``; a training with one value in all of its engines is named without the engines."""
     parts = []
     for value, rows in table.groupby(column, sort=False):

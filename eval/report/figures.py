@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from xreset.eval.plots import COLORS, INK, percent_axis, picture, svg
 from xreset.eval.report.clips import Clip
 from xreset.eval.report.curves import Line, X, fates, line, share_of_runs
 from xreset.eval.report.groups import Group, Scores, engines_of
 from xreset.eval.report.read import Curve
-from xreset.eval.results import EvalResult
+from xreset.eval.results import EvalResult, Table
 from xreset.learning.clock import SHARES
 from xreset.text import short_name
 
@@ -59,7 +58,7 @@ def color(index: int) -> str:
 # Results of one policy --------------------------------------------------------------------------------------------------------------------
 
 
-def object_progress(episodes: pd.DataFrame) -> pd.DataFrame:
+def object_progress(episodes: Table) -> Table:
     """Return the mean task progress of each object (rows) in each engine (columns)."""
     return episodes.pivot_table(index="object", columns="engine", values="task_progress")
 
@@ -93,7 +92,7 @@ def draw_stages(ax: Axes, results: Results) -> None:
     ax.set_ylabel("episodes")
 
 
-def draw_objects(ax: Axes, progress: pd.DataFrame) -> None:
+def draw_objects(ax: Axes, progress: Table) -> None:
     """Draw a dot for each object and engine."""
     count = len(progress.columns)
     for i, engine in enumerate(progress):
@@ -123,7 +122,7 @@ def figure_stages(results: Results) -> str:
     return _with_legend(draw_stages, results, (5.2, 3.0), "stages")
 
 
-def figure_objects(progress: pd.DataFrame) -> str:
+def figure_objects(progress: Table) -> str:
     """Return :func:`draw_objects` as SVG."""
     return _with_legend(draw_objects, progress, (10.6, 1.3 + 0.36 * len(progress)), "objects")
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from xreset.description import load_robot
 from xreset.errors import RunError
-from xreset.eval.report.clips import camera_for, choose_sequence, draw_clip, encode_mp4, recorded_episode
+from xreset.eval.report.clips import camera_for, choose_sequence, draw_clip, encode_mp4, recorded_episode, trace_of
 from xreset.eval.report.read import collect
 from xreset.eval.results import mesh_folder, read_traces
 from xreset.files import write_whole
@@ -44,15 +45,19 @@ def make_film(
     spec = load_robot(robot or data.robot)
     traces = {engine: read_traces(data.folder, engine, spec.joint_names) for engine in data.engines}
     meshes = mesh_folder(objects, data.results[0].objects_folder)
-    names = sorted({trace.object for found in traces.values() for trace in found})
+    names = set()
+    for found in traces.values():
+        names.update(trace.object for trace in found)
     columns = {}
     rate = 0.0
-    for number, name in enumerate(names):
-        own = {engine: [t for t in found if t.object == name] for engine, found in traces.items()}
+    for number, name in enumerate(sorted(names)):
+        own = {}
+        for engine, found in traces.items():
+            own[engine] = [trace for trace in found if trace.object == name]
         sequence = choose_sequence(data.episodes, own)
         if sequence is None:
             continue
-        shown = {engine: next(t for t in found if t.sequence == sequence) for engine, found in own.items()}
+        shown = {engine: trace_of(found, sequence) for engine, found in own.items()}
         camera = camera_for(list(shown.values()))
         obj = load_object(name, meshes)
         columns[name] = []
@@ -66,7 +71,7 @@ def make_film(
         raise RunError(
             f"no demonstration in {data.folder} was recorded in every engine. Evaluate all engines in one command."
         )
-    length = max(len(frames) for column in columns.values() for frames in column)
+    length = max(map(len, chain(*columns.values())))
     films = []
     for column in columns.values():
         lasting = [frames[np.minimum(np.arange(length), len(frames) - 1)] for frames in column]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from os.path import commonprefix
 
@@ -12,7 +12,7 @@ import pandas as pd
 
 from xreset.eval.report.curves import processes
 from xreset.eval.report.read import Training, conditions
-from xreset.eval.results import mean
+from xreset.eval.results import Table, mean
 from xreset.eval.stats import crossed_bootstrap_ci95
 
 
@@ -76,8 +76,16 @@ def grouped(trainings: Sequence[Training]) -> tuple[tuple[Group, ...], tuple[str
             groups += singles(members)
             notes.append(f"{', '.join(names)} have the same configuration and are not grouped: {reason}.")
     if len({group.label for group in groups}) < len(groups):  # shortened names may be equal
-        groups = [Group(label=" + ".join(m.label for m in group.members), members=group.members) for group in groups]
+        groups = [replace(group, label=" + ".join(m.label for m in group.members)) for group in groups]  # noqa: XR002
     return tuple(groups), tuple(notes)
+
+
+def members_of(groups: Iterable[Group]) -> list[Training]:
+    """Return the trainings of all groups."""
+    members = []
+    for group in groups:
+        members += group.members
+    return members
 
 
 def singles(trainings: Sequence[Training]) -> tuple[Group, ...]:
@@ -130,12 +138,12 @@ def scores(groups: Iterable[Group]) -> Scores:
     for group in groups:
         evaluated = [m.episodes for m in group.members if m.results]
         if evaluated:
-            episodes = pd.concat(evaluated)
+            episodes: Table = pd.concat(evaluated)
             found[group.label] = {str(engine): score(own) for engine, own in episodes.groupby("engine")}
     return found
 
 
-def score(episodes: pd.DataFrame) -> Score:
+def score(episodes: Table) -> Score:
     """Return the score of a group in one engine, from the episodes of all its trainings there."""
     task_progress, ci95 = estimate(episodes, "task_progress")
     stages = ("approach", "grasp", "reorient", "reorient_once", "reorientation_progress")
@@ -150,7 +158,7 @@ def score(episodes: pd.DataFrame) -> Score:
     )
 
 
-def estimate(episodes: pd.DataFrame, metric: str) -> tuple[float, tuple[float, float]]:
+def estimate(episodes: Table, metric: str) -> tuple[float, tuple[float, float]]:
     """Return the mean of a metric over all episodes of several trainings on the same demonstrations, and its 95 % interval.
 
     The interval is a bootstrap over demonstrations, as in ``xreset eval``, and for several trainings over trainings, too
@@ -163,4 +171,4 @@ def estimate(episodes: pd.DataFrame, metric: str) -> tuple[float, tuple[float, f
 
 def engines_of(found: Scores) -> tuple[str, ...]:
     """Return every engine in which anything was evaluated, in order of name."""
-    return tuple(sorted({engine for row in found.values() for engine in row}))
+    return tuple(sorted(set().union(*found.values())))

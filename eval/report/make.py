@@ -96,11 +96,11 @@ def _draw(
     sequence = drawing.choose_sequence(data.episodes, recorded)
     if sequence is None:
         raise XResetError("no demonstration was recorded in every engine. Evaluate all engines in one command.")
-    traces = {engine: next(t for t in found if t.sequence == sequence) for engine, found in recorded.items()}
+    traces = {engine: drawing.trace_of(found, sequence) for engine, found in recorded.items()}
     first = data.engines[0]
     missed = drawing.choose_failures(data.episodes_in(first), recorded[first], _FAILURES)
     meshes = mesh_folder(objects, data.results[0].objects_folder)
-    names = {trace.object for trace in (*traces.values(), *(trace for _, trace in missed))}
+    names = {trace.object for _, trace in missed} | {trace.object for trace in traces.values()}
     loaded = {name: load_object(name, meshes) for name in sorted(names)}
     camera = drawing.camera_for(list(traces.values()))
     total = len(traces) + len(missed)
@@ -189,7 +189,7 @@ def choose_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple
     Raises:
         RunError: no training has one of the wanted curves.
     """
-    known = sorted({tag for t in trainings for tag in t.scalars})
+    known = sorted(set().union(*(t.scalars for t in trainings)))
     if not known and not wanted:
         return ()
     chosen = tuple(dict.fromkeys(wanted or CURVES))

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from xreset.errors import FileFormatError, RunError, XResetError, needs
-from xreset.eval.results import EvalResult, read_evaluation
+from xreset.eval.results import EvalResult, Table, read_evaluation
 from xreset.eval.stress import Stress, read_stress
 from xreset.files import read_json
 from xreset.learning.choice import Choice, read_choice
@@ -62,7 +62,7 @@ class Training:
     """TensorBoard tag -> curve; empty without event files."""
     results: dict[str, EvalResult]
     """Engine -> result."""
-    episodes: pd.DataFrame
+    episodes: Table
     """Episodes in all engines (:func:`xreset.eval.results.episode_table`), where ``run`` is the label."""
     lift: Lift | None = None
     """When the training first succeeded from home; None without ``lift.json``."""
@@ -78,7 +78,7 @@ class ReportData:
     """Folder of the results."""
     results: tuple[EvalResult, ...]
     """The result of every engine, in order of name."""
-    episodes: pd.DataFrame
+    episodes: Table
     """Episodes in all engines."""
     run: RunInfo | None
     """The training; None for baselines, and where ``run.json`` cannot be read."""
@@ -107,7 +107,7 @@ class ReportData:
         """What was evaluated."""
         return f"{self.results[0].policy} on {self.results[0].robot}"
 
-    def episodes_in(self, engine: str) -> pd.DataFrame:
+    def episodes_in(self, engine: str) -> Table:
         """Return the episodes in one engine."""
         return self.episodes[self.episodes["engine"] == engine]
 
@@ -197,7 +197,7 @@ def conditions(result: EvalResult) -> dict[str, Any]:
 def differences(results: Sequence[EvalResult]) -> list[str]:
     """Return a sentence for each condition in which the engines of one policy differ."""
     notes = []
-    table = pd.DataFrame([conditions(s) for s in results], index=[s.backend for s in results])
+    table: Table = pd.DataFrame([conditions(s) for s in results], index=[s.backend for s in results])
     for what in table:
         if table[what].nunique() > 1:
             listing = ", ".join(f"{engine}: {value}" for engine, value in table[what].items())

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from xreset.errors import RunError
 from xreset.eval.report.curves import Fate, X, amounts, fates, processes, share_of_runs
-from xreset.eval.report.groups import Group, Score, Scores, engines_of
+from xreset.eval.report.groups import Group, Score, Scores, engines_of, members_of
 from xreset.eval.report.read import Fact, Training
 from xreset.eval.table import Rows
 from xreset.learning.clock import SHARES
@@ -23,10 +23,9 @@ def results(groups: Sequence[Group], found: Scores) -> Rows:
     """Return three rows for each group (four for several trainings), one column for each engine; ``-`` where it was not evaluated."""
     engines = engines_of(found)
     versions: dict[str, set[str]] = {engine: set() for engine in engines}
-    for group in groups:
-        for member in group.members:
-            for engine, result in member.results.items():
-                versions[engine].add(result.backend_version)
+    for member in members_of(groups):
+        for engine, result in member.results.items():
+            versions[engine].add(result.backend_version)
     body = []
     for label, row in found.items():
         several = any(len(s.each) > 1 for s in row.values())
@@ -86,8 +85,10 @@ def different(groups: Sequence[Group]) -> Rows:
     Baselines, which have no configuration, have no column.
     """
     columns = [g for g in groups if g.members[0].facts or g.members[0].scalars]
-    configured = [m for g in columns for m in g.members if m.facts]
-    names = dict.fromkeys(name for m in configured for name in m.facts)
+    configured = [m for m in members_of(columns) if m.facts]
+    names: dict[str, None] = {}
+    for member in configured:
+        names |= dict.fromkeys(member.facts)
     body = []
     for name in names:
         values = [m.facts.get(name, _ABSENT).value for m in configured]
@@ -110,12 +111,20 @@ def _lengths(columns: Sequence[Group]) -> Iterator[tuple[str, list[list[str]]]]:
         "minutes of training": "minutes",
     }
     for name, x in kinds.items():
-        cells = [[_amount(m, x) for m in g.members] for g in columns]
+        cells = _cells(columns, lambda m, x=x: _amount(m, x))
         if _distinct(cells) - {"-"}:
             yield name, cells
-    cells = [[str(processes(m) or "-") for m in g.members] for g in columns]
+    cells = _cells(columns, lambda m: str(processes(m) or "-"))
     if len(_distinct(cells) - {"-"}) > 1:
         yield "processes", cells
+
+
+def _cells(columns: Sequence[Group], text: Callable[[Training], str]) -> list[list[str]]:
+    """Return the text of every training of every group."""
+    cells = []
+    for group in columns:
+        cells.append([text(member) for member in group.members])
+    return cells
 
 
 def _amount(member: Training, x: X) -> str:

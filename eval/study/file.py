@@ -63,7 +63,10 @@ Axis = Literal["run", "object", "metric"]
 
 def _config_flags(**configs: type) -> set[str]:
     """Return the command-line flags of configuration classes, such as ``--hand.jump-limit``."""
-    return {f"--{group}.{f.name}".replace("_", "-") for group, config in configs.items() for f in fields(config)}
+    flags = set()
+    for group, config in configs.items():
+        flags |= {f"--{group}.{f.name}".replace("_", "-") for f in fields(config)}
+    return flags
 
 
 COMMAND_FLAGS = {
@@ -173,7 +176,7 @@ class Runs(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Table:
+class TableSpec:
     """A table of the study's page: one for each engine, and a picture."""
 
     runs: dict[str, str]
@@ -198,7 +201,7 @@ class Study:
     data: dict[str, Data]
     runs: dict[str, Runs]
     evaluations: dict[str, Evaluation] = field(default_factory=lambda: {"eval": Evaluation()})
-    tables: tuple[Table, ...] = ()
+    tables: tuple[TableSpec, ...] = ()
 
 
 def study_path(name: str) -> Path:

@@ -385,8 +385,10 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
     unknown = sorted(set(only) - set(study.runs))
     if unknown:
         raise RunError(f"the study has no runs {', '.join(unknown)}; it has {', '.join(study.runs)}.")
-    engines = {engine for e in study.evaluations.values() for engine in e.engines}
-    reasons = {engine: backend_status(engine).reason for engine in sorted(engines)}
+    engines: dict[str, None] = {}
+    for evaluation in study.evaluations.values():
+        engines |= dict.fromkeys(evaluation.engines)
+    reasons = {engine: backend_status(engine).reason for engine in engines}
     plan = Plan(
         study=study,
         name=name,

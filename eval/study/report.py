@@ -79,7 +79,7 @@ def _incomplete(plan: Plan) -> Iterator[str]:
 
 def _unfair(plan: Plan, table: FilledTable, trained: dict[str, Lift]) -> Iterator[str]:
     """Yield what makes a table's figures incomparable, with one another and with the paper's."""
-    trainings = [t for members in table.members.values() for t in members]
+    trainings = table.trainings
     if not trainings:
         return
     for note in (*fairness.notes(trainings), *fairness.health(table.scores())):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from xreset.eval.plots import INK, percent_axis, picture
 from xreset.eval.report.figures import color
 from xreset.eval.report.groups import Group, Scores, estimate, scores
 from xreset.eval.report.read import Training, read_training
-from xreset.eval.study.file import Table
+from xreset.eval.results import Table
+from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import ALL, METRICS, PaperTable, paper_tables
 from xreset.eval.study.plan import Plan
 from xreset.eval.table import Rows
@@ -66,6 +68,11 @@ class FilledTable:
     paper: bool
     """Whether it has figures of the paper."""
 
+    @property
+    def trainings(self) -> list[Training]:
+        """All seeds of all runs."""
+        return list(chain(*self.members.values()))
+
     def as_rows(self, engine: str) -> Rows:
         """Return the table of one engine."""
         body = []
@@ -75,15 +82,14 @@ class FilledTable:
 
     def versions(self, engine: str) -> str:
         """Return the engine's versions in which the runs were evaluated."""
-        trainings = [t for members in self.members.values() for t in members if engine in t.results]
-        return ", ".join(sorted({t.results[engine].backend_version for t in trainings}))
+        return ", ".join(sorted({t.results[engine].backend_version for t in self.trainings if engine in t.results}))
 
     def scores(self) -> Scores:
         """Return the scores of the runs, which count the episodes in which an engine broke down."""
         return scores(Group(label=name, members=members) for name, members in self.members.items())
 
 
-def fill(plan: Plan, table: Table) -> FilledTable:
+def fill(plan: Plan, table: TableSpec) -> FilledTable:
     """Fill a table with what has been evaluated so far.
 
     Raises:
@@ -107,7 +113,7 @@ def fill(plan: Plan, table: Table) -> FilledTable:
         figure, error = paper.figure(key["method"], key["object"], key["metric"]) if paper else (None, None)
         return Cell(mean=mean, ci95=ci95, paper=figure, paper_error=error)
 
-    engines = {engine for trainings in members.values() for t in trainings for engine in t.results}
+    engines = set().union(*(t.results for t in chain(*members.values())))
     cells: dict[str, list[list[Cell]]] = {}
     for engine in sorted(engines):
         cells[engine] = []
@@ -138,7 +144,7 @@ def _joined(label: str, parts: Sequence[Training]) -> Training:
     """Join trainings to one, and number their demonstrations consecutively."""
     if len(parts) == 1:
         return parts[0]
-    episodes = pd.concat([t.episodes for t in parts], ignore_index=True)
+    episodes: Table = pd.concat([t.episodes for t in parts], ignore_index=True)
     numbers = episodes.groupby(["object", "sequence_name"]).ngroup()
     episodes = episodes.assign(run=label, sequence=numbers)
     results = {}
@@ -149,21 +155,21 @@ def _joined(label: str, parts: Sequence[Training]) -> Training:
     return replace(parts[0], label=label, scalars={}, results=results, episodes=episodes, lift=None)
 
 
-def _episodes_with(members: Sequence[Training], engine: str, objects: set[str]) -> pd.DataFrame:
+def _episodes_with(members: Sequence[Training], engine: str, objects: set[str]) -> Table:
     """Return the episodes of the given objects in an engine.
 
     Seeds that miss one of the objects are left out, because a mean over some of the objects is not comparable.
     """
-    tables = [pd.DataFrame()]
+    tables = []
     for member in members:
         own = member.episodes
-        own = own[(own["engine"] == engine) & own["object"].isin(objects)]
+        own = own[(own["engine"] == engine) & own["object"].isin(list(objects))]
         if set(own["object"]) == objects:
             tables.append(own)
-    return pd.concat(tables[1:]) if len(tables) > 1 else tables[0]
+    return pd.concat(tables) if tables else pd.DataFrame()
 
 
-def objects_of(plan: Plan, group: str, table: Table) -> tuple[str, ...]:
+def objects_of(plan: Plan, group: str, table: TableSpec) -> tuple[str, ...]:
     """Return the objects with which a run of the study is evaluated."""
     objects = set()
     for step in plan.steps.values():
@@ -172,9 +178,9 @@ def objects_of(plan: Plan, group: str, table: Table) -> tuple[str, ...]:
     return tuple(sorted(objects))
 
 
-def _axes(plan: Plan, table: Table, paper: PaperTable | None) -> tuple[Axis, Axis, dict[str, str]]:
+def _axes(plan: Plan, table: TableSpec, paper: PaperTable | None) -> tuple[Axis, Axis, dict[str, str]]:
     """Return rows, columns, and what is the same in all cells."""
-    known = sorted({name for run in table.runs for name in objects_of(plan, run, table)})
+    known = sorted(set().union(*(objects_of(plan, run, table) for run in table.runs)))
     methods = list(table.runs.values())
     if paper is not None:
         names = {"method": methods, "metric": list(METRICS), "object": [*known, ALL]}

@@ -81,8 +81,8 @@ class FileTest(InFolder):
                 HEAD + DATA + RUN + "[runs.a]\nweights = 'b'\n[runs.b]\nweights = 'a'\n",
                 r"runs\.a\.weights lead back to themselves: a -> b -> a",
             ),
-            (HEAD + DATA + RUN + "[runs.'../a']\n", "'../a' is no name for a folder"),
-            (HEAD + DATA + RUN + run + "[evaluations.checkpoints]\n", "would be a folder of that name"),
+            (HEAD + DATA + RUN + "[runs.'../a']\n", "'../a' cannot be the name of a folder"),
+            (HEAD + DATA + RUN + run + "[evaluations.checkpoints]\n", "is a folder in every run: call it"),
             (
                 HEAD + DATA + RUN + run + "[[tables]]\nruns = { b = 'B' }\n",
                 r"tables\[0\]\.runs is 'b', expected one of 'a'",
@@ -98,7 +98,7 @@ class FileTest(InFolder):
         ):
             with self.subTest(message), self.assertRaisesRegex(FileFormatError, message):
                 read_study(self.file(text))
-        with self.assertRaisesRegex(RunError, "no study 'nothing'.*first_grasp.*seconds"):
+        with self.assertRaisesRegex(RunError, "Unknown study 'nothing'.*first_grasp.*seconds"):
             study_path("nothing")
 
     def test_options_that_name_files_are_refused(self):

@@ -77,7 +77,8 @@ def _task_notes(trainings: Sequence[Training]) -> list[str]:
     if not rows:
         return []
     found = []
-    for field, own in pd.DataFrame(rows).groupby("field"):
+    table: Table = pd.DataFrame(rows)
+    for field, own in table.groupby("field"):
         if own["value"].nunique() > 1:
             found.append(f"{_UNFAIR}each policy plays its own task, whose {field} differs ({_listing(own, 'text')}).")
     return found

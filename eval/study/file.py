@@ -30,6 +30,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, fields
 from math import isfinite
 from pathlib import Path
@@ -46,7 +47,7 @@ from xreset.text import shown
 
 SCHEMA = "xreset-study/1"
 SHIPPED = Path(__file__).parent.parent / "studies"
-"""Studies that ship with xreset, known by name."""
+"""Folder of the studies that ship with xreset."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 _LARGEST_SEED = 2**32 - 1
@@ -79,7 +80,7 @@ COMMAND_FLAGS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Data(Checked):
-    """Demonstrations, and how states to reset to are made of them."""
+    """Demonstrations, and the options with which reset states are made of them."""
 
     demos: str | None = None
     """An archive (``xreset demos``), relative to ``--data``. None: synthetic ones of the stand-ins."""
@@ -113,19 +114,19 @@ def _is_number(text: str) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation(Checked):
-    """From where, how often and in what a policy is tried."""
+    """Starts, number of episodes and engines of an evaluation."""
 
     data: str | None = None
-    """Of whose demonstrations starts and goals are; None: those that the policy was trained with."""
+    """Data with the starts and goals; None: the data of the policy's training."""
     objects: tuple[str, ...] = ()
-    """Only these, where a run has them; empty: all of the run's."""
+    """Only these objects, where a run has them; empty: all objects of the run."""
     per_object: Positive[int] | None = None
-    """Only the first so many demonstrations of each; None: all (of the run's own data: as many as it was trained with)."""
+    """Largest number of demonstrations of each object; None: all (of the run's own data: as many as in training)."""
     episodes: Positive[int] = 5
-    """Perturbed starts of each demonstration."""
+    """Episodes of each demonstration, each with a perturbed start."""
     seed: Seed = 0
     engines: tuple[str, ...] = ("mujoco", "mujoco-warp", "pybullet", "sapien")
-    """Those that are not there are left out, and that is said."""
+    """Engines that are not installed are left out, with a note."""
     num_envs: Positive[int] = 64
 
 
@@ -136,13 +137,13 @@ class Runs(Checked):
     data: str
     robot: str = "ur7e-sharpa"
     objects: tuple[str, ...] = ()
-    """Empty: all that the data have."""
+    """Empty: all objects of the data."""
     alone: bool = False
-    """A training for each object, not one for all."""
+    """Train a policy for each object, not one for all."""
     per_object: Positive[int] | None = None
-    """Only the first so many demonstrations of each object."""
+    """Largest number of demonstrations of each object."""
     policy: Literal["ik", "zero", "random"] | None = None
-    """A baseline that is evaluated and not trained."""
+    """A baseline, which is evaluated and not trained."""
     recipe: str = "minutes"
     config: dict[str, Any] = field(default_factory=dict)
     """Changes of the recipe, nested as the configuration is."""
@@ -152,9 +153,9 @@ class Runs(Checked):
     minutes: Positive[Finite[float]] | None = None
     """Minutes of training, without compiling."""
     steps: Positive[Finite[float]] | None = None
-    """Environment steps of all worlds; of both the one that is reached first. Neither: the recipe's iterations."""
+    """Environment steps of all worlds. With minutes and steps, the first limit ends the training; with neither, the recipe's iterations."""
     weights: str | None = None
-    """Other runs of the study, whose networks these begin with: those of the same seed, and of the same object if they are alone, too."""
+    """Another run of the study, from whose networks this one begins: of the same seed, and of the same object if both train alone."""
     backend: str = "mujoco-warp"
     device: Literal["cuda", "cpu"] = "cuda"
     gpus: Positive[int] = 1
@@ -162,7 +163,7 @@ class Runs(Checked):
     num_envs: Positive[int] = 4096
     """Worlds of each process."""
     evaluations: tuple[str, ...] = ()
-    """Names of those that are done; none: all."""
+    """Names of the evaluations; empty: all."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -180,15 +181,15 @@ class TableSpec:
     """A table of the study's page: one for each engine, and a picture."""
 
     runs: dict[str, str]
-    """Run -> what the paper's table calls it; without ``paper``, what the table shall call it."""
+    """Run -> its name in the paper's table, or without ``paper`` its name in this table."""
     paper: str | None = None
-    """The paper's table whose figures stand beside ours, and whose rows and columns these are."""
+    """Table of the paper: its figures are shown next to ours, and its rows and columns are used."""
     title: str | None = None
     evaluation: str = "eval"
     rows: Axis = "object"
-    """Without ``paper``: what the rows are. The columns are runs, or if these are the rows, objects."""
+    """Rows of a table without ``paper``. The columns are runs, or objects if the rows are runs."""
     object: str | None = None
-    """Only this one; None: all."""
+    """Only this object; None: all."""
     metric: str = "task_progress"
 
 
@@ -205,14 +206,13 @@ class Study:
 
 
 def study_path(name: str) -> Path:
-    """The file of a study, by path or, of those that ship with xreset, by name."""
-    path, shipped = Path(name), {file.stem: file for file in sorted(SHIPPED.glob("*.toml"))}
-    if path.is_file() or name not in shipped:
-        if not path.is_file():
-            raise RunError(
-                f"there is no study {name!r}: expected a file, or one that ships with xreset: {', '.join(shipped)}."
-            )
+    """Return the file of a study, by path or, if the study ships with xreset, by name."""
+    path = Path(name)
+    shipped = {file.stem: file for file in sorted(SHIPPED.glob("*.toml"))}
+    if path.is_file():
         return path
+    if name not in shipped:
+        raise RunError(f"Unknown study {name!r}. Give a file, or a study that ships with xreset: {', '.join(shipped)}.")
     return shipped[name]
 
 
@@ -220,25 +220,25 @@ def read_study(path: Path) -> Study:
     """Read a study file.
 
     Raises:
-        FileFormatError: it is no TOML, holds an unknown key or a value of the wrong type, or names something that it does not define.
+        FileFormatError: the file is not TOML, holds an unknown key or a wrong value, or names something that it does not define.
     """
     raw = read_toml(path, SCHEMA)
-    defaults, runs = raw.pop("defaults", {}), raw.get("runs", {})
-    if (
-        not isinstance(defaults, dict)
-        or not isinstance(runs, dict)
-        or not all(isinstance(run, dict) for run in runs.values())
-    ):
+    defaults = raw.pop("defaults", {})
+    runs = raw.get("runs", {})
+    tables = [defaults, runs]
+    if isinstance(runs, dict):
+        tables += runs.values()
+    if not all(isinstance(table, dict) for table in tables):
         raise FileFormatError(f"{path}: defaults, runs and each of the runs must be tables.")
     raw["runs"] = {name: merged(defaults, run) for name, run in runs.items()}
     study = from_dict(Study, raw, str(path))
-    if problem := _problem(study):
+    for problem in _problems(study):
         raise FileFormatError(f"{path}: {problem}")
     return study
 
 
 def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """``base`` with nested changes."""
+    """Return ``base`` with nested changes."""
     result = dict(base)
     for name, value in changes.items():
         both = isinstance(value, dict) and isinstance(base.get(name), dict)
@@ -246,54 +246,41 @@ def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _problem(study: Study) -> str | None:
-    def unknown(what: str, name: str | None, known: Any) -> str | None:
-        return (
-            None
-            if name is None or name in known
-            else f"{what} is {name!r}, expected one of {', '.join(map(repr, known)) or 'none'}."
-        )
-
+def _problems(study: Study) -> Iterator[str]:
+    """Yield what is wrong with the names in a study."""
     for name in (*study.data, *study.runs, *study.evaluations):
         if not _NAME.fullmatch(name):
-            return f"the name {name!r} is no name for a folder: use letters, digits, dots, dashes and underscores."
+            yield f"{name!r} cannot be the name of a folder. Use letters, digits, dots, dashes and underscores."
     for name, evaluation in study.evaluations.items():
         if name != "eval" and not name.startswith("eval-"):
-            return f"the evaluation {name!r} would be a folder of that name in every run; call it 'eval', or 'eval-' and something."
-        if found := unknown(f"evaluations.{name}.data", evaluation.data, study.data):
-            return found
+            yield f"the evaluation {name!r} is a folder in every run: call it 'eval', or a name that begins with 'eval-'."
+        yield from _unknown(f"evaluations.{name}.data", evaluation.data, study.data)
     for name, run in study.runs.items():
-        problems = (
-            unknown(f"runs.{name}.data", run.data, study.data),
-            unknown(
-                f"runs.{name}.weights",
-                run.weights,
-                [n for n, r in study.runs.items() if n != name and r.policy is None],
-            ),
-            *(unknown(f"runs.{name}.evaluations", evaluation, study.evaluations) for evaluation in run.evaluations),
-        )
-        if found := next(filter(None, problems), None):
-            return found
+        trained = [other for other, spec in study.runs.items() if other != name and spec.policy is None]
+        yield from _unknown(f"runs.{name}.data", run.data, study.data)
+        yield from _unknown(f"runs.{name}.weights", run.weights, trained)
+        for evaluation in run.evaluations:
+            yield from _unknown(f"runs.{name}.evaluations", evaluation, study.evaluations)
+    for name in study.runs:
         chain = [name]
         while (weights := study.runs[chain[-1]].weights) is not None:
-            if weights in chain:
-                return f"runs.{name}.weights lead back to themselves: {' -> '.join([*chain, weights])}."
             chain.append(weights)
-            if weights not in study.runs:
-                break
+            if chain.count(weights) > 1:
+                yield f"runs.{name}.weights lead back to themselves: {' -> '.join(chain)}."
+                return
+    papers = paper_tables()
     for i, table in enumerate(study.tables):
-        papers = paper_tables()
-        problems = (
-            unknown(f"tables[{i}].paper", table.paper, papers),
-            unknown(f"tables[{i}].evaluation", table.evaluation, study.evaluations),
-            unknown(f"tables[{i}].metric", table.metric, METRICS),
-            *(unknown(f"tables[{i}].runs", run, study.runs) for run in table.runs),
-        )
-        if found := next(filter(None, problems), None):
-            return found
-        methods = papers[table.paper].methods if table.paper else ()
-        if table.paper and (
-            found := next(filter(None, (unknown(f"tables[{i}].runs", m, methods) for m in table.runs.values())), None)
-        ):
-            return found
-    return None
+        where = f"tables[{i}]"
+        yield from _unknown(f"{where}.paper", table.paper, papers)
+        yield from _unknown(f"{where}.evaluation", table.evaluation, study.evaluations)
+        yield from _unknown(f"{where}.metric", table.metric, METRICS)
+        for run, method in table.runs.items():
+            yield from _unknown(f"{where}.runs", run, study.runs)
+            if table.paper:
+                yield from _unknown(f"{where}.runs", method, papers[table.paper].methods)
+
+
+def _unknown(where: str, name: str | None, known: Collection[str]) -> Iterator[str]:
+    """Yield a sentence if a name is given and not known."""
+    if name is not None and name not in known:
+        yield f"{where} is {name!r}, expected one of {', '.join(map(repr, known)) or 'none'}."

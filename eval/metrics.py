@@ -1,9 +1,9 @@
 """The paper's evaluation metrics (section V and appendix A), accumulated over an episode for N worlds.
 
-Stages: approach (a fingertip within 5 cm of the object), grasp (thumb and one other finger in contact while the object is lifted by at
-least 1 cm), reorientation (object within 2 cm and 15 degrees of the goal at the episode's end). Task progress is 0, 0.33, 0.66 or 1 for
-the highest stage. Reorientation progress is 1 - min_t d(o_t, g) / d(o_0, g), in [0, 1], with d the largest distance of four object
-keypoints.
+Stages: approach (a fingertip within 5 cm of the object), grasp (thumb and one other finger in contact while the object
+is lifted by at least 1 cm), reorientation (object within 2 cm and 15 degrees of the goal at the episode's end). Task
+progress is 0, 0.33, 0.66 or 1 for the highest stage. Reorientation progress is 1 - min_t d(o_t, g) / d(o_0, g), in [0,
+1], with d the largest distance of four object keypoints.
 """
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ class EpisodeMetrics:
         self._look(start)
 
     def update(self, reading: Reading, out_of_bounds: Tensor) -> None:
-        """Add the reading after a step; out_of_bounds [N] bool ends a world, and so does a number that is not finite."""
+        """Add the reading after a step; out_of_bounds [N] bool ends a world, and so does a number that is not
+        finite."""
         self.nonfinite |= reading.health.nonfinite & ~self._ended
         self.overflow |= reading.health.overflow & ~self._ended
         self.out_of_bounds |= out_of_bounds & ~self._ended & ~self.nonfinite

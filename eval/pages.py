@@ -20,9 +20,13 @@ def percent(share: float, digits: int = 0) -> str:
 @cache
 def _environment() -> Environment:
     made = Environment(
-        loader=PackageLoader("xreset.eval"), autoescape=lambda name: name is not None and ".html" in name, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-    )  # fmt: skip
+        loader=PackageLoader("xreset.eval"),
+        autoescape=lambda name: name is not None and ".html" in name,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
     made.filters |= {"percent": percent, "short_name": short_name, "md": escape, "table": markdown}
     made.globals["version"] = __version__
     return made

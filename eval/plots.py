@@ -1,4 +1,5 @@
-"""Drawing with matplotlib in the project's style: as SVG that takes the page's text colour, or as a picture. No window, no global state."""
+"""Drawing with matplotlib in the project's style: as SVG that takes the page's text colour, or as a picture. No window,
+no global state."""
 
 from __future__ import annotations
 
@@ -17,14 +18,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d3b", "#666666")
-"""Colour of each engine, in their order: Okabe and Ito's palette, told apart with colour-blind eyes and on light and dark ground."""
+"""Colour of each engine, in their order: Okabe and Ito's palette, told apart with colour-blind eyes and on light and
+dark ground."""
 INK = "#010203"
 """Text colour; in an SVG it is replaced by ``currentColor``."""
 
 
 @contextmanager
 def picture(path: Path, size: tuple[float, float], *, dpi: int = 120, **style: Any) -> Iterator[Figure]:
-    """A figure of a size [inches] that is written as PNG at the end of the block; ``style``: matplotlib's settings with _ for a dot."""
+    """A figure of a size [inches] that is written as PNG at the end of the block; ``style``: matplotlib's settings with
+    _ for a dot."""
     with figure_style({name.replace("_", ".", 1): value for name, value in style.items()}) as figure_class:
         figure = figure_class(figsize=size, layout="constrained", facecolor="white")
         yield figure
@@ -38,7 +41,8 @@ def svg(draw: Callable[[Figure], None], size: tuple[float, float], salt: str) ->
 
     Args:
         size: width and height [inches].
-        salt: keeps its identifiers apart from those of other figures on the page; the same salt and drawing give the same text.
+        salt: keeps its identifiers apart from those of other figures on the page; the same salt and drawing give the
+            same text.
     """
     with figure_style({"svg.hashsalt": salt, "svg.fonttype": "none"}) as figure_class:
         figure = figure_class(figsize=size, layout="constrained")

@@ -1,6 +1,7 @@
 """Results of evaluations: their files, and one table with a row for each episode.
 
-``ENGINE.json`` holds the summary of one engine, ``ENGINE.episodes.json`` its episodes and ``ENGINE.trace.npz`` recorded states.
+``ENGINE.json`` holds the summary of one engine, ``ENGINE.episodes.json`` its episodes and ``ENGINE.trace.npz`` recorded
+states.
 """
 
 from __future__ import annotations
@@ -143,15 +144,15 @@ class Evaluation(list[EvalResult]):
         return table_text(self)
 
 
-# Episodes as a table ----------------------------------------------------------------------------------------------------------------------
+# Episodes as a table --------------------------------------------------------------------------------------------------
 
 
 def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = "") -> Table:
     """Return a table with one row for each episode.
 
-    Columns: run, policy, engine, robot and seed, then the fields of :class:`~xreset.eval.rollout.Episode`: sequence (index of the
-    demonstration), sequence_name, object, repetition, approach, grasp, reorient, reorient_once, reorientation_progress, task_progress,
-    out_of_bounds, nonfinite, overflow.
+    Columns: run, policy, engine, robot and seed, then the fields of :class:`~xreset.eval.rollout.Episode`: sequence
+    (index of the demonstration), sequence_name, object, repetition, approach, grasp, reorient, reorient_once,
+    reorientation_progress, task_progress, out_of_bounds, nonfinite, overflow.
     """
     table: Table = pd.DataFrame([asdict(e) for e in episodes], columns=[f.name for f in fields(Episode)])
     about = {
@@ -226,13 +227,14 @@ def _rates(episodes: Table) -> dict[str, float]:
 
 
 def mesh_folder(given: Path | None, recorded: str | None) -> Path | None:
-    """Return the folder of meshes to use: the given one, else the one that a run or its results name; None: the stand-ins."""
+    """Return the folder of meshes to use: the given one, else the one that a run or its results name; None: the
+    stand-ins."""
     if given is not None or recorded is None:
         return given
     return Path(recorded)
 
 
-# Files ------------------------------------------------------------------------------------------------------------------------------------
+# Files ----------------------------------------------------------------------------------------------------------------
 
 
 def write_results(folder: Path, summary: EvalResult, rollouts: Rollouts, joint_names: tuple[str, ...]) -> Path:
@@ -321,7 +323,8 @@ def read_traces(folder: Path, backend: str, joint_names: tuple[str, ...]) -> tup
     found = tuple(arrays["joint_names"].tolist())
     if found != joint_names:
         raise FileFormatError(
-            f"{path} is a trace of the joints {', '.join(found)}; the robot has {', '.join(joint_names)}. Evaluate again."
+            f"{path} is a trace of the joints {', '.join(found)}; the robot has {', '.join(joint_names)}. "
+            "Evaluate again."
         )
     traces = []
     for i, name in enumerate(arrays["object_name"]):

@@ -1,7 +1,7 @@
 """Select one of a training's checkpoints: the one whose score in its worst engine is highest.
 
-A policy that is selected by the score in one engine is fitted to that engine. The selection plays other starts than evaluations do, and
-``xreset eval`` refuses the seed of the selection.
+A policy that is selected by the score in one engine is fitted to that engine. The selection plays other starts than
+evaluations do, and ``xreset eval`` refuses the seed of the selection.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ def select(
 ) -> Choice:
     """Play the checkpoints and write ``FOLDER/choice.json``; a run's ``policy.onnx`` becomes the chosen one.
 
-    The newest is played in all engines. Another is given up as soon as its score in one engine is below the best so far, because its worst
-    score can only become lower. The engine in which the best does worst comes first.
+    The newest is played in all engines. Another is given up as soon as its score in one engine is below the best so
+    far, because its worst score can only become lower. The engine in which the best does worst comes first.
 
     Args:
         folder: run folder, or a folder of exported policies.
@@ -110,7 +110,7 @@ def select(
             episodes_per_demo=episodes,
             demos=file_hash(demos),
         )
-        # In this order: a run whose policy is not the chosen checkpoint's exports it again, so a kill in between does no harm.
+        # A kill after this line does no harm: a run whose policy is not the chosen checkpoint's exports it again.
         write_choice(folder, choice)
         if is_run:
             write_whole(folder / "policy.onnx", files[best.name].read_bytes())

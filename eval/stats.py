@@ -12,8 +12,8 @@ def bootstrap_ci95(
 
     Args:
         values: [E] one value per episode.
-        groups: [E] demonstration of each episode. Episodes of one demonstration resemble one another, so whole demonstrations are drawn
-            (cluster bootstrap); with a single one, or None, episodes are drawn.
+        groups: [E] demonstration of each episode. Episodes of one demonstration resemble one another, so whole
+            demonstrations are drawn (cluster bootstrap); with a single one, or None, episodes are drawn.
         draws: resamples.
         seed: of the resampling: the same values give the same interval.
     """
@@ -34,7 +34,8 @@ def bootstrap_ci95(
 
 
 def wilson_ci95(hits: float, count: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share, of which ``hits`` of ``count`` were observed (Wilson, J. Am. Stat. Assoc. 22, 1927).
+    """Return the 95 % interval of a share, of which ``hits`` of ``count`` were observed (Wilson, J. Am. Stat. Assoc.
+    22, 1927).
 
     Unlike a bootstrap, it holds for small counts, and for a share of 0 or 1. Without observations it is all of [0, 1].
     """
@@ -51,13 +52,14 @@ def wilson_ci95(hits: float, count: int) -> tuple[float, float]:
 def crossed_bootstrap_ci95(
     values: np.ndarray, runs: np.ndarray, groups: np.ndarray, *, draws: int = 2000, seed: int = 0
 ) -> tuple[float, float]:
-    """Return the 95 % percentile bootstrap interval of the mean over trainings that were evaluated on the same demonstrations.
+    """Return the 95 % percentile bootstrap interval of the mean over trainings that were evaluated on the same
+    demonstrations.
 
-    Trainings and demonstrations are drawn with replacement, independently of each other. The weight of an episode is the number of draws
-    of its training times the number of draws of its demonstration (the "pigeonhole bootstrap" of Owen, Annals of Applied Statistics 1,
-    2007). The interval thus covers other training seeds and other demonstrations. It is too narrow for few trainings: the spread between
-    n trainings appears smaller by sqrt((n - 1) / n), 0.71 for two and 0.82 for three. For a single training it is
-    :func:`bootstrap_ci95`, which does not cover other seeds.
+    Trainings and demonstrations are drawn with replacement, independently of each other. The weight of an episode is
+    the number of draws of its training times the number of draws of its demonstration (the "pigeonhole bootstrap" of
+    Owen, Annals of Applied Statistics 1, 2007). The interval thus covers other training seeds and other demonstrations.
+    It is too narrow for few trainings: the spread between n trainings appears smaller by sqrt((n - 1) / n), 0.71 for
+    two and 0.82 for three. For a single training it is :func:`bootstrap_ci95`, which does not cover other seeds.
 
     Args:
         values: [E] one value per episode.

@@ -125,7 +125,8 @@ def _unseen_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
 def results_table(summaries: Sequence[EvalResult]) -> Table:
     """Return the table of an evaluation: one column for each engine; four engines fit into 80 characters."""
     first = summaries[0]
-    title = f"{first.policy} on {first.robot}\n{first.episodes} episodes of {len(first.per_demo)} demonstrations, seed {first.seed}"
+    title = f"{first.policy} on {first.robot}\n"
+    title += f"{first.episodes} episodes of {len(first.per_demo)} demonstrations, seed {first.seed}"
     table = Table("", title=title, title_justify="left")
     table.columns[0].no_wrap = True
     for s in summaries:

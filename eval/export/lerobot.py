@@ -1,5 +1,5 @@
-"""Recorded episodes as a LeRobot data set, format v3.0: parquet files, films and meta (github.com/huggingface/lerobot, ``docs/source/
-lerobot-dataset-v3.mdx``). It is written without the package ``lerobot``, which reads it.
+"""Recorded episodes as a LeRobot data set, format v3.0: parquet files, films and meta (github.com/huggingface/lerobot,
+``docs/source/lerobot-dataset-v3.mdx``). It is written without the package ``lerobot``, which reads it.
 
 Shape letters: T frames of an episode, J actuated joints.
 """
@@ -30,7 +30,8 @@ _CHUNK = 1000
 """Files of a folder."""
 _FIRST = "chunk-000/file-000.parquet"
 _KEYFRAMES = 2
-"""Every second frame can be shown without the frames before it, as in films of LeRobot: training draws frames at random."""
+"""Every second frame can be shown without the frames before it, as in films of LeRobot: training draws frames at
+random."""
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 

@@ -46,12 +46,14 @@ class Recording:
     fps: float
     """Frames per second."""
     episodes: Table
-    """One row for each recorded episode (:func:`xreset.eval.results.episode_table`), with the task in words in the column ``task``."""
+    """One row for each recorded episode (:func:`xreset.eval.results.episode_table`), with the task in words in the
+    column ``task``."""
     traces: tuple[Trace, ...]
-    """Finite states [T] of each episode. Joint positions in rad (prismatic: m), poses in the world frame (z up, table top at z = 0),
-    quaternions (w, x, y, z)."""
+    """Finite states [T] of each episode. Joint positions in rad (prismatic: m), poses in the world frame (z up, table
+    top at z = 0), quaternions (w, x, y, z)."""
     actions: tuple[np.ndarray, ...]
-    """[T, J] joint targets of each episode: the last target before the next frame. The last frame repeats its target."""
+    """[T, J] joint targets of each episode: the last target before the next frame. The last frame repeats its
+    target."""
     meshes: tuple[Path | None, ...]
     """Folder of each object's mesh; None: a stand-in."""
 
@@ -81,7 +83,8 @@ def read_recorded(
         task: the task in words; ``{object}`` stands for the object's name.
 
     Raises:
-        RunError: a folder does not exist, or none holds episodes of the engines; or the episodes have two robots or rates.
+        RunError: a folder does not exist, or none holds episodes of the engines; or the episodes have two robots or
+            rates.
         FileFormatError: a file is damaged, or older than recorded actions.
     """
     rows = []

@@ -52,7 +52,7 @@ class Strip:
     """[MOMENTS] time of each picture [s]."""
 
 
-# Which episodes ---------------------------------------------------------------------------------------------------------------------------
+# Which episodes -------------------------------------------------------------------------------------------------------
 
 
 def recorded(episodes: Table, sequences: Iterable[int]) -> Table:
@@ -82,7 +82,8 @@ def trace_of(traces: Sequence[Trace], sequence: int) -> Trace:
 def choose_sequence(episodes: Table, traces: Mapping[str, Sequence[Trace]]) -> int | None:
     """Return the demonstration with the best recorded episodes; None if no demonstration was recorded in every engine.
 
-    Best is the highest mean task progress over all engines, then the highest mean reorientation progress, then the lowest index.
+    Best is the highest mean task progress over all engines, then the highest mean reorientation progress, then the
+    lowest index.
     """
     if not traces:
         return None
@@ -99,8 +100,8 @@ def choose_sequence(episodes: Table, traces: Mapping[str, Sequence[Trace]]) -> i
 def choose_failures(episodes: Table, traces: Sequence[Trace], count: int) -> list[tuple[Any, Trace]]:
     """Return the recorded episodes of one engine that missed the goal, worst first, at most ``count``.
 
-    Worst is the lowest stage, then the least reorientation progress, then the lowest index of the demonstration. Objects take turns, so
-    that a hard object does not hide the others.
+    Worst is the lowest stage, then the least reorientation progress, then the lowest index of the demonstration.
+    Objects take turns, so that a hard object does not hide the others.
     """
     by_sequence = {trace.sequence: trace for trace in traces}
     missed = recorded(episodes, by_sequence)
@@ -123,7 +124,7 @@ def count_failures(episodes: Table) -> dict[str, int]:
     return {what: int(rows.sum()) for what, rows in missed.items()}
 
 
-# Drawing ----------------------------------------------------------------------------------------------------------------------------------
+# Drawing --------------------------------------------------------------------------------------------------------------
 
 
 def camera_for(traces: Sequence[Trace], *, distance: float = 1.0) -> Camera:

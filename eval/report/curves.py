@@ -1,11 +1,13 @@
-"""Progress of trainings: how far they had come at each iteration, their mean curves, and when they first succeeded from home.
+"""Progress of trainings: how far they had come at each iteration, their mean curves, and when they first succeeded from
+home.
 
-Steps and minutes are sums of what every iteration logged: ``speed/collect_seconds`` + ``speed/learn_seconds``, and these times
-``speed/env_steps_per_second``. Not counted are pauses between a run and its continuation, iterations that were lost and done again, and
-the time before the first iteration; steps are summed over all processes. An iteration without a log counts like the next one with a log.
+Steps and minutes are sums of what every iteration logged: ``speed/collect_seconds`` + ``speed/learn_seconds``, and
+these times ``speed/env_steps_per_second``. Not counted are pauses between a run and its continuation, iterations that
+were lost and done again, and the time before the first iteration; steps are summed over all processes. An iteration
+without a log counts like the next one with a log.
 
-The share of runs that have passed a threshold is the product-limit estimate of Kaplan and Meier (J. Am. Stat. Assoc. 53, 1958): a run
-that ended before it passed counts until its end.
+The share of runs that have passed a threshold is the product-limit estimate of Kaplan and Meier (J. Am. Stat. Assoc.
+53, 1958): a run that ended before it passed counts until its end.
 """
 
 from __future__ import annotations
@@ -103,7 +105,7 @@ def line(members: Sequence[Training], tag: str, x: X) -> Line | None:
     return Line(x=at, mean=values.mean(axis=0), low=values.min(axis=0), high=values.max(axis=0))
 
 
-# First success from home ------------------------------------------------------------------------------------------------------------------
+# First success from home ----------------------------------------------------------------------------------------------
 
 
 class Fate(NamedTuple):
@@ -117,7 +119,8 @@ class Fate(NamedTuple):
 
 
 def lift_of(training: Training) -> Lift | None:
-    """Return when a training passed which share: from ``lift.json``, or from its learning curves; None if it has neither."""
+    """Return when a training passed which share: from ``lift.json``, or from its learning curves; None if it has
+    neither."""
     if training.lift is not None or SUCCESS not in training.scalars:
         return training.lift
     curve = training.scalars[SUCCESS]
@@ -163,10 +166,11 @@ def fates(members: Sequence[Training], share: float, x: X) -> list[Fate]:
 
 
 def share_of_runs(found: Sequence[Fate]) -> Line:
-    """Return the share of runs that have passed, as steps from 0 to the end of the last run: ``mean`` holds until the next ``x``.
+    """Return the share of runs that have passed, as steps from 0 to the end of the last run: ``mean`` holds until the
+    next ``x``.
 
-    ``low`` and ``high`` are Wilson's 95 % interval of the share. It counts the runs whose fate is known: those that have passed, and those
-    that have not ended.
+    ``low`` and ``high`` are Wilson's 95 % interval of the share. It counts the runs whose fate is known: those that
+    have passed, and those that have not ended.
     """
     at = np.array([fate.at for fate in found])
     passed = np.array([fate.passed for fate in found])
@@ -202,7 +206,8 @@ def lift_notes(members: Sequence[Training], single: Sequence[Training]) -> list[
     unknown = [label for label, lift in known.items() if lift is None]
     if unknown:
         notes.append(
-            f"When they lifted is not known, because they have neither lift.json nor the curve {SUCCESS}: {', '.join(unknown)}."
+            f"When they lifted is not known, because they have neither lift.json nor the curve {SUCCESS}: "
+            f"{', '.join(unknown)}."
         )
     alone = [m.label for m in single if known.get(m.label)]
     if alone:

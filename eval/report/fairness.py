@@ -12,7 +12,8 @@ from xreset.eval.results import Table
 from xreset.text import short_name
 
 _PLAYED_TASK = ("task.termination.", "task.reset.spawn_", "task.reset.home_noise", "task.timestep")
-"""Fields of a training's task that its evaluation keeps (:func:`xreset.task.config.evaluation_task`) and that make it easier or harder."""
+"""Fields of a training's task that its evaluation keeps (:func:`xreset.task.config.evaluation_task`) and that make it
+easier or harder."""
 _UNFAIR = "These results are not comparable: "
 
 
@@ -34,9 +35,9 @@ def notes(trainings: Sequence[Training]) -> tuple[str, ...]:
     if first["sequences"].nunique() == 1:
         if table["demonstrations"].nunique() > 1:
             found.append(
-                f"The files of demonstrations differ ({_listing(table, 'demonstrations')}), their sequences have the same names. "
-                "That is so if one was made from the other, such as retargeted trajectories for ik; otherwise the results are "
-                "not comparable."
+                f"The files of demonstrations differ ({_listing(table, 'demonstrations')}), their sequences have the "
+                "same names. That is so if one was made from the other, such as retargeted trajectories for ik; "
+                "otherwise the results are not comparable."
             )
     else:
         what = "objects" if first["objects"].nunique() > 1 else "demonstrations"
@@ -85,7 +86,8 @@ def _task_notes(trainings: Sequence[Training]) -> list[str]:
 
 
 def begun(trainings: Sequence[Training]) -> tuple[str, ...]:
-    """Return a sentence for each training that began with the networks of another: its curves are not all of its learning."""
+    """Return a sentence for each training that began with the networks of another: its curves are not all of its
+    learning."""
     found = []
     for training in trainings:
         weights = training.facts.get("weights")
@@ -134,7 +136,8 @@ def missing(groups: Sequence[Group], tags: Sequence[str]) -> tuple[str, ...]:
 
 
 def _listing(table: Table, column: str) -> str:
-    """Return ``value: who has it; ...``; a training with one value in all of its engines is named without the engines."""
+    """Return ``value: who has it; ...``; a training with one value in all of its engines is named without the
+    engines."""
     parts = []
     for value, rows in table.groupby(column, sort=False):
         whole = []

@@ -55,7 +55,7 @@ def color(index: int) -> str:
     return COLORS[index % len(COLORS)]
 
 
-# Results of one policy --------------------------------------------------------------------------------------------------------------------
+# Results of one policy ------------------------------------------------------------------------------------------------
 
 
 def object_progress(episodes: Table) -> Table:
@@ -146,7 +146,8 @@ def figure_curves(curves: Sequence[Curve]) -> str:
 
 
 def write_overview(path: Path, title: str, results: Results, clips: Sequence[Clip], caption: str) -> None:
-    """Write one picture: task progress and stages of every engine, and two frames of each clip, from the middle and the end."""
+    """Write one picture: task progress and stages of every engine, and two frames of each clip, from the middle and the
+    end."""
     columns = max(len(clips), 2)
     width = max(2.9 * columns, 9.0)
     heights = [1.6 + 0.36 * len(results)]
@@ -171,11 +172,12 @@ def write_overview(path: Path, title: str, results: Results, clips: Sequence[Cli
             parts[1].supxlabel(caption, fontsize="small")
 
 
-# Comparisons ------------------------------------------------------------------------------------------------------------------------------
+# Comparisons ----------------------------------------------------------------------------------------------------------
 
 
 def curve_axes(ax: Axes, title: str, x: str, *, percent: bool) -> None:
-    """Set title, horizontal axis and grid of learning curves; with ``percent`` the axis of the values begins at zero."""
+    """Set title, horizontal axis and grid of learning curves; with ``percent`` the axis of the values begins at
+    zero."""
     ax.set_title(title, fontsize="medium", loc="left")
     ax.set_xlabel(x)
     ax.grid(axis="y", color=INK, alpha=0.12)
@@ -226,7 +228,8 @@ def draw_lines(
 
 
 def draw_scores(ax: Axes, found: Scores, order: Sequence[str]) -> None:
-    """Draw task progress with its 95 % interval: engines side by side, in each a bar for every group, in the color of its curve."""
+    """Draw task progress with its 95 % interval: engines side by side, in each a bar for every group, in the color of
+    its curve."""
     engines = engines_of(found)
     width = min(0.84 / len(found), 0.28)
     for i, (label, row) in enumerate(found.items()):

@@ -27,7 +27,8 @@ class Group:
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """Means over all episodes of all trainings of a group, in [0, 1]; rounded as ``xreset eval`` does, so that both show the same."""
+    """Means over all episodes of all trainings of a group, in [0, 1]; rounded as ``xreset eval`` does, so that both
+    show the same."""
 
     task_progress: float
     ci95: tuple[float, float]
@@ -55,7 +56,8 @@ def grouped(trainings: Sequence[Training]) -> tuple[tuple[Group, ...], tuple[str
     """Group trainings of the same configuration that have different seeds and were evaluated alike.
 
     Returns:
-        The groups, in the order of their first trainings, and sentences about trainings of the same configuration that are not grouped.
+        The groups, in the order of their first trainings, and sentences about trainings of the same configuration that
+        are not grouped.
     """
     alike: list[list[Training]] = []
     for training in trainings:
@@ -159,10 +161,11 @@ def score(episodes: Table) -> Score:
 
 
 def estimate(episodes: Table, metric: str) -> tuple[float, tuple[float, float]]:
-    """Return the mean of a metric over all episodes of several trainings on the same demonstrations, and its 95 % interval.
+    """Return the mean of a metric over all episodes of several trainings on the same demonstrations, and its 95 %
+    interval.
 
-    The interval is a bootstrap over demonstrations, as in ``xreset eval``, and for several trainings over trainings, too
-    (:func:`xreset.eval.stats.crossed_bootstrap_ci95`).
+    The interval is a bootstrap over demonstrations, as in ``xreset eval``, and for several trainings over trainings,
+    too (:func:`xreset.eval.stats.crossed_bootstrap_ci95`).
     """
     values = episodes[metric].to_numpy(float)
     runs = pd.factorize(episodes["run"])[0]

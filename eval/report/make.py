@@ -217,6 +217,7 @@ def _captions(trainings: Sequence[Training], groups: Sequence[Group]) -> list[st
                 "curves are their mean, bands go from the lowest to the highest"
             )
             if sum(bool(m.results) for m in group.members) > 1:
-                text += ", and the interval is a bootstrap over trainings and demonstrations, which is too narrow for few trainings"
+                text += ", and the interval is a bootstrap over trainings and demonstrations, "
+                text += "which is too narrow for few trainings"
             captions.append(text + ".")
     return captions

@@ -73,7 +73,8 @@ def headline(data: ReportData) -> str:
         text = f"Task progress is {high} in each of the {len(ranked)} engines"
     else:
         number = f"{len(ranked)} engines" if len(ranked) > 2 else "the two engines"
-        text = f"Task progress is {high} in {best.backend} and {low} in {worst.backend}, the best and the worst of {number}"
+        text = f"Task progress is {high} in {best.backend} and {low} in {worst.backend}, "
+        text += f"the best and the worst of {number}"
     grasped = _between([s.grasp_rate for s in ranked])
     at_goal = _between([s.reorient_rate for s in ranked])
     text += f". The object is grasped in {grasped} of the episodes and at its goal at the end of {at_goal}."
@@ -94,7 +95,7 @@ def _facts(data: ReportData) -> dict[str, str]:
         "Policy": s.policy,
         "Engines": ", ".join(f"{x.backend} {x.backend_version}" for x in data.results),
         "Objects": f"{', '.join(map(short_name, s.objects))} ({meshes})",
-        "Episodes": f"{s.episodes} in each engine: {demos} demonstration{'s' * (demos != 1)}, {starts} start{'s' * (starts != 1)} each",
+        "Episodes": f"{s.episodes} in each engine: {_count(demos, 'demonstration')}, {_count(starts, 'start')} each",
         "Seed": str(s.seed),
     }
     if run is not None:
@@ -104,6 +105,10 @@ def _facts(data: ReportData) -> dict[str, str]:
     if data.choice is not None:
         facts["Checkpoint"] = data.choice.sentence()
     return facts | {"Report by": f"xreset {__version__}"}
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def outcome_of(episode: Any) -> str:

@@ -1,4 +1,5 @@
-"""Read what reports and comparisons show: configuration, learning curves and evaluations, from folders of runs and of results."""
+"""Read what reports and comparisons show: configuration, learning curves and evaluations, from folders of runs and of
+results."""
 
 from __future__ import annotations
 
@@ -129,7 +130,8 @@ def collect(folder: Path) -> ReportData:
         policy = str(folder) if is_run else "POLICY"
         out = "" if is_run else f" --out {results}"
         raise RunError(
-            f"{results} holds no evaluation results. Make them first: xreset eval {policy} --backend mujoco --demos DEMOS{out}"
+            f"{results} holds no evaluation results. "
+            f"Make them first: xreset eval {policy} --backend mujoco --demos DEMOS{out}"
         )
     curves, curve_note = read_curves(folder)
     notes = differences(evaluation)
@@ -202,12 +204,13 @@ def differences(results: Sequence[EvalResult]) -> list[str]:
         if table[what].nunique() > 1:
             listing = ", ".join(f"{engine}: {value}" for engine, value in table[what].items())
             notes.append(
-                f"These results are not comparable: the {what} differs ({listing}). Evaluate all engines in one command."
+                f"These results are not comparable: the {what} differs ({listing}). "
+                "Evaluate all engines in one command."
             )
     return notes
 
 
-# Learning curves --------------------------------------------------------------------------------------------------------------------------
+# Learning curves ------------------------------------------------------------------------------------------------------
 
 
 def read_curves(folder: Path) -> tuple[tuple[Curve, ...], str | None]:
@@ -271,14 +274,15 @@ def _scalars(file: Path) -> Iterator[tuple[str, int, float]]:
                 yield value.tag, event.step, value.simple_value
 
 
-# Trainings to compare ---------------------------------------------------------------------------------------------------------------------
+# Trainings to compare -------------------------------------------------------------------------------------------------
 
 
 def read_trainings(runs: Sequence[str]) -> tuple[Training, ...]:
     """Read the trainings to compare.
 
     Args:
-        runs: ``FOLDER`` or ``LABEL=FOLDER``: run folders, folders of results, or names of shipped policies (their ``runs/NAME``).
+        runs: ``FOLDER`` or ``LABEL=FOLDER``: run folders, folders of results, or names of shipped policies (their
+            ``runs/NAME``).
 
     Raises:
         RunError: none is given, a folder does not exist or is empty, or two have the same label or are the same folder.
@@ -364,9 +368,10 @@ _RUN_TYPES = {"robot": str, "resets": str, "resets_hash": str, "device": str, "s
 def run_facts(run: dict[str, Any], file: Path) -> dict[str, Fact]:
     """Return the content of ``run.json``, flat.
 
-    The content is not checked against this version's configuration, so that trainings of different versions of xreset can be compared.
-    A reset bank is identified by its hash, wherever the file is; a folder of meshes by whether there is one, because the bank was made
-    with certain meshes; a device by its kind, because the number of a GPU does not matter.
+    The content is not checked against this version's configuration, so that trainings of different versions of xreset
+    can be compared. A reset bank is identified by its hash, wherever the file is; a folder of meshes by whether there
+    is one, because the bank was made with certain meshes; a device by its kind, because the number of a GPU does not
+    matter.
     """
     wrong = [name for name, kind in _RUN_TYPES.items() if not isinstance(run.get(name), kind)]
     contract = run.get("contract") or {}

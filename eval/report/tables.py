@@ -12,15 +12,16 @@ from xreset.eval.table import Rows
 from xreset.learning.clock import SHARES
 
 LIFTED = (
-    "First success from home: share of runs (95 % interval) in which 1, 10 and 50 % of the steps of worlds that began at home have been at "
-    "the goal, and when that was first so in each. A run that ended without (>) counts until it ended (Kaplan-Meier); the interval is "
-    "Wilson's, of as many runs as were watched so long."
+    "First success from home: share of runs (95 % interval) in which 1, 10 and 50 % of the steps of worlds that began "
+    "at home have been at the goal, and when that was first so in each. A run that ended without (>) counts until it "
+    "ended (Kaplan-Meier); the interval is Wilson's, of as many runs as were watched so long."
 )
 _ABSENT = Fact(None, "-")
 
 
 def results(groups: Sequence[Group], found: Scores) -> Rows:
-    """Return three rows for each group (four for several trainings), one column for each engine; ``-`` where it was not evaluated."""
+    """Return three rows for each group (four for several trainings), one column for each engine; ``-`` where it was not
+    evaluated."""
     engines = engines_of(found)
     versions: dict[str, set[str]] = {engine: set() for engine in engines}
     for member in members_of(groups):
@@ -53,7 +54,8 @@ def _score_texts(s: Score, several: bool) -> dict[str, str]:
 
 
 def lifted(groups: Sequence[Group], x: X) -> Rows:
-    """Return one row for each group, one column for each share of success: how many of its trainings passed it, and when each did."""
+    """Return one row for each group, one column for each share of success: how many of its trainings passed it, and
+    when each did."""
     scale = 1e6 if x == "steps" else 1.0
     unit = {"minutes": "min", "steps": "M steps", "iterations": "iterations"}[x]
     digits = 0 if x == "iterations" else 1

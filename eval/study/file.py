@@ -75,7 +75,8 @@ COMMAND_FLAGS = {
     "resets": _config_flags(closing=ClosingConfig, squeeze=SqueezeConfig)
     | {"--backend", "--device", "--num-envs", "--hold", "--no-hold"},
 }
-"""Flags that a study file may give to a command. Flags that name files are not among them: a study writes only into ``--out``."""
+"""Flags that a study file may give to a command. Flags that name files are not among them: a study writes only into
+``--out``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,9 +154,11 @@ class Runs(Checked):
     minutes: Positive[Finite[float]] | None = None
     """Minutes of training, without compiling."""
     steps: Positive[Finite[float]] | None = None
-    """Environment steps of all worlds. With minutes and steps, the first limit ends the training; with neither, the recipe's iterations."""
+    """Environment steps of all worlds. With minutes and steps, the first limit ends the training; with neither, the
+    recipe's iterations."""
     weights: str | None = None
-    """Another run of the study, from whose networks this one begins: of the same seed, and of the same object if both train alone."""
+    """Another run of the study, from whose networks this one begins: of the same seed, and of the same object if both
+    train alone."""
     backend: str = "mujoco-warp"
     device: Literal["cuda", "cpu"] = "cuda"
     gpus: Positive[int] = 1
@@ -220,7 +223,8 @@ def read_study(path: Path) -> Study:
     """Read a study file.
 
     Raises:
-        FileFormatError: the file is not TOML, holds an unknown key or a wrong value, or names something that it does not define.
+        FileFormatError: the file is not TOML, holds an unknown key or a wrong value, or names something that it does
+        not define.
     """
     raw = read_toml(path, SCHEMA)
     defaults = raw.pop("defaults", {})
@@ -253,7 +257,7 @@ def _problems(study: Study) -> Iterator[str]:
             yield f"{name!r} cannot be the name of a folder. Use letters, digits, dots, dashes and underscores."
     for name, evaluation in study.evaluations.items():
         if name != "eval" and not name.startswith("eval-"):
-            yield f"the evaluation {name!r} is a folder in every run: call it 'eval', or a name that begins with 'eval-'."
+            yield f"the evaluation {name!r} is a folder in every run: call it 'eval', or begin its name with 'eval-'."
         yield from _unknown(f"evaluations.{name}.data", evaluation.data, study.data)
     for name, run in study.runs.items():
         trained = [other for other, spec in study.runs.items() if other != name and spec.policy is None]

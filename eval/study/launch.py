@@ -1,6 +1,7 @@
 """Run the steps of a plan through submitit: as processes on this machine, spread over its GPUs, or as jobs of Slurm.
 
-A step looks at what is left to do when it begins, so a step that was killed, requeued or started twice continues or finds itself done.
+A step looks at what is left to do when it begins, so a step that was killed, requeued or started twice continues or
+finds itself done.
 """
 
 from __future__ import annotations
@@ -165,7 +166,8 @@ def launch(
 
 @dataclass
 class Job:
-    """What submitit runs: the commands that a step needs now. It returns what went wrong, in a line; None if nothing did."""
+    """What submitit runs: the commands that a step needs now. It returns what went wrong, in a line; None if nothing
+    did."""
 
     step: Step
     out: Path
@@ -190,7 +192,8 @@ class Job:
         return None
 
     def checkpoint(self) -> Any:
-        """Let the training write its checkpoint, and continue in another job: submitit calls this when a job's time is over."""
+        """Let the training write its checkpoint, and continue in another job: submitit calls this when a job's time is
+        over."""
         if self.process is not None:
             self.process.terminate()
             # Not wait(): this is a signal handler, perhaps inside of wait(), which holds a lock.
@@ -250,7 +253,8 @@ def _executor(submitit: Any, out: Path, cluster: Cluster, step: Step, gpus: list
 
 
 def _submitted(executor: Any, job: Job) -> Any:
-    """Submit a job. Ctrl-C is left to :func:`launch`: submitit's own process would kill the training a second after it."""
+    """Submit a job. Ctrl-C is left to :func:`launch`: submitit's own process would kill the training a second after
+    it."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         return executor.submit(job)

@@ -1,4 +1,5 @@
-"""The runs and steps of a study: a step has a name, the steps it needs, what is left to do, and the commands that do it.
+"""The runs and steps of a study: a step has a name, the steps it needs, what is left to do, and the commands that do
+it.
 
     OUT/data/SUBSET/demos.npz               demonstrations of a subset of the data, and its definition (subset.json)
     OUT/data/SUBSET/ROBOT/resets.npz        reset bank, made by xreset retarget and xreset resets
@@ -156,7 +157,7 @@ class Step:
         return is_claimed(self.writes)
 
 
-# Steps ------------------------------------------------------------------------------------------------------------------------------------
+# Steps ----------------------------------------------------------------------------------------------------------------
 
 
 def bank_step(subset: Subset, robot: str) -> Step:
@@ -207,7 +208,8 @@ def _train_commands(run: Run) -> list[list[str]]:
     if not checkpoints(run.folder):
         if run.begun:
             raise RunError(
-                f"{run.folder} cannot be continued: it has a policy and no checkpoint. Bring its checkpoints, or choose another --out."
+                f"{run.folder} cannot be continued: it has a policy and no checkpoint. "
+                "Bring its checkpoints, or choose another --out."
             )
         options |= {
             "robot": spec.robot,
@@ -335,7 +337,7 @@ def _result(folder: Path, engine: str) -> EvalResult | None:
     return read_result(file) if file.is_file() else None
 
 
-# The plan ---------------------------------------------------------------------------------------------------------------------------------
+# The plan -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(kw_only=True)

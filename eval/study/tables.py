@@ -131,7 +131,8 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
 
 
 def seeds_of(plan: Plan, group: str, evaluation: str) -> tuple[Training, ...]:
-    """Return the evaluated trainings of a run of the study. Trainings of one seed, one for each object alone, are joined."""
+    """Return the evaluated trainings of a run of the study. Trainings of one seed, one for each object alone, are
+    joined."""
     by_seed: dict[int, list[Training]] = {}
     for run in plan.runs:
         folder = run.folder / evaluation

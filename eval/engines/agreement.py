@@ -122,6 +122,11 @@ class EngineParity:
     broken: int
     """Worlds that were not finite or dropped contacts, over all tries."""
 
+    @property
+    def ok(self) -> bool:
+        """Whether every target is met."""
+        return all(metric.ok for metric in self.metrics)
+
     def as_dict(self) -> dict[str, Any]:
         """Return JSON-able content."""
         return {
@@ -155,7 +160,6 @@ class Parity:
             for label, i in zip(tried.label, tried.object_index.tolist(), strict=True):
                 rows.append({"grasp": label, "object": self.objects[i].name})
             grasps[name] = rows
-        metrics = [metric for tested in self.engines for metric in tested.metrics]  # noqa: XR002
         return {
             "schema": SCHEMA,
             "robot": self.robot.name,
@@ -165,7 +169,7 @@ class Parity:
             "floor": self.floor.as_dict(),
             "engines": [tested.as_dict() for tested in self.engines],
             "grasps": grasps,
-            "ok": all(metric.ok for metric in metrics),
+            "ok": all(tested.ok for tested in self.engines),
         }
 
 

@@ -193,9 +193,11 @@ def _failures(check: Json) -> str:
 
 def _parity(data: Json) -> dict[str, Any]:
     columns = [data["floor"], *data["engines"]]
-    metrics = [{m["metric"]: m for m in engine["metrics"]} for engine in columns]  # noqa: XR002
+    metrics = []
     known: dict[str, Json] = {}
-    for found in metrics:
+    for engine in columns:
+        found = {m["metric"]: m for m in engine["metrics"]}
+        metrics.append(found)
         known |= found
     rows = []
     for name, metric in known.items():

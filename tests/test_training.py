@@ -288,6 +288,9 @@ class TrainingTest(unittest.TestCase):
         with redirect_stderr(io.StringIO()) as text, self.assertRaises(SystemExit):
             main(["train", *resume])
         self.assertIn("add " + " ".join(naming), text.getvalue())
+        with redirect_stderr(io.StringIO()) as text:
+            self.train("from-python", config=None, recipe=str(stranger), iterations=1)
+        self.assertIn("add " + " ".join(naming), text.getvalue())
         self.assertNotIn("strangers_term", sys.modules)
         for arguments in (resume, [*like, "--out", str(self.folder / "with")]):
             self.assertNotIn("reward terms", said(*arguments, *naming))

@@ -13,7 +13,7 @@ from xreset.checks import without_effect
 from xreset.errors import RunError
 from xreset.learning import train as training
 from xreset.learning.config import TrainConfig
-from xreset.learning.recipes import dropped_terms, own_terms_flag, starting_config
+from xreset.learning.recipes import dropped_terms, starting_config
 
 
 def train(
@@ -65,12 +65,9 @@ def train(
         raise RunError("A new run needs --robot and --resets. To continue the run in --out, add --resume.")
     if sentences := without_effect(config, starting_config(like)):
         raise RunError(f"--config.{'; --config.'.join(sentences)}. Omit it, or change the other one.")
-    if (dropped := dropped_terms(like)) and not config.task.reward.own:
-        print(
-            f"{like} was trained with reward terms of your own. They are off, because a run folder must not decide "
-            f"which code is imported. If you trust this code, add {own_terms_flag(dropped)}.",
-            file=sys.stderr,
-        )
+    note = dropped_terms(like)
+    if note and not config.task.reward.own:
+        print(note, file=sys.stderr)
     training.train(
         resets,
         out=out,

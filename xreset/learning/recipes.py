@@ -106,10 +106,15 @@ def starting_config(like: str) -> TrainConfig:
     return replace(config, task=replace(config.task, reward=reward))
 
 
-def dropped_terms(like: str) -> dict[str, float]:
-    """Return the user's own reward terms of a run, which :func:`starting_config` leaves out: ``module:function`` ->
-    weight."""
-    return {} if like in RECIPES else read_run(like).config.task.reward.own
+def dropped_terms(like: str) -> str | None:
+    """Return a note on a run's own reward terms, which :func:`starting_config` leaves out; None if there are none."""
+    own = {} if like in RECIPES else read_run(like).config.task.reward.own
+    if not own:
+        return None
+    return (
+        f"{like} was trained with reward terms of your own. They are off, because a run folder must not decide which "
+        f"code is imported. If you trust this code, add {own_terms_flag(own)}."
+    )
 
 
 def own_terms_flag(own: dict[str, float]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
@@ -20,7 +21,7 @@ from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel
-from xreset.learning.recipes import own_terms_flag, starting_config
+from xreset.learning.recipes import dropped_terms, own_terms_flag, starting_config
 from xreset.learning.run import RunInfo, checkpoints, latest_checkpoint, read_run, write_run
 from xreset.learning.runner import TrainingRunner
 from xreset.plugins import backend_class, device_for
@@ -51,7 +52,8 @@ def train(
     Args:
         bank: reset bank, or its file. A bank without a file is written to ``resets.npz`` in the run folder.
         out: run folder to make.
-        recipe: where the configuration comes from: ``paper``, ``minutes``, ``robust``, or another run's folder.
+        recipe: where the configuration comes from: ``paper``, ``minutes``, ``robust``, or another run's folder, without
+            reward terms of the user's own, which must be named in ``config``.
         config: the whole configuration, instead of a recipe.
         robot: name or folder of the robot; default: the robot that the bank names.
         objects: folder of object meshes; default: the built-in stand-ins.
@@ -73,7 +75,10 @@ def train(
         XResetError: bank, robot, objects and configuration do not fit together.
     """
     out = Path(out)
-    config = config or starting_config(recipe)
+    if config is None:
+        config = starting_config(recipe)
+        if note := dropped_terms(recipe):
+            print(note, file=sys.stderr)
     if iterations is not None:
         config = replace(config, iterations=iterations)
     device = device or device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")

@@ -13,7 +13,7 @@ from xreset.text import short_name
 
 
 def percent(share: float, digits: int = 0) -> str:
-    """``0.345`` -> ``34%``."""
+    """Return a share as percent: ``0.345`` is ``34%``."""
     return f"{share:.{digits}%}"
 
 
@@ -33,5 +33,5 @@ def _environment() -> Environment:
 
 
 def render(template: str, **values: Any) -> str:
-    """A page; in HTML, what could be read as markup is escaped."""
+    """Return a page; in HTML, text that could be read as markup is escaped."""
     return _environment().get_template(template).render(values)

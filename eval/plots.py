@@ -1,5 +1,7 @@
-"""Drawing with matplotlib in the project's style: as SVG that takes the page's text colour, or as a picture. No window,
-no global state."""
+"""Draw with matplotlib in the project's style, without windows and global state.
+
+Drawings become SVG with the page's text color, or pictures.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +20,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d3b", "#666666")
-"""Colour of each engine, in their order: Okabe and Ito's palette, told apart with colour-blind eyes and on light and
-dark ground."""
+"""Color of each engine: the palette of Okabe and Ito, for color-blind readers and for light and dark pages."""
 INK = "#010203"
-"""Text colour; in an SVG it is replaced by ``currentColor``."""
+"""Text color; in an SVG it is replaced by ``currentColor``."""
 
 
 @contextmanager
 def picture(path: Path, size: tuple[float, float], *, dpi: int = 120, **style: Any) -> Iterator[Figure]:
-    """A figure of a size [inches] that is written as PNG at the end of the block; ``style``: matplotlib's settings with
-    _ for a dot."""
+    """Yield a figure that is written as PNG at the end of the block.
+
+    Args:
+        size: width and height [inches].
+        style: matplotlib's settings, with _ in place of the first dot.
+    """
     with figure_style({name.replace("_", ".", 1): value for name, value in style.items()}) as figure_class:
         figure = figure_class(figsize=size, layout="constrained", facecolor="white")
         yield figure
@@ -37,7 +42,7 @@ def picture(path: Path, size: tuple[float, float], *, dpi: int = 120, **style: A
 
 
 def svg(draw: Callable[[Figure], None], size: tuple[float, float], salt: str) -> str:
-    """An ``<svg>`` element that scales with the page and takes its text colour.
+    """Return an ``<svg>`` element that scales with the page and has its text color.
 
     Args:
         size: width and height [inches].
@@ -59,13 +64,13 @@ def svg(draw: Callable[[Figure], None], size: tuple[float, float], salt: str) ->
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     used = set(re.findall(r"#([\w.-]+)", text))
     text = re.sub(r' id="([\w.-]+)"', lambda m: m[0] if m[1] in used else "", text)
-    return re.sub(
-        r'(<svg[^>]*?) width="[^"]*"', r"\1", re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1), count=1
-    ).strip()
+    for attribute in ("width", "height"):
+        text = re.sub(rf'(<svg[^>]*?) {attribute}="[^"]*"', r"\1", text, count=1)
+    return text.strip()
 
 
 def percent_axis(ax: Axes, which: str) -> None:
-    """Make an axis, ``x`` or ``y``, go from 0 to 100 percent, with lines across."""
+    """Set an axis, ``x`` or ``y``, to 0 to 100 percent, with grid lines."""
     axis = ax.xaxis if which == "x" else ax.yaxis
     (ax.set_xlim if which == "x" else ax.set_ylim)(0, 104)
     axis.set_ticks(range(0, 101, 25))
@@ -75,7 +80,7 @@ def percent_axis(ax: Axes, which: str) -> None:
 
 @contextmanager
 def figure_style(style: dict[str, Any]) -> Iterator[type[Figure]]:
-    """matplotlib's ``Figure`` class within the style of the project's plots; no window, no global state."""
+    """Yield matplotlib's ``Figure`` class; figures made in the block have the style of the project."""
     with needs("matplotlib", "eval"):
         import matplotlib
         from matplotlib.figure import Figure

@@ -11,6 +11,7 @@ import time
 import unittest
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from unittest import mock
@@ -310,12 +311,15 @@ class LaunchTest(InFolder):
         self.assertTrue(any(line.startswith("d: begun on GPU ") for line in said))
 
     @SUBMITIT
-    def test_a_step_that_another_command_is_at_is_waited_for(self):
+    def test_a_step_that_another_process_runs_is_waited_for(self):
         step = self.step("a", "touch done")
         step.writes.mkdir()
+        leftover = step.writes / ".mine.part"
+        leftover.touch()
+        (self.out / "logs").mkdir(parents=True)
+        (self.out / "logs" / "a.process").write_text("4711 workstation")
         held = claim(step.writes)
         held.__enter__()
-
         said: list[str] = []
 
         def finish():
@@ -325,10 +329,28 @@ class LaunchTest(InFolder):
             held.__exit__(None, None, None)
 
         threading.Thread(target=finish, daemon=True).start()
-        problems = launch(
-            mock.Mock(spec=Plan, out=self.out, steps={"a": step}), [step], cluster="local", say=said.append
-        )
-        self.assertEqual((problems, said), ([], ["a: in progress in another process; waiting for its end"]))
+        plan = mock.Mock(spec=Plan, out=self.out, steps={"a": step})
+        self.assertEqual(launch(plan, [step], cluster="local", say=said.append), [])
+        expected = "a: in progress in another process; waiting for its end (to end it: kill 4711 on workstation; "
+        self.assertEqual([line[: len(expected)] for line in said], [expected])
+        self.assertTrue(leftover.exists(), "to ask is not to sweep")
+
+    @SUBMITIT
+    def test_a_step_that_waits_for_a_gpu_is_asked_once_whether_it_is_done(self):
+        first = self.step("a", "sleep 2; touch done", gpus=1)
+        second = self.step("b", "touch done", gpus=1)
+        with mock.patch("xreset.eval.study.launch.visible_gpus", return_value=(0,)):
+            problems, _ = self.launch(
+                first, replace(second, left=partial(self.ask, self.folder / "asked", second.left))
+            )
+        self.assertEqual(problems, [])
+        self.assertEqual((self.folder / "asked").read_text(), "...", "before its turn, in its job, and at its end")
+
+    @staticmethod
+    def ask(log: Path, left) -> str:
+        with log.open("a") as file:
+            file.write(".")
+        return left()
 
     @SUBMITIT
     def test_ctrl_c_asks_the_command_to_end(self):

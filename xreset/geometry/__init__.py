@@ -1,2 +1,1 @@
-"""Rotations, kinematic trees, shapes, surfaces and distances: what lies beneath objects, robots, retargeting and
-engines."""
+"""Rotations, kinematic trees, shapes, surfaces and distances. Objects, robots, retargeting and engines build on them."""

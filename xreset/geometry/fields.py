@@ -74,7 +74,7 @@ class DistanceFields(Tensors):
     def nearer(self, points: Tensor, which: Tensor, limit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Find the points that are nearer to their object than a limit.
 
-        The bounding box rules most points out. One grid step is added, because beside an edge interpolated distances
+        The bounding box rules most points out. One grid step is added, because next to an edge interpolated distances
         may be too small by that much.
 
         Args:

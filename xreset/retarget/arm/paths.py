@@ -152,7 +152,7 @@ def best(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
     return paths.joints[torch.arange(len(which)), which], worth
 
 
-def mend(problem: ArmProblem, known: Paths, missed: Tensor, progress: Progress) -> Tensor:
+def repaired(problem: ArmProblem, known: Paths, missed: Tensor, progress: Progress) -> Tensor:
     """[S, T, n] the best path from pieces of the ``known`` paths and of new ones.
 
     The new paths lead both ways from some of the frames that are ``missed`` [S, T], solved again: a path from either

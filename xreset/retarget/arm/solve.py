@@ -32,7 +32,7 @@ from xreset.retarget.arm.paths import (
     best,
     branches,
     follow,
-    mend,
+    repaired,
 )
 from xreset.retarget.validity import REASONS, Measures, Thresholds
 
@@ -111,7 +111,7 @@ def _rescued(
     def mended(part: ArmProblem, rows: Tensor, missed: Tensor) -> Tensor:
         present = part.examined(joints[rows, None])  # it may have been followed again
         known = Paths.cat((present, paths[rows]), dim=1)
-        return mend(part, known, missed, lambda done: progress(0.7 + 0.3 * done))
+        return repaired(part, known, missed, lambda done: progress(0.7 + 0.3 * done))
 
     _improve(problem, joints, ("self collision",), without_collision)
     if problem.config.reseeds:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -134,7 +134,7 @@ def lift_of(training: Training) -> Lift | None:
     minutes = until("minutes")
     steps = np.nan_to_num(until("steps"))
 
-    def progress(i: int) -> dict[str, float]:
+    def progress(i: int) -> dict[str, Any]:
         return {
             "iteration": int(curve.iteration[i]),
             "env_steps": round(steps[i]),
@@ -145,8 +145,8 @@ def lift_of(training: Training) -> Lift | None:
     for share in SHARES:
         above = curve.value >= share
         if above.any():
-            passed.append(Passing(share=share, **progress(int(np.argmax(above)))))  # pyright: ignore[reportArgumentType]
-    return Lift(passed=tuple(passed), success_from_home=float(curve.value[-1]), **progress(-1))  # pyright: ignore[reportArgumentType]
+            passed.append(Passing(share=share, **progress(int(np.argmax(above)))))
+    return Lift(passed=tuple(passed), success_from_home=float(curve.value[-1]), **progress(-1))
 
 
 def fates(members: Sequence[Training], share: float, x: X) -> list[Fate]:

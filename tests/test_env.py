@@ -1,6 +1,5 @@
 """The environment and the rollouts on the MuJoCo C engine: episodes begin and end as they should, world by world."""
 
-import math
 import tempfile
 import unittest
 from dataclasses import fields, replace
@@ -18,10 +17,8 @@ from xreset.env import ManipulationEnv, make_scene
 from xreset.errors import CapabilityError
 from xreset.eval.rollout import roll_out
 from xreset.eval.trial import Engine, Trial
-from xreset.geometry.rotations import quat_rotate
 from xreset.learning.recipes import RECIPES
 from xreset.objects.catalogue import load_objects
-from xreset.objects.sampling import keypoints
 from xreset.physics import State
 from xreset.policy import ZeroPolicy
 from xreset.resets.distribution import ResetDistribution
@@ -31,7 +28,6 @@ from xreset.task.config import (
     ObservationConfig,
     RandomizationConfig,
     ResetConfig,
-    RewardConfig,
     TaskConfig,
     TerminationConfig,
     evaluation_task,
@@ -173,24 +169,6 @@ class StepTest(WithEnv):
         best = torch.stack(distance).cummin(dim=0).values[1:]
         torch.testing.assert_close(torch.stack(reach), 1 - torch.tanh(best / TASK.reward.reach_width))
         self.assertTrue(bool((torch.stack(distance)[1:] > best + 1e-3).any()), "the hand moved away at times")
-
-    def test_progress_counts_from_each_worlds_demonstration(self):
-        env = self.make(replace(QUIET, reward=RewardConfig(tracking="progress", progress_width=0.3)))
-        with mock.patch("xreset.task.rewards.contact_gate", lambda *_, **__: torch.ones(N, dtype=torch.bool)):
-            reading, reward = env.advance(torch.zeros(N, 7))
-        for world in range(N):
-            demo, corners = (
-                int(env.sequence[world]),
-                torch.as_tensor(keypoints(self.objects[int(env.backend.object_index[world])])).float(),
-            )
-            poses = [torch.as_tensor(array[demo]) for array in (self.bank.start_pos, self.bank.start_quat_wxyz)]
-            poses += [reading.state.object_pos[world], reading.state.object_quat[world]]
-            poses += [torch.as_tensor(array[demo]) for array in (self.bank.goal_pos, self.bank.goal_quat_wxyz)]
-            start, now, goal = (
-                pos + quat_rotate(quat, corners) for pos, quat in zip(poses[::2], poses[1::2], strict=True)
-            )
-            far, farthest = (math.tanh(float((points - goal).norm(dim=-1).max()) / 0.3) for points in (now, start))
-            self.assertAlmostEqual(float(reward.terms["progress"][world]), 8 * (1 - far / farthest), places=4)
 
     def test_the_same_seed_gives_the_same_episodes(self):
         runs = [self.make(seed=seed) for seed in (3, 3, 4)]
@@ -343,7 +321,7 @@ class RobustnessTest(WithEnv):
         with mock.patch.object(MujocoBackend, "capabilities", able):
             self.make()
             with self.assertRaisesRegex(
-                CapabilityError, "'mujoco' cannot set drives, object com world by world, which this task draws"
+                CapabilityError, "'mujoco' cannot set drives, object com in each world, which this task draws"
             ):
                 self.make(task)
 

@@ -1,7 +1,7 @@
 """The environment: N worlds of a physics backend, and the task's pure functions around them.
 
-It keeps rsl-rl's vector-environment contract (``step`` resets finished worlds itself) but needs rsl-rl only where a policy is trained. The
-same class, with another configuration, runs evaluations.
+It keeps rsl-rl's contract of vector environments (``step`` resets finished worlds itself) but needs rsl-rl only where a
+policy is trained. Evaluations run in the same class with another configuration.
 """
 
 from __future__ import annotations
@@ -37,14 +37,23 @@ if TYPE_CHECKING:
 
 
 _LASTING = (
-    "goal_pos", "goal_quat", "gravity_fraction", "sequence", "bank_state", "_episode_length", "_target", "_previous_action", "_best_reach",
-    "_reward", "_cloud",
-)  # fmt: skip
-"""What an environment keeps of each world from step to step, besides the engine's state."""
+    "goal_pos",
+    "goal_quat",
+    "gravity_fraction",
+    "sequence",
+    "bank_state",
+    "_episode_length",
+    "_target",
+    "_previous_action",
+    "_best_reach",
+    "_reward",
+    "_cloud",
+)
+"""Buffers that carry each world from step to step, in addition to the engine's state."""
 
 
 def make_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
-    """The scene that a task is played in."""
+    """Return the scene that a task is played in."""
     return SceneSpec(robot=robot, objects=objects, timestep=task.timestep, substeps=task.substeps)
 
 
@@ -59,18 +68,20 @@ def make_env(
     device: str = "cpu",
     seed: int = 0,
 ) -> ManipulationEnv:
-    """N worlds of the task in an engine. Close it, or use it as a context manager.
+    """Make N worlds of the task in an engine. Close the environment, or use it as a context manager.
 
     Args:
-        objects: those of the bank; world i holds object i modulo their number.
+        robot: the robot of the bank.
+        objects: the objects of the bank; world i holds object i modulo their number.
         bank: where episodes begin, and their goals.
-        task: what to observe, reward and end on; None: the paper's.
-        engine: its name, as ``xreset engines list`` prints it.
+        task: what to observe, reward and end on; None: the paper's task.
+        engine: name of the engine, as ``xreset engines list`` prints it.
         num_envs: N.
         device: where the engine and all tensors live.
-        seed: of every random number that the environment draws.
+        seed: seed of every random number that the environment draws.
     """
-    task, objects = task or TaskConfig(), tuple(objects)
+    task = task or TaskConfig()
+    objects = tuple(objects)
     backend = make_backend(engine, make_scene(robot, objects, task), num_envs, device=device)
     try:
         resets = ResetDistribution(bank, robot, tuple(o.name for o in objects), task.reset, backend.device)
@@ -83,8 +94,8 @@ def make_env(
 class ManipulationEnv:
     """N worlds in which a robot brings an object to a goal pose.
 
-    All tensors live on the backend's device. World i always holds the same object. What a step does besides physics is a few functions
-    over fixed buffers, without a branch on what a world is doing, so that a GPU replays them as graphs.
+    All tensors live on the backend's device. World i always holds the same object. Apart from physics, a step is a few
+    functions over fixed buffers without a branch on what a world is doing, so that a GPU replays them as graphs.
 
     Attributes:
         num_envs: N.
@@ -97,20 +108,24 @@ class ManipulationEnv:
         gravity_fraction: [N] share of the object's weight that acts.
         nonfinite_count: [] number of episodes that ended because a number was not finite.
         overflow_count: [] number of episodes that ended because the engine dropped contacts.
-        faults: the last of those worlds, before and after the step in which they broke.
-        variation: what else differs between one world and the next.
+        faults: the last worlds that failed, before and after the step in which they failed.
+        variation: differences between the worlds, such as masses and delays.
     """
 
     def __init__(self, backend: Backend, task: TaskConfig, resets: ResetDistribution, *, seed: int = 0) -> None:
-        """Wrap a backend; every world is reset at once.
+        """Wrap a backend and reset every world.
 
         Args:
+            backend: the worlds.
+            task: what to observe, reward and end on.
             resets: where episodes start, on the backend's device.
-            seed: of every random number that the environment draws.
+            seed: seed of every random number that the environment draws.
         """
         for name in task.reward.own:
-            own_term(name)  # what cannot be loaded is refused now, not after the first step
-        self.backend, self.task, self.resets = backend, task, resets
+            own_term(name)  # a term that cannot be loaded is refused now, not after the first step
+        self.backend = backend
+        self.task = task
+        self.resets = resets
         self.cfg = task
         self.device = backend.device
         scene = backend.scene
@@ -129,11 +144,10 @@ class ManipulationEnv:
         self._cloud_points = per_object(lambda o: surface_points(o, task.observation.cloud_points))
         self._surface_points = per_object(lambda o: surface_points(o, task.distance_points))
         self._keypoints = per_object(keypoints)
-        self._limits = tuple(
-            torch.where(limit.isfinite(), limit, sign * torch.pi)
-            for limit, sign in ((self.actions.lower, -1.0), (self.actions.upper, 1.0))
-        )
-
+        lower = self.actions.lower
+        upper = self.actions.upper
+        self._joint_lower = torch.where(lower.isfinite(), lower, -torch.pi)
+        self._joint_upper = torch.where(upper.isfinite(), upper, torch.pi)
         self._renderer: Renderer | None = None
         self._allocate()
         self.reset()
@@ -142,37 +156,44 @@ class ManipulationEnv:
         """Make every buffer that a step writes to."""
         from tensordict import TensorDict
 
-        n, task = self.num_envs, self.task
-
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(n, *shape, dtype=dtype, device=self.device)
+            return torch.zeros(self.num_envs, *shape, dtype=dtype, device=self.device)
 
-        self._episode_length = zeros(dtype=torch.long)
-        self.goal_pos, self.goal_quat = zeros(3), zeros(4)
-        self.gravity_fraction, self.sequence = zeros(), zeros(dtype=torch.long)
+        def mask() -> Tensor:
+            return zeros(dtype=torch.bool)
+
+        self.goal_pos = zeros(3)
+        self.goal_quat = zeros(4)
+        self.gravity_fraction = zeros()
+        self.sequence = zeros(dtype=torch.long)
         self.bank_state = torch.full_like(self.sequence, -1)
-        self.nonfinite_count, self.overflow_count = zeros(dtype=torch.long).sum(), zeros(dtype=torch.long).sum()
-        self._action, self._previous_action = zeros(self.num_actions), zeros(self.num_actions)
+        self.nonfinite_count = torch.zeros((), dtype=torch.long, device=self.device)
+        self.overflow_count = self.nonfinite_count.clone()
+        self._episode_length = zeros(dtype=torch.long)
+        self._action = zeros(self.num_actions)
+        self._previous_action = zeros(self.num_actions)
         self._target = zeros(self.num_actions)
-        self._best_reach, self._reward, self._time_out = zeros(), zeros(), zeros(dtype=torch.bool)
-        self._cloud = zeros(*task.observation.cloud_shape)
-        # What a step puts down for the next part of it: which worlds are reset, to what, and which are over and wait for it.
-        self._reset_mask, self._over = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
-        self._bad_action = zeros(dtype=torch.bool)
-        self._new_start = self.resets.sample(self.backend.object_index, torch.Generator(device=self.device)).clone()
-        self.variation = Variation(self.backend, task.randomization, self.actions.is_arm)
         self._sent_target = zeros(self.num_actions)
-        # What is kept of a step in case that it breaks a world.
+        self._best_reach = zeros()
+        self._reward = zeros()
+        self._cloud = zeros(*self.task.observation.cloud_shape)
+        self._time_out = mask()
+        self._bad_action = mask()
+        self._faulty = mask()
+        # Worlds to reset, and worlds whose episode is over and that wait for a reset.
+        self._reset_mask = mask()
+        self._over = mask()
+        self._new_start = self.resets.sample(self.backend.object_index, torch.Generator(device=self.device)).clone()
+        self.variation = Variation(self.backend, self.task.randomization, self.actions.is_arm)
+        # The state before a step is kept in case the step breaks a world.
         state = self.backend.state()
         self._state_before = {f.name: getattr(state, f.name).clone() for f in fields(state)}
-        self._faulty = zeros(dtype=torch.bool)
-        self._worlds = torch.arange(n, device=self.device)
-        self.faults = FaultRecorder(
-            {name: tuple(value.shape[1:]) for name, value in self._fault_values(state).items()}, self.device
-        )
+        self._worlds = torch.arange(self.num_envs, device=self.device)
+        shapes = {name: tuple(value.shape[1:]) for name, value in self._fault_values(state).items()}
+        self.faults = FaultRecorder(shapes, self.device)
         self._log_names: tuple[str, ...] = ()
         self._log_values = torch.zeros(0, device=self.device)
-        self._observations = TensorDict({}, batch_size=[n], device=self.device)
+        self._observations = TensorDict({}, batch_size=[self.num_envs], device=self.device)
 
     def close(self) -> None:
         """Close the engine."""
@@ -188,7 +209,7 @@ class ManipulationEnv:
 
     @property
     def episode_length_buf(self) -> Tensor:
-        """[N] control steps since each world's reset; what is assigned is copied."""
+        """[N] control steps since each world's reset. Assigned values are copied into the buffer."""
         return self._episode_length
 
     @episode_length_buf.setter
@@ -205,27 +226,27 @@ class ManipulationEnv:
         return self._observations.clone()
 
     def step(self, action: Tensor, begin: Tensor | None = None) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
-        """One control step, then a reset of every world whose episode has ended.
+        """Take one control step, then reset every world whose episode has ended.
 
         Args:
-            action: [N, J] in [-1, 1] (limited to it). A world that is given numbers that are not finite ends as if its engine had failed.
-            begin: [N] bool, worlds that are reset instead; None: those whose episode has ended. A world whose episode has ended and that is
-                not reset yet counts no more: it does not end again, and nothing is learned from it.
+            action: [N, J], limited to [-1, 1]. A world whose numbers are not finite ends as if its engine had failed.
+            begin: [N] bool, worlds to reset instead; None: the worlds whose episode has ended. A world whose episode
+                has ended and that is not reset yet does not end again, and nothing is learned from it.
 
         Returns:
-            Observations (of the new episode where one has begun), reward [N], done [N] (0 or 1), extras with ``time_outs`` [N] (ended
-            without failing: the value is to be bootstrapped), ``faulty`` [N] bool (ended because the simulation failed: nothing is to be
-            learned from this step) and ``log``.
+            Observations (of the new episode where one has begun), reward [N], done [N] (0 or 1), and a dictionary with
+            ``time_outs`` [N] (the episode ended without failing: bootstrap its value), ``faulty`` [N] bool (the
+            simulation failed: learn nothing from this step) and ``log``.
         """
         self._apply_action(action)
         self._graphs.run(self._compute_rewards)
-        reward, done, time_out, faulty = (
-            self._reward.clone(),
-            self._reset_mask.long(),
-            self._time_out.float(),
-            self._faulty.clone(),
-        )
-        log = dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True))
+        reward = self._reward.clone()
+        done = self._reset_mask.long()
+        extras = {
+            "time_outs": self._time_out.float(),
+            "faulty": self._faulty.clone(),
+            "log": dict(zip(self._log_names, self._log_values.clone().unbind(), strict=True)),
+        }
         if begin is not None:
             self._over |= self._reset_mask
             self._reset_mask.copy_(begin)
@@ -233,12 +254,12 @@ class ManipulationEnv:
             self._graphs.run(self._sample_resets)
             self._write_resets()
         self._graphs.run(self._compute_observations)
-        return self.get_observations(), reward, done, {"time_outs": time_out, "faulty": faulty, "log": log}
+        return self.get_observations(), reward, done, extras
 
-    # Stepping and resetting --------------------------------------------------------------------------------------------------------
+    # Stepping and resetting
 
     def advance(self, action: Tensor) -> tuple[Reading, Reward]:
-        """One control step without any reset: for evaluation, which ends episodes by itself."""
+        """Take one control step without any reset, for evaluation, which ends episodes itself."""
         self._apply_action(action)
         reading, reward = self._compute_rewards()
         self._reset_mask.zero_()
@@ -249,8 +270,8 @@ class ManipulationEnv:
         """Start new episodes.
 
         Args:
-            worlds: [M] long indices; None means all.
-            start: the M starts; None draws them from the reset distribution.
+            worlds: [M] long indices of worlds; None: all worlds.
+            start: M starts; None: they are drawn from the reset distribution.
         """
         if worlds is None:
             worlds = torch.arange(self.num_envs, device=self.device)
@@ -263,7 +284,7 @@ class ManipulationEnv:
         self._compute_observations()
 
     def reading(self) -> Reading:
-        """The present physical state and what follows from it."""
+        """Return the present physical state and what follows from it."""
         return Reading.of(self.backend, self._surface_points, self._bad_action)
 
     def render(self, world: int = 0, size: tuple[int, int] = (640, 480)) -> np.ndarray:
@@ -301,7 +322,7 @@ class ManipulationEnv:
         self.generator.set_state(state.cpu())
 
     def snapshot(self) -> dict[str, Tensor]:
-        """All that the worlds' futures depend on besides random numbers and an engine's warm start, on the CPU: for :meth:`restore`."""
+        """Return the state of all worlds on the CPU, without random numbers and warm starts, for :meth:`restore`."""
         state = self.backend.state()
         values = {f"state.{f.name}": getattr(state, f.name) for f in fields(state)}
         values |= {f"env.{name}": value for name, value in self._lasting.items()}
@@ -309,10 +330,13 @@ class ManipulationEnv:
         return {name: value.to("cpu", copy=True) for name, value in values.items()}
 
     def restore(self, snapshot: dict[str, Tensor]) -> bool:
-        """Go on from a snapshot; False, and nothing is changed, if it is of another number of worlds or of another task."""
-        if {name: value.shape for name, value in snapshot.items()} != {
-            name: value.shape for name, value in self.snapshot().items()
-        }:
+        """Continue from a snapshot.
+
+        Returns:
+            False, and nothing is changed, if the snapshot is of another number of worlds or of another task.
+        """
+        expected = {name: value.shape for name, value in self.snapshot().items()}
+        if {name: value.shape for name, value in snapshot.items()} != expected:
             return False
         for name, value in self._lasting.items():
             value.copy_(snapshot[f"env.{name}"])
@@ -325,10 +349,10 @@ class ManipulationEnv:
 
     @property
     def _lasting(self) -> dict[str, Tensor]:
-        """What is kept of each world from step to step, besides the engine's state."""
+        """Buffers that carry each world from step to step, in addition to the engine's state."""
         return {name: getattr(self, name) for name in _LASTING} | self.variation.lasting()
 
-    # Parts -------------------------------------------------------------------------------------------------------------------------
+    # Parts
 
     def _apply_action(self, action: Tensor) -> None:
         self._action.copy_(action)
@@ -337,24 +361,23 @@ class ManipulationEnv:
         self.backend.step()
 
     def _process_action(self) -> None:
-        """From the action to the drives' targets."""
+        """Turn the action into the drives' targets."""
         state = self.backend.state()
         for name, value in self._state_before.items():
             value.copy_(getattr(state, name))
-        self._bad_action |= ~self._action.isfinite().all(
-            dim=1
-        )  # a world without an action ends as one whose engine failed
+        self._bad_action |= ~self._action.isfinite().all(dim=1)
         self._action.nan_to_num_(0.0, 0.0, 0.0)
         if not self.task.reward.raw_actions:
             self._action.clamp_(-1.0, 1.0)
         self._target.copy_(self.actions.targets(self._action, self._target, state.joint_pos))
-        self._sent_target.copy_(self.variation.heard(self._target))
+        self._sent_target.copy_(self.variation.delayed_targets(self._target))
 
     def _compute_rewards(self) -> tuple[Reading, Reward]:
-        """What the step has brought: reward, ends of episodes, numbers to log."""
+        """Compute rewards, ends of episodes and the numbers to log."""
         reading = self.reading()
-        # What failed in the simulation ends, is counted and kept, and is not learned from. Numbers that are not finite say nothing at all.
-        broken, live = reading.health.nonfinite, ~self._over
+        # A failed world ends, is counted and recorded, and nothing is learned from it.
+        broken = reading.health.nonfinite
+        live = ~self._over
         self._faulty.copy_((broken | reading.health.overflow) & live)
         self.nonfinite_count += (self._faulty & broken).sum()
         self.overflow_count += (self._faulty & ~broken).sum()
@@ -389,12 +412,13 @@ class ManipulationEnv:
         totals = {"health/nonfinite_total": self.nonfinite_count, "health/overflow_total": self.overflow_count}
         names, values = step_log(reward, self._reset_mask, sound=~broken, from_home=~self.from_bank, totals=totals)
         if not self._log_names:
-            self._log_names, self._log_values = names, torch.zeros_like(values)
+            self._log_names = names
+            self._log_values = torch.zeros_like(values)
         self._log_values.copy_(values)
         return reading, reward
 
     def _fault_values(self, after: State) -> dict[str, Tensor]:
-        """What is kept of a world that breaks: name -> [N, ...]."""
+        """Return what is recorded of a world that fails: name -> [N, ...]."""
         return {
             "world": self._worlds,
             "object_index": self.backend.object_index,
@@ -409,8 +433,9 @@ class ManipulationEnv:
         }
 
     def _sample_resets(self, from_distribution: bool = True) -> None:
-        """Draw how every world would begin anew, so that nothing waits for their number, and let the fresh ones take it over."""
-        fresh, start = self._reset_mask, self._new_start
+        """Draw a start for every world, so that nothing waits for the number of resets; the worlds to reset take it."""
+        fresh = self._reset_mask
+        start = self._new_start
         if from_distribution:
             start.map(Tensor.copy_, self.resets.sample(self.backend.object_index, self.generator))
         self.variation.begin(fresh, start.joint_target)
@@ -428,36 +453,36 @@ class ManipulationEnv:
             cleared.masked_fill_(fresh.view(-1, *[1] * (cleared.ndim - 1)), 0)
 
     def _write_resets(self) -> None:
-        """Put the fresh worlds into their new states."""
+        """Put the worlds to reset into their new states."""
         start = self._new_start
         self._bad_action &= ~self._reset_mask
         self._set_worlds(State.at_rest(start.joint_pos, start.object_pos, start.object_quat, start.joint_target))
 
     def _set_worlds(self, state: State) -> None:
-        """Give the worlds of the mask states [N, ...] and their physical parameters."""
+        """Set states [N, ...] and physical parameters of the worlds to reset."""
         self.backend.set_where(
             self._reset_mask, state, Parameters(**self.variation.parameters, object_gravity=self.gravity_fraction)
         )
 
     def _compute_observations(self) -> None:
-        """Refresh the observations; fresh worlds start with a cloud history of copies, and with this reach as their best."""
+        """Refresh the observations. A fresh world's cloud history is copies, and its best reach is the present one."""
         reading = self.reading()
-        c, state, links = self.task.observation, reading.state, reading.links
+        c = self.task.observation
         self._best_reach.copy_(torch.where(self._reset_mask, reading.tip_distance.mean(dim=-1), self._best_reach))
-        seen_pos, seen_quat = self.variation.seen(state, self._reset_mask)
+        observed_pos, observed_quat = self.variation.observed_pose(reading.state, self._reset_mask)
         x = obs.ObservationInput(
-            state=state,
-            links=links,
+            state=reading.state,
+            links=reading.links,
             joint_target=self._target,
-            joint_lower=self._limits[0],
-            joint_upper=self._limits[1],
-            seen_pos=seen_pos,
-            seen_quat=seen_quat,
+            joint_lower=self._joint_lower,
+            joint_upper=self._joint_upper,
+            observed_pos=observed_pos,
+            observed_quat=observed_quat,
             goal_pos=self.goal_pos,
             goal_quat=self.goal_quat,
             gravity_fraction=self.gravity_fraction,
             previous_action=self._previous_action.clamp(-1.0, 1.0),
-            tip_force=self.variation.felt(reading.contacts.tip_force),
+            tip_force=self.variation.scaled_forces(reading.contacts.tip_force),
             tip_distance=reading.tip_distance,
             reward=self._reward,
         )

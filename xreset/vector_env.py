@@ -22,14 +22,16 @@ if TYPE_CHECKING:
 class VectorEnv(gymnasium.vector.VectorEnv):
     """N worlds of the task in any engine.
 
-    Observations are a dictionary of the environment's groups, [N, ...] float32 and always finite; actions are [N, J] in [-1, 1].
+    Observations are a dictionary of the environment's groups, [N, ...] float32 and always finite; actions are [N, J] in
+    [-1, 1].
 
-    An episode is truncated when its time is over: a learner bootstraps its value from the last observation, which is the one that the step
-    returns. An episode is terminated when the object leaves the scene or the simulation fails. A world whose simulation fails repeats its
-    last sound observation, gives no reward, and is named by ``infos["faulty"]``.
+    An episode is truncated when its time is over: a learner bootstraps its value from the last observation, which is
+    the one that the step returns. An episode is terminated when the object leaves the scene or the simulation fails. A
+    world whose simulation fails repeats its last sound observation, gives no reward, and is named by
+    ``infos["faulty"]``.
 
-    The step after an end ignores the world's action, gives no reward, and returns the first observation of the next episode (Gymnasium's
-    ``AutoresetMode.NEXT_STEP``).
+    The step after an end ignores the world's action, gives no reward, and returns the first observation of the next
+    episode (Gymnasium's ``AutoresetMode.NEXT_STEP``).
     """
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012
@@ -72,10 +74,11 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """Take one control step in every world.
 
         Args:
-            actions: [N, J] real numbers in [-1, 1]; numbers beyond are limited. A world whose numbers are not finite fails.
+            actions: [N, J] real numbers, limited to [-1, 1]. A world whose numbers are not finite fails.
 
         Returns:
-            Observations, reward [N], terminated [N], truncated [N], and ``faulty`` [N] (whether the simulation failed) in a dictionary.
+            Observations, reward [N], terminated [N], truncated [N], and a dictionary with ``faulty`` [N]: whether the
+            simulation failed.
 
         Raises:
             XResetError: the actions have another shape, or are not real numbers.

@@ -1,4 +1,4 @@
-"""The task's one typed configuration. Defaults are the paper's; where it is silent, the docstring says what was chosen.
+"""The task's typed configuration. Defaults are the paper's; where the paper is silent, the docstring says so.
 
 "Table VIII", "Table IX" and "appendix D" name parts of the X-RESET paper.
 """
@@ -14,29 +14,33 @@ from xreset.checks import Checked, Finite, NotNegative, Only, Positive, Range, S
 
 @dataclass(frozen=True, kw_only=True)
 class ActionConfig(Checked):
-    """How a policy's output in [-1, 1] becomes joint targets (Table VIII: relative arm commands, absolute hand targets)."""
+    """How a policy's output in [-1, 1] becomes joint targets.
+
+    In the paper, arm commands are relative and hand targets absolute (Table VIII).
+    """
+
+    REMOVED: ClassVar[dict[str, Any]] = {"hand_smoothing": 1.0}
 
     arm_step: Positive[float] = 0.03
     """Largest change of an arm joint's target per control step [rad]: 1.8 rad/s at 60 Hz. Not in the paper."""
     arm_lead: Positive[float] = 0.15
-    """Farthest that an arm target may run ahead of the joint [rad], so that a blocked arm does not wind up. Not in the paper."""
+    """Largest distance from an arm joint to its target [rad], so that a blocked arm does not wind up. Not in the
+    paper."""
     hand: Literal["absolute", "relative"] = "absolute"
-    """``absolute``: an action says where between its limits a hand joint is to go (the paper). ``relative``: how far its target moves, as
-    for the arm, so that a policy that does nothing holds what it was given: with absolute targets a new policy opens the hand in every
-    demonstrated grasp and has to learn to hold before it can learn to lift. In-hand manipulation is commonly learned so (Qi et al. 2022,
-    In-Hand Object Rotation via Rapid Motor Adaptation)."""
+    """``absolute``: the action is the target between the joint's limits (the paper). ``relative``: the action moves the
+    target, as for the arm, so that a policy that does nothing keeps a grasp. With absolute targets a new policy opens
+    the hand in every demonstrated grasp, and learns to hold before it can learn to lift. In-hand manipulation is
+    commonly learned with relative targets (Qi et al. 2022, In-Hand Object Rotation via Rapid Motor Adaptation)."""
     hand_step: Annotated[Positive[float], Only("hand", "relative")] = 0.05
     """Largest change of a hand joint's target per control step [rad]: 3 rad/s at 60 Hz. Joints that slide move 4 cm
     for every radian."""
     hand_lead: Annotated[Positive[float], Only("hand", "relative")] = 0.4
-    """Farthest that a hand joint's target may run ahead of the joint [rad], which is how hard it can press: drives of
-    the Sharpa hand reach their effort limits at 0.3 to 0.7."""
+    """Largest distance from a hand joint to its target [rad]. It limits how hard the joint presses: drives of the
+    Sharpa hand reach their effort limits at 0.3 to 0.7."""
     hand_zero: Annotated[Literal["middle", "home"], Only("hand", "absolute")] = "middle"
-    """Where a hand joint is sent by action 0: to the middle of its limits, which is a half-closed fist, or to the
-    robot's home pose, from which -1 and +1 lead to the limits along two slopes. A new policy's mean is 0: with ``middle`` it closes the
-    open hand at once and comes down on the object with its knuckles. Not in the paper."""
-    hand_smoothing: Annotated[Positive[Share[float]], Only("hand", "absolute")] = 1.0
-    """Share of the new hand target that is taken per control step, in (0, 1]; 1 is the paper's plain target."""
+    """Target of a hand joint under action 0: the middle of its limits, or the robot's home pose, from which -1 and +1
+    lead to the limits along two slopes. A new policy's mean is 0: with ``middle`` it half closes the hand at once and
+    meets the object with its knuckles. Not in the paper."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,26 +61,30 @@ class NoiseConfig(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationConfig(Checked):
-    """What the policy sees (appendix C): groups ``policy``, ``proprio``, ``perception``; the critic's ``privileged``."""
+    """What the policy observes (appendix C): the groups ``policy``, ``proprio`` and ``perception``.
+
+    The critic also observes the group ``privileged``.
+    """
 
     cloud_points: Positive[int] = 64
     """Points per cloud (P)."""
     cloud: Literal["history", "paired"] = "history"
-    """What the policy sees of the object's surface points. ``history``: their positions in the last ``cloud_history`` frames (the draft of
-    the paper). ``paired``: for every point its position, its position at the goal, and the goal's minus the present one, in this frame
-    only (the published paper): the error of the pose, point by point."""
+    """What the policy observes of the object's surface points. ``history``: their positions in the last
+    ``cloud_history`` frames (the draft of the paper). ``paired``: the position of every point, its position at the
+    goal, and the goal's minus the present one, in this frame only (the published paper). It shows the pose error point
+    by point."""
     cloud_history: Annotated[Positive[int], Only("cloud", "history")] = 5
     """Frames of cloud history, oldest first."""
     rotation: Literal["quaternion", "matrix"] = "quaternion"
-    """How orientations are shown: a quaternion with w >= 0, which jumps where w is 0, or the first two columns of the rotation matrix,
-    which never do (Zhou et al. 2019, On the Continuity of Rotation Representations)."""
+    """``quaternion``: a quaternion with w >= 0, which jumps where w is 0. ``matrix``: the first two columns of the
+    rotation matrix, which never jump (Zhou et al. 2019, On the Continuity of Rotation Representations)."""
     cloud_scale: Positive[Finite[float]] = 1.0
     """Factor on the clouds' coordinates [1/m]."""
     contact_force_scale: NotNegative[float] = 0.1
     """Factor on fingertip forces [1/N] before they are limited to [-1, 1]."""
     joint_target: bool = False
-    """Whether the policy sees how far each drive's target is ahead of its joint [rad]. With absolute hand targets the previous action says
-    so; with relative ones nothing does."""
+    """Whether the policy observes the distance from each joint to its drive's target [rad]. With relative hand targets
+    no other observation contains it."""
     joint_vel_scale: NotNegative[float] = 0.1
     """Factor on joint velocities [s/rad]."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
@@ -93,39 +101,34 @@ class ObservationConfig(Checked):
 class RewardConfig(Checked):
     """Weights and widths of the reward (appendix D.d)."""
 
+    REMOVED: ClassVar[dict[str, Any]] = {"tracking": "presence", "progress": 8.0, "progress_width": 0.15}
+
     reach: Finite[float] = 1.0
     reach_width: Positive[float] = 0.1
     """Distance [m] at which 1 - tanh(d / width) falls to 0.24. Not in the paper."""
     reach_near: Finite[float] = 0.0
-    """Weight of a second reach term with its own width. One width cannot do both: 0.1 m pays nothing 36 cm away, where home is, and with
-    0.4 m the last centimetres, in which fingers wrap around the object, are worth less than what moving costs."""
+    """Weight of a second reach term with its own width. A width of 0.1 m pays nothing at home, 36 cm away. With 0.4 m
+    the last centimetres, in which fingers wrap around the object, are worth less than moving costs."""
     reach_near_width: Positive[float] = 0.05
     """[m]"""
     reach_distance: Literal["best", "present"] = "best"
-    """What both reach terms are paid for: the episode's smallest distance so far (the paper), also while the hand moves away again, or the
-    present one (as in Isaac Lab's dexterous lift), so that a hand that has missed stays near and tries again."""
+    """Distance that both reach terms pay for. ``best``: the smallest of the episode (the paper), so that a hand that
+    moves away is still paid. ``present``: the present one (as in Isaac Lab's dexterous lift), so that a hand that has
+    missed stays near and tries again."""
     grasp: Finite[float] = 1.0
-    tracking: Literal["presence", "progress"] = "presence"
-    """What pays for the object's pose while the contact gate is open. ``presence``: how near it is to the goal, in position and in rotation
-    (the paper), also of an object that is only pressed down where it stands. ``progress``: how much nearer than at the demonstration's
-    start, which pays nothing for that. Isaac Lab came to reward lifting so (isaac-sim/IsaacLab#6155); this form is our own."""
-    position: Annotated[Finite[float], Only("tracking", "presence")] = 4.0
-    position_width: Annotated[Positive[float], Only("tracking", "presence")] = 0.2
+    position: Finite[float] = 4.0
+    position_width: Positive[float] = 0.2
     """[m]"""
-    rotation: Annotated[Finite[float], Only("tracking", "presence")] = 4.0
-    rotation_shape: Annotated[Literal["tanh", "linear"], Only("tracking", "presence")] = "tanh"
-    """How ``rotation`` falls with the angle to the goal. ``tanh``: 1 - tanh(angle / ``rotation_width``) (the paper), which is flat beyond a
-    right angle. ``linear``: 1 - angle / pi, which has the same slope everywhere."""
+    rotation: Finite[float] = 4.0
+    rotation_shape: Literal["tanh", "linear"] = "tanh"
+    """``tanh``: ``rotation`` times 1 - tanh(angle / ``rotation_width``) (the paper), which is flat beyond a right
+    angle. ``linear``: times 1 - angle / pi, which has the same slope everywhere."""
     rotation_width: Annotated[Positive[float], Only("rotation_shape", "tanh")] = 1.5
     """[rad]"""
-    rotation_near: Annotated[Finite[float], Only("tracking", "presence")] = 0.0
+    rotation_near: Finite[float] = 0.0
     """Weight of a second rotation term, 1 - tanh(angle / ``rotation_near_width``), which pays for the last degrees."""
     rotation_near_width: Positive[float] = 0.3
     """[rad]"""
-    progress: Annotated[Finite[float], Only("tracking", "progress")] = 8.0
-    """Paid in full at the goal, nothing at the start, and less than nothing farther away."""
-    progress_width: Annotated[Positive[float], Only("tracking", "progress")] = 0.15
-    """[m]"""
     success: Finite[float] = 10.0
     success_position: Positive[float] = 0.02
     """[m] (section V)"""
@@ -135,16 +138,17 @@ class RewardConfig(Checked):
     action_rate: Finite[float] = -0.005
     out_of_bounds: Finite[float] = -500.0
     contact: Literal["any", "opposing"] = "any"
-    """What opens the gate of ``position``, ``rotation`` and ``success``: thumb and another finger press (the paper), or press against each
-    other: their forces on the object are more than 90 degrees apart. A hand that presses an object down from above pushes with both in one
-    direction; one that holds it does not. ``grasp`` is paid for either."""
+    """What opens the gate of ``position``, ``rotation`` and ``success``. ``any``: the thumb and another finger press
+    (the paper). ``opposing``: their forces on the object are more than 90 degrees apart. A hand that presses an object
+    down from above pushes with both in one direction; a hand that holds it does not. ``grasp`` is paid for either."""
     contact_threshold: NotNegative[float] = 0.1
     """Force [N] from which a finger counts as in contact. Not in the paper."""
     raw_actions: bool = False
-    """Whether ``action`` and ``action_rate`` take actions as the policy gave them, and not as limited to [-1, 1]. Where a mean lies beyond
-    the limit, noise explores nothing, and only a penalty of the raw action pulls it back (as in Isaac Lab's action terms)."""
+    """Whether ``action`` and ``action_rate`` penalise actions as the policy gave them, instead of limited to [-1, 1].
+    Beyond the limit noise explores nothing, and only a penalty of the raw action pulls the mean back (as in Isaac Lab's
+    action terms)."""
     own: dict[str, float] = field(default_factory=dict)
-    """Terms of your own: ``module:function`` -> weight (:func:`xreset.task.rewards.own_term`)."""
+    """Reward terms of the user: ``module:function`` -> weight (:func:`xreset.task.rewards.own_term`)."""
     scale: Positive[Finite[float]] = 0.01
     """Factor on the total (Table VIII)."""
 
@@ -209,9 +213,10 @@ class ResetConfig(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizationConfig(Checked):
-    """Physical parameters drawn at each reset (Table IX), and what else differs between one robot and the next (not in the paper).
+    """Physical parameters drawn at each reset.
 
-    The second kind is off by default: what a policy loses to it between engines is measured in docs/sim-to-sim.md.
+    The first ones are the paper's (Table IX). The others differ between one robot and the next and are off by default;
+    docs/sim-to-sim.md has what each costs a policy between engines.
     """
 
     enabled: bool = True
@@ -220,7 +225,8 @@ class RandomizationConfig(Checked):
     friction_buckets: Positive[int] = 250
     """Number of distinct materials."""
     elastomer: NotNegative[float] = 0.8
-    """Coefficient of the fingertips' material. A pair's friction is the mean of its two materials, the rule of the paper's simulator."""
+    """Coefficient of the fingertips' material. The friction of a pair is the mean of its two materials, as in the
+    paper's simulator."""
     metal: NotNegative[float] = 0.1
     """Coefficient of every other link's material."""
     table: NotNegative[float] = 0.5
@@ -230,22 +236,25 @@ class RandomizationConfig(Checked):
     torsional_friction: Range = (1.0, 1.0)
     """Range of the factor on the torsional friction of the object's pairs."""
     object_inertia: Range = (1.0, 1.0)
-    """Range of the factor on the object's inertia, beside what its mass does."""
+    """Range of the factor on the object's inertia, in addition to the factor on its mass."""
     object_com: Range = (0.0, 0.0)
-    """Range of the distance [m] by which the object's centre of mass is off, in any direction."""
+    """Range of the distance [m] by which the object's centre of mass is moved, in any direction."""
     hand_friction: Range | None = None
-    """Range of the coefficient of every link's material beside the fingertips'; None: ``metal``."""
+    """Range of the coefficient of every link's material except the fingertips'; None: ``metal``."""
     arm_stiffness: Range = (1.0, 1.0)
-    """Range of the factor on the stiffness of the arm's drives, one for all of them; likewise the next four."""
+    """Range of the factor on the stiffness of the arm's drives, the same for all of them."""
     arm_damping: Range = (1.0, 1.0)
+    """Range of the factor on their damping."""
     hand_stiffness: Range = (1.0, 1.0)
+    """Range of the factor on the stiffness of the hand's drives."""
     hand_damping: Range = (1.0, 1.0)
+    """Range of the factor on their damping."""
     effort: Range = (1.0, 1.0)
-    """Of every drive's effort limit."""
+    """Range of the factor on the effort limit of every drive."""
     action_latency: Range = (0.0, 0.0)
-    """Range of the control steps by which drives hear of an action late; between whole ones the two targets are mixed."""
+    """Range of the delay of actions [control steps]. Between whole steps the two targets are interpolated."""
     observation_latency: Range = (0.0, 0.0)
-    """Range of the control steps by which the object's pose and cloud are seen late."""
+    """Range of the delay of the observed object pose and cloud [control steps]."""
     force_gain: Range = (1.0, 1.0)
     """Range of the factor on the fingertips' force readings."""
 
@@ -256,7 +265,7 @@ class RandomizationConfig(Checked):
                 raise ValueError(f"{name} begins with {getattr(self, name)[0]}, expected factors above 0")
 
     def draws(self, *names: str) -> bool:
-        """Whether one of these ranges is another than its default."""
+        """Whether one of these ranges differs from its default."""
         return self.enabled and any(getattr(self, name) != getattr(_AS_STATED, name) for name in names)
 
     @property
@@ -289,9 +298,10 @@ class TaskConfig(Checked):
         super().__post_init__()
         steps = self.termination.episode_seconds / (self.timestep * self.substeps)
         for name in ("action_latency", "observation_latency"):
-            if (longest := getattr(self.randomization, name)[1]) >= steps:
+            longest = getattr(self.randomization, name)[1]
+            if longest >= steps:
                 raise ValueError(
-                    f"{name} goes up to {longest:g} control steps, expected fewer than an episode has, which are {steps:.0f}"
+                    f"{name} goes up to {longest:g} control steps, expected fewer than the {steps:.0f} of an episode"
                 )
 
 
@@ -300,10 +310,10 @@ EVALUATION_TIMESTEP = 1.0 / 240.0
 
 
 def evaluation_task(task: TaskConfig) -> TaskConfig:
-    """The task as a policy is evaluated: from home at full gravity, nominal physics, no observation noise; spawns stay perturbed.
+    """Return the task in which a policy is evaluated: from home at full gravity, with nominal physics and no noise.
 
-    Physics takes steps of :data:`EVALUATION_TIMESTEP`, if whole ones make a control step. Reward terms of the user's own are left out: no
-    figure rests on them, and their module need not be where a policy is evaluated.
+    Spawns stay perturbed. Physics takes steps of :data:`EVALUATION_TIMESTEP` if a whole number of them makes a control
+    step. Reward terms of the user are left out: no figure rests on them, and their module need not be installed.
     """
     zero = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
     substeps = round(task.timestep * task.substeps / EVALUATION_TIMESTEP)

@@ -1,4 +1,4 @@
-"""What is heard or seen late: the last values of each world, read back a whole or broken number of steps later."""
+"""Delays: the last values of each world, read back a number of steps later."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from torch import Tensor
 
 
 class DelayLine:
-    """The last values of N worlds, newest first; all work is over fixed buffers, so that it can be captured in a graph."""
+    """The last values of N worlds, newest first.
+
+    All work is done in fixed buffers, so that it can be captured in a graph.
+    """
 
     def __init__(self, like: Tensor, longest: float) -> None:
         """Allocate.
 
         Args:
-            like: [N, D] what is delayed.
+            like: [N, D] the delayed quantity.
             longest: largest delay [steps].
         """
         self.values = torch.zeros(like.shape[0], math.ceil(longest) + 1, like.shape[1], device=like.device)
@@ -24,11 +27,11 @@ class DelayLine:
         """[N] steps."""
 
     def fill(self, fresh: Tensor, value: Tensor) -> None:
-        """In the worlds of a mask [N], a value [N, D] becomes all that was."""
+        """Make a value [N, D] the whole past of the worlds of a mask [N]."""
         self.values.copy_(torch.where(fresh[:, None, None], value[:, None], self.values))
 
     def push(self, value: Tensor) -> Tensor:
-        """Take in the newest value [N, D] and return what is known of the past: [N, D], mixed between whole steps."""
+        """Add the newest value [N, D] and return the delayed one [N, D], interpolated between whole steps."""
         self.values.copy_(torch.cat((value[:, None], self.values[:, :-1]), dim=1))
         whole = self.delay.floor()
         at = whole.long()[:, None, None].expand(-1, 1, value.shape[1])

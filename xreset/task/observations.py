@@ -1,7 +1,7 @@
 """Observations (the paper's appendix C), as pure functions, and the layout that a policy file carries.
 
-Groups: ``policy`` (object pose, goal pose, gravity fraction, previous action), ``proprio`` (joints, palm, fingertips, contact forces),
-``perception`` (cloud history) and, for the critic only, ``privileged``.
+Groups: ``policy`` (object pose, goal pose, gravity fraction, previous action), ``proprio`` (joints, palm, fingertips,
+contact forces), ``perception`` (cloud history or paired points) and, for the critic only, ``privileged``.
 Shape letters: N worlds, J joints, E fingertips, P points, K numbers per point, H history.
 """
 
@@ -27,7 +27,7 @@ from xreset.task.config import ObservationConfig
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationInput:
-    """What observations are made of: world frame, quaternions (w, x, y, z)."""
+    """Quantities that observations are made of: world frame, quaternions (w, x, y, z)."""
 
     state: State
     links: Links
@@ -37,9 +37,9 @@ class ObservationInput:
     """[J]"""
     joint_upper: Tensor
     """[J]"""
-    seen_pos: Tensor
-    """[N, 3] object position as the policy sees it, which may be late."""
-    seen_quat: Tensor
+    observed_pos: Tensor
+    """[N, 3] object position as the policy observes it, possibly delayed."""
+    observed_quat: Tensor
     goal_pos: Tensor
     goal_quat: Tensor
     gravity_fraction: Tensor
@@ -85,18 +85,19 @@ def layout(num_joints: int, num_tips: int, c: ObservationConfig) -> dict[str, di
 
 
 def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
-    """[N, 15 + J] (19 + J with ``rotation="matrix"``) object pose (noisy), goal pose, gravity fraction, previous action."""
+    """[N, 15 + J] object pose (noisy), goal pose, gravity fraction, previous action; 4 more as matrices."""
     noise = c.noise
-    pos = x.seen_pos + noise.object_pos * _normal(x.seen_pos, generator)
-    turn = quat_from_axis_angle(noise.object_rot * _normal(x.seen_pos, generator))
-    rotation, goal_rotation = _shown(torch.stack((quat_multiply(turn, x.seen_quat), x.goal_quat)), c)
+    pos = x.observed_pos + noise.object_pos * _normal(x.observed_pos, generator)
+    turn = quat_from_axis_angle(noise.object_rot * _normal(x.observed_pos, generator))
+    rotation, goal_rotation = _shown(torch.stack((quat_multiply(turn, x.observed_quat), x.goal_quat)), c)
     return torch.cat((pos, rotation, x.goal_pos, goal_rotation, x.gravity_fraction[:, None], x.previous_action), dim=-1)
 
 
 def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
-    """[N, 2 J + 13 + 6 E] joints (position within the limits as [-1, 1], scaled velocity), palm, fingertips, limited contact forces.
+    """[N, 2 J + 13 + 6 E] joints, palm, fingertips and limited contact forces.
 
-    With ``rotation="matrix"`` there are two numbers more, with ``joint_target`` J.
+    Joint positions are scaled to [-1, 1] between their limits. With ``rotation="matrix"`` there are two numbers more,
+    with ``joint_target`` J more.
     """
     pos = x.state.joint_pos + c.noise.joint_pos * _normal(x.state.joint_pos, generator)
     vel = x.state.joint_vel + c.noise.joint_vel * _normal(x.state.joint_vel, generator)
@@ -118,7 +119,7 @@ def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Ge
 
 
 def privileged_group(x: ObservationInput) -> Tensor:
-    """[N, 15] object velocities, pose error to the goal, closest fingertip distance, gravity fraction, current reward (critic only)."""
+    """[N, 15] object velocities, pose error, least fingertip distance, gravity fraction and reward (critic)."""
     rotation_error = quat_to_axis_angle(quat_multiply(x.goal_quat, quat_conjugate(x.state.object_quat)))
     return torch.cat(
         (
@@ -139,7 +140,7 @@ def cloud_frame(points: Tensor, x: ObservationInput, c: ObservationConfig, gener
 
     The present positions are noisy. With ``cloud="paired"`` the goal positions and the differences follow them.
     """
-    cloud = quat_rotate(x.seen_quat[:, None], points) + x.seen_pos[:, None]
+    cloud = quat_rotate(x.observed_quat[:, None], points) + x.observed_pos[:, None]
     cloud = cloud + c.noise.cloud * _normal(cloud, generator)
     if c.cloud == "history":
         return c.cloud_scale * cloud
@@ -152,7 +153,7 @@ def _normal(like: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _shown(quat: Tensor, c: ObservationConfig) -> Tensor:
-    """[..., 4] or [..., 6] the same rotation for whichever of its two quaternions: a policy must not see two numbers for one pose."""
+    """[..., 4] or [..., 6] a rotation, the same numbers for both of its quaternions."""
     if c.rotation == "quaternion":
         return torch.where(quat[..., :1] < 0, -quat, quat)
     return quat_to_matrix(quat)[..., :2].mT.flatten(-2)

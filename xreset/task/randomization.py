@@ -1,4 +1,4 @@
-"""Physical parameters that are drawn anew at each reset (the paper's Table IX), as pure functions."""
+"""Physical parameters that are drawn at each reset (the paper's Table IX), as pure functions."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ def pair_friction(material: Tensor, c: RandomizationConfig, link: Tensor | float
     Args:
         material: [M] the object material's coefficient. A pair's coefficient is the mean of its two materials.
         c: the other materials' coefficients.
-        link: [M] that of the links beside the fingertips; None: ``c.metal``.
+        link: [M] coefficient of the links except the fingertips; None: ``c.metal``.
     """
     others = (c.elastomer, c.metal if link is None else link, c.table)
     return torch.stack([(material + other) / 2 for other in others], dim=-1)
 
 
 def sample_friction(count: int, c: RandomizationConfig, generator: torch.Generator) -> Tensor:
-    """[M, 3] pair friction of objects whose material is one of ``friction_buckets`` evenly spaced ones; the middle one if disabled."""
+    """[M, 3] pair friction of objects whose material is one of ``friction_buckets`` evenly spaced ones.
+
+    Without randomisation it is the material in the middle.
+    """
     low, high = c.friction
     if not c.enabled:
         return pair_friction(torch.full((count,), (low + high) / 2, device=generator.device), c)
@@ -33,8 +36,10 @@ def sample_friction(count: int, c: RandomizationConfig, generator: torch.Generat
 
 
 def own_friction(materials: Sequence[float | None], c: RandomizationConfig) -> Tensor:
-    """[n, 1] what is to be added to pair friction that was drawn, for objects whose materials' coefficients are known: they take the place
-    of the middle of the range, and a pair's coefficient is the mean of two. None: nothing."""
+    """[n, 1] offset of the pair friction of objects whose material is known; 0 for the others.
+
+    The known coefficient replaces the middle of the range, and a pair's coefficient is the mean of two materials.
+    """
     middle = sum(c.friction) / 2
     return torch.tensor([[0.0 if material is None else (material - middle) / 2] for material in materials])
 

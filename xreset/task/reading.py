@@ -1,4 +1,4 @@
-"""What an engine said after a step, what follows from it, and what of a step is logged."""
+"""State, contacts and distances of a control step, and the numbers that are logged about it."""
 
 from __future__ import annotations
 
@@ -15,25 +15,27 @@ from xreset.task.rewards import Reward
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """What the backend said after a step, and what follows from it."""
+    """State and contacts after a control step, and what follows from them."""
 
     state: State
     links: Links
     contacts: Contacts
     health: Health
-    """Of the engine; a world that was given an action that is not finite counts as not finite, too."""
+    """Health of the engine. A world that was given an action that is not finite counts as not finite."""
     tip_distance: Tensor
     """[N, E] distance from each fingertip to the object's surface points [m]."""
 
     @classmethod
     def of(cls, backend: Backend, surface_points: Tensor, bad_action: Tensor) -> Self:
-        """The present one.
+        """Read a backend.
 
         Args:
             surface_points: [N, P, 3] on each world's object, in its frame [m].
             bad_action: [N] bool, worlds that were given an action that is not finite.
         """
-        state, links, health = backend.state(), backend.links(), backend.health()
+        state = backend.state()
+        links = backend.links()
+        health = backend.health()
         local = quat_rotate_inverse(state.object_quat[:, None], links.pos[:, 1:] - state.object_pos[:, None])
         return cls(
             state=state,
@@ -47,12 +49,12 @@ class Reading:
 def step_log(
     reward: Reward, done: Tensor, *, sound: Tensor, from_home: Tensor, totals: dict[str, Tensor]
 ) -> tuple[tuple[str, ...], Tensor]:
-    """Names and values [K] of what there is to say about a step: means over worlds, on the device, so that nothing waits for them.
+    """Return names and values [K] of a step's log: means over worlds, on the device, so that nothing waits for them.
 
     Args:
-        reward: of N worlds. Its terms are means over the worlds that are ``sound``: the others' say nothing, and are counted.
+        reward: rewards of N worlds. Its terms are averaged over the ``sound`` worlds.
         done: [N] bool, worlds whose episode has ended.
-        sound: [N] bool.
+        sound: [N] bool, worlds whose simulation has not failed.
         from_home: [N] bool, worlds whose episode began at home.
         totals: further numbers [], by name.
     """

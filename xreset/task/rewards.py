@@ -1,9 +1,6 @@
 """The object-centric reward of the paper's appendix D.d, a pure function.
 
 r = r_reach + r_grasp + 4 r_p + 4 r_R + 10 r_success - 0.005 |a_t|^2 - 0.005 |a_t - a_{t-1}|^2 - 500 r_oob
-
-4 r_p + 4 r_R may be replaced by 8 C (f(d) - f(d_0)) / (1 - f(d_0)), which pays for progress: C is the contact gate, d and d_0 the distances
-of the object's keypoints to the goal now and at the demonstration's start, f(x) = 1 - tanh(x / 0.15 m).
 """
 
 from __future__ import annotations
@@ -38,7 +35,7 @@ class RewardInput:
     goal_pos: Tensor
     goal_quat: Tensor
     start_pos: Tensor
-    """[N, 3] where the object is at the demonstration's start."""
+    """[N, 3] position of the object at the start of the demonstration."""
     start_quat: Tensor
     keypoints: Tensor
     """[N, 4, 3] :func:`xreset.objects.keypoints` of each world's object, in its frame."""
@@ -74,8 +71,8 @@ class Reward:
 
 
 OwnTerm = Callable[[RewardInput], Tensor]
-"""A reward term of the user's own: what the reward looks at -> [N] before its weight. On a GPU it is replayed as part of a graph, so it
-must not ask what a tensor holds (``if``, ``item``, ``nonzero``)."""
+"""A reward term of the user: returns [N] before its weight. On a GPU it is replayed as part of a graph, so it must not
+ask for the value of a tensor (``if``, ``item``, ``nonzero``)."""
 
 
 @cache
@@ -118,18 +115,6 @@ def keypoint_distance(pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Te
     return (here - goal).norm(dim=-1).amax(dim=-1)
 
 
-def progress(x: RewardInput, c: RewardConfig) -> Tensor:
-    """[N] how much nearer the object is to its goal than at the demonstration's start: 0 there, 1 at the goal, negative beyond.
-
-    Where the demonstration ends within ``success_position`` of its start, that distance stands for d_0: nothing is divided by zero.
-    """
-    goal = (x.goal_pos, x.goal_quat, x.keypoints)
-    now = keypoint_distance(x.object_pos, x.object_quat, *goal)
-    start = keypoint_distance(x.start_pos, x.start_quat, *goal).clamp_min(c.success_position)
-    far, farthest = torch.tanh(now / c.progress_width), torch.tanh(start / c.progress_width)
-    return (farthest - far) / farthest
-
-
 def rotation_closeness(angle: Tensor, c: RewardConfig) -> Tensor:
     """[N] 1 at the goal, falling with the angle to it [rad]."""
     if c.rotation_shape == "linear":
@@ -146,19 +131,13 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     success = gate & (position_error < c.success_position) & (rotation_error < c.success_rotation)
     gate_f = gate.to(position_error.dtype)
     reach = x.best_reach if c.reach_distance == "best" else x.tip_distance.mean(dim=-1)
-    if c.tracking == "progress":
-        tracking = {"progress": c.progress * gate_f * progress(x, c)}
-    else:
-        tracking = {
-            "position": c.position * gate_f * (1.0 - torch.tanh(position_error / c.position_width)),
-            "rotation": c.rotation * gate_f * rotation_closeness(rotation_error, c),
-            "rotation_near": c.rotation_near * gate_f * (1.0 - torch.tanh(rotation_error / c.rotation_near_width)),
-        }
     terms = {
         "reach": c.reach * (1.0 - torch.tanh(reach / c.reach_width)),
         "reach_near": c.reach_near * (1.0 - torch.tanh(reach / c.reach_near_width)),
         "grasp": c.grasp * grasped.to(gate_f.dtype),
-        **tracking,
+        "position": c.position * gate_f * (1.0 - torch.tanh(position_error / c.position_width)),
+        "rotation": c.rotation * gate_f * rotation_closeness(rotation_error, c),
+        "rotation_near": c.rotation_near * gate_f * (1.0 - torch.tanh(rotation_error / c.rotation_near_width)),
         "success": c.success * success.to(gate_f.dtype),
         "action": c.action * x.action.square().sum(dim=-1),
         "action_rate": c.action_rate * (x.action - x.previous_action).square().sum(dim=-1),
@@ -174,6 +153,6 @@ def _checked(name: str, value: Tensor, like: Tensor) -> Tensor:
     if not isinstance(value, Tensor) or value.shape != like.shape:
         found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
         raise RunError(
-            f"the reward term {name!r} gave {found}, expected a tensor of one value for each world, {tuple(like.shape)}."
+            f"The reward term {name!r} gave {found}. Return a tensor of shape {tuple(like.shape)}: one value a world."
         )
     return value.to(like.dtype)

@@ -15,8 +15,8 @@ sys.path.insert(0, os.getcwd())
 
 
 QUICK = (
-    "accounts", "engines_page", "eval", "files", "kinematics", "mirror", "render", "retarget_terms", "robots", "schedule",
-    "task",
+    "accounts", "docs", "engines_page", "eval", "files", "kinematics", "mirror", "render", "retarget_terms", "robots",
+    "schedule", "schedules", "task",
 )  # fmt: skip
 """Modules of tests that a change of code is first tried with."""
 

@@ -205,7 +205,7 @@ class ManipulationEnv:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # rsl-rl's contract -------------------------------------------------------------------------------------------------------------
+    # rsl-rl's contract
 
     @property
     def episode_length_buf(self) -> Tensor:

@@ -122,5 +122,5 @@ def _arrays(observations: TensorDict) -> dict[str, np.ndarray]:
     return {name: _array(value) for name, value in observations.items()}
 
 
-def _array(value: torch.Tensor) -> np.ndarray:
+def _array(value: Any) -> np.ndarray:
     return value.detach().cpu().numpy()

@@ -30,8 +30,8 @@ def evaluate(
         demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the
             path of ik.
         episodes: Episodes per demonstration, each with another perturbation of robot and object.
-        settle: Let objects come to rest before episodes begin. Default: the recorded poses, as in the paper; one in eight
-            of them tips or rolls before the hand arrives.
+        settle: Let objects come to rest before episodes begin. Default: the recorded poses, as in the paper, from which
+            one object in eight tips or rolls.
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: eval/ in the run folder or next to the policy, runs/NAME/eval for a policy
             that ships with xreset, runs/BASELINE-ROBOT/eval for a baseline.

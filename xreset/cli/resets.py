@@ -52,7 +52,7 @@ def resets(
         closing: States between frames where the hand closes in.
         squeeze: Targets of states after contact that press.
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
-            poses, as in the paper; one in eight objects tips or rolls before a hand arrives.
+            poses, as in the paper, from which one object in eight tips or rolls.
         hold: Also count, in every engine, which lifted states hold the object for a second at full gravity.
     """
     backends = list(dict.fromkeys(backend)) or ["mujoco"]

@@ -1,1 +1,1 @@
-"""Rotations, kinematic trees, shapes, surfaces and distances. Objects, robots, retargeting and engines build on them."""
+"""Rotations, kinematic trees, shapes, surfaces and distances, for objects, robots, retargeting and engines."""

@@ -29,7 +29,7 @@ class ScheduleTest(unittest.TestCase):
 
     def test_a_training_moves_the_share_of_demonstrated_states(self):
         resets = SimpleNamespace(demo_probability=torch.tensor(0.5))
-        runner = SimpleNamespace(env=SimpleNamespace(resets=resets), train_config=TrainConfig())
+        runner = SimpleNamespace(world=SimpleNamespace(resets=resets), train_config=TrainConfig())
         TrainingRunner._follow_schedule(runner, 0.5)
         self.assertEqual(float(resets.demo_probability), 0.5)
         runner.train_config = TrainConfig(schedule=ScheduleConfig(demo_probability=((0.0, 1.0), (1.0, 0.0))))

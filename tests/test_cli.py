@@ -183,7 +183,7 @@ class UsageTest(unittest.TestCase):
     def test_an_engine_that_does_not_exist(self):
         code, _, err = run("engines", "check", "--backend", "bulet")
         self.assertEqual(code, 1)
-        self.assertRegex(err, "Unknown backend 'bulet'\. Choose from: .*pybullet")
+        self.assertRegex(err, r"Unknown backend 'bulet'\. Choose from: .*pybullet")
 
     def test_a_missing_engine_is_named_with_the_command_that_mends_it(self):
         code = "import sys; sys.modules['pybullet'] = None; from xreset.cli import main; main(['engines', 'list'])"

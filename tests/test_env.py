@@ -170,6 +170,19 @@ class StepTest(WithEnv):
         torch.testing.assert_close(torch.stack(reach), 1 - torch.tanh(best / TASK.reward.reach_width))
         self.assertTrue(bool((torch.stack(distance)[1:] > best + 1e-3).any()), "the hand moved away at times")
 
+    def test_a_reset_of_one_world_leaves_the_others_as_they_are(self):
+        env = self.make()
+        for action in self.actions(3):
+            env.step(action)
+        before = env.get_observations()
+        length = env.episode_length_buf.clone()
+        env.reset(torch.tensor([1]))
+        after = env.get_observations()
+        for name in set(before.keys()):
+            self.assertTrue(torch.equal(after[name][[0, 2]], before[name][[0, 2]]), name)
+        self.assertFalse(torch.equal(after["policy"][1], before["policy"][1]))
+        self.assertEqual(env.episode_length_buf.tolist(), [int(length[0]), 0, int(length[2])])
+
     def test_the_same_seed_gives_the_same_episodes(self):
         runs = [self.make(seed=seed) for seed in (3, 3, 4)]
         for action in self.actions(40):  # past the time limit: resets are drawn too

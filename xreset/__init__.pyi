@@ -32,6 +32,7 @@ from xreset.retarget.pipeline import retarget_demos as retarget_demos
 from xreset.spec import ObjectSpec as ObjectSpec
 from xreset.spec import RobotSpec as RobotSpec
 from xreset.spec import SceneSpec as SceneSpec
+from xreset.stable_baselines import StableBaselinesEnv as StableBaselinesEnv
 from xreset.task.config import TaskConfig as TaskConfig
 from xreset.vector_env import VectorEnv as VectorEnv
 

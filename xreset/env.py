@@ -267,7 +267,7 @@ class ManipulationEnv:
         return reading, reward
 
     def reset(self, worlds: Tensor | None = None, start: Reset | None = None) -> None:
-        """Start new episodes.
+        """Start new episodes. The other worlds and their observations stay as they are.
 
         Args:
             worlds: [M] long indices of worlds; None: all worlds.
@@ -279,9 +279,15 @@ class ManipulationEnv:
         self._reset_mask[worlds] = True
         if start is not None:
             self._new_start[worlds] = start
+        observed: dict[str, Any] = dict(self._observations.items())
+        lasting = self._lasting | observed
+        before = {name: value.clone() for name, value in lasting.items()}
         self._sample_resets(start is None)
         self._write_resets()
         self._compute_observations()
+        others = ~self._reset_mask
+        for name, value in before.items():
+            lasting[name][others] = value[others]
 
     def reading(self) -> Reading:
         """Return the present physical state and what follows from it."""

@@ -41,12 +41,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.env = env
         self.num_envs = env.num_envs
         env.reset()
-        shapes = {name: tuple(value.shape[1:]) for name, value in env.get_observations().items()}
-        spaces: dict[str, gymnasium.Space[Any]] = {
-            name: gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32) for name, shape in shapes.items()
-        }
-        self.single_observation_space = gymnasium.spaces.Dict(spaces)
-        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (env.num_actions,), np.float32)
+        self.single_observation_space = observation_space(env)
+        self.single_action_space = action_space(env)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._ended = torch.zeros(self.num_envs, dtype=torch.bool, device=env.device)
@@ -68,7 +64,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self._ended.zero_()
         self.env.reset()
         self._observations = self.env.get_observations()
-        return _arrays(self._observations), {}
+        return arrays(self._observations), {}
 
     def step(self, actions: Any) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Take one control step in every world.
@@ -83,7 +79,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             XResetError: the actions have another shape, or are not real numbers.
         """
-        action = self._action(actions)
+        action = checked_action(self.env, actions)
         action = torch.where(self._ended[:, None], 0.0, action)  # ignored: the world begins a new episode
         observations, reward, done, extras = self.env.step(action, begin=self._ended)
         reward = torch.where(self._ended, 0.0, reward)
@@ -92,23 +88,41 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self._ended = done.bool()
         truncated = self._ended & extras["time_outs"].bool() & ~faulty
         terminated = self._ended & ~truncated
-        infos = {"faulty": _array(faulty)}
-        return _arrays(self._observations), _array(reward), _array(terminated), _array(truncated), infos
-
-    def _action(self, actions: Any) -> torch.Tensor:
-        """Check actions and bring them to the environment's device."""
-        values = np.asarray(actions.detach().cpu() if isinstance(actions, torch.Tensor) else actions)
-        expected = (self.num_envs, self.env.num_actions)
-        if values.shape != expected or values.dtype.kind not in "fiu":
-            raise XResetError(
-                f"The actions are {values.dtype} of shape {values.shape}. Give real numbers of shape {expected}: "
-                "one row for each world, one column for each joint."
-            )
-        return torch.as_tensor(values, dtype=torch.float32, device=self.env.device)
+        infos = {"faulty": array(faulty)}
+        return arrays(self._observations), array(reward), array(terminated), array(truncated), infos
 
     def close_extras(self, **_: Any) -> None:
         """Close the engine."""
         self.env.close()
+
+
+def observation_space(env: ManipulationEnv) -> gymnasium.spaces.Dict:
+    """Return the space of one world's observations, by group."""
+    boxes: dict[str, gymnasium.Space[Any]] = {}
+    for name, value in env.get_observations().items():
+        boxes[name] = gymnasium.spaces.Box(-np.inf, np.inf, tuple(value.shape[1:]), np.float32)
+    return gymnasium.spaces.Dict(boxes)
+
+
+def action_space(env: ManipulationEnv) -> gymnasium.spaces.Box:
+    """Return the space of one world's actions."""
+    return gymnasium.spaces.Box(-1.0, 1.0, (env.num_actions,), np.float32)
+
+
+def checked_action(env: ManipulationEnv, actions: Any) -> torch.Tensor:
+    """Return actions [N, J] on the environment's device.
+
+    Raises:
+        XResetError: the actions have another shape, or are not real numbers.
+    """
+    values = np.asarray(actions.detach().cpu() if isinstance(actions, torch.Tensor) else actions)
+    expected = (env.num_envs, env.num_actions)
+    if values.shape != expected or values.dtype.kind not in "fiu":
+        raise XResetError(
+            f"The actions are {values.dtype} of shape {values.shape}. Give real numbers of shape {expected}: "
+            "one row for each world, one column for each joint."
+        )
+    return torch.as_tensor(values, dtype=torch.float32, device=env.device)
 
 
 def with_sound_rows(observations: TensorDict, before: TensorDict) -> TensorDict:
@@ -118,9 +132,11 @@ def with_sound_rows(observations: TensorDict, before: TensorDict) -> TensorDict:
     return observations.apply(lambda new, old: torch.where(sound.view(-1, *[1] * (new.ndim - 1)), new, old), before)
 
 
-def _arrays(observations: TensorDict) -> dict[str, np.ndarray]:
-    return {name: _array(value) for name, value in observations.items()}
+def arrays(observations: TensorDict) -> dict[str, np.ndarray]:
+    """Return observations as arrays, by group."""
+    return {name: array(value) for name, value in observations.items()}
 
 
-def _array(value: Any) -> np.ndarray:
+def array(value: Any) -> np.ndarray:
+    """Return a tensor as an array."""
     return value.detach().cpu().numpy()

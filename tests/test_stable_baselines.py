@@ -1,0 +1,77 @@
+"""The environment as Stable-Baselines3 knows it."""
+
+import unittest
+from dataclasses import replace
+
+import numpy as np
+
+from tests.test_env import TASK, BreakableBackend, N, WithEnv
+from xreset.task.config import TerminationConfig
+
+try:
+    from stable_baselines3 import PPO
+except ImportError as error:
+    raise unittest.SkipTest("stable-baselines3 is not installed") from error
+
+from xreset.stable_baselines import StableBaselinesEnv
+
+
+class StableBaselinesTest(WithEnv):
+    def wrapped(self, seconds: float, **options) -> StableBaselinesEnv:
+        task = replace(TASK, termination=TerminationConfig(episode_seconds=seconds))
+        env = StableBaselinesEnv(self.make(task, **options))
+        self.addCleanup(env.close)
+        return env
+
+    def test_the_last_observation_of_a_truncated_episode_is_given(self):
+        env = self.wrapped(0.1)
+        still = np.zeros((N, env.env.num_actions), np.float32)
+        env.reset()
+        for step in range(1, 2 * env.env.max_episode_length + 1):
+            observations, _, done, infos = env.step(still)
+            ends = step % env.env.max_episode_length == 0
+            self.assertEqual(done.tolist(), [ends] * N)
+            for world, info in enumerate(infos):
+                self.assertEqual(bool(info), ends)
+                if ends:
+                    self.assertTrue(info["TimeLimit.truncated"])
+                    self.assertFalse(info["faulty"])
+                    last = info["terminal_observation"]["policy"]
+                    self.assertFalse(np.array_equal(last, observations["policy"][world]), "it is the old episode's")
+        self.assertEqual(env.env.episode_length_buf.tolist(), [0] * N)
+
+    def test_a_world_that_fails_is_terminated_and_the_others_go_on(self):
+        env = self.wrapped(1.0, kind=BreakableBackend)
+        still = np.zeros((N, env.env.num_actions), np.float32)
+        env.reset()
+        before, *_ = env.step(still)
+        env.env.backend.broken[0] = True
+        observations, reward, done, infos = env.step(still)
+        self.assertEqual(done.tolist(), [True] + [False] * (N - 1))
+        self.assertTrue(infos[0]["faulty"])
+        self.assertFalse(infos[0]["TimeLimit.truncated"])
+        self.assertEqual(reward[0], 0.0)
+        for name, value in observations.items():
+            self.assertTrue(np.isfinite(value).all(), name)
+            np.testing.assert_array_equal(infos[0]["terminal_observation"][name], before[name][0])
+        self.assertEqual(env.env.episode_length_buf.tolist(), [0] + [2] * (N - 1))
+
+    def test_the_seed_decides(self):
+        env = self.wrapped(1.0)
+        first = []
+        for seed in (3, 3, 4):
+            env.seed(seed)
+            first.append(env.reset()["policy"])
+        np.testing.assert_array_equal(first[0], first[1])
+        self.assertFalse(np.array_equal(first[0], first[2]))
+
+    def test_a_learner_takes_steps(self):
+        env = self.wrapped(0.2)
+        learner = PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, n_epochs=1, device="cpu", seed=0)
+        learner.learn(16 * N)
+        actions, _ = learner.predict(env.reset())
+        self.assertEqual(actions.shape, (N, env.env.num_actions))
+
+
+if __name__ == "__main__":
+    unittest.main()

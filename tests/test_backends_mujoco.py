@@ -375,7 +375,7 @@ class Limits(unittest.TestCase):
             for device in ("cpu", "cuda", "cuda:1"):
                 self.assertEqual(device_for("mujoco-warp", device), device)
                 self.assertEqual(device_for("mujoco", device), "cpu")
-            with self.assertRaisesRegex(BackendUnavailableError, "no device 'gpu'; expected cpu, cuda"):
+            with self.assertRaisesRegex(BackendUnavailableError, "Unknown device 'gpu'. Expected cpu, cuda"):
                 device_for("mujoco", "gpu")
 
 

@@ -54,7 +54,7 @@ class StressedTest(unittest.TestCase):
                 chosen([text])
         (late,) = chosen(["action-latency=300"])
         with self.assertRaisesRegex(
-            XResetError, "action-latency of 300 control steps cannot be tried: .* fewer than an episode has"
+            XResetError, "action-latency of 300 control steps cannot be tried: .* fewer than the 300 of an episode"
         ):
             stressed(TaskConfig(), late, 300.0)
         (light,) = chosen(["object-mass=0"])

@@ -253,8 +253,15 @@ class TrainingTest(unittest.TestCase):
                 "task.action.hand_zero is home, which means something where hand is absolute; it is relative. (Leave it out|Omit it)",
             ),
             (
-                ("--config.task.action.hand-step", "0.1", "--config.task.reward.progress", "3"),
-                "hand_step is 0.1, .* hand is relative; it is absolute; --config.task.reward.progress is 3.0, which",
+                (
+                    "--config.task.action.hand-step",
+                    "0.1",
+                    "--config.task.reward.rotation-shape",
+                    "linear",
+                    "--config.task.reward.rotation-width",
+                    "1",
+                ),
+                "hand_step is 0.1, .* hand is relative; it is absolute; --config.task.reward.rotation_width is 1.0, which",
             ),
         ):
             with self.subTest(arguments), redirect_stderr(io.StringIO()) as said, self.assertRaises(SystemExit):

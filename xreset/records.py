@@ -208,7 +208,12 @@ def _read(
 
 def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     with archive.open(member) as stream:
-        array = np.lib.format.read_array(stream, allow_pickle=False)
+        try:
+            array = np.lib.format.read_array(stream, allow_pickle=False)
+        except ValueError as error:
+            if "allow_pickle" not in str(error):
+                raise
+            raise _BadArray(f"{member.filename} holds Python objects, and objects are never read") from error
         stream.read(1)  # at the end the checksum is compared
     return array
 

@@ -722,6 +722,7 @@ class PolicyTest(WithRobot):
         self.refused("another joint order", joint_names=list(reversed(self.robot.joint_names)))
         self.refused("another fingertips", fingertip_names=["index", "thumb"])
         self.refused("another version of 'toy'", robot_fingerprint="00")
+        self.refused("another version of 'toy'", robot_fingerprint="")
         fewer = replace(self.TASK, observation=replace(self.TASK.observation, cloud_history=3))
         self.refused("observation layout .perception.cloud: 960 in the policy, 576 here", task=fewer)
         extra = policy_contract(self.robot, self.TASK, ())["observation_layout"]

@@ -75,7 +75,7 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
     """
     check_contract_entries(source, contract)
     here = policy_contract(robot, task, ())
-    if contract["robot_fingerprint"] == robot.like:
+    if robot.like and contract["robot_fingerprint"] == robot.like:
         here |= {key: contract[key] for key in ("robot", "robot_fingerprint")}
     for key, what in (("robot", "robot"), ("joint_names", "joint order"), ("fingertip_names", "fingertips")):
         if contract[key] != here[key]:

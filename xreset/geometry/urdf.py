@@ -6,13 +6,14 @@ a URDF is read once, here, and the backends build their models from a :class:`Ro
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
@@ -23,6 +24,9 @@ from xreset.files import max_bytes
 from xreset.geometry.shapes import hull, load_mesh
 from xreset.spec import Geometry, RobotSpec, Shape
 from xreset.text import is_plain, shown
+
+if TYPE_CHECKING:
+    import yourdfpy
 
 JointType = Literal["revolute", "prismatic", "fixed"]
 
@@ -168,35 +172,56 @@ def _load(path: Path) -> tuple[RobotTree, dict[Path, int]]:
         raise RobotError(f"{path} is MJCF, not URDF; `xreset robots import` makes a robot of it.")
     if xml.tag != "robot":
         raise RobotError(f"{path} starts with <{shown(xml.tag)[1:-1]}>, which is not a URDF. Expected <robot>.")
+    for mesh in xml.iterfind("link/collision/geometry/mesh"):
+        file = find_mesh(mesh.get("filename", ""), path)
+        if file is not None:
+            files |= _modified([file])
+    robot = _parsed(xml, path)
     try:
-        for mesh in xml.iterfind("link/collision/geometry/mesh"):
-            file = find_mesh(mesh.attrib["filename"], path)
-            if file is not None:
-                files |= _modified([file])
         with np.errstate(invalid="ignore"):  # check_tree refuses what is not finite
             links = {}
-            for element in xml.findall("link"):
-                link = _link(element, path)
+            for each in robot.links:
+                link = _link(each, path)
                 if link.name in links:
                     raise RobotError(f"{path}: the link name {shown(link.name)} occurs twice.")
                 links[link.name] = link
             joints = {}
-            for element in xml.findall("joint"):
-                joint = _joint(element, path)
+            for each in robot.joints:
+                joint = _joint(each, path)
                 if joint.child in joints:
                     raise RobotError(f"{path}: link {joint.child!r} is the child of two joints, expected one.")
                 joints[joint.child] = joint
-            tree = _ordered(xml.get("name") or path.stem, links, joints, path)
-    except (
-        ValueError,
-        TypeError,
-        KeyError,
-        AttributeError,
-        IndexError,
-    ) as error:
+            tree = _ordered(robot.name or path.stem, links, joints, path)
+    except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
         raise RobotError(f"{path} cannot be read as a URDF: {shown(f'{type(error).__name__}: {error}')}") from error
     check_tree(tree, path)
     return tree, files
+
+
+def _parsed(xml: Element, path: Path) -> yourdfpy.Robot:
+    """Return what yourdfpy reads from a URDF; capsules, which it does not know, become cylinders of negative radius."""
+    import yourdfpy
+
+    for shape in xml.iterfind("link/collision/geometry/*"):
+        if shape.get("radius", "").strip().startswith("-"):
+            raise RobotError(f"{path} has a {shown(shape.tag)} of negative radius.")
+        if shape.tag == "capsule":
+            shape.tag = "cylinder"
+            shape.set("radius", f"-{shape.get('radius')}")
+    for joint in xml.iterfind("joint"):
+        for end in ("parent", "child"):
+            if joint.find(end) is None:
+                raise RobotError(f"{path}: joint {shown(joint.get('name', ''))} has no {end} link.")
+    try:
+        with np.errstate(invalid="ignore"):
+            return yourdfpy.URDF.load(
+                io.BytesIO(ElementTree.tostring(xml)),
+                build_scene_graph=False,
+                load_meshes=False,
+                filename_handler=lambda name: name,
+            ).robot
+    except Exception as error:  # yourdfpy raises whatever its parsing meets
+        raise RobotError(f"{path} cannot be read as a URDF: {shown(f'{type(error).__name__}: {error}')}") from error
 
 
 def _ordered(name: str, links: dict[str, Link], joints: dict[str, Joint], path: Path) -> RobotTree:
@@ -253,82 +278,55 @@ def check_tree(tree: RobotTree, path: Path) -> None:
             )
 
 
-def _name(element: Element, path: Path) -> str:
-    name = element.attrib["name"]
+def _checked_name(name: str | None, path: Path) -> str:
     if not name or not is_plain(name):
         raise RobotError(f"{path}: the name {shown(name)} is empty or contains control characters.")
     return name
 
 
-def _vector(text: str, length: int) -> np.ndarray:
-    """[length] numbers that a text holds."""
-    values = np.array(text.replace(",", " ").split(), dtype=float)
-    if len(values) != length:
-        raise ValueError(f"expected {length} numbers, found {shown(text)}")
-    return values
+def _pose(origin: np.ndarray | None) -> np.ndarray:
+    """[4, 4]"""
+    return np.eye(4) if origin is None else np.asarray(origin, dtype=float)
 
 
-def _origin(element: Element) -> np.ndarray:
-    """[4, 4] pose that the element's ``origin`` gives."""
-    from trimesh.transformations import compose_matrix
-
-    origin = element.find("origin")
-    if origin is None:
-        return np.eye(4)
-    xyz = _vector(origin.get("xyz", "0 0 0"), 3)
-    rpy = _vector(origin.get("rpy", "0 0 0"), 3)
-    return compose_matrix(translate=xyz, angles=rpy)
-
-
-def _link(element: Element, path: Path) -> Link:
-    name = _name(element, path)
+def _link(link: yourdfpy.Link, path: Path) -> Link:
+    name = _checked_name(link.name, path)
     mass = 0.0
     com = np.zeros(3)
     inertia = np.zeros((3, 3))
-    inertial = element.find("inertial")
-    if inertial is not None:
-        given = inertial.find("mass")
-        mass = 0.0 if given is None else float(given.get("value", 0.0))
-    if inertial is not None and mass:
-        origin = _origin(inertial)
+    if link.inertial is not None and link.inertial.mass:
+        mass = float(link.inertial.mass)
+        origin = _pose(link.inertial.origin)
         com = origin[:3, 3]
-        given = inertial.find("inertia")
-        if given is not None:
-            diagonal = [float(given.get(key, 1.0)) for key in ("ixx", "iyy", "izz")]
-            ixy, ixz, iyz = [float(given.get(key, 0.0)) for key in ("ixy", "ixz", "iyz")]
-            inertia = np.array([[0.0, ixy, ixz], [ixy, 0.0, iyz], [ixz, iyz, 0.0]])
-            np.fill_diagonal(inertia, diagonal)
+        if link.inertial.inertia is not None:
+            inertia = np.asarray(link.inertial.inertia, dtype=float)
         inertia = origin[:3, :3] @ inertia @ origin[:3, :3].T
     shapes = []
-    for collision in element.findall("collision"):
-        geometry = collision.find("geometry")
-        if geometry is None or not len(geometry):
-            raise RobotError(f"{path}: link {name!r} has a collision without a geometry.")
-        shapes.append(
-            Shape(
-                geometry=_geometry(geometry[0], name, path),
-                T_body_shape=_origin(collision),
-            )
-        )
+    for collision in link.collisions:
+        geometry = _geometry(collision.geometry, name, path)
+        shapes.append(Shape(geometry=geometry, T_body_shape=_pose(collision.origin)))
     return Link(name=name, mass=mass, com=com, inertia=inertia, collisions=tuple(shapes))
 
 
-def _geometry(shape: Element, link: str, path: Path) -> Geometry:
-    if shape.tag == "box":
-        size = _vector(shape.attrib["size"], 3) / 2
-        return Geometry(kind="box", size=tuple(size.tolist()))
-    if shape.tag == "sphere":
-        return Geometry(kind="sphere", size=(float(shape.attrib["radius"]),))
-    if shape.tag == "mesh":
-        return _mesh_hull(shape, link, path)
-    if shape.tag not in ("cylinder", "capsule"):
-        raise RobotError(f"{path}: link {link!r} has a collision shape {shown(shape.tag)}, which is not supported.")
-    size = (float(shape.attrib["radius"]), float(shape.attrib["length"]) / 2)
-    return Geometry(kind="capsule" if shape.tag == "capsule" else "cylinder", size=size)
+def _geometry(geometry: yourdfpy.Geometry, link: str, path: Path) -> Geometry:
+    if geometry.box is not None:
+        size = tuple(float(number) / 2 for number in geometry.box.size)
+        if len(size) != 3:
+            raise ValueError(f"link {link!r} has a box of {len(size)} numbers")
+        return Geometry(kind="box", size=size)
+    if geometry.sphere is not None:
+        return Geometry(kind="sphere", size=(float(geometry.sphere.radius),))
+    if geometry.cylinder is not None:
+        radius = float(geometry.cylinder.radius)
+        size = (abs(radius), float(geometry.cylinder.length) / 2)
+        return Geometry(kind="capsule" if radius < 0 else "cylinder", size=size)
+    if geometry.mesh is not None:
+        return _mesh_hull(geometry.mesh, link, path)
+    raise RobotError(f"{path}: link {link!r} has a collision without a geometry.")
 
 
-def _mesh_hull(mesh: Element, link: str, path: Path) -> Geometry:
-    name = mesh.attrib["filename"]
+def _mesh_hull(mesh: yourdfpy.Mesh, link: str, path: Path) -> Geometry:
+    name = mesh.filename
     file = find_mesh(name, path)
     if file is None:
         raise RobotError(
@@ -338,7 +336,7 @@ def _mesh_hull(mesh: Element, link: str, path: Path) -> Geometry:
         vertices = np.asarray(load_mesh(file).vertices)
         if not (np.abs(vertices) < _LARGEST).all():
             raise ObjectError("a vertex is not finite, or too far away")
-        scale = np.array(mesh.get("scale", "1").replace(",", " ").split(), dtype=float)
+        scale = 1.0 if mesh.scale is None else np.asarray(mesh.scale, dtype=float)
         return hull(vertices * np.broadcast_to(scale, 3), HULL_TOLERANCE).geometry
     except (ObjectError, ValueError) as error:
         raise RobotError(
@@ -364,40 +362,36 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
     return None
 
 
-def _joint(element: Element, path: Path) -> Joint:
-    name = _name(element, path)
-    kind = element.get("type")
+def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:
+    name = _checked_name(joint.name, path)
+    kind = joint.type
     if kind not in ("revolute", "continuous", "prismatic", "fixed"):
         raise RobotError(
             f"{path}: joint {name!r} has type {kind!r}; supported are revolute, continuous, prismatic and fixed."
         )
-    given = element.find("axis")
-    axis = _vector("1 0 0" if given is None else given.get("xyz", "1 0 0"), 3)
+    axis = np.array([1.0, 0, 0]) if joint.axis is None else np.asarray(joint.axis, dtype=float)
+    if axis.shape != (3,):
+        raise ValueError(f"joint {name!r} has an axis of {axis.size} numbers, expected 3 numbers")
     length = float(np.linalg.norm(axis))
     if kind != "fixed" and not length > _SHORTEST_AXIS:
         raise RobotError(f"{path}: joint {name!r} has the axis {axis}, expected a direction.")
     lower = -math.inf
     upper = math.inf
     velocity = math.inf
-    limit = element.find("limit")
+    limit = joint.limit
     if limit is not None:
-        velocity = float(limit.get("velocity", math.inf))
+        velocity = math.inf if limit.velocity is None else float(limit.velocity)
         if kind != "continuous":
-            lower = float(limit.get("lower", 0.0))
-            upper = float(limit.get("upper", 0.0))
-    ends = {}
-    for end in ("parent", "child"):
-        link = element.find(end)
-        if link is None:
-            raise RobotError(f"{path}: joint {name!r} has no {end} link.")
-        ends[end] = link.attrib["link"]
+            lower = 0.0 if limit.lower is None else float(limit.lower)
+            upper = 0.0 if limit.upper is None else float(limit.upper)
     return Joint(
         name=name,
         type="revolute" if kind == "continuous" else kind,
-        T_parent_joint=_origin(element),
+        parent=joint.parent,
+        child=joint.child,
+        T_parent_joint=_pose(joint.origin),
         axis=axis / max(length, _SHORTEST_AXIS),
         lower=lower,
         upper=upper,
         velocity=velocity,
-        **ends,
     )

@@ -95,9 +95,9 @@ class TrainingRunner(OnPolicyRunner):
         begin = time.perf_counter()
         with _stop_on_interrupt() as requests:
             while self.iteration < total:
-                start = time.perf_counter()
-                if self._agreed(bool(requests) or start - begin > seconds):
+                if self._agreed(bool(requests) or time.perf_counter() - begin > seconds):
                     break
+                start = time.perf_counter()
                 self._follow_schedule(max(self.iteration / total, (start - begin) / seconds))
                 with torch.no_grad():
                     obs = self._roll_out(obs, log)

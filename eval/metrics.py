@@ -1,21 +1,30 @@
-"""The paper's evaluation metrics (section V and appendix A), accumulated over an episode for N worlds.
+"""Metrics of both versions of the paper, accumulated at every control step of an episode for N worlds.
 
-Stages: approach (a fingertip within 5 cm of the object), grasp (thumb and one other finger in contact while the object
-is lifted by at least 1 cm), reorientation (object within 2 cm and 15 degrees of the goal at the episode's end). Task
-progress is 0, 0.33, 0.66 or 1 for the highest stage. Reorientation progress is 1 - min_t d(o_t, g) / d(o_0, g), in [0,
-1], with d the largest distance of four object keypoints.
+The published paper (https://arxiv.org/abs/2609.35715, section V): an episode succeeds if the mean distance of 64
+surface points to the goal pose is at most 2 cm at any time, the start included, whether or not a hand holds the object.
+
+The draft (section V and appendix A) has stages: approach (a fingertip within 5 cm of the object), grasp (thumb and one
+other finger in contact while the object is lifted by at least 1 cm), reorientation (object within 2 cm and 15 degrees
+of the goal at the episode's end). Task progress is 0, 0.33, 0.66 or 1 for the highest stage. Reorientation progress is
+1 - min_t d(o_t, g) / d(o_0, g), in [0, 1], with d the largest distance of four object keypoints.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from xreset.geometry.rotations import quat_angle
+from xreset.objects.sampling import keypoints, metric_points
+from xreset.spec import ObjectSpec
 from xreset.task.reading import Reading
-from xreset.task.rewards import contact_gate, keypoint_distance
+from xreset.task.rewards import contact_gate, keypoint_distance, mean_distance
+from xreset.tensors import Tensors
 
 STAGE_SCORES = (0.0, 0.33, 0.66, 1.0)
 """Task progress of: no stage, approach, grasp, reorientation."""
@@ -23,7 +32,10 @@ STAGE_SCORES = (0.0, 0.33, 0.66, 1.0)
 
 @dataclass(frozen=True, kw_only=True)
 class MetricsConfig:
-    """Thresholds of the stages."""
+    """Thresholds of the published success and of the draft's stages."""
+
+    published_distance: float = 0.02
+    """Largest mean distance of the surface points to the goal that is a success [m]."""
 
     approach_distance: float = 0.05
     """[m]"""
@@ -37,11 +49,33 @@ class MetricsConfig:
     """[rad], 15 degrees."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class MetricPoints(Tensors):
+    """Points of N objects, in their frames."""
+
+    keypoints: Tensor
+    """[N, 4, 3] of the draft's reorientation progress."""
+    surface: Tensor
+    """[N, 64, 3] of the published success."""
+
+    @classmethod
+    def of(cls, objects: Sequence[ObjectSpec]) -> Self:
+        """Return the points of some objects."""
+
+        def stacked(points: list[np.ndarray]) -> Tensor:
+            return torch.as_tensor(np.stack(points), dtype=torch.float32)
+
+        return cls(
+            keypoints=stacked([keypoints(o) for o in objects]),
+            surface=stacked([metric_points(o) for o in objects]),
+        )
+
+
 class EpisodeMetrics:
     """Metrics of one episode in N worlds, accumulated step by step; a world that has ended no longer changes them."""
 
     def __init__(
-        self, start: Reading, goal_pos: Tensor, goal_quat: Tensor, keypoints: Tensor, config: MetricsConfig
+        self, start: Reading, goal_pos: Tensor, goal_quat: Tensor, points: MetricPoints, config: MetricsConfig
     ) -> None:
         """Start with the first reading.
 
@@ -49,15 +83,24 @@ class EpisodeMetrics:
             start: reading before the first step.
             goal_pos: [N, 3]
             goal_quat: [N, 4]
-            keypoints: [N, 4, 3] in the object frame.
+            points: of each world's object.
         """
         self._config = config
-        self._keypoints = keypoints
+        self._points = points
         self._goal_pos = goal_pos.clone()
         self._goal_quat = goal_quat.clone()
         self._start_height = start.state.object_pos[:, 2].clone()
-        self._start_distance = self._distance(start)
+        self._start_distance = self._keypoint_distance(start)
         self._best = self._start_distance.clone()
+        far = torch.full_like(self._best, torch.inf)
+        self.least_distance = far.clone()
+        """[N] least mean distance of the surface points to the goal [m]."""
+        self.final_distance = far.clone()
+        """[N] this distance at the end; of a world that has ended early, before its end [m]."""
+        self.final_position_error = far.clone()
+        """[N] distance of the object's origin from its place at the goal, likewise [m]."""
+        self.final_angle = far.clone()
+        """[N] angle between the object and the goal, likewise [rad]."""
         no = torch.zeros_like(self._best, dtype=torch.bool)
         self.approach = no.clone()
         self.grasp = no.clone()
@@ -79,6 +122,11 @@ class EpisodeMetrics:
         self._look(reading)
 
     @property
+    def published_success(self) -> Tensor:
+        """[N] bool"""
+        return self.least_distance <= self._config.published_distance
+
+    @property
     def reorientation_progress(self) -> Tensor:
         """[N] in [0, 1]"""
         return (1.0 - self._best / self._start_distance.clamp_min(1e-9)).clamp(0.0, 1.0)
@@ -96,13 +144,22 @@ class EpisodeMetrics:
         self.approach |= live & (reading.tip_distance.amin(dim=-1) <= c.approach_distance)
         lifted = state.object_pos[:, 2] - self._start_height >= c.lift
         self.grasp |= live & lifted & contact_gate(reading.contacts.tip_force, c.contact_force)
-        near = (state.object_pos - self._goal_pos).norm(dim=-1) <= c.goal_distance
-        at_goal = live & near & (quat_angle(state.object_quat, self._goal_quat) <= c.goal_angle)
+        position_error = (state.object_pos - self._goal_pos).norm(dim=-1)
+        angle = quat_angle(state.object_quat, self._goal_quat)
+        at_goal = live & (position_error <= c.goal_distance) & (angle <= c.goal_angle)
         self.reorient = at_goal  # only the last reading counts; a world that ended early is not at its goal
         self.reorient_once |= at_goal
-        self._best = torch.where(live, torch.minimum(self._best, self._distance(reading)), self._best)
+        self._best = torch.where(live, torch.minimum(self._best, self._keypoint_distance(reading)), self._best)
+        distance = mean_distance(
+            state.object_pos, state.object_quat, self._goal_pos, self._goal_quat, self._points.surface
+        )
+        self.final_distance = torch.where(live, distance, self.final_distance)
+        self.final_position_error = torch.where(live, position_error, self.final_position_error)
+        self.final_angle = torch.where(live, angle, self.final_angle)
+        self.least_distance = torch.minimum(self.least_distance, self.final_distance)
 
-    def _distance(self, reading: Reading) -> Tensor:
+    def _keypoint_distance(self, reading: Reading) -> Tensor:
+        state = reading.state
         return keypoint_distance(
-            reading.state.object_pos, reading.state.object_quat, self._goal_pos, self._goal_quat, self._keypoints
+            state.object_pos, state.object_quat, self._goal_pos, self._goal_quat, self._points.keypoints
         )

@@ -15,7 +15,7 @@ import torch
 
 from xreset.checks import NotNegative, Share
 from xreset.env import ManipulationEnv
-from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
+from xreset.eval.metrics import EpisodeMetrics, MetricPoints, MetricsConfig
 from xreset.eval.trial import Engine, Trial
 from xreset.policy import Policy
 from xreset.resets.bank import ResetBank
@@ -54,6 +54,17 @@ class Episode:
     nonfinite: bool
     overflow: bool
     """Whether the engine dropped contacts or constraints."""
+    published_success: bool | None = None
+    """Whether ``least_distance`` is at most 2 cm: the success of the published paper. None, as in the fields below:
+    recorded by an earlier version, which did not measure it."""
+    least_distance: NotNegative[float] | None = None
+    """Least mean distance of 64 surface points to the goal over the episode [m]."""
+    final_distance: NotNegative[float] | None = None
+    """This distance at the end; of an episode that ended early, before its end [m]."""
+    final_position_error: NotNegative[float] | None = None
+    """Distance of the object's origin from its place at the goal, likewise [m]."""
+    final_angle: NotNegative[float] | None = None
+    """Angle between the object and the goal, likewise [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,8 +153,8 @@ class Round:
     """Worlds that were just reset, each to play one item."""
 
     env: ManipulationEnv
-    points: torch.Tensor
-    """[N, 4, 3] keypoints of the objects, in their frames."""
+    points: MetricPoints
+    """The metric's points of each world's object."""
     items: np.ndarray
     """[N] item of each world."""
     fresh: list[int]
@@ -183,13 +194,13 @@ def play_rounds(
             yield Round(env=env, points=points, items=items, fresh=worlds, number=number, total=len(plan.rounds))
 
 
-def play(policy: Policy, env: ManipulationEnv, points: torch.Tensor, look: Look) -> tuple[EpisodeMetrics, float]:
+def play(policy: Policy, env: ManipulationEnv, points: MetricPoints, look: Look) -> tuple[EpisodeMetrics, float]:
     """Play one episode in every world, from its present state.
 
     Args:
         policy: what acts; it starts fresh.
         env: the worlds, just reset.
-        points: [N, 4, 3] keypoints of the objects, in their frames.
+        points: the metric's points of each world's object.
         look: called at the start and after every control step.
 
     Returns:
@@ -219,7 +230,24 @@ def episode_starts(distribution: ResetDistribution, sequence: np.ndarray, repeti
     return Reset.cat(parts)
 
 
-_FLAGS = ("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow")
+_FLAGS = (
+    "approach",
+    "grasp",
+    "reorient",
+    "reorient_once",
+    "out_of_bounds",
+    "nonfinite",
+    "overflow",
+    "published_success",
+)
+_NUMBERS = (
+    "reorientation_progress",
+    "task_progress",
+    "least_distance",
+    "final_distance",
+    "final_position_error",
+    "final_angle",
+)
 
 
 def _episode(result: EpisodeMetrics, world: int, bank: ResetBank, sequence: int, repetition: int) -> Episode:
@@ -228,9 +256,8 @@ def _episode(result: EpisodeMetrics, world: int, bank: ResetBank, sequence: int,
         sequence_name=str(bank.sequence_name[sequence]),
         object=str(bank.sequence_object[sequence]),
         repetition=repetition,
-        reorientation_progress=round(float(result.reorientation_progress[world]), 6),
-        task_progress=round(float(result.task_progress[world]), 6),
         **{name: bool(getattr(result, name)[world]) for name in _FLAGS},
+        **{name: round(float(getattr(result, name)[world]), 6) for name in _NUMBERS},
     )
 
 

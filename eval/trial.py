@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from xreset.env import ManipulationEnv, make_scene
+from xreset.eval.metrics import MetricPoints
 from xreset.eval.policy_spec import PolicySpec
 from xreset.inputs import Data, Kind, load_inputs
-from xreset.objects.sampling import keypoints
 from xreset.physics import Backend
 from xreset.plugins import backend_class, device_for, make_backend
 from xreset.resets.bank import ResetBank
@@ -114,7 +114,7 @@ class Trial:
         return ResetDistribution(self.bank, self.robot, self.names, self.task.reset, device)
 
     @contextmanager
-    def worlds(self, engine: Engine, object_index: Tensor) -> Iterator[tuple[ManipulationEnv, Tensor]]:
+    def worlds(self, engine: Engine, object_index: Tensor) -> Iterator[tuple[ManipulationEnv, MetricPoints]]:
         """Open an environment in an engine.
 
         Args:
@@ -122,12 +122,11 @@ class Trial:
             object_index: [N] index of the object in each world.
 
         Yields:
-            The environment, and the keypoints [N, 4, 3] of each world's object in the object's frame.
+            The environment, and the metric's points of each world's object.
         """
         with engine.make(self.scene, len(object_index), object_index) as backend:
             env = ManipulationEnv(backend, self.task, self.starts(backend.device), seed=self.seed)
-            points = torch.stack([torch.as_tensor(keypoints(o), dtype=torch.float32) for o in self.objects])
-            yield env, points.to(backend.device)[backend.object_index]
+            yield env, MetricPoints.of(self.objects).to(backend.device)[backend.object_index]
 
 
 def load_trial(

@@ -17,7 +17,7 @@ from tests.toy_results import OBJECTS, toy_rollouts, toy_summary
 from xreset.checks import from_dict
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.evaluate import evaluate
-from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
+from xreset.eval.metrics import EpisodeMetrics, MetricPoints, MetricsConfig
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import EvalResult, read_results, read_traces, write_results
 from xreset.eval.rollout import Episode
@@ -32,6 +32,7 @@ from xreset.task.rewards import keypoint_distance
 from xreset.tensors import Tensors
 
 CORNERS = torch.tensor([[-1.0, -1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]]) * 0.05
+POINTS = MetricPoints(keypoints=CORNERS[None], surface=CORNERS[None])
 IDENTITY = torch.tensor([1.0, 0, 0, 0])
 START, GOAL = torch.tensor([0.5, 0.3, 0.05]), torch.tensor([0.5, 0.3, 0.25])
 PRESS, LIGHT = (1.0, 0.0, 1.0), (0.0, 1.0, 1.0)
@@ -66,7 +67,7 @@ def turned(degrees: float) -> torch.Tensor:
 
 def episode(*steps: Reading, start: Reading | None = None, lost_at: int | None = None) -> EpisodeMetrics:
     """The metrics of an episode; at step ``lost_at`` the object leaves the scene."""
-    metrics = EpisodeMetrics(start or reading(), GOAL[None], IDENTITY[None], CORNERS[None], MetricsConfig())
+    metrics = EpisodeMetrics(start or reading(), GOAL[None], IDENTITY[None], POINTS, MetricsConfig())
     for i, step in enumerate(steps):
         metrics.update(step, torch.tensor([i == lost_at]))
     return metrics
@@ -133,6 +134,25 @@ class MetricsTest(unittest.TestCase):
         there = episode(reading(GOAL), start=reading(GOAL))  # nothing is left to do: no division by zero
         self.assertTrue(0.0 <= float(there.reorientation_progress) <= 1.0)
 
+    def test_published_success_is_a_mean_distance_of_two_centimetres_at_any_time(self):
+        """No turn moves every point as far as the origin; 20 degrees about z move each corner by 2 sqrt(2) 5 cm sin 10
+        degrees."""
+        turn = 0.1 * math.sqrt(2) * math.sin(math.radians(10))
+        near = GOAL + torch.tensor([0.0, 0.0199, 0.0])
+        far = GOAL + torch.tensor([0.0, 0.0201, 0.0])
+        for name, m, success, least, last in (
+            ("near, then away", episode(reading(near), reading(raised(0.1))), True, 0.0199, (0.1, 0.1, 0.0)),
+            ("not near enough", episode(reading(far)), False, 0.0201, (0.0201, 0.0201, 0.0)),
+            ("at the start", episode(reading(), start=reading(GOAL)), True, 0.0, (0.2, 0.2, 0.0)),
+            ("turned", episode(reading(GOAL, turned(20))), False, turn, (turn, 0.0, math.radians(20))),
+            ("left the scene", episode(reading(raised(0.1)), reading(GOAL), lost_at=1), False, 0.1, (0.1, 0.1, 0.0)),
+        ):
+            with self.subTest(name):
+                self.assertEqual(bool(m.published_success), success)
+                self.assertAlmostEqual(float(m.least_distance), least, places=6)
+                found = [float(x) for x in (m.final_distance, m.final_position_error, m.final_angle)]
+                np.testing.assert_allclose(found, last, atol=1e-3)
+
     def test_a_world_that_is_not_finite_is_counted_and_no_longer_looked_at(self):
         nan = torch.full((3,), math.nan)
         broken = reading(nan, tips=(math.nan,) * 3, press=(math.nan,) * 3, nonfinite=True)
@@ -140,6 +160,7 @@ class MetricsTest(unittest.TestCase):
         self.assertFalse(m.approach or m.grasp or m.reorient or m.out_of_bounds)
         self.assertTrue(m.nonfinite)
         self.assertAlmostEqual(float(m.reorientation_progress), 0.25, places=5)
+        self.assertAlmostEqual(float(m.final_distance), 0.15, places=5)
 
     def test_an_episode_has_one_end(self):
         """What happens to a world after its end is not counted, nor is the place of a broken world."""
@@ -163,7 +184,8 @@ class MetricsTest(unittest.TestCase):
             )
 
         start = both(reading(), reading())
-        m = EpisodeMetrics(start, GOAL.expand(2, 3), IDENTITY.expand(2, 4), CORNERS.expand(2, 4, 3), MetricsConfig())
+        points = MetricPoints.cat((POINTS, POINTS))
+        m = EpisodeMetrics(start, GOAL.expand(2, 3), IDENTITY.expand(2, 4), points, MetricsConfig())
         m.update(both(reading(tips=(0.01, 0.2, 0.2)), reading(GOAL)), torch.tensor([False, True]))
         m.update(both(reading(GOAL), reading(GOAL)), torch.tensor([False, False]))
         torch.testing.assert_close(m.task_progress, torch.tensor([1.0, 0.0]))

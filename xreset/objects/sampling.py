@@ -6,6 +6,8 @@ import numpy as np
 
 from xreset.spec import ObjectSpec
 
+METRIC_POINTS = 64
+"""Points of the published success (the published paper, section V)."""
 _CANDIDATES_PER_POINT = 8
 _PROBE = 2e-4
 """Distance from the surface at which a sample is tested [m]: above rounding, below any feature."""
@@ -22,6 +24,11 @@ def surface_points(obj: ObjectSpec, count: int = 64, seed: int = 0) -> np.ndarra
     points, normals = sample_surface(obj, max(_CANDIDATES_PER_POINT * count, 256), seed)
     outside = winding_number(points + _PROBE * normals, obj.vertices, obj.faces) < 0.5
     return farthest_points(points[outside], count)
+
+
+def metric_points(obj: ObjectSpec) -> np.ndarray:
+    """[64, 3] the ordered surface points whose mean distance to the goal decides the published success."""
+    return surface_points(obj, METRIC_POINTS)
 
 
 def sample_surface(obj: ObjectSpec, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

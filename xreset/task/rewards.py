@@ -108,11 +108,21 @@ def contact_gate(tip_force: Tensor, threshold: float, *, opposing: bool = False)
     return pressing[:, 0] & others.any(dim=-1)
 
 
+def point_distances(pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, points: Tensor) -> Tensor:
+    """[N, P] distance |o_i - g_i| of each object-frame point [N, P, 3] from its place at the goal [m]."""
+    here = pos[:, None] + quat_rotate(quat[:, None], points)
+    goal = goal_pos[:, None] + quat_rotate(goal_quat[:, None], points)
+    return (here - goal).norm(dim=-1)
+
+
 def keypoint_distance(pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, keypoints: Tensor) -> Tensor:
-    """[N] pose error d(o, g) = max_i |o_i - g_i| of object-frame keypoints [N, 4, 3]."""
-    here = pos[:, None] + quat_rotate(quat[:, None], keypoints)
-    goal = goal_pos[:, None] + quat_rotate(goal_quat[:, None], keypoints)
-    return (here - goal).norm(dim=-1).amax(dim=-1)
+    """[N] pose error d(o, g) = max_i |o_i - g_i| of object-frame keypoints [N, 4, 3] (the draft)."""
+    return point_distances(pos, quat, goal_pos, goal_quat, keypoints).amax(dim=-1)
+
+
+def mean_distance(pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor, points: Tensor) -> Tensor:
+    """[N] pose error d = mean_i |o_i - g_i| of object-frame surface points [N, P, 3] (the published paper)."""
+    return point_distances(pos, quat, goal_pos, goal_quat, points).mean(dim=-1)
 
 
 def rotation_closeness(angle: Tensor, c: RewardConfig) -> Tensor:

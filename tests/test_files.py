@@ -22,7 +22,16 @@ from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.checks import from_dict
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import atomic_folder, atomic_write, claim, is_claimed, read_json, read_toml, write_json
+from xreset.files import (
+    atomic_folder,
+    atomic_write,
+    claim,
+    is_claimed,
+    read_json,
+    read_toml,
+    remove_leftovers,
+    write_json,
+)
 from xreset.records import Field, read_npz, write_npz
 from xreset.resets.bank import check_objects, read_bank, write_bank
 from xreset.spec import ObjectSpec
@@ -183,6 +192,13 @@ class ClaimTest(InFolder):
         leave()
         with atomic_folder(self.folder / "made"):
             self.assertEqual(len(list(self.folder.iterdir())), 1)
+
+    def test_a_leftover_that_cannot_be_removed_keeps_no_file_open(self):
+        (self.folder / ".xreset-dead.part").write_text("half")
+        before = len(os.listdir("/proc/self/fd"))
+        with mock.patch.object(Path, "unlink", side_effect=PermissionError):
+            remove_leftovers(self.folder)
+        self.assertEqual(len(os.listdir("/proc/self/fd")), before)
 
     def test_files_of_others_are_not_removed(self):
         (self.folder / ".download.part").write_text("precious")

@@ -170,6 +170,16 @@ class Pickles(InFolder):
         self.refused("cannot be read", b"\x80\x05\x96" + (1 << 40).to_bytes(8, "little") + b".")  # a bytearray of 1 TiB
         self.assertLess(tracemalloc.get_traced_memory()[1], 1 << 20)
 
+    def test_repeated_texts_and_arrays_take_little_memory(self):
+        text = pickle.dumps("x" * 1_000_000, protocol=2)[2:-1]
+        encoded = b"c_codecs\nencode\nh\x00X\x06\0\0\0latin1\x86R"
+        tracemalloc.start()
+        self.addCleanup(tracemalloc.stop)
+        self.load(b"\x80\x02" + text + b"0}X\x01\0\0\0a](" + 100 * encoded + b"es.")
+        self.assertLess(tracemalloc.get_traced_memory()[1], 20 << 20)
+        array = np.zeros(1_000_000)
+        self.refused("take more memory", pickle.dumps({str(i): array for i in range(4)}))
+
 
 if __name__ == "__main__":
     unittest.main()

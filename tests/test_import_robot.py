@@ -357,6 +357,9 @@ class Toy(WithFolder):
             )
         with self.assertRaisesRegex(RobotError, "cannot be read as XML"):
             import_robot(self.arm, self.folder / "nothing.urdf", self.folder / "x")
+        entities = self.file("entities.urdf", f'<!DOCTYPE robot [<!ENTITY a "b">]>{HAND}')
+        with self.assertRaisesRegex(RobotError, "has a DOCTYPE. Remove it"):
+            import_robot(self.arm, entities, self.folder / "x")
         with self.assertRaisesRegex(RobotError, "--thumb 'f9' is in 0 fingers"):
             import_robot(self.arm, self.hand, self.folder / "x", thumb="f9")
         self.file("taken", "")

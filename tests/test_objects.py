@@ -1,6 +1,7 @@
 """Objects: stand-ins, sampling, rest, and the import of meshes."""
 
 import importlib.util
+import json
 import os
 import unittest
 import zipfile
@@ -333,6 +334,23 @@ class MeshImport(InFolder):
             self.assertRaisesRegex(ObjectError, "takes 32 MB"),
         ):
             read_mesh(self.folder / "mesh.3mf")
+
+    def test_a_gltf_of_any_size_is_bounded(self):
+        scene = trimesh.Scene(trimesh.creation.box((0.1, 0.06, 0.04)))
+        (self.folder / "box.glb").write_bytes(scene.export(file_type="glb"))
+        self.assertEqual(len(read_mesh(self.folder / "box.glb").faces), 12)
+        header = {"asset": {"version": "2.0"}, "accessors": [{"componentType": 5126, "type": "VEC3", "count": 10**9}]}
+        (self.folder / "huge.gltf").write_text(json.dumps(header))
+        with self.assertRaisesRegex(ObjectError, "takes 22888 MB"):
+            read_mesh(self.folder / "huge.gltf")
+        for i in range(50):
+            scene.add_geometry(scene.geometry["geometry_0"], node_name=f"copy {i}", geom_name="geometry_0")
+        (self.folder / "copies.glb").write_bytes(scene.export(file_type="glb"))
+        with (
+            mock.patch("xreset.geometry.shapes.max_bytes", lambda: 50_000),
+            self.assertRaisesRegex(ObjectError, "more than XRESET_MAX_FILE_MB"),
+        ):
+            read_mesh(self.folder / "copies.glb")
 
     def test_the_cache_knows_the_version_of_the_cutter(self):
         path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)))

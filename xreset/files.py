@@ -103,8 +103,10 @@ def remove_leftovers(folder: Path) -> None:
         with suppress(OSError):
             descriptor = _lock(leftover, required=True)
             if descriptor is not None:
-                _remove(leftover)
-                os.close(descriptor)
+                try:
+                    _remove(leftover)
+                finally:
+                    os.close(descriptor)
 
 
 def _remove(path: Path) -> None:

@@ -365,7 +365,12 @@ class Plan:
         if data.demos is not None and chosen == self.objects[name]:
             chosen = ()
         made = Subset(name=name, data=data, given=self.given, out=self.out, objects=chosen, per_object=per_object)
-        return self.subsets.setdefault(made.folder, made)
+        first = self.subsets.setdefault(made.folder, made)
+        if first != made:
+            raise RunError(
+                f"data.{first.name} and data.{name} would both write {made.folder}. Give one of them another name."
+            )
+        return first
 
     def add(self, step: Step) -> str:
         """Add a step, unless there is one of its name, and return the name."""
@@ -402,6 +407,7 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
     for group in study.runs:
         if not only or group in only:
             plan.runs += _runs(plan, group)
+    _check_folders(plan)
     trained = {run.folder: f"train {run.name}" for run in plan.runs if run.config is not None}
     for run in sorted(plan.runs, key=lambda run: run.weights is not None):
         run.check()
@@ -416,6 +422,16 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
     for subset in plan.subsets.values():
         subset.check()
     return plan
+
+
+def _check_folders(plan: Plan) -> None:
+    """Raise ``RunError`` if two runs, or the banks of two robots, would have the same folder."""
+    owners = {plan.out / name: "the study" for name in ("data", "logs", "reports")}
+    for run in plan.runs:
+        for folder, owner in ((run.folder, f"runs.{run.group}"), (run.bank.parent, f"the robot {run.runs.robot}")):
+            first = owners.setdefault(folder, owner)
+            if first != owner:
+                raise RunError(f"{first} and {owner} would both write {folder}. Give one of them another name.")
 
 
 def _add_evaluation(plan: Plan, run: Run, key: str, training: str | None) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import pickle
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from xreset.files import max_bytes
 from xreset.text import shown
 
 _KINDS = "fiub"
+_PER_BYTE = 64
+"""Bytes of memory that a byte of a pickle may take: one byte makes an empty list."""
 
 
 class _Dtype:
@@ -34,34 +37,47 @@ class _Dtype:
 
 
 class _Array:
-    """Replaces ``numpy.ndarray`` while it is built."""
+    """Replaces ``numpy.ndarray``. The array is made when it is asked for: many may share one text of the file."""
 
-    value: np.ndarray | None = None
+    data: Any = None
+    dtype: Any = None
+    shape: Any = ()
+    order: Any = "C"
 
     def __init__(self, *_: Any) -> None:
         pass  # numpy's _reconstruct, which passes a type and a shape that do not matter
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
-        _, shape, dtype, fortran, data = state
-        self.value = _array(data, dtype, shape, "F" if fortran else "C").value
+        _, self.shape, self.dtype, fortran, self.data = state
+        self.order = "F" if fortran else "C"
+
+    @cached_property
+    def value(self) -> np.ndarray:
+        data = self.data
+        if isinstance(data, str):  # written by Python 2, or for it
+            data = data.encode("latin-1")
+        is_plain = isinstance(self.dtype, _Dtype) and isinstance(self.shape, tuple)
+        if not is_plain or not isinstance(data, bytes | bytearray):
+            raise ValueError("an array that is not made of plain numbers")
+        order = "F" if self.order == "F" else "C"
+        return np.frombuffer(data, dtype=self.dtype.dtype).reshape(self.shape, order=order)
 
 
 def _array(data: Any, dtype: Any, shape: Any = (), order: Any = "C") -> _Array:
     """Replaces numpy's ``scalar`` and ``_frombuffer``."""
-    if isinstance(data, str):  # written by Python 2
-        data = data.encode("latin-1")
-    if not isinstance(dtype, _Dtype) or not isinstance(data, bytes | bytearray) or not isinstance(shape, tuple):
-        raise ValueError("an array that is not made of plain numbers")
     found = _Array()
-    found.value = np.frombuffer(bytes(data), dtype=dtype.dtype).reshape(shape, order="F" if order == "F" else "C")
+    found.data = data
+    found.dtype = dtype
+    found.shape = shape
+    found.order = order
     return found
 
 
-def _encode(text: Any, encoding: Any) -> bytes:
-    """Replaces ``_codecs.encode``, with which Python 3 writes bytes for Python 2."""
+def _encode(text: Any, encoding: Any) -> str:
+    """Replaces ``_codecs.encode``, with which Python 3 writes bytes for Python 2: the text stands for its bytes."""
     if encoding != "latin1" or not isinstance(text, str):
         raise ValueError(f"a text to be encoded as {shown(encoding)}")
-    return text.encode("latin-1")
+    return text
 
 
 _FUNCTIONS: dict[str, Any] = {
@@ -103,14 +119,27 @@ def read_pickle(path: Path) -> dict[str, Any]:
         DemoError: it is damaged, too large, no dictionary, or asks for anything but arrays.
     """
     try:
-        if path.stat().st_size > max_bytes():
+        if path.stat().st_size > max_bytes() // _PER_BYTE:
             raise ValueError(f"it has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows")
         # a file in memory reserves no memory for what it does not hold
         data = _Unpickler(io.BytesIO(path.read_bytes()), encoding="latin-1").load()
+        if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
+            raise ValueError(f"it holds {shown(type(data).__name__)}, expected a dictionary with names")
+        return _with_arrays(data)
     except MemoryError:
         raise
     except Exception as error:  # a damaged pickle raises any kind of error
         raise DemoError(f"{path} cannot be read as pickled arrays: {shown(str(error))}.") from error
-    if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
-        raise DemoError(f"{path} holds {shown(type(data).__name__)}, expected a dictionary with names.")
-    return {name: value.value if isinstance(value, _Array) else value for name, value in data.items()}
+
+
+def _with_arrays(data: dict[str, Any]) -> dict[str, Any]:
+    left = max_bytes() // _PER_BYTE
+    found = {}
+    for name, value in data.items():
+        if isinstance(value, _Array):
+            value = value.value
+            left -= value.nbytes
+            if left < 0:
+                raise ValueError("its arrays take more memory than XRESET_MAX_FILE_MB allows")
+        found[name] = value
+    return found

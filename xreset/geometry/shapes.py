@@ -5,6 +5,7 @@ Lengths in meters, coordinates in the object's mesh frame.
 
 from __future__ import annotations
 
+import json
 import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -27,6 +28,9 @@ _MOST_HULL_POINTS = 300
 _ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz")
 _UNPACKED = 16
 """Bytes of memory per byte of a zipped mesh format, such as 3MF."""
+_PER_VERTEX_BYTE = 8
+"""Bytes of memory of a mesh per byte of its vertices: faces, and copies on the way."""
+_GLTF_NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 CYLINDER_SECTIONS = 48
 """Sides of the prism that stands for a cylinder in a surface mesh."""
 
@@ -124,10 +128,14 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         if zipfile.is_zipfile(path):  # the archive states the sizes, and zipfile reads no more than these
             with zipfile.ZipFile(path) as archive:
                 size = _UNPACKED * sum(member.file_size for member in archive.infolist())
-        if size > max_bytes():
-            raise ObjectError(f"{path} takes {size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
+        if path.suffix.lower() in (".gltf", ".glb"):
+            size = max(size, _gltf_size(path))
+        _check_memory(path, size)
         # Processing would drop damaged vertices silently.
-        mesh = trimesh.load(path, force="mesh", skip_materials=True, process=False)
+        scene = trimesh.load_scene(path, skip_materials=True, process=False)
+        sizes = [scene.geometry[scene.graph[node][1]].vertices.nbytes for node in scene.graph.nodes_geometry]
+        _check_memory(path, _PER_VERTEX_BYTE * sum(sizes))  # a scene may show a mesh any number of times
+        mesh = scene.to_mesh()
     except ObjectError:
         raise
     except Exception as error:  # trimesh's parsers raise any kind of error
@@ -135,6 +143,21 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces) or not len(mesh.vertices):
         raise ObjectError(f"{path} contains no triangles. It is empty or damaged.")
     return mesh
+
+
+def _check_memory(path: Path, size: int) -> None:
+    if size > max_bytes():
+        raise ObjectError(f"{path} takes {size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
+
+
+def _gltf_size(path: Path) -> int:
+    """Return the memory that the arrays of a glTF file take [bytes]: they may share data, or have none."""
+    content = path.read_bytes()
+    if content[:4] == b"glTF":  # binary: the JSON text comes first
+        length = int.from_bytes(content[12:16], "little")
+        content = content[20 : 20 + length]
+    accessors = json.loads(content).get("accessors", [])
+    return sum(_GLTF_NUMBERS[accessor["type"]] * 8 * accessor["count"] for accessor in accessors)
 
 
 def loft(sections: Iterable[np.ndarray]) -> Shape:

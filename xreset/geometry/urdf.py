@@ -141,20 +141,22 @@ def load_urdf(path: str | Path) -> RobotTree:
     return tree
 
 
+class _NoDoctype(ElementTree.TreeBuilder):
+    """Refuses document types, whose entities can grow to any size."""
+
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
+        raise ValueError("it has a DOCTYPE. Remove it; a robot's file needs none")
+
+
 def parse_xml(path: Path) -> Element:
     """Return the root element of a file.
 
     Raises:
-        RobotError: the file cannot be read.
+        RobotError: the file cannot be read, or has a document type.
     """
     try:
-        return ElementTree.parse(path).getroot()
-    except (
-        OSError,
-        ElementTree.ParseError,
-        ValueError,
-        LookupError,
-    ) as error:  # the last two: encodings
+        return ElementTree.parse(path, ElementTree.XMLParser(target=_NoDoctype())).getroot()
+    except (OSError, ElementTree.ParseError, ValueError, LookupError) as error:  # the last two: encodings
         raise RobotError(f"{path} cannot be read as XML: {shown(str(error))}") from error
 
 

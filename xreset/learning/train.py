@@ -225,7 +225,8 @@ def _train(processes: Processes, out: Path, info: RunInfo, inputs: Inputs, *, se
         elif info.weights is not None:
             runner.load_networks(Path(info.weights))
         if processes.is_main:
-            if not runner.iteration:  # before the first checkpoint a killed run leaves nothing worth keeping
+            # before the first checkpoint a killed run leaves nothing worth keeping; files without a run are of others
+            if not runner.iteration and (out / "run.json").is_file():
                 for events in out.glob("events.out.tfevents.*"):
                     events.unlink()
             write_run(out, info)

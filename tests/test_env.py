@@ -3,6 +3,7 @@
 import tempfile
 import unittest
 from dataclasses import fields, replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
@@ -17,6 +18,7 @@ from xreset.env import ManipulationEnv, make_scene
 from xreset.errors import CapabilityError
 from xreset.eval.rollout import roll_out
 from xreset.eval.trial import Engine, Trial
+from xreset.geometry.rotations import quat_rotate
 from xreset.learning.recipes import RECIPES
 from xreset.objects.catalogue import load_objects
 from xreset.physics import State
@@ -26,10 +28,12 @@ from xreset.task.config import (
     ActionConfig,
     NoiseConfig,
     ObservationConfig,
+    PushConfig,
     RandomizationConfig,
     ResetConfig,
     TaskConfig,
     TerminationConfig,
+    TrackerConfig,
     evaluation_task,
 )
 from xreset.task.observations import layout
@@ -299,6 +303,115 @@ class RobustnessTest(WithEnv):
         for late, pose in zip(seen[2:], poses, strict=False):
             torch.testing.assert_close(late, pose)
 
+    def test_arm_and_hand_may_be_late_apart(self):
+        env = self.make(self.task(action_latency=(0.0, 0.0), hand_latency=(1.0, 1.0)))
+        last = env.joint_target.clone()
+        with mock.patch.object(env.backend, "set_joint_targets") as sent:
+            for action in self.actions(3):
+                env.step(action)
+                arm, hand = sent.call_args.args[0].split((3, 4), dim=-1)
+                torch.testing.assert_close(arm, env.joint_target[:, :3])
+                torch.testing.assert_close(hand, last[:, 3:])
+                last = env.joint_target.clone()
+
+    def test_a_lost_action_leaves_the_targets_where_they_are(self):
+        held = []
+        for share in (1.0, 0.5):
+            env = self.make(self.task(lost_actions=(share, share)))
+            for action in self.actions(20):
+                before = env.joint_target.clone()
+                env.step(action)
+                held.append((env.joint_target == before).all(dim=-1).float())
+        all_lost, half_lost = torch.stack(held).view(2, -1).mean(dim=-1).tolist()
+        self.assertEqual(all_lost, 1.0)
+        self.assertTrue(0.25 < half_lost < 0.75, half_lost)
+
+    def test_joints_and_forces_are_observed_late(self):
+        env, same = self.make(self.task(proprio_latency=(2.0, 2.0))), self.make(self.task())
+        late, present = [], []
+        for action in self.actions(6):
+            late.append(env.step(action)[0]["proprio"])
+            present.append(same.step(action)[0]["proprio"])
+        torch.testing.assert_close(torch.stack(late[2:]), torch.stack(present[:-2]))
+
+    def observed(self, tracker: TrackerConfig, steps: int = 12, **ranges) -> tuple[torch.Tensor, torch.Tensor]:
+        """Errors of the observed positions [steps, N, 3], and errors of the cloud's middle that follow from them."""
+        env = self.make(self.task(tracker=tracker, **ranges))
+        errors, cloud_errors = [], []
+        for action in self.actions(steps):
+            observations, *_ = env.step(action)
+            state = env.backend.state()
+            cloud = quat_rotate(state.object_quat[:, None], env._cloud_points) + state.object_pos[:, None]
+            errors.append(observations["policy"][:, :3] - state.object_pos)
+            cloud_errors.append((observations["perception"][:, -1] - cloud).mean(dim=1))
+        return torch.stack(errors), torch.stack(cloud_errors)
+
+    def test_a_tracker_errs_by_the_same_in_an_episode_and_anew_in_every_pose(self):
+        bias, cloud_bias = self.observed(TrackerConfig(position_bias=0.01))
+        self.assertTrue(bool(((bias.abs() <= 0.01001) & (bias.abs() > 0)).all()))
+        torch.testing.assert_close(bias, bias[:1].expand_as(bias))
+        torch.testing.assert_close(bias, cloud_bias)
+        noise, _ = self.observed(TrackerConfig(position_noise=0.01))
+        self.assertTrue(bool((noise.abs() <= 0.01001).all()) and bool((noise[1:] != noise[:-1]).all()))
+        position, cloud = self.observed(TrackerConfig(rotation_noise=0.1, rotation_bias=0.1))
+        self.assertLess(float(position.abs().max()), 1e-6)
+        self.assertGreater(float(cloud.abs().max()), 1e-4)
+
+    def test_poses_may_come_seldom_and_go_missing(self):
+        """The error of each pose is another one, so the same error is the same pose."""
+        cases = ((TrackerConfig(interval=(3.0, 3.0)), 3), (TrackerConfig(loss=1.0, loss_steps=(4.0, 4.0)), 5))
+        for tracker, period in cases:
+            env = self.make(self.task(tracker=replace(tracker, position_noise=0.01)))
+            poses = [env.step(action)[0]["policy"][:, :3] for action in self.actions(12)]
+            same = [torch.equal(a, b) for a, b in pairwise(poses)]  # the first pose came with the reset
+            self.assertEqual(same, [(step + 2) % period != 0 for step in range(11)])
+
+    def test_a_delay_jitters_within_its_range(self):
+        env = self.make(self.task(observation_latency=(2.0, 2.0), tracker=TrackerConfig(jitter=3.0)))
+        delay = [env.variation._tracker._jittered_delay(env.generator) for _ in range(50)]
+        low, high = torch.stack(delay).aminmax()
+        self.assertTrue(float(low) < 0.5 and float(high) == 2.0)
+        with self.assertRaisesRegex(ValueError, "jitter changes observation_latency, which is 0"):
+            RandomizationConfig(tracker=TrackerConfig(jitter=1.0))
+
+    def test_pushes_change_velocities_by_what_they_say(self):
+        push = PushConfig(probability=(1.0, 1.0), object_velocity=0.5, object_spin=4.0)
+        env, same = self.make(self.task(push=push)), self.make(self.task())
+        for each in (env, same):
+            state = each.backend.state()
+            each.backend.set_state(replace(state, object_pos=state.object_pos + torch.tensor([0.0, 0.0, 0.3])))
+            each.step(torch.zeros(N, 7))
+        pushes, pushed, free = env.variation.pushes, env.backend.state(), same.backend.state()
+        mass = env.variation.parameters["object_mass"][:, None]
+        expected = pushes.force / mass * env.backend.scene.control_dt
+        self.assertTrue(bool(((expected.norm(dim=-1) > 0) & (expected.norm(dim=-1) <= 0.5)).all()))
+        spin = pushed.object_angvel - free.object_angvel
+        self.assertTrue(bool(((spin.norm(dim=-1) > 0) & (spin.norm(dim=-1) <= 4.2)).all()))
+        com = torch.as_tensor(np.stack([o.com for o in self.objects]), dtype=torch.float32)[env.backend.object_index]
+        arm = quat_rotate(pushed.object_quat, com)
+        velocity = pushed.object_linvel + torch.linalg.cross(pushed.object_angvel, arm) - free.object_linvel
+        torch.testing.assert_close(velocity, expected, atol=0.01, rtol=0.02)
+
+    def test_pushes_wait_for_the_gate_and_move_the_arms_targets(self):
+        push = PushConfig(probability=(1.0, 1.0), object_velocity=0.5, arm_torque=0.5, when="gated")
+        env = self.make(self.task(push=push))
+        with mock.patch.object(env.backend, "set_joint_targets") as sent:
+            env.step(torch.zeros(N, 7))
+        self.assertEqual(float(env.variation.pushes.force.abs().max()), 0.0)
+        offset = sent.call_args.args[0] - env.joint_target
+        drives = [joint.drive for joint in self.robot.joints]
+        torque = offset * torch.tensor([drive.kp for drive in drives]) / torch.tensor([d.effort for d in drives])
+        self.assertTrue(bool((torque[:, :3].abs() <= 0.5001).all() and (torque[:, :3] != 0).all()))
+        self.assertEqual(float(torque[:, 3:].abs().max()), 0.0)
+        env.variation.pushes.gate.fill_(True)
+        env.step(torch.zeros(N, 7))
+        self.assertGreater(float(env.variation.pushes.force.norm(dim=-1).min()), 0.0)
+        able = MujocoBackend.capabilities - {"object_wrench"}
+        with mock.patch.object(MujocoBackend, "capabilities", able), self.assertRaisesRegex(CapabilityError, "wrench"):
+            self.make(self.task(push=push))
+        with self.assertRaisesRegex(ValueError, "expected two numbers above 0"):
+            PushConfig(probability=(0.0, 0.1))
+
     def test_drives_are_set_for_the_worlds_that_begin(self):
         env = self.make(self.task(arm_stiffness=(0.5, 0.6), hand_damping=(2.0, 3.0)))
         with mock.patch.object(env.backend, "set_drives") as drives:
@@ -345,6 +458,11 @@ class RobustnessTest(WithEnv):
             effort=(0.5, 1.0),
             force_gain=(0.5, 1.0),
             object_com=(0.0, 0.01),
+            hand_latency=(0.0, 2.0),
+            proprio_latency=(0.0, 2.0),
+            lost_actions=(0.0, 0.5),
+            tracker=TrackerConfig(interval=(1.0, 3.0), position_bias=0.01, jitter=1.0, loss=0.3),
+            push=PushConfig(probability=(0.1, 0.5), object_velocity=0.1),
         )
         env, other = self.make(task), self.make(task, seed=1)
         for action in self.actions(5):
@@ -358,7 +476,7 @@ class RobustnessTest(WithEnv):
 
     def test_a_step_with_all_of_it_never_waits_for_the_device(self):
         """As on a GPU, where any of these operations would stop the host until the device is done, and could not be captured."""
-        task = RECIPES["robust"].config.task
+        task = RECIPES["live"].config.task
         env = self.make(task)
         waiting = Waiting()
         with mock.patch.object(env._graphs, "active", True), mock.patch.object(env._graphs, "run", lambda part: part()):

@@ -483,6 +483,26 @@ class ResetTest(WithRobot):
         unmoved = self.distribution(demo_probability=0.0, spawn_xy=0.0, spawn_yaw=0.0).sample(self.SOUPS, generator())
         torch.testing.assert_close(unmoved.object_pos, torch.as_tensor(bank.start_pos)[unmoved.sequence])
 
+    def test_goals_move_around_the_demonstrated_ones_and_never_below_the_start(self):
+        bank = toy_bank(self.robot)
+        options = {"goal_xy": 0.03, "goal_z": 0.05, "goal_yaw": 0.5}
+        reset = self.distribution(demo_probability=0.5, **options).sample(self.SOUPS, generator())
+        goal = torch.as_tensor(bank.goal_pos, dtype=torch.float32)[reset.sequence]
+        offset = (reset.goal_pos - goal).masked_fill(reset.from_bank[:, None], 0)
+        angle = quat_angle(reset.goal_quat, torch.as_tensor(bank.goal_quat_wxyz, dtype=torch.float32)[reset.sequence])
+        torch.testing.assert_close(reset.goal_pos[reset.from_bank], goal[reset.from_bank])
+        largest = torch.cat((offset.abs().amax(dim=0), angle[~reset.from_bank].max()[None]))
+        torch.testing.assert_close(largest, torch.tensor([0.03, 0.03, 0.05, 0.5]), atol=2e-3, rtol=0)
+        low = toy_bank(self.robot, goal_pos=bank.start_pos)
+        reset = self.distribution(bank=low, demo_probability=0.0, **options).sample(self.SOUPS, generator())
+        start = torch.as_tensor(bank.start_pos, dtype=torch.float32)[reset.sequence]
+        self.assertGreaterEqual(float((reset.goal_pos - start)[:, 2].min()), 0.0)
+        wide = self.distribution(demo_probability=0.0, training_xy=0.1).sample(self.SOUPS, generator())
+        offset = wide.object_pos - torch.as_tensor(bank.start_pos)[wide.sequence]
+        self.assertAlmostEqual(float(offset.max()), 0.1, delta=1e-3)
+        task = evaluation_task(TaskConfig(reset=ResetConfig(training_xy=0.1, **options)))
+        self.assertEqual(task.reset, evaluation_task(TaskConfig()).reset)
+
     def test_home_turns_about_the_worlds_vertical(self):
         lying = toy_bank(self.robot, start_quat_wxyz=np.tile(turned(90, (1.0, 0, 0)).numpy(), (3, 1)))
         reset = self.distribution(bank=lying, demo_probability=0.0).sample(self.SOUPS, generator())

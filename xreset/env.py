@@ -184,7 +184,10 @@ class ManipulationEnv:
         self._reset_mask = mask()
         self._over = mask()
         self._new_start = self.resets.sample(self.backend.object_index, torch.Generator(device=self.device)).clone()
-        self.variation = Variation(self.backend, self.task.randomization, self.actions.is_arm)
+        robot = self.backend.scene.robot
+        proprio = obs.layout(len(robot.joints), len(robot.fingertips), self.task.observation)["proprio"]
+        randomization = self.task.randomization
+        self.variation = Variation(self.backend, randomization, self.actions.is_arm, sum(proprio.values()))
         # The state before a step is kept in case the step breaks a world.
         state = self.backend.state()
         self._state_before = {f.name: getattr(state, f.name).clone() for f in fields(state)}
@@ -364,6 +367,9 @@ class ManipulationEnv:
         self._action.copy_(action)
         self._graphs.run(self._process_action)
         self.backend.set_joint_targets(self._sent_target)
+        pushes = self.variation.pushes
+        if pushes is not None and pushes.config.moves_object:
+            self.backend.set_object_wrench(pushes.force, pushes.torque)
         self.backend.step()
 
     def _process_action(self) -> None:
@@ -375,8 +381,9 @@ class ManipulationEnv:
         self._action.nan_to_num_(0.0, 0.0, 0.0)
         if not self.task.reward.raw_actions:
             self._action.clamp_(-1.0, 1.0)
-        self._target.copy_(self.actions.targets(self._action, self._target, state.joint_pos))
-        self._sent_target.copy_(self.variation.delayed_targets(self._target))
+        target = self.actions.targets(self._action, self._target, state.joint_pos)
+        self._target.copy_(self.variation.received_targets(target, self._target, self.generator))
+        self._sent_target.copy_(self.variation.sent_targets(self._target, state, self.generator))
 
     def _compute_rewards(self) -> tuple[Reading, Reward]:
         """Compute rewards, ends of episodes and the numbers to log."""
@@ -410,6 +417,8 @@ class ManipulationEnv:
             self.task.reward,
         )
         self._reward.copy_(torch.where(broken, 0.0, reward.total))
+        if self.variation.pushes is not None:
+            self.variation.pushes.gate.copy_(reward.gate & ~broken)
         self._previous_action.copy_(self._action)
         self._episode_length += 1
         time_out = (self._episode_length >= self.max_episode_length) | self._faulty
@@ -475,7 +484,7 @@ class ManipulationEnv:
         reading = self.reading()
         c = self.task.observation
         self._best_reach.copy_(torch.where(self._reset_mask, reading.tip_distance.mean(dim=-1), self._best_reach))
-        observed_pos, observed_quat = self.variation.observed_pose(reading.state, self._reset_mask)
+        observed_pos, observed_quat = self.variation.observed_pose(reading.state, self._reset_mask, self.generator)
         x = obs.ObservationInput(
             state=reading.state,
             links=reading.links,
@@ -497,7 +506,7 @@ class ManipulationEnv:
         self._cloud.copy_(torch.where(self._reset_mask.view(-1, 1, 1, 1), frame, history))
         groups = {
             "policy": obs.policy_group(x, c, self.generator),
-            "proprio": obs.proprio_group(x, c, self.generator),
+            "proprio": self.variation.observed_proprio(obs.proprio_group(x, c, self.generator), self._reset_mask),
             "perception": self._cloud,
             "privileged": obs.privileged_group(x),
         }

@@ -52,7 +52,7 @@ def train(
     Args:
         bank: reset bank, or its file. A bank without a file is written to ``resets.npz`` in the run folder.
         out: run folder to make.
-        recipe: where the configuration comes from: ``paper``, ``minutes``, ``robust``, or another run's folder, without
+        recipe: where the configuration comes from: a recipe such as ``minutes``, or another run's folder, without
             reward terms of the user's own, which must be named in ``config``.
         config: the whole configuration, instead of a recipe.
         robot: name or folder of the robot; default: the robot that the bank names.

@@ -141,6 +141,7 @@ class ResetDistribution:
         joints = [robot_tree(robot).joint(name) for name in robot.joint_names]
         self._lower = _tensor(np.array([float(joint.lower) for joint in joints]), device)
         self._upper = _tensor(np.array([float(joint.upper) for joint in joints]), device)
+        self._goal_shift = torch.tensor([config.goal_xy, config.goal_xy, config.goal_z, config.goal_yaw], device=device)
         self._home = _tensor(robot.home, device)
         self._home_std = _tensor(np.array([robot.home_std[joint.group == "hand"] for joint in robot.joints]), device)
 
@@ -177,18 +178,35 @@ class ResetDistribution:
         noise = noise * self._home_std * float(c.home_noise)
         joint_pos = torch.minimum(torch.maximum(self._home + noise, self._lower), self._upper)
         shift = 2.0 * torch.rand(m, 3, generator=generator, device=device) - 1.0
-        offset = torch.cat((shift[:, :2] * c.spawn_xy, torch.zeros(m, 1, device=device)), dim=-1)
+        spawn_xy = c.spawn_xy if c.training_xy is None else c.training_xy
+        offset = torch.cat((shift[:, :2] * spawn_xy, torch.zeros(m, 1, device=device)), dim=-1)
         yaw = torch.cat((torch.zeros(m, 2, device=device), shift[:, 2:] * c.spawn_yaw), dim=-1)
         start_pos, start_quat = self.start_pose(sequence)
         gravity = 1.0 + torch.randn(m, generator=generator, device=device) * c.home_gravity_std / GRAVITY
+        goal_pos, goal_quat = self._moved_goal(sequence, start_pos, generator)
         return Reset(
             joint_pos=joint_pos,
             joint_target=joint_pos,
             object_pos=start_pos + offset,
             object_quat=quat_multiply(quat_from_axis_angle(yaw), start_quat),
-            goal_pos=self._goal_pos[sequence],
-            goal_quat=self._goal_quat[sequence],
+            goal_pos=goal_pos,
+            goal_quat=goal_quat,
             gravity_fraction=gravity.clamp(1.0 - c.home_gravity_clip, 1.0 + c.home_gravity_clip),
             state=torch.full((m,), -1, device=device),
             sequence=sequence,
         )
+
+    def _moved_goal(self, sequence: Tensor, start_pos: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return goals [M, 3], [M, 4] of given demonstrations [M], perturbed as configured."""
+        c = self.config
+        pos = self._goal_pos[sequence]
+        quat = self._goal_quat[sequence]
+        if not (c.goal_xy or c.goal_z or c.goal_yaw):
+            return pos, quat
+        uniform = torch.rand(len(pos), 4, generator=generator, device=generator.device)
+        shift = (2.0 * uniform - 1.0) * self._goal_shift
+        moved = pos + shift[:, :3]
+        lowest = torch.minimum(pos[:, 2], start_pos[:, 2])
+        height = torch.maximum(moved[:, 2], lowest)
+        yaw = torch.cat((torch.zeros_like(shift[:, :2]), shift[:, 3:]), dim=-1)
+        return torch.cat((moved[:, :2], height[:, None]), dim=-1), quat_multiply(quat_from_axis_angle(yaw), quat)

@@ -209,11 +209,84 @@ class ResetConfig(Checked):
     """Home resets: the object is turned about the vertical by U(-y, y) [rad], 25 degrees."""
     home_noise: bool = True
     """Home resets: joints start around home with the robot's ``home_std``."""
+    training_xy: NotNegative[float] | None = None
+    """Replaces ``spawn_xy`` in trainings, so that starts are wider there than in evaluations [m]."""
+    goal_xy: NotNegative[float] = 0.0
+    """Home resets: the goal is moved by U(-x, x) in both directions [m]."""
+    goal_z: NotNegative[float] = 0.0
+    """Home resets: the goal is moved by U(-z, z) upwards [m], but not below the height at which the object starts."""
+    goal_yaw: NotNegative[float] = 0.0
+    """Home resets: the goal is turned about the vertical by U(-y, y) [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackerConfig(Checked):
+    """Faults of the tracker that observes the object's pose. They move the observed pose and points together.
+
+    All are off by default. How late a pose is: ``observation_latency``.
+    """
+
+    interval: Range = (1.0, 1.0)
+    """Range of the time from one pose to the next [control steps], drawn for every pose and rounded. Until then the
+    last pose is observed. With control at 60 Hz, 2 is a tracker of 30 Hz."""
+    jitter: NotNegative[float] = 0.0
+    """The delay of a pose differs from ``observation_latency`` by U(-j, j) [control steps], drawn at every step. It
+    stays between 0 and the longest delay."""
+    position_bias: NotNegative[float] = 0.0
+    """Error of the position during a whole episode: U(-b, b) along each axis [m]."""
+    rotation_bias: NotNegative[float] = 0.0
+    """Error of the orientation during a whole episode: U(-b, b) about each axis [rad]."""
+    position_noise: NotNegative[float] = 0.0
+    """Error of each pose's position: U(-n, n) along each axis [m]."""
+    rotation_noise: NotNegative[float] = 0.0
+    """Error of each pose's orientation: U(-n, n) about each axis [rad]."""
+    loss: Share[float] = 0.0
+    """Probability that the tracker loses the object after a pose."""
+    loss_steps: Range = (1.0, 1.0)
+    """Range of the time that it takes to find the object again [control steps], in addition to ``interval``."""
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether poses are wrong."""
+        return max(self.position_bias, self.rotation_bias, self.position_noise, self.rotation_noise) > 0
+
+    @property
+    def skips_steps(self) -> bool:
+        """Whether some control steps have no new pose."""
+        return self.interval[1] > 1 or self.loss > 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushConfig(Checked):
+    """Pushes on object and arm, each during one control step. All are off by default."""
+
+    probability: Range = (0.001, 0.1)
+    """Range of the probability of a push per control step. Each episode draws one, log-uniformly."""
+    object_velocity: NotNegative[float] = 0.0
+    """Largest change of the object's velocity [m/s], in any direction, by a force at its centre of mass."""
+    object_spin: NotNegative[float] = 0.0
+    """Largest change of the object's angular velocity [rad/s], about any axis, by a torque."""
+    arm_torque: NotNegative[float] = 0.0
+    """Largest torque on each joint of the arm, as a share of the joint's effort limit. The joint's target is moved by
+    torque / stiffness, which a drive feels like the torque itself until it reaches its effort limit."""
+    when: Literal["always", "gated"] = "always"
+    """``gated``: the object is pushed only while the gate of the reward is open (``task.reward.contact``). Pushes on
+    the arm are never gated."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.probability[0] <= self.probability[1] <= 1:
+            raise ValueError(f"probability is {self.probability}, expected two numbers above 0 and at most 1")
+
+    @property
+    def moves_object(self) -> bool:
+        """Whether the object is pushed."""
+        return self.object_velocity > 0 or self.object_spin > 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomizationConfig(Checked):
-    """Physical parameters drawn at each reset.
+    """Physical parameters, delays and faults drawn at each reset.
 
     The first ones are the paper's (Table IX). The others differ between one robot and the next and are off by default;
     docs/sim-to-sim.md has what each costs a policy between engines.
@@ -252,14 +325,27 @@ class RandomizationConfig(Checked):
     effort: Range = (1.0, 1.0)
     """Range of the factor on the effort limit of every drive."""
     action_latency: Range = (0.0, 0.0)
-    """Range of the delay of actions [control steps]. Between whole steps the two targets are interpolated."""
+    """Range of the delay of actions [control steps]. Between whole steps the two targets are interpolated, which is
+    their mean over the step; a physics step is 1 / ``substeps`` of a control step."""
+    hand_latency: Range | None = None
+    """The same for the hand, drawn apart from the arm's; None: the hand has the arm's delay."""
+    lost_actions: Range = (0.0, 0.0)
+    """Range of the share of actions that do not arrive: the targets stay where they are. Each episode draws one."""
     observation_latency: Range = (0.0, 0.0)
     """Range of the delay of the observed object pose and cloud [control steps]."""
+    proprio_latency: Range = (0.0, 0.0)
+    """Range of the delay of the group ``proprio`` [control steps], rounded to whole ones."""
     force_gain: Range = (1.0, 1.0)
     """Range of the factor on the fingertips' force readings."""
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    push: PushConfig = field(default_factory=PushConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.tracker.jitter and not self.observation_latency[1]:
+            raise ValueError("tracker.jitter changes observation_latency, which is 0. Set observation_latency")
+        if self.lost_actions[1] > 1:
+            raise ValueError(f"lost_actions goes up to {self.lost_actions[1]:g}, expected a share of at most 1")
         for name in ("mass_scale", "object_inertia"):
             if not getattr(self, name)[0] > 0:
                 raise ValueError(f"{name} begins with {getattr(self, name)[0]}, expected factors above 0")
@@ -297,8 +383,8 @@ class TaskConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         steps = self.termination.episode_seconds / (self.timestep * self.substeps)
-        for name in ("action_latency", "observation_latency"):
-            longest = getattr(self.randomization, name)[1]
+        for name in ("action_latency", "hand_latency", "observation_latency", "proprio_latency"):
+            longest = (getattr(self.randomization, name) or (0.0, 0.0))[1]
             if longest >= steps:
                 raise ValueError(
                     f"{name} goes up to {longest:g} control steps, expected fewer than the {steps:.0f} of an episode"
@@ -312,8 +398,9 @@ EVALUATION_TIMESTEP = 1.0 / 240.0
 def evaluation_task(task: TaskConfig) -> TaskConfig:
     """Return the task in which a policy is evaluated: from home at full gravity, with nominal physics and no noise.
 
-    Spawns stay perturbed. Physics takes steps of :data:`EVALUATION_TIMESTEP` if a whole number of them makes a control
-    step. Reward terms of the user are left out: no figure rests on them, and their module need not be installed.
+    Spawns stay perturbed by ``spawn_xy`` and ``spawn_yaw``; goals are the demonstrated ones. Physics takes steps of
+    :data:`EVALUATION_TIMESTEP` if a whole number of them makes a control step. Reward terms of the user are left out:
+    no figure rests on them, and their module need not be installed.
     """
     zero = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)
     substeps = round(task.timestep * task.substeps / EVALUATION_TIMESTEP)
@@ -323,6 +410,14 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
         task,
         observation=replace(task.observation, noise=zero),
         reward=replace(task.reward, own={}),
-        reset=replace(task.reset, demo_probability=0.0, home_gravity_std=0.0),
+        reset=replace(
+            task.reset,
+            demo_probability=0.0,
+            home_gravity_std=0.0,
+            training_xy=None,
+            goal_xy=0.0,
+            goal_z=0.0,
+            goal_yaw=0.0,
+        ),
         randomization=replace(task.randomization, enabled=False),
     )

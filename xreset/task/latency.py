@@ -14,27 +14,34 @@ class DelayLine:
     All work is done in fixed buffers, so that it can be captured in a graph.
     """
 
-    def __init__(self, like: Tensor, longest: float) -> None:
+    def __init__(self, like: Tensor, longest: float, *, by_column: bool = False) -> None:
         """Allocate.
 
         Args:
             like: [N, D] the delayed quantity.
             longest: largest delay [steps].
+            by_column: whether each of the D numbers has a delay of its own.
         """
         self.values = torch.zeros(like.shape[0], math.ceil(longest) + 1, like.shape[1], device=like.device)
         """[N, K, D]"""
-        self.delay = torch.zeros(like.shape[0], device=like.device)
-        """[N] steps."""
+        self.delay = torch.zeros(like.shape[0], *([like.shape[1]] if by_column else []), device=like.device)
+        """[N] steps, or [N, D]."""
 
     def fill(self, fresh: Tensor, value: Tensor) -> None:
         """Make a value [N, D] the whole past of the worlds of a mask [N]."""
         self.values.copy_(torch.where(fresh[:, None, None], value[:, None], self.values))
 
-    def push(self, value: Tensor) -> Tensor:
-        """Add the newest value [N, D] and return the delayed one [N, D], interpolated between whole steps."""
+    def push(self, value: Tensor, delay: Tensor | None = None) -> Tensor:
+        """Add the newest value [N, D] and return the delayed one [N, D], interpolated between whole steps.
+
+        Args:
+            delay: [N] delay in this step; None: :attr:`delay`.
+        """
         self.values.copy_(torch.cat((value[:, None], self.values[:, :-1]), dim=1))
-        whole = self.delay.floor()
-        at = whole.long()[:, None, None].expand(-1, 1, value.shape[1])
+        delay = self.delay if delay is None else delay
+        delay = delay.view(len(value), -1)
+        whole = delay.floor()
+        at = whole.long()[:, None].expand(-1, 1, value.shape[1])
         newer = self.values.gather(1, at)[:, 0]
         older = self.values.gather(1, (at + 1).clamp_max(self.values.shape[1] - 1))[:, 0]
-        return newer + (self.delay - whole)[:, None] * (older - newer)
+        return newer + (delay - whole) * (older - newer)

@@ -66,8 +66,10 @@ class Reward:
     """Name -> [N] weighted term, before ``scale``."""
     grasped: Tensor
     """[N] bool: the thumb and at least one other finger press on the object."""
+    gate: Tensor
+    """[N] bool: position, rotation and success are paid."""
     success: Tensor
-    """[N] bool, contact-gated pose success."""
+    """[N] bool, gated pose success."""
 
 
 OwnTerm = Callable[[RewardInput], Tensor]
@@ -156,7 +158,7 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     for name, weight in c.own.items():
         terms[name] = weight * _checked(name, own_term(name)(x), position_error)
     total = c.scale * torch.stack(list(terms.values())).sum(dim=0)
-    return Reward(total=total, terms=terms, grasped=grasped, success=success)
+    return Reward(total=total, terms=terms, grasped=grasped, gate=gate, success=success)
 
 
 def _checked(name: str, value: Tensor, like: Tensor) -> Tensor:

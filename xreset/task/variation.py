@@ -1,4 +1,4 @@
-"""Differences between one world and the next: physical parameters, delays and the gain of observed forces.
+"""Differences between one world and the next: physical parameters, delays, pushes and faults of sensors.
 
 All are drawn again with every episode.
 """
@@ -14,6 +14,7 @@ from xreset.errors import CapabilityError
 from xreset.physics import Backend, State
 from xreset.task.config import RandomizationConfig
 from xreset.task.latency import DelayLine
+from xreset.task.pushes import Pushes
 from xreset.task.randomization import (
     own_friction,
     sample_drives,
@@ -22,6 +23,7 @@ from xreset.task.randomization import (
     sample_offset,
     sample_range,
 )
+from xreset.task.tracker import Tracker
 
 
 class Variation:
@@ -31,13 +33,15 @@ class Variation:
         parameters: physical parameters [N, ...] by name, without the gravity fraction, which belongs to the start of an
             episode.
         force_gain: [N, 1, 1] factor on the observed forces; None: 1.
+        pushes: pushes on object and arm; None: there are none.
     """
 
-    def __init__(self, backend: Backend, config: RandomizationConfig, is_arm: Tensor) -> None:
+    def __init__(self, backend: Backend, config: RandomizationConfig, is_arm: Tensor, proprio_width: int) -> None:
         """Allocate.
 
         Args:
             is_arm: [J] bool.
+            proprio_width: numbers in the observation group ``proprio``.
 
         Raises:
             CapabilityError: the engine cannot set a parameter that is drawn.
@@ -60,27 +64,41 @@ class Variation:
         for name, shape in (("torsional_friction", ()), ("object_inertia", ()), ("object_com", (3,))):
             if config.draws(name):
                 self.parameters[name] = zeros(*shape)
-        missing = [name.replace("_", " ") for name in self.parameters if name not in backend.capabilities]
+        push = config.push
+        pushed = config.draws("push")
+        needed = [*self.parameters, *(["object_wrench"] if pushed and push.moves_object else [])]
+        missing = [name.replace("_", " ") for name in needed if name not in backend.capabilities]
         if missing:
             raise CapabilityError(
                 f"The backend {backend.name!r} cannot set {', '.join(missing)} in each world, which this task draws. "
                 "Leave these ranges of task.randomization at their defaults, or use another backend."
             )
         self.force_gain = zeros(1, 1) + 1 if config.draws("force_gain") else None
-        action_latency = config.action_latency[1] if config.enabled else 0.0
-        observation_latency = config.observation_latency[1] if config.enabled else 0.0
-        self._commands = DelayLine(zeros(joints), action_latency) if action_latency else None
-        self._poses = DelayLine(zeros(7), observation_latency) if observation_latency else None
+        self._commands = None
+        if config.draws("action_latency", "hand_latency"):
+            hand_latency = config.hand_latency or (0.0, 0.0)
+            longest = max(config.action_latency[1], hand_latency[1])
+            self._commands = DelayLine(zeros(joints), longest, by_column=config.hand_latency is not None)
+        self._proprio = (
+            DelayLine(zeros(proprio_width), config.proprio_latency[1]) if config.draws("proprio_latency") else None
+        )
+        self._lost_actions = zeros(1) if config.draws("lost_actions") else None
+        self._tracker = Tracker(backend.num_worlds, config, device)
+        self.pushes = Pushes(backend, push, is_arm) if pushed else None
 
     def lasting(self) -> dict[str, Tensor]:
         """Return all buffers by name, for a snapshot."""
         lasting = {f"_parameters.{name}": value for name, value in self.parameters.items()}
         if self.force_gain is not None:
             lasting["_force_gain"] = self.force_gain
-        for name in ("_commands", "_poses"):
+        for name in ("_commands", "_proprio"):
             if (line := getattr(self, name)) is not None:
                 lasting |= {f"{name}.values": line.values, f"{name}.delay": line.delay}
-        return lasting
+        if self._lost_actions is not None:
+            lasting["_lost_actions"] = self._lost_actions
+        if self.pushes is not None:
+            lasting |= {"_pushes.probability": self.pushes.probability, "_pushes.gate": self.pushes.gate}
+        return lasting | self._tracker.lasting()
 
     def draw(self, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
         """Draw for every world; return pairs of the drawn values [N, ...] and the buffer that they belong to."""
@@ -104,36 +122,61 @@ class Variation:
         drawn = [(samples[name](), kept) for name, kept in self.parameters.items()]
         if self.force_gain is not None:
             drawn.append((sample_range(n, c.force_gain, generator).view(-1, 1, 1), self.force_gain))
-        for line, limits in ((self._commands, c.action_latency), (self._poses, c.observation_latency)):
-            if line is not None:
-                drawn.append((sample_range(n, limits, generator), line.delay))
+        if self._commands is not None:
+            delay = sample_range(n, c.action_latency, generator)
+            if c.hand_latency is not None:
+                hand_delay = sample_range(n, c.hand_latency, generator)
+                delay = torch.where(self._is_arm, delay[:, None], hand_delay[:, None])
+            drawn.append((delay, self._commands.delay))
+        drawn += self._tracker.draw(generator)
+        if self._proprio is not None:
+            drawn.append((sample_range(n, c.proprio_latency, generator).round(), self._proprio.delay))
+        if self._lost_actions is not None:
+            drawn.append((sample_range(n, c.lost_actions, generator)[:, None], self._lost_actions))
+        if self.pushes is not None:
+            drawn.append(self.pushes.draw(generator))
         return drawn
 
     def begin(self, fresh: Tensor, target: Tensor) -> None:
         """Fill the delay line of the worlds of a mask [N] with the start's joint targets [N, J]."""
         if self._commands is not None:
             self._commands.fill(fresh, target)
+        if self.pushes is not None:
+            self.pushes.gate &= ~fresh
 
-    def delayed_targets(self, target: Tensor) -> Tensor:
-        """[N, J] the joint targets that reach the drives in this step."""
-        return target if self._commands is None else self._commands.push(target)
+    def received_targets(self, new: Tensor, old: Tensor, generator: torch.Generator) -> Tensor:
+        """[N, J] the new joint targets, or the old ones in worlds whose action is lost."""
+        if self._lost_actions is None:
+            return new
+        lost = torch.rand(self._lost_actions.shape, generator=generator, device=new.device) < self._lost_actions
+        return torch.where(lost, old, new)
+
+    def sent_targets(self, target: Tensor, state: State, generator: torch.Generator) -> Tensor:
+        """[N, J] the joint targets that reach the drives in this step, moved where the arm is pushed."""
+        if self._commands is not None:
+            target = self._commands.push(target)
+        if self.pushes is None:
+            return target
+        inertia_scale = self.parameters.get("object_inertia", 1.0)
+        return target + self.pushes.act(state, self.parameters["object_mass"], inertia_scale, generator)
+
+    def observed_proprio(self, proprio: Tensor, fresh: Tensor) -> Tensor:
+        """[N, D] joints, links and forces as they are observed, possibly delayed.
+
+        In the ``fresh`` worlds [N] the present values become the whole past.
+        """
+        if self._proprio is None:
+            return proprio
+        self._proprio.fill(fresh, proprio)
+        return self._proprio.push(proprio)
 
     def scaled_forces(self, force: Tensor) -> Tensor:
         """[N, E, 3] forces as they are observed."""
         return force * (1.0 if self.force_gain is None else self.force_gain)
 
-    def observed_pose(self, state: State, fresh: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the object's position [N, 3] and orientation [N, 4] as they are observed, possibly delayed.
+    def observed_pose(self, state: State, fresh: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return the object's position [N, 3] and orientation [N, 4] as its tracker reports them.
 
         In the ``fresh`` worlds [N] the present pose becomes the whole past.
         """
-        if self._poses is None:
-            return state.object_pos, state.object_quat
-        last = self._poses.values[:, 0, 3:]
-        opposite = (state.object_quat * last).sum(dim=-1, keepdim=True) < 0
-        # Of a rotation's two quaternions the one near the last is kept, so that interpolation takes the short way.
-        quat = torch.where(opposite, -state.object_quat, state.object_quat)
-        pose = torch.cat((state.object_pos, quat), dim=-1)
-        self._poses.fill(fresh, pose)
-        pos, quat = self._poses.push(pose).split((3, 4), dim=-1)
-        return pos, torch.nn.functional.normalize(quat, dim=-1)
+        return self._tracker.observe(state.object_pos, state.object_quat, fresh, generator)

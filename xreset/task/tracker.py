@@ -1,0 +1,101 @@
+"""What a pose tracker reports of the object: poses that are late, wrong, or missing."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply
+from xreset.task.config import RandomizationConfig
+from xreset.task.latency import DelayLine
+from xreset.task.randomization import sample_range
+
+
+class Tracker:
+    """Fixed buffers of N worlds. What is off costs nothing and draws no random number."""
+
+    def __init__(self, num_worlds: int, config: RandomizationConfig, device: torch.device) -> None:
+        """Allocate."""
+        self._config = config
+        c = config.tracker if config.enabled else type(config.tracker)()
+
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(num_worlds, *shape, device=device)
+
+        self._delays = (
+            DelayLine(zeros(7), config.observation_latency[1]) if config.draws("observation_latency") else None
+        )
+        self._bias = zeros(6) if c.has_errors else None
+        self._limits = torch.tensor(
+            [[c.position_bias] * 3 + [c.rotation_bias] * 3, [c.position_noise] * 3 + [c.rotation_noise] * 3],
+            device=device,
+        )
+        self._wait = zeros() if c.skips_steps else None
+        self._last = zeros(7) if c.skips_steps else None
+        self._tracker = c
+
+    def lasting(self) -> dict[str, Tensor]:
+        """Return all buffers by name, for a snapshot."""
+        lasting = {}
+        if self._delays is not None:
+            lasting |= {"_poses.values": self._delays.values, "_poses.delay": self._delays.delay}
+        for name in ("_bias", "_wait", "_last"):
+            if (value := getattr(self, name)) is not None:
+                lasting[f"_tracker.{name}"] = value
+        return lasting
+
+    def draw(self, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
+        """Draw for every world; return pairs of the drawn values [N, ...] and the buffer that they belong to."""
+        drawn = []
+        if self._delays is not None:
+            count = len(self._delays.delay)
+            drawn.append((sample_range(count, self._config.observation_latency, generator), self._delays.delay))
+        if self._bias is not None:
+            drawn.append((self._limits[0] * _symmetric(self._bias, generator), self._bias))
+        return drawn
+
+    def observe(self, pos: Tensor, quat: Tensor, fresh: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return position [N, 3] and orientation [N, 4] as they are observed.
+
+        Args:
+            pos: [N, 3] true position.
+            quat: [N, 4] true orientation.
+            fresh: [N] bool, worlds that have just begun: their present pose is their whole past.
+            generator: random numbers.
+        """
+        if self._bias is not None:
+            error = self._bias + self._limits[1] * _symmetric(self._bias, generator)
+            pos = pos + error[:, :3]
+            quat = quat_multiply(quat_from_axis_angle(error[:, 3:]), quat)
+        if self._wait is not None and self._last is not None:
+            arrives = fresh | (self._wait <= 0)
+            pose = torch.where(arrives[:, None], torch.cat((pos, quat), dim=-1), self._last)
+            self._last.copy_(pose)
+            c = self._tracker
+            lost = torch.rand(self._wait.shape, generator=generator, device=generator.device) < c.loss
+            pause = sample_range(len(pos), c.loss_steps, generator).round()
+            until_next = sample_range(len(pos), c.interval, generator).round() + torch.where(lost, pause, 0.0)
+            self._wait.copy_(torch.where(arrives, until_next, self._wait) - 1.0)
+            pos, quat = pose.split((3, 4), dim=-1)
+        if self._delays is None:
+            return pos, quat
+        last = self._delays.values[:, 0, 3:]
+        opposite = (quat * last).sum(dim=-1, keepdim=True) < 0
+        # Of a rotation's two quaternions the one near the last is kept, so that interpolation takes the short way.
+        pose = torch.cat((pos, torch.where(opposite, -quat, quat)), dim=-1)
+        self._delays.fill(fresh, pose)
+        pos, quat = self._delays.push(pose, self._jittered_delay(generator)).split((3, 4), dim=-1)
+        return pos, torch.nn.functional.normalize(quat, dim=-1)
+
+    def _jittered_delay(self, generator: torch.Generator) -> Tensor | None:
+        """Return the delay of this step's pose [N]; None: as drawn for the episode."""
+        jitter = self._tracker.jitter
+        if self._delays is None or not jitter:
+            return None
+        delay = self._delays.delay + jitter * _symmetric(self._delays.delay, generator)
+        return delay.clamp(0.0, self._config.observation_latency[1])
+
+
+def _symmetric(like: Tensor, generator: torch.Generator) -> Tensor:
+    """Uniform numbers in [-1, 1) of the shape of a tensor."""
+    return 2.0 * torch.rand(like.shape, generator=generator, device=like.device) - 1.0

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tests.data import InFolder, data_dir, run
 from xreset.demos import hand
 from xreset.demos.align import grounded, levelled, on_something
-from xreset.demos.archive import concatenate, demo_objects, read_demos, write_demos
+from xreset.demos.archive import demo_objects, merge_demos, read_demos, write_demos
 from xreset.demos.dexycb import read_dexycb
 from xreset.demos.grasp import TIPS, Solid
 from xreset.demos.info import summarize
@@ -149,25 +149,62 @@ class Archive(InFolder):
             ({"names": ["x"]}, "no sequence_name x"),
             ({"indices": [4]}, "there are 4 sequences"),
             ({"indices": [0], "objects": ["banana"]}, "No sequence meets"),
+            ({"objects": ["soup", "cup", "tuna", "mug"]}, "Unknown objects 'cup', 'tuna', 'mug'"),
+            ({"subjects": ["anna"]}, "no subject anna"),
+            ({"share": 0.0}, "share is 0, expected"),
         ):
             with self.assertRaisesRegex(DemoError, message):
                 self.demos.select(**options)
 
-    def test_concatenate(self):
+    def test_split(self):
+        for options, names in (
+            ({"share": 0.5}, [0, 2]),
+            ({"max_per_object": 1, "seed": 0}, None),
+            ({"objects": ["soup"]}, [0, 1]),
+        ):
+            with self.subTest(**options):
+                kept, rest = self.demos.split(**options)
+                if names is not None:
+                    self.assertEqual(kept.sequence_name.tolist(), self.demos.sequence_name[names].tolist())
+                self.assertEqual((len(kept), len(rest)), (2, 2))
+                self.assertFalse(set(kept.sequence_name) & set(rest.sequence_name))
+        with self.assertRaisesRegex(DemoError, "none is left"):
+            self.demos.split(share=1.0)
+
+    def test_a_random_choice_for_an_object_depends_on_the_seed_alone(self):
+        demos = synthesize(["soup", "banana"], per_object=12, fps=5)
+        few = demos.select(objects=["soup"]).select(max_per_object=3, seed=1)
+        both = demos.select(max_per_object=3, seed=1)
+        self.assertEqual(both.select(objects=["soup"]).sequence_name.tolist(), few.sequence_name.tolist())
+        other = demos.select(objects=["soup"], max_per_object=3, seed=2)
+        self.assertNotEqual(other.sequence_name.tolist(), few.sequence_name.tolist())
+
+    def test_merge_demos(self):
         parts = [self.demos.select(indices=[i]) for i in range(4)]
-        self.assert_same(concatenate(parts), self.demos)
+        self.assert_same(merge_demos(parts), self.demos)
+        self.assert_same(merge_demos([self.demos, parts[2], self.demos]), self.demos)
+        T = np.tile(np.eye(4), (1, 1, 1))
+        T[0, 2, 3] = 0.01
+        level = {"subjects": np.array(["anna"]), "T_level_from_table": T}
+        anna = replace(parts[0], subject=np.array(["anna"]), **level)
+        both = merge_demos([anna, parts[1]])  # without a transform poses stay as they are
+        self.assertEqual(both.subjects.tolist(), ["anna", "synthetic"])
+        np.testing.assert_array_equal(both.T_level_from_table, [T[0], np.eye(4)])
         for wrong, message in (
-            ([self.demos, self.demos], "unique"),
+            ([self.demos, replace(self.demos, object_pos=self.demos.object_pos + 0.01)], "two different sequences"),
             ([parts[0], replace(parts[1], fps=25.0)], "rates"),
+            ([anna, replace(parts[1], subject=np.array(["anna"]))], "anna has two different transforms"),
         ):
             with self.assertRaisesRegex(DemoError, message):
-                concatenate(wrong)
+                merge_demos(wrong)
 
     def test_unknown_object(self):
         demos = self.changed("object_name", 3, "055_baseball")
         write_demos(self.folder / "a.npz", demos)  # the archive may hold any object
-        with self.assertRaisesRegex(DemoError, r"_001' needs the object '055_baseball'.*Choose from: 003_cracker_box"):
+        with self.assertRaisesRegex(DemoError, r"Unknown object '055_baseball'. Choose from: 003_cracker_box"):
             demo_objects(read_demos(self.folder / "a.npz"))
+        write_demos(self.folder / "b.npz", self.changed("object_name", 3, "banana"))  # the paper's name
+        self.assertEqual(read_demos(self.folder / "b.npz").object_name.tolist(), self.demos.object_name.tolist())
         self.assertEqual(list(demo_objects(self.demos)), ["005_tomato_soup_can", "011_banana"])
 
     def test_levelled_applies_the_subjects_transform_once(self):
@@ -421,7 +458,7 @@ class Synthetic(InFolder):
     def setUpClass(cls):
         right = synthesize(None, per_object=1, seed=0)
         left = synthesize(["soup", "banana"], per_object=1, seed=0, side="left")
-        cls.demos = concatenate([right, left])
+        cls.demos = merge_demos([right, left])
         cls.objects = demo_objects(cls.demos)
 
     def sequences(self):

@@ -15,7 +15,7 @@ from xreset.demos.archive import Demos, demo_objects, read_demos
 from xreset.description import load_robot
 from xreset.errors import DemoError, FileFormatError
 from xreset.files import file_hash
-from xreset.objects.catalogue import canonical_name, load_objects
+from xreset.objects.catalogue import canonical_names, load_objects
 from xreset.records import npz_schema
 from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import ResetBank, check_objects, check_retargeted, check_robot, read_bank, starts_and_goals
@@ -120,7 +120,7 @@ def load_inputs(
     folder = Path(objects) if objects else None
     names = _object_names(data)
     if only:
-        names = tuple(dict.fromkeys(canonical_name(name, names) for name in only))
+        names = tuple(dict.fromkeys(canonical_names(only, names)))
     if only and isinstance(data, Demos):
         data = data.select(objects=names)
     if isinstance(data, Demos):

@@ -98,7 +98,7 @@ def read_npz(
 
     Args:
         schema_name: schema that the file must state; None: a file that others made, which states none.
-        schema: fields that it must have. Others are ignored, with a warning.
+        schema: fields that it must have. Others are ignored.
         what: what the file is, for messages ("a reset bank").
         check: further check; returns a message if something is wrong.
 
@@ -130,7 +130,7 @@ def read_npz(
     if problem is not None:
         raise FileFormatError(f"{path} is not valid as {what}: {problem}")
     if unknown := sorted(set(members) - set(own)):
-        logging.getLogger(__name__).warning(
+        logging.getLogger(__name__).info(
             "%s also holds %s, which this xreset (%s) ignores.", path, shown(unknown), __version__
         )
     return arrays

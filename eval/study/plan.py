@@ -28,7 +28,7 @@ from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import starting_config
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
-from xreset.objects.catalogue import canonical_name, object_names
+from xreset.objects.catalogue import canonical_names, object_names
 from xreset.plugins import backend_status
 from xreset.text import short_name, shown
 
@@ -477,7 +477,7 @@ def _objects_of(name: str, data: Data, given: Path) -> tuple[str, ...]:
 def _official_names(where: str, objects: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
     """Return the official names of objects; all known ones if none is given."""
     try:
-        return tuple(canonical_name(name, known) for name in objects) or known
+        return canonical_names(objects, known) or known
     except XResetError as error:
         raise DemoError(f"{where}.objects: {error}") from None
 

@@ -20,7 +20,7 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 COMMANDS: dict[str, str] = {
-    "demos": "Import, synthesize and describe human demonstrations.",
+    "demos": "Import, synthesize, select, merge and describe human demonstrations.",
     "objects": "List objects and import meshes.",
     "robots": "List, check, import and place robots.",
     "engines": "List, check and compare physics engines, and trace where they diverge.",

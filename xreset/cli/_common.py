@@ -19,6 +19,8 @@ from xreset.plugins import backend_names, backend_status
 _T = TypeVar("_T")
 Source = Annotated[Path, tyro.conf.Positional]
 """A file or folder, given without a flag."""
+Sources = Annotated[tuple[Path, ...], tyro.conf.Positional]
+"""Files or folders, given without a flag."""
 Name = Annotated[str, tyro.conf.Positional]
 """A text, given without a flag."""
 Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]

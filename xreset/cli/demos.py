@@ -1,16 +1,18 @@
-"""``xreset demos``: import, synth, mirror, info."""
+"""``xreset demos``: import, synth, select, split, merge, mirror, info."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from math import degrees
 from pathlib import Path
 from typing import Any, Literal
 
 from rich.table import Table
 
-from xreset.cli._common import Source
+from xreset.checks import Options
+from xreset.cli._common import Flat, Source, Sources
 from xreset.cli._terminal import Console, Progress
 from xreset.demos import archive, dexycb, ho3d, info, keypoints, mirror, plausible, synth
 from xreset.errors import DemoError
@@ -128,7 +130,7 @@ def synthesize(
         meshes: Folder of real meshes, with z up; default: the built-in stand-ins.
     """
     with _progress("making demonstrations") as progress:
-        demos = archive.concatenate(
+        demos = archive.merge_demos(
             [
                 synth.synthesize(objects or None, per_object, seed, fps=fps, side=s, meshes=meshes, progress=progress)
                 for s in _sides(side)
@@ -136,6 +138,84 @@ def synthesize(
         )
     config = {"objects": list(objects), "per_object": per_object, "seed": seed, "fps": fps, "side": side}
     _save(demos, out, config)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection(Options):
+    """Conditions that a sequence must meet, all of them, and how many sequences of each object are kept."""
+
+    objects: tuple[str, ...] = ()
+    """Only sequences that grasp one of these objects."""
+    sequences: tuple[str, ...] = ()
+    """Only the sequences of these names."""
+    subjects: tuple[str, ...] = ()
+    """Only sequences of these persons."""
+    side: Side = "both"
+    """Only sequences of this hand."""
+    per_object: int | None = None
+    """Keep at most this many sequences of each object."""
+    share: float | None = None
+    """Keep this share of each object's sequences, at least one: a number from 0 to 1."""
+    pick: Literal["first", "spread", "random"] = "first"
+    """Which sequences --per-object and --share keep: the first, or some from all over the archive."""
+    seed: int = 0
+    """Seed of --pick random."""
+
+    def conditions(self) -> dict[str, Any]:
+        """Return the arguments of ``Demos.select``."""
+        if self.pick != "first" and self.per_object is None and self.share is None:
+            raise DemoError(f"--pick {self.pick} needs a number of sequences. Add --per-object or --share.")
+        return {
+            "objects": self.objects or None,
+            "names": self.sequences or None,
+            "subjects": self.subjects or None,
+            "sides": None if self.side == "both" else [self.side],
+            "max_per_object": self.per_object,
+            "share": self.share,
+            "spread": self.pick == "spread",
+            "seed": self.seed if self.pick == "random" else None,
+        }
+
+
+def select(file: Source, *, out: Path, selection: Flat[Selection] = Selection()) -> None:
+    """Take some sequences out of an archive.
+
+    Args:
+        file: Archive of demonstrations.
+        out: Archive to write.
+        selection: Conditions.
+    """
+    chosen = archive.read_demos(file).select(**selection.conditions())
+    _save(chosen, out, {"select": asdict(selection)}, {"demos": file_hash(file)})
+
+
+def split(file: Source, *, out: Path, rest: Path, selection: Flat[Selection] = Selection()) -> None:
+    """Split an archive into two, for training and test: what the options select, and the rest.
+
+    Args:
+        file: Archive of demonstrations.
+        out: Archive to write: the sequences that meet the conditions.
+        rest: Archive to write: all other sequences.
+        selection: Conditions.
+    """
+    if out.resolve() == rest.resolve():
+        raise DemoError(f"--out and --rest are both {out}. Choose two files.")
+    kept, others = archive.read_demos(file).split(**selection.conditions())
+    inputs = {"demos": file_hash(file)}
+    _save(kept, out, {"select": asdict(selection)}, inputs)
+    _save(others, rest, {"select_others": asdict(selection)}, inputs)
+
+
+def merge(files: Sources, *, out: Path) -> None:
+    """Merge archives. A sequence that several archives hold is kept once; archives that contradict each other are
+    refused.
+
+    Args:
+        files: Archives of demonstrations.
+        out: Archive to write.
+    """
+    demos = archive.merge_demos([archive.read_demos(file) for file in files])
+    _save(demos, out, {"merge": len(files)}, {f"demos {i}": file_hash(file) for i, file in enumerate(files)})
 
 
 def reflect(
@@ -230,6 +310,9 @@ COMMAND = {
     "import ho3d": import_ho3d,
     "import keypoints": import_keypoints,
     "synth": synthesize,
+    "select": select,
+    "split": split,
+    "merge": merge,
     "mirror": reflect,
     "info": describe,
 }

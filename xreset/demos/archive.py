@@ -6,6 +6,7 @@ x, y, z). Poses are in the table frame: z up, table top at z = 0, the person at 
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from xreset.checks import is_rigid
 from xreset.errors import DemoError, ObjectError
-from xreset.objects.catalogue import canonical_name, load_object, object_names
+from xreset.objects.catalogue import canonical_names, load_object, object_names, official_name
 from xreset.records import POSITION, RATE, UNIT_TOLERANCE, Field, arrays_of, offsets_problem, read_record, write_record
 from xreset.spec import ObjectSpec
 from xreset.text import shown
@@ -118,20 +119,29 @@ class Demos(ObjectMotions):
         names: Iterable[str] | None = None,
         objects: Iterable[str] | None = None,
         sides: Iterable[str] | None = None,
+        subjects: Iterable[str] | None = None,
         max_per_object: int | None = None,
+        share: float | None = None,
         spread: bool = False,
+        seed: int | None = None,
     ) -> Demos:
         """Return the sequences that meet every given condition.
 
         Args:
             indices: sequence indices; the result has their order.
+            names: names of sequences.
             objects: object names, official or the paper's.
+            sides: ``right``, ``left``.
+            subjects: names of the demonstrating persons.
             max_per_object: keep the first n sequences of each object.
-            spread: keep n of each object from all over the archive instead of the first, which in most archives are one
-                person's.
+            share: keep this share of each object's sequences, at least one.
+            spread: keep sequences of each object from all over the archive instead of the first, which in most archives
+                are one person's.
+            seed: keep sequences of each object at random. The choice for an object does not depend on other objects.
 
         Raises:
-            DemoError: unknown index, name, object or side, or nothing is left.
+            DemoError: unknown index, name, object, side or subject (the message names all of them), a share that is
+                none, or nothing is left.
         """
         chosen = np.arange(self.num_sequences)
         if indices is not None:
@@ -146,14 +156,19 @@ class Demos(ObjectMotions):
         if objects is not None:
             known = sorted(set(self.object_name.tolist()))
             try:
-                objects = [canonical_name(name, known) for name in objects]
+                objects = canonical_names(objects, known)
             except ObjectError as error:
                 raise DemoError(f"The demonstrations lack an object: {error}") from None
             chosen = self._having("object_name", objects, chosen)
         if sides is not None:
             chosen = self._having("hand_side", sides, chosen)
-        if max_per_object is not None:
-            chosen = self._few_per_object(chosen, max_per_object, spread)
+        if subjects is not None:
+            chosen = self._having("subject", subjects, chosen)
+        if share is not None and not 0 < share <= 1:
+            raise DemoError(f"The share is {share:g}, expected a number above 0 and at most 1.")
+        if max_per_object is not None or share is not None:
+            most = len(self) if max_per_object is None else max_per_object
+            chosen = self._few_per_object(chosen, most, 1.0 if share is None else share, spread, seed)
         if not len(chosen):
             raise DemoError("No sequence meets all conditions of the selection. Relax one of them.")
         frames = [np.arange(self.frame_offsets[i], self.frame_offsets[i + 1]) for i in chosen]
@@ -161,6 +176,18 @@ class Demos(ObjectMotions):
         changes = {name: getattr(self, name)[chosen] for name in _PER_SEQUENCE}
         changes |= {name: getattr(self, name)[rows] for name in _PER_FRAME}
         return replace(self, frame_offsets=_offsets([len(part) for part in frames]), **changes)
+
+    def split(self, **conditions: Any) -> tuple[Demos, Demos]:
+        """Return the sequences that :meth:`select` keeps, and the others, in the archive's order.
+
+        Raises:
+            DemoError: one of the two would be empty, or a condition is wrong.
+        """
+        kept = self.select(**conditions)
+        others = np.flatnonzero(~np.isin(self.sequence_name, kept.sequence_name))
+        if not len(others):
+            raise DemoError("Every sequence meets the conditions, so that none is left for the other part. Add one.")
+        return kept, self.select(indices=others)
 
     def _having(self, field: str, wanted: Iterable[str], chosen: np.ndarray) -> np.ndarray:
         """Return those of the chosen sequences whose field has one of the wanted values."""
@@ -172,14 +199,19 @@ class Demos(ObjectMotions):
             raise DemoError(f"The demonstrations have no {field} {', '.join(missing)}. Choose from: {shown(known)}.")
         return chosen[np.isin(values[chosen], wanted)]
 
-    def _few_per_object(self, chosen: np.ndarray, count: int, spread: bool) -> np.ndarray:
+    def _few_per_object(
+        self, chosen: np.ndarray, most: int, share: float, spread: bool, seed: int | None
+    ) -> np.ndarray:
         names = self.object_name[chosen]
         objects = np.unique(names)
         kept = []
         for number, name in enumerate(objects):
             rows = np.flatnonzero(names == name)
-            picks = np.arange(min(count, len(rows)))
-            if spread:  # one from each of n even parts, at another place in the parts for every object
+            count = min(most, max(1, round(share * len(rows))))
+            picks = np.arange(count)
+            if seed is not None:
+                picks = np.random.default_rng([seed, zlib.crc32(name.encode())]).permutation(len(rows))[:count]
+            elif spread:  # one from each of n even parts, at another place in the parts for every object
                 place = (number + 0.5) / len(objects)
                 picks = ((picks + place) * len(rows) / max(len(picks), 1)).astype(int)
             kept.extend(rows[picks])
@@ -229,24 +261,23 @@ def one_sequence(
     )
 
 
-def concatenate(parts: Sequence[Demos]) -> Demos:
-    """Join several sets of demonstrations.
+def merge_demos(parts: Sequence[Demos]) -> Demos:
+    """Join several sets of demonstrations, one after another. A sequence that is in several of them is kept once.
 
     Raises:
-        DemoError: nothing to join, different frame rates, or a sequence name occurs twice.
+        DemoError: there is nothing to join, or the parts contradict each other: in their frame rates, in a sequence of
+            the same name, or in the table of a subject.
     """
     if not parts:
         raise DemoError("There are no demonstrations to join.")
     rates = sorted({round(float(part.fps), 3) for part in parts})
     if len(rates) > 1:
         raise DemoError(f"Demonstrations in one file must have one frame rate, but these have the frame rates {rates}.")
+    levels = _levels(parts)
+    parts = _without_repeats(parts)
     joined = {}
     for name in _PER_SEQUENCE + _PER_FRAME:
         joined[name] = np.concatenate([getattr(part, name) for part in parts])
-    levels: dict[str, np.ndarray] = {}
-    for part in parts:
-        if part.subjects is not None and part.T_level_from_table is not None:
-            levels |= dict(zip(part.subjects.tolist(), part.T_level_from_table, strict=True))
     demos = Demos(
         frame_offsets=_offsets(np.concatenate([np.diff(part.frame_offsets) for part in parts])),
         fps=parts[0].fps,
@@ -258,14 +289,59 @@ def concatenate(parts: Sequence[Demos]) -> Demos:
     return demos
 
 
+def _levels(parts: Sequence[Demos]) -> dict[str, np.ndarray]:
+    """Return the transforms of all subjects; the identity for subjects of parts without transforms."""
+    levels: dict[str, np.ndarray] = {}
+    if all(part.subjects is None for part in parts):
+        return levels
+    for part in parts:
+        subjects = np.unique(part.subject) if part.subjects is None else part.subjects
+        tables = part.T_level_from_table
+        if tables is None:
+            tables = np.tile(np.eye(4), (len(subjects), 1, 1))
+        for subject, T in zip(subjects.tolist(), tables, strict=True):
+            if not np.array_equal(levels.setdefault(subject, T), T):
+                raise DemoError(f"The subject {subject} has two different transforms in T_level_from_table.")
+    return levels
+
+
+def _without_repeats(parts: Sequence[Demos]) -> list[Demos]:
+    """Return the parts without the sequences that an earlier part holds."""
+    kept: list[Demos] = []
+    owners: dict[str, int] = {}
+    for number, part in enumerate(parts):
+        new = []
+        for i, name in enumerate(part.sequence_name.tolist()):
+            first = owners.setdefault(name, number)
+            if first == number:
+                new.append(i)
+            elif not _is_same(parts[first].select(names=[name]), part.select(indices=[i])):
+                raise DemoError(f"There are two different sequences of the name {name!r}. Rename one.")
+        if new:
+            kept.append(part if len(new) == len(part) else part.select(indices=new))
+    return kept
+
+
+def _is_same(a: Demos, b: Demos) -> bool:
+    same = [np.array_equal(getattr(a, name), getattr(b, name)) for name in _PER_SEQUENCE]
+    for name in _PER_FRAME:
+        is_float = getattr(a, name).dtype.kind == "f"
+        same.append(np.array_equal(getattr(a, name), getattr(b, name), equal_nan=is_float))
+    return all(same)
+
+
 def read_demos(path: str | Path) -> Demos:
-    """Read an archive; all of it is checked before any of it is used.
+    """Read an archive; all of it is checked before any of it is used. Objects get their official names.
 
     Raises:
         FileFormatError: the file is missing, damaged or not an archive, or a value in it is wrong: the message names
             sequence and frame.
     """
-    return read_record(Demos, path, SCHEMA_NAME, what="an archive of demonstrations", check=_problem)
+    demos = read_record(Demos, path, SCHEMA_NAME, what="an archive of demonstrations", check=_problem)
+    names = [official_name(name) for name in demos.object_name.tolist()]
+    if names != demos.object_name.tolist():
+        demos = replace(demos, object_name=np.array(names))
+    return demos
 
 
 def write_demos(
@@ -284,21 +360,16 @@ def demo_objects(demos: Demos, folder: Path | None = None) -> dict[str, ObjectSp
     """Return the objects of the demonstrations by name: stand-ins, or the meshes of a folder.
 
     Raises:
-        DemoError: an object is unknown; the message names a sequence that needs it, and the known objects.
+        DemoError: objects are unknown; the message names all of them, and the known objects.
         ObjectError: a mesh cannot be used.
     """
-    known = object_names(folder)
-    objects: dict[str, ObjectSpec] = {}
-    for name, sequence in zip(demos.object_name.tolist(), demos.sequence_name.tolist(), strict=True):
-        if name in objects:
-            continue
-        try:
-            canonical_name(name, known)
-        except ObjectError as error:
-            hint = "" if folder else " Or give a folder of meshes with --objects."
-            raise DemoError(f"The sequence {sequence!r} needs the object {name!r}. {error}{hint}") from None
-        objects[name] = load_object(name, folder)
-    return objects
+    names = list(dict.fromkeys(demos.object_name.tolist()))
+    try:
+        canonical_names(names, object_names(folder))
+    except ObjectError as error:
+        hint = "" if folder else " Or give a folder of meshes with --objects."
+        raise DemoError(f"The demonstrations need objects that are not there. {error}{hint}") from None
+    return {name: load_object(name, folder) for name in names}
 
 
 def _offsets(lengths: Sequence[int] | np.ndarray) -> np.ndarray:

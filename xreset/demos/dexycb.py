@@ -23,9 +23,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from xreset.checks import is_rigid
-from xreset.demos.archive import SIDES, Demos, Progress, concatenate, no_progress, one_sequence
+from xreset.demos.archive import SIDES, Demos, Progress, merge_demos, no_progress, one_sequence
 from xreset.errors import DemoError, FileFormatError
-from xreset.objects.catalogue import canonical_name
+from xreset.objects.catalogue import canonical_names
 from xreset.objects.ycb import NAME_OF_ID
 from xreset.records import read_arrays
 from xreset.text import is_plain, shown
@@ -77,7 +77,7 @@ def read_dexycb(
     """
     root = Path(root)
     names = NAME_OF_ID.values()
-    wanted = set(names) if objects is None else {canonical_name(name, names) for name in objects}
+    wanted = set(names) if objects is None else set(canonical_names(objects, names))
     found = [_read_meta(path) for path in sorted(root.glob("*/*/meta.yml"))]
     if not found:
         raise DemoError(
@@ -98,7 +98,7 @@ def read_dexycb(
         if sequence.extrinsics not in calibrations:
             calibrations[sequence.extrinsics] = _read_extrinsics(root, sequence.extrinsics)
         parts.append(_read(sequence, calibrations[sequence.extrinsics]))
-    return concatenate(parts)
+    return merge_demos(parts)
 
 
 def _read(sequence: _Sequence, extrinsics: _Poses) -> Demos:

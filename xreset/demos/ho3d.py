@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.demos.archive import Demos, Progress, concatenate, no_progress
+from xreset.demos.archive import Demos, Progress, merge_demos, no_progress
 from xreset.demos.keypoints import Convention, read_transform, sequence_of
 from xreset.demos.pickles import read_pickle
 from xreset.errors import DemoError
@@ -79,7 +79,7 @@ def read_ho3d(
         )
         arrays = {"sequence": np.array(name), **_read_sequence(folder, fps)}
         parts.append(sequence_of(arrays, str(folder), convention))
-    return concatenate(parts)
+    return merge_demos(parts)
 
 
 def _read_sequence(folder: Path, fps: float) -> dict[str, np.ndarray]:

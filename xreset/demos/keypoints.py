@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from xreset.checks import is_rigid
 from xreset.demos import hand
-from xreset.demos.archive import SIDES, Demos, Progress, concatenate, no_progress, one_sequence
+from xreset.demos.archive import SIDES, Demos, Progress, merge_demos, no_progress, one_sequence
 from xreset.errors import DemoError
 from xreset.files import max_bytes
 from xreset.objects.catalogue import official_name
@@ -157,7 +157,7 @@ def read_keypoints(
         sequences = _read_csv(file, name) if file.suffix == ".csv" else [_read_npz(file, name)]
         for arrays in sequences:
             parts.append(sequence_of(arrays, f"{file}, sequence {arrays['sequence']}", convention))
-    return concatenate(parts)
+    return merge_demos(parts)
 
 
 def read_transform(path: str | Path) -> np.ndarray:

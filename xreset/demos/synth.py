@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.demos.archive import Demos, concatenate, no_progress, one_sequence
+from xreset.demos.archive import Demos, merge_demos, no_progress, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, plan_contacts
 from xreset.demos.motion import clear_approach, object_path, place_hand, random_timing
 from xreset.errors import DemoError
@@ -99,7 +99,7 @@ def synthesize(
             progress(len(parts), len(specs) * per_object, name)
             rng = np.random.default_rng([seed, index, zlib.crc32(spec.name.encode()), side == "left"])
             parts.append(_sequence(spec, starts, name, side, fps, rng))
-    return concatenate(parts)
+    return merge_demos(parts)
 
 
 def _sequence(

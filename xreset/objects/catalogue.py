@@ -39,15 +39,31 @@ def canonical_name(name: str, known: Iterable[str] = STAND_INS) -> str:
     Raises:
         ObjectError: no known object has this name.
     """
+    return canonical_names([name], known)[0]
+
+
+def canonical_names(names: Iterable[str], known: Iterable[str] = STAND_INS) -> tuple[str, ...]:
+    """Return the names of known objects; see :func:`canonical_name`.
+
+    Raises:
+        ObjectError: names every unknown object.
+    """
     known = tuple(known)
-    if name in known:
-        return name
-    key = _key(name)
-    matches = [other for other in known if key in (_key(other), _key(other).partition("_")[2])]
-    if len(matches) == 1:
-        return matches[0]
-    listing = [f"{other} ({_ALIAS_OF[other]})" if other in _ALIAS_OF else other for other in known]
-    raise ObjectError(f"Unknown object {name!r}. Choose from: {', '.join(listing) or 'none'}.")
+    found = []
+    unknown = []
+    for name in names:
+        key = _key(name)
+        matches = [name] if name in known else []
+        matches = matches or [other for other in known if key in (_key(other), _key(other).partition("_")[2])]
+        if len(matches) == 1:
+            found.append(matches[0])
+        else:
+            unknown.append(repr(name))
+    if unknown:
+        listing = [f"{other} ({_ALIAS_OF[other]})" if other in _ALIAS_OF else other for other in known]
+        what = f"Unknown object{'s' * (len(unknown) > 1)} {', '.join(dict.fromkeys(unknown))}"
+        raise ObjectError(f"{what}. Choose from: {', '.join(listing) or 'none'}.")
+    return tuple(found)
 
 
 def official_name(name: str) -> str:
@@ -69,7 +85,7 @@ def load_object(name: str, folder: Path | None = None) -> ObjectSpec:
     Args:
         name: official name, name without number, or the paper's name.
         folder: folder of real meshes (``NAME.obj``, ``NAME/textured_simple.obj`` or ``NAME/textured.obj``); None for
-            the stand-in.
+            the stand-in. An object that is asked for by its official name has it, whatever its mesh is called.
 
     Raises:
         ObjectError: unknown object, or no usable mesh of it in the folder.
@@ -83,7 +99,7 @@ def load_object(name: str, folder: Path | None = None) -> ObjectSpec:
         raise ObjectError(
             f"{error} These are the meshes in {folder}; omit the folder for the built-in objects."
         ) from None
-    return import_mesh(files[full], full)
+    return import_mesh(files[full], name if name in STAND_INS else full)
 
 
 def load_objects(names: Iterable[str], folder: Path | None = None) -> tuple[ObjectSpec, ...]:

@@ -1,0 +1,164 @@
+"""Write a policy with its contract and the runtime, for computers without xreset."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from xreset import __version__, runtime
+from xreset.errors import PolicyError
+from xreset.files import atomic_folder, file_hash, write_json
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.urdf import robot_tree
+from xreset.objects.sampling import surface_points
+from xreset.policy import policy_contract
+from xreset.spec import ObjectSpec, RobotSpec
+from xreset.task.actions import ActionSpace
+from xreset.task.config import TaskConfig
+
+FRAMES = {
+    "world": "z up; the top of the table is at z = 0; the root link of the robot is at kinematics.base",
+    "object": "the frame of its mesh; its points are in this frame",
+    "quaternion": "w, x, y, z",
+    "tip_force": "force of a fingertip on the object, along the axes of the world",
+}
+UNITS = {
+    "position": "m",
+    "revolute joint": "rad",
+    "prismatic joint": "m",
+    "time": "s",
+    "force": "N",
+    "angular velocity": "rad/s",
+}
+
+
+def deploy_contract(
+    robot: RobotSpec, task: TaskConfig, objects: Sequence[ObjectSpec], policy: Path | None = None
+) -> dict[str, Any]:
+    """Return all that :mod:`xreset.runtime` needs to know of a policy, as JSON.
+
+    Args:
+        robot: robot of the policy.
+        task: task of the policy's training.
+        objects: objects whose points the contract lists.
+        policy: exported policy, of which the contract states the hash; None: the contract stays in this process.
+    """
+    trained = policy_contract(robot, task, tuple(o.name for o in objects))
+    listed = {}
+    for each in objects:
+        points = surface_points(each, task.observation.cloud_points).astype(np.float32)
+        listed[each.name] = {"source": each.source, "points": points.tolist()}
+    observation = asdict(task.observation)
+    observation.pop("noise")
+    contract = {
+        "schema": runtime.SCHEMA,
+        "xreset": __version__,
+        "policy_sha256": file_hash(policy) if policy else "",
+        "robot": robot.name,
+        "robot_fingerprint": robot.fingerprint,
+        "control_dt": trained["control_dt"],
+        "rate": 1.0 / trained["control_dt"],
+        "frames": FRAMES,
+        "units": UNITS,
+        "joints": _joints(robot, task),
+        "fingertips": list(robot.fingertip_names),
+        "observation": observation,
+        "observation_layout": trained["observation_layout"],
+        "action": asdict(task.action),
+        "kinematics": _chain(robot),
+        "objects": listed,
+    }
+    runtime.check_contract(contract, f"The task of {robot.name}")
+    return contract
+
+
+def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:
+    """Return names, limits and the mapping of actions of every joint, in joint order."""
+    space = ActionSpace.of(robot, task.action)
+    tree = robot_tree(robot)
+    rows = []
+    for i, joint in enumerate(robot.joints):
+        in_tree = tree.joint(joint.name)
+        row: dict[str, Any] = {
+            "name": joint.name,
+            "group": joint.group,
+            "type": in_tree.type,
+            "velocity": in_tree.velocity,
+            "home": joint.home,
+        }
+        for name in ("lower", "upper", "step", "lead", "zero", "below", "above"):
+            row[name] = float(getattr(space, name)[i])
+        rows.append({name: _number(value) for name, value in row.items()})
+    return rows
+
+
+def _number(value: Any) -> Any:
+    """Return None for an infinite number, which JSON does not have."""
+    return None if isinstance(value, float) and math.isinf(value) else value
+
+
+def _chain(robot: RobotSpec) -> dict[str, Any]:
+    """Return the joints from the root to the palm and the fingertips."""
+    tree = robot_tree(robot)
+    by_child = {joint.child: joint for joint in tree.joints}
+    needed = set()
+    for link in robot.tracked_links:
+        name = link
+        while name in by_child:
+            needed.add(name)
+            name = by_child[name].parent
+    mimics = {mimic.joint: mimic for mimic in robot.mimics}
+    index = {tree.root: 0}
+    steps = []
+    for joint in tree.joints:
+        if joint.child not in needed:
+            continue
+        index[joint.child] = len(index)
+        mimic = mimics.get(joint.name)
+        source = mimic.source if mimic else joint.name
+        step = {
+            "link": joint.child,
+            "parent": index[joint.parent],
+            "type": joint.type,
+            "joint": None if joint.type == "fixed" else robot.joint_names.index(source),
+            "multiplier": mimic.multiplier if mimic else 1.0,
+            "offset": mimic.offset if mimic else 0.0,
+            "origin": joint.T_parent_joint.tolist(),
+            "axis": np.asarray(joint.axis, dtype=float).tolist(),
+        }
+        steps.append(step)
+    tracked = [index[name] for name in robot.tracked_links]
+    base = Kinematics(robot).base.to(torch.float64).tolist()
+    return {"base": base, "palm": tracked[0], "tips": tracked[1:], "steps": steps}
+
+
+def export_deploy(
+    policy: Path, robot: RobotSpec, task: TaskConfig, objects: Sequence[ObjectSpec], out: Path
+) -> dict[str, Any]:
+    """Write ``policy.onnx``, ``contract.json`` and ``runtime.py`` into a new folder; return the contract.
+
+    Args:
+        policy: exported policy (.onnx).
+        robot: robot of the policy.
+        task: task of the policy's training.
+        objects: objects whose points the contract lists.
+        out: folder to write; must not exist, or be empty.
+
+    Raises:
+        PolicyError: the folder is not empty.
+        LiveError: the task has options that the runtime does not carry out.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise PolicyError(f"{out} exists already. Choose another --out, or remove it.")
+    contract = deploy_contract(robot, task, objects, policy)
+    with atomic_folder(out) as folder:
+        (folder / runtime.POLICY).write_bytes(policy.read_bytes())
+        (folder / "runtime.py").write_bytes(Path(runtime.__file__).read_bytes())
+        write_json(folder / runtime.CONTRACT, contract)
+    return contract

@@ -77,6 +77,10 @@ class DemoResult(Checked):
     grasp_rate: Share[float]
     reorient_rate: Share[float]
     reorientation_progress: Share[float]
+    published_success_rate: Share[float] | None = None
+    """None, as in the next field: an earlier version did not measure it."""
+    least_distance: NotNegative[float] | None = None
+    """Mean of :attr:`~xreset.eval.rollout.Episode.least_distance` [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,6 +123,13 @@ class EvalResult(Checked):
     """SHA-256 of the policy and the demonstrations."""
     unseen: tuple[str, ...] = ()
     """Objects that the policy was not trained with, sorted; empty for a baseline."""
+    published_success_rate: Share[float] | None = None
+    """Share of episodes that succeed in the sense of the published paper. None, as in the next two fields: an earlier
+    version did not measure it."""
+    published_success_ci95: Range | None = None
+    """95 % bootstrap interval over demonstrations."""
+    least_distance: NotNegative[float] | None = None
+    """Mean of :attr:`~xreset.eval.rollout.Episode.least_distance` [m]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -151,10 +162,12 @@ def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = ""
     """Return a table with one row for each episode.
 
     Columns: run, policy, engine, robot and seed, then the fields of :class:`~xreset.eval.rollout.Episode`: sequence
-    (index of the demonstration), sequence_name, object, repetition, approach, grasp, reorient, reorient_once,
-    reorientation_progress, task_progress, out_of_bounds, nonfinite, overflow.
+    (index of the demonstration), sequence_name, object, repetition, approach, grasp, reorient (at the goal at the end),
+    reorient_once, reorientation_progress, task_progress, out_of_bounds, nonfinite, overflow, published_success,
+    least_distance, final_distance, final_position_error [m], final_angle [rad]. What an earlier version did not measure
+    is NaN.
     """
-    table: Table = pd.DataFrame([asdict(e) for e in episodes], columns=[f.name for f in fields(Episode)])
+    table = _table(episodes)
     about = {
         "run": run or result.policy,
         "policy": result.policy,
@@ -167,9 +180,21 @@ def episode_table(result: EvalResult, episodes: Sequence[Episode], run: str = ""
     return table
 
 
+def _table(episodes: Sequence[Episode]) -> Table:
+    """Return a row for each episode, with NaN for what was not measured."""
+    table: Table = pd.DataFrame([asdict(e) for e in episodes], columns=[f.name for f in fields(Episode)])
+    return table.astype({name: float for name in table if table[name].isna().any()})
+
+
 def mean(episodes: Table, metric: str) -> float:
-    """Return the mean of one metric over episodes, rounded to six digits."""
+    """Return the mean of one metric over episodes, rounded to six digits; NaN if it was not measured in all of them."""
     return round(float(episodes[metric].to_numpy(float).mean()), 6)
+
+
+def measured(episodes: Table, metric: str) -> float | None:
+    """Return :func:`mean`, or None if the metric was not measured in all of the episodes."""
+    value = mean(episodes, metric)
+    return None if np.isnan(value) else value
 
 
 def summarize(
@@ -185,8 +210,8 @@ def summarize(
     unseen: tuple[str, ...] = (),
 ) -> EvalResult:
     """Return the means, intervals and faults of the episodes of one engine."""
-    episodes: Table = pd.DataFrame([asdict(e) for e in rollouts.episodes])
-    low, high = bootstrap_ci95(episodes["task_progress"].to_numpy(float), episodes["sequence"].to_numpy())
+    episodes = _table(rollouts.episodes)
+    success = measured(episodes, "published_success")
     per_demo = []
     for _, own in episodes.groupby("sequence", sort=False):
         first = own.iloc[0]
@@ -209,7 +234,8 @@ def summarize(
         episodes=len(episodes),
         episodes_per_demo=1 + int(episodes["repetition"].max()),
         seed=seed,
-        task_progress=TaskProgress(mean=mean(episodes, "task_progress"), ci95=(round(low, 6), round(high, 6))),
+        task_progress=TaskProgress(mean=mean(episodes, "task_progress"), ci95=_ci95(episodes, "task_progress")),
+        published_success_ci95=None if success is None else _ci95(episodes, "published_success"),
         reorient_once_rate=mean(episodes, "reorient_once"),
         per_demo=tuple(per_demo),
         health=EpisodeFaults(**{f.name: int(episodes[f.name].sum()) for f in fields(EpisodeFaults)}),
@@ -220,9 +246,16 @@ def summarize(
     )
 
 
-def _rates(episodes: Table) -> dict[str, float]:
-    rates = {f"{stage}_rate": mean(episodes, stage) for stage in ("approach", "grasp", "reorient")}
-    rates["reorientation_progress"] = mean(episodes, "reorientation_progress")
+def _ci95(episodes: Table, metric: str) -> tuple[float, float]:
+    low, high = bootstrap_ci95(episodes[metric].to_numpy(float), episodes["sequence"].to_numpy())
+    return round(low, 6), round(high, 6)
+
+
+def _rates(episodes: Table) -> dict[str, Any]:
+    stages = ("approach", "grasp", "reorient", "published_success")
+    rates = {f"{stage}_rate": measured(episodes, stage) for stage in stages}
+    for name in ("reorientation_progress", "least_distance"):
+        rates[name] = measured(episodes, name)
     return rates
 
 

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -251,13 +252,14 @@ _NUMBERS = (
 
 
 def _episode(result: EpisodeMetrics, world: int, bank: ResetBank, sequence: int, repetition: int) -> Episode:
+    values: dict[str, Any] = {name: bool(getattr(result, name)[world]) for name in _FLAGS}
+    values |= {name: round(float(getattr(result, name)[world]), 6) for name in _NUMBERS}
     return Episode(
         sequence=sequence,
         sequence_name=str(bank.sequence_name[sequence]),
         object=str(bank.sequence_object[sequence]),
         repetition=repetition,
-        **{name: bool(getattr(result, name)[world]) for name in _FLAGS},
-        **{name: round(float(getattr(result, name)[world]), 6) for name in _NUMBERS},
+        **values,
     )
 
 

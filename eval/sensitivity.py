@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from xreset.eval.rollout import Episode
-from xreset.eval.stats import bootstrap_ci95
+from xreset.eval.stats import bootstrap_ci95, mean_of_known
 from xreset.physics import Capability
 
 Interval = tuple[float, float]
@@ -26,6 +26,9 @@ class Effect:
     ci95: Interval
     difference: float
     difference_ci95: Interval
+    published_success: float | None = None
+    """Share of the episodes that succeed in the sense of the published paper; None: an earlier version did not measure
+    it."""
 
     @classmethod
     def of(cls, episodes: Sequence[Episode], nominal: Sequence[Episode], metric: str = "task_progress") -> Effect:
@@ -38,6 +41,7 @@ class Effect:
             ci95=bootstrap_ci95(score, groups),
             difference=float(difference.mean()),
             difference_ci95=bootstrap_ci95(difference, groups),
+            published_success=mean_of_known([e.published_success for e in episodes]),
         )
 
     @property

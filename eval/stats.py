@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+
+
+def mean_of_known(values: Sequence[float | None]) -> float | None:
+    """Return the mean, or None if one of the values was not measured."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if len(known) == len(values) else None
 
 
 def bootstrap_ci95(

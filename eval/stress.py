@@ -95,6 +95,8 @@ class Stress:
     episodes: int
     task_progress: float
     ci95: Interval
+    published_success: float | None = None
+    """None: an earlier version did not measure it."""
     curves: tuple[Curve, ...]
     left_out: tuple[str, ...]
     """Properties that the engine cannot set."""
@@ -244,6 +246,7 @@ def stress(
             episodes=len(nominal),
             task_progress=as_is.task_progress,
             ci95=as_is.ci95,
+            published_success=as_is.published_success,
             curves=(),
             left_out=tuple(prop.option for prop in sweeps if prop not in usable),
         )

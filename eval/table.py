@@ -6,13 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
 import rich.console
 from rich.table import Table
 from rich.text import Text
 
+from xreset.eval.stats import mean_of_known
+
 if TYPE_CHECKING:
-    from xreset.eval.results import EvalResult
+    from xreset.eval.results import DemoResult, EvalResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +62,23 @@ def _cell(text: str) -> Text:
     return Text(text.replace(" / ", "/").replace(" %", "\N{NO-BREAK SPACE}%"))
 
 
+VERSIONS = (
+    "Published success and distance (mean of 64 surface points, least over the episode) are the published paper's. "
+    "The others are its draft's."
+)
+"""Says of every table which version of the paper a figure refers to."""
+
+
+def success_text(share: float | None) -> str:
+    """Return the published success as text; None: an earlier version did not measure it."""
+    return "missing" if share is None else f"{share:.1%}"
+
+
+def distance_text(distance: float | None) -> str:
+    """Return the published distance [m] as text; None: an earlier version did not measure it."""
+    return "missing" if distance is None else f"{100 * distance:.1f} cm"
+
+
 @dataclass(frozen=True)
 class Figure:
     """A figure of an evaluation: a row of the terminal's table, a column of the report's table."""
@@ -68,8 +86,8 @@ class Figure:
     text: Callable[[EvalResult], str]
     share: Callable[[EvalResult], float] | None = None
     """Length of the bar behind the text, in [0, 1]."""
-    interval: Callable[[EvalResult], tuple[float, float]] | None = None
-    """95 % interval, in [0, 1]."""
+    interval: Callable[[EvalResult], tuple[float, float] | None] | None = None
+    """95 % interval, in [0, 1]; None where the figure was not measured."""
     fault: bool = False
     """Whether every number but 0 is a fault."""
 
@@ -86,6 +104,12 @@ FIGURES = {
     "reorientation progress": Figure(
         lambda s: f"{s.reorientation_progress:.1%}", share=lambda s: s.reorientation_progress
     ),
+    "published success": Figure(
+        lambda s: success_text(s.published_success_rate),
+        share=lambda s: s.published_success_rate or 0.0,
+        interval=lambda s: s.published_success_ci95,
+    ),
+    "published distance": Figure(lambda s: distance_text(s.least_distance)),
     "not finite": Figure(lambda s: str(s.health.nonfinite), fault=True),
     "overflow": Figure(lambda s: str(s.health.overflow), fault=True),
     "left the scene": Figure(lambda s: str(s.health.out_of_bounds)),
@@ -100,15 +124,22 @@ def result_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
     for name, figure in FIGURES.items():
         rows.append((name, *map(figure.text, summaries)))
         if figure.interval is not None:
-            intervals = map(figure.interval, summaries)
-            rows.append(("  95 % interval", *(f"{100 * low:.0f}-{100 * high:.0f}%" for low, high in intervals)))
+            rows.append(("  95 % interval", *(_interval(figure.interval(s)) for s in summaries)))
         if name == "task progress":
-            rows += _unseen_rows(summaries)
+            rows += _unseen_rows(summaries, lambda d: d.task_progress)
+        if name == "published success" and summaries[0].published_success_rate is not None:
+            rows += _unseen_rows(summaries, lambda d: d.published_success_rate)
     return rows
 
 
-def _unseen_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
-    """Return task progress of trained and of unseen objects; nothing if all objects are of one kind."""
+def _interval(interval: tuple[float, float] | None) -> str:
+    return "-" if interval is None else f"{100 * interval[0]:.0f}-{100 * interval[1]:.0f}%"
+
+
+def _unseen_rows(
+    summaries: Sequence[EvalResult], metric: Callable[[DemoResult], float | None]
+) -> list[tuple[str, ...]]:
+    """Return a metric of trained and of unseen objects; nothing if all objects are of one kind."""
     unseen = summaries[0].unseen
     trained = [name for name in summaries[0].objects if name not in unseen]
     rows = []
@@ -116,8 +147,8 @@ def _unseen_rows(summaries: Sequence[EvalResult]) -> list[tuple[str, ...]]:
         for label, objects in (("  trained objects", trained), ("  unseen objects", unseen)):
             cells = []
             for s in summaries:
-                value = np.mean([d.task_progress for d in s.per_demo if d.object in objects])
-                cells.append(f"{value:.1%}")
+                values = [metric(d) for d in s.per_demo if d.object in objects]
+                cells.append(success_text(mean_of_known(values)))
             rows.append((label, *cells))
     return rows
 
@@ -127,12 +158,12 @@ def results_table(summaries: Sequence[EvalResult]) -> Table:
     first = summaries[0]
     title = f"{first.policy} on {first.robot}\n"
     title += f"{first.episodes} episodes of {len(first.per_demo)} demonstrations, seed {first.seed}"
-    table = Table("", title=title, title_justify="left")
+    table = Table("", title=title, title_justify="left", caption=VERSIONS, caption_justify="left")
     table.columns[0].no_wrap = True
     for s in summaries:
         table.add_column(s.backend, justify="right", no_wrap=True)
     for row in result_rows(summaries):
-        table.add_row(*row, style="bold" if row[0] == "task progress" else None)
+        table.add_row(*row, style="bold" if row[0] in ("task progress", "published success") else None)
     return table
 
 

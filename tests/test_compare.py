@@ -611,6 +611,8 @@ class WrittenTest(Compared):
         self.assertEqual(rows["x", "task progress of each seed"], ["29.8, 34.8 %"] * 2)
         self.assertEqual(rows["fixed", "approach / grasp / reorient"], ["75 / 50 / 25 %"] * 2)
         self.assertEqual(rows["ik", "at the goal at any time; reorientation progress"], ["25 %; 37.5 %", "-"])
+        self.assertTrue(rows["fixed", "published success (95 % interval)"][0].startswith("25.0 % ("))
+        self.assertEqual(rows["ik", "published distance"], ["7.8 cm", "-"])
         text = made.page.read_text()
         self.assertRegex(text, r"x is 2 trainings that differ in the seed only \(x-s0, x-s1\)")
         self.assertRegex(text, r"\| seed \| 0; 1 \| 0 \|")

@@ -233,7 +233,7 @@ class BootstrapTest(unittest.TestCase):
 class ResultsTest(unittest.TestCase):
     def test_the_table_tells_trained_objects_from_unseen_ones(self):
         summary = toy_summary(unseen=(OBJECTS[1],))
-        table = {row[0].strip(): row[1] for row in result_rows([summary])}
+        table = {row[0].strip(): row[1] for row in reversed(result_rows([summary]))}
         self.assertEqual((table["trained objects"], table["unseen objects"]), ("66.5%", "33.0%"))
         for same in (toy_summary(), toy_summary(unseen=OBJECTS)):
             self.assertNotIn("unseen objects", {row[0].strip() for row in result_rows([same])})

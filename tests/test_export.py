@@ -53,6 +53,7 @@ class Episodes(Case):
         np.testing.assert_allclose(steps, [2, 5, 8, 11, 11], atol=1e-4)
         self.assertEqual(recording.episodes["task"][0], "Grasp the tomato soup can and bring it to the goal pose.")
         self.assertEqual(list(recording.episodes["repetition"]), [0] * 4)
+        self.assertEqual(list(recording.episodes["least_distance"]), [0.01, 0.1] * 2)
 
     def test_only_some_engines_of_several_folders(self):
         folders = [self.evaluate("a"), self.evaluate("b")]

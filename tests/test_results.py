@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tests.toy_results import toy_rollouts, toy_summary
 from xreset.errors import FileFormatError
+from xreset.eval.report.groups import score
 from xreset.eval.results import read_evaluation, write_results
 from xreset.files import write_json
 from xreset.learning.choice import read_choice
@@ -33,6 +34,31 @@ class ResultsTest(unittest.TestCase):
         )
         for expected in ("mujoco", "sapien", "49.8%", "4 episodes of 2 demonstrations, seed 3"):
             self.assertIn(expected, str(evaluation))
+
+    def test_an_earlier_version_did_not_measure_the_published_success(self):
+        """Its files load and say so; the rest of the table is as it was, also next to results of today."""
+        today = read_evaluation(self.folder)
+        self.assertEqual(today.to_frame()["published_success"].dtype, bool)
+        self.assertRegex(str(today), r"published success *│ *25.0% │ *25.0%")
+        for file, fields in (
+            ("mujoco.json", ("published_success_rate", "published_success_ci95", "least_distance")),
+            ("mujoco.episodes.json", ("published_success", "least_distance", "final_distance", "final_angle")),
+        ):
+            content = json.loads((self.folder / file).read_text())
+            rows = content["episodes"] if "episodes" in file else content["per_demo"]
+            for entry in (content, *rows):
+                for name in fields:
+                    entry.pop(name, None)
+            (self.folder / file).write_text(json.dumps(content))
+        evaluation = read_evaluation(self.folder)
+        self.assertRegex(str(evaluation), r"published success *│ *missing │ *25.0%")
+        self.assertRegex(str(evaluation), r"task progress *│ *49.8% │ *49.8%")
+        table = evaluation.to_frame()
+        self.assertEqual(table.groupby("engine")["least_distance"].count().to_dict(), {"mujoco": 0, "sapien": 4})
+        found = {engine: score(own) for engine, own in table.groupby("engine")}
+        self.assertEqual((found["mujoco"].published_success, found["sapien"].published_success), (None, 0.25))
+        self.assertIsNone(found["mujoco"].least_distance)
+        self.assertAlmostEqual(found["sapien"].least_distance, 0.0775)
 
     def test_nothing_was_evaluated(self):
         evaluation = read_evaluation(self.folder / "empty")

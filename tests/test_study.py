@@ -419,6 +419,8 @@ class TablesTest(InFolder):
         page = write_page(plan, self.folder / "page")
         text = page.path.read_text()
         self.assertIn("![Table I", text)
+        self.assertRegex(text, r"\| published success \| 25.0 \(0-50\) \| - \| 25.0 \(0-50\) \|")
+        self.assertRegex(text, r"\| published distance \\\[cm\\\] \| 7.8 \(6-10\) \|")
         for note in (
             "The training ours-seed0 is not finished: not begun",
             "Not evaluated yet: eval x-sim-seed0, eval x-sim-seed1",

@@ -23,14 +23,16 @@ ENGINES = ("mujoco", "mujoco-warp", "pybullet", "sapien")
 def toy_episode(sequence: int, repetition: int, *reached: str, thing: str = "", **changes: Any) -> Episode:
     """An episode of a demonstration that reached some stages; nothing else is special but for ``changes``."""
     flags = ("approach", "grasp", "reorient", "reorient_once", "out_of_bounds", "nonfinite", "overflow")
-    values = {"reorientation_progress": 0.0, "task_progress": 0.0} | changes
+    distance = 0.01 if "reorient_once" in reached else 0.1
+    values = {"reorientation_progress": 0.0, "task_progress": 0.0, "published_success": distance < 0.02}
+    values |= dict.fromkeys(("least_distance", "final_distance", "final_position_error", "final_angle"), distance)
     return Episode(
         sequence=sequence,
         sequence_name=f"demo_{sequence}",
         object=thing or OBJECTS[sequence],
         repetition=repetition,
         **{name: name in reached for name in flags},
-        **values,
+        **(values | changes),
     )
 
 

@@ -121,6 +121,7 @@ class Attribution:
             "grasp_rate": round(row.mean("grasp"), 6),
             "reorient_rate": round(row.mean("reorient"), 6),
             "reorientation_progress": round(row.mean("reorientation_progress"), 6),
+            "published_success_rate": row.effect.published_success,
             "difference": _interval(effect.difference, effect.difference_ci95),
             "share_of_gap": None if math.isnan(share) else round(share, 6),
             "health": {

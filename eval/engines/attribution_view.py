@@ -13,13 +13,15 @@ from xreset.eval.engines.attribution import Attribution, Row
 from xreset.eval.engines.measure import Measured
 from xreset.eval.plots import COLORS, picture
 from xreset.eval.sensitivity import COMPARED
+from xreset.eval.table import success_text
 
 
 def rich_table(found: Attribution, title: str) -> Table:
     """One row for each run: change, score, and difference to A as it is. Bold: the interval leaves out zero."""
     table = Table(title=title, title_justify="left")
     table.add_column("")
-    for name in ("value", "task progress", "grasp", "reorient", f"against {found.a}", "of gap"):
+    names = ("value", "task progress", "grasp", "reorient", "published success", f"against {found.a}", "of gap")
+    for name in names:
         table.add_column(name, justify="right")
     for row in found.rows:
         effect = row.effect
@@ -33,6 +35,7 @@ def rich_table(found: Attribution, title: str) -> Table:
             f"{effect.task_progress:.1%}\n{100 * low:.0f}-{100 * high:.0f}",
             f"{row.mean('grasp'):.0%}",
             f"{row.mean('reorient'):.0%}",
+            success_text(effect.published_success),
             "" if first else f"{100 * effect.difference:+.1f}\n{100 * least:+.1f} to {100 * most:+.1f}",
             "" if first or math.isnan(share) else f"{share:.0%}",
             style="bold" if effect.is_certain else None,

@@ -89,6 +89,7 @@ def _write(
         progress(i, count)
         length = int(offsets[i + 1] - offsets[i])
         arrays = _arrays(recording, i, int(task_index[i]))
+        distance = episode["least_distance"]  # NaN: an earlier version did not measure it
         row = {
             "episode_index": i,
             "tasks": [episode["task"]],
@@ -102,6 +103,8 @@ def _write(
             "demonstration": episode["sequence_name"],
             "success": episode["reorient"],
             "task_progress": episode["task_progress"],
+            "published_success": None if pd.isna(distance) else bool(episode["published_success"]),
+            "least_distance": None if pd.isna(distance) else distance,
             "data/chunk_index": 0,
             "data/file_index": 0,
             "meta/episodes/chunk_index": 0,

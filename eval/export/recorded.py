@@ -34,6 +34,8 @@ _COLUMNS = {
     "sequence_name": "sequence_name",
     "success": "reorient",
     "task_progress": "task_progress",
+    "published_success": "published_success",
+    "least_distance": "least_distance",
 }
 """Array of the npz file -> column of the table of episodes."""
 

@@ -23,6 +23,11 @@ def notes(trainings: Sequence[Training]) -> tuple[str, ...]:
     found = []
     for training in evaluated:
         found += [f"{training.label}: {note}" for note in differences(tuple(training.results.values()))]
+        if training.episodes["published_success"].isna().any():
+            found.append(
+                f"{training.label}: the published success is missing, because an earlier version evaluated it. "
+                "Evaluate it again."
+            )
     table = _condition_table(evaluated)
     if table.empty:
         return tuple(found)

@@ -12,7 +12,7 @@ import pandas as pd
 
 from xreset.eval.report.curves import processes
 from xreset.eval.report.read import Training, conditions
-from xreset.eval.results import Table, mean
+from xreset.eval.results import Table, mean, measured
 from xreset.eval.stats import crossed_bootstrap_ci95
 
 
@@ -39,6 +39,11 @@ class Score:
     reorient_once: float
     """At the goal at any time."""
     reorientation_progress: float
+    published_success: float | None
+    """None, as in the next two fields: an earlier version did not measure it in some of the episodes."""
+    published_success_ci95: tuple[float, float] | None
+    least_distance: float | None
+    """[m]"""
     each: dict[str, float]
     """Label of every training that was evaluated in the engine -> its mean task progress."""
     nonfinite: int
@@ -149,10 +154,14 @@ def score(episodes: Table) -> Score:
     """Return the score of a group in one engine, from the episodes of all its trainings there."""
     task_progress, ci95 = estimate(episodes, "task_progress")
     stages = ("approach", "grasp", "reorient", "reorient_once", "reorientation_progress")
+    success = measured(episodes, "published_success")
     return Score(
         task_progress=task_progress,
         ci95=ci95,
         **{name: mean(episodes, name) for name in stages},
+        published_success=success,
+        published_success_ci95=None if success is None else estimate(episodes, "published_success")[1],
+        least_distance=measured(episodes, "least_distance"),
         each=episodes.groupby("run", sort=False)["task_progress"].mean().to_dict(),
         nonfinite=int(episodes["nonfinite"].sum()),
         overflow=int(episodes["overflow"].sum()),

@@ -15,7 +15,7 @@ from xreset.eval.report import figures
 from xreset.eval.report.clips import Clip, Strip, count_failures, encode_mp4
 from xreset.eval.report.read import ReportData
 from xreset.eval.results import EvalResult
-from xreset.eval.table import FIGURES
+from xreset.eval.table import FIGURES, VERSIONS, distance_text
 from xreset.pictures.render import encode_png
 from xreset.text import short_name
 
@@ -37,6 +37,7 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) 
         "report.html.j2",
         data=data,
         figures=FIGURES,
+        versions=VERSIONS,
         title=data.title,
         headline=headline(data),
         facts=_facts(data),
@@ -78,6 +79,9 @@ def headline(data: ReportData) -> str:
     grasped = _between([s.grasp_rate for s in ranked])
     at_goal = _between([s.reorient_rate for s in ranked])
     text += f". The object is grasped in {grasped} of the episodes and at its goal at the end of {at_goal}."
+    successes = [s.published_success_rate for s in ranked if s.published_success_rate is not None]
+    if len(successes) == len(ranked):
+        text += f" By the published paper's measure {_between(successes)} of the episodes succeed."
     if data.run is not None and data.run.backend in data.engines and len(ranked) > 1:
         text += f" The policy was trained in {data.run.backend}."
     return text
@@ -120,7 +124,10 @@ def outcome_of(episode: Any) -> str:
         stage = "grasped and lifted"
     elif episode.approach:
         stage = "approached"
-    return f"{stage}, {episode.reorientation_progress:.0%} of the way to the goal"
+    text = f"{stage}, {episode.reorientation_progress:.0%} of the way to the goal"
+    if episode.least_distance == episode.least_distance:  # an earlier version did not measure it
+        text += f", {distance_text(episode.least_distance)} from it at best"
+    return text
 
 
 def _charts(data: ReportData) -> dict[str, str]:

@@ -8,7 +8,7 @@ from xreset.errors import RunError
 from xreset.eval.report.curves import Fate, X, amounts, fates, processes, share_of_runs
 from xreset.eval.report.groups import Group, Score, Scores, engines_of, members_of
 from xreset.eval.report.read import Fact, Training
-from xreset.eval.table import Rows
+from xreset.eval.table import Rows, distance_text, success_text
 from xreset.learning.clock import SHARES
 
 LIFTED = (
@@ -20,7 +20,7 @@ _ABSENT = Fact(None, "-")
 
 
 def results(groups: Sequence[Group], found: Scores) -> Rows:
-    """Return three rows for each group (four for several trainings), one column for each engine; ``-`` where it was not
+    """Return five rows for each group (six for several trainings), one column for each engine; ``-`` where it was not
     evaluated."""
     engines = engines_of(found)
     versions: dict[str, set[str]] = {engine: set() for engine in engines}
@@ -50,6 +50,12 @@ def _score_texts(s: Score, several: bool) -> dict[str, str]:
     texts["at the goal at any time; reorientation progress"] = (
         f"{_percent(s.reorient_once)}; {_percent(s.reorientation_progress, 1)}"
     )
+    success = success_text(s.published_success)
+    if s.published_success_ci95 is not None:
+        low, high = s.published_success_ci95
+        success = f"{success.replace('%', ' %')} ({100 * low:.0f}-{100 * high:.0f})"
+    texts["published success (95 % interval)"] = success
+    texts["published distance"] = distance_text(s.least_distance)
     return texts
 
 

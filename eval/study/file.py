@@ -190,7 +190,8 @@ class TableSpec:
     title: str | None = None
     evaluation: str = "eval"
     rows: Axis = "object"
-    """Rows of a table without ``paper``. The columns are runs, or objects if the rows are runs."""
+    """Rows of a table without ``paper``. The columns are runs, or objects if the rows are runs. ``metric``: the metrics
+    of both versions of the paper, over all objects or ``object``."""
     object: str | None = None
     """Only this object; None: all."""
     metric: str = "task_progress"

@@ -19,8 +19,10 @@ METRICS = {
     "reorient": "reorient",
     "reorient_once": "at the goal at any time",
     "reorientation_progress": "reorientation progress",
+    "published_success": "published success",
+    "least_distance": "published distance [cm]",
 }
-"""Column of the table of episodes -> its name in tables."""
+"""Column of the table of episodes -> its name in tables. Shares are shown in percent, and 100 times metres are cm."""
 ALL = "all"
 """In place of an object: the mean over all of them."""
 

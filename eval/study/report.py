@@ -9,10 +9,11 @@ from pathlib import Path
 from xreset.eval.pages import render
 from xreset.eval.report import fairness
 from xreset.eval.report.make import compare
+from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import paper_training
 from xreset.eval.study.plan import Plan, Run
 from xreset.eval.study.tables import FilledTable, draw, fill
-from xreset.eval.table import Rows
+from xreset.eval.table import VERSIONS, Rows
 from xreset.files import write_whole
 from xreset.learning.clock import Lift, read_lift
 from xreset.text import short_name
@@ -38,6 +39,8 @@ class Page:
 
     path: Path
     tables: tuple[FilledTable, ...]
+    metrics: tuple[FilledTable, ...]
+    """Every metric of the same runs, over all objects."""
     notes: tuple[str, ...]
     """What makes the figures incomparable, doubtful or incomplete."""
     runs: Rows
@@ -47,6 +50,12 @@ def write_page(plan: Plan, out: Path) -> Page:
     """Write ``study.md``, its pictures, and comparisons of the trainings of each object."""
     trained = {run.name: run.trained() for run in plan.runs if run.config is not None}
     tables = tuple(fill(plan, table) for table in plan.study.tables)
+    every_metric: list[TableSpec] = []
+    for table in plan.study.tables:
+        title = f"Every metric, {table.evaluation}"
+        spec = TableSpec(runs=table.runs, title=title, evaluation=table.evaluation, rows="metric")
+        if spec not in every_metric:
+            every_metric.append(spec)
     notes = [*_incomplete(plan)]
     for i, table in enumerate(tables, 1):
         notes += _unfair(plan, table, trained)
@@ -55,10 +64,12 @@ def write_page(plan: Plan, out: Path) -> Page:
     page = Page(
         path=out / "study.md",
         tables=tables,
+        metrics=tuple(fill(plan, table) for table in every_metric),
         notes=tuple(dict.fromkeys(notes)),
         runs=Rows(head=_HEAD, body=tuple(_run_row(run, trained.get(run.name)) for run in plan.runs)),
     )
-    write_whole(page.path, render("study.md.j2", plan=plan, compared=_compare(plan, out), **vars(page)))
+    compared = _compare(plan, out)
+    write_whole(page.path, render("study.md.j2", plan=plan, compared=compared, versions=VERSIONS, **vars(page)))
     return page
 
 

@@ -14,7 +14,7 @@ from xreset.eval.plots import INK, percent_axis, picture
 from xreset.eval.report.figures import color
 from xreset.eval.report.groups import Group, Scores, estimate, scores
 from xreset.eval.report.read import Training, read_training
-from xreset.eval.results import Table
+from xreset.eval.results import Table, measured
 from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import ALL, METRICS, PaperTable, paper_tables
 from xreset.eval.study.plan import Plan
@@ -28,10 +28,10 @@ Axis = tuple[str, list[str]]
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """A figure, in [0, 1]."""
+    """A figure: a share, or a distance [m]."""
 
     mean: float | None
-    """None: not evaluated."""
+    """None: not evaluated, or not measured by an earlier version."""
     ci95: tuple[float, float]
     """95 % interval, as :func:`~xreset.eval.report.groups.estimate` gives it."""
     paper: float | None
@@ -67,6 +67,8 @@ class FilledTable:
     """Run of the study -> its seeds."""
     paper: bool
     """Whether it has figures of the paper."""
+    unit: str = "%"
+    """Unit of the cells, where their column does not state one."""
 
     @property
     def trainings(self) -> list[Training]:
@@ -78,7 +80,7 @@ class FilledTable:
         body = []
         for name, cells in zip(self.rows, self.cells[engine], strict=True):
             body.append((name, *(cell.text for cell in cells)))
-        return Rows(head=("%", *self.columns), body=tuple(body))
+        return Rows(head=(self.unit, *self.columns), body=tuple(body))
 
     def versions(self, engine: str) -> str:
         """Return the engine's versions in which the runs were evaluated."""
@@ -108,7 +110,7 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
         mean = None
         ci95 = (0.0, 0.0)
         episodes = _episodes_with(members[run], engine, objects)
-        if len(episodes):
+        if len(episodes) and measured(episodes, key["metric"]) is not None:
             mean, ci95 = estimate(episodes, key["metric"])
         figure, error = paper.figure(key["method"], key["object"], key["metric"]) if paper else (None, None)
         return Cell(mean=mean, ci95=ci95, paper=figure, paper_error=error)
@@ -127,6 +129,7 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
         cells=cells,
         members=members,
         paper=paper is not None,
+        unit="cm" if fixed.get("metric") == "least_distance" else "%",
     )
 
 
@@ -189,6 +192,9 @@ def _axes(plan: Plan, table: TableSpec, paper: PaperTable | None) -> tuple[Axis,
         columns = [name for name in paper.names if name in names[paper.columns]]
         fixed = {"object": paper.object or ALL, "metric": paper.metric or "task_progress"}
         return (paper.rows, rows), (paper.columns, columns), fixed
+    if table.rows == "metric":
+        fixed = {"object": canonical_name(table.object, known) if table.object else ALL}
+        return ("metric", list(METRICS)), ("method", methods), fixed
     objects = known
     if table.object:
         objects = [canonical_name(table.object, known)]
@@ -229,8 +235,11 @@ def draw(path: Path, table: FilledTable) -> None:
                         ends = [at - 0.45 * width, at + 0.45 * width]
                         ax.plot(ends, [cell.paper] * 2, color="black", linewidth=2)
             ax.set_xticks(range(len(table.rows)), table.rows, fontsize="small")
-            percent_axis(ax, "y")
-            ax.set_ylim(0, 105)
+            if table.unit == "%":
+                percent_axis(ax, "y")
+                ax.set_ylim(0, 105)
+            else:
+                ax.set_ylabel(table.unit)
             ax.set_title(engine, fontsize="medium", loc="left")
         last = panels[-1]
         if table.paper:

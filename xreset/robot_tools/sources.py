@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from xreset.errors import ObjectError, RobotError
 from xreset.geometry.shapes import hull, mass_properties, surface_of
 from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree, check_tree, load_urdf, parse_xml
-from xreset.geometry.urdf_writer import FRAME_INERTIA, FRAME_MASS, fixed
+from xreset.geometry.urdf_writer import FRAME_INERTIA, FRAME_MASS, fixed, pose
+from xreset.robot_tools.couplings import Couplings, Line, read_couplings, resolved, tendon_joints
 from xreset.robot_tools.draft import below
 from xreset.spec import DriveSpec, Geometry, MimicSpec, Shape
 from xreset.text import shown
@@ -97,6 +98,13 @@ def _read_urdf(path: Path, root: ElementTree.Element) -> Source:
         limit = joint.find("limit")
         if limit is not None and 0 < number(limit, "effort", 0) < math.inf:
             efforts[name] = number(limit, "effort", 0)
+    followers = {mimic.joint for mimic in mimics}
+    if any(mimic.source in followers for mimic in mimics):
+        lines = [Line(mimic.joint, mimic.source, mimic.multiplier, mimic.offset) for mimic in mimics]
+        try:
+            mimics = [MimicSpec(**line._asdict()) for line in resolved(lines)]
+        except ValueError as error:
+            raise RobotError(f"{path}: {error}. Let one of them follow nothing.") from error
     return Source(tree=tree, mimics=tuple(mimics), effort=efforts)
 
 
@@ -281,14 +289,15 @@ def _read_mjcf(path: Path, root: ElementTree.Element) -> Source:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise RobotError(f"{path} is not valid MJCF: {error}") from error
-    if problems := _unsupported(model, mujoco):
+    couplings = read_couplings(model, mujoco)
+    if problems := [*_unsupported(model, mujoco), *couplings.problems]:
         raise RobotError(
             f"{path} uses what xreset does not have:" + "".join(f"\n  - {problem}" for problem in problems)
         )
     for quats in (model.body_quat, model.body_iquat, model.geom_quat):
         if not np.allclose(np.linalg.norm(quats, axis=1), 1, atol=1e-3):
             raise RobotError(f"{path} has an orientation that is not finite.")
-    return _MjcfReader(path, model, mujoco).source()
+    return _MjcfReader(path, model, mujoco, couplings).source()
 
 
 def _check_sizes(path: Path, root: ElementTree.Element) -> None:
@@ -315,13 +324,14 @@ class _MjcfReader:
     A joint may be away from its body's origin. The link's frame is put onto the joint, ``shift`` from the origin.
     """
 
-    def __init__(self, path: Path, model: Any, mujoco: Any) -> None:
+    def __init__(self, path: Path, model: Any, mujoco: Any, couplings: Couplings) -> None:
         self.path = path
         self.model = model
         self.mujoco = mujoco
+        self.couplings = couplings
         self.names = [model.body(i).name or f"body{i}" for i in range(model.nbody)]
         self.shift = np.zeros((model.nbody, 3))
-        self.notes: list[str] = []
+        self.notes = [*couplings.notes]
         self.links: dict[str, Link] = {}
         self.joints: list[Joint] = []
         self.joint_names: dict[int, str] = {}
@@ -342,12 +352,10 @@ class _MjcfReader:
             joints=tuple(self.joints),
         )
         mimics = []
-        for equality in map(self.model.equality, range(self.model.neq)):
-            if equality.obj2id[0] >= 0:
-                offset, multiplier = map(float, equality.data[:2])
-                joint = self.joint_names[int(equality.obj1id[0])]
-                driver = self.joint_names[int(equality.obj2id[0])]
-                mimics.append(MimicSpec(joint=joint, source=driver, multiplier=multiplier, offset=offset))
+        for line in self.couplings.lines:
+            joint = self.joint_names[line.joint]
+            driver = self.joint_names[line.source]
+            mimics.append(MimicSpec(joint=joint, source=driver, multiplier=line.multiplier, offset=line.offset))
         drives, efforts = self._drives()
         return Source(tree=tree, mimics=tuple(mimics), effort=efforts, drives=drives, notes=tuple(self.notes))
 
@@ -395,47 +403,69 @@ class _MjcfReader:
     def _joint(self, joint: Any, parent: str, child: str, T: np.ndarray) -> Joint:
         name = joint.name or f"joint{joint.id}"
         self.joint_names[joint.id] = name
+        is_slide = int(joint.type[0]) == int(self.mujoco.mjtJoint.mjJNT_SLIDE)
+        axis = joint.axis / np.linalg.norm(joint.axis)
+        moved = self.couplings.held.get(joint.id, 0.0) - float(self.model.qpos0[joint.qposadr[0]])
+        if moved:  # the file's poses are those at qpos0
+            if is_slide:
+                step = pose(moved * axis)
+            else:
+                step = pose(quat=Rotation.from_rotvec(moved * axis).as_quat(scalar_first=True))
+            T = T @ step
+        if joint.id in self.couplings.held:
+            return replace(fixed(parent, child, T), name=name)
         lower = -math.inf
         upper = math.inf
         if self.model.jnt_limited[joint.id]:
             lower, upper = map(float, joint.range)
-        is_slide = int(joint.type[0]) == int(self.mujoco.mjtJoint.mjJNT_SLIDE)
         return Joint(
             name=name,
             type="prismatic" if is_slide else "revolute",
             parent=parent,
             child=child,
             T_parent_joint=T,
-            axis=joint.axis / np.linalg.norm(joint.axis),
+            axis=axis,
             lower=lower,
             upper=upper,
             velocity=math.inf,
         )
 
     def _drives(self) -> tuple[dict[str, DriveSpec], dict[str, float]]:
-        """Return position drives and efforts of the joints that have actuators."""
+        """Return position drives and efforts of the joints that have actuators. What drives coupled joints is the
+        drive of the joint that they follow."""
         model = self.model
         drives = {}
         efforts = {}
         for i in range(model.nu):
-            joint = int(model.actuator_trnid[i, 0])
+            target = int(model.actuator_trnid[i, 0])
+            gear = float(model.actuator_gear[i, 0])
+            kind = int(model.actuator_trntype[i])
+            if kind == int(self.mujoco.mjtTrn.mjTRN_TENDON):
+                parts = tendon_joints(model, self.mujoco, target)
+            elif kind in (int(self.mujoco.mjtTrn.mjTRN_JOINT), int(self.mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
+                parts = ([target], [1.0])
+            else:
+                continue
+            assert parts is not None, "a tendon through space was refused"
+            joint, lever = self.couplings.lever(*parts)
+            lever = abs(lever * gear)
             name = self.joint_names[joint]
             gain = float(model.actuator_gainprm[i, 0])
             _, kp, kd = map(float, -model.actuator_biasprm[i, :3])
             limit = 0.0
             if model.actuator_forcelimited[i]:
-                limit = float(model.actuator_forcerange[i, 1])
+                limit = lever * float(model.actuator_forcerange[i, 1])
             elif kp == 0 and model.actuator_ctrllimited[i]:  # a motor: its control is a force
-                limit = abs(gain * model.actuator_gear[i, 0]) * float(model.actuator_ctrlrange[i, 1])
+                limit = abs(gain) * lever * float(model.actuator_ctrlrange[i, 1])
             if limit <= 0 and model.jnt_actfrclimited[joint]:
                 limit = float(model.jnt_actfrcrange[joint, 1])
             if limit > 0:
                 efforts[name] = limit
-            if gain > 0 and kp > 0:
+            if gain > 0 and kp > 0 and lever > 0:
                 dof = int(model.jnt_dofadr[joint])
-                kd += float(model.dof_damping[dof])
+                kd = kd * lever**2 + float(model.dof_damping[dof])
                 armature = float(model.dof_armature[dof])
-                drives[name] = DriveSpec(kp=gain, kd=kd, effort=max(limit, 0.0), armature=armature)
+                drives[name] = DriveSpec(kp=kp * lever**2, kd=kd, effort=max(limit, 0.0), armature=armature)
         return drives, efforts
 
     def _shapes(self, number: int) -> Iterable[Shape]:
@@ -475,25 +505,16 @@ def _unsupported(model: Any, mujoco: Any) -> list[str]:
     problems = []
     for joint in map(model.joint, range(model.njnt)):
         if int(joint.type[0]) == int(mujoco.mjtJoint.mjJNT_BALL):
-            problems.append(f"the ball joint {joint.name!r}")
+            problems.append(f"the ball joint {joint.name!r}. Replace it by three hinges of the same body")
     for geom in map(model.geom, range(model.ngeom)):
         kind = _kind(mujoco, geom)
         if _is_solid(geom) and kind not in _SOLIDS:
             body = model.body(int(geom.bodyid[0])).name
-            problems.append(f"the {kind} {geom.name or geom.id!r} of body {body!r}")
-    for actuator in map(model.actuator, range(model.nu)):
-        if int(actuator.trntype[0]) != int(mujoco.mjtTrn.mjTRN_JOINT):
-            problems.append(f"the actuator {actuator.name!r}, which does not drive a single joint")
-    for equality in map(model.equality, range(model.neq)):
-        name = equality.name or equality.id
-        kind = mujoco.mjtEq(int(equality.type[0]))
-        if kind != mujoco.mjtEq.mjEQ_JOINT:
-            problems.append(f"the equality {name!r} of type {kind.name.removeprefix('mjEQ_').lower()}")
-        elif np.abs(equality.data[2:5]).max() > 0:
-            problems.append(f"the equality {name!r}, which couples joints by a curve that is not straight")
-    problems += [f"the tendon {model.tendon(i).name or i!r}" for i in range(model.ntendon)]
+            problems.append(
+                f"the {kind} {geom.name or geom.id!r} of body {body!r}. Replace it by a capsule, box or mesh"
+            )
     if model.nflex:
-        problems.append("flexible bodies")
+        problems.append("flexible bodies. Leave them out, or make them rigid")
     return problems
 
 

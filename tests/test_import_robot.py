@@ -93,6 +93,25 @@ MJCF = (
 )
 
 
+_SIDE = """<body name="{0}_arm" pos="0 0.02 0.05" {1}><inertial pos="0 0.01 0" mass="0.02" diaginertia="1e-5 1e-5 1e-5"/>
+  <joint name="{0}_crank" axis="1 0 0" range="0 0.8"/><geom type="box" pos="0 0.02 0.015" size="0.005 0.02 0.004"/>
+  <body name="{0}_pad" pos="0 0.04 0.03"><inertial pos="0 0 0.02" mass="0.02" diaginertia="1e-5 1e-5 1e-5"/>
+  <joint name="{0}_finger" axis="1 0 0" range="-1 1"/><geom type="box" pos="0 0 0.025" size="0.01 0.004 0.02"/></body></body>
+  <body name="{0}_rod" pos="0 {2} 0.07" {1}><inertial pos="0 0.01 0" mass="0.02" diaginertia="1e-5 1e-5 1e-5"/>
+  <joint name="{0}_rocker" axis="1 0 0" range="-1 1"/><geom type="capsule" fromto="0 0 0 0 0.03 0.02" size="0.004"/></body>"""
+JAW = (
+    '<mujoco model="jaw"><compiler angle="radian"/><worldbody><body name="mount"><geom type="box" pos="0 0 0.02" '
+    'size="0.03 0.03 0.02"/>'
+    + _SIDE.format("l", "", 0.02)
+    + _SIDE.format("r", 'quat="0 0 0 1"', -0.02).replace('pos="0 0.02 0.05"', 'pos="0 -0.02 0.05"')
+    + '</body></worldbody><equality><connect name="left" body1="l_rod" body2="l_pad" anchor="0 0.04 0.03"/>'
+    '<connect name="right" body1="r_rod" body2="r_pad" anchor="0 0.04 0.03"/>'
+    '<joint joint1="r_crank" joint2="l_crank"/></equality>'
+    '<actuator><position joint="l_crank" kp="20" forcerange="-5 5"/></actuator></mujoco>'
+)
+"""Two fingers on parallelograms: rods that are pinned to the pads keep these parallel."""
+
+
 class WithFolder(unittest.TestCase):
     def setUp(self):
         folder = tempfile.TemporaryDirectory()
@@ -271,9 +290,48 @@ class Toy(WithFolder):
         )
         ball = ball.replace('type="box" pos="0.04 0 0"', 'name="egg" type="ellipsoid" pos="0.04 0 0"')
         with self.assertRaisesRegex(
-            RobotError, "(?s)ball joint 'f1_2'.*ellipsoid 'egg' of body 'base'.*couples joints by a curve"
+            RobotError,
+            "(?s)ball joint 'f1_2'. Replace it by.*ellipsoid 'egg' of body 'base'. Replace it by.*"
+            "couples joints by a curve that is 0.36 rad .m. off a straight line. Give",
         ):
             read_source(self.file("ball.xml", ball))
+
+    def test_a_tendon_couples_the_joints_that_it_pulls(self):
+        head, _ = MJCF.split("<equality>")
+        tendon = """<tendon><fixed name="t"><joint joint="f1_1" coef="1"/><joint joint="f1_2" coef="0.5"/></fixed>
+          <fixed name="idle"><joint joint="f2_1" coef="1"/></fixed></tendon>
+          <actuator><position tendon="t" kp="2" forcerange="-3 3"/></actuator></mujoco>"""
+        source = read_source(self.file("tendon.xml", head + tendon))
+        self.assertEqual([(m.joint, m.source, m.multiplier) for m in source.mimics], [("f1_2", "f1_1", 0.5)])
+        self.assertEqual(source.effort, {"f1_1": 3 * 1.25})  # the tendon shortens by 1 + 0.5 * 0.5 for each rad
+        self.assertEqual(source.drives["f1_1"].kp, 2 * 1.25**2)
+        self.assertRegex(" ".join(source.notes), "'f1_2' follows 'f1_1', because the tendon 't'.*'idle', which no")
+
+    def test_a_joint_that_follows_a_follower_follows_its_source(self):
+        chained = HAND.replace('joint="f2_1" multiplier="0.8"', 'joint="f1_2" multiplier="0.5"')
+        mimics = {mimic.joint: mimic for mimic in read_source(self.file("chain.urdf", chained)).mimics}
+        self.assertEqual(
+            (mimics["f2_2"].source, mimics["f2_2"].multiplier, mimics["f2_2"].offset),
+            ("f1_1", 0.4, 0.15000000000000002),
+        )
+        circle = HAND.replace('<mimic joint="f1_1"', '<mimic joint="f1_2"')
+        with self.assertRaisesRegex(RobotError, "follow one another in a circle: f1_2"):
+            read_source(self.file("circle.urdf", circle))
+
+    def test_a_gripper_with_closed_loops_becomes_a_jaw(self):
+        made = import_robot(self.arm, self.file("jaw.xml", JAW), self.folder / "mine")
+        spec, found = check_description(made.folder)
+        self.assertEqual([f"{f.topic}: {f.message}" for f in found if f.level == "error"], [])
+        self.assertEqual(len(spec.hand_indices), 1)
+        coupled = {mimic.joint: round(mimic.multiplier, 3) for mimic in spec.mimics}
+        self.assertEqual(coupled, {"l_rocker": 1, "l_finger": -1, "r_crank": 1, "r_rocker": 1, "r_finger": -1})
+        self.assertEqual([tip.contact_links for tip in spec.fingertips], [("l_pad",), ("r_pad",)])
+        notes = "\n".join(made.guessed)
+        self.assertRegex(notes, r"closed loop 'left' is replaced by .*'l_finger', 'l_rocker' with 'l_crank'.* 0.00 mm")
+        self.assertRegex(notes, r"bars of a linkage: l_rod \(at l_pad\), r_rod")
+        away = JAW.replace('anchor="0 0.04 0.03"', 'anchor="0 0.015 0.01"', 1)
+        with self.assertRaisesRegex(RobotError, "loop 'left', whose joints do not move in proportion: .*[0-9] mm"):
+            read_source(self.file("away.xml", away))
 
     def test_damaged_or_huge_mjcf_is_refused(self):
         def asset(text):

@@ -19,8 +19,9 @@ _CURVED = 0.05
 _STILL = 2e-3
 """[rad or m] A joint of a loop that moves by less is fixed."""
 _GAP_WEIGHT = 1e4
-"""[1/m] Against springs, and against staying where the joint was: a spring opens a loop by hundredths of a millimetre."""
+"""[1/m] Weight of a gap against springs, which then open a loop by hundredths of a millimetre."""
 _STAY = 1e-3
+_DIGITS = 5
 
 
 class Line(NamedTuple):
@@ -131,11 +132,18 @@ def _name(model: Any, joint: int) -> str:
     return repr(model.joint(joint).name or f"joint{joint}")
 
 
-def _limits(model: Any, joint: int) -> np.ndarray:
-    """[2] limits of a joint; a turn about where it is in the file if it has none."""
+def _limits(model: Any, joint: int) -> tuple[float, float]:
+    """Return the limits of a joint; half a turn to either side of where it is in the file if it has none."""
     if model.jnt_limited[joint]:
-        return model.jnt_range[joint].copy()
-    return model.qpos0[model.jnt_qposadr[joint]] + np.array([-np.pi, np.pi])
+        low, high = model.jnt_range[joint].tolist()
+        return low, high
+    middle = float(model.qpos0[model.jnt_qposadr[joint]])
+    return middle - np.pi, middle + np.pi
+
+
+def _samples(model: Any, joint: int) -> np.ndarray:
+    low, high = _limits(model, joint)
+    return np.linspace(low, high, _SAMPLES)
 
 
 def _read_equalities(model: Any, mujoco: Any, found: Couplings, lines: list[Line]) -> None:
@@ -158,8 +166,8 @@ def _read_equalities(model: Any, mujoco: Any, found: Couplings, lines: list[Line
             offset = float(equality.data[0])
             multiplier = float(equality.data[1])
             if np.abs(equality.data[2:5]).max() > 0:
-                x = np.linspace(*_limits(model, second), _SAMPLES) - shift
-                offset, multiplier = np.polynomial.Polynomial.fit(x, curve(x), 1).convert().coef.tolist()
+                x = _samples(model, second) - shift
+                multiplier, offset = np.polyfit(x, curve(x), 1).round(_DIGITS).tolist()
                 away = float(np.abs(offset + multiplier * x - curve(x)).max())
                 if away > _CURVED:
                     found.problems.append(
@@ -257,6 +265,10 @@ def _joints_above(model: Any, body: int) -> set[int]:
     return joints
 
 
+def _moving(loops: list[_Loop]) -> frozenset[int]:
+    return frozenset().union(*(loop.joints for loop in loops))
+
+
 def _close(model: Any, mujoco: Any, found: Couplings, loops: list[_Loop], driven: list[int]) -> None:
     """Add lines for the joints of closed loops that nothing else drives."""
     lines = {line.joint: line for line in found.lines}
@@ -267,23 +279,28 @@ def _close(model: Any, mujoco: Any, found: Couplings, loops: list[_Loop], driven
     groups: list[list[_Loop]] = []
     for loop in loops:  # loops that share a joint without a drive are closed together
         free = loop.joints - lines.keys()
-        joined = [group for group in groups if any(free & other.joints for other in group)]
-        groups = [group for group in groups if group not in joined]
-        groups.append([loop, *(other for group in joined for other in group)])  # noqa: XR002
+        apart = []
+        joined = [loop]
+        for group in groups:
+            if free & _moving(group):
+                joined += group
+            else:
+                apart.append(group)
+        groups = [*apart, joined]
     for group in groups:
         names = ", ".join(loop.name for loop in group)
-        joints = frozenset().union(*(loop.joints for loop in group))
+        joints = _moving(group)
         free = sorted(joints - lines.keys() - found.held.keys())
         sources = {lines[joint].source for joint in joints if joint in lines}
         if len(sources) != 1:
             drives = ", ".join(_name(model, joint) for joint in sources) or "none"
             found.problems.append(
-                f"the closed loop {names!r}, which {len(sources)} drives move ({drives}), expected one. Use the maker's "
-                "URDF with mimic joints, or state the coupling as equalities of two joints"
+                f"the closed loop {names!r}, which {len(sources)} drives move ({drives}), expected one. Use the "
+                "maker's URDF with mimic joints, or state the coupling as equalities of two joints"
             )
             continue
         source = sources.pop()
-        values = np.linspace(*_limits(model, source), _SAMPLES)
+        values = _samples(model, source)
         moved = {joint: line for joint, line in lines.items() if line.source == source}
         positions = _closed(model, mujoco, group, free, moved, found.held, values)
         fitted = []
@@ -291,7 +308,7 @@ def _close(model: Any, mujoco: Any, found: Couplings, loops: list[_Loop], driven
             if np.ptp(track) < _STILL:
                 fitted.append(Line(joint, source, 0.0, float(track.mean())))
             else:
-                multiplier, offset = np.polyfit(values, track, 1).tolist()
+                multiplier, offset = (np.polyfit(values, track, 1).round(_DIGITS) + 0.0).tolist()
                 fitted.append(Line(joint, source, multiplier, offset))
         straight = np.stack([line.multiplier * values + line.offset for line in fitted], axis=1)
         data = mujoco.MjData(model)

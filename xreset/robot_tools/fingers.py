@@ -4,28 +4,31 @@ which human keypoint."""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from xreset.errors import RobotError
+from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import surface_of
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import fixed, frame
 from xreset.robot_tools.draft import below, draft_spec, link_places
-from xreset.spec import FingertipSpec, KeypointSpec, MimicSpec
+from xreset.robot_tools.opposition import closing_range, most_opposed, opposition
+from xreset.spec import FingertipSpec, KeypointSpec, MimicSpec, RobotSpec
 
 _FINGERS = ("index", "middle", "ring", "little")
 _WORDS = {
     "thumb": ("thumb",),
-    "index": ("index", "fore"),
-    "middle": ("middle",),
+    "index": ("index", "forefinger"),
     "ring": ("ring",),
-    "little": ("little", "pinky"),
+    "little": ("little", "pinky", "pinkie"),
+    "middle": ("middle",),
 }
-"""Words in the names of a finger's links and joints."""
+"""With which words in the names of a finger's links and joints begin; "middle" may also be a bone."""
 _CODES = {"th": "thumb", "ff": "index", "mf": "middle", "rf": "ring", "lf": "little"}
 """Fingers in names such as ``rh_FFdistal`` and ``THJ5``, as the Shadow hand has them."""
 _CODE = re.compile(r"(?<![a-z])(th|ff|mf|rf|lf)(?=j\d|base|hub|knuckle|metacarpal|proximal|middle|distal|tip)")
@@ -39,6 +42,13 @@ _WRIST_BEHIND = 0.095
 """[m] The human wrist behind the knuckles."""
 _PALM_BEHIND = 0.04
 """[m] The palm's center behind the knuckles."""
+_PIN_SAMPLES = 9
+_PIN = 1e-3
+"""[m] By which the point of a linkage's pin may move in either body."""
+_PIN_TURN = 0.1
+"""Least change of a rotation matrix between two bodies that turn about a pin."""
+_PIN_BESIDE = 5e-3
+"""[m] Least distance of a pin from the bar's own joint."""
 _BEND = 0.15
 """Share of its range by which a finger's joint is bent at home."""
 
@@ -62,13 +72,14 @@ def find_fingers(
     tree: RobotTree, mimics: Sequence[MimicSpec], hand_root: str, folder: Path, thumb: str | None, notes: list[str]
 ) -> list[Finger]:
     """Return the hand's fingers, thumb first, then from the thumb's side on."""
-    chains = _chains(tree, hand_root)
+    spec = draft_spec(tree, mimics, hand_root, folder)
+    chains = _without_bars(spec, _chains(tree, hand_root), notes)
     if len(chains) < 2:
         raise RobotError(
             f"below {hand_root!r} there are {len(chains)} chains of moving links, expected a thumb and at least one "
             "finger."
         )
-    at = link_places(draft_spec(tree, mimics, hand_root, folder), {})
+    at = link_places(spec, {})
     bases = np.array([at[chain.links[0]][:3, 3] for chain in chains])
     ends = np.array([_end(tree, chain, at) for chain in chains])
     stated = [_stated_finger(tree, chain) for chain in chains]
@@ -82,11 +93,13 @@ def find_fingers(
     if len(marked) == 1:
         first = marked[0]
     else:
-        first = _farthest_back(bases, ends)
-        notes.append(
-            f"the thumb is the finger of {', '.join(chains[first].links)}: its base is farthest back (--thumb says "
-            "another)"
-        )
+        tips = [_in_link(at[chain.links[-1]], end) for chain, end in zip(chains, ends, strict=True)]
+        first = most_opposed(opposition(spec, [chain.links[-1] for chain in chains], np.array(tips)))
+        why = "it can oppose the others"
+        if first is None:
+            first = _farthest_back(bases, ends)
+            why = "its base is farthest back"
+        notes.append(f"the thumb is the finger of {', '.join(chains[first].links)}: {why} (--thumb says another)")
     others = [i for i in range(len(chains)) if i != first]
     named = {i: stated[i] for i in others}
     if not set(named.values()) <= set(_FINGERS) or len(set(named.values())) < len(others):
@@ -126,14 +139,58 @@ def _chains(tree: RobotTree, hand_root: str) -> list[Finger]:
     return chains
 
 
+def _drives_of(finger: Finger, sources: Mapping[str, str]) -> set[str]:
+    """Return the joints with a drive that move a finger."""
+    return {sources.get(joint, joint) for joint in finger.joints}
+
+
+def _without_bars(spec: RobotSpec, chains: list[Finger], notes: list[str]) -> list[Finger]:
+    """Return the chains without the bars of linkages: a bar follows the same drive as a longer chain, and is pinned to
+    it."""
+    kinematics = Kinematics(spec, root=spec.hand_root)
+    if not len(kinematics.joint_names):
+        return chains
+    sources = {mimic.joint: mimic.source for mimic in spec.mimics}
+    drives = [_drives_of(chain, sources) for chain in chains]
+    share = torch.linspace(0, 1, _PIN_SAMPLES, dtype=torch.float64)[:, None]
+    poses = kinematics.link_poses(kinematics.lower + share * (kinematics.upper - kinematics.lower)).numpy()
+    bars = {}
+    for i, chain in enumerate(chains):
+        for j, other in enumerate(chains):
+            if drives[i] != drives[j] or len(chain.links) >= len(other.links):
+                continue
+            bar = poses[:, kinematics.link_index(chain.links[-1])]
+            for link in other.links:
+                if _pinned(np.linalg.inv(poses[:, kinematics.link_index(link)]) @ bar):
+                    bars[chain.links[-1]] = link
+    if bars:
+        listed = ", ".join(f"{bar} (at {link})" for bar, link in bars.items())
+        notes.append(f"not fingers, but bars of a linkage: {listed}")
+    return [chain for chain in chains if chain.links[-1] not in bars]
+
+
+def _pinned(relative: np.ndarray) -> bool:
+    """Return whether a body turns about a point that is fixed in another, not about its own frame's origin, where its
+    joint is, given its poses [V, 4, 4] in the other's frame."""
+    rotations = relative[:, :3, :3]
+    identity = np.broadcast_to(-np.eye(3), rotations.shape)
+    A = np.concatenate((rotations, identity), axis=2).reshape(-1, 6)  # R p + t = c
+    b = -relative[:, :3, 3].reshape(-1)
+    point, *_ = np.linalg.lstsq(A, b, rcond=1e-6)
+    gaps = (A @ point - b).reshape(-1, 3)
+    turns = np.ptp(rotations, axis=0).max() > _PIN_TURN
+    return bool(turns and np.linalg.norm(gaps, axis=1).max() < _PIN and np.linalg.norm(point[:3]) > _PIN_BESIDE)
+
+
 def _stated_finger(tree: RobotTree, chain: Finger) -> str:
     """Return the finger that the names of a chain state, or an empty text."""
     fixed_joints = [joint.name for joint in tree.joints if joint.child in chain.rest]
-    text = " ".join((*chain.links, *chain.joints, *chain.rest, *fixed_joints)).lower()
+    text = " ".join((*chain.links, *chain.joints, *chain.rest, *fixed_joints))
+    text = re.sub("(?<=[a-z])(?=[A-Z][a-z])", "_", text).lower()  # leftThumb
     if code := _CODE.search(text):
         return _CODES[code[1]]
     for finger, words in _WORDS.items():
-        if any(word in text for word in words):
+        if re.search(rf"(?<![a-z])({'|'.join(words)})", text):
             return finger
     return ""
 
@@ -158,9 +215,13 @@ def find_palm(
     """Return the palm's frame [4, 4] in the hand root's, poses of links with straight fingers, and how far each joint
     is bent at home [rad]."""
     spec = draft_spec(tree, mimics, hand_root, folder)
+    drive_of = {mimic.joint: mimic.source for mimic in mimics}
     straight = link_places(spec, {})
-    bases = np.array([_on_axis(tree, finger.links[0], straight) for finger in fingers[1:]])
-    ends = np.array([_end(tree, finger, straight) for finger in fingers[1:]])
+    drives = _drives_of(fingers[0], drive_of) | _drives_of(fingers[1], drive_of)
+    is_jaw = len(fingers) == 2 and len(drives) == 1
+    along = fingers if is_jaw else fingers[1:]
+    bases = np.array([_on_axis(tree, finger.links[0], straight) for finger in along])
+    ends = np.array([_end(tree, finger, straight) for finger in along])
     x = ((ends - bases) / np.linalg.norm(ends - bases, axis=1, keepdims=True)).mean(axis=0)
     x /= np.linalg.norm(x)
     bent = {}
@@ -170,16 +231,16 @@ def find_palm(
             if name not in spec.joint_names:
                 continue
             joint = tree.joint(name)
-            zero = float(np.clip(0.0, joint.lower, joint.upper))
-            far = joint.upper if joint.upper - zero > zero - joint.lower else joint.lower
-            lopsided = abs(joint.upper + joint.lower - 2 * zero) / (joint.upper - joint.lower)
-            if lopsided <= 0.4:  # spreading joints go about as far to either side
+            closing = closing_range(joint.lower, joint.upper)
+            if closing is None:
                 continue
-            bent[name] = _BEND * (far - zero)
+            bent[name] = _BEND * closing
             if finger.name != "thumb":
-                at = link_places(spec, {name: zero + 0.5 * (far - zero)})
+                at = link_places(spec, {name: float(np.clip(0.0, joint.lower, joint.upper)) + 0.5 * closing})
                 moved += _end(tree, finger, at) - _end(tree, finger, straight)
     z = moved - (moved @ x) * x
+    if is_jaw:
+        z = np.cross(x, ends[1] - ends[0])  # as in a right hand, whose thumb is against the palm's y
     if np.linalg.norm(z) < 0.01:
         raise RobotError(
             "the fingers do not bend to one side when their joints move, so the palm's inner side is unknown."

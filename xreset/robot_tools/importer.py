@@ -104,12 +104,12 @@ def import_robot(
             f"the hand's root lies {1e3 * stand_off:.0f} mm along z of {mount.parent!r}, so that its body begins "
             "there (--offset)"
         )
-    hand_root = _carrier(whole.tree, mount.child)
+    hand_root, wrist = _palm(whole.tree, mount.child, notes)
     with atomic_folder(out) as work:
-        spec = _described(whole, hand_root, work, thumb, notes)
+        spec = _described(whole, hand_root, wrist, work, thumb, notes)
         (work / DESCRIPTION).write_text(description_text(spec, notes))
         load_robot(work)
-        to_say = (_mounting(spec, mount.parent, T), *_TO_SAY)
+        to_say = (_mounting(spec, mount.parent, wrist, T), *_TO_SAY)
     return Imported(folder=out, guessed=tuple(notes), to_say=to_say)
 
 
@@ -121,9 +121,9 @@ _TO_SAY = (
 )
 
 
-def _mounting(spec: RobotSpec, flange: str, T_flange_hand: np.ndarray) -> str:
+def _mounting(spec: RobotSpec, flange: str, wrist: list[str], T_flange_hand: np.ndarray) -> str:
     """Return how the hand is mounted, and the angles that let its fingers point along the flange's z axis."""
-    at = link_places(spec, {})
+    at = link_places(spec, dict.fromkeys(wrist, 0.0))
     palm = np.linalg.inv(at[flange]) @ at[spec.palm]
     ahead = palm[:3, 0]
     text = (
@@ -154,6 +154,27 @@ def _carrier(tree: RobotTree, link: str) -> str:
     return link
 
 
+def _palm(tree: RobotTree, link: str, notes: list[str]) -> tuple[str, list[str]]:
+    """Return the link after which the fingers part, and the joints before it, which are those of a wrist."""
+    wrist = []
+    link = _carrier(tree, link)
+    while True:
+        inside = set(below(tree, link)) - {link}
+        body = tree.moving_ancestor(link)
+        first = [j for j in tree.joints if j.type != "fixed" and j.child in inside]
+        first = [joint for joint in first if tree.moving_ancestor(joint.parent) == body]
+        if len(first) != 1:
+            break
+        wrist.append(first[0].name)
+        link = _carrier(tree, first[0].child)
+    if wrist:
+        notes.append(
+            f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm. To keep a wrist still, make "
+            "its joints fixed in the hand's file"
+        )
+    return link, wrist
+
+
 def _stand_off(hand: RobotTree, rpy: tuple[float, float, float]) -> float:
     """Distance [m] by which a hand's body would reach behind the flange's origin if its root were there."""
     poses = {hand.root: pose((0, 0, 0), rpy=rpy)}
@@ -168,7 +189,9 @@ def _stand_off(hand: RobotTree, rpy: tuple[float, float, float]) -> float:
     return max(0.0, round(-min(lowest), 3))
 
 
-def _described(source: Source, hand_root: str, folder: Path, thumb: str | None, notes: list[str]) -> RobotSpec:
+def _described(
+    source: Source, hand_root: str, wrist: list[str], folder: Path, thumb: str | None, notes: list[str]
+) -> RobotSpec:
     """Return the robot, its URDF written; what is guessed is appended to the notes."""
     tree = _with_rotors(source, hand_root, notes)
     mimics = source.mimics
@@ -180,7 +203,7 @@ def _described(source: Source, hand_root: str, folder: Path, thumb: str | None, 
         joint = tree.joint(name)
         home[name] = float(np.clip(0.0, joint.lower, joint.upper)) + bent.get(name, 0.0)
     spec = draft_spec(tree, mimics, hand_root, folder, tips=tips, keypoints=keypoints, home=home)
-    spec = _with_arm_home(spec, notes)
+    spec = _with_arm_home(spec, wrist, notes)
     spec = _with_drives(spec, source, notes)
     pairs = always_meeting(spec)
     if pairs:
@@ -209,13 +232,13 @@ def _with_rotors(source: Source, hand_root: str, notes: list[str]) -> RobotTree:
 # Home, drives, collisions ---------------------------------------------------------------------------------------------
 
 
-def _with_arm_home(spec: RobotSpec, notes: list[str]) -> RobotSpec:
-    """Return the robot whose arm at home holds the palm over the table, looking down.
+def _with_arm_home(spec: RobotSpec, wrist: list[str], notes: list[str]) -> RobotSpec:
+    """Return the robot whose arm at home holds the palm over the table, looking down, with a straight wrist.
 
     Of several solutions it is the one farthest from the limits that is clear of the table and of itself.
     """
     kinematics = Kinematics(spec)
-    arm = torch.as_tensor(spec.arm_indices)
+    arm = torch.as_tensor([i for i in spec.arm_indices.tolist() if spec.joint_names[i] not in wrist])
     lower = kinematics.lower[arm]
     upper = kinematics.upper[arm]
     low = lower.clamp_min(-np.pi)

@@ -1,0 +1,63 @@
+"""Which fingertips can meet pad to pad: a thumb can meet fingers, fingers cannot meet each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from xreset.geometry.kinematics import Kinematics
+from xreset.spec import RobotSpec
+
+_SAMPLES = 400
+_NEAR = 0.04
+"""[m] Distance of fingertips that can hold something small between them."""
+_FACING = -0.3
+"""Largest product of the directions in which two fingertips close, as unit vectors, where they face each other."""
+_STEP = 0.02
+"""[rad or m] Step of the joints that gives this direction."""
+_LOPSIDED = 0.4
+
+
+def closing_range(lower: float, upper: float) -> float | None:
+    """Return how far a joint goes from 0, or from the limit nearest to 0, as a finger bends; None for a joint that
+    spreads, which goes about as far to either side."""
+    zero = float(np.clip(0.0, lower, upper))
+    if upper <= lower or abs(upper + lower - 2 * zero) / (upper - lower) <= _LOPSIDED:
+        return None
+    far = upper if upper - zero > zero - lower else lower
+    return far - zero
+
+
+def opposition(robot: RobotSpec, links: Sequence[str], offsets: np.ndarray) -> np.ndarray:
+    """Return for each pair of fingertips [E, E] the share of random joint positions in which they are near each other
+    and close towards each other.
+
+    Args:
+        robot: the robot; only what is below its hand root counts.
+        links: link of each fingertip (length E).
+        offsets: [E, 3] fingertips in their links' frames [m].
+    """
+    kinematics = Kinematics(robot, root=robot.hand_root)
+    generator = torch.Generator().manual_seed(0)
+    draw = torch.rand(_SAMPLES, len(kinematics.joint_names), generator=generator, dtype=torch.float64)
+    q = kinematics.lower + draw * (kinematics.upper - kinematics.lower)
+    ranges = [closing_range(*ends) for ends in zip(kinematics.lower.tolist(), kinematics.upper.tolist(), strict=True)]
+    step = q.new_tensor([_STEP * np.sign(closing or 0.0) for closing in ranges])
+    tips = torch.as_tensor(offsets)
+    here = kinematics.points(q, links, tips)
+    closing = torch.nn.functional.normalize(kinematics.points(q + step, links, tips) - here, dim=-1)
+    meetings = np.zeros((len(links), len(links)))
+    for i in range(len(links)):
+        for j in range(i):
+            near = torch.cdist(here[:, i], here[:, j]) < _NEAR
+            facing = closing[:, i] @ closing[:, j].T < _FACING
+            meetings[i, j] = meetings[j, i] = float((near & facing).double().mean())
+    return meetings
+
+
+def most_opposed(meetings: np.ndarray) -> int | None:
+    """Return the fingertip that opposes the others most, and as many of them as possible; None if none opposes any."""
+    scores = np.sqrt(meetings).sum(axis=1)
+    return int(scores.argmax()) if scores.max() > 0 else None

@@ -39,7 +39,6 @@ from xreset.backends import mujoco_warp_kernels as kernels
 from xreset.backends.mjcf import KNOWN_DIFFERENCES, MujocoSettings, compile_scene
 from xreset.backends.mjcf_model import MIN_FRICTION
 from xreset.backends.mujoco_warp_setup import (
-    TorchStream,
     announced,
     contact_room,
     correct_engine,
@@ -47,8 +46,8 @@ from xreset.backends.mujoco_warp_setup import (
     engine_step,
     existing_device,
     fill_batched,
-    quiet,
 )
+from xreset.torch_warp import TorchStream, quiet
 
 _DRIVE_FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
 _SET_PER_WORLD = (

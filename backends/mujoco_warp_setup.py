@@ -27,18 +27,6 @@ _ANNOUNCE_AFTER = 3.0
 """Seconds after which the wait for kernels is explained. From the cache they take less."""
 
 
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Hold back the line that Warp prints for each of some hundred kernels, in this block only."""
-    level = wp.config.log_level
-    wp.config.log_level = wp.LOG_WARNING
-    try:
-        wp.init()
-        yield
-    finally:
-        wp.config.log_level = level
-
-
 def correct_engine() -> None:
     """Correct the depths of contacts, before any kernel is made; warn where it is unknown whether they are wrong."""
     try:
@@ -140,29 +128,6 @@ def fill_batched(model: Any, scenes: dict[int, SceneModel], object_index: Tensor
         view = wp.to_torch(getattr(model, name))
         table = torch.as_tensor(np.stack(values), device=row.device).to(view.dtype).reshape(len(order), *view.shape[1:])
         view.copy_(table[row])
-
-
-class TorchStream:
-    """Makes Warp work on torch's current stream, so that the work of both is done in the order of the program."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._device = device
-        self._warp_device = wp.device_from_torch(device)
-        self._streams: dict[int, Any] = {}
-
-    @contextmanager
-    def __call__(self) -> Iterator[None]:
-        """Enter a block whose Warp work is queued on torch's current stream."""
-        with wp.ScopedDevice(self._warp_device):
-            if not self._warp_device.is_cuda:
-                yield
-                return
-            stream = torch.cuda.current_stream(self._device)
-            known = self._streams.get(stream.cuda_stream)
-            if known is None:
-                known = self._streams[stream.cuda_stream] = wp.stream_from_torch(stream)
-            with wp.ScopedStream(known, sync_enter=False):
-                yield
 
 
 @contextmanager

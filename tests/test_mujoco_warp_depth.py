@@ -16,7 +16,8 @@ from mujoco_warp._src import collision_convex
 from xreset.backends import mujoco_warp_depth, mujoco_warp_step
 from xreset.backends.conformance.scene import scene
 from xreset.backends.mujoco_warp import MujocoWarpBackend
-from xreset.backends.mujoco_warp_setup import correct_engine, engine_step, quiet
+from xreset.backends.mujoco_warp_setup import correct_engine, engine_step
+from xreset.torch_warp import quiet
 
 WORLDS = 200
 

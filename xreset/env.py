@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from tensordict import TensorDict
 
     from xreset.pictures.render import Renderer
+    from xreset.task.vision import Vision
 
 
 _LASTING = (
@@ -110,6 +111,7 @@ class ManipulationEnv:
         overflow_count: [] number of episodes that ended because the engine dropped contacts.
         faults: the last worlds that failed, before and after the step in which they failed.
         variation: differences between the worlds, such as masses and delays.
+        vision: the cameras; None: the task has none.
     """
 
     def __init__(self, backend: Backend, task: TaskConfig, resets: ResetDistribution, *, seed: int = 0) -> None:
@@ -188,6 +190,11 @@ class ManipulationEnv:
         proprio = obs.layout(len(robot.joints), len(robot.fingertips), self.task.observation)["proprio"]
         randomization = self.task.randomization
         self.variation = Variation(self.backend, randomization, self.actions.is_arm, sum(proprio.values()))
+        self.vision: Vision | None = None
+        if self.task.vision.cameras:
+            from xreset.task.vision import Vision  # Warp, which other tasks do not need
+
+            self.vision = Vision(self.backend, self.task)
         # The state before a step is kept in case the step breaks a world.
         state = self.backend.state()
         self._state_before = {f.name: getattr(state, f.name).clone() for f in fields(state)}
@@ -256,6 +263,7 @@ class ManipulationEnv:
         if self._graphs.active or bool(self._reset_mask.any()):
             self._graphs.run(self._sample_resets)
             self._write_resets()
+        self._look()
         self._graphs.run(self._compute_observations)
         return self.get_observations(), reward, done, extras
 
@@ -266,6 +274,7 @@ class ManipulationEnv:
         self._apply_action(action)
         reading, reward = self._compute_rewards()
         self._reset_mask.zero_()
+        self._look()
         self._compute_observations()
         return reading, reward
 
@@ -287,6 +296,7 @@ class ManipulationEnv:
         before = {name: value.clone() for name, value in lasting.items()}
         self._sample_resets(start is None)
         self._write_resets()
+        self._look()
         self._compute_observations()
         others = ~self._reset_mask
         for name, value in before.items():
@@ -359,7 +369,8 @@ class ManipulationEnv:
     @property
     def _lasting(self) -> dict[str, Tensor]:
         """Buffers that carry each world from step to step, in addition to the engine's state."""
-        return {name: getattr(self, name) for name in _LASTING} | self.variation.lasting()
+        seen = {} if self.vision is None else self.vision.lasting()
+        return {name: getattr(self, name) for name in _LASTING} | self.variation.lasting() | seen
 
     # Parts
 
@@ -456,6 +467,7 @@ class ManipulationEnv:
         self.variation.begin(fresh, start.joint_target)
         for new, old in (
             *self.variation.draw(self.generator),
+            *(self.vision.draw(self.generator) if self.vision is not None else ()),
             (start.goal_pos, self.goal_pos),
             (start.goal_quat, self.goal_quat),
             (start.gravity_fraction, self.gravity_fraction),
@@ -478,6 +490,16 @@ class ManipulationEnv:
         self.backend.set_where(
             self._reset_mask, state, Parameters(**self.variation.parameters, object_gravity=self.gravity_fraction)
         )
+
+    def _look(self) -> None:
+        """Let the cameras take their images."""
+        if self.vision is not None:
+            self._graphs.run(self._aim_cameras)
+            self.vision.cameras.cast()
+
+    def _aim_cameras(self) -> None:
+        if self.vision is not None:
+            self.vision.aim(self.backend.state(), self.goal_pos, self.goal_quat, self._episode_length)
 
     def _compute_observations(self) -> None:
         """Refresh the observations. A fresh world's cloud history is copies, and its best reach is the present one."""
@@ -510,6 +532,9 @@ class ManipulationEnv:
             "perception": self._cloud,
             "privileged": obs.privileged_group(x),
         }
+        if self.vision is not None:
+            groups["goal"] = obs.goal_group(x, c)
+            groups["view"] = self.vision.observe(self._reset_mask, self.generator)
         for name, value in groups.items():
             if name not in self._observations:
                 self._observations[name] = torch.zeros_like(value)

@@ -61,7 +61,7 @@ def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]
         "joint_names": list(robot.joint_names),
         "fingertip_names": list(robot.fingertip_names),
         "objects": list(objects),
-        "observation_layout": layout(len(robot.joints), len(robot.fingertips), task.observation),
+        "observation_layout": layout(len(robot.joints), len(robot.fingertips), task.observation, task.vision),
         "control_dt": task.timestep * task.substeps,
         "task": json.loads(json.dumps(asdict(task))),  # as it will be read back: lists for tuples
     }

@@ -21,11 +21,12 @@ import numpy as np
 
 from xreset.errors import ObjectError, RobotError
 from xreset.files import max_bytes
-from xreset.geometry.shapes import hull, load_mesh
+from xreset.geometry.shapes import hull, load_mesh, shape_mesh
 from xreset.spec import Geometry, RobotSpec, Shape
 from xreset.text import is_plain, shown
 
 if TYPE_CHECKING:
+    import trimesh
     import yourdfpy
 
 JointType = Literal["revolute", "prismatic", "fixed"]
@@ -117,6 +118,19 @@ class RobotTree:
 def robot_tree(robot: RobotSpec) -> RobotTree:
     """Return the tree of a robot's URDF; the file is read again only after a change."""
     return load_urdf(robot.urdf)
+
+
+def link_meshes(robot: RobotSpec) -> list[trimesh.Trimesh | None]:
+    """Return the collision shapes of each link of the robot's URDF as one mesh in the link's frame; None for no
+    shape."""
+    import trimesh
+
+    meshes = []
+    tree = robot_tree(robot)
+    for name in tree.link_names:
+        shapes = [shape_mesh(shape, coarse=True) for shape in tree.link(name).collisions]
+        meshes.append(trimesh.util.concatenate(shapes) if shapes else None)
+    return meshes
 
 
 def load_urdf(path: str | Path) -> RobotTree:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from xreset.geometry.shapes import shape_mesh
 from xreset.geometry.urdf import robot_tree
 from xreset.spec import ObjectSpec, RobotSpec, TableSpec
 
@@ -70,17 +69,6 @@ def shade_smoothly(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def object_mesh(obj: ObjectSpec) -> trimesh.Trimesh:
     """Return the surface of an object in its own frame."""
     return trimesh.Trimesh(obj.vertices, obj.faces, process=False)
-
-
-def link_meshes(robot: RobotSpec) -> list[trimesh.Trimesh | None]:
-    """Return the collision shapes of each link of the robot's URDF as one mesh in the link's frame; None for no
-    shape."""
-    meshes = []
-    tree = robot_tree(robot)
-    for name in tree.link_names:
-        shapes = [shape_mesh(shape, coarse=True) for shape in tree.link(name).collisions]
-        meshes.append(trimesh.util.concatenate(shapes) if shapes else None)
-    return meshes
 
 
 def link_colors(robot: RobotSpec) -> list[Color]:

@@ -19,9 +19,11 @@ import trimesh
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
+from xreset.cameras.config import look_at
 from xreset.errors import XResetError
 from xreset.files import write_whole
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.urdf import link_meshes
 from xreset.pictures.meshes import (
     GOAL_COLOR,
     OBJECT_COLOR,
@@ -29,7 +31,6 @@ from xreset.pictures.meshes import (
     Triangles,
     join,
     link_colors,
-    link_meshes,
     object_mesh,
     place,
     rgb,
@@ -64,13 +65,7 @@ class Camera:
 
     def axes(self) -> np.ndarray:
         """[3, 3] unit vectors to the right, down and forward, as rows."""
-        forward = np.array(self.target) - self.eye
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, (0.0, 0.0, 1.0))
-        if np.linalg.norm(right) < 1e-6:  # straight up or down
-            right = np.array([1.0, 0.0, 0.0])
-        right /= np.linalg.norm(right)
-        return np.stack((right, np.cross(forward, right), forward))
+        return look_at(self.eye, self.target)
 
     def focal_length(self, height: int) -> float:
         """Focal length in pixels of a picture of this height."""

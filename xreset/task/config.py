@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from math import isfinite
 from typing import Annotated, Any, ClassVar, Literal
 
+from xreset.cameras.config import VisionConfig
 from xreset.checks import Checked, Finite, NotNegative, Only, Positive, Range, Share
 
 
@@ -339,6 +340,16 @@ class RandomizationConfig(Checked):
     """Range of the factor on the fingertips' force readings."""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     push: PushConfig = field(default_factory=PushConfig)
+    camera_shift: Range = (0.0, 0.0)
+    """Range of the distance by which a camera is moved, in any direction [m]."""
+    camera_turn: Range = (0.0, 0.0)
+    """Range of the angle by which a camera is turned, about any axis [rad]."""
+    camera_fov: Range = (1.0, 1.0)
+    """Range of the factor on the field of view."""
+    camera_noise: Range = (1.0, 1.0)
+    """Range of the factor on the errors of depth images."""
+    camera_latency: Range = (0.0, 0.0)
+    """Range of the additional age of images [control steps], rounded to whole steps."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -373,6 +384,7 @@ class TaskConfig(Checked):
     termination: TerminationConfig = field(default_factory=TerminationConfig)
     reset: ResetConfig = field(default_factory=ResetConfig)
     randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
+    vision: VisionConfig = field(default_factory=VisionConfig)
     timestep: Positive[Finite[float]] = 1.0 / 240.0
     """Physics timestep [s]."""
     substeps: Positive[int] = 4

@@ -1,7 +1,8 @@
 """Observations (the paper's appendix C), as pure functions, and the layout that a policy file carries.
 
 Groups: ``policy`` (object pose, goal pose, gravity fraction, previous action), ``proprio`` (joints, palm, fingertips,
-contact forces), ``perception`` (cloud history or paired points) and, for the critic only, ``privileged``.
+contact forces), ``perception`` (cloud history or paired points) and, for the critic only, ``privileged``. With cameras
+there are also ``goal`` (goal pose, previous action) and ``view`` (images or points).
 Shape letters: N worlds, J joints, E fingertips, P points, K numbers per point, H history.
 """
 
@@ -13,6 +14,7 @@ from math import prod
 import torch
 from torch import Tensor
 
+from xreset.cameras.config import VisionConfig
 from xreset.geometry.rotations import (
     quat_conjugate,
     quat_from_axis_angle,
@@ -54,13 +56,16 @@ class ObservationInput:
     """[N]"""
 
 
-def layout(num_joints: int, num_tips: int, c: ObservationConfig) -> dict[str, dict[str, int]]:
+def layout(
+    num_joints: int, num_tips: int, c: ObservationConfig, vision: VisionConfig | None = None
+) -> dict[str, dict[str, int]]:
     """Width of every term of the flat groups, in order; a policy fits a task only if this is equal.
 
-    ``perception`` is listed with its number of values H * P * K.
+    ``perception`` is listed with its number of values H * P * K. A policy with cameras gets ``goal``, ``proprio`` and
+    ``view``.
     """
     turn, width = ("quat", 4) if c.rotation == "quaternion" else ("rotation", 6)
-    return {
+    groups = {
         "policy": {
             "object_pos": 3,
             f"object_{turn}": width,
@@ -82,6 +87,14 @@ def layout(num_joints: int, num_tips: int, c: ObservationConfig) -> dict[str, di
         },
         "perception": {"cloud" if c.cloud == "history" else "paired_cloud": prod(c.cloud_shape)},
     }
+    if vision is None or not vision.cameras:
+        return groups
+    goal = ("goal_pos", f"goal_{turn}", "previous_action")
+    return {
+        "goal": {name: groups["policy"][name] for name in goal},
+        "proprio": groups["proprio"],
+        "view": {vision.view: prod(vision.view_shape)},
+    }
 
 
 def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
@@ -91,6 +104,11 @@ def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Gen
     turn = quat_from_axis_angle(noise.object_rot * _normal(x.observed_pos, generator))
     rotation, goal_rotation = _shown(torch.stack((quat_multiply(turn, x.observed_quat), x.goal_quat)), c)
     return torch.cat((pos, rotation, x.goal_pos, goal_rotation, x.gravity_fraction[:, None], x.previous_action), dim=-1)
+
+
+def goal_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
+    """[N, 7 + J] goal pose, previous action; 2 more as matrices."""
+    return torch.cat((x.goal_pos, _shown(x.goal_quat, c), x.previous_action), dim=-1)
 
 
 def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:

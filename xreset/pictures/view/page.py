@@ -17,13 +17,13 @@ import torch
 from xreset.errors import XResetError, needs
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat
+from xreset.geometry.urdf import link_meshes
 from xreset.pictures.meshes import (
     GOAL_COLOR,
     OBJECT_COLOR,
     TABLE_COLORS,
     Color,
     link_colors,
-    link_meshes,
     rgb,
     tint,
 )

@@ -1,0 +1,216 @@
+"""Depth cameras: what the rays hit, errors of the images, the same picture in every engine, timing, and refusals."""
+
+import tempfile
+import unittest
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+
+from tests.toy_bank import SOUP, toy_bank
+from tests.toy_robot import toy_hand_arm
+from xreset.backends.pool import PoolBackend
+from xreset.cameras.config import CameraConfig, DepthNoise, VisionConfig
+from xreset.env import ManipulationEnv, make_scene
+from xreset.errors import BackendUnavailableError, RobotError, XResetError
+from xreset.objects.catalogue import load_objects
+from xreset.physics import State
+from xreset.plugins import backend_class, backend_names, make_backend
+from xreset.resets.distribution import ResetDistribution
+from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfig, evaluation_task
+
+try:
+    from xreset.cameras.sensor import Cameras
+except XResetError as error:
+    raise unittest.SkipTest(str(error)) from error
+
+IDEAL = DepthNoise(spread=0.0, step=0.0, holes=0.0, edges=0.0)
+ABOVE = CameraConfig(pos=(0.57, 0.3, 0.5), target=(0.57, 0.3, 0.0), noise=IDEAL)
+TASK = TaskConfig(distance_points=8, observation=ObservationConfig(cloud_points=4, cloud="paired"))
+SIZE = {"width": 32, "height": 24}
+VISION = VisionConfig(cameras=(ABOVE, replace(ABOVE, pos=(1.0, 0.2, 0.4))), interval=1, **SIZE)
+
+
+class TestCameras(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        folder = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(folder.cleanup)
+        cls.robot = toy_hand_arm(Path(folder.name))
+        cls.objects = tuple(load_objects([SOUP], None))
+        cls.scene = make_scene(cls.robot, cls.objects, TaskConfig())
+        cls.index = torch.zeros(2, dtype=torch.long)
+        cls.state = State.initial(cls.scene, cls.index)
+
+    def cameras(self, vision: VisionConfig = VISION, **options) -> Cameras:
+        return Cameras(self.scene, self.index, vision, **options)
+
+    def look(self, cameras: Cameras, state: State | None = None) -> torch.Tensor:
+        state = state or self.state
+        goal = state.object_pos + torch.tensor([0.0, 0.0, 0.2])
+        cameras.aim(state, goal, state.object_quat, torch.ones(2, dtype=torch.bool))
+        cameras.cast()
+        return cameras.observe(torch.Generator().manual_seed(0))
+
+    def test_depths_along_the_view_axis(self):
+        cameras = self.cameras()
+        view = self.look(cameras)
+        depth = cameras.rays.depth[0, 0]
+        body = cameras.rays.body[0, 0]
+        table, can = body.max() - 1, body.max()
+        torch.testing.assert_close(depth[body == table], torch.full((int((body == table).sum()),), 0.5))
+        top = 0.5 - (self.objects[0].vertices[:, 2].max() + float(self.state.object_pos[0, 2]))
+        self.assertAlmostEqual(float(depth[12, 16]), top, places=4)
+        self.assertEqual(int(body[12, 16]), int(can))
+        # as many pixels as a disk of the can's size has at that depth
+        radius = np.ptp(self.objects[0].vertices[:, 0]) / 2
+        pixels_per_metre = 24 / 2 / np.tan(ABOVE.fov / 2) / top
+        self.assertAlmostEqual(float((body == can).sum()), np.pi * (radius * pixels_per_metre) ** 2, delta=12)
+        torch.testing.assert_close(view[0, 0], ((2.0 - depth) / 1.9).where(depth > 0, 0.0))
+
+    def test_same_state_same_pixels_in_every_engine(self):
+        generator = torch.Generator().manual_seed(1)
+        joints = self.state.joint_pos + 0.2 * torch.rand(self.state.joint_pos.shape, generator=generator)
+        quat = torch.nn.functional.normalize(torch.randn(2, 4, generator=generator), dim=1)
+        state = State.at_rest(joints, self.state.object_pos + torch.tensor([0.02, -0.03, 0.1]), quat)
+        expected = self.look(self.cameras(), state).clone()
+        for name in backend_names():
+            with self.subTest(engine=name):
+                try:
+                    options = {"workers": 0} if issubclass(backend_class(name), PoolBackend) else {}
+                    backend = make_backend(name, self.scene, 2, **options)
+                except BackendUnavailableError as error:
+                    self.skipTest(str(error))
+                with backend:
+                    backend.set_state(state)
+                    view = self.look(self.cameras(), backend.state())
+                differs = (view - expected).abs() > 1e-4
+                self.assertLess(float(differs.float().mean()), 2e-3)  # pixels at an edge may change
+
+    def test_errors_of_depth(self):
+        def image(vision: VisionConfig = VISION, scale: float = 1.0, **noise: float) -> torch.Tensor:
+            camera = replace(ABOVE, noise=replace(IDEAL, **noise))
+            cameras = self.cameras(replace(vision, cameras=(camera, replace(camera, pos=(1.0, 0.2, 0.4)))))
+            cameras.noise_scale.fill_(scale)
+            self.look(cameras)
+            return cameras.image
+
+        exact = image()
+        with self.subTest("spread grows with the square of the depth, and with the scale"):
+            for scale in (1.0, 2.0):
+                error = (image(spread=0.002, scale=scale) - exact) / exact.square().clamp_min(1e-3)
+                self.assertAlmostEqual(float(error[exact > 0].std()), 0.002 * scale, delta=2e-4 * scale)
+        with self.subTest("steps"):
+            steps = 1 / image(step=0.01)[exact > 0] / 0.01
+            self.assertLess(float((steps - steps.round()).abs().max()), 1e-3)
+        with self.subTest("holes"):
+            lost = (image(holes=0.2) == 0) & (exact > 0)
+            self.assertAlmostEqual(float(lost.sum() / (exact > 0).sum()), 0.2, delta=0.04)
+        with self.subTest("edges: around the can, and not on the table"):
+            lost = (image(edges=1.0) == 0) & (exact > 0)
+            self.assertGreater(int(lost[0, 0].sum()), 10)
+            self.assertFalse(bool(lost[0, 0, :, :6].any()))
+
+    def test_points_are_on_the_object(self):
+        cameras = self.cameras(replace(VISION, view="points", points=20, goal_image=True), scale=2.0)
+        cloud = self.look(cameras)
+        self.assertEqual(cloud.shape, (2, 2, 20, 4))
+        self.assertTrue(bool((cloud[..., 3] == 1).all()))
+        points = cloud[..., :3] / 2 - self.state.object_pos[:, None, None]
+        points[:, 1, :, 2] -= 0.2  # the goal is higher
+        low, high = (torch.tensor(getattr(self.objects[0].vertices, end)(axis=0)) for end in ("min", "max"))
+        self.assertTrue(bool(((points > low - 1e-3) & (points < high + 1e-3)).all()))
+
+    def test_a_camera_on_a_link_moves_with_it(self):
+        cameras = self.cameras(
+            replace(VISION, cameras=(CameraConfig(link="palm", pos=(0, 0, 0.2), target=(1, 0, 0.2)),))
+        )
+        self.look(cameras)
+        before = cameras.rays.camera.clone()
+        joints = self.state.joint_pos.clone()
+        joints[:, self.robot.joint_names.index("arm_3")] += 0.1
+        self.look(cameras, replace(self.state, joint_pos=joints))
+        moved = (cameras.rays.camera - before)[0, 0, :3, 3].norm()
+        self.assertAlmostEqual(float(moved), 0.1, places=5)
+
+    def test_refusals(self):
+        for camera, error, words in (
+            (CameraConfig(link="nose"), RobotError, "nose"),
+            (
+                CameraConfig(link="palm", pos=(0, 0, 0.001), target=(1, 0, 0)),
+                XResetError,
+                "inside the robot's link 'palm'",
+            ),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(error, words):
+                self.cameras(replace(VISION, cameras=(camera,)))
+        with (
+            mock.patch("xreset.cameras.rays.wp.launch", side_effect=RuntimeError("no driver")),
+            self.assertRaisesRegex(XResetError, "renderer of depth images cannot start on cpu: no driver"),
+        ):
+            self.cameras()
+        for changes in ({"near": 3.0}, {"fov": 4.0}, {"target": ABOVE.pos}):
+            with self.subTest(changes), self.assertRaises(ValueError):
+                replace(ABOVE, **changes)
+
+
+class TestVisionInTheEnvironment(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        folder = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(folder.cleanup)
+        cls.bank = toy_bank(toy_hand_arm(Path(folder.name)))
+        cls.robot = toy_hand_arm(Path(folder.name))
+        cls.objects = tuple(load_objects(list(cls.bank.object_names), None))
+
+    def make(self, vision: VisionConfig, **changes):
+        task = replace(evaluation_task(TASK), vision=vision, **changes)
+        backend = make_backend("mujoco", make_scene(self.robot, self.objects, task), 2, workers=0)
+        self.addCleanup(backend.close)
+        resets = ResetDistribution(self.bank, self.robot, self.bank.object_names, task.reset, "cpu")
+        return ManipulationEnv(backend, task, resets)
+
+    def play(self, env, steps: int) -> list[torch.Tensor]:
+        views = [env.get_observations()["view"]]
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(steps):
+            env.advance(2 * torch.rand(2, env.num_actions, generator=generator) - 1)
+            views.append(env.get_observations()["view"])
+        return views
+
+    def test_interval_and_latency(self):
+        every = self.play(self.make(VISION), 6)
+        self.assertFalse(torch.equal(every[1], every[2]))
+        third = self.play(self.make(replace(VISION, interval=3)), 6)
+        late = self.play(self.make(replace(VISION, latency=2.0)), 6)
+        drawn = RandomizationConfig(camera_latency=(2.0, 2.0), friction=(0.75, 0.75), mass_scale=(1.0, 1.0))
+        drawn_late = self.play(self.make(VISION, randomization=drawn), 6)
+        for step in range(7):
+            torch.testing.assert_close(third[step], every[step - step % 3])
+            torch.testing.assert_close(late[step], every[max(step - 2, 0)])
+            torch.testing.assert_close(drawn_late[step], late[step])
+
+    def test_a_reset_renews_its_world_alone(self):
+        env = self.make(replace(VISION, interval=50, latency=3.0))
+        self.play(env, 4)
+        before = env.get_observations()["view"]
+        snapshot = env.snapshot()
+        env.reset(torch.tensor([1]))
+        after = env.get_observations()["view"]
+        self.assertTrue(torch.equal(after[0], before[0]))
+        self.assertFalse(torch.equal(after[1], before[1]))
+        self.assertTrue(env.restore(snapshot))
+        self.assertTrue(torch.equal(env.get_observations()["view"], before))
+
+    def test_cameras_are_moved_as_drawn(self):
+        moved = RandomizationConfig(camera_shift=(0.03, 0.03), camera_turn=(0.05, 0.05), camera_fov=(0.9, 1.1))
+        cameras = self.make(VISION, randomization=moved).vision.cameras
+        torch.testing.assert_close(cameras.shift.norm(dim=-1), torch.full((2, 2), 0.03))
+        torch.testing.assert_close(cameras.turn.norm(dim=-1), torch.full((2, 2), 0.05))
+        self.assertEqual(len(cameras.fov_scale.unique()), 4)
+
+
+if __name__ == "__main__":
+    unittest.main()

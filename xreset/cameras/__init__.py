@@ -1,0 +1,1 @@
+"""Depth cameras: what they are (``config``), what they hit (``rays``), and what they deliver (``sensor``)."""

@@ -1,0 +1,114 @@
+"""Depth cameras of a task. The numbers of an ideal camera are 0; the defaults are those of a stereo camera."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+import numpy as np
+
+from xreset.checks import Checked, Finite, NotNegative, Positive, Rule, Share
+
+Point = tuple[Finite[float], Finite[float], Finite[float]]
+Pixels = Annotated[int, Rule("a number from 8 to 1024", lambda n: 8 <= n <= 1024)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthNoise(Checked):
+    """Errors of depth images.
+
+    A stereo camera measures the inverse of the depth, so that its errors grow with the square of the depth (Khoshelham
+    and Elberink 2012, Accuracy and Resolution of Kinect Depth Data).
+    """
+
+    spread: NotNegative[float] = 0.002
+    """Standard deviation of the depth at 1 m [m]."""
+    step: NotNegative[float] = 0.002
+    """Distance between two depths that the camera can tell apart at 1 m [m]."""
+    holes: Share[float] = 0.01
+    """Share of the pixels that see nothing."""
+    edges: Share[float] = 0.5
+    """Share of the pixels next to an edge that see nothing."""
+    edge: Positive[float] = 0.03
+    """Step in depth that counts as an edge [m]. A plane has none, however steeply the camera sees it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraConfig(Checked):
+    """A depth camera, fixed in the world or on a link of the robot."""
+
+    link: str | None = None
+    """Link of the URDF that carries the camera; ``palm`` is the robot's palm; None: the camera is fixed in the
+    world."""
+    pos: Point = (1.20, 0.22, 0.55)
+    """Position of the camera in the frame of the link or of the world [m]."""
+    target: Point = (0.53, 0.22, 0.21)
+    """Point in the middle of the picture, in the same frame [m]. The frame's z axis is up in the picture."""
+    fov: Annotated[float, Rule("an angle between 0.05 and 3 rad", lambda x: 0.05 <= x <= 3.0)] = math.radians(52.0)
+    """Vertical field of view [rad]."""
+    near: NotNegative[float] = 0.1
+    """Least depth that the camera measures [m]."""
+    far: Positive[Finite[float]] = 2.0
+    """Largest depth that the camera measures [m]."""
+    noise: DepthNoise = field(default_factory=DepthNoise)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.near < self.far:
+            raise ValueError(f"near is {self.near}, expected less than far, which is {self.far}")
+        if math.dist(self.pos, self.target) < 1e-3:
+            raise ValueError(f"target is {self.target}, expected another point than pos")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VisionConfig(Checked):
+    """What a policy sees of the object. Without cameras it is told pose and shape."""
+
+    cameras: tuple[CameraConfig, ...] = ()
+    width: Pixels = 64
+    """Pixels of an image, the same for all cameras."""
+    height: Pixels = 64
+    interval: Positive[int] = 2
+    """Control steps from one image to the next: 2 is 30 Hz where control runs at 60 Hz."""
+    latency: NotNegative[float] = 0.0
+    """Age of an image when the policy gets it [control steps], rounded to whole steps."""
+    view: Literal["depth", "points"] = "depth"
+    """``depth``: the images. ``points``: points of the images in the world, without those of the table and the robot,
+    whose geometry is known."""
+    points: Positive[int] = 128
+    """Points of the view ``points``, drawn at random from the pixels."""
+    goal_image: bool = False
+    """Whether the policy also sees the object at its goal: another image for each camera, or as many points."""
+
+    @property
+    def channels(self) -> int:
+        """Images that the policy gets at a time."""
+        return len(self.cameras) * (2 if self.goal_image else 1)
+
+    @property
+    def view_shape(self) -> tuple[int, int, int]:
+        """Shape of one world's view: images, height, width; or clouds, points, coordinates and 1 (0: no point)."""
+        if self.view == "depth":
+            return self.channels, self.height, self.width
+        return 2 if self.goal_image else 1, self.points, 4
+
+
+FRONT = CameraConfig()
+"""A camera in front of the table, opposite the robot."""
+SIDE = CameraConfig(pos=(0.55, -0.45, 0.55), target=(0.55, 0.22, 0.18))
+WRIST = CameraConfig(link="palm", pos=(-0.10, 0.0, 0.06), target=(0.10, 0.0, 0.10), near=0.03, far=1.0, fov=1.4)
+"""A camera behind the palm that looks along the fingers."""
+CAMERAS = {"front": FRONT, "side": SIDE, "wrist": WRIST}
+"""Name -> camera."""
+
+
+def look_at(eye: tuple[float, ...], target: tuple[float, ...]) -> np.ndarray:
+    """Return [3, 3] unit vectors to the right, down and forward, as rows; z is up."""
+    forward = np.array(target, dtype=float) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    if np.linalg.norm(right) < 1e-6:  # straight up or down
+        right = np.array([1.0, 0.0, 0.0])
+    right /= np.linalg.norm(right)
+    return np.stack((right, np.cross(forward, right), forward))

@@ -1,0 +1,160 @@
+"""Depth images of many worlds at once: one ray for each pixel, against the meshes of a world's bodies, in Warp.
+
+The same kernel runs on the CPU and on a GPU, without a display, and draws the states of every engine. Shape letters: N
+worlds, C cameras, B bodies, H x W pixels.
+"""
+
+# Warp compiles the kernels from their source; to a type checker of Python they make no sense.
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportOperatorIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from xreset.errors import XResetError, needs
+
+with needs("warp", "cameras"):
+    import warp as wp
+
+from xreset.torch_warp import TorchStream, quiet
+
+
+@wp.kernel
+def _cast(
+    due: wp.array(dtype=wp.bool),
+    camera: wp.array2d(dtype=wp.mat44),
+    tangent: wp.array2d(dtype=float),
+    pose: wp.array2d(dtype=wp.mat44),
+    mesh: wp.array2d(dtype=wp.uint64),
+    sphere: wp.array2d(dtype=wp.vec4),
+    height: int,
+    width: int,
+    depth: wp.array3d(dtype=float),
+    body: wp.array3d(dtype=wp.int8),
+):
+    world, view, pixel = wp.tid()
+    if not due[world]:
+        return
+    scale = 2.0 * tangent[world, view] / float(height)
+    right = (float(pixel % width) + 0.5 - 0.5 * float(width)) * scale
+    down = (float(pixel // width) + 0.5 - 0.5 * float(height)) * scale
+    length = wp.sqrt(1.0 + right * right + down * down)
+    eye = camera[world, view]
+    start = wp.vec3(eye[0, 3], eye[1, 3], eye[2, 3])
+    ray = wp.transform_vector(eye, wp.vec3(right, down, 1.0)) / length
+    nearest = wp.float32(1.0e6)
+    hit = wp.int32(-1)
+    for i in range(pose.shape[1]):
+        T = pose[world, i]
+        turn = wp.transpose(T)
+        local = wp.transform_vector(turn, start - wp.vec3(T[0, 3], T[1, 3], T[2, 3]))
+        along = wp.transform_vector(turn, ray)
+        ball = sphere[world, i]
+        to_center = wp.vec3(ball[0], ball[1], ball[2]) - local
+        middle = wp.dot(to_center, along)
+        inside = ball[3] * ball[3] - wp.dot(to_center, to_center) + middle * middle
+        if inside > 0.0:
+            half = wp.sqrt(inside)
+            if middle + half > 0.0 and middle - half < nearest:
+                query = wp.mesh_query_ray(mesh[world, i], local, along, nearest)
+                if query.result:
+                    nearest = query.t
+                    hit = i
+    depth[world, view, pixel] = wp.where(hit < 0, 0.0, nearest / length)
+    body[world, view, pixel] = wp.int8(hit)
+
+
+class RayCaster:
+    """Casts the rays of N worlds with C cameras each, and B bodies each.
+
+    Attributes:
+        camera: [N, C, 4, 4] poses of the cameras: x to the right, y down, z forward.
+        tangent: [N, C] tangent of half the vertical field of view.
+        pose: [N, B, 4, 4] poses of the bodies.
+        due: [N] bool: the worlds whose images :meth:`cast` draws; the other images stay.
+        depth: [N, C, H, W] distance along the view axis [m]; 0 where a ray hits nothing.
+        body: [N, C, H, W] int8, index of the body that a ray hits, or -1.
+    """
+
+    def __init__(
+        self,
+        meshes: Sequence[trimesh.Trimesh],
+        bodies: Tensor,
+        cameras: int,
+        size: tuple[int, int],
+        device: torch.device,
+    ) -> None:
+        """Build the meshes' trees and compile the kernel.
+
+        Args:
+            meshes: closed surfaces.
+            bodies: [N, B] index of each body's mesh.
+            cameras: C.
+            size: height and width [pixels].
+            device: where everything lives.
+
+        Raises:
+            XResetError: Warp cannot be used here.
+        """
+        shape = (len(bodies), cameras)
+
+        def poses(*shape: int) -> Tensor:
+            return torch.eye(4, device=device).repeat(*shape, 1, 1)
+
+        self.camera = poses(*shape)
+        self.tangent = torch.ones(shape, device=device)
+        self.pose = poses(*bodies.shape)
+        self.due = torch.ones(len(bodies), dtype=torch.bool, device=device)
+        self.depth = torch.zeros(*shape, *size, device=device)
+        self.body = torch.zeros(*shape, *size, dtype=torch.int8, device=device)
+        balls = torch.tensor([_ball(mesh) for mesh in meshes], dtype=torch.float32)
+        self._sphere = balls[bodies.cpu()].to(device)
+        self._launch: Any = None
+        try:
+            with quiet():
+                self._on_stream = TorchStream(device)
+                with self._on_stream():
+                    self._meshes = [_warp_mesh(mesh) for mesh in meshes]
+                    self._ids = torch.tensor([mesh.id for mesh in self._meshes])[bodies.cpu()].to(device)
+                    self._launch = wp.launch(_cast, (*shape, size[0] * size[1]), self._arrays(*size), record_cmd=True)
+        except Exception as error:  # a missing compiler or driver may fail in any way
+            raise XResetError(
+                f"The renderer of depth images cannot start on {device}: {error}. Use --device cpu, or a policy "
+                "without cameras."
+            ) from error
+
+    def _arrays(self, *size: int) -> list[Any]:
+        return [
+            wp.from_torch(self.due, dtype=wp.bool),
+            wp.from_torch(self.camera, dtype=wp.mat44),
+            wp.from_torch(self.tangent),
+            wp.from_torch(self.pose, dtype=wp.mat44),
+            wp.from_torch(self._ids, dtype=wp.uint64),
+            wp.from_torch(self._sphere, dtype=wp.vec4),
+            *size,
+            wp.from_torch(self.depth.flatten(2)),
+            wp.from_torch(self.body.flatten(2)),
+        ]
+
+    def cast(self) -> None:
+        """Draw the images of the worlds that are due. Nothing waits for a GPU."""
+        with self._on_stream():
+            self._launch.launch()
+
+
+def _ball(mesh: trimesh.Trimesh) -> list[float]:
+    """Return center and radius of a sphere around a mesh."""
+    center = mesh.bounds.mean(axis=0)
+    return [*center, float(np.linalg.norm(mesh.vertices - center, axis=1).max())]
+
+
+def _warp_mesh(mesh: trimesh.Trimesh) -> Any:
+    return wp.Mesh(
+        wp.array(np.float32(mesh.vertices), dtype=wp.vec3), wp.array(np.int32(mesh.faces).ravel(), dtype=int)
+    )

@@ -1,0 +1,250 @@
+"""The depth cameras of N worlds: where they are, when they take an image, and what the policy gets of it.
+
+Shape letters: N worlds, C cameras, H x W pixels, B bodies, P points.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from xreset.cameras.config import CameraConfig, VisionConfig, look_at
+from xreset.cameras.rays import RayCaster
+from xreset.errors import XResetError
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import quat_from_axis_angle, quat_to_matrix
+from xreset.geometry.urdf import link_meshes
+from xreset.objects.sampling import winding_number
+from xreset.physics import State
+from xreset.spec import SceneSpec, TableSpec
+
+
+class Cameras:
+    """Fixed buffers of N worlds. Apart from the rays, a step is torch operations that can be captured in a graph.
+
+    Attributes:
+        rays: what the cameras hit. The last body of a world is its object.
+        shift: [N, C, 3] how far each camera is from where it should be, in its own frame [m].
+        turn: [N, C, 3] rotation of each camera from how it should be, axis times angle, in its own frame [rad].
+        fov_scale: [N, C] factor on the field of view.
+        noise_scale: [N] factor on the errors of depth.
+        image: [N, C, H, W] newest image with its errors [m]; 0 where a pixel sees nothing.
+    """
+
+    def __init__(self, scene: SceneSpec, object_index: Tensor, config: VisionConfig, *, scale: float = 1.0) -> None:
+        """Allocate, and start the renderer.
+
+        Args:
+            scene: the scene.
+            object_index: [N] object of each world, on the device of everything.
+            config: the cameras.
+            scale: factor on the coordinates of points [1/m].
+
+        Raises:
+            XResetError: a camera is inside a body, or the renderer cannot start.
+            RobotError: the robot has no such link.
+        """
+        self.config = config
+        self._scale = scale
+        device = object_index.device
+        robot = scene.robot
+        self._kinematics = Kinematics(robot, dtype=torch.float32, device=device)
+        meshes = dict(zip(self._kinematics.link_names, link_meshes(robot), strict=True))
+        bodies = {name: mesh for name, mesh in meshes.items() if mesh is not None}
+        objects = [trimesh.Trimesh(o.vertices, o.faces, process=False) for o in scene.objects]
+        first_object = len(bodies) + 1
+        self._num_links = len(bodies)
+        mounts = [robot.palm if c.link == "palm" else c.link for c in config.cameras]
+        self._mounts = [None if name is None else len(bodies) + i for i, name in enumerate(mounts)]
+        self._links = [*bodies, *(name or self._kinematics.root for name in mounts)]
+        home = self._kinematics.link_poses(torch.as_tensor(robot.home, dtype=torch.float32, device=device), self._links)
+        _check_outside(config.cameras, self._mounts, home.cpu().numpy(), list(bodies.items()))
+        worlds = len(object_index)
+        fixed = torch.arange(first_object, device=device).expand(worlds, -1)
+        held = first_object + object_index[:, None]
+        size = (config.height, config.width)
+        count = len(config.cameras)
+        surfaces = [*bodies.values(), _table(scene.table), *objects]
+        self.rays = RayCaster(surfaces, torch.cat((fixed, held), dim=1), count, size, device)
+        self._goal_rays = RayCaster(objects, object_index[:, None], count, size, device) if config.goal_image else None
+
+        def tensor(values: list[float] | np.ndarray) -> Tensor:
+            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=device)
+
+        def column(values: list[float]) -> Tensor:
+            return tensor(values).view(-1, 1, 1)
+
+        noise = [c.noise for c in config.cameras]
+        self._near = column([c.near for c in config.cameras])
+        self._far = column([c.far for c in config.cameras])
+        self._spread = column([n.spread for n in noise])
+        self._step = column([n.step for n in noise])
+        self._holes = column([n.holes for n in noise])
+        self._edges = column([n.edges for n in noise])
+        self._edge = column([n.edge for n in noise])
+        self._half_fov = tensor([c.fov / 2 for c in config.cameras])
+        self._mounted = tensor(np.stack([mounted_pose(c) for c in config.cameras]))
+        y, x = torch.meshgrid(*(torch.arange(n, device=device) + 0.5 - n / 2 for n in size), indexing="ij")
+        self._pixels = (
+            torch.stack((x, y), dim=-1).flatten(0, 1) * 2 / config.height
+        )  # at half a field of view of 45 deg
+        self.shift = torch.zeros(worlds, count, 3, device=device)
+        self.turn = torch.zeros_like(self.shift)
+        self.fov_scale = torch.ones(worlds, count, device=device)
+        self.noise_scale = torch.ones(worlds, device=device)
+        self.image = torch.zeros(worlds, count, *size, device=device)
+        self._believed = torch.zeros(worlds, count, 4, 4, device=device)
+        self._view = torch.zeros(worlds, *config.view_shape, device=device)
+
+    def lasting(self) -> dict[str, Tensor]:
+        """Return the buffers that carry each world from step to step, by name."""
+        names = ("shift", "turn", "fov_scale", "noise_scale", "image", "_view")
+        return {f"cameras.{name}": getattr(self, name) for name in names}
+
+    def aim(self, state: State, goal_pos: Tensor, goal_quat: Tensor, due: Tensor) -> None:
+        """Put bodies and cameras where they are.
+
+        Args:
+            state: of all worlds.
+            goal_pos: [N, 3] world frame [m].
+            goal_quat: [N, 4]
+            due: [N] bool: the worlds that take an image now.
+        """
+        rays = self.rays
+        links = self._kinematics.link_poses(state.joint_pos, self._links)
+        rays.pose[:, : self._num_links] = links[:, : self._num_links]
+        _set_pose(rays.pose[:, -1], state.object_pos, state.object_quat)
+        for i, mount in enumerate(self._mounts):
+            self._believed[:, i] = self._mounted[i] if mount is None else links[:, mount] @ self._mounted[i]
+        moved = torch.zeros_like(self._believed)
+        moved[..., :3, 3] = self.shift
+        moved[..., :3, :3] = quat_to_matrix(quat_from_axis_angle(self.turn))
+        moved[..., 3, 3] = 1.0
+        rays.camera.copy_(self._believed @ moved)
+        rays.tangent.copy_((self.fov_scale * self._half_fov).tan())
+        rays.due.copy_(due)
+        if (goal := self._goal_rays) is not None:
+            _set_pose(goal.pose[:, 0], goal_pos, goal_quat)
+            goal.camera.copy_(rays.camera)
+            goal.tangent.copy_(rays.tangent)
+            goal.due.copy_(due)
+
+    def cast(self) -> None:
+        """Draw the images of the worlds that are due."""
+        self.rays.cast()
+        if self._goal_rays is not None:
+            self._goal_rays.cast()
+
+    def observe(self, generator: torch.Generator) -> Tensor:
+        """[N, ...] what the newest images show: :attr:`VisionConfig.view_shape`.
+
+        Depths are 1 at the camera's least depth, 0 at its largest one, and 0 where a pixel sees nothing.
+        """
+        due = self.rays.due.view(-1, 1, 1, 1)
+        self.image.copy_(torch.where(due, self._with_errors(self.rays.depth, generator), self.image))
+        images = [self.image]
+        if self._goal_rays is not None:
+            images.append(self._in_range(self._goal_rays.depth))
+        if self.config.view == "depth":
+            shown = []
+            for image in images:
+                shown.append(torch.where(image > 0, (self._far - image) / (self._far - self._near), 0.0))
+            view = torch.cat(shown, dim=1)
+        else:
+            is_object = [self.rays.body == self.rays.pose.shape[1] - 1, images[-1] > 0]
+            clouds = []
+            for image, mask in zip(images, is_object, strict=False):
+                clouds.append(self._points(image, mask, generator))
+            view = torch.stack(clouds, dim=1)
+        self._view.copy_(torch.where(due, view, self._view))
+        return self._view
+
+    def _in_range(self, depth: Tensor) -> Tensor:
+        return torch.where((depth >= self._near) & (depth <= self._far), depth, 0.0)
+
+    def _with_errors(self, depth: Tensor, generator: torch.Generator) -> Tensor:
+        """Return depths [N, C, H, W] as a camera measures them; 0 where it does not."""
+        scale = self.noise_scale.view(-1, 1, 1, 1)
+        seen = self._in_range(depth)
+        inverse = torch.where(seen > 0, 1.0 / seen.clamp_min(1e-6), 0.0)
+        lost = torch.where(_bend(inverse) * seen.square() > self._edge, self._edges.maximum(self._holes), self._holes)
+        chance = torch.rand(depth.shape, generator=generator, device=depth.device)
+        error = torch.randn(depth.shape, generator=generator, device=depth.device)
+        measured = inverse + scale * self._spread * error
+        step = scale * self._step
+        measured = torch.where(step > 0, (measured / step.clamp_min(1e-9)).round() * step, measured)
+        is_measured = (seen > 0) & (chance >= scale * lost) & (measured > 0)
+        return torch.where(is_measured, self._in_range(1.0 / measured.clamp_min(1e-6)), 0.0)
+
+    def _points(self, image: Tensor, is_object: Tensor, generator: torch.Generator) -> Tensor:
+        """Return P points [N, P, 4] of the object: coordinates in the world where the cameras are believed to be, and
+        1, or zeros where fewer pixels show the object."""
+        depth = image.flatten(2)
+        offset = self._pixels * self._half_fov.tan().view(-1, 1, 1)  # [C, H W, 2]
+        local = torch.cat((offset * depth[..., None], depth[..., None]), dim=-1)
+        pose = self._believed
+        world = (local @ pose[..., :3, :3].mT + pose[..., None, :3, 3]).flatten(1, 2)
+        valid = (is_object.flatten(2) & (depth > 0)).flatten(1)
+        order = torch.rand(valid.shape, generator=generator, device=valid.device) + valid.float()
+        chosen = order.topk(self.config.points, dim=1).indices
+        kept = valid.gather(1, chosen)[..., None].float()
+        points = world.gather(1, chosen[..., None].expand(-1, -1, 3))
+        return torch.cat((self._scale * points * kept, kept), dim=-1)
+
+
+def _bend(inverse: Tensor) -> Tensor:
+    """Return the larger second difference, across or down, of inverse depths [..., H, W].
+
+    It is 0 on a plane, because there the inverse depth is linear in the pixels, and at the border of the picture.
+    """
+    bend = torch.zeros_like(inverse)
+    bend[..., 1:-1] = inverse.diff(n=2).abs()
+    bend[..., 1:-1, :] = bend[..., 1:-1, :].maximum(inverse.diff(n=2, dim=-2).abs())
+    return bend
+
+
+def mounted_pose(camera: CameraConfig) -> np.ndarray:
+    """Return the pose [4, 4] of a camera in the frame of its link or of the world: x right, y down, z forward."""
+    T = np.eye(4)
+    T[:3, :3] = look_at(camera.pos, camera.target).T
+    T[:3, 3] = camera.pos
+    return T
+
+
+def _set_pose(pose: Tensor, pos: Tensor, quat: Tensor) -> None:
+    """Write positions [N, 3] and quaternions [N, 4] into poses [N, 4, 4]."""
+    pose[:, :3, :3] = quat_to_matrix(quat)
+    pose[:, :3, 3] = pos
+
+
+def _table(table: TableSpec) -> trimesh.Trimesh:
+    mesh = trimesh.creation.box(2 * np.array(table.half_size))
+    mesh.apply_translation((*table.center, -table.half_size[2]))
+    return mesh
+
+
+def _check_outside(
+    cameras: tuple[CameraConfig, ...],
+    mounts: list[int | None],
+    poses: np.ndarray,
+    bodies: list[tuple[str, trimesh.Trimesh]],
+) -> None:
+    """Refuse cameras inside a link of the robot at home.
+
+    Args:
+        poses: [L, 4, 4] poses of the bodies, then of the cameras' links.
+        mounts: index of each camera's link among the poses.
+    """
+    for i, (camera, mount) in enumerate(zip(cameras, mounts, strict=True)):
+        eye = mounted_pose(camera)[:, 3]
+        if mount is not None:
+            eye = poses[mount] @ eye
+        for (name, mesh), pose in zip(bodies, poses, strict=False):
+            local = np.linalg.inv(pose) @ eye
+            if winding_number(local[None, :3], mesh.vertices, mesh.faces)[0] > 0.5:
+                raise XResetError(
+                    f"Camera {i + 1} at {camera.pos} is inside the robot's link {name!r} and sees nothing else. "
+                    "Move it out (pos)."
+                )

@@ -59,7 +59,8 @@ class TestCameras(unittest.TestCase):
         view = self.look(cameras)
         depth = cameras.rays.depth[0, 0]
         body = cameras.rays.body[0, 0]
-        table, can = body.max() - 1, body.max()
+        can = body.max()
+        table = can - 1
         torch.testing.assert_close(depth[body == table], torch.full((int((body == table).sum()),), 0.5))
         top = 0.5 - (self.objects[0].vertices[:, 2].max() + float(self.state.object_pos[0, 2]))
         self.assertAlmostEqual(float(depth[12, 16]), top, places=4)

@@ -5,7 +5,7 @@ worlds, C cameras, B bodies, H x W pixels.
 """
 
 # Warp compiles the kernels from their source; to a type checker of Python they make no sense.
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportOperatorIssue=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false, reportAssignmentType=false
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from xreset.torch_warp import TorchStream, quiet
 
 @wp.kernel
 def _cast(
-    due: wp.array(dtype=wp.bool),
-    camera: wp.array2d(dtype=wp.mat44),
-    tangent: wp.array2d(dtype=float),
-    pose: wp.array2d(dtype=wp.mat44),
-    mesh: wp.array2d(dtype=wp.uint64),
-    sphere: wp.array2d(dtype=wp.vec4),
+    due: wp.array[wp.bool],
+    camera: wp.array2d[wp.mat44],
+    tangent: wp.array2d[float],
+    pose: wp.array2d[wp.mat44],
+    mesh: wp.array2d[wp.uint64],
+    sphere: wp.array2d[wp.vec4],
     height: int,
     width: int,
-    depth: wp.array3d(dtype=float),
-    body: wp.array3d(dtype=wp.int8),
+    depth: wp.array3d[float],
+    body: wp.array3d[wp.int8],
 ):
     world, view, pixel = wp.tid()
     if not due[world]:

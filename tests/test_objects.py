@@ -215,12 +215,13 @@ class MeshImport(InFolder):
             np.diag(result.obj.inertia), result.obj.mass / 12 * np.array([0.0052, 0.0116, 0.0136]), rtol=1e-6
         )
         self.assertIn("mass is unknown", result.notes[0])
+        self.assertEqual(result.mass_source, "500 kg/m^3")
         self.assertEqual(import_with_notes(path, "thing", mass=0.2).obj.mass, 0.2)
 
     def test_published_mass_by_name(self):
         path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)), "025_mug")
         result = import_with_notes(path, "025_mug")
-        self.assertEqual(result.obj.mass, 0.118)
+        self.assertEqual((result.obj.mass, result.mass_source), (0.118, "published (YCB)"))
         self.assertEqual(result.notes, ())
 
     @CUTS
@@ -273,7 +274,7 @@ class MeshImport(InFolder):
         whole = self.bracket().subdivide().subdivide()
         path = self.write(trimesh.Trimesh(whole.vertices, whole.faces[1:]))
         result = import_with_notes(path, "thing", mass=1.0)
-        self.assertIn("holes were filled", result.notes[0])
+        self.assertIn("(1 hole, the widest 25 mm): its holes were filled", result.notes[0])
         np.testing.assert_allclose(result.obj.com[:2], (0.003 * 0.05 + 0.0021 * 0.015) / 0.0051, atol=5e-4)
 
     def test_a_hollow_objects_mass_is_on_its_surface(self):
@@ -317,9 +318,26 @@ class MeshImport(InFolder):
             with self.assertRaises(KeyboardInterrupt):
                 add_mesh(path, out, "brick", properties=Properties(mass=0.2))
         out.mkdir()
-        (out / "brick.toml").write_text("mass = 0.2\n")  # killed between the two files
+        (out / "brick.toml").write_text("mass = 0.2\ntolerance = 0.002\n")  # killed between the two files
         add_mesh(path, out, "brick", properties=Properties(mass=0.2))
         self.assertEqual(load_object("brick", out).mass, 0.2)
+
+    @CUTS
+    def test_the_neck_of_a_bottle_stays_free(self):
+        half = [[0, 0], [0.03, 0], [0.03, 0.14], [0.014, 0.16], [0.014, 0.17], [0.018, 0.171], [0.018, 0.18], [0, 0.18]]
+        path = self.write(trimesh.creation.revolve(np.array(half), sections=24))
+        plain = import_with_notes(path, "bottle")
+        self.assertEqual(len(plain.obj.pieces), 1)
+        self.assertRegex(
+            plain.hollows(), r"its convex hull fills hollows up to \d\.\d mm deep, the deepest at \(.*, 1\d\d\) mm"
+        )
+        found = add_mesh(path, self.folder / "objects", "bottle")
+        self.assertGreater(len(found.obj.pieces), 1)
+        self.assertLessEqual(found.deviation, 0.002)
+        self.assertEqual(found.hollows(), "")
+        neck = np.array([[0.0205, 0, 0.157]])
+        self.assertGreater(distance_to_pieces(neck, found.obj)[0], 0.001)
+        self.assertLess(distance_to_pieces(neck, plain.obj)[0], -0.003)
 
     def test_archives_are_refused_or_bounded(self):
         box = trimesh.creation.box((0.1, 0.06, 0.04))

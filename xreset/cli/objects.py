@@ -36,6 +36,7 @@ def import_(
     mass: float | None = None,
     density: float | None = None,
     friction: float | None = None,
+    tolerance: float | None = None,
     png: Path | None = None,
 ) -> None:
     """Cut a mesh, or every mesh of a folder, into convex pieces, and keep them for later runs.
@@ -52,17 +53,18 @@ def import_(
         mass: Mass in kg.
         density: Density in kg/m^3, instead of the mass.
         friction: Friction coefficient: the middle of the range that training and evaluation draw from.
+        tolerance: Largest deviation of the pieces from the surface, in metres; default: 0.002.
         png: Picture to write: the meshes next to their pieces, with the deviation in millimetres.
     """
     try:
-        properties = Properties(mass=mass, density=density, friction=friction)
+        properties = Properties(mass=mass, density=density, friction=friction, tolerance=tolerance)
     except ValueError as error:
         raise ObjectError(f"{error}.") from error
     if path.is_dir():
         if (out, name, scale, properties) != (None, None, 1.0, Properties()):
             raise ObjectError(
-                f"{path} is a folder. --out, --name, --scale, --mass, --density and --friction are for one mesh file."
-                " For a folder, write mass, density and friction into NAME.toml next to each mesh."
+                f"{path} is a folder. --out, --name, --scale, --mass, --density, --friction and --tolerance are for one"
+                " mesh file. For a folder, write these properties into NAME.toml next to each mesh."
             )
         files = meshes.mesh_files(path)
     elif out is None:
@@ -70,7 +72,7 @@ def import_(
     else:
         files = {name or path.stem: path}
     console = Console()
-    table = _table("deviation, mm", "time")
+    table = _table("mass from", "deviation, mm", "time")
     found = []
     notes = []
     with console.status("") as status:
@@ -85,8 +87,8 @@ def import_(
             else:
                 result = meshes.add_mesh(file, out, object_name, scale=scale, properties=properties, progress=progress)
             seconds = "cached" if result.cached else f"{result.seconds:.1f} s"
-            table.add_row(*_cells(result.obj), f"{1e3 * result.deviation:.1f}", seconds)
-            notes += [f"{object_name}: {note}" for note in result.notes]
+            table.add_row(*_cells(result.obj), result.mass_source, f"{1e3 * result.deviation:.1f}", seconds)
+            notes += [f"{object_name}: {note}" for note in (*result.notes, result.hollows()) if note]
             found.append(result)
     console.print(table)
     for note in notes:

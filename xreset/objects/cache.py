@@ -33,13 +33,12 @@ _ALGORITHM = 1
 """Raise it when :mod:`xreset.objects.decompose` gives other pieces than before."""
 
 
-def cached_pieces(mesh: trimesh.Trimesh, source: str, progress: Progress) -> Pieces:
+def cached_pieces(mesh: trimesh.Trimesh, source: str, settings: Settings, progress: Progress) -> Pieces:
     """Return the pieces of a mesh, from the cache if they are there. An unfinished decomposition is not kept.
 
     Args:
         source: SHA-256 of the mesh's file.
     """
-    settings = Settings()
     config = asdict(settings)
     try:
         cutter = version("manifold3d")

@@ -61,13 +61,19 @@ class Settings:
     """Most vertices of each piece."""
     hull_depth: float = 0.05
     """A mesh is one convex piece if no point of its hull is farther from its surface than this fraction of its bounding
-    box's diagonal.
+    box's diagonal; 0: than the tolerance.
 
     The volume ratio would be no good measure: the recessed lids of a tuna can cost as much volume as a pitcher's
     handle.
     """
     tolerance: float = 0.002
     """Largest deviation of the pieces from the surface of a mesh that is more than one piece [m]."""
+
+    @staticmethod
+    def within(tolerance: float | None) -> Settings:
+        """Return the settings for pieces that deviate by at most the tolerance [m]; None: the default."""
+        return Settings() if tolerance is None else Settings(hull_depth=0.0, tolerance=tolerance)
+
     thickness: float = 0.001
     """Thickness of the sheet that stands for a mesh that is not closed [m]."""
     effort: int = 12_000_000
@@ -112,7 +118,8 @@ def decompose(
     surface = _Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     around = mesh.convex_hull
     finished = True
-    if surface.deviation(around.vertices, around.faces) <= settings.hull_depth * np.linalg.norm(mesh.extents):
+    depth = settings.hull_depth * np.linalg.norm(mesh.extents) or settings.tolerance
+    if surface.deviation(around.vertices, around.faces) <= depth:
         shapes: Sequence[Shape] = [limited_hull(mesh.vertices, settings.max_vertices)]
         piece = shape_mesh(shapes[0])
         deviation = surface.deviation(piece.vertices, piece.faces)
@@ -137,6 +144,26 @@ def decompose(
         inertia=inertia,
         finished=finished,
     )
+
+
+def deepest_hollow(mesh: trimesh.Trimesh, shapes: Sequence[Shape]) -> np.ndarray:
+    """Return the point [3] of the pieces that is farthest from the surface of the mesh, of many that are tried [m]."""
+    surface = _Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    points = []
+    for shape in shapes:
+        piece = shape_mesh(shape)
+        points.append(_samples(np.asarray(piece.vertices), np.asarray(piece.faces), 4000)[0])
+    tried = np.concatenate(points)
+    return tried[surface.distance(tried).argmax()]
+
+
+def openings(mesh: trimesh.Trimesh) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the vertices [n] and the edges [n, 2] around each hole of a mesh."""
+    import trimesh
+
+    edges = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
+    loops = trimesh.graph.connected_components(edges, min_len=3)
+    return [(loop, edges[np.isin(edges[:, 0], loop)]) for loop in loops]
 
 
 # Solids
@@ -194,12 +221,11 @@ def _capped(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Close the small holes of a mesh by triangles to their centers."""
     import trimesh
 
-    edges = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
     centers = []
     faces = [np.asarray(mesh.faces)]
-    for loop in trimesh.graph.connected_components(edges, min_len=3):
+    for loop, edges in openings(mesh):
         center = mesh.vertices[loop].mean(axis=0)
-        a, b = edges[np.isin(edges[:, 0], loop)].T
+        a, b = edges.T
         area = np.linalg.norm(np.cross(mesh.vertices[a] - center, mesh.vertices[b] - center), axis=1).sum() / 2
         if area <= _SMALL_HOLE * mesh.area:
             faces.append(np.column_stack((b, a, np.full(len(a), len(mesh.vertices) + len(centers)))))
@@ -221,10 +247,14 @@ class _Surface:
         self._face = np.concatenate((face_of_vertex, face))
         self._tree = cKDTree(self._points)
 
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """[N] distances from points [N, 3] to the nearest of many points of this surface [m]."""
+        return self._tree.query(points)[0]
+
     def quick_deviation(self, vertices: np.ndarray, faces: np.ndarray) -> float:
         """Return the largest distance from a few points of another surface to the nearest of many of this one [m]."""
         points, _ = _samples(vertices, faces, 400)
-        return float(self._tree.query(np.concatenate((vertices, points)))[0].max())
+        return float(self.distance(np.concatenate((vertices, points))).max())
 
     def deviation(self, vertices: np.ndarray, faces: np.ndarray) -> float:
         """Return the largest distance of a point of another surface to this one, to ``_EXACT`` [m].

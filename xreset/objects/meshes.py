@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ from xreset.errors import ObjectError
 from xreset.files import file_hash, write_whole
 from xreset.geometry.shapes import load_mesh, shell_properties
 from xreset.objects.cache import cached_pieces
-from xreset.objects.decompose import Progress, Settings
+from xreset.objects.decompose import Progress, Settings, deepest_hollow, openings
 from xreset.objects.properties import Properties, properties_of
 from xreset.objects.ycb import MASSES
 from xreset.spec import ObjectSpec
@@ -52,6 +52,22 @@ class Import:
     """Whether the convex pieces came from the cache."""
     deviation: float
     """Largest distance between the pieces' surface and the mesh's [m]."""
+    mass_source: str
+    """Where the mass comes from, in words."""
+
+    def hollows(self) -> str:
+        """Return a sentence about what the pieces fill or leave out; empty if they keep to the surface."""
+        if self.deviation <= _FEW_MM:
+            return ""
+        import trimesh
+
+        mesh = trimesh.Trimesh(self.obj.vertices, self.obj.faces, process=False)
+        x, y, z = 1e3 * deepest_hollow(mesh, self.obj.pieces)
+        pieces = f"its {len(self.obj.pieces)} pieces fill" if len(self.obj.pieces) > 1 else "its convex hull fills"
+        return (
+            f"{pieces} hollows up to {1e3 * self.deviation:.1f} mm deep, the deepest at "
+            f"({x:.0f}, {y:.0f}, {z:.0f}) mm. `tolerance = 0.002` in {self.obj.name}.toml keeps them open"
+        )
 
 
 def mesh_files(folder: str | Path) -> dict[str, Path]:
@@ -107,24 +123,32 @@ def import_with_notes(
     own = properties_of(path)
     source = file_hash(path)
     try:
-        pieces = cached_pieces(mesh, source, progress)
+        pieces = cached_pieces(mesh, source, Settings.within(own.tolerance), progress)
     except QhullError as error:
         raise ObjectError(f"{path} spans no volume: it is flat, or damaged. A solid object is needed.") from error
     notes = []
     if not mesh.is_volume:
         thickness = Settings().thickness
+        widths = [1e3 * np.ptp(mesh.vertices[loop], axis=0).max() for loop, _ in openings(mesh)]
+        problem = "the mesh is not closed"
+        if widths:
+            problem += f" ({len(widths)} hole{'s' * (len(widths) > 1)}, the widest {max(widths):.0f} mm)"
         if len(pieces.shapes) == 1:
-            notes.append("the mesh is not closed: volume, center of mass and inertia are those of its convex hull")
+            notes.append(f"{problem}: volume, center of mass and inertia are those of its convex hull")
         elif pieces.volume < 1.5 * mesh.area * thickness:
-            notes.append(f"the mesh is not closed: it is taken as a wall {1e3 * thickness:g} mm thick")
+            notes.append(f"{problem}: it is taken as a wall {1e3 * thickness:g} mm thick")
         else:
-            notes.append("the mesh is not closed: its holes were filled")
+            notes.append(f"{problem}: its holes were filled")
     mass = mass or own.mass
-    if mass is None and own.density is None:
-        mass = MASSES.get(name)
+    mass_source = "stated"
+    if mass is None and own.density is None and name in MASSES:
+        mass = MASSES[name]
+        mass_source = "published (YCB)"
     com = pieces.com
     if mass is None:
-        mass = (own.density or DEFAULT_DENSITY) * pieces.volume
+        density = own.density or DEFAULT_DENSITY
+        mass = density * pieces.volume
+        mass_source = f"{density:g} kg/m^3"
         inertia = pieces.inertia * mass
         if own.density is None:
             notes.append(f"its mass is unknown: {mass:.3f} kg by a density of {DEFAULT_DENSITY:.0f} kg/m^3")
@@ -150,7 +174,14 @@ def import_with_notes(
         friction=own.friction,
     )
     seconds = time.perf_counter() - start
-    return Import(obj=obj, notes=tuple(notes), seconds=seconds, cached=pieces.cached, deviation=pieces.deviation)
+    return Import(
+        obj=obj,
+        notes=tuple(notes),
+        seconds=seconds,
+        cached=pieces.cached,
+        deviation=pieces.deviation,
+        mass_source=mass_source,
+    )
 
 
 def add_mesh(
@@ -165,7 +196,8 @@ def add_mesh(
     """Import a mesh of any format and scale, and put it with its properties as ``NAME.obj`` and ``NAME.toml`` into a
     folder.
 
-    The files are written when the mesh has been cut: a command that was killed can be repeated.
+    The pieces keep to the surface within the tolerance of the properties, 2 mm if they state none. The files are
+    written when the mesh has been cut: a command that was killed can be repeated.
 
     Raises:
         ObjectError: the mesh cannot be used, is not in metres once scaled, or the folder has one of that name; nothing
@@ -176,7 +208,8 @@ def add_mesh(
         raise ObjectError(f"{shown(name)} cannot be an object's name. Use letters, digits, - and _.")
     target = folder / f"{name}.obj"
     facts = target.with_suffix(".toml")
-    known = properties.to_toml() if properties else ""
+    properties = properties or Properties()
+    known = replace(properties, tolerance=properties.tolerance or Settings.tolerance).to_toml()
     if target.exists() or (facts.exists() and facts.read_bytes() != known.encode()):
         raise ObjectError(
             f"{target} or its .toml is there already. Nothing was changed; choose another --name or --out."
@@ -190,8 +223,7 @@ def add_mesh(
         draft.write_text(text)
         draft.with_suffix(".toml").write_text(known)
         result = import_with_notes(draft, name, progress=progress)
-    if known:
-        write_whole(facts, known)
+    write_whole(facts, known)
     write_whole(target, text)
     return result
 

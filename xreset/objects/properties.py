@@ -1,5 +1,5 @@
-"""Physical properties of an object, as ``NAME.toml`` next to its mesh: ``mass`` [kg] or ``density`` [kg/m^3], and
-``friction``."""
+"""Properties of an object, as ``NAME.toml`` next to its mesh: ``mass`` [kg] or ``density`` [kg/m^3], ``friction``, and
+``tolerance`` [m]."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from xreset.errors import ObjectError
 from xreset.files import read_toml
 from xreset.text import shown
 
-_RANGES = {"mass": (1e-4, 50.0), "density": (1.0, 25_000.0), "friction": (0.05, 3.0)}
-"""[kg], [kg/m^3] (osmium has 22,600), coefficient."""
+_RANGES = {"mass": (1e-4, 50.0), "density": (1.0, 25_000.0), "friction": (0.05, 3.0), "tolerance": (5e-4, 0.1)}
+"""[kg], [kg/m^3] (osmium has 22,600), coefficient, [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +25,8 @@ class Properties:
     """[kg/m^3], of the mesh's volume."""
     friction: float | None = None
     """Coefficient of its material; see :attr:`xreset.spec.ObjectSpec.friction`."""
+    tolerance: float | None = None
+    """Largest deviation of the convex pieces from the surface [m]; None: a mesh near its convex hull is one piece."""
 
     def __post_init__(self) -> None:
         for name, value in self.known.items():

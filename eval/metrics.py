@@ -13,14 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from xreset.geometry.rotations import quat_angle
-from xreset.objects.sampling import keypoints, metric_points
+from xreset.objects.sampling import center, keypoints, metric_points
 from xreset.spec import ObjectSpec
 from xreset.task.reading import Reading
 from xreset.task.rewards import contact_gate, keypoint_distance, mean_distance
@@ -51,7 +51,7 @@ class MetricsConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class MetricPoints(Tensors):
-    """Points of N objects, in their frames."""
+    """Points of N objects, in their frames of the task."""
 
     keypoints: Tensor
     """[N, 4, 3] of the draft's reorientation progress."""
@@ -59,15 +59,15 @@ class MetricPoints(Tensors):
     """[N, 64, 3] of the published success."""
 
     @classmethod
-    def of(cls, objects: Sequence[ObjectSpec]) -> Self:
-        """Return the points of some objects."""
+    def of(cls, objects: Sequence[ObjectSpec], frame: Literal["mesh", "center"] = "mesh") -> Self:
+        """Return the points of some objects; ``frame``: ``object_frame`` of the task."""
 
         def stacked(points: list[np.ndarray]) -> Tensor:
             return torch.as_tensor(np.stack(points), dtype=torch.float32)
 
         return cls(
-            keypoints=stacked([keypoints(o) for o in objects]),
-            surface=stacked([metric_points(o) for o in objects]),
+            keypoints=stacked([keypoints(o, frame) for o in objects]),
+            surface=stacked([metric_points(o) - (center(o) if frame == "center" else 0.0) for o in objects]),
         )
 
 
@@ -81,7 +81,7 @@ class EpisodeMetrics:
 
         Args:
             start: reading before the first step.
-            goal_pos: [N, 3]
+            goal_pos: [N, 3] of the object's origin in the task.
             goal_quat: [N, 4]
             points: of each world's object.
         """
@@ -89,7 +89,7 @@ class EpisodeMetrics:
         self._points = points
         self._goal_pos = goal_pos.clone()
         self._goal_quat = goal_quat.clone()
-        self._start_height = start.state.object_pos[:, 2].clone()
+        self._start_height = start.task_state.object_pos[:, 2].clone()
         self._start_distance = self._keypoint_distance(start)
         self._best = self._start_distance.clone()
         far = torch.full_like(self._best, torch.inf)
@@ -139,7 +139,7 @@ class EpisodeMetrics:
 
     def _look(self, reading: Reading) -> None:
         c = self._config
-        state = reading.state
+        state = reading.task_state
         live = ~self._ended
         self.approach |= live & (reading.tip_distance.amin(dim=-1) <= c.approach_distance)
         lifted = state.object_pos[:, 2] - self._start_height >= c.lift
@@ -159,7 +159,7 @@ class EpisodeMetrics:
         self.least_distance = torch.minimum(self.least_distance, self.final_distance)
 
     def _keypoint_distance(self, reading: Reading) -> Tensor:
-        state = reading.state
+        state = reading.task_state
         return keypoint_distance(
             state.object_pos, state.object_quat, self._goal_pos, self._goal_quat, self._points.keypoints
         )

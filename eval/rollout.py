@@ -209,13 +209,14 @@ def play(policy: Policy, env: ManipulationEnv, points: MetricPoints, look: Look)
     """
     policy.begin(env)
     reading = env.reading()
-    result = EpisodeMetrics(reading, env.goal_pos, env.goal_quat, points, MetricsConfig())
+    result = EpisodeMetrics(reading, env.task_goal_pos, env.goal_quat, points, MetricsConfig())
     look(0, reading)
     seconds = 0.0
     for step in range(1, env.max_episode_length + 1):
         before = time.perf_counter()
         reading, _ = env.advance(policy.act(env.get_observations()))
-        result.update(reading, out_of_bounds(reading.state.object_pos, env.backend.scene.table, env.task.termination))
+        lost = out_of_bounds(reading.task_state.object_pos, env.backend.scene.table, env.task.termination)
+        result.update(reading, lost)
         seconds += time.perf_counter() - before
         look(step, reading)
     return result, seconds

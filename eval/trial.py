@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from xreset.env import ManipulationEnv, make_scene
+from xreset.env import ManipulationEnv, make_scene, object_origins
 from xreset.eval.metrics import MetricPoints
 from xreset.eval.policy_spec import PolicySpec
 from xreset.inputs import Data, Kind, load_inputs
@@ -111,7 +111,8 @@ class Trial:
 
     def starts(self, device: str | torch.device = "cpu") -> ResetDistribution:
         """Return the distribution of starts. Drawn on the CPU, they are the same in every engine."""
-        return ResetDistribution(self.bank, self.robot, self.names, self.task.reset, device)
+        pivots = object_origins(self.objects, self.task)
+        return ResetDistribution(self.bank, self.robot, self.names, self.task.reset, device, pivots)
 
     @contextmanager
     def worlds(self, engine: Engine, object_index: Tensor) -> Iterator[tuple[ManipulationEnv, MetricPoints]]:
@@ -126,7 +127,7 @@ class Trial:
         """
         with engine.make(self.scene, len(object_index), object_index) as backend:
             env = ManipulationEnv(backend, self.task, self.starts(backend.device), seed=self.seed)
-            yield env, MetricPoints.of(self.objects).to(backend.device)[backend.object_index]
+            yield env, MetricPoints.of(self.objects, self.task.object_frame).to(backend.device)[backend.object_index]
 
 
 def load_trial(

@@ -10,17 +10,20 @@ from unittest import mock
 
 import numpy as np
 import torch
+import trimesh
+from scipy.spatial.transform import Rotation
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
-from xreset.env import ManipulationEnv, make_scene
+from xreset.env import ManipulationEnv, make_scene, object_origins
 from xreset.errors import CapabilityError
+from xreset.eval.metrics import EpisodeMetrics, MetricPoints, MetricsConfig
 from xreset.eval.rollout import roll_out
 from xreset.eval.trial import Engine, Trial
 from xreset.geometry.rotations import quat_rotate
 from xreset.learning.recipes import RECIPES
-from xreset.objects.catalogue import load_objects
+from xreset.objects.catalogue import load_object, load_objects
 from xreset.physics import State
 from xreset.policy import ZeroPolicy
 from xreset.resets.distribution import ResetDistribution
@@ -487,6 +490,81 @@ class RobustnessTest(WithEnv):
             with waiting:
                 env.step(self.actions(1)[0])  # an engine on the CPU asks which worlds begin anew: that must show
             self.assertEqual(waiting.found, ["aten.nonzero.default"])
+
+
+class ObjectFrameTest(WithEnv):
+    """The same thing, drawn in another place and along other axes of its file."""
+
+    TURN = Rotation.from_euler("xyz", (100, -35, 160), degrees=True)
+    SHIFT = np.array([0.03, -0.12, 0.2])
+
+    @classmethod
+    def setUpClass(cls):
+        super().setUpClass()
+        folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
+        corners = np.random.default_rng(2).normal(size=(14, 3)) * (0.02, 0.03, 0.05)
+        mesh = trimesh.convex.convex_hull(corners + np.array([0.0, 0.01, 0.05]))
+        cls.specs = []
+        for name, vertices in (("drawn", mesh.vertices), ("moved", cls.TURN.apply(mesh.vertices) + cls.SHIFT)):
+            (folder / name).mkdir()
+            trimesh.Trimesh(vertices, mesh.faces, process=False).export(folder / name / f"{SOUP}.obj", digits=12)
+            cls.specs.append(load_object(SOUP, folder / name))
+
+    def moved_bank(self):
+        """The bank with the poses that the moved mesh has where the other one was."""
+        poses = {}
+        bank = toy_bank(self.robot)
+        for pos, quat in (
+            ("start_pos", "start_quat_wxyz"),
+            ("goal_pos", "goal_quat_wxyz"),
+            ("object_pos", "object_quat_wxyz"),
+        ):
+            turn = Rotation.from_quat(getattr(bank, quat), scalar_first=True) * self.TURN.inv()
+            poses[quat] = turn.as_quat(scalar_first=True).astype(np.float32)
+            poses[pos] = (getattr(bank, pos) - turn.apply(self.SHIFT)).astype(np.float32)
+        return toy_bank(self.robot, **poses)
+
+    def played(self, spec, bank, task: TaskConfig) -> list[torch.Tensor]:
+        """Observations, rewards and actions of every step; the action is a function of the observations."""
+        names = (spec.name,)
+        backend = MujocoBackend(make_scene(self.robot, (spec,), task), N, workers=0)
+        self.addCleanup(backend.close)
+        pivots = object_origins((spec,), task)
+        env = ManipulationEnv(backend, task, ResetDistribution(bank, self.robot, names, task.reset, "cpu", pivots))
+        groups = ("policy", "proprio", "perception", "privileged")
+        found = []
+        for _ in range(12):
+            observations = env.get_observations()
+            flat = torch.cat([observations[group].flatten(1) for group in groups], dim=-1)
+            weights = torch.randn(flat.shape[1], 7, generator=torch.Generator().manual_seed(0))
+            action = torch.tanh(0.1 * flat @ weights)
+            _, reward, *_ = env.step(action)
+            found += [flat, action, reward]
+        metrics = EpisodeMetrics(
+            env.reading(),
+            env.task_goal_pos,
+            env.goal_quat,
+            MetricPoints.of((spec,) * N, task.object_frame),
+            MetricsConfig(),
+        )
+        return [*found, metrics.final_distance, metrics.final_position_error, metrics.final_angle, metrics._best]
+
+    def test_the_frame_of_a_mesh_does_not_matter(self):
+        base = RECIPES["minutes"].config.task
+        reset = replace(base.reset, goal_xy=0.03, goal_z=0.05, goal_yaw=0.5, training_xy=0.05)
+        task = replace(
+            base,
+            object_frame="center",
+            reset=reset,
+            distance_points=64,
+            observation=replace(base.observation, rotation="to_goal"),
+        )
+        one = self.played(self.specs[0], toy_bank(self.robot), task)
+        other = self.played(self.specs[1], self.moved_bank(), task)
+        for step, (a, b) in enumerate(zip(one, other, strict=True)):
+            torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5, msg=lambda text, step=step: f"{step}: {text}")
+        away = self.played(self.specs[0], toy_bank(self.robot), replace(task, object_frame="mesh"))[0]
+        self.assertGreater(float((one[0] - away).abs().max()), 0.01)
 
 
 class FailureTest(WithEnv):

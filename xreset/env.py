@@ -16,7 +16,8 @@ from torch import Tensor
 
 from xreset.capture import GraphRunner
 from xreset.faults import FaultRecorder
-from xreset.objects.sampling import keypoints, surface_points
+from xreset.geometry.rotations import quat_rotate
+from xreset.objects.sampling import center, keypoints, surface_points
 from xreset.physics import Backend, Parameters, State
 from xreset.plugins import make_backend
 from xreset.resets.bank import ResetBank
@@ -85,11 +86,20 @@ def make_env(
     objects = tuple(objects)
     backend = make_backend(engine, make_scene(robot, objects, task), num_envs, device=device)
     try:
-        resets = ResetDistribution(bank, robot, tuple(o.name for o in objects), task.reset, backend.device)
+        names = tuple(o.name for o in objects)
+        pivots = object_origins(objects, task)
+        resets = ResetDistribution(bank, robot, names, task.reset, backend.device, pivots)
         return ManipulationEnv(backend, task, resets, seed=seed)
     except BaseException:
         backend.close()
         raise
+
+
+def object_origins(objects: Sequence[ObjectSpec], task: TaskConfig) -> dict[str, np.ndarray] | None:
+    """Return the origin [3] of each object in the task, in its mesh frame, by name; None: the mesh's own."""
+    if task.object_frame == "mesh":
+        return None
+    return {o.name: center(o) for o in objects}
 
 
 class ManipulationEnv:
@@ -145,7 +155,11 @@ class ManipulationEnv:
 
         self._cloud_points = per_object(lambda o: surface_points(o, task.observation.cloud_points))
         self._surface_points = per_object(lambda o: surface_points(o, task.distance_points))
-        self._keypoints = per_object(keypoints)
+        self._keypoints = per_object(lambda o: keypoints(o, task.object_frame))
+        self._center = None
+        if task.object_frame == "center":
+            self._center = per_object(center)
+            self._cloud_points = self._cloud_points - self._center[:, None]
         lower = self.actions.lower
         upper = self.actions.upper
         self._joint_lower = torch.where(lower.isfinite(), lower, -torch.pi)
@@ -304,7 +318,16 @@ class ManipulationEnv:
 
     def reading(self) -> Reading:
         """Return the present physical state and what follows from it."""
-        return Reading.of(self.backend, self._surface_points, self._bad_action)
+        return Reading.of(self.backend, self._surface_points, self._bad_action, self._center)
+
+    @property
+    def task_goal_pos(self) -> Tensor:
+        """[N, 3] goal position of the object's origin in the task (``TaskConfig.object_frame``)."""
+        return self._task_origin(self.goal_pos, self.goal_quat)
+
+    def _task_origin(self, pos: Tensor, quat: Tensor) -> Tensor:
+        """Return where the object's origin in the task is [N, 3] when its mesh frame has given poses."""
+        return pos if self._center is None else pos + quat_rotate(quat, self._center)
 
     def render(self, world: int = 0, size: tuple[int, int] = (640, 480)) -> np.ndarray:
         """Return a picture of one world, [H, W, 3] uint8, with the goal as a translucent object.
@@ -406,7 +429,8 @@ class ManipulationEnv:
         self.nonfinite_count += (self._faulty & broken).sum()
         self.overflow_count += (self._faulty & ~broken).sum()
         self.faults.record(self._faulty, self._fault_values(reading.state))
-        lost = out_of_bounds(reading.state.object_pos, self.backend.scene.table, self.task.termination) & ~broken
+        state = reading.task_state
+        lost = out_of_bounds(state.object_pos, self.backend.scene.table, self.task.termination) & ~broken
         reach = reading.tip_distance.mean(dim=-1)
         self._best_reach.copy_(torch.where(broken, self._best_reach, torch.minimum(self._best_reach, reach)))
         start_pos, start_quat = self.resets.start_pose(self.sequence)
@@ -415,10 +439,10 @@ class ManipulationEnv:
                 tip_distance=reading.tip_distance,
                 best_reach=self._best_reach.clone(),
                 tip_force=reading.contacts.tip_force,
-                state=reading.state,
-                goal_pos=self.goal_pos,
+                state=state,
+                goal_pos=self.task_goal_pos,
                 goal_quat=self.goal_quat,
-                start_pos=start_pos,
+                start_pos=self._task_origin(start_pos, start_quat),
                 start_quat=start_quat,
                 keypoints=self._keypoints,
                 action=self._action,
@@ -504,18 +528,19 @@ class ManipulationEnv:
     def _compute_observations(self) -> None:
         """Refresh the observations. A fresh world's cloud history is copies, and its best reach is the present one."""
         reading = self.reading()
+        state = reading.task_state
         c = self.task.observation
         self._best_reach.copy_(torch.where(self._reset_mask, reading.tip_distance.mean(dim=-1), self._best_reach))
-        observed_pos, observed_quat = self.variation.observed_pose(reading.state, self._reset_mask, self.generator)
+        observed_pos, observed_quat = self.variation.observed_pose(state, self._reset_mask, self.generator)
         x = obs.ObservationInput(
-            state=reading.state,
+            state=state,
             links=reading.links,
             joint_target=self._target,
             joint_lower=self._joint_lower,
             joint_upper=self._joint_upper,
             observed_pos=observed_pos,
             observed_quat=observed_quat,
-            goal_pos=self.goal_pos,
+            goal_pos=self.task_goal_pos,
             goal_quat=self.goal_quat,
             gravity_fraction=self.gravity_fraction,
             previous_action=self._previous_action.clamp(-1.0, 1.0),

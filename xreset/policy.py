@@ -93,6 +93,7 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
         ("another observation layout", _widths(contract), _widths(here)),
         ("another action mapping", asdict(trained.action), asdict(task.action)),
         ("other scales of observations", _scales(trained), _scales(task)),
+        ("another frame of objects", *({"object_frame": t.object_frame} for t in (trained, task))),
     ):
         names = [name for name in of_policy | of_task if of_policy.get(name) != of_task.get(name)]
         if names:

@@ -80,6 +80,8 @@ _LIVE = replace(
     _ROBUST,
     task=replace(
         _ROBUST.task,
+        object_frame="center",
+        observation=replace(_ROBUST.task.observation, rotation="to_goal"),
         reset=replace(_ROBUST.task.reset, goal_xy=0.03, goal_z=0.05, goal_yaw=pi / 6),
         randomization=replace(
             _ROBUST.task.randomization,
@@ -120,7 +122,10 @@ RECIPES: dict[str, Recipe] = {
     ),
     "live": Recipe(
         config=_LIVE,
-        about="robust, for a real loop: late and lost actions, a late and faulty pose tracker, pushes, moved goals",
+        about=(
+            "robust, for a real loop: late and lost actions, a late and faulty pose tracker, pushes, moved goals; the "
+            "frame of a mesh does not matter"
+        ),
     ),
 }
 """Name -> recipe."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from xreset.spec import ObjectSpec
 
@@ -89,12 +92,26 @@ def bounding_box(obj: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:
     return obj.vertices.min(axis=0), obj.vertices.max(axis=0)
 
 
-def keypoints(obj: ObjectSpec) -> np.ndarray:
+def center(obj: ObjectSpec) -> np.ndarray:
+    """[3] center of volume of the object's convex hull: defined for any mesh, and independent of its origin, axes and
+    triangles."""
+    hull = ConvexHull(obj.vertices)
+    inside = hull.points[hull.vertices].mean(axis=0)
+    corners = hull.points[hull.simplices] - inside
+    volumes = np.abs(np.linalg.det(corners))
+    return inside + volumes @ corners.sum(axis=1) / (4 * volumes.sum())
+
+
+def keypoints(obj: ObjectSpec, frame: Literal["mesh", "center"] = "mesh") -> np.ndarray:
     """[4, 3] the object-frame keypoints of the pose metric (the paper, appendix A).
 
     The paper does not define them; here they are four alternating corners of the axis-aligned bounding box: a
-    tetrahedron, so that no rotation leaves all four in place, at the object's own scale.
+    tetrahedron, so that no rotation leaves all four in place, at the object's own scale. A box depends on the axes of
+    the mesh: with the frame ``center`` they are the first four of :func:`metric_points`, which are far from each other
+    too, relative to :func:`center`.
     """
+    if frame == "center":
+        return metric_points(obj)[:4] - center(obj)
     corners = np.array(bounding_box(obj))
     pick = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]])
     return corners[pick, np.arange(3)]

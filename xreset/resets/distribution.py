@@ -6,6 +6,7 @@ restores a demonstrated hand-object state. The goal is the last object pose of t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import DemoError
-from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply
+from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply, quat_rotate
 from xreset.geometry.urdf import robot_tree
 from xreset.resets.bank import ResetBank
 from xreset.spec import GRAVITY, RobotSpec
@@ -108,6 +109,7 @@ class ResetDistribution:
         object_names: tuple[str, ...],
         config: ResetConfig,
         device: torch.device | str = "cpu",
+        pivots: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Prepare the tables.
 
@@ -117,6 +119,8 @@ class ResetDistribution:
             object_names: objects of the scene, in the scene's order.
             config: how resets are drawn.
             device: where the tensors live.
+            pivots: point [3] of each object, by name, about which starts and goals are turned, and whose height decides
+                how low a goal may be; in its mesh frame [m]. None: the origin of that frame.
 
         Raises:
             DemoError: an object of the scene has no demonstration in the bank.
@@ -138,6 +142,11 @@ class ResetDistribution:
         self._start_quat = _tensor(bank.start_quat_wxyz, device)
         self._goal_pos = _tensor(bank.goal_pos, device)
         self._goal_quat = _tensor(bank.goal_quat_wxyz, device)
+        self._pivots: Tensor | None = None
+        """[S, 3] of each demonstration's object."""
+        if pivots is not None:
+            of_known = [pivots.get(str(name), np.zeros(3)) for name in bank.sequence_object]
+            self._pivots = _tensor(np.array(of_known), device)
         joints = [robot_tree(robot).joint(name) for name in robot.joint_names]
         self._lower = _tensor(np.array([float(joint.lower) for joint in joints]), device)
         self._upper = _tensor(np.array([float(joint.upper) for joint in joints]), device)
@@ -182,13 +191,15 @@ class ResetDistribution:
         offset = torch.cat((shift[:, :2] * spawn_xy, torch.zeros(m, 1, device=device)), dim=-1)
         yaw = torch.cat((torch.zeros(m, 2, device=device), shift[:, 2:] * c.spawn_yaw), dim=-1)
         start_pos, start_quat = self.start_pose(sequence)
+        object_quat = quat_multiply(quat_from_axis_angle(yaw), start_quat)
+        object_pos = self._turned(start_pos, start_quat, object_quat, sequence) + offset
         gravity = 1.0 + torch.randn(m, generator=generator, device=device) * c.home_gravity_std / GRAVITY
-        goal_pos, goal_quat = self._moved_goal(sequence, start_pos, generator)
+        goal_pos, goal_quat = self._moved_goal(sequence, generator)
         return Reset(
             joint_pos=joint_pos,
             joint_target=joint_pos,
-            object_pos=start_pos + offset,
-            object_quat=quat_multiply(quat_from_axis_angle(yaw), start_quat),
+            object_pos=object_pos,
+            object_quat=object_quat,
             goal_pos=goal_pos,
             goal_quat=goal_quat,
             gravity_fraction=gravity.clamp(1.0 - c.home_gravity_clip, 1.0 + c.home_gravity_clip),
@@ -196,7 +207,14 @@ class ResetDistribution:
             sequence=sequence,
         )
 
-    def _moved_goal(self, sequence: Tensor, start_pos: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def _turned(self, pos: Tensor, quat: Tensor, new_quat: Tensor, sequence: Tensor) -> Tensor:
+        """Return positions [M, 3] of objects that turn about their pivots, from orientations [M, 4] to new ones."""
+        if self._pivots is None:
+            return pos
+        pivot = self._pivots[sequence]
+        return pos + quat_rotate(quat, pivot) - quat_rotate(new_quat, pivot)
+
+    def _moved_goal(self, sequence: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return goals [M, 3], [M, 4] of given demonstrations [M], perturbed as configured."""
         c = self.config
         pos = self._goal_pos[sequence]
@@ -205,8 +223,10 @@ class ResetDistribution:
             return pos, quat
         uniform = torch.rand(len(pos), 4, generator=generator, device=generator.device)
         shift = (2.0 * uniform - 1.0) * self._goal_shift
-        moved = pos + shift[:, :3]
-        lowest = torch.minimum(pos[:, 2], start_pos[:, 2])
-        height = torch.maximum(moved[:, 2], lowest)
         yaw = torch.cat((torch.zeros_like(shift[:, :2]), shift[:, 3:]), dim=-1)
-        return torch.cat((moved[:, :2], height[:, None]), dim=-1), quat_multiply(quat_from_axis_angle(yaw), quat)
+        new_quat = quat_multiply(quat_from_axis_angle(yaw), quat)
+        moved = self._turned(pos, quat, new_quat, sequence)
+        start_pos, start_quat = self.start_pose(sequence)
+        above_start = (self._turned(pos, quat, start_quat, sequence) - start_pos)[:, 2]
+        rise = torch.maximum(shift[:, 2], -above_start.clamp_min(0.0))
+        return moved + torch.cat((shift[:, :2], rise[:, None]), dim=-1), new_quat

@@ -76,9 +76,11 @@ class ObservationConfig(Checked):
     by point."""
     cloud_history: Annotated[Positive[int], Only("cloud", "history")] = 5
     """Frames of cloud history, oldest first."""
-    rotation: Literal["quaternion", "matrix"] = "quaternion"
+    rotation: Literal["quaternion", "matrix", "to_goal"] = "quaternion"
     """``quaternion``: a quaternion with w >= 0, which jumps where w is 0. ``matrix``: the first two columns of the
-    rotation matrix, which never jump (Zhou et al. 2019, On the Continuity of Rotation Representations)."""
+    rotation matrix, which never jump (Zhou et al. 2019, On the Continuity of Rotation Representations). ``to_goal``: in
+    place of the orientations of object and goal, the columns of the rotation that leads from one to the other, along
+    the world's axes. It does not depend on the axes in which a mesh was drawn."""
     cloud_scale: Positive[Finite[float]] = 1.0
     """Factor on the clouds' coordinates [1/m]."""
     contact_force_scale: NotNegative[float] = 0.1
@@ -389,6 +391,11 @@ class TaskConfig(Checked):
     """Physics timestep [s]."""
     substeps: Positive[int] = 4
     """Physics steps per control step: control at 60 Hz. Not in the paper."""
+    object_frame: Literal["mesh", "center"] = "mesh"
+    """Origin of the object in observations, rewards, ends of episodes, perturbed starts and goals, and the draft's
+    metrics. ``mesh``: the origin of the mesh file (the paper), so that it matters where somebody put it. ``center``:
+    :func:`xreset.objects.sampling.center`, the same point of the object whatever the file's origin and axes. With
+    ``observation.rotation="to_goal"`` and ``observation.cloud="paired"`` the file's axes have no effect either."""
     distance_points: Positive[int] = 256
     """Surface points per object for fingertip distances."""
 

@@ -65,12 +65,12 @@ def layout(
     ``view``.
     """
     turn, width = ("quat", 4) if c.rotation == "quaternion" else ("rotation", 6)
+    pose = {"object_pos": 3, f"object_{turn}": width, "goal_pos": 3, f"goal_{turn}": width}
+    if c.rotation == "to_goal":
+        pose = {"object_pos": 3, "goal_pos": 3, "rotation_to_goal": 6}
     groups = {
         "policy": {
-            "object_pos": 3,
-            f"object_{turn}": width,
-            "goal_pos": 3,
-            f"goal_{turn}": width,
+            **pose,
             "gravity_fraction": 1,
             "previous_action": num_joints,
         },
@@ -89,20 +89,26 @@ def layout(
     }
     if vision is None or not vision.cameras:
         return groups
-    goal = ("goal_pos", f"goal_{turn}", "previous_action")
     return {
-        "goal": {name: groups["policy"][name] for name in goal},
+        "goal": {"goal_pos": 3, f"goal_{turn}": width, "previous_action": num_joints},
         "proprio": groups["proprio"],
         "view": {vision.view: prod(vision.view_shape)},
     }
 
 
 def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
-    """[N, 15 + J] object pose (noisy), goal pose, gravity fraction, previous action; 4 more as matrices."""
+    """[N, 15 + J] object pose (noisy), goal pose, gravity fraction, previous action.
+
+    With ``rotation="matrix"`` there are four numbers more, with ``to_goal`` two less.
+    """
     noise = c.noise
     pos = x.observed_pos + noise.object_pos * _normal(x.observed_pos, generator)
     turn = quat_from_axis_angle(noise.object_rot * _normal(x.observed_pos, generator))
-    rotation, goal_rotation = _shown(torch.stack((quat_multiply(turn, x.observed_quat), x.goal_quat)), c)
+    observed_quat = quat_multiply(turn, x.observed_quat)
+    if c.rotation == "to_goal":
+        to_goal = _shown(quat_multiply(x.goal_quat, quat_conjugate(observed_quat)), c)
+        return torch.cat((pos, x.goal_pos, to_goal, x.gravity_fraction[:, None], x.previous_action), dim=-1)
+    rotation, goal_rotation = _shown(torch.stack((observed_quat, x.goal_quat)), c)
     return torch.cat((pos, rotation, x.goal_pos, goal_rotation, x.gravity_fraction[:, None], x.previous_action), dim=-1)
 
 
@@ -114,8 +120,8 @@ def goal_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
 def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
     """[N, 2 J + 13 + 6 E] joints, palm, fingertips and limited contact forces.
 
-    Joint positions are scaled to [-1, 1] between their limits. With ``rotation="matrix"`` there are two numbers more,
-    with ``joint_target`` J more.
+    Joint positions are scaled to [-1, 1] between their limits. Without quaternions there are two numbers more, with
+    ``joint_target`` J more.
     """
     pos = x.state.joint_pos + c.noise.joint_pos * _normal(x.state.joint_pos, generator)
     vel = x.state.joint_vel + c.noise.joint_vel * _normal(x.state.joint_vel, generator)

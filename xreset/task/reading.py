@@ -8,7 +8,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from xreset.geometry.rotations import quat_rotate_inverse
+from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.physics import Backend, Contacts, Health, Links, State
 from xreset.task.rewards import Reward
 
@@ -24,14 +24,29 @@ class Reading:
     """Health of the engine. A world that was given an action that is not finite counts as not finite."""
     tip_distance: Tensor
     """[N, E] distance from each fingertip to the object's surface points [m]."""
+    center: Tensor | None = None
+    """[N, 3] origin of each world's object in the task, in its mesh frame [m]; None: the mesh's origin."""
+
+    @property
+    def task_state(self) -> State:
+        """The state with the object's origin where the task has it (``TaskConfig.object_frame``)."""
+        if self.center is None:
+            return self.state
+        arm = quat_rotate(self.state.object_quat, self.center)
+        return replace(
+            self.state,
+            object_pos=self.state.object_pos + arm,
+            object_linvel=self.state.object_linvel + torch.linalg.cross(self.state.object_angvel, arm),
+        )
 
     @classmethod
-    def of(cls, backend: Backend, surface_points: Tensor, bad_action: Tensor) -> Self:
+    def of(cls, backend: Backend, surface_points: Tensor, bad_action: Tensor, center: Tensor | None = None) -> Self:
         """Read a backend.
 
         Args:
-            surface_points: [N, P, 3] on each world's object, in its frame [m].
+            surface_points: [N, P, 3] on each world's object, in its mesh frame [m].
             bad_action: [N] bool, worlds that were given an action that is not finite.
+            center: the field of this name.
         """
         state = backend.state()
         links = backend.links()
@@ -43,6 +58,7 @@ class Reading:
             contacts=backend.contacts(),
             health=replace(health, nonfinite=health.nonfinite | bad_action),
             tip_distance=torch.cdist(local, surface_points).amin(dim=-1),
+            center=center,
         )
 
 

@@ -61,6 +61,15 @@ def rotate(quat: Array, vector: Array) -> Array:
     return _fused(w, t, v) + _cross(u, t)
 
 
+def _multiply(a: Array, b: Array) -> Array:
+    """[N, 4] product of quaternions [N, 4], in float32: rotation b first, then a."""
+    aw, u = a[:, :1], a[:, 1:]
+    bw, v = b[:, :1], b[:, 1:]
+    products = a * b
+    w = products[:, :1] - ((products[:, 1] + products[:, 2]) + products[:, 3])[:, None]
+    return np.concatenate((w, _fused(bw, u, _fused(aw, v, _cross(u, v)))), axis=1)
+
+
 def _shown(quat: Array, rotation: str) -> Array:
     """[N, 4] or [N, 6] a rotation as the policy observes it."""
     if rotation == "quaternion":
@@ -332,7 +341,9 @@ class Controller:
         self.step_size = self._mapping["step"]
         self._is_arm = np.array([joint["group"] == "arm" for joint in joints])
 
-    def begin(self, object_points: Array, goal_pos: Array, goal_quat: Array, target: Array) -> None:
+    def begin(
+        self, object_points: Array, goal_pos: Array, goal_quat: Array, target: Array, center: Array | None = None
+    ) -> None:
         """Begin an episode.
 
         Args:
@@ -340,6 +351,8 @@ class Controller:
             goal_pos: [N, 3] or [3] goal position.
             goal_quat: [N, 4] or [4] goal orientation.
             target: [N, J] or [J] present joint targets of the robot.
+            center: [N, 3] or [3] origin that the object has for the policy, in its frame; see :meth:`center`. Needed
+                where the contract's ``object_frame`` is ``center``.
         """
         self.target = np.atleast_2d(np.asarray(target, dtype=np.float32))
         count = len(self.target)
@@ -347,6 +360,12 @@ class Controller:
         points = np.asarray(object_points, dtype=np.float32)
         if points.shape[-2:] != (expected, 3):
             raise LiveError(f"The object has points of shape {points.shape}, expected ({expected}, 3).")
+        self._center: Array | None = None
+        if self.contract["object_frame"] == "center":
+            if center is None:
+                raise LiveError("This policy needs the center of the object. Give center, as Controller.center does.")
+            self._center = np.broadcast_to(np.asarray(center, dtype=np.float32), (count, 3))
+            points = points - self._center[:, None]
         self._points = np.broadcast_to(points, (count, expected, 3))
         self.set_goal(goal_pos, goal_quat)
         self.action = np.zeros_like(self.target)
@@ -356,8 +375,13 @@ class Controller:
     def set_goal(self, pos: Array, quat: Array) -> None:
         """Set the goal pose, also while the policy acts; shapes as for :meth:`begin`."""
         count = len(self.target)
-        self._goal_pos = np.broadcast_to(np.asarray(pos, dtype=np.float32), (count, 3))
         self._goal_quat = np.broadcast_to(np.asarray(quat, dtype=np.float32), (count, 4))
+        goal_pos = np.broadcast_to(np.asarray(pos, dtype=np.float32), (count, 3))
+        self._goal_pos = self._origin(goal_pos, self._goal_quat)
+
+    def _origin(self, pos: Array, quat: Array) -> Array:
+        """[N, 3] where the policy's origin of the object is, for poses [N, 3], [N, 4] of the object's frame."""
+        return pos if self._center is None else pos + rotate(quat, self._center)
 
     def points(self, name: str) -> Array:
         """[P, 3] points of an object of the contract."""
@@ -365,6 +389,11 @@ class Controller:
         if name not in objects:
             raise LiveError(f"The contract has no object {name!r}. Choose from: {', '.join(objects)}.")
         return np.array(objects[name]["points"], dtype=np.float32)
+
+    def center(self, name: str) -> Array:
+        """[3] center of an object of the contract, in its frame."""
+        self.points(name)  # refuses an unknown name
+        return np.array(self.contract["objects"][name]["center"], dtype=np.float32)
 
     def step(self, reading: Reading) -> Array:
         """[N, J] new joint targets for a reading with the axis N."""
@@ -381,12 +410,16 @@ class Controller:
         force = reading.tip_force
         if force is None:
             force = np.zeros_like(links.tip_pos)
+        pose = [self._origin(reading.object_pos, reading.object_quat)]
+        if o["rotation"] == "to_goal":
+            inverse = reading.object_quat * np.array([1, -1, -1, -1], np.float32)
+            pose += [self._goal_pos, _shown(_multiply(self._goal_quat, inverse), o["rotation"])]
+        else:
+            pose += [_shown(reading.object_quat, o["rotation"]), self._goal_pos]
+            pose += [_shown(self._goal_quat, o["rotation"])]
         scaled = np.float32(2.0) * (reading.joint_pos - self._scaled_lower) / (self._scaled_upper - self._scaled_lower)
         parts = [
-            reading.object_pos,
-            _shown(reading.object_quat, o["rotation"]),
-            self._goal_pos,
-            _shown(self._goal_quat, o["rotation"]),
+            *pose,
             np.ones((count, 1), np.float32),  # the share of its weight that the object has
             self.action,
             scaled - np.float32(1.0),
@@ -405,7 +438,8 @@ class Controller:
     def _observe_cloud(self, reading: Reading) -> Array:
         o = self.contract["observation"]
         scale = np.float32(o["cloud_scale"])
-        cloud = rotate(reading.object_quat[:, None], self._points) + reading.object_pos[:, None]
+        origin = self._origin(reading.object_pos, reading.object_quat)
+        cloud = rotate(reading.object_quat[:, None], self._points) + origin[:, None]
         if o["cloud"] == "paired":
             goal = rotate(self._goal_quat[:, None], self._points) + self._goal_pos[:, None]
             return scale * np.concatenate((cloud, goal, goal - cloud), axis=-1)[:, None]

@@ -16,7 +16,7 @@ from xreset.errors import PolicyError
 from xreset.files import atomic_folder, file_hash, write_json
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import robot_tree
-from xreset.objects.sampling import surface_points
+from xreset.objects.sampling import center, surface_points
 from xreset.policy import policy_contract
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.actions import ActionSpace
@@ -53,7 +53,8 @@ def deploy_contract(
     listed = {}
     for each in objects:
         points = surface_points(each, task.observation.cloud_points).astype(np.float32)
-        listed[each.name] = {"source": each.source, "points": points.tolist()}
+        middle = center(each).astype(np.float32)
+        listed[each.name] = {"source": each.source, "points": points.tolist(), "center": middle.tolist()}
     observation = asdict(task.observation)
     observation.pop("noise")
     contract = {
@@ -72,6 +73,7 @@ def deploy_contract(
         "observation_layout": trained["observation_layout"],
         "action": asdict(task.action),
         "kinematics": _chain(robot),
+        "object_frame": task.object_frame,
         "objects": listed,
     }
     runtime.check_contract(contract, f"The task of {robot.name}")

@@ -100,5 +100,6 @@ def make_controller(env: ManipulationEnv, actor: OnnxActor | Any) -> Controller:
     controller = Controller(contract, actor)
     names = [scene.objects[i].name for i in env.backend.object_index.tolist()]
     points = np.stack([controller.points(name) for name in names])
-    controller.begin(points, _array(env.goal_pos), _array(env.goal_quat), _array(env.joint_target))
+    centers = np.stack([controller.center(name) for name in names])
+    controller.begin(points, _array(env.goal_pos), _array(env.goal_quat), _array(env.joint_target), centers)
     return controller

@@ -11,6 +11,8 @@ FOLDER``.
   at all; not every engine has armature, but the inertia of a link means the same in all of them.
 - ``shapes`` are boxes (edge lengths, center) and cylinders and capsules (ends of the axis, radius).
 - ``frames`` are links without shapes.
+- ``arm_of`` and ``hand_of`` name the folder of a robot that has the same arm or the same hand. What is stated in
+  addition replaces that robot's figures; ``palm`` is merged with its table, since the hand may be mounted differently.
 """
 
 from __future__ import annotations
@@ -28,11 +30,19 @@ from xreset.spec import MimicSpec
 
 Figures = dict[str, Any]
 SHAPES = {"box": box, "capsule": capsule, "cylinder": cylinder}
+SHARED = {"arm_of": ("base", "arm"), "hand_of": ("palm", "hand", "frames", "rotor")}
+"""What a robot takes from another one."""
 
 
 def read_figures(folder: str) -> Figures:
-    """Return the content of a robot's ``build.toml``."""
-    return tomllib.loads((Path(__file__).parent / folder / "build.toml").read_text())
+    """Return the content of a robot's ``build.toml``, completed with what it takes from other robots."""
+    figures = tomllib.loads((Path(__file__).parent / folder / "build.toml").read_text())
+    for key, names in SHARED.items():
+        if key in figures:
+            other = read_figures(figures[key])
+            mounted = {"palm": other["palm"] | figures.get("palm", {})} if key == "hand_of" else {}
+            figures = {name: other[name] for name in names} | figures | mounted
+    return figures
 
 
 def robot_tree(figures: Figures) -> RobotTree:

@@ -24,7 +24,7 @@ from xreset.plugins import robot_folder, robot_names
 from xreset.robot_tools.check import check_description
 from xreset.robots import build
 
-BUILT_IN = ("ur7e-sharpa", "openarm", "panda-allegro", "xarm7-leap")
+BUILT_IN = ("ur7e-sharpa", "openarm", "panda-allegro", "xarm7-leap", "iiwa14-sharpa", "ur7e-robotiq")
 
 
 class BuiltIn(unittest.TestCase):
@@ -55,9 +55,8 @@ class BuiltIn(unittest.TestCase):
 
     def test_degrees_of_freedom(self):
         counts = {name: (len(load(name).arm_indices), len(load(name).hand_indices)) for name in BUILT_IN}
-        self.assertEqual(
-            counts, {"ur7e-sharpa": (6, 22), "openarm": (7, 1), "panda-allegro": (7, 16), "xarm7-leap": (7, 16)}
-        )
+        expected = ((6, 22), (7, 1), (7, 16), (7, 16), (7, 22), (6, 1))
+        self.assertEqual(counts, dict(zip(BUILT_IN, expected, strict=True)))
 
     def test_efforts_in_the_description_are_those_of_the_urdf(self):
         for name in BUILT_IN:
@@ -101,16 +100,22 @@ class BuiltIn(unittest.TestCase):
                 column = jacobian.linear[0, :, robot.joint_names.index(f"right_{finger}_{joint}")]
                 self.assertGreater(float(column @ palm), 0, f"{finger} {joint}")
 
-    def test_openarm_jaws_close_on_each_other(self):
-        robot = load("openarm")
-        kinematics = Kinematics(robot)
-        for opening, gap in ((0.0, 0.001), (0.044, 0.089)):
+    def test_jaws_face_each_other_from_closed_to_open(self):
+        for name, position, gap in (
+            ("openarm", 0.0, 0.001),
+            ("openarm", 0.044, 0.089),
+            ("ur7e-robotiq", 0.8, 0.0001),
+            ("ur7e-robotiq", 0.4, 0.0452),
+            ("ur7e-robotiq", 0.0, 0.0849),
+        ):
+            robot = load(name)
             q = torch.tensor(robot.home)
-            q[-1] = opening
-            thumb, index = kinematics.link_poses(q, ["thumb_tip", "index_tip"]).numpy()
+            q[-1] = position
+            thumb, index = Kinematics(robot).link_poses(q, ["thumb_tip", "index_tip"]).numpy()
             apart = index[:3, 3] - thumb[:3, 3]
-            np.testing.assert_allclose(apart @ thumb[:3, 2], gap, atol=1e-6)  # z looks out of the pad, at the other jaw
-            np.testing.assert_allclose(thumb[:3, 2], -index[:3, 2], atol=1e-9)
+            np.testing.assert_allclose(apart @ thumb[:3, 2], gap, atol=1e-4)  # z looks out of the pad, at the other jaw
+            np.testing.assert_allclose(np.linalg.norm(apart), gap, atol=1e-4)
+            np.testing.assert_allclose(thumb[:3, 2], -index[:3, 2], atol=1e-6)
 
     def test_rotors_are_in_the_hand_links(self):
         tree = robot_tree(load("ur7e-sharpa"))

@@ -1,0 +1,1 @@
+"""UR7e arm with the Robotiq 2F-85 gripper."""

@@ -22,6 +22,7 @@ from xreset.physics import Backend
 from xreset.plugins import backend_names, make_backend, robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
 from xreset.robot_tools.draft import below
+from xreset.robot_tools.opposition import opposition, opposition_scores
 from xreset.robot_tools.sources import largest_moment, read_source
 from xreset.spec import Geometry, MimicSpec, ObjectSpec, RobotSpec, SceneSpec, Shape, TableSpec
 from xreset.text import shown
@@ -40,6 +41,10 @@ _OFF = 0.01
 """[m] From the middle of a link's shapes: a centre of mass in the joint that is farther away is doubted."""
 _LISTED = 4
 """Pairs of links that are named, most frequent first."""
+_PALM = 0.12
+"""[m] From the palm's frame to the nearest joint of a finger: a human palm is 10 cm long."""
+_LESS_OPPOSED = 0.75
+"""Share of the best fingertip's opposition that a thumb has at least. Index fingers have up to 0.73 (Allegro)."""
 _HOLD_STEPS = 30
 _HOLD_TOLERANCE = 0.02
 
@@ -90,7 +95,8 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
         return spec, [*found, Finding("skipped", "home", "fix the errors above first")]
     ratio = damping_ratio(spec, spec.home)
     found += _topic("drives", _drives(spec), f"damping ratios at home are {ratio.min():.2f}..{ratio.max():.2f}")
-    found += _topic("frames", _frames(spec), "the palm looks along the fingers")
+    found += _topic("frames", _frames(spec), "the palm frame is in the palm, and looks along the fingers")
+    found += _topic("fingers", _fingers(spec, tree), "the thumb can oppose every other fingertip")
     found += _home(spec)
     found.append(_size(spec))
     if spec.placement is not None:
@@ -340,9 +346,11 @@ def _drives(spec: RobotSpec) -> Problems:
 
 
 def _frames(spec: RobotSpec) -> Problems:
-    palm, *tips = Kinematics(spec).link_poses(torch.tensor(spec.home), spec.tracked_links).numpy()
-    away = np.array([tip[:3, 3] - palm[:3, 3] for tip in tips])
-    along = away[1:].mean(axis=0) @ palm[:3, :3] if len(tips) > 1 else np.zeros(3)
+    kinematics = Kinematics(spec)
+    poses = dict(zip(kinematics.link_names, kinematics.link_poses(torch.tensor(spec.home)).numpy(), strict=True))
+    palm = poses[spec.palm]
+    away = np.array([poses[tip.link][:3, 3] - palm[:3, 3] for tip in spec.fingertips])
+    along = away[1:].mean(axis=0) @ palm[:3, :3] if len(away) > 1 else np.zeros(3)
     longest = int(np.abs(along).argmax())
     ahead = away.mean(axis=0) @ palm[:3, 0]
     if longest != 0:
@@ -352,6 +360,68 @@ def _frames(spec: RobotSpec) -> Problems:
     elif ahead <= 0:
         text = "its x should point towards the fingers."
         yield "warning", f"the fingertips lie {-ahead:.3f} m behind the palm {spec.palm!r}: {text}"
+    tree = kinematics.tree
+    body = tree.moving_ancestor(spec.hand_root)
+    if tree.moving_ancestor(spec.palm) != body:
+        yield (
+            "warning",
+            f"the palm {spec.palm!r} is not fixed to the hand's root {spec.hand_root!r}, but to "
+            f"{tree.moving_ancestor(spec.palm)!r}. Fix it to the body that carries the fingers.",
+        )
+    knuckles = [poses[_moving_links(tree, tip.link, body)[0]][:3, 3] for tip in spec.fingertips[1:]]
+    distance = min(float(np.linalg.norm(knuckle - palm[:3, 3])) for knuckle in knuckles) if knuckles else 0.0
+    if distance > _PALM:
+        yield (
+            "error",
+            f"the palm {spec.palm!r} is {1e3 * distance:.0f} mm from the nearest finger, expected {1e3 * _PALM:.0f} mm "
+            "at most: it is not in the palm. Move its frame.",
+        )
+
+
+def _moving_links(tree: RobotTree, link: str, body: str) -> list[str]:
+    """Return the moving links from a rigid body to a link, the body's neighbor first."""
+    joints = {joint.child: joint for joint in tree.joints}
+    found = []
+    while link != body and link in joints:
+        if joints[link].type != "fixed":
+            found.insert(0, link)
+        link = joints[link].parent
+    return found
+
+
+def _fingers(spec: RobotSpec, tree: RobotTree) -> Problems:
+    body = tree.moving_ancestor(spec.hand_root)
+    chains = [_moving_links(tree, tip.link, body) for tip in spec.fingertips]
+    shared = set(chains[0]).intersection(*chains)
+    wrist = [joint.name for joint in tree.joints if joint.child in shared]
+    if wrist and len(chains) > 1:
+        yield (
+            "error",
+            f"{', '.join(wrist)} move every fingertip: joints of a wrist belong to the arm. Give them the group "
+            "'arm', and let hand.root be the link after them.",
+        )
+    elif len(chains) > 2 and len(spec.hand_indices):  # two jaws are alike
+        yield from _thumb(spec)
+
+
+def _thumb(spec: RobotSpec) -> Problems:
+    tips = [tip.link for tip in spec.fingertips]
+    names = spec.fingertip_names
+    meetings = opposition(spec, tips, np.zeros((len(tips), 3)))
+    scores = opposition_scores(meetings)
+    best = int(scores.argmax())
+    met = [", ".join(names[i] for i in np.flatnonzero(row)) or "no other" for row in meetings]  # noqa: XR002
+    if scores[best] == 0:
+        yield "warning", "no fingertip can come near another and press against it. Are the joints' limits right?"
+    elif scores[0] < _LESS_OPPOSED * scores[best]:
+        yield (
+            "error",
+            f"the thumb {tips[0]!r} can meet {met[0]} pad to pad, {names[best]} {tips[best]!r} can meet {met[best]} "
+            "more often: is that the thumb? Then import again with "
+            f"--thumb {tips[best]}, or make it the first fingertip, with keypoint thumb4.",
+        )
+    elif not meetings[0, 1:].all():
+        yield "ok", f"the thumb can meet {met[0]} pad to pad"
 
 
 def _home(spec: RobotSpec) -> list[Finding]:

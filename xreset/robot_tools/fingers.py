@@ -17,7 +17,7 @@ from xreset.geometry.shapes import surface_of
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import fixed, frame
 from xreset.robot_tools.draft import below, draft_spec, link_places
-from xreset.robot_tools.opposition import closing_range, most_opposed, opposition
+from xreset.robot_tools.opposition import closing_range, opposition, opposition_scores
 from xreset.spec import FingertipSpec, KeypointSpec, MimicSpec, RobotSpec
 
 _FINGERS = ("index", "middle", "ring", "little")
@@ -94,9 +94,10 @@ def find_fingers(
         first = marked[0]
     else:
         tips = [_in_link(at[chain.links[-1]], end) for chain, end in zip(chains, ends, strict=True)]
-        first = most_opposed(opposition(spec, [chain.links[-1] for chain in chains], np.array(tips)))
+        scores = opposition_scores(opposition(spec, [chain.links[-1] for chain in chains], np.array(tips)))
+        first = int(scores.argmax())
         why = "it can oppose the others"
-        if first is None:
+        if scores[first] == 0:
             first = _farthest_back(bases, ends)
             why = "its base is farthest back"
         notes.append(f"the thumb is the finger of {', '.join(chains[first].links)}: {why} (--thumb says another)")

@@ -57,7 +57,6 @@ def opposition(robot: RobotSpec, links: Sequence[str], offsets: np.ndarray) -> n
     return meetings
 
 
-def most_opposed(meetings: np.ndarray) -> int | None:
-    """Return the fingertip that opposes the others most, and as many of them as possible; None if none opposes any."""
-    scores = np.sqrt(meetings).sum(axis=1)
-    return int(scores.argmax()) if scores.max() > 0 else None
+def opposition_scores(meetings: np.ndarray) -> np.ndarray:
+    """[E] how much each fingertip opposes the others, and as many of them as possible; see :func:`opposition`."""
+    return np.sqrt(meetings).sum(axis=1)

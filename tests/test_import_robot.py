@@ -23,6 +23,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import load_urdf
 from xreset.geometry.urdf_writer import urdf_text, write_meshes
 from xreset.policy import check_contract, policy_contract
+from xreset.robot_tools import check as checks
 from xreset.robot_tools.check import check_description, check_engine
 from xreset.robot_tools.importer import import_robot
 from xreset.robot_tools.reshape import reshape
@@ -517,6 +518,48 @@ class Published(WithFolder):
         with lzma.open(archive) as file, tarfile.open(fileobj=file) as tar:
             tar.extractall(self.folder, filter="data")
         return self.folder / name
+
+    def test_the_shadow_hands_wrist_and_thumb_whatever_its_names(self):
+        arm = self.unpacked("iiwa14") / "iiwa14.urdf"
+        hand = self.unpacked("shadow_hand") / "shadow_hand_right.urdf"
+        text = hand.read_text()
+        for number, code in enumerate(("th", "ff", "mf", "rf", "lf")):
+            text = re.sub(rf'"({code}|{code.upper()})(?!\w*[./])', f'"part{number}', text)
+        hand.write_text(text)
+        made = import_robot(arm, hand, self.folder / "mine")
+        spec, found = check_description(made.folder)
+        self.assertEqual([f"{f.topic}: {f.message}" for f in found if f.level == "error"], [])
+        self.assertEqual((len(spec.arm_indices), len(spec.hand_indices), spec.hand_root), (9, 22, "palm"))
+        self.assertEqual(spec.fingertips[0].link, "thumb_tip_frame")
+        self.assertEqual([tip.contact_links[0][:5] for tip in spec.fingertips], [f"part{i}" for i in range(5)])
+        self.assertRegex("\n".join(made.guessed), "WRJ2, WRJ1 move the whole hand: they are the last joints of the arm")
+
+        toml = (made.folder / "robot.toml").read_text()
+        tips = re.findall(r"^    { name = .*contact_links.*$", toml, re.MULTILINE)
+        rows = [tips[4].replace('name = "little"', 'name = "thumb"').replace("little4", "thumb4"), *tips[1:4]]
+        rows.append(tips[0].replace('name = "thumb"', 'name = "little"').replace("thumb4", "little4"))
+        swapped = toml.replace("\n".join(tips), "\n".join(rows))
+        wrist = re.sub(r'(name = "WRJ\d", group = )"arm"', r'\1"hand"', toml)
+        for wrong, expected in (
+            (swapped, "the thumb 'little_tip_frame' can meet little pad to pad, little 'thumb_tip_frame' can meet"),
+            (wrist.replace('root = "palm"', 'root = "forearm"'), "WRJ2, WRJ1 move every fingertip: joints of a wrist"),
+        ):
+            (made.folder / "robot.toml").write_text(wrong)
+            spec = load_robot(made.folder)
+            self.assertIn(expected, dict(checks._fingers(spec, load_urdf(spec.urdf)))["error"])
+        (made.folder / "robot.toml").write_text(toml)
+        urdf = made.folder / "robot.urdf"
+        pattern = r'(name="palm_frame_fixed"[^>]*>\s*<origin xyz=")[^"]*'
+        urdf.write_text(re.sub(pattern, r"\g<1>0 0 -0.2", urdf.read_text()))
+        errors = dict(checks._frames(load_robot(made.folder)))
+        self.assertRegex(errors["error"], "the palm 'palm_frame' is 2.. mm from the nearest finger")
+
+    def test_the_robotiq_gripper_is_a_jaw(self):
+        arm = self.unpacked("iiwa14") / "iiwa14.urdf"
+        hand = self.unpacked("robotiq_2f_85") / "robotiq_2f_85.urdf"
+        spec, found = check_description(import_robot(arm, hand, self.folder / "mine").folder)
+        self.assertEqual([f"{f.topic}: {f.message}" for f in found if f.level == "error"], [])
+        self.assertEqual((len(spec.hand_indices), len(spec.mimics), len(spec.fingertips)), (1, 5, 2))
 
     def test_inspires_coupled_joints_in_the_engines(self):
         arm = self.unpacked("xarm7") / "xarm7.urdf"

@@ -30,6 +30,8 @@ from xreset.resets.filter import make_bank as make_bank
 from xreset.retarget.file import Retargeted as Retargeted
 from xreset.retarget.pipeline import RetargetConfig as RetargetConfig
 from xreset.retarget.pipeline import retarget_demos as retarget_demos
+from xreset.robot_tools.judge import Judgement as Judgement
+from xreset.robot_tools.judge import judge as judge
 from xreset.spec import ObjectSpec as ObjectSpec
 from xreset.spec import RobotSpec as RobotSpec
 from xreset.spec import SceneSpec as SceneSpec

@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 COMMANDS: dict[str, str] = {
     "demos": "Import, synthesize, select, merge and describe human demonstrations.",
     "objects": "List objects and import meshes.",
-    "robots": "List, check, import and place robots.",
+    "robots": "List, check, import, place and judge robots.",
     "engines": "List, check and compare physics engines, and trace where they diverge.",
     "retarget": "Turn human demonstrations into robot motion.",
     "resets": "Test robot states in physics and keep the stable ones.",

@@ -1,4 +1,4 @@
-"""``xreset robots``: list, check, import, reshape and place robots."""
+"""``xreset robots``: list, check, import, reshape, place and judge robots."""
 
 from __future__ import annotations
 
@@ -9,17 +9,20 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from xreset import description
+from xreset import __version__, description, inputs
 from xreset.backends import workers
-from xreset.cli._common import Name, this_command
+from xreset.cli._common import Name, Several, Source, this_command, usable_engines
 from xreset.cli._terminal import Console, Progress
 from xreset.demos import archive
 from xreset.errors import RobotError
+from xreset.files import write_json
 from xreset.pictures import render
 from xreset.plugins import robot_names
+from xreset.resets.config import SqueezeConfig
 from xreset.retarget import pipeline
 from xreset.robot_tools import check as checks
 from xreset.robot_tools import importer, placement
+from xreset.robot_tools import judge as judging
 from xreset.robot_tools import picture as pictures
 from xreset.robot_tools import place as places
 from xreset.robot_tools import reshape as reshaping
@@ -178,8 +181,68 @@ def place(
         console.print(f"wrote {file}")
 
 
+def judge(
+    bank: Source,
+    /,
+    *,
+    robot: str | None = None,
+    objects: Path | None = None,
+    backend: Several = (),
+    states: int = 8,
+    squeeze: SqueezeConfig = SqueezeConfig(force=5.0, reach=0.01),  # noqa: B008  tyro reads flags from the default
+    num_envs: int = 32,
+    device: str = "cpu",
+    picture: Path | None = None,
+    json: Path | None = None,
+) -> None:
+    """Judge a robot without training: which objects it holds for a second at full gravity, lifts and turns.
+
+    Accepted states in which the object is in the air start a fixed program: the fingers press, the object gets its
+    weight for a second, the arm raises the hand by 10 cm, and turns it by 45 degrees about the fingers' direction. The
+    object must stay within 3 cm and 45 degrees of where it was in the hand.
+
+    Args:
+        bank: File made by `xreset resets`.
+        robot: Folder of the robot, if it is not one that is known by name.
+        objects: Folder of real meshes; default: the built-in stand-ins.
+        backend: Engine to judge in; give it again for more. Default: all that can be used here.
+        states: Number of states of each object: those that grasp most tightly.
+        squeeze: How hard fingers press, and which fingers.
+        num_envs: Worlds at a time.
+        device: Where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
+        picture: PNG to write: the best state of each object at the start and after each phase.
+        json: File to write the counts to.
+    """
+    console = Console()
+    loaded = inputs.load_inputs(bank, robot=robot, objects=objects, accept=("bank",))
+    names = list(dict.fromkeys(backend)) or usable_engines(console)
+    with Progress(console) as bar:
+        found = judging.judge(
+            loaded.bank, loaded.robot, loaded.objects, names, states=states, squeeze=squeeze, num_envs=num_envs,
+            device=device, progress=bar.count(f"states in {', '.join(names)}"),
+        )  # fmt: skip
+    table = Table("object", "states", *names, title=f"{found.robot}: states that hold, also lift, also turn the object")
+    for label in dict.fromkeys(row.object_name for row in found.rows):
+        mine = [row for row in found.rows if row.object_name == label]
+        table.add_row(label, str(mine[0].tried), *(f"{row.hold}, {row.lift}, {row.turn}" for row in mine))
+    console.print(table)
+    if fails := found.rows[-1].arm_fails:
+        console.print(f"the arm cannot raise or turn the hand that far in {fails} of {found.rows[-1].tried} states")
+    if found.without:
+        console.print(f"no accepted state has these objects in the air between thumb and finger: {found.without}")
+    console.print(
+        f"at least half of the states hold, lift and turn these objects in every engine: {', '.join(found.kept) or '-'}"
+    )
+    if json is not None:
+        write_json(json, {**found.as_dict(), "xreset_version": __version__, "command": this_command()})
+        console.print(f"wrote {json}")
+    if picture is not None:
+        render.write_png(picture, judging.judge_picture(found, loaded.robot, loaded.objects))
+        console.print(f"wrote {picture}")
+
+
 def _digits(values: Sequence[float]) -> str:
     return ", ".join(f"{value:.4f}" for value in values)
 
 
-COMMAND = {"list": list_robots, "check": check, "import": import_, "reshape": reshape, "place": place}
+COMMAND = {"list": list_robots, "check": check, "import": import_, "reshape": reshape, "place": place, "judge": judge}

@@ -1,0 +1,95 @@
+"""The judge of a robot: which accepted states hold, lift and turn their object."""
+
+import io
+import json
+import tempfile
+import unittest
+from contextlib import redirect_stdout
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+from PIL import Image
+
+from tests import toy_grasp
+from tests.toy_grasp import OPEN, brick, brick_pose, robot
+from xreset.cli import main
+from xreset.description import load_robot
+from xreset.errors import RobotError
+from xreset.geometry.kinematics import Kinematics
+from xreset.resets.bank import write_bank
+from xreset.resets.config import SqueezeConfig
+from xreset.robot_tools import judge as judging
+from xreset.spec import SceneSpec
+
+
+def bank():
+    """Six states with the brick between the jaws, 5 cm above where the demonstrations start; half are before contact."""
+    pos, quat = brick_pose()
+    base = toy_grasp.bank()
+    return replace(
+        base,
+        joint_pos=np.tile(robot().home, (6, 1)).astype(np.float32),
+        object_pos=np.tile(pos, (6, 1)).astype(np.float32),
+        object_quat_wxyz=np.tile(quat, (6, 1)).astype(np.float32),
+        start_pos=base.start_pos - np.array([0, 0, 0.05], dtype=np.float32),
+    )
+
+
+class Judge(unittest.TestCase):
+    def test_a_firm_grip_holds_and_lifts_and_a_weak_one_drops(self):
+        for force, held in ((4.0, 3), (0.2, 0)):
+            with self.subTest(force=force):
+                squeeze = SqueezeConfig(force=force, reach=0.01)
+                found = judging.judge(bank(), robot(), (brick(),), squeeze=squeeze)
+                rows = {row.object_name: row for row in found.rows}
+                self.assertEqual((rows["brick"].tried, rows["brick"].hold, rows["brick"].lift), (3, held, held))
+                self.assertEqual((rows["all"].arm_fails, rows["all"].turn), (3, 0))  # its arm cannot turn that way
+                self.assertEqual(found.kept, [])
+                rise = np.diff([moment["object_pos"][2] for moment in found.shots["brick"]])
+                self.assertEqual(bool(rise[1] > 0.08), held > 0, rise)
+
+    def test_the_arm_raises_and_turns_the_palm(self):
+        program = judging._Program(SceneSpec(robot=load_robot("ur7e-sharpa"), objects=()))
+        home = torch.as_tensor(program.scene.robot.home)[None]
+        palm = program.kinematics.link_poses(home, [program.scene.robot.palm])[:, 0]
+        for turn in (0.0, judging.TURN):
+            with self.subTest(turn=turn):
+                path, error = program.path(home, palm, rise=judging.HEIGHT, turn=turn)
+                self.assertLess(float(error), 1.0)
+                end = Kinematics(program.scene.robot).link_poses(path[-1], [program.scene.robot.palm])[:, 0]
+                relative = torch.linalg.inv(palm[0]) @ end[0]
+                self.assertAlmostEqual(float(end[0, 2, 3] - palm[0, 2, 3]), judging.HEIGHT, delta=0.005)
+                self.assertAlmostEqual(float(torch.atan2(relative[2, 1], relative[2, 2])), turn, delta=0.03)
+
+    def test_a_bank_without_grasps_in_the_air_is_refused(self):
+        low = replace(bank(), object_pos=bank().object_pos - np.array([0, 0, 0.05], dtype=np.float32))
+        with self.assertRaisesRegex(RobotError, "no state in which an object is in the air"):
+            judging.judge(low, robot(), (brick(),))
+        wide = bank().joint_pos.copy()
+        wide[:, robot().joint_names.index("jaw_a_slide")] = OPEN + 0.03
+        with self.assertRaisesRegex(RobotError, "within 10 mm of the object"):
+            judging.judge(replace(bank(), joint_pos=wide), robot(), (brick(),))
+
+    def test_command(self):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            write_bank(folder / "bank.npz", bank(), config={}, inputs={})
+            words = ["robots", "judge", "bank.npz", "--robot", "gripper", "--backend", "mujoco", "--squeeze.force", "4"]
+            words += ["--json", str(folder / "judge.json"), "--picture", str(folder / "judge.png")]
+            words[2] = str(folder / words[2])
+            with (
+                mock.patch("xreset.inputs.load_robot", return_value=robot()),
+                mock.patch("xreset.inputs.load_objects", return_value=(brick(),)),
+                redirect_stdout(io.StringIO()) as output,
+            ):
+                main(words)
+            self.assertRegex(output.getvalue(), r"brick +│ 3 +│ 3, 3, 0")
+            self.assertEqual(json.loads((folder / "judge.json").read_text())["rows"][0]["lift"], 3)
+            self.assertEqual(Image.open(folder / "judge.png").size[0], 4 * judging._TILE[0])
+
+
+if __name__ == "__main__":
+    unittest.main()

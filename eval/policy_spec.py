@@ -43,6 +43,8 @@ class PolicySpec:
     """Names of the objects of the training; None: a baseline, which was not trained."""
     hash: str | None = None
     """SHA-256 of the policy's file; None: a baseline."""
+    file: Path | None = None
+    """The exported policy; None: a baseline."""
 
     @property
     def follows_motion(self) -> bool:
@@ -89,6 +91,16 @@ class PolicySpec:
             check_contract(self.name, policy.contract, env.backend.scene.robot, env.task)
         policy.begin(env)
         return policy
+
+    def exported(self) -> Path:
+        """Return the exported policy.
+
+        Raises:
+            PolicyError: a baseline has none.
+        """
+        if self.file is None:
+            raise PolicyError(f"The baseline {self.name!r} is no exported policy. Give a run folder or a .onnx file.")
+        return self.file
 
     def check_seed(self, seed: int) -> None:
         """Refuse the seed whose starts chose this checkpoint, because a result on them is biased.
@@ -150,6 +162,7 @@ def load_policy(policy: str | Path, *, robot: str | Path | None = None, seed: in
         objects_folder=objects_folder,
         objects=tuple(contract["objects"]),
         hash=file_hash(file),
+        file=file,
     )
 
 

@@ -141,7 +141,7 @@ def roll_out(
             traces += recorder.traces(trial.names)
             for world in r.fresh:
                 item = int(r.items[world])
-                found[item] = _episode(result, world, bank, int(sequences[item]), int(repetition[item]))
+                found[item] = episode_of(result, world, bank, int(sequences[item]), int(repetition[item]))
     return Rollouts(
         episodes=tuple(found[i] for i in sorted(found)),
         traces=tuple(sorted(traces, key=lambda t: t.sequence)),
@@ -252,7 +252,8 @@ _NUMBERS = (
 )
 
 
-def _episode(result: EpisodeMetrics, world: int, bank: ResetBank, sequence: int, repetition: int) -> Episode:
+def episode_of(result: EpisodeMetrics, world: int, bank: ResetBank, sequence: int, repetition: int) -> Episode:
+    """Return the result of one world, which has played a start of a demonstration."""
     values: dict[str, Any] = {name: bool(getattr(result, name)[world]) for name in _FLAGS}
     values |= {name: round(float(getattr(result, name)[world]), 6) for name in _NUMBERS}
     return Episode(

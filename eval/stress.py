@@ -26,6 +26,7 @@ from xreset.task.config import RandomizationConfig, TaskConfig
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 SCHEMA = "xreset-stress/1"
 COSTLY = 0.10
@@ -112,7 +113,7 @@ class Stress:
             for value in limits:
                 size = abs(math.log(value)) if curve.unit == "x" else math.inf
                 found = sure if curve.is_certain(value) else perhaps
-                found.append((size, f"{curve.property} {_amount(curve.unit, value)}"))
+                found.append((size, f"{curve.property} {amount(curve.unit, value)}"))
         points = f"{100 * COSTLY:.0f} points"
         parts = [f"{100 * self.task_progress:.0f} %"]
         if sure:
@@ -131,18 +132,19 @@ def _smallest_first(costs: list[tuple[float, str]]) -> str:
     return ", or ".join(text for _, text in ordered)
 
 
-def _amount(unit: str, value: float) -> str:
+def amount(unit: str, value: float) -> str:
+    """Return a value of a property in words, such as ``x 0.8`` or ``of 33 ms``."""
     number = f"{float(f'{value:.2g}'):g}"
     return f"x {number}" if unit == "x" else f"of {number} {unit}"
 
 
-def chosen(wanted: Sequence[str]) -> tuple[Property, ...]:
-    """Return sweeps by ``NAME`` or ``NAME=VALUE,VALUE...``; all if nothing is wanted.
+def chosen(wanted: Sequence[str], properties: Sequence[Property] = SWEEPS) -> tuple[Property, ...]:
+    """Return some of the properties, by ``NAME`` or ``NAME=VALUE,VALUE...``; all if nothing is wanted.
 
     Raises:
         XResetError: a property is unknown, or a value is impossible.
     """
-    known = {prop.option: prop for prop in SWEEPS}
+    known = {prop.option: prop for prop in properties}
     found = []
     for text in wanted:
         name, _, values = text.partition("=")
@@ -152,7 +154,7 @@ def chosen(wanted: Sequence[str]) -> tuple[Property, ...]:
         if values:
             prop = replace(prop, values=_values(text, values, prop))
         found.append(prop)
-    return tuple(found) or SWEEPS
+    return tuple(found or properties)
 
 
 def _values(text: str, values: str, prop: Property) -> tuple[float, ...]:
@@ -181,7 +183,7 @@ def stressed(task: TaskConfig, prop: Property | None = None, value: float = 1.0)
     try:
         return replace(task, randomization=replace(still, **{prop.task_field: (value, value)}))
     except ValueError as error:
-        raise XResetError(f"{prop.option} {_amount(prop.unit, value)} cannot be tried: {error}.") from None
+        raise XResetError(f"{prop.option} {amount(prop.unit, value)} cannot be tried: {error}.") from None
 
 
 def stress(
@@ -301,29 +303,46 @@ def _limit(outwards: Sequence[Point]) -> float | None:
 
 
 def write_plot(path: Path, found: Sequence[Stress], title: str) -> None:
-    """Draw task progress against each property, a line for each engine."""
+    """Draw task progress against each property, a line for each engine, as a picture."""
+    with picture(path, plot_size(found), dpi=110, font_size=9) as figure:
+        draw_curves(figure, found)
+        note = "(shaded: difference to the nominal value, 95 %; dashed: ten points less)"
+        figure.suptitle(f"{title}\n{note}", fontsize="medium", fontweight="bold")
+
+
+def _names(found: Sequence[Stress]) -> list[str]:
     names: list[str] = []
     for card in found:
         names += [curve.property for curve in card.curves if curve.property not in names]
+    return names
+
+
+def plot_size(found: Sequence[Stress]) -> tuple[float, float]:
+    """Return the size of the drawing of :func:`draw_curves` [inches]."""
+    columns = min(4, len(_names(found)))
+    rows = math.ceil(len(_names(found)) / columns)
+    return max(2.9 * columns, 5.0), 0.8 + 2.3 * rows
+
+
+def draw_curves(figure: Figure, found: Sequence[Stress]) -> None:
+    """Draw task progress against each property, a line for each engine."""
+    names = _names(found)
     columns = min(4, len(names))
     rows = math.ceil(len(names) / columns)
-    with picture(path, (max(2.9 * columns, 5.0), 0.8 + 2.3 * rows), dpi=110, font_size=9) as figure:
-        axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
-        for ax in axes.flat[len(names) :]:
-            ax.set_visible(False)
-        for ax, name in zip(axes.flat, names, strict=False):
-            ax.set_title(name)
-            ax.set_ylim(0, 100)
-            for card, color in zip(found, COLORS, strict=False):
-                ax.axhline(100 * (card.task_progress - COSTLY), color=color, linewidth=0.7, linestyle="--")
-                for curve in card.curves:
-                    if curve.property == name:
-                        _draw(ax, card, curve, color)
-        axes[0, 0].legend(loc="lower left", fontsize=8)
-        for row in axes:
-            row[0].set_ylabel("task progress [%]")
-        note = "(shaded: difference to the nominal value, 95 %; dashed: ten points less)"
-        figure.suptitle(f"{title}\n{note}", fontsize="medium", fontweight="bold")
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    for ax in axes.flat[len(names) :]:
+        ax.set_visible(False)
+    for ax, name in zip(axes.flat, names, strict=False):
+        ax.set_title(name)
+        ax.set_ylim(0, 100)
+        for card, color in zip(found, COLORS, strict=False):
+            ax.axhline(100 * (card.task_progress - COSTLY), color=color, linewidth=0.7, linestyle="--")
+            for curve in card.curves:
+                if curve.property == name:
+                    _draw(ax, card, curve, color)
+    axes[0, 0].legend(loc="lower left", fontsize=8)
+    for row in axes:
+        row[0].set_ylabel("task progress [%]")
 
 
 def _draw(ax: Axes, card: Stress, curve: Curve, color: str) -> None:

@@ -32,6 +32,7 @@ COMMANDS: dict[str, str] = {
     "eval": "Evaluate a policy or a baseline in one or several engines.",
     "frontier": "Show from which demonstrated states a policy reaches the goal.",
     "stress": "Measure robustness: change stiffness, latency, friction and more, one at a time.",
+    "rehearse": "Rehearse a policy for a robot: late poses and actions, lost frames, pushes, in every engine.",
     "select": "Choose the checkpoint that is best in its worst engine.",
     "compare": "Compare trainings: learning curves, results in every engine, and configurations.",
     "study": "Run a study: trainings by object and seed, evaluations, and tables next to the paper's.",

@@ -48,7 +48,13 @@ def deploy_contract(
         task: task of the policy's training.
         objects: objects whose points the contract lists.
         policy: exported policy, of which the contract states the hash; None: the contract stays in this process.
+
+    Raises:
+        PolicyError: the policy looks through cameras.
+        LiveError: the task has options that the runtime does not carry out.
     """
+    if task.vision.cameras:
+        raise PolicyError("The policy looks through cameras, which the runtime cannot do. Use a policy without cameras.")
     trained = policy_contract(robot, task, tuple(o.name for o in objects))
     listed = {}
     for each in objects:

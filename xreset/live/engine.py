@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -20,15 +22,19 @@ class EngineDriver(Driver):
     It reads and steps the engine directly; of the environment it uses resets, physical parameters and readings.
     """
 
-    def __init__(self, env: ManipulationEnv, look: Callable[[int], None] = lambda step: None) -> None:
+    def __init__(
+        self, env: ManipulationEnv, look: Callable[[int], None] = lambda step: None, *, real_time: bool = False
+    ) -> None:
         """Wrap worlds that were just reset.
 
         Args:
             env: the worlds.
             look: called with (control steps done) after every control step.
+            real_time: whether the simulation waits for the wall clock.
         """
         self.env = env
         self._look = look
+        self._begun = time.monotonic() if real_time else -math.inf
         self._substeps = 0
         self._target = env.joint_target.clone()
 
@@ -45,6 +51,7 @@ class EngineDriver(Driver):
             self._advance(count)
             self._substeps += count
             due -= count
+            time.sleep(max(0.0, self._begun + self.now() - time.monotonic()))
             if self._substeps % scene.substeps == 0:
                 self._look(self._substeps // scene.substeps)
 
@@ -58,14 +65,14 @@ class EngineDriver(Driver):
         state = backend.state()
         links = backend.links()
         force = self.env.variation.scaled_forces(backend.contacts().tip_force)
-        time = np.full(backend.num_worlds, self.now())
+        now = np.full(backend.num_worlds, self.now())
         return Reading(
             joint_pos=_array(state.joint_pos),
             joint_vel=_array(state.joint_vel),
-            joint_time=time,
+            joint_time=now,
             object_pos=_array(state.object_pos),
             object_quat=_array(state.object_quat),
-            object_time=time,
+            object_time=now,
             tip_force=_array(force),
             links=Links(
                 palm_pos=_array(links.pos[:, 0]),
@@ -89,17 +96,21 @@ def _array(value: Tensor) -> np.ndarray:
 
 
 def make_controller(env: ManipulationEnv, actor: OnnxActor | Any) -> Controller:
-    """Return a controller for the worlds of an environment that were just reset: their objects, goals and targets.
+    """Return a controller for the worlds of an environment.
 
     Args:
         env: the worlds, of the policy's own task.
         actor: the policy's network.
     """
     scene = env.backend.scene
-    contract = deploy_contract(scene.robot, env.task, scene.objects)
-    controller = Controller(contract, actor)
-    names = [scene.objects[i].name for i in env.backend.object_index.tolist()]
+    controller = Controller(deploy_contract(scene.robot, env.task, scene.objects), actor)
+    begin(controller, env)
+    return controller
+
+
+def begin(controller: Controller, env: ManipulationEnv) -> None:
+    """Begin an episode in worlds that were just reset, with their objects, goals and targets."""
+    names = [env.backend.scene.objects[i].name for i in env.backend.object_index.tolist()]
     points = np.stack([controller.points(name) for name in names])
     centers = np.stack([controller.center(name) for name in names])
     controller.begin(points, _array(env.goal_pos), _array(env.goal_quat), _array(env.joint_target), centers)
-    return controller

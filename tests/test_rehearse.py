@@ -1,0 +1,171 @@
+"""Faults between a policy and its robots, what they cost, and the verdict."""
+
+from __future__ import annotations
+
+import tempfile
+import unittest
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests import toy_grasp
+from tests.command import xreset
+from tests.toy_bank import SOUP
+from tests.toy_results import episodes
+from xreset.eval.rehearse import PROPERTIES, Rehearsal, judge, page
+from xreset.eval.stress import curve
+from xreset.eval.trial import engine
+from xreset.files import read_json
+from xreset.live.engine import EngineDriver
+from xreset.live.faults import Faults, FaultyDriver
+from xreset.policies import shipped
+from xreset.task.config import TaskConfig, evaluation_task
+
+STEPS = 30
+
+
+@unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
+class FaultyDriverTest(unittest.TestCase):
+    def setUp(self):
+        self.trial = toy_grasp.trial(evaluation_task(TaskConfig()))
+
+    def play(self, *faults: Faults, seed: int = 0):
+        """Close and lift with one world for each fault; returns the readings of all steps, and the drives' targets."""
+        worlds = torch.zeros(max(1, len(faults)), dtype=torch.long)
+        readings = []
+        targets = []
+        with self.trial.worlds(engine("mujoco"), worlds) as (env, _):
+            env.reset(start=self.trial.starts().home(worlds, torch.Generator().manual_seed(0)))
+            env.backend.set_state(toy_grasp.start()[worlds])
+            driver = EngineDriver(env)
+            if faults:
+                driver = FaultyDriver(env, faults, [(seed, 1)] * len(faults))
+            for step in range(STEPS):
+                readings.append(driver.read())
+                wanted = np.tile(toy_grasp.targets(step).astype(np.float32), (len(worlds), 1))
+                driver.send(wanted)
+                driver.wait_until(driver.now() + env.backend.scene.control_dt)
+                targets.append(env.backend.state().joint_target.numpy().copy())
+        return readings, np.stack(targets)
+
+    def test_without_faults_nothing_differs(self):
+        for plain, faulty in zip(self.play()[0], self.play(Faults())[0], strict=True):
+            for name in ("joint_pos", "object_pos", "object_quat", "object_time", "tip_force"):
+                np.testing.assert_array_equal(getattr(plain, name), getattr(faulty, name))
+
+    def test_each_fault_does_what_it_says(self):
+        step = 1 / 60
+        readings, targets = self.play(
+            Faults(),
+            Faults(pose_delay=0.1),
+            Faults(tracker_interval=0.05),
+            Faults(lost_frames=Faults.LOSS_PERIOD),
+            Faults(arm_delay=2 * step, hand_delay=4.5 * step),
+            Faults(missed_deadlines=0.5),
+            Faults(position_bias=0.01, angle_bias=0.1),
+            Faults(position_noise=0.01),
+            Faults(object_push=1.0),
+            Faults(arm_push=1.0),
+        )
+        now = np.arange(STEPS) * step
+        time = np.stack([reading.object_time for reading in readings])
+        np.testing.assert_allclose(now[8:] - time[8:, 1], 0.1, atol=step)
+        np.testing.assert_allclose(time[:, 2], np.floor(np.arange(STEPS) / 3) * 3 * step, atol=1e-9)
+        np.testing.assert_array_equal(time[:, 3], 0)
+        pos = np.stack([reading.object_pos for reading in readings])
+        self.assertLess(np.abs(pos[:, 1] - pos[0, 1]).max() - 1e-6, np.abs(pos[:, 0] - pos[0, 0]).max())
+        bias = (pos[:, 6] - pos[:, 0])[:5]
+        self.assertGreater(np.abs(bias).max(), 1e-4)
+        np.testing.assert_allclose(bias, np.broadcast_to(bias[0], bias.shape), atol=1e-6)
+        noise = (pos[:, 7] - pos[:, 0])[:5]
+        self.assertLessEqual(np.abs(noise).max(), 0.01 + 1e-6)
+        self.assertGreater(np.ptp(noise, axis=0).max(), 1e-4)
+        is_arm = np.array([joint.group == "arm" for joint in self.trial.robot.joints])
+        expected = targets[:, 0]
+        np.testing.assert_array_equal(targets[2:, 4][:, is_arm], expected[:-2][:, is_arm])
+        np.testing.assert_array_equal(targets[5:, 4][:, ~is_arm], expected[:-5][:, ~is_arm])
+        lifts = np.diff(expected[:, is_arm].sum(axis=1))[15:] > 1e-6
+        kept = np.diff(targets[:, 5][:, is_arm].sum(axis=1))[15:] == 0
+        self.assertTrue(0 < (kept & lifts).sum() < lifts.sum())
+        self.assertTrue((targets[:, 9][:, is_arm] != expected[:, is_arm]).any())
+        self.assertGreater(np.abs(pos[:, 8] - pos[:, 0]).max(), 1e-3)
+
+    def test_a_seed_decides_everything(self):
+        faults = Faults(position_noise=0.01, pose_delay=0.2, missed_deadlines=0.3, drawn_delays=True)
+        first = self.play(faults)[0]
+        for other, same in ((self.play(faults, faults)[0], True), (self.play(faults, seed=1)[0], False)):
+            equal = [np.array_equal(a.object_pos[0], b.object_pos[0]) for a, b in zip(first, other, strict=True)]
+            self.assertEqual(all(equal), same)
+
+
+class VerdictTest(unittest.TestCase):
+    def card(self, backend: str = "mujoco", **losses: float) -> Rehearsal:
+        """A card of five episodes; ``action_delay_67=0.2`` is a loss of 20 points in every one."""
+        curves = []
+        for prop in PROPERTIES:
+            name = prop.option.replace("-", "_")
+            swept = {}
+            for value in prop.values:
+                swept[value] = episodes([0.8 - losses.get(f"{name}_{value:g}", 0.0)] * 5)
+            curves.append(curve(prop, episodes([0.8] * 5), swept))
+        return Rehearsal(
+            backend=backend,
+            backend_version="4",
+            episodes=5,
+            task_progress=0.8,
+            ci95=(0.7, 0.9),
+            curves=tuple(curves),
+            left_out=(),
+            stopped={"The pose is old.": 2},
+        )
+
+    def test_verdicts(self):
+        self.assertEqual(judge([self.card()]).sentence, "Ready for a first, careful trial on a robot.")
+        bad = judge([self.card(), self.card("sapien", action_delay_67=0.2)])
+        self.assertEqual(bad.sentence, "Not ready for a robot.")
+        self.assertRegex(bad.reasons[0], "sapien: action delay of 67 ms changes task progress by -20.0 .* at most 4")
+        weak = judge([replace(self.card(), task_progress=0.3)])
+        self.assertIn("only 30 % without any fault", weak.reasons[0])
+        self.assertIn("No verdict", judge([replace(self.card(), curves=self.card().curves[:3])]).sentence)
+
+    def test_the_page_has_every_fault(self):
+        text = page([self.card(), self.card("sapien", action_delay_67=0.2, action_delay_133=0.4)])
+        for expected in (
+            "Not ready",
+            "of 50 ms",
+            "none that was tried",
+            "not tried on hardware",
+            "The pose is old",
+            "<svg",
+        ):
+            self.assertIn(expected, text)
+        for prop in PROPERTIES:
+            self.assertIn(prop.option.replace("-", " "), text)
+
+
+@unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
+class CommandTest(unittest.TestCase):
+    def test_a_page_from_the_command_line(self):
+        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        demos = folder / "demos.npz"
+        xreset("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
+        options = ("--demos", demos, "--backend", "mujoco", "--out", folder)
+        _, out, _ = xreset(
+            "rehearse", shipped()["soup-can"], *options, "--fault", "published-faults=0.5", "--fault", "lost-frames=1.2"
+        )
+        self.assertIn("No verdict: not every fault that decides was tried.", out)
+        found = read_json(folder / "mujoco.json", "xreset-rehearsal/1")
+        self.assertEqual([c["property"] for c in found["curves"]], ["published-faults", "lost-frames"])
+        self.assertEqual(list(found["stopped"].values()), [1])
+        self.assertIn("pose of the object is ... s old", next(iter(found["stopped"])))
+        self.assertTrue((folder / "index.html").is_file())
+        code, _, err = xreset("rehearse", shipped()["soup-can"], *options, "--fault", "missed-deadlines=150")
+        self.assertEqual(code, 1)
+        self.assertIn("missed-deadlines of 150 % of the steps cannot be tried", err)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,74 @@
+"""``xreset rehearse``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.table import Table
+
+from xreset.cli._common import Flat, Name, Several, chosen_engines, engine_bars, usable_engines
+from xreset.cli._terminal import Console
+from xreset.eval import policy_spec, stress, trial
+from xreset.eval import rehearse as rehearsal
+from xreset.eval.setting import Setting
+
+
+def rehearse(
+    policy: Name,
+    *,
+    demos: Path | None = None,
+    backend: Several = (),
+    fault: Several = (),
+    episodes: int = 1,
+    real_time: bool = False,
+    setting: Flat[Setting] = Setting(),  # noqa: B008
+    out: Path | None = None,
+) -> None:
+    """Rehearse a policy for a robot: late and wrong poses, late actions, lost frames, pushes, one fault at a time.
+
+    Args:
+        policy: Run folder, exported policy (.onnx), or name of a policy that ships with xreset (xreset policies list).
+        demos: Demonstrations whose starts and goals are played. Default: two synthetic ones of each of the policy's
+            objects.
+        backend: Physics engine; give it again for more engines. Default: all that can be used here, but on a CPU no
+            engine that solves another one's equations.
+        fault: Fault to try, or NAME=VALUE,VALUE... for values of your own; give it again for more. Default: all.
+        episodes: Episodes of each demonstration, the same for every fault.
+        real_time: Let the simulation wait for the wall clock.
+        setting: Robot, meshes, seed, device and worlds.
+        out: Folder for the results; default: rehearsal/ in the run folder or next to the policy.
+    """
+    properties = stress.chosen(fault, rehearsal.PROPERTIES)
+    console = Console()
+    spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
+    source = demos or rehearsal.default_demos(spec, setting.objects)
+    played = trial.load_trial(spec, source, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs)
+    engines = chosen_engines(backend or usable_engines(console), setting.device)
+    if not backend:
+        engines = [each for each in engines if each.grasps]
+    folder = out or spec.folder.parent / "rehearsal"
+    with engine_bars(console, [e.name for e in engines]) as progress:
+        found = rehearsal.rehearse(
+            spec,
+            played,
+            engines,
+            folder,
+            properties=properties,
+            repetitions=episodes,
+            real_time=real_time,
+            progress=progress,
+        )
+    table = Table("fault", title=f"{spec.name}: the smallest fault that costs ten points of task progress")
+    for card in found:
+        table.add_column(f"{card.backend}, {100 * card.task_progress:.0f} % without", justify="right")
+    for name, limits in rehearsal.limits(found):
+        table.add_row(name, *limits)
+    console.print(table)
+    verdict = rehearsal.judge(found)
+    console.print(verdict.sentence, style="bold")
+    for reason in verdict.reasons:
+        console.print(reason)
+    console.print(f"page and results in {folder}")
+
+
+COMMAND = rehearse

@@ -1,0 +1,216 @@
+"""What goes wrong between a policy and a robot: late and wrong poses, late and lost targets, pushes.
+
+Shape letters: N worlds, C control steps, J joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from xreset.checks import Checked, NotNegative, Share
+from xreset.env import ManipulationEnv
+from xreset.live.engine import EngineDriver
+from xreset.runtime import Reading
+
+_NEVER = np.iinfo(np.int64).max
+
+
+@dataclass(frozen=True, kw_only=True)
+class Faults(Checked):
+    """Faults of one robot and its tracker; all are off by default.
+
+    Errors of poses are uniform per axis, as in the published table A3 and in trainings
+    (:class:`xreset.task.config.TrackerConfig`). Directions, gaps and pushes are drawn, so that the same episode has the
+    same ones in every engine.
+    """
+
+    LOSS_PERIOD: ClassVar[float] = 2.0
+    """The tracker loses the object once in every such time [s]."""
+    PUSH_PERIOD: ClassVar[float] = 1.5
+    """There is one push in every such time [s]."""
+
+    tracker_interval: NotNegative[float] = 0.0
+    """Time from one pose to the next [s], rounded to control steps; 0: every control step."""
+    pose_delay: NotNegative[float] = 0.0
+    """Time from the moment of a pose to its arrival [s]."""
+    pose_jitter: NotNegative[float] = 0.0
+    """The delay of each pose differs by up to this [s]. Poses may therefore overtake each other."""
+    position_noise: NotNegative[float] = 0.0
+    """Largest error of each pose, along each axis [m]."""
+    position_bias: NotNegative[float] = 0.0
+    """Largest error that lasts for the episode, along each axis [m]."""
+    angle_noise: NotNegative[float] = 0.0
+    """Largest error of each pose about each axis [rad]."""
+    angle_bias: NotNegative[float] = 0.0
+    """Largest error that lasts for the episode, about each axis [rad]."""
+    lost_frames: NotNegative[float] = 0.0
+    """How long the tracker loses the object each time [s]."""
+    arm_delay: NotNegative[float] = 0.0
+    """Time from sending the arm's targets to their effect [s], rounded to physics steps."""
+    hand_delay: NotNegative[float] = 0.0
+    """The same for the hand [s]."""
+    missed_deadlines: Share[float] = 0.0
+    """Share of the targets that come too late to be used, so that the drives keep the ones before."""
+    object_push: NotNegative[float] = 0.0
+    """Change of the object's velocity by each push [m/s]: a force in a random direction for one control step."""
+    arm_push: NotNegative[float] = 0.0
+    """Torque of each push on every joint of the arm for one control step, at most this share of the drive's limit."""
+    drawn_delays: bool = False
+    """Whether each episode draws its delays between 0 and those above."""
+
+
+class FaultyDriver(EngineDriver):
+    """Worlds of an environment, each with its own faults."""
+
+    def __init__(
+        self,
+        env: ManipulationEnv,
+        faults: Sequence[Faults],
+        seeds: Sequence[Sequence[int]],
+        look: Callable[[int], None] = lambda step: None,
+        *,
+        real_time: bool = False,
+    ) -> None:
+        """Wrap worlds that were just reset.
+
+        Args:
+            env: the worlds.
+            faults: faults of each world.
+            seeds: seed of each world's faults.
+            look: called with (control steps done) after every control step.
+            real_time: whether the simulation waits for the wall clock.
+        """
+        super().__init__(env, look, real_time=real_time)
+        scene = env.backend.scene
+        self._dt = scene.control_dt
+        steps = env.max_episode_length + 1
+        seconds = steps * self._dt
+        generators = [np.random.default_rng(list(seed)) for seed in seeds]
+
+        def drawn(*shape: int) -> np.ndarray:
+            """[N, ...] uniform numbers in [-1, 1); the same ones whatever the faults are."""
+            return np.stack([generator.uniform(-1.0, 1.0, shape) for generator in generators])
+
+        def each(name: str) -> np.ndarray:
+            return np.array([getattr(fault, name) for fault in faults])
+
+        share = np.where(each("drawn_delays")[:, None], (drawn(3) + 1.0) / 2.0, 1.0)
+        self._interval = np.maximum(1, np.round(each("tracker_interval") / self._dt).astype(int))
+        jitter = each("pose_jitter")[:, None] * drawn(steps)
+        self._pose_delay = np.maximum(0.0, (each("pose_delay") * share[:, 0])[:, None] + jitter)
+        bias = (
+            drawn(1, 6) * np.repeat(np.stack((each("position_bias"), each("angle_bias")), axis=1), 3, axis=1)[:, None]
+        )
+        noise = np.repeat(np.stack((each("position_noise"), each("angle_noise")), axis=1), 3, axis=1)[:, None]
+        self._error = bias + noise * drawn(steps, 6)
+        self._lost = self._gaps(each("lost_frames"), drawn(int(seconds / Faults.LOSS_PERIOD) + 1), steps)
+        delay = np.where(
+            env.actions.is_arm.cpu().numpy(),
+            *((each(f"{part}_delay") * share[:, 1 + i])[:, None] for i, part in enumerate(("arm", "hand"))),
+        )
+        self._delay = np.round(delay / scene.timestep).astype(np.int64)
+        self._missed = (drawn(steps) + 1.0) / 2.0 < each("missed_deadlines")[:, None]
+        self._plan_pushes(each("object_push"), each("arm_push"), drawn, steps)
+        self._frames: list[dict[str, np.ndarray]] = []
+        self._shown: dict[str, np.ndarray] = {}
+        self._sent: list[tuple[np.ndarray, np.ndarray]] = []
+        self._current = env.joint_target.cpu().numpy().copy()
+
+    def _gaps(self, length: np.ndarray, where: np.ndarray, steps: int) -> np.ndarray:
+        """[N, C] whether the pose of a step is lost."""
+        period = Faults.LOSS_PERIOD
+        start = period * np.arange(where.shape[1]) + (where + 1.0) / 2.0 * np.maximum(0.0, period - length)[:, None]
+        time = np.arange(steps)[None, :, None] * self._dt
+        inside = (time >= start[:, None]) & (time < start[:, None] + length[:, None, None])
+        return inside.any(axis=2)
+
+    def _plan_pushes(
+        self, velocity: np.ndarray, torque: np.ndarray, drawn: Callable[..., np.ndarray], steps: int
+    ) -> None:
+        """Set the changes of the object's velocity [N, C, 3] and the offsets of the targets [N, C, J]."""
+        robot = self.env.backend.scene.robot
+        count = int(steps * self._dt / Faults.PUSH_PERIOD) + 1
+        moment = Faults.PUSH_PERIOD * (np.arange(count) + (drawn(count) + 1.0) / 2.0)
+        step = np.round(moment / self._dt).astype(int)
+        direction = drawn(count, 3)
+        direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+        # The drive's own spring exerts the torque: its target is moved.
+        reach = [j.drive.effort / j.drive.kp if j.group == "arm" else 0.0 for j in robot.joints]
+        offset = drawn(count, len(reach)) * np.array(reach)
+        self._velocity = np.zeros((len(step), steps, 3))
+        self._offset = np.zeros((len(step), steps, len(reach)))
+        world, event = np.nonzero(step < steps)
+        at = step[world, event]
+        self._velocity[world, at] = velocity[world, None] * direction[world, event]
+        self._offset[world, at] = torque[world, None] * offset[world, event]
+
+    @property
+    def _step(self) -> int:
+        return min(self._substeps // self.env.backend.scene.substeps, self._error.shape[1] - 1)
+
+    def read(self) -> Reading:
+        """Return joints as they are, and the pose that has arrived last."""
+        reading = super().read()
+        k = self._step
+        now = self.now()
+        seen = k % self._interval == 0
+        arrival = np.where(seen & ~self._lost[:, k], now + self._pose_delay[:, k], np.inf)
+        if k == 0:  # the tracker has watched the object before
+            arrival = np.zeros_like(arrival)
+        self._frames.append({"arrival": arrival, **self._with_errors(reading, k)})
+        for frame in self._frames:
+            arrived = frame["arrival"] <= now + 1e-9
+            for name in ("object_pos", "object_quat", "object_time"):
+                old = self._shown.get(name, frame[name])
+                self._shown[name] = np.where(arrived.reshape(-1, *[1] * (old.ndim - 1)), frame[name], old)
+            frame["arrival"][arrived] = np.inf
+        self._frames = [frame for frame in self._frames if np.isfinite(frame["arrival"]).any()]
+        return replace(reading, **self._shown)
+
+    def _with_errors(self, reading: Reading, k: int) -> dict[str, np.ndarray]:
+        """Return the pose as the tracker sees it in step k."""
+        error = self._error[:, k]
+        wrong = error.any(axis=1)[:, None]
+        pos = (reading.object_pos + error[:, :3]).astype(np.float32)
+        turned = Rotation.from_rotvec(error[:, 3:]) * Rotation.from_quat(reading.object_quat, scalar_first=True)
+        quat = turned.as_quat(scalar_first=True).astype(np.float32)
+        return {
+            "object_pos": np.where(wrong, pos, reading.object_pos),
+            "object_quat": np.where(wrong, quat, reading.object_quat),
+            "object_time": np.asarray(reading.object_time),
+        }
+
+    def send(self, target: np.ndarray) -> None:
+        """Send targets [N, J], which take effect later, or never."""
+        due = self._substeps + self._delay
+        due[self._missed[:, self._step]] = _NEVER
+        self._sent.append((due, target))
+
+    def _advance(self, substeps: int) -> None:
+        backend = self.env.backend
+        k = self._step
+        if self._velocity.any():
+            mass = self.env.variation.parameters["object_mass"][:, None]
+            velocity = torch.as_tensor(self._velocity[:, k], dtype=torch.float32, device=backend.device)
+            backend.set_object_wrench(mass * velocity / self._dt, torch.zeros_like(velocity))
+        at = self._substeps
+        end = at + substeps
+        while at < end:
+            following = end
+            for due, target in self._sent:
+                arrived = due <= at
+                self._current = np.where(arrived, target, self._current)
+                due[arrived] = _NEVER
+                following = min(following, int(due.min()))
+            self._target = torch.as_tensor(
+                (self._current + self._offset[:, k]).astype(np.float32), device=backend.device
+            )
+            super()._advance(following - at)
+            at = following
+        self._sent = [(due, target) for due, target in self._sent if (due < _NEVER).any()]

@@ -306,7 +306,7 @@ class _Player:
         def look(step: int) -> None:
             reading = env.reading()
             table = env.backend.scene.table
-            result.update(reading, out_of_bounds(reading.state.object_pos, table, env.task.termination))
+            result.update(reading, out_of_bounds(reading.task_state.object_pos, table, env.task.termination))
 
         driver = FaultyDriver(env, faults, seeds, look, real_time=self._real_time)
         outcome = Runner(controller, driver).run(env.max_episode_length * controller.dt)

@@ -63,11 +63,11 @@ def rotate(quat: Array, vector: Array) -> Array:
 
 def _multiply(a: Array, b: Array) -> Array:
     """[N, 4] product of quaternions [N, 4], in float32: rotation b first, then a."""
-    aw, u = a[:, :1], a[:, 1:]
-    bw, v = b[:, :1], b[:, 1:]
+    u = a[:, 1:]
+    v = b[:, 1:]
     products = a * b
     w = products[:, :1] - ((products[:, 1] + products[:, 2]) + products[:, 3])[:, None]
-    return np.concatenate((w, _fused(bw, u, _fused(aw, v, _cross(u, v)))), axis=1)
+    return np.concatenate((w, _fused(b[:, :1], u, _fused(a[:, :1], v, _cross(u, v)))), axis=1)
 
 
 def _shown(quat: Array, rotation: str) -> Array:

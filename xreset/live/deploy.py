@@ -54,7 +54,9 @@ def deploy_contract(
         LiveError: the task has options that the runtime does not carry out.
     """
     if task.vision.cameras:
-        raise PolicyError("The policy looks through cameras, which the runtime cannot do. Use a policy without cameras.")
+        raise PolicyError(
+            "The policy looks through cameras, which the runtime cannot do. Use a policy without cameras."
+        )
     trained = policy_contract(robot, task, tuple(o.name for o in objects))
     listed = {}
     for each in objects:

@@ -102,9 +102,9 @@ class UsageTest(unittest.TestCase):
                 self.assertIn("usage: xreset", out)
 
     def test_version(self):
-        from xreset import __version__
+        from xreset.files import code_version
 
-        self.assertEqual(run("--version"), (0, f"xreset {__version__}\n", ""))
+        self.assertEqual(run("--version"), (0, f"xreset {code_version()}\n", ""))
 
     def test_unknown_command(self):
         code, _, err = run("trian")

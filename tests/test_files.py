@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -20,12 +21,14 @@ import numpy as np
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
+from xreset import __version__
 from xreset.checks import from_dict
 from xreset.errors import FileFormatError, XResetError
 from xreset.files import (
     atomic_folder,
     atomic_write,
     claim,
+    code_version,
     is_claimed,
     read_json,
     read_toml,
@@ -233,6 +236,16 @@ class ClaimTest(InFolder):
 
 
 class JsonTest(InFolder):
+    def test_the_version_is_recorded_and_does_not_matter(self):
+        path = self.folder / "a.json"
+        write_json(path, {"schema": "x/1", "a": 1})
+        self.assertEqual(json.loads(path.read_text()), {"schema": "x/1", "xreset": code_version(), "a": 1})
+        self.assertEqual(read_json(path, "x/1"), {"a": 1})
+        write_npz(self.folder / "a.npz", "x/1", {"a": np.zeros(2)})
+        meta = json.loads(str(np.load(self.folder / "a.npz")["meta"]))
+        self.assertRegex(meta["xreset"], rf"^{re.escape(__version__)}(\+g[0-9a-f]{{12}}(\.dirty)?)?$")
+        self.assertEqual(meta["xreset"], code_version())
+
     def test_non_finite_numbers_are_refused_and_nothing_is_written(self):
         with self.assertRaises(ValueError):
             write_json(self.folder / "a.json", {"x": float("nan")})

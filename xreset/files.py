@@ -10,10 +10,13 @@ import os
 import secrets
 import shutil
 import stat
+import subprocess
 import time
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import IO, Any
 
@@ -213,13 +216,41 @@ def _lock(path: Path, *, required: bool = False) -> int | None:
     return None
 
 
+@cache
+def code_version() -> str:
+    """Return the version of xreset and the commit that is running, as files record them: ``0.2.0+g1a2b3c4d5e6f``.
+
+    ``.dirty`` is added if files of the checkout were changed. There is no commit in a package that was not installed
+    from a repository.
+    """
+    root = Path(__file__).parent.parent
+    commit = ""
+    if (root / ".git").exists():
+        command = ["git", "--no-optional-locks", "-C", str(root), "describe", "--always", "--dirty=.dirty"]
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+        with suppress(OSError, subprocess.TimeoutExpired):
+            found = subprocess.run(
+                [*command, "--abbrev=12", "--exclude=*"], capture_output=True, text=True, timeout=20, env=environment
+            )
+            commit = found.stdout.strip()
+    else:
+        with suppress(PackageNotFoundError, ValueError, AttributeError):  # no package, or one without such an origin
+            origin = json.loads(distribution("xreset").read_text("direct_url.json") or "{}")
+            commit = str(origin.get("vcs_info", {}).get("commit_id", ""))[:12]
+    return f"{__version__}+g{commit}" if commit else __version__
+
+
 def write_json(path: str | Path, data: Any) -> None:
-    """Write ``data`` as indented JSON; non-finite numbers are refused (``ValueError``)."""
+    """Write ``data`` as indented JSON; non-finite numbers are refused (``ValueError``). Data with a ``schema`` get
+    :func:`code_version` as ``xreset``."""
+    if isinstance(data, dict) and "schema" in data:
+        data = {"schema": data["schema"], "xreset": code_version()} | data
     write_whole(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
-def read_json(path: str | Path, schema: str | None = None) -> dict[str, Any]:
-    """Read a JSON object; with ``schema``, its ``schema`` entry must be that, and is removed."""
+def read_json(path: str | Path, schema: str | None = None, *, keep_version: bool = False) -> dict[str, Any]:
+    """Read a JSON object; with ``schema``, its ``schema`` entry must be that, and is removed, and so is the version of
+    xreset that wrote it unless ``keep_version``."""
     path = Path(path)
     must_exist(path, "JSON file")
     if path.stat().st_size > max_bytes() // 16:  # objects in memory are about that many times larger
@@ -230,6 +261,8 @@ def read_json(path: str | Path, schema: str | None = None) -> dict[str, Any]:
         raise FileFormatError(f"{path} is not valid JSON ({error}). It may be truncated; make it again.") from error
     if schema is not None:
         check_schema(path, data.pop("schema", None), schema)
+        if not keep_version:
+            data.pop("xreset", None)
     return data
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from xreset import __version__
 from xreset.errors import FileFormatError, XResetError
-from xreset.files import RAISE_LIMIT, atomic_write, check_schema, max_bytes, must_exist
+from xreset.files import RAISE_LIMIT, atomic_write, check_schema, code_version, max_bytes, must_exist
 from xreset.text import is_plain, shown
 
 T = TypeVar("T")
@@ -75,7 +75,7 @@ def write_npz(
         config: JSON-able configuration that made the content.
         inputs: name -> SHA-256 of each input.
     """
-    meta = {"xreset": __version__, "config": dict(config or {}), "inputs": dict(inputs or {})}
+    meta = {"xreset": code_version(), "config": dict(config or {}), "inputs": dict(inputs or {})}
     out = {"schema": np.array(schema_name), "meta": np.array(json.dumps(meta, sort_keys=True, allow_nan=False))}
     for name, value in arrays.items():
         array = np.asarray(value)

@@ -22,9 +22,8 @@ from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate_inverse
 from xreset.geometry.shapes import hull
-from xreset.geometry.urdf import robot_tree
+from xreset.geometry.urdf import link_meshes, robot_tree
 from xreset.physics import Backend, State
-from xreset.pictures.meshes import link_meshes
 from xreset.spec import GRAVITY, ObjectSpec, SceneSpec
 
 

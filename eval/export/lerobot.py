@@ -21,6 +21,7 @@ from xreset.objects.catalogue import load_object
 from xreset.pictures.render import Renderer
 from xreset.spec import SceneSpec
 
+SCHEMA = "xreset-lerobot/1"
 VERSION = "v3.0"
 VIDEO = "observation.images.front"
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -142,6 +143,7 @@ def _write(
         root / "meta/tasks.parquet"
     )
     write_json(root / "meta/stats.json", {key: _stats(key, np.concatenate(parts)) for key, parts in samples.items()})
+    write_json(root / "meta/xreset.json", {"schema": SCHEMA})  # with the version of xreset
     write_json(root / "meta/info.json", _info(recording, len(tasks), features))
     progress(count, count)
 

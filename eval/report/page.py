@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any
 
-from xreset import __version__
 from xreset.eval.pages import percent, render
 from xreset.eval.plots import COLORS
 from xreset.eval.report import figures
@@ -16,6 +15,7 @@ from xreset.eval.report.clips import Clip, Strip, count_failures, encode_mp4
 from xreset.eval.report.read import ReportData
 from xreset.eval.results import EvalResult
 from xreset.eval.table import FIGURES, VERSIONS, distance_text
+from xreset.files import code_version
 from xreset.pictures.render import encode_png
 from xreset.text import short_name
 
@@ -108,7 +108,7 @@ def _facts(data: ReportData) -> dict[str, str]:
         facts["Training"] = f"{done}{run.config.iterations:,} iterations, seed {run.seed}, xreset {data.trained_with}"
     if data.choice is not None:
         facts["Checkpoint"] = data.choice.sentence()
-    return facts | {"Report by": f"xreset {__version__}"}
+    return facts | {"Report by": f"xreset {code_version()}"}
 
 
 def _count(number: int, what: str) -> str:

@@ -142,7 +142,7 @@ def collect(folder: Path) -> ReportData:
     if is_run:
         try:
             run = read_run(folder)
-            trained_with = str(read_json(folder / "run.json", RUN_SCHEMA).get("xreset"))
+            trained_with = str(read_json(folder / "run.json", RUN_SCHEMA, keep_version=True).get("xreset"))
         except FileFormatError as error:  # results outlive a change of the training's configuration
             notes.append(f"The training is not described here: {error}")
     choice = read_choice(results.parent)
@@ -338,7 +338,7 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
     return Training(
         label=label,
         folder=folder,
-        facts=run_facts(read_json(file, RUN_SCHEMA), file) if file.is_file() else {},
+        facts=run_facts(read_json(file, RUN_SCHEMA, keep_version=True), file) if file.is_file() else {},
         scalars=scalars,
         results={s.backend: s for s in evaluation},
         episodes=evaluation.to_frame(),
@@ -383,6 +383,7 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, Fact]:
             f"{file} lacks {', '.join(wrong)}, or holds it as another type. Train again, or leave this run out."
         )
     bank = str(run["resets_hash"])
+    version = str(run.get("xreset"))
     meshes = run.get("objects")
     facts = {
         "robot": Fact((run["robot"], contract.get("robot_fingerprint")), str(run["robot"])),
@@ -394,7 +395,7 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, Fact]:
         "device": Fact(run["device"].partition(":")[0], run["device"]),
         "num_envs": _fact(run.get("num_envs")),
         "seed": _fact(run["seed"]),
-        "xreset": _fact(run.get("xreset")),
+        "xreset": Fact(version.partition("+")[0], version),  # runs of another commit are repetitions
     }
     return facts | _flat_facts(run["config"], "")
 

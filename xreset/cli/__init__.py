@@ -67,9 +67,9 @@ def main(argv: list[str] | None = None) -> None:
         if isinstance(stream, TextIOWrapper):  # write an escape for a character that the terminal lacks
             stream.reconfigure(errors="backslashreplace")
     if argv[:1] == ["--version"]:
-        from xreset import __version__
+        from xreset.files import code_version
 
-        print(f"xreset {__version__}")
+        print(f"xreset {code_version()}")
         return
     if argv and argv[0] in MOVED:
         print(f"xreset: {argv[0]} is now called {MOVED[argv[0]]!r}: xreset {MOVED[argv[0]]} --help", file=sys.stderr)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from xreset import __version__
 from xreset.checks import Checked, NotNegative, Positive, from_dict
 from xreset.files import read_json, write_json
 
@@ -80,7 +79,7 @@ class Choice(Checked):
 
 def write_choice(folder: Path, choice: Choice) -> None:
     """Write ``choice.json``."""
-    write_json(folder / FILE, {"schema": SCHEMA, "xreset": __version__} | asdict(choice))
+    write_json(folder / FILE, {"schema": SCHEMA} | asdict(choice))
 
 
 def read_choice(folder: Path) -> Choice | None:
@@ -92,6 +91,4 @@ def read_choice(folder: Path) -> Choice | None:
     path = folder / FILE
     if not path.is_file():
         return None
-    data = read_json(path, SCHEMA)
-    data.pop("xreset", None)
-    return from_dict(Choice, data, str(path))
+    return from_dict(Choice, read_json(path, SCHEMA), str(path))

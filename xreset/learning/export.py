@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict
 
 from xreset.checks import from_dict
-from xreset.files import atomic_write, file_hash
+from xreset.files import atomic_write, code_version, file_hash
 from xreset.learning.checkpoint import read_checkpoint
 from xreset.learning.choice import Choice, read_choice
 from xreset.learning.config import rsl_rl_config
@@ -26,6 +26,8 @@ from xreset.learning.shrink import drop_exporter_notes
 from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS
 from xreset.task.config import ObservationConfig
 
+_VERSION_KEY = "xreset-version"
+"""Key of the ONNX metadata entry that holds the version and commit of xreset."""
 _CHECKPOINT_KEY = "xreset-checkpoint"
 """Key of the ONNX metadata entry that holds the SHA-256 of the checkpoint."""
 
@@ -63,7 +65,7 @@ def export_onnx(
         )
         model = onnx.load(str(file))
     drop_exporter_notes(model)
-    entries = {METADATA_KEY: json.dumps(contract, sort_keys=True)}
+    entries = {METADATA_KEY: json.dumps(contract, sort_keys=True), _VERSION_KEY: code_version()}
     if checkpoint is not None:
         entries[_CHECKPOINT_KEY] = file_hash(checkpoint)
     onnx.helper.set_model_props(model, entries)

@@ -17,7 +17,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from xreset import __version__
 from xreset.checks import Checked, NotNegative, Positive, from_dict
 from xreset.errors import FileFormatError, PolicyError, RunError
 from xreset.files import read_json, write_json
@@ -55,7 +54,7 @@ class RunInfo(Checked):
 
 def write_run(folder: Path, info: RunInfo) -> None:
     """Write ``run.json``."""
-    write_json(folder / "run.json", {"schema": SCHEMA, "xreset": __version__} | asdict(info))
+    write_json(folder / "run.json", {"schema": SCHEMA} | asdict(info))
 
 
 def read_run(folder: str | Path) -> RunInfo:
@@ -72,7 +71,7 @@ def read_run(folder: str | Path) -> RunInfo:
         raise RunError(
             f"{folder} is not a run folder: it has no run.json. Make one with: xreset train --out {folder} ..."
         )
-    data = read_json(folder / "run.json", SCHEMA)
+    data = read_json(folder / "run.json", SCHEMA, keep_version=True)
     where = f"{folder / 'run.json'} (of xreset {shown(data.pop('xreset', None))})"
     info = from_dict(RunInfo, data, where)
     try:

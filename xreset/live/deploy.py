@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from xreset import __version__, runtime
+from xreset import runtime
 from xreset.errors import PolicyError
-from xreset.files import atomic_folder, file_hash, write_json
+from xreset.files import atomic_folder, code_version, file_hash, write_json
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import robot_tree
 from xreset.objects.sampling import center, surface_points
@@ -67,7 +67,7 @@ def deploy_contract(
     observation.pop("noise")
     contract = {
         "schema": runtime.SCHEMA,
-        "xreset": __version__,
+        "xreset": code_version(),
         "policy_sha256": file_hash(policy) if policy else "",
         "robot": robot.name,
         "robot_fingerprint": robot.fingerprint,

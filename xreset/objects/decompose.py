@@ -163,7 +163,7 @@ def openings(mesh: trimesh.Trimesh) -> list[tuple[np.ndarray, np.ndarray]]:
 
     edges = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
     loops = trimesh.graph.connected_components(edges, min_len=3)
-    return [(loop, edges[np.isin(edges[:, 0], loop)]) for loop in loops]
+    return [(np.asarray(loop), edges[np.isin(edges[:, 0], loop)]) for loop in loops]
 
 
 # Solids

@@ -8,12 +8,12 @@ from typing import Annotated, Any
 import tyro
 from rich.text import Text
 
-from xreset import __version__, description
+from xreset import description
 from xreset.backends import conformance, pool
 from xreset.cli._common import Several, this_command, usable_engines
 from xreset.cli._terminal import Console
 from xreset.errors import XResetError
-from xreset.files import write_json
+from xreset.files import code_version, write_json
 from xreset.plugins import backend_class, backend_status, make_backend
 from xreset.spec import SceneSpec
 
@@ -63,9 +63,8 @@ def check(
             }
         )
     if json is not None:
-        write_json(
-            json, {"schema": conformance.SCHEMA, "xreset_version": __version__, "command": this_command(), "runs": runs}
-        )
+        content = {"schema": conformance.SCHEMA, "xreset_version": code_version(), "command": this_command()}
+        write_json(json, content | {"runs": runs})
         console.print(f"wrote {json}")
     failed = 0
     for record in runs:

@@ -7,12 +7,11 @@ from pathlib import Path
 from rich.table import Table
 from rich.text import Text
 
-from xreset import __version__
 from xreset.cli._common import Several, Source, this_command, usable_engines
 from xreset.cli._terminal import Console, Progress
 from xreset.eval import trial
 from xreset.eval.engines import agreement, sources
-from xreset.files import file_hash, write_json
+from xreset.files import code_version, file_hash, write_json
 
 
 def compare(
@@ -66,7 +65,7 @@ def compare(
             )
     if json is not None:
         write_json(
-            json, result.as_dict() | {"xreset_version": __version__, "command": this_command(), "inputs": inputs}
+            json, result.as_dict() | {"xreset_version": code_version(), "command": this_command(), "inputs": inputs}
         )
         console.print(f"wrote {json}")
     missed = []

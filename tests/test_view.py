@@ -396,9 +396,10 @@ class Served(WithFiles):
             self.assertEqual("joint limit" in page._text.content, color is not None)
             np.testing.assert_allclose(scene._objects[1].position, page.view.object_pos[4 + frame])
             self.assertEqual([handle.visible for handle in scene._objects], [False, True])
-            for i, link in scene._links.items():
-                np.testing.assert_allclose(link.position, poses[i, :3, 3], atol=1e-6)
-                own = scene._colors[i]
+            kinematics = Kinematics(self.robot)
+            for name, link in scene._robot.links.items():
+                np.testing.assert_allclose(link.position, poses[kinematics.link_index(name), :3, 3], atol=1e-6)
+                own = scene._robot._colors[name]
                 np.testing.assert_array_equal(link.color, rgb(tint(own, color) if color else own))
 
     def test_frames_of_one_reason_are_picked(self):
@@ -428,7 +429,7 @@ class Served(WithFiles):
         page._choose()
         self.assertIsNone(page.row)
         self.assertIn("nothing", page._text.content)
-        self.assertFalse(any(link.visible for link in page._scene._links.values()))
+        self.assertFalse(any(link.visible for link in page._scene._robot.links.values()))
 
     def test_the_command_serves_until_interrupted(self):
         command = [sys.executable, "-u", "-m", "xreset", "view", str(self.bank), "--port", "8960"]
@@ -451,7 +452,7 @@ class OwnPageOnly(WithFiles):
     """A socket from another site, or a name that is made to point here, gets nothing."""
 
     def test_headers(self):
-        from xreset.pictures.view.page import is_own_page
+        from xreset.pictures.view.server import is_own_page
 
         for host, origin, served, expected in (
             ("localhost:8080", None, "127.0.0.1", True),
@@ -473,7 +474,7 @@ class OwnPageOnly(WithFiles):
         from websockets.exceptions import InvalidStatus
         from websockets.sync.client import connect
 
-        from xreset.pictures.view.page import _own_page_only
+        from xreset.pictures.view.server import _own_page_only
 
         with _own_page_only("127.0.0.1") as guarded:
             server = viser.ViserServer(host="127.0.0.1", port=8990, verbose=False)

@@ -4,34 +4,16 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from ipaddress import ip_address
-from socket import getfqdn, gethostname
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
-import torch
 
-from xreset.errors import XResetError, needs
-from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import matrix_to_quat
-from xreset.geometry.urdf import link_meshes
-from xreset.pictures.meshes import (
-    GOAL_COLOR,
-    OBJECT_COLOR,
-    TABLE_COLORS,
-    Color,
-    link_colors,
-    rgb,
-    tint,
-)
-from xreset.pictures.render import Camera
+from xreset.errors import XResetError
+from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, Color, rgb
 from xreset.pictures.view.colors import CONTACT_COLOR, HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, GOOD, PHASES, View
+from xreset.pictures.view.server import RobotMeshes, start_server, url_of
 from xreset.pictures.view.timeline import bar, legend, mark
-from xreset.spec import TableSpec
 
 _ALL = "all"
 _IDLE = 0.1
@@ -55,8 +37,6 @@ class Page:
         Raises:
             XResetError: viser is not installed, the server does not start, or the sequence or frame is unknown.
         """
-        with needs("viser, without which --png and --mp4 work,", "viewer"):
-            import viser
         self.view = view
         if sequence is None and view.kind != "reset states":
             sequence = 0
@@ -64,16 +44,7 @@ class Page:
         if not 0 <= frame < len(self._rows):
             raise XResetError(f"There is no frame {frame}: the sequence has {len(self._rows)}, counted from 0.")
         self._lock = threading.RLock()
-        try:
-            with _own_page_only(host) as guarded:
-                self._server = viser.ViserServer(host=host, port=port, label="xreset view", verbose=False)
-        except OSError as error:
-            raise XResetError(
-                f"Cannot serve the page at {host}:{port}: {error}. Choose another --host or --port."
-            ) from error
-        if not guarded:
-            self.close()
-            raise XResetError("This version of viser cannot be restricted to its own page. Install viser 1.1.")
+        self._server = start_server(host, port, label="xreset view")
         self._scene = _Scene(view, self._server)
         self._make_controls(sequence)
         self._show_choice()
@@ -83,10 +54,7 @@ class Page:
     @property
     def url(self) -> str:
         """Address of the page, seen from this machine."""
-        host = self._server.get_host()
-        if host in ("0.0.0.0", "127.0.0.1"):
-            host = "localhost"
-        return f"http://{host}:{self._server.get_port()}"
+        return url_of(self._server)
 
     @property
     def row(self) -> int | None:
@@ -187,15 +155,7 @@ class _Scene:
 
     def __init__(self, view: View, server: Any) -> None:
         self._view = view
-        camera = Camera()
-        server.initial_camera.position = camera.eye
-        server.initial_camera.look_at = camera.target
-        server.initial_camera.fov = camera.fov
         scene = server.scene
-        scene.set_up_direction("+z")
-        table = TableSpec()
-        size = tuple(2 * half for half in table.half_size)
-        scene.add_box("/table", rgb(TABLE_COLORS[0]), size, position=(*table.center, -table.half_size[2]))
         self._objects = []
         self._goals = []
         for spec in view.objects:
@@ -206,18 +166,7 @@ class _Scene:
             )
             self._objects.append(body)
             self._goals.append(goal)
-        self._links: dict[int, Any] = {}
-        self._colors: list[Color] = []
-        self._reason = ""
-        if view.robot is not None:
-            self._kinematics = Kinematics(view.robot)
-            self._colors = link_colors(view.robot)
-            for i, mesh in enumerate(link_meshes(view.robot)):
-                if mesh is not None:
-                    name = f"/robot/{self._kinematics.link_names[i]}"
-                    self._links[i] = scene.add_mesh_simple(
-                        name, mesh.vertices, mesh.faces, color=rgb(self._colors[i]), flat_shading=False
-                    )
+        self._robot = None if view.robot is None else RobotMeshes(scene, view.robot)
 
         def add_points(name: str, color: Color, size: float) -> Any:
             nowhere = np.zeros((1, 3), dtype=np.float32)
@@ -237,7 +186,7 @@ class _Scene:
         for i, (body, goal) in enumerate(zip(self._objects, self._goals, strict=True)):
             body.visible = i == shown
             goal.visible = i == shown
-        for link in self._links.values():
+        for link in self._robot.links.values() if self._robot else ():
             link.visible = row is not None
         self._tips.visible = row is not None and view.fingertips is not None
         self._show_human(row)
@@ -250,8 +199,9 @@ class _Scene:
         self._goals[shown].wxyz = view.goal_quat[sequence]
         if view.fingertips is not None:
             self._tips.points = view.fingertips[row].astype(np.float32)
-        if view.joint_pos is not None:
-            self._place_robot(view.joint_pos[row], view.reason[row])
+        if self._robot is not None and view.joint_pos is not None:
+            reason = view.reason[row]
+            self._robot.place(view.joint_pos[row], reason_color(reason) if reason else None)
 
     def _show_human(self, row: int | None) -> None:
         human = self._view.human
@@ -270,65 +220,3 @@ class _Scene:
         if touching.any():
             self._contacts.visible = True
             self._contacts.points = human.contacts[row][touching].astype(np.float32)
-
-    def _place_robot(self, joint_pos: np.ndarray, reason: str) -> None:
-        poses = self._kinematics.link_poses(torch.as_tensor(joint_pos, dtype=torch.float64))
-        quats = matrix_to_quat(poses[:, :3, :3]).numpy()
-        for i, link in self._links.items():
-            link.position = poses[i, :3, 3].numpy()
-            link.wxyz = quats[i]
-            if reason != self._reason:
-                color = self._colors[i]
-                link.color = rgb(tint(color, reason_color(reason)) if reason else color)
-        self._reason = reason
-
-
-@contextmanager
-def _own_page_only(host: str) -> Iterator[list[str]]:
-    """Make servers that viser starts in this block answer requests of their own pages only.
-
-    A page of another site may open a socket to any address, and a foreign name may point to this machine. viser checks
-    neither and has no option for it, so the function that starts its server is replaced. The block's value lists the
-    servers that are
-    restricted: none if viser starts its server in another way.
-    """
-    from websockets.asyncio import server
-
-    serve = server.serve
-    guarded = []
-
-    def guarded_serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
-        def check(connection: Any, request: Any) -> Any:
-            try:
-                own = is_own_page(request.headers.get("Host", ""), request.headers.get("Origin"), host)
-            except Exception:  # several headers of one name, or a damaged address
-                own = False
-            if not own:
-                return connection.respond(403, "this server answers its own page only\n")
-            return process_request(connection, request) if process_request else None
-
-        guarded.append(host)
-        return serve(*arguments, process_request=check, **options)
-
-    server.serve = guarded_serve
-    try:
-        yield guarded
-    finally:
-        server.serve = serve
-
-
-def is_own_page(host: str, origin: str | None, served: str) -> bool:
-    """Whether a request comes from the page itself.
-
-    Args:
-        host: the header ``Host``: an address, which no foreign name can hide behind, or this machine's name.
-        origin: the header ``Origin``, which a browser sends with a socket; None without a browser.
-        served: the address that the server listens at.
-    """
-    name = urlsplit(f"//{host}").hostname or ""
-    try:
-        ip_address(name)
-    except ValueError:
-        if name not in ("localhost", served, gethostname(), getfqdn()):
-            return False
-    return origin is None or origin in (f"http://{host}", f"https://{host}")

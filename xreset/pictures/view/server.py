@@ -1,0 +1,146 @@
+"""The web server of a page, restricted to that page, and what every page shows: the table and the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from ipaddress import ip_address
+from socket import getfqdn, gethostname
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import torch
+
+from xreset.errors import XResetError, needs
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import matrix_to_quat
+from xreset.geometry.urdf import link_meshes
+from xreset.pictures.meshes import TABLE_COLORS, Color, link_colors, rgb, tint
+from xreset.pictures.render import Camera
+from xreset.spec import RobotSpec, TableSpec
+
+
+def start_server(host: str, port: int, *, label: str) -> Any:
+    """Start a viser server that answers its own page only, and show the table.
+
+    Args:
+        host: address to listen at; 0.0.0.0 for every address of the machine.
+        port: port to listen at; the next free one if it is taken.
+        label: title of the page.
+
+    Raises:
+        XResetError: viser is not installed, or the server does not start.
+    """
+    with needs("viser, without which --png and --mp4 of xreset view work,", "viewer"):
+        import viser
+    try:
+        with _own_page_only(host) as guarded:
+            server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    except OSError as error:
+        raise XResetError(
+            f"Cannot serve the page at {host}:{port}: {error}. Choose another --host or --port."
+        ) from error
+    if not guarded:
+        server.stop()
+        raise XResetError("This version of viser cannot be restricted to its own page. Install viser 1.1.")
+    camera = Camera()
+    server.initial_camera.position = camera.eye
+    server.initial_camera.look_at = camera.target
+    server.initial_camera.fov = camera.fov
+    server.scene.set_up_direction("+z")
+    table = TableSpec()
+    size = tuple(2 * half for half in table.half_size)
+    server.scene.add_box("/table", rgb(TABLE_COLORS[0]), size, position=(*table.center, -table.half_size[2]))
+    return server
+
+
+def url_of(server: Any) -> str:
+    """Return the address of a server's page, seen from this machine."""
+    host = server.get_host()
+    if host in ("0.0.0.0", "127.0.0.1"):
+        host = "localhost"
+    return f"http://{host}:{server.get_port()}"
+
+
+class RobotMeshes:
+    """The links of a robot on a page.
+
+    Attributes:
+        links: mesh on the page by name of the link; links without a shape are left out.
+    """
+
+    def __init__(self, scene: Any, robot: RobotSpec) -> None:
+        """Add the meshes to a viser scene."""
+        self._kinematics = Kinematics(robot)
+        self._tint: Color | None = None
+        self._colors: dict[str, Color] = {}
+        self.links: dict[str, Any] = {}
+        names = self._kinematics.link_names
+        for name, mesh, color in zip(names, link_meshes(robot), link_colors(robot), strict=True):
+            if mesh is not None:
+                self._colors[name] = color
+                self.links[name] = scene.add_mesh_simple(
+                    f"/robot/{name}", mesh.vertices, mesh.faces, color=rgb(color), flat_shading=False
+                )
+
+    def place(self, joint_pos: np.ndarray, color: Color | None = None) -> None:
+        """Show joint positions [J] [rad, m], with a color mixed into the robot's own."""
+        poses = self._kinematics.link_poses(torch.as_tensor(joint_pos, dtype=torch.float64), tuple(self.links))
+        quats = matrix_to_quat(poses[:, :3, :3]).numpy()
+        for (name, link), pose, quat in zip(self.links.items(), poses.numpy(), quats, strict=True):
+            link.position = pose[:3, 3]
+            link.wxyz = quat
+            if color != self._tint:
+                link.color = rgb(self._colors[name] if color is None else tint(self._colors[name], color))
+        self._tint = color
+
+
+@contextmanager
+def _own_page_only(host: str) -> Iterator[list[str]]:
+    """Make servers that viser starts in this block answer requests of their own pages only.
+
+    A page of another site may open a socket to any address, and a foreign name may point to this machine. viser checks
+    neither and has no option for it, so the function that starts its server is replaced. The block's value lists the
+    servers that are restricted: none if viser starts its server in another way.
+    """
+    from websockets.asyncio import server
+
+    serve = server.serve
+    guarded = []
+
+    def guarded_serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            try:
+                own = is_own_page(request.headers.get("Host", ""), request.headers.get("Origin"), host)
+            except Exception:  # several headers of one name, or a damaged address
+                own = False
+            if not own:
+                return connection.respond(403, "this server answers its own page only\n")
+            return process_request(connection, request) if process_request else None
+
+        guarded.append(host)
+        return serve(*arguments, process_request=check, **options)
+
+    server.serve = guarded_serve
+    try:
+        yield guarded
+    finally:
+        server.serve = serve
+
+
+def is_own_page(host: str, origin: str | None, served: str) -> bool:
+    """Whether a request comes from the page itself.
+
+    Args:
+        host: the header ``Host``: an address, which no foreign name can hide behind, or this machine's name.
+        origin: the header ``Origin``, which a browser sends with a socket; None without a browser.
+        served: the address that the server listens at.
+    """
+    name = urlsplit(f"//{host}").hostname or ""
+    try:
+        ip_address(name)
+    except ValueError:
+        if name not in ("localhost", served, gethostname(), getfqdn()):
+            return False
+    return origin is None or origin in (f"http://{host}", f"https://{host}")

@@ -10,6 +10,7 @@ from xreset.env import make_env as make_env
 from xreset.errors import XResetError as XResetError
 from xreset.eval.evaluate import evaluate as evaluate
 from xreset.eval.film import film as film
+from xreset.eval.play.run import play as play
 from xreset.eval.policy_spec import PolicySpec as PolicySpec
 from xreset.eval.policy_spec import load_policy as load_policy
 from xreset.eval.results import EvalResult as EvalResult

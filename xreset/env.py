@@ -283,9 +283,15 @@ class ManipulationEnv:
 
     # Stepping and resetting
 
-    def advance(self, action: Tensor) -> tuple[Reading, Reward]:
-        """Take one control step without any reset, for evaluation, which ends episodes itself."""
-        self._apply_action(action)
+    def advance(self, action: Tensor, push: Tensor | None = None) -> tuple[Reading, Reward]:
+        """Take one control step without any reset, for evaluation, which ends episodes itself.
+
+        Args:
+            action: [N, J], limited to [-1, 1].
+            push: [N, J] what is added to the targets that the drives get [rad, m]: a torque from outside, divided by
+                the drive's stiffness.
+        """
+        self._apply_action(action, push)
         reading, reward = self._compute_rewards()
         self._reset_mask.zero_()
         self._look()
@@ -397,10 +403,10 @@ class ManipulationEnv:
 
     # Parts
 
-    def _apply_action(self, action: Tensor) -> None:
+    def _apply_action(self, action: Tensor, push: Tensor | None = None) -> None:
         self._action.copy_(action)
         self._graphs.run(self._process_action)
-        self.backend.set_joint_targets(self._sent_target)
+        self.backend.set_joint_targets(self._sent_target if push is None else self._sent_target + push)
         pushes = self.variation.pushes
         if pushes is not None and pushes.config.moves_object:
             self.backend.set_object_wrench(pushes.force, pushes.torque)

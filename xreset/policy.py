@@ -195,6 +195,8 @@ class OnnxPolicy:
             import onnxruntime
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3
+        # Its threads would otherwise spin between the steps, which costs as much as the physics.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
             self._session = onnxruntime.InferenceSession(
                 path.read_bytes(),

@@ -27,6 +27,7 @@ COMMANDS: dict[str, str] = {
     "retarget": "Turn human demonstrations into robot motion.",
     "resets": "Test robot states in physics and keep the stable ones.",
     "view": "Show demonstrations, robot motion or a reset bank in a browser, or as pictures.",
+    "play": "Play with a policy in a browser: drag the goal, push the robot, change the engine.",
     "train": "Train a policy.",
     "policies": "List the policies that ship with xreset, and shrink exported ones.",
     "eval": "Evaluate a policy or a baseline in one or several engines.",

@@ -50,7 +50,7 @@ def start_server(host: str, port: int, *, label: str) -> Any:
     server.initial_camera.fov = camera.fov
     server.scene.set_up_direction("+z")
     table = TableSpec()
-    size = tuple(2 * half for half in table.half_size)
+    size = 2 * np.array(table.half_size)
     server.scene.add_box("/table", rgb(TABLE_COLORS[0]), size, position=(*table.center, -table.half_size[2]))
     return server
 

@@ -1,0 +1,460 @@
+"""The page of a session: what a visitor sees, drags and chooses. All visitors share one robot."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from math import degrees
+from multiprocessing import get_context
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from xreset.errors import XResetError
+from xreset.eval.play.record import draw_film, last_moments, write_trace
+from xreset.eval.play.session import Session
+from xreset.eval.plots import COLORS
+from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, rgb
+from xreset.pictures.view.colors import TOUCH_COLOR
+from xreset.pictures.view.server import RobotMeshes, start_server, url_of
+from xreset.plugins import backend_names, robot_names
+from xreset.policies import shipped
+from xreset.text import short_name
+
+HELP = "Drag the **green shape**, and the robot brings the object there. Pull at the object or the robot to disturb it."
+NOBODY = "zero"
+"""The policy of a robot that no policy was trained for: it rests."""
+PHONE_STYLE = """<style>@media (max-width: 36em) {
+[style*="width: 20em"] {width: 100% !important} [style*="max-height: 60%"] {max-height: 42% !important}
+}</style>"""
+"""On a phone, the controls leave the upper half to the robot."""
+FRAME = 1 / 30
+"""Time between two pictures [s]."""
+CURVE_FRAME = 0.25
+"""Time between two updates of text and curves [s]."""
+CURVE_SECONDS = 10.0
+CURVE_POINTS = 120
+"""Most points of a curve."""
+BEHIND = 0.2
+"""A delay behind the clock from which the page does not try to catch up [s]."""
+GROWTH = 1.03
+"""Size of the goal next to the object, so that a pointer meets the goal first where both are in one place."""
+
+
+class Page:
+    """A page at :attr:`url` until :meth:`close`.
+
+    The session is used by :meth:`serve` alone. Visitors' wishes wait in a queue until the next control step.
+    """
+
+    def __init__(self, session: Session, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+        """Start the server.
+
+        Args:
+            session: what is played.
+            host: address to listen at; 0.0.0.0 for every address of the machine.
+            port: port to listen at; the next free one if it is taken.
+
+        Raises:
+            XResetError: viser is not installed, or the server does not start.
+        """
+        self.session = session
+        self._server = start_server(host, port, label="xreset play")
+        self._wishes: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._paused = False
+        self._factor = 1.0
+        """How many seconds are played in a second."""
+        self._holder: int | None = None
+        """The visitor who pulls or turns something."""
+        self._turning = False
+        self._drawn = self._written = self._due = 0.0
+        self._clock = (time.monotonic(), session.time)
+        self._films = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+        self._robot: RobotMeshes | None = None
+        self._things: list[Any] = []
+        self._make_controls()
+        self._make_scene()
+        self._server.on_client_connect(self._welcome)
+        self._server.on_client_disconnect(self._part)
+        self._draw()
+
+    @property
+    def url(self) -> str:
+        """Address of the page, seen from this machine."""
+        return url_of(self._server)
+
+    def serve(self) -> None:
+        """Play until interrupted. While nobody looks, time stands still."""
+        while True:
+            self.tick()
+
+    def tick(self) -> None:
+        """Fulfil wishes, take a control step if one is due, and wait for the next one."""
+        self._fulfil()
+        now = time.monotonic()
+        if self._paused or not self._server.get_clients():
+            self._clock = (now, self.session.time)
+            self._due = now
+            self._draw()
+            time.sleep(FRAME)
+            return
+        self._step()
+        if now - self._drawn > FRAME:
+            self._draw()
+        self._due = max(self._due + self.session.control_dt / self._speed.value, now - BEHIND)
+        time.sleep(max(0.0, self._due - time.monotonic()))
+
+    def close(self) -> None:
+        """Stop the server. The session stays open."""
+        self._films.shutdown(cancel_futures=True)
+        self._server.stop()
+
+    def _wish(self, action: Callable[..., Any], *arguments: Any) -> None:
+        self._wishes.put(lambda: action(*arguments))
+
+    def _fulfil(self) -> None:
+        while True:
+            try:
+                wish = self._wishes.get_nowait()
+            except Empty:
+                return
+            try:
+                wish()
+            except XResetError as error:
+                self._tell("That does not work", str(error))
+
+    def _step(self) -> None:
+        try:
+            self.session.step()
+        except XResetError as error:
+            self._tell("Restarted", str(error))
+        if self._retry.value and self.session.dropped:
+            self._tell("Dropped", "The robot goes home and tries again.")
+            self.session.put_back()
+
+    def _tell(self, title: str, text: str) -> None:
+        for client in self._server.get_clients().values():
+            client.add_notification(title, text, auto_close_seconds=8.0)
+
+    @contextmanager
+    def _loading(self, what: str) -> Iterator[None]:
+        """Show that something is being loaded, and restore the controls from the session, whatever happened."""
+        notes = []
+        for client in self._server.get_clients().values():
+            notes.append(client.add_notification(f"Loading {what}", "", loading=True, with_close_button=False))
+        try:
+            yield
+        finally:
+            for note in notes:
+                note.remove()
+            self._show_choices()
+
+    # Visitors ---------------------------------------------------------------------------------------------------------
+
+    def _welcome(self, client: Any) -> None:
+        if client.camera.aspect < 1.0:  # a phone: its controls cover the lower half
+            client.camera.position = (1.5, -1.35, 0.95)
+            client.camera.look_at = (0.55, 0.3, -0.35)
+        others = len(self._server.get_clients()) - 1
+        if others > 0:
+            self._tell("A shared robot", f"{others + 1} visitors are here. All of them move the same robot.")
+
+    def _part(self, client: Any) -> None:
+        if self._holder == client.client_id:
+            self._turning = False
+            self._wish(self.session.release)
+
+    # The scene --------------------------------------------------------------------------------------------------------
+
+    def _make_scene(self) -> None:
+        """Show robot, object and goal of the session in place of earlier ones."""
+        for thing in self._things:
+            thing.remove()
+        session = self.session
+        scene = self._server.scene
+        obj = session.env.backend.scene.objects[0]
+        radius = float(np.ptp(obj.vertices, axis=0).max()) / 2
+        middle = (obj.vertices.max(axis=0) + obj.vertices.min(axis=0)) / 2
+        body = scene.add_mesh_simple("/object", obj.vertices, obj.faces, color=rgb(OBJECT_COLOR))
+        # Rings turn the goal. The shape itself is dragged.
+        goal = scene.add_transform_controls(
+            "/goal", scale=2.4 * radius, disable_axes=True, disable_sliders=True, depth_test=False, line_width=3.5
+        )
+        ghost = scene.add_mesh_simple(
+            "/goal/shape",
+            middle + GROWTH * (obj.vertices - middle),
+            obj.faces,
+            color=rgb(GOAL_COLOR),
+            opacity=0.4,
+            cast_shadow=False,
+        )
+        hint = scene.add_label("/hint", "drag me", anchor="bottom-center")
+        self._above = np.array((0.0, 0.0, 1.4 * radius))
+        points = scene.add_point_cloud(
+            "/points", np.zeros((1, 3), np.float32), rgb(TOUCH_COLOR), point_size=0.006, visible=False
+        )
+        robot = RobotMeshes(scene, session.policy.robot)
+        self._robot = robot
+        self._body = body
+        self._goal = goal
+        self._hint = hint
+        self._points = points
+        self._things = [hint, ghost, goal, body, points, *robot.links.values()]
+        goal.on_update(self._turn)
+        ghost.on_drag("left")(self._drag)
+        self._pull_at(body, None)
+        for name, link in robot.links.items():
+            self._pull_at(link, name)
+
+    def _pull_at(self, mesh: Any, link: str | None) -> None:
+        async def pull(event: Any) -> None:
+            if event.phase == "start":
+                self._holder = event.client_id
+                self._wish(self.session.grab, link, event.start_position)
+            self._wish(self.session.pull, event.end_position)
+            if event.phase == "end":
+                self._wish(self.session.release)
+
+        mesh.on_drag("left")(pull)
+
+    async def _drag(self, event: Any) -> None:
+        if event.phase == "start":
+            self._grasped = self._goal.position - np.array(event.start_position)
+        self._wish(self._move_goal, np.array(event.end_position) + self._grasped, self._goal.wxyz.copy())
+
+    async def _turn(self, event: Any) -> None:
+        self._holder = event.client_id
+        self._turning = event.phase != "end"
+        self._wish(self._move_goal, event.target.position.copy(), event.target.wxyz.copy())
+
+    def _move_goal(self, pos: np.ndarray, quat: np.ndarray) -> None:
+        self._hint.visible = False
+        self.session.move_goal(pos, quat)
+
+    def _draw(self) -> None:
+        """Show the present state."""
+        session = self.session
+        env = session.env
+        state = env.backend.state()
+        assert self._robot is not None
+        with self._server.atomic():
+            self._robot.place(state.joint_pos[0].cpu().numpy())
+            self._body.position = state.object_pos[0].cpu().numpy()
+            self._body.wxyz = state.object_quat[0].cpu().numpy()
+            self._body.visible = not session.away
+            if not self._turning:
+                self._goal.position = env.goal_pos[0].cpu().numpy()
+                self._goal.wxyz = env.goal_quat[0].cpu().numpy()
+                self._hint.position = self._goal.position + self._above
+            if self._see.value:
+                self._points.points = session.cloud().astype(np.float32)
+        self._drawn = time.monotonic()
+        if self._drawn - self._written > CURVE_FRAME:
+            self._write()
+
+    # The controls -----------------------------------------------------------------------------------------------------
+
+    def _make_controls(self) -> None:
+        gui: Any = self._server.gui
+        gui.set_panel_label("xreset play")
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=rgb(GOAL_COLOR))
+        gui.add_html(PHONE_STYLE)
+        gui.add_markdown(HELP)
+        self._text = gui.add_markdown("")
+        self._run = gui.add_button_group("time", ("Pause", "Step", "Restart"))
+        self._run.on_click(lambda _: self._wish(self._control, self._run.value))
+        self._speed = gui.add_slider("speed", 0.1, 1.0, 0.1, 1.0)
+        self._take = gui.add_button("Take the object away")
+        self._take.on_click(lambda _: self._wish(self._take_or_put))
+        self._retry = gui.add_checkbox("try again", True, hint="Put a dropped object back, after the robot went home.")
+        self._object = gui.add_dropdown("object", ("",))
+        self._engine = gui.add_dropdown("engine", backend_names())
+        self._policies = {
+            self.session.policy.name: self.session.policy,
+            **{name: name for name in shipped()},
+            NOBODY: NOBODY,
+        }
+        with gui.add_folder("robot and policy", expand_by_default=False):
+            self._policy = gui.add_dropdown("policy", tuple(self._policies))
+            names = dict.fromkeys((self.session.policy.robot.name, *robot_names()))
+            self._robot_name = gui.add_dropdown("robot", tuple(names))
+        with gui.add_folder("curves", expand_by_default=False):
+            self._see = gui.add_checkbox("the object's points that the policy sees", False)
+            self._see.on_update(lambda _: setattr(self._points, "visible", self._see.value))
+            self._curves = [
+                _Curves(gui, "fingertip forces [N]"),
+                _Curves(gui, "terms of the reward"),
+                _Curves(gui, "the policy's inputs", legend=False),
+            ]
+            self._input = gui.add_dropdown("input", tuple(self.session.inputs))
+        with gui.add_folder("save", expand_by_default=False):
+            self._seconds = gui.add_slider("seconds", 2, 60, 1, 10)
+            film = gui.add_button("Film (mp4)")
+            film.on_click(lambda event: self._wish(self._save_film, event.client))
+            trace = gui.add_button("Numbers (npz)")
+            trace.on_click(lambda event: self._wish(self._save_trace, event.client))
+        self._show_choices()
+        for control, choose in (
+            (self._object, self._choose_object),
+            (self._engine, self._choose_engine),
+            (self._policy, self._choose_policy),
+            (self._robot_name, self._choose_robot),
+        ):
+            control.on_update(lambda _, choose=choose: self._wish(choose))
+
+    def _show_choices(self) -> None:
+        """Let the controls say what the session is."""
+        session = self.session
+        self._names = {short_name(name): name for name in session.objects}
+        self._object.options = tuple(self._names)
+        self._object.value = short_name(session.object_name)
+        self._engine.value = session.engine
+        self._policy.value = session.policy.name
+        self._robot_name.value = session.policy.robot.name
+        inputs = tuple(session.inputs)
+        if self._input.options != inputs:
+            self._input.options = inputs
+
+    def _control(self, button: str) -> None:
+        if button == "Restart":
+            self.session.begin()
+        else:
+            self._paused = button != "Go on"
+            self._run.options = ("Go on" if self._paused else "Pause", "Step", "Restart")
+        if button == "Step":
+            self._step()
+
+    def _take_or_put(self) -> None:
+        if self.session.away or self.session.lost:
+            self.session.put_back()
+        else:
+            self.session.take_away()
+
+    def _choose_object(self) -> None:
+        name = self._names[self._object.value]
+        if name != self.session.object_name:
+            with self._loading(self._object.value):
+                self.session.choose_object(name)
+                self._make_scene()
+
+    def _choose_engine(self) -> None:
+        if self._engine.value != self.session.engine:
+            with self._loading(self._engine.value):
+                self.session.choose_engine(self._engine.value)
+
+    def _choose_policy(self) -> None:
+        name = self._policy.value
+        if name != self.session.policy.name:
+            robot = self.session.policy.robot.name if name == NOBODY else None
+            self._open(name, robot)
+
+    def _choose_robot(self) -> None:
+        robot = self._robot_name.value
+        if robot != self.session.policy.robot.name:
+            self._open(NOBODY, robot)
+
+    def _open(self, name: str, robot: str | None) -> None:
+        with self._loading(robot or name):
+            self.session.choose_policy(self._policies[name], robot=robot)
+            self._make_scene()
+
+    def _write(self) -> None:
+        """Show text and curves."""
+        session = self.session
+        now = time.monotonic()
+        wall = now - self._clock[0]
+        if wall > 1.0:
+            self._factor = (session.time - self._clock[1]) / wall
+            self._clock = (now, session.time)
+        self._take.label = "Put the object back" if session.away or session.lost else "Take the object away"
+        self._written = now
+        if not session.history:
+            return
+        self._text.content = self._status()
+        begin = session.history[-1].time - CURVE_SECONDS
+        moments = [moment for moment in session.history if moment.time > begin]
+        moments = moments[:: max(1, len(moments) // CURVE_POINTS)]
+        times = np.array([moment.time for moment in moments])
+        forces = np.array([np.linalg.norm(moment.tip_force, axis=1) for moment in moments])
+        place = session.inputs[self._input.value]
+        inputs = np.array([moment.inputs[place] for moment in moments])
+        columns = [f"{self._input.value} {i}" for i in range(inputs.shape[1])]
+        rewards = np.array([moment.reward for moment in moments])
+        curves = (
+            (forces, session.policy.robot.fingertip_names),
+            (rewards, session.terms),
+            (inputs, columns),
+        )
+        for curve, (values, names) in zip(self._curves, curves, strict=True):
+            curve.show(times, values, names)
+
+    def _status(self) -> str:
+        session = self.session
+        last = session.history[-1]
+        if session.away:
+            where = "The object is **away**."
+        elif session.lost:
+            where = "The object has **left the table**. Put it back."
+        elif last.success:
+            where = f"**At the goal**: {100 * last.distance:.1f} cm, {degrees(last.angle):.0f} degrees off."
+        else:
+            where = f"{100 * last.distance:.1f} cm and {degrees(last.angle):.0f} degrees from the goal."
+        if self._paused:
+            return f"{where}\n\n{session.engine}, paused"
+        slow = self._factor < 0.9 * self._speed.value
+        return f"{where}\n\n{session.engine}: {self._factor:.2f} x real time{', its best here' if slow else ''}"
+
+    # Saving -----------------------------------------------------------------------------------------------------------
+
+    def _save_film(self, client: Any) -> None:
+        moments = last_moments(self.session, self._seconds.value)
+        note = client.add_notification("Drawing the film", "It takes a while. Go on playing.", loading=True)
+        film = self._films.submit(draw_film, self.session.env.backend.scene, moments)
+
+        def send(done: Any) -> None:
+            note.remove()
+            if done.exception():
+                client.add_notification("No film", str(done.exception()))
+            else:
+                client.send_file_download("play.mp4", done.result())
+
+        film.add_done_callback(send)
+
+    def _save_trace(self, client: Any) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "play.npz"
+            write_trace(path, self.session)
+            client.send_file_download(path.name, path.read_bytes())
+
+
+class _Curves:
+    """One plot. It is made anew where the number of its curves changes."""
+
+    def __init__(self, gui: Any, title: str, *, legend: bool = True) -> None:
+        self._gui = gui
+        self._title = title
+        self._legend = legend
+        self._names: tuple[str, ...] = ()
+        self._plot: Any = None
+        self._folder = gui.add_folder(title)
+
+    def show(self, times: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
+        """Show values [T, K] of K names over times [T]; curves that are zero throughout are left out of the legend."""
+        data = (times, *np.ascontiguousarray(values.T, dtype=float))
+        if tuple(names) == self._names:
+            self._plot.data = data
+            return
+        self._names = tuple(names)
+        if self._plot is not None:
+            self._plot.remove()
+        series: list[dict[str, Any]] = [{"label": "time"}]
+        for i, name in enumerate(names):
+            series.append({"label": name, "stroke": COLORS[i % len(COLORS)], "width": 1.5})
+        options = {"scales": {"x": {"time": False}}, "legend": {"show": self._legend}, "height": 180}
+        with self._folder:
+            self._plot = self._gui.add_uplot(data, tuple(series), **options)

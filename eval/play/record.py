@@ -1,0 +1,76 @@
+"""Save what happened in a session: a film, or a file with all numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from xreset.errors import XResetError
+from xreset.eval.play.session import Moment, Session
+from xreset.eval.report.clips import encode_mp4
+from xreset.files import write_whole
+from xreset.pictures.render import Renderer, pose_matrix
+from xreset.records import write_npz
+from xreset.spec import SceneSpec
+
+SCHEMA = "xreset-play/1"
+FRAMES_PER_SECOND = 20.0
+SIZE = (640, 480)
+"""Width and height of a film [pixels]."""
+
+
+def write_trace(path: str | Path, session: Session) -> None:
+    """Write all moments that a session remembers, T of them, as npz.
+
+    Every field of :class:`~xreset.eval.play.session.Moment` is an array [T, ...]. ``reward`` [T, R] has the names
+    ``reward_names`` [R]. The columns of ``inputs`` [T, D] have the names ``input_names`` [D].
+
+    Raises:
+        XResetError: nothing has happened yet.
+    """
+    moments = last_moments(session, None)
+    arrays = {}
+    for f in fields(Moment):
+        arrays[f.name] = np.array([getattr(moment, f.name) for moment in moments])
+    input_names = []
+    for name, place in session.inputs.items():
+        input_names += [name] * (place.stop - place.start)
+    robot = session.policy.robot
+    names = {
+        "policy": session.policy.name,
+        "robot": robot.name,
+        "object_name": session.object_name,
+        "joint_names": np.array(robot.joint_names),
+        "fingertip_names": np.array(robot.fingertip_names),
+        "reward_names": np.array(session.terms),
+        "input_names": np.array(input_names),
+    }
+    write_npz(path, SCHEMA, names | arrays)
+
+
+def write_film(path: str | Path, session: Session, *, seconds: float = 10.0) -> None:
+    """Write the last seconds of a session as an mp4 at its own speed; ``XResetError`` if nothing has happened yet."""
+    write_whole(Path(path), draw_film(session.env.backend.scene, last_moments(session, seconds)))
+
+
+def draw_film(scene: SceneSpec, moments: Sequence[Moment]) -> bytes:
+    """Draw moments as an mp4, :data:`FRAMES_PER_SECOND` of them for each second."""
+    renderer = Renderer(scene, size=SIZE)
+    every = max(1, round(1.0 / (FRAMES_PER_SECOND * scene.control_dt)))
+    frames = []
+    for moment in moments[::every]:
+        pose = pose_matrix(moment.object_pos, moment.object_quat)
+        goal = pose_matrix(moment.goal_pos, moment.goal_quat)
+        frames.append(renderer.draw(moment.joint_pos, pose, goal_pose=goal))
+    return encode_mp4(np.stack(frames), 1.0 / (every * scene.control_dt))
+
+
+def last_moments(session: Session, seconds: float | None) -> list[Moment]:
+    """Return the moments of the last seconds; None: all that a session remembers."""
+    if not session.history:
+        raise XResetError("Nothing has happened yet. Let the policy act first.")
+    now = session.history[-1].time
+    return [moment for moment in session.history if seconds is None or moment.time > now - seconds]

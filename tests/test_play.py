@@ -1,0 +1,173 @@
+"""A live episode, without a browser: every way in which a user can interfere."""
+
+import tempfile
+import unittest
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from xreset.errors import XResetError
+from xreset.eval.play.record import SCHEMA, write_film, write_trace
+from xreset.eval.play.session import AWAY, Session
+from xreset.plugins import backend_names, backend_status
+from xreset.records import npz_schema
+from xreset.tensors import one_thread
+
+
+class Played(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.enterClassContext(one_thread())
+        cls.session = Session("nine-objects")
+        cls.addClassCleanup(lambda: cls.session.close())
+
+    def setUp(self):
+        self.session.env.generator.manual_seed(0)
+        self.session.begin()
+
+    def steps(self, seconds: float):
+        """Let time pass; returns the last moment."""
+        for _ in range(round(seconds / self.session.control_dt)):
+            moment = self.session.step()
+        return moment
+
+    def test_the_object_follows_the_goal_beyond_the_time_limit(self):
+        session = self.session
+        moment = self.steps(4.0)
+        self.assertLess(moment.distance, 0.05)
+        session.move_goal(moment.goal_pos + np.array((0.08, 0.0, 0.0)), moment.goal_quat)
+        self.assertGreater(session.step().distance, 0.05)
+        moment = self.steps(3.0)
+        self.assertGreater(moment.time - session.history[0].time, session.env.cfg.termination.episode_seconds)
+        self.assertLess(moment.distance, 0.05)
+        self.assertFalse(session.dropped)
+
+    def test_a_goal_stays_above_the_table_and_within_reach(self):
+        obj = self.session.env.backend.scene.objects[0]
+        for pos in ((0.5, 0.3, -1.0), (9.0, -9.0, 9.0)):
+            with self.subTest(pos=pos):
+                self.session.move_goal(pos, (2.0, 0.0, 0.0, 0.0))
+                goal = self.session.env.goal_pos[0].numpy()
+                self.assertGreater(goal[2] + obj.vertices[:, 2].min(), -1e-6)
+                self.assertLess(np.abs(goal).max(), 1.5)
+                self.assertAlmostEqual(float(self.session.env.goal_quat[0].norm()), 1.0, places=6)
+
+    def test_the_object_is_pulled_and_let_go(self):
+        session = self.session
+        start = session.step().object_pos
+        session.grab(None, start)
+        session.pull(start + np.array((0.0, -0.1, 0.2)))
+        self.assertGreater(self.steps(0.7).object_pos[2], start[2] + 0.1)
+        session.release()
+        self.assertLess(self.steps(0.7).object_pos[2], start[2] + 0.05)
+
+    def test_a_force_at_the_arm_moves_it_as_far_as_its_drives_give_way(self):
+        session = self.session
+        link = "wrist_2_link"
+        session.choose_policy("zero", robot=session.policy.robot.name)
+        self.addCleanup(session.choose_policy, "nine-objects")
+        places = []
+        for pull in ((0.0, 0.0, 0.0), (0.0, 0.2, 0.0)):
+            q = torch.as_tensor(self.steps(1.0).joint_pos).double()
+            at = session._kinematics.jacobian(q, [link])
+            session.grab(link, at.pos[0].tolist())
+            session.pull((at.pos[0].numpy() + pull).tolist())
+            self.steps(1.0)
+            now = torch.as_tensor(session.history[-1].joint_pos).double()
+            places.append(session._kinematics.points(now, [link])[0] - at.pos[0])
+        self.assertLess(float(places[0].norm()), 1e-3)
+        jacobian = at.linear[0]
+        compliance = jacobian @ torch.diag(1 / session._stiffness.double()) @ jacobian.T
+        spring = 500.0 * (torch.tensor(pull).double() - places[1])
+        torch.testing.assert_close(places[1], compliance @ spring, atol=3e-3, rtol=0.1)
+        session.release()
+
+    def test_the_object_is_taken_away_and_put_back(self):
+        session = self.session
+        start = session.step().object_pos
+        self.steps(2.0)
+        session.take_away()
+        moment = self.steps(4.0)
+        np.testing.assert_allclose(moment.object_pos, AWAY, atol=1e-3)
+        self.assertTrue(session.away and session.lost and not session.dropped)
+        session.put_back()
+        while session.away:
+            moment = self.steps(0.1)
+            self.assertLess(moment.time - session.history[0].time, 15.0)
+        np.testing.assert_allclose(session.step().object_pos[:2], start[:2], atol=0.05)
+        self.assertLess(self.steps(4.0).distance, 0.05)
+
+    def test_what_falls_off_the_table_is_caught(self):
+        session = self.session
+        session.grab(None, session.step().object_pos)
+        session.pull((0.57, -0.6, 0.3))
+        self.steps(2.0)
+        session.release()
+        self.assertTrue(session.lost)
+        self.steps(1.5)
+        self.assertTrue(session.away)
+        session.begin()
+        self.assertFalse(session.away or session.lost)
+
+    def test_another_engine_goes_on_at_the_same_state(self):
+        session = self.session
+        self.addCleanup(session.choose_engine, "mujoco")
+        self.steps(2.0)
+        player = session._player
+        for engine in (name for name in backend_names() if name not in ("mujoco", "mujoco-warp")):
+            if backend_status(engine).reason:
+                continue
+            with self.subTest(engine=engine):
+                before = session.env.snapshot()
+                session.choose_engine(engine)
+                after = session.env.snapshot()
+                for name, value in before.items():
+                    torch.testing.assert_close(after[name], value, atol=1e-5, rtol=0, msg=name)
+                self.assertIs(session._player, player)
+                self.assertEqual(session.step().engine, engine)
+
+    def test_what_cannot_be_used_changes_nothing(self):
+        session = self.session
+        self.steps(0.1)
+        before = session.env.snapshot()
+        for choose, name, words in (
+            (session.choose_engine, "nosuch", "Unknown backend 'nosuch'"),
+            (session.choose_object, "nosuch", "Unknown object 'nosuch'"),
+            (session.choose_policy, "nosuch", "Unknown policy 'nosuch'"),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
+                choose(name)
+        for name, value in session.env.snapshot().items():
+            torch.testing.assert_close(value, before[name], atol=0, rtol=0)
+        session.step()
+
+    def test_a_broken_simulation_begins_anew(self):
+        session = self.session
+        session.step()
+        session.env.backend.state().joint_vel.fill_(float("nan"))
+        session.env.backend.set_state(session.env.backend.state())
+        with self.assertRaisesRegex(XResetError, "broke down. A new episode has begun"):
+            session.step()
+        self.assertLess(self.steps(0.1).distance, 1.0)
+
+    def test_film_and_trace(self):
+        session = self.session
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "play"
+            for write in (write_trace, write_film):
+                with self.assertRaisesRegex(XResetError, "Nothing has happened yet"):
+                    write(path, session)
+            self.steps(0.5)
+            write_trace(path, session)
+            self.assertEqual(npz_schema(path), SCHEMA)
+            with np.load(path) as arrays:
+                self.assertEqual(arrays["inputs"].shape, (30, len(arrays["input_names"])))
+                self.assertEqual(arrays["reward"].shape, (30, len(arrays["reward_names"])))
+                np.testing.assert_array_equal(arrays["joint_pos"][-1], session.history[-1].joint_pos)
+            write_film(path, session, seconds=0.2)
+            self.assertEqual(path.read_bytes()[4:8], b"ftyp")
+
+
+if __name__ == "__main__":
+    unittest.main()

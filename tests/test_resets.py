@@ -13,7 +13,7 @@ from xreset.errors import DemoError
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
 from xreset.physics import Health, State
-from xreset.resets import filter as filtering
+from xreset.resets.config import FilterConfig
 from xreset.resets.filter import REASONS, make_bank, rejection
 from xreset.resets.probe import settle
 from xreset.retarget.file import Retargeted
@@ -34,15 +34,16 @@ class FilterTest(unittest.TestCase):
         cls.objects = load_objects([SOUP, SPAM])
         cls.height = float(rest_height(cls.objects[0], UPRIGHT))
 
-    def try_one(self, pos, joint_pos=None, backend_class=MujocoBackend):
+    def try_one(self, pos, joint_pos=None, backend_class=MujocoBackend, **limits):
         """The reason (None: accepted) of one state with the soup can at ``pos``."""
+        config = FilterConfig(**limits)
         scene = SceneSpec(robot=self.robot, objects=self.objects[:1])
         joint_pos = self.robot.home if joint_pos is None else joint_pos
         rows = [torch.as_tensor(np.asarray(v)[None], dtype=torch.float32) for v in (joint_pos, pos, UPRIGHT)]
         with backend_class(scene, 1, workers=0) as backend:
             start = State.at_rest(*rows)
-            settle(backend, start, gravity=0.0, steps=filtering.STEPS)
-            reason = int(rejection(backend, start))
+            settle(backend, start, gravity=0.0, steps=config.steps)
+            reason = int(rejection(backend, start, config))
         return None if reason < 0 else REASONS[reason]
 
     def test_an_object_at_rest_is_accepted(self):
@@ -59,9 +60,10 @@ class FilterTest(unittest.TestCase):
 
     def test_thresholds_count(self):
         pos = [0.5, 0.3, self.height - 0.02]
-        limits = {"LINEAR_VELOCITY": 1e3, "ANGULAR_VELOCITY": 1e3, "JOINT_VELOCITY": 1e3}
-        with mock.patch.multiple(filtering, **limits):
-            self.assertIsNone(self.try_one(pos))
+        limits = {"linear_velocity": 1e3, "angular_velocity": 1e3, "joint_velocity": 1e3}
+        self.assertIsNone(self.try_one(pos, **limits))
+        loose = FilterConfig(linear_velocity=1e3, angular_velocity=1e3, joint_velocity=1e3)
+        self.assertEqual(self.bank(num_envs=4, limits=loose).num_states, 5)
 
     def test_broken_and_overflowing_worlds_are_rejected(self):
         for field, reason in (("nonfinite", "not finite"), ("overflow", "overflow")):

@@ -40,7 +40,7 @@ from xreset.checks import Checked, Finite, Positive, Rule, from_dict
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.paper import METRICS, paper_tables
 from xreset.files import read_toml
-from xreset.resets.config import ClosingConfig, SqueezeConfig
+from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.hand.config import HandConfig
 from xreset.text import shown
@@ -72,7 +72,7 @@ def _config_flags(**configs: type) -> set[str]:
 
 COMMAND_FLAGS = {
     "retarget": _config_flags(hand=HandConfig, arm=ArmConfig) | {"--device"},
-    "resets": _config_flags(closing=ClosingConfig, squeeze=SqueezeConfig)
+    "resets": _config_flags(closing=ClosingConfig, filter=FilterConfig, squeeze=SqueezeConfig)
     | {"--backend", "--device", "--num-envs", "--hold", "--no-hold"},
 }
 """Flags that a study file may give to a command. Flags that name files are not among them: a study writes only into

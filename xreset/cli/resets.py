@@ -20,7 +20,7 @@ from xreset.resets import bank as banks
 from xreset.resets import filter as trying
 from xreset.resets import hold as holding
 from xreset.resets import settle as settling_starts
-from xreset.resets.config import ClosingConfig, SqueezeConfig
+from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.retarget import file
 
 
@@ -33,8 +33,9 @@ def resets(
     objects: Path | None = None,
     num_envs: int = 64,
     device: str = "cpu",
-    closing: ClosingConfig = ClosingConfig(),  # noqa: B008 (frozen)
-    squeeze: SqueezeConfig = SqueezeConfig(),  # noqa: B008 (frozen)
+    limits: Annotated[FilterConfig, tyro.conf.arg(name="filter")] = FilterConfig(),  # noqa: B008 (frozen)
+    closing: ClosingConfig = ClosingConfig(),  # noqa: B008
+    squeeze: SqueezeConfig = SqueezeConfig(),  # noqa: B008
     hold: bool = False,
     settle: bool = False,
 ) -> None:
@@ -49,6 +50,7 @@ def resets(
         objects: Folder of real meshes; default: the built-in stand-ins.
         num_envs: Worlds at a time.
         device: Where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
+        limits: Time and speeds by which states are judged.
         closing: States between frames where the hand closes in.
         squeeze: Targets of states after contact that press.
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
@@ -63,7 +65,8 @@ def resets(
     loaded = catalogue.load_objects(sorted({*map(str, data.object_name)}), objects)
     with Progress(console) as bar:
         bank = trying.make_bank(
-            data, spec, loaded, backends, num_envs=num_envs, device=device, closing=closing, squeeze=squeeze,
+            data, spec, loaded, backends, num_envs=num_envs, device=device, limits=limits, closing=closing,
+            squeeze=squeeze,
             progress=bar.count(f"states in {', '.join(backends)}"),
         )  # fmt: skip
         settling = None
@@ -81,6 +84,7 @@ def resets(
     config = {
         "backends": backends,
         "num_envs": num_envs,
+        "filter": asdict(limits),
         "closing": asdict(closing),
         "squeeze": asdict(squeeze),
         "settle": settle,

@@ -1,6 +1,6 @@
 """The physics filter: which retargeted states stay put when they are spawned (the paper's appendix D.c).
 
-Each candidate is spawned at rest, the drives hold its joint positions, the object has no weight, and eight control
+Each candidate is spawned at rest, the drives hold its joint positions, the object has no weight, and a few control
 steps pass. It is rejected if it leaves the scene or still moves.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -17,22 +18,13 @@ from xreset.errors import DemoError
 from xreset.physics import Backend, State
 from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import with_closing_frames
-from xreset.resets.config import ClosingConfig, SqueezeConfig
+from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
 from xreset.resets.probe import probe
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task.config import TerminationConfig
 from xreset.task.terminations import out_of_bounds
-
-STEPS = 8
-"""Control steps with the drives holding."""
-LINEAR_VELOCITY = 0.10
-"""Largest residual speed of the object's origin [m/s]."""
-ANGULAR_VELOCITY = 1.0
-"""Largest residual angular speed of the object [rad/s]."""
-JOINT_VELOCITY = 2.0
-"""Largest residual joint speed [rad/s or m/s]."""
 
 REASONS = (
     "out of bounds",
@@ -46,16 +38,16 @@ REASONS = (
 nothing else."""
 
 
-def rejection(backend: Backend, start: State) -> Tensor:
+def rejection(backend: Backend, start: State, limits: FilterConfig) -> Tensor:
     """Return why the present states of an engine's worlds are rejected: [N] index into :data:`REASONS`, -1 where
     accepted."""
     state = backend.state()
     health = backend.health()
     tests = (
         out_of_bounds(state.object_pos, backend.scene.table, TerminationConfig()),
-        state.object_linvel.norm(dim=-1) > LINEAR_VELOCITY,
-        state.object_angvel.norm(dim=-1) > ANGULAR_VELOCITY,
-        state.joint_vel.abs().amax(dim=-1) > JOINT_VELOCITY,
+        state.object_linvel.norm(dim=-1) > limits.linear_velocity,
+        state.object_angvel.norm(dim=-1) > limits.angular_velocity,
+        state.joint_vel.abs().amax(dim=-1) > limits.joint_velocity,
         health.nonfinite,
         health.overflow,
     )
@@ -73,6 +65,7 @@ def make_bank(
     *,
     num_envs: int = 64,
     device: str = "cpu",
+    limits: FilterConfig | None = None,
     closing: ClosingConfig | None = None,
     squeeze: SqueezeConfig | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -86,6 +79,7 @@ def make_bank(
         engine: one or several engines, tried in this order; a rejection states the first engine's reason.
         num_envs: worlds at a time.
         device: where engines run that can use it; the others run on the CPU.
+        limits: time and speeds by which states are judged; None: the draft paper's.
         closing: states to add between frames; None: none.
         squeeze: with which force the drive targets of states after contact press on the object; None: targets are the
             joints' positions. Accepted states are tried once more with the targets, and an engine that rejects this
@@ -96,6 +90,7 @@ def make_bank(
         DemoError: no frame is valid.
     """
     engines = (engine,) if isinstance(engine, str) else tuple(engine)
+    limits = limits or FilterConfig()
     squeeze = squeeze or SqueezeConfig()
     if not retargeted.valid.any():
         raise DemoError(
@@ -132,9 +127,9 @@ def make_bank(
                 scene,
                 object_index[rows[left]],
                 states[torch.as_tensor(left)],
-                rejection,
+                partial(rejection, limits=limits),
                 gravity=0.0,
-                steps=STEPS,
+                steps=limits.steps,
                 num_envs=num_envs,
                 device=device,
                 progress=lambda done, before=before: report(before + done),

@@ -102,21 +102,23 @@ class PlaceTest(unittest.TestCase):
         self.assertEqual(found.frames, 40)
         self.assertGreaterEqual(np.linalg.norm(avoid - found.best.placement.pos, axis=1).min(), CONFIG.clear)
         self.assertEqual(seen, sorted(seen))  # the best yet never gets worse
-        self.assertIsNone(found.home)  # home held the hand three metres up
+        self.assertEqual(found.best.home_rule, "the joints as they were")  # home held the hand three metres up
+        np.testing.assert_allclose(found.home, lost.home[lost.arm_indices])
+        self.assertIn(found.own, found.finalists)
 
     def test_a_placement_that_keeps_home_is_preferred(self):
         def home(robot, placement):
             homes.append(placement)
-            return None if len(homes) == 1 else robot.home[robot.arm_indices]
+            return (None, "") if len(homes) == 2 else (tuple(robot.home[robot.arm_indices]), "test")
 
         homes = []
         lost = dataclasses.replace(self.robot, base_pos=(0.45, 0.6, 3.0))
         with mock.patch.object(placing, "_home", home):
             config = dataclasses.replace(CONFIG, elite=2, candidates=16, rounds=1)
             found = placing.place(lost, [self.wrists], np.zeros((0, 3)), config)
-        self.assertEqual(len(homes), 2)
-        self.assertEqual(found.best.placement, homes[1])
-        self.assertIsNotNone(found.home)
+        self.assertEqual(len(homes), 3)
+        self.assertEqual(found.best.placement, homes[2])
+        self.assertIsNone(next(one for one in found.finalists if one.placement == homes[1]).home)
 
     def test_the_same_seed_finds_the_same_in_any_number_of_processes(self):
         small = dataclasses.replace(CONFIG, candidates=2, rounds=2)
@@ -145,11 +147,12 @@ class PlaceTest(unittest.TestCase):
 
     def test_home_holds_the_hand_where_it_did(self):
         near = Placement(pos=(0.46, 0.61, 0.56), quat=self.robot.base_quat)
-        home = placing._home(self.robot, near)
+        home, rule = placing._home(self.robot, near)
+        self.assertEqual(rule, "the hand where it was")
         moved = dataclasses.replace(self.robot, base_pos=near.pos)
         q = torch.tensor(self.robot.home)
         before = ArmModel(self.robot).kinematics.link_poses(q, ["palm"])
-        q[self.robot.arm_indices] = torch.as_tensor(home)
+        q[self.robot.arm_indices] = torch.tensor(home, dtype=q.dtype)
         assert_close(ArmModel(moved).kinematics.link_poses(q, ["palm"]), before, atol=5e-3, rtol=0)
 
     def test_nothing_to_reach_is_an_error(self):
@@ -279,13 +282,15 @@ class WritePlacementTest(unittest.TestCase):
             placement=Placement(pos=(0.1, 0.2, 0.3), quat=(0.6, 0.0, 0.8, 0.0)),
             reach=Reach(reached=0.9123, dexterity=0.5),
             followed=0.8765,
+            home=tuple(np.linspace(-0.3, 0.4, 7)),
         )
         own = Finalist(
             placement=Placement(pos=(0.45, 0.60, 0.55), quat=(0.38268343, 0.92387953, 0.0, 0.0)),
             reach=Reach(reached=0.8, dexterity=0.5),
             followed=0.75,
+            home=(0.0,) * 7,
         )
-        self.found = Search(best=best, own=own, home=np.linspace(-0.3, 0.4, 7), frames=321)
+        self.found = Search(finalists=(best, own), own=own, frames=321)
 
     def lines(self) -> list[str]:
         """Lines of the description without the figure of its placement."""
@@ -307,7 +312,7 @@ class WritePlacementTest(unittest.TestCase):
     def test_where_the_own_placement_is_best_only_its_figure_is_written(self):
         before = load(self.folder)
         lines = self.lines()
-        write_placement(self.file, before, dataclasses.replace(self.found, best=self.found.own), r"a \\g<1> \b")
+        write_placement(self.file, before, dataclasses.replace(self.found, finalists=(self.found.own,)), r"a \\g<1> \b")
         after = load(self.folder)
         self.assertEqual(after.fingerprint, before.fingerprint)
         self.assertEqual((after.placement.followed, after.placement.command), (0.75, r"a \\g<1> \b"))
@@ -326,8 +331,9 @@ class WritePlacementTest(unittest.TestCase):
 
     def test_refusals(self):
         robot = load(self.folder)
-        with self.assertRaisesRegex(RobotError, "Change the home of the arm's joints"):
-            write_placement(self.file, robot, dataclasses.replace(self.found, home=None), "x")
+        homeless = tuple(dataclasses.replace(finalist, home=None) for finalist in self.found.finalists)
+        with self.assertRaisesRegex(RobotError, r"no placement has a home. Put base.pos = \[0.1, 0.2, 0.3\]"):
+            write_placement(self.file, robot, dataclasses.replace(self.found, finalists=homeless), "x")
         self.file.write_text(self.file.read_text().replace("pos = [", "position = ["))
         with self.assertRaisesRegex(RobotError, "edit it by hand"):
             write_placement(self.file, robot, self.found, "x")

@@ -142,7 +142,8 @@ class Toy(WithFolder):
             {(m.joint, m.multiplier, m.offset) for m in spec.mimics}, {(f"f{i}_2", 0.8, 0.1) for i in range(1, 5)}
         )
         self.assertTrue(any("thumb is the finger of f4_a, f4_b" in note for note in made.guessed), made.guessed)
-        self.assertRegex(made.to_say[0], "--offset.*--rpy 0 -1.5708 0$")
+        self.assertIn("the hand is turned by --rpy 0 -1.5708 0, so that its fingers point along", made.guessed[0])
+        self.assertRegex(made.to_say[0], r"its fingers point along \(0.05, 0.00, 1.00\).*The angle about z is yours")
         self.assertEqual([path.name for path in self.folder.iterdir() if path.name.startswith(".")], [])
         keypoints = {point.keypoint: point.link for point in spec.keypoints}
         self.assertEqual([keypoints[f"index{i}"] for i in (1, 2, 4)], ["f1_a", "f1_b", "index_tip_frame"])

@@ -83,7 +83,7 @@ def import_(
     name: str | None = None,
     flange: str | None = None,
     offset: tuple[float, float, float] | None = None,
-    rpy: tuple[float, float, float] = (0, 0, 0),
+    rpy: tuple[float, float, float] | None = None,
     thumb: str | None = None,
 ) -> None:
     """Make a robot's folder from the published files of an arm and a hand.
@@ -96,10 +96,11 @@ def import_(
         hand: URDF or MJCF of the hand.
         out: Folder to make.
         name: Name of the robot; default: the folder's.
-        flange: Link of the arm that carries the hand; default: the arm's last link.
+        flange: Link of the arm that carries the hand; default: one that makers call so, or the arm's last link.
         offset: Position of the hand's root link in the flange's frame [m]; default: the origin, or as far along z as
             keeps the hand's body out of the arm.
-        rpy: Roll, pitch and yaw of the hand about the flange's fixed axes [rad].
+        rpy: Roll, pitch and yaw of the hand about the flange's fixed axes [rad]; default: as in the hand's file, or
+            turned so that the fingers point along the flange's z axis.
         thumb: A link or joint of the thumb, if the import chooses another finger.
     """
     made = importer.import_robot(arm, hand, out, name=name, flange=flange, offset=offset, rpy=rpy, thumb=thumb)
@@ -165,15 +166,21 @@ def place(
             bar.update(task, completed=done, description=f"placements (best yet reaches {best.reached:.0%})")
 
         found = places.place(spec, paths, avoid, search, report, processes or min(workers.usable_cores(), 8))
-    for title, finalist in (("as described", found.own), ("best found", found.best)):
-        reach = finalist.reach
-        console.print(
-            f"{title:12}  follows {finalist.followed:.1%}, reaches {reach.reached:.1%}, "
-            f"dexterity {reach.dexterity:.3f}: pos [{_digits(finalist.placement.pos)}], "
-            f"quat [{_digits(finalist.placement.quat)}]"
+    table = Table("", "follows", "reaches", "dexterity", "base.pos", "base.quat", "home", title="placements")
+    for finalist in found.finalists:
+        titles = [title for title, one in (("as described", found.own), ("best", found.best)) if one is finalist]
+        table.add_row(
+            ", ".join(titles) or "runner-up",
+            f"{finalist.followed:.1%}",
+            f"{finalist.reach.reached:.1%}",
+            f"{finalist.reach.dexterity:.3f}",
+            f"[{_digits(finalist.placement.pos)}]",
+            f"[{_digits(finalist.placement.quat)}]",
+            finalist.home_rule or "not found",
         )
+    console.print(table)
     if found.home is not None:
-        console.print(f"{'its home':12}  {', '.join(f'{v:.3f}' for v in found.home)}")
+        console.print(f"arm at home in the best: {', '.join(f'{v:.3f}' for v in found.home)}")
     console.print(f"of {found.frames} annotated frames of {chosen.num_sequences} sequences")
     if write:
         file = description.robot_folder(robot) / description.DESCRIPTION

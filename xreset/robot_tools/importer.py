@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -45,6 +47,8 @@ _ALWAYS = 0.9
 _SAMPLES = 200
 _HOME_PALM = (0.57, 0.45, 0.25)
 """[m] Position of the palm at home: above the table, looking down, fingers away from the person."""
+_ALONG = 0.9
+"""Cosine of the angle to an axis below which fingers do not point along it."""
 _IK_STARTS = 128
 _IK_STEPS = 120
 
@@ -68,7 +72,7 @@ def import_robot(
     name: str | None = None,
     flange: str | None = None,
     offset: tuple[float, float, float] | None = None,
-    rpy: tuple[float, float, float] = (0, 0, 0),
+    rpy: tuple[float, float, float] | None = None,
     thumb: str | None = None,
 ) -> Imported:
     """Make a robot's folder.
@@ -81,7 +85,8 @@ def import_robot(
         flange: link of the arm that carries the hand; default: its last one.
         offset: position of the hand's root link in the flange's frame [m]; default: the flange's origin, or as far
             along its z axis as keeps the hand's body before the flange.
-        rpy: roll, pitch and yaw of the hand's root link about the flange's fixed axes [rad].
+        rpy: roll, pitch and yaw of the hand's root link about the flange's fixed axes [rad]; default: as in the hand's
+            file, or turned so that the fingers point along the flange's z axis.
         thumb: a link or joint of the thumb, where names and geometry do not tell.
 
     Raises:
@@ -91,6 +96,13 @@ def import_robot(
         raise RobotError(f"{out} is there already; give another folder, or remove it.")
     arm_source = read_source(arm)
     hand_source = read_source(hand)
+    notes: list[str] = []
+    if rpy is None:
+        rpy = _upright(hand_source, thumb)
+        if any(rpy):
+            notes.append(
+                f"the hand is turned by --rpy {_angles(rpy)}, so that its fingers point along the flange's z axis"
+            )
     stand_off = 0.0
     if offset is None:
         stand_off = _stand_off(hand_source.tree, rpy)
@@ -98,7 +110,7 @@ def import_robot(
     T = pose(offset, rpy=rpy)
     whole = combined(arm_source, hand_source, flange=flange, T_flange_hand=T, name=name or out.name)
     mount = next(joint for joint in whole.tree.joints if joint.child not in arm_source.tree.link_names)
-    notes = list(whole.notes)
+    notes += whole.notes
     if stand_off > 0:
         notes.append(
             f"the hand's root lies {1e3 * stand_off:.0f} mm along z of {mount.parent!r}, so that its body begins "
@@ -130,14 +142,35 @@ def _mounting(spec: RobotSpec, flange: str, wrist: list[str], T_flange_hand: np.
         f"how the hand is mounted (--offset, --rpy): now its fingers point along ({_vector(ahead)}) of {flange!r}, "
         f"its inner side along ({_vector(palm[:3, 2])})"
     )
-    if ahead[2] > 0.9:
-        return text
+    if ahead[2] > _ALONG:
+        return f"{text}. The angle about z is yours to know: --rpy turns the hand as it is mounted on your arm"
+    angles = _angles(_turned_up(ahead, T_flange_hand[:3, :3]))
+    return f"{text}; for fingers along its z axis: --rpy {angles}"
+
+
+def _upright(hand: Source, thumb: str | None) -> tuple[float, float, float]:
+    """Return the roll, pitch and yaw with which a hand's fingers point along z; zeros where they nearly do as it is."""
+    tree = hand.tree
+    hand_root, wrist = _palm(tree, tree.root, [])
+    with TemporaryDirectory() as folder:
+        fingers = find_fingers(tree, hand.mimics, hand_root, Path(folder), thumb, [])
+        palm, _, _ = find_palm(tree, hand.mimics, hand_root, fingers, Path(folder))
+        at = link_places(draft_spec(tree, hand.mimics, hand_root, Path(folder)), dict.fromkeys(wrist, 0.0))
+    ahead = (np.linalg.inv(at[tree.root]) @ palm)[:3, 0]
+    return (0.0, 0.0, 0.0) if ahead[2] > _ALONG else _turned_up(ahead, np.eye(3))
+
+
+def _turned_up(ahead: np.ndarray, R: np.ndarray) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of a frame with rotation R after the shortest turn of a direction to the z axis."""
     if np.abs(ahead).max() > 0.95:
         ahead = ahead.round()  # along an axis, as far as fingers are straight
     turn = Rotation.align_vectors([[0, 0, 1]], [ahead])[0]
-    turned = turn * Rotation.from_matrix(T_flange_hand[:3, :3])
-    angles = np.round(roll_pitch_yaw(turned.as_matrix()), 4) + 0.0
-    return f"{text}; for fingers along its z axis: --rpy {' '.join(f'{angle:g}' for angle in angles)}"
+    roll, pitch, yaw = (np.round(roll_pitch_yaw(turn.as_matrix() @ R), 4) + 0.0).tolist()
+    return roll, pitch, yaw
+
+
+def _angles(angles: Iterable[float]) -> str:
+    return " ".join(f"{angle:g}" for angle in angles)
 
 
 def _vector(values: np.ndarray) -> str:

@@ -18,6 +18,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -25,13 +26,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from xreset.errors import RobotError
+from xreset.geometry.collision import height_above_table, table_points
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search
-from xreset.spec import RobotSpec
+from xreset.spec import RobotSpec, TableSpec
 from xreset.tensors import one_thread
 
 _LENGTH = 0.10
@@ -44,6 +46,10 @@ _DRAWS = 1000
 """Times that a candidate is drawn until it is clear of wrists and objects; then the round goes without it."""
 _SHRINK = 0.6
 """Factor by which the spread of candidates about the best shrinks from round to round."""
+_HOME_STEPS = (-0.15, 0.0, 0.15)
+"""[m] Steps along each axis from the hand's pose at home to others that are tried."""
+_HOME_CLEAR = 0.02
+"""[m] Least height above the table of a home of which only the joints are kept."""
 _FINALIST = 10
 """A finalist takes about as long as this many candidates."""
 
@@ -59,7 +65,7 @@ def place(
 ) -> Search:
     """Find the placement from which the robot follows most of the motions.
 
-    A placement is preferred from which the arm can hold the hand where home holds it.
+    Of the finalists, the best is the one that follows most and has a home; the others are kept as runners-up.
 
     Args:
         robot: the robot; its own placement is the first candidate, and a finalist.
@@ -107,18 +113,8 @@ def place(
             finalists.append(finalist)
             progress(1.0 - _FINALIST * (1 + config.elite - len(finalists)) / effort, found[0][1])
     frames = sum(int(path.annotated.sum()) for path in paths)
-    best = max(finalists, key=lambda finalist: finalist.followed)
-    home = None
-    if best.placement == own:
-        home = robot.home[robot.arm_indices]
-    else:
-        better = [finalist for finalist in finalists if finalist.followed > finalists[0].followed]
-        for finalist in sorted(better, key=lambda finalist: finalist.followed, reverse=True):
-            home = _home(robot, finalist.placement)
-            if home is not None:
-                best = finalist
-                break
-    return Search(best=best, own=finalists[0], home=home, frames=frames)
+    ranked = sorted(finalists, key=lambda finalist: finalist.followed, reverse=True)
+    return Search(finalists=tuple(ranked), own=finalists[0], frames=frames)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +140,8 @@ class _Trial:
             _, measures = track(model, path, Thresholds())
             valid += int((classify(measures, Thresholds()) == 0).sum())
             annotated += int(path.annotated.sum())
-        return Finalist(placement=placement, reach=reached, followed=valid / annotated)
+        home, rule = _home(self.robot, placement)
+        return Finalist(placement=placement, reach=reached, followed=valid / annotated, home=home, home_rule=rule)
 
 
 _own_trial: list[_Trial] = []
@@ -278,22 +275,42 @@ def _parameters(placement: Placement) -> np.ndarray:
     return np.array([*placement.pos, *np.degrees((azimuth, tilt, spin))])
 
 
-def _home(robot: RobotSpec, placement: Placement) -> np.ndarray | None:
-    """[n] arm joints near home, from a placement, that hold the hand where the robot's own placement and home hold it;
-    or None."""
+def _home(robot: RobotSpec, placement: Placement) -> tuple[tuple[float, ...] | None, str]:
+    """Return arm joints for home from a placement, and how they were chosen; None if nothing is found.
+
+    The first of these that the arm can reach, clear of the table and of itself: the pose of the hand at the
+    description's home; the nearest of poses beside and above it; the description's joints.
+    """
+    described = robot.home[robot.arm_indices]
+    if placement == Placement(pos=robot.base_pos, quat=robot.base_quat):
+        return tuple(described.tolist()), "as described"
     own = ArmModel(robot)
+    placed = ArmModel(_placed(robot, placement))
     home = torch.as_tensor(robot.home)[None, None]
     root = own.kinematics.link_poses(home, [robot.hand_root])[..., 0, :, :]
-    zero = torch.zeros(1, 1, dtype=root.dtype)
-    target = ArmTargets(
-        root_pos=root[..., :3, 3],
-        root_quat=matrix_to_quat(root[..., :3, :3]),
-        hand_joints=home[..., torch.as_tensor(own.hand.joint_indices)],
-        annotated=torch.ones(1, 1, dtype=torch.bool),
+    steps = torch.tensor(list(product(_HOME_STEPS, _HOME_STEPS, _HOME_STEPS)), dtype=root.dtype)
+    steps = steps[steps.norm(dim=1).argsort(stable=True)]
+    count = len(steps)
+    zero = torch.zeros(count, 1, dtype=root.dtype)
+    targets = ArmTargets(
+        root_pos=root[..., :3, 3] + steps[:, None],
+        root_quat=matrix_to_quat(root[..., :3, :3]).expand(count, 1, 4),
+        hand_joints=home[..., torch.as_tensor(own.hand.joint_indices)].expand(count, 1, -1),
+        annotated=torch.ones(count, 1, dtype=torch.bool),
         hand_error=zero,
         hand_clearance=zero,
     )
-    joints, measures = track(ArmModel(_placed(robot, placement)), target, Thresholds())
-    if int(classify(measures, Thresholds())) != 0:
-        return None
-    return joints[0, 0].numpy()
+    for begin, end in ((0, 1), (1, count)):
+        joints, measures = track(placed, targets[torch.arange(begin, end)], Thresholds())
+        reached = np.flatnonzero(classify(measures, Thresholds())[:, 0] == 0)
+        if len(reached):
+            moved = 100 * steps[begin + reached[0]]
+            rule = "the hand where it was"
+            if moved.any():
+                rule = f"the hand moved by ({', '.join(f'{value:.0f}' for value in moved.tolist())}) cm"
+            return tuple(joints[reached[0], 0].tolist()), rule
+    support = table_points(robot, placed.kinematics)
+    points = placed.kinematics.points(home[0, 0], support.links, torch.tensor(support.points))
+    if height_above_table(points, torch.tensor(support.radii), TableSpec()).min() > _HOME_CLEAR:
+        return tuple(described.tolist()), "the joints as they were"
+    return None, ""

@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from xreset.errors import RobotError
 from xreset.files import write_whole
 from xreset.spec import RobotSpec
@@ -82,22 +80,32 @@ class Finalist:
     followed: float
     """Share of all annotated frames that are valid when the arm follows the motions from frame to frame, as in ``xreset
     retarget``."""
+    home: tuple[float, ...] | None = None
+    """Arm joints at home; None: no home was found."""
+    home_rule: str = ""
+    """How home was chosen."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Search:
     """Result of :func:`xreset.robot_tools.place.place`."""
 
-    best: Finalist
-    """The finalist that follows most. If possible, the arm can hold the hand from there where the description's home
-    holds it."""
+    finalists: tuple[Finalist, ...]
+    """Those that follow most first. The description's own placement is one of them."""
     own: Finalist
     """The description's own placement."""
-    home: np.ndarray | None
-    """[n] arm joints that hold the hand, from the best placement, where the description's home holds it; None: they
-    cannot."""
     frames: int
     """Annotated frames of the motions."""
+
+    @property
+    def best(self) -> Finalist:
+        """The finalist that follows most and has a home."""
+        return next((finalist for finalist in self.finalists if finalist.home is not None), self.finalists[0])
+
+    @property
+    def home(self) -> tuple[float, ...] | None:
+        """Arm joints at home in the best placement."""
+        return self.best.home
 
 
 def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) -> None:
@@ -109,9 +117,9 @@ def write_placement(path: Path, robot: RobotSpec, search: Search, command: str) 
     """
     if search.home is None:
         raise RobotError(
-            f"robot {robot.name!r}: from none of the best placements can the arm hold the hand where home holds it. "
-            f"Change the home of the arm's joints in {path}, look at it (xreset robots check --picture), and search "
-            "again."
+            f"robot {robot.name!r}: no placement has a home. Put base.pos = {_listed(search.best.placement.pos)} and "
+            f"base.quat = {_listed(search.best.placement.quat)} into {path}, and choose a home of the arm's joints "
+            "there: look at it with xreset robots check --picture."
         )
     text = re.sub(r"^placement *=.*\n", "", path.read_text(), flags=re.MULTILINE)
     best = search.best

@@ -28,6 +28,12 @@ _ROTOR_AT_MOST = 0.01
 """[kg m^2] Reflected inertia of a rotor that descriptions add to light links."""
 _TURNS = 2 * math.pi
 """[rad] Range in either direction of a joint without limits."""
+_FLANGES = (
+    *("tool0", "flange", "tool_link", "ee_link", "link_eef", "link_ee", "end_effector_link", "attachment"),
+    *("panda_link8", "fr3_link8", "fer_link8", "iiwa_link_ee", "lbr_link_ee", "lbr_iiwa_link_7", "bracelet_link"),
+)
+"""Links that carry the tool in the makers' files: UR, ABB and Fanuc (ROS-Industrial), xArm, Panda and FR3, iiwa,
+Kinova."""
 _SMALLEST = 1e-6
 """[m] Smallest size of a shape."""
 
@@ -112,7 +118,8 @@ def combined(arm: Source, hand: Source, *, flange: str | None, T_flange_hand: np
     """Return an arm with a hand at its flange. What the flange carries already is left out.
 
     Args:
-        flange: link of the arm that carries the hand; None: the arm's last link, if there is only one.
+        flange: link of the arm that carries the hand; None: a link that makers of arms call so, or the arm's last link,
+            if there is only one.
         T_flange_hand: [4, 4] pose of the hand's root link in the flange's frame.
 
     Raises:
@@ -121,7 +128,7 @@ def combined(arm: Source, hand: Source, *, flange: str | None, T_flange_hand: np
     notes = [*arm.notes, *hand.notes]
     if flange is None:
         flange = _last_link(arm.tree)
-        notes.append(f"the hand is carried by the arm's last link, {flange!r} (--flange says another)")
+        notes.append(f"the hand is carried by the arm's link {flange!r} (--flange says another)")
     arm.tree.link(flange)
     carriers = {link for link in arm.tree.link_names if flange in below(arm.tree, link)}
     removed = set(below(arm.tree, flange)) - {flange}
@@ -159,6 +166,9 @@ def combined(arm: Source, hand: Source, *, flange: str | None, T_flange_hand: np
 def _last_link(arm: RobotTree) -> str:
     parents = {joint.parent for joint in arm.joints}
     ends = [link for link in arm.link_names if link not in parents]
+    known = [link for link in arm.link_names if link in _FLANGES]
+    if known:
+        return known[-1]
     if len(ends) == 1:
         return ends[0]
     before = [link for link in arm.link_names if set(ends) < set(below(arm, link))]

@@ -13,6 +13,8 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import resource
+import sys
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields, replace
@@ -27,13 +29,15 @@ except ImportError:  # a deployed policy runs without xreset
     XResetError = Exception  # pyright: ignore
 
 SCHEMA = "xreset-deploy/1"
+LIVE_SCHEMA = "xreset-live/1"
+"""Schema of the messages of ``xreset serve``."""
 CONTRACT = "contract.json"
 POLICY = "policy.onnx"
 
 Array = np.ndarray
 
 
-class LiveError(XResetError):
+class LiveError(XResetError):  # pyright: ignore
     """A deployed policy cannot be read, or a robot cannot go on."""
 
 
@@ -166,52 +170,52 @@ class Kinematics:
         self._chain = chain
         self._steps = []
         for step in chain["steps"]:
-            self._steps.append(step | {"origin": np.array(step["origin"]), "axis": np.array(step["axis"])})
+            axis = np.array(step["axis"])
+            cross = np.cross(np.eye(3), axis)  # cross @ v = axis x v
+            arrays = {"origin": np.array(step["origin"]), "axis": axis, "cross": cross, "twice": cross @ cross}
+            self._steps.append(step | arrays)
 
     def links(self, joint_pos: Array, joint_vel: Array) -> Links:
         """Return the links of joint positions and velocities [N, J]."""
         count = len(joint_pos)
+        joint_pos = joint_pos.astype(np.float64)
+        joint_vel = joint_vel.astype(np.float64)
         base = np.array(self._chain["base"])
-        rotations = [np.broadcast_to(base[:3, :3], (count, 3, 3))]
-        positions = [np.broadcast_to(base[:3, 3], (count, 3))]
-        linear = [np.zeros((count, 3))]
-        angular = [np.zeros((count, 3))]
+        rotations = [np.tile(base[:3, :3], (count, 1, 1))]
+        positions = [np.tile(base[:3, 3], (count, 1))]
+        velocities = [np.zeros((count, 3))]
+        spins = [np.zeros((count, 3, 3))]  # matrices W with W @ v = angular velocity x v
         for step in self._steps:
             parent = step["parent"]
             rotation = rotations[parent] @ step["origin"][:3, :3]
             arm = rotations[parent] @ step["origin"][:3, 3]
-            spin = angular[parent]
-            drift = np.zeros((count, 3))
+            spin = spins[parent]
+            drift = 0.0
             if step["joint"] is not None:
-                axis = rotation @ step["axis"]
-                value = (step["multiplier"] * joint_pos[:, step["joint"]].astype(np.float64) + step["offset"])[:, None]
-                speed = (step["multiplier"] * joint_vel[:, step["joint"]].astype(np.float64))[:, None]
+                value = (step["multiplier"] * joint_pos[:, step["joint"]] + step["offset"])[:, None]
+                speed = (step["multiplier"] * joint_vel[:, step["joint"]])[:, None]
                 if step["type"] == "prismatic":
+                    axis = rotation @ step["axis"]
                     arm = arm + axis * value
                     drift = axis * speed
                 else:
-                    rotation = rotation @ _turn(step["axis"], value[:, 0])
-                    spin = spin + axis * speed
+                    spin = spin + speed[:, None] * (rotation @ step["cross"] @ rotation.transpose(0, 2, 1))
+                    # Rodrigues' formula
+                    turn = np.sin(value)[:, None] * step["cross"] + (1.0 - np.cos(value))[:, None] * step["twice"]
+                    rotation = rotation + rotation @ turn
             rotations.append(rotation)
             positions.append(positions[parent] + arm)
-            linear.append(linear[parent] + np.cross(angular[parent], arm) + drift)
-            angular.append(spin)
+            velocities.append(velocities[parent] + (spins[parent] @ arm[..., None])[..., 0] + drift)
+            spins.append(spin)
         palm = self._chain["palm"]
+        spin = spins[palm]
         return Links(
             palm_pos=positions[palm].astype(np.float32),
             palm_quat=_quaternion(rotations[palm]).astype(np.float32),
-            palm_linvel=linear[palm].astype(np.float32),
-            palm_angvel=angular[palm].astype(np.float32),
+            palm_linvel=velocities[palm].astype(np.float32),
+            palm_angvel=np.stack((spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]), axis=1).astype(np.float32),
             tip_pos=np.stack([positions[tip] for tip in self._chain["tips"]], axis=1).astype(np.float32),
         )
-
-
-def _turn(axis: Array, angle: Array) -> Array:
-    """[N, 3, 3] rotations by angles [N] about an axis [3] (Rodrigues' formula)."""
-    cross = np.cross(np.eye(3), axis)
-    sine = np.sin(angle)[:, None, None]
-    versine = (1.0 - np.cos(angle))[:, None, None]
-    return np.eye(3) + sine * cross + versine * (cross @ cross)
 
 
 def _quaternion(matrix: Array) -> Array:
@@ -322,7 +326,13 @@ class Controller:
         target: [N, J] the present joint targets.
     """
 
-    def __init__(self, contract: dict[str, Any], actor: OnnxActor) -> None:
+    def __init__(self, contract: dict[str, Any], actor: OnnxActor | Any = None) -> None:
+        """Prepare.
+
+        Args:
+            contract: what the policy expects.
+            actor: its network.
+        """
         self.contract = contract
         self.dt: float = contract["control_dt"]
         self._actor = actor
@@ -457,6 +467,80 @@ class Controller:
             hand = m["zero"] + np.where(action < 0, m["below"], m["above"]) * action
             new = np.where(self._is_arm, new, hand)
         return np.clip(new, self.lower, self.upper)
+
+
+class RemoteController(Controller):
+    """A policy that ``xreset serve`` runs, perhaps on another computer. It needs websockets on this one."""
+
+    def __init__(self, url: str, timeout: float = 0.5) -> None:
+        """Connect.
+
+        Args:
+            url: address of the server, such as ``ws://127.0.0.1:8765``.
+            timeout: longest time to wait for an answer [s].
+
+        Raises:
+            LiveError: there is no such server, or it is of another version.
+        """
+        from websockets.sync.client import connect
+
+        self._timeout = timeout
+        try:
+            self._socket = connect(url, open_timeout=5, max_size=None, compression=None)
+        except OSError as error:
+            raise LiveError(f"No policy is served at {url} ({error}). Start it: xreset serve POLICY") from error
+        hello = self._receive()
+        if hello.get("schema") != LIVE_SCHEMA:
+            raise LiveError(f"{url} speaks {hello.get('schema')!r}, this runtime speaks {LIVE_SCHEMA!r}.")
+        check_contract(hello["contract"], url)
+        super().__init__(hello["contract"])
+
+    def begin(
+        self, object_points: Array, goal_pos: Array, goal_quat: Array, target: Array, center: Array | None = None
+    ) -> None:
+        """Begin an episode of one robot."""
+        self.target = np.atleast_2d(np.asarray(target, dtype=np.float32))
+        values = {"points": object_points, "goal_pos": goal_pos, "goal_quat": goal_quat, "target": target}
+        self._ask({"begin": _lists(values | {"center": center})})
+
+    def set_goal(self, pos: Array, quat: Array) -> None:
+        """Set the goal pose."""
+        self._ask({"goal": _lists({"goal_pos": pos, "goal_quat": quat})})
+
+    def step(self, reading: Reading) -> Array:
+        """[1, J] new joint targets for a reading with the axis N."""
+        names = ("joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
+        values = {name: getattr(reading, name) for name in names}
+        found = self._ask({"step": _lists({name: None if v is None else v[0] for name, v in values.items()})})
+        self.target = np.array([found["target"]], dtype=np.float32)
+        return self.target
+
+    def close(self) -> None:
+        """End the connection."""
+        self._socket.close()
+
+    def _ask(self, message: dict[str, Any]) -> dict[str, Any]:
+        try:
+            self._socket.send(json.dumps(message))
+        except Exception as error:
+            raise LiveError("the server has gone") from error
+        answer = self._receive()
+        if "error" in answer:
+            raise LiveError(answer["error"])
+        return answer
+
+    def _receive(self) -> dict[str, Any]:
+        try:
+            return json.loads(self._socket.recv(timeout=self._timeout))
+        except TimeoutError as error:
+            raise LiveError(f"the server has not answered for {self._timeout:g} s") from error
+        except Exception as error:
+            raise LiveError("the server has gone") from error
+
+
+def _lists(values: dict[str, Any]) -> dict[str, Any]:
+    """Return arrays as lists, which JSON can hold; None is left out."""
+    return {name: np.asarray(value).tolist() for name, value in values.items() if value is not None}
 
 
 def load_controller(folder: str | Path) -> Controller:
@@ -674,3 +758,53 @@ def _rows(chosen: Array, new: Any, old: Any) -> Any:
         parts = {each.name: _rows(chosen, getattr(new, each.name), getattr(old, each.name)) for each in fields(Links)}
         return Links(**parts)
     return np.where(chosen.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+
+def measure(controller: Controller, steps: int = 1000) -> dict[str, float]:
+    """Return mean and 99th percentile of the time of a step [ms], and the memory of the process [MB].
+
+    The robot is at home, the object in front of it; the numbers mean nothing else.
+    """
+    contract = controller.contract
+    home = np.array([joint["home"] for joint in contract["joints"]], dtype=np.float32)
+    pos = np.array([0.5, 0.0, 0.1])
+    quat = np.array([1.0, 0.0, 0.0, 0.0])
+    points = np.zeros((contract["observation"]["cloud_points"], 3))
+    controller.begin(points, pos, quat, home, np.zeros(3))
+    reading = Reading(
+        joint_pos=home,
+        joint_vel=np.zeros_like(home),
+        joint_time=0.0,
+        object_pos=pos,
+        object_quat=quat,
+        object_time=0.0,
+        tip_force=np.zeros((len(contract["fingertips"]), 3)),
+    )
+    times = []
+    for _ in range(steps):
+        began = time.perf_counter()
+        controller.step(reading.batched())
+        times.append(1000.0 * (time.perf_counter() - began))
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {"mean_ms": float(np.mean(times)), "p99_ms": float(np.percentile(times, 99)), "memory_mb": memory}
+
+
+def main() -> None:
+    """Check the folder of this file, and measure how long a step takes on this computer."""
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else __file__)
+    try:
+        controller = load_controller(folder if folder.is_dir() else folder.parent)
+    except LiveError as error:
+        sys.exit(f"runtime.py: {error}")
+    contract = controller.contract
+    found = measure(controller)
+    print(f"{contract['robot']}, {len(contract['joints'])} joints, one step every {1000 * controller.dt:.1f} ms")
+    print(f"objects: {', '.join(contract['objects'])}")
+    print(
+        f"a step takes {found['mean_ms']:.2f} ms (99th percentile {found['p99_ms']:.2f} ms) on one core; "
+        f"{found['memory_mb']:.0f} MB of memory"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -34,10 +34,11 @@ COMMANDS: dict[str, str] = {
     "frontier": "Show from which demonstrated states a policy reaches the goal.",
     "stress": "Measure robustness: change stiffness, latency, friction and more, one at a time.",
     "rehearse": "Rehearse a policy for a robot: late poses and actions, lost frames, pushes, in every engine.",
+    "serve": "Serve a policy to a robot's computer over the network.",
     "select": "Choose the checkpoint that is best in its worst engine.",
     "compare": "Compare trainings: learning curves, results in every engine, and configurations.",
     "study": "Run a study: trainings by object and seed, evaluations, and tables next to the paper's.",
-    "export": "Write recorded episodes as a LeRobot data set or as plain arrays.",
+    "export": "Write a policy for a robot, or recorded episodes as a LeRobot data set or as plain arrays.",
     "report": "Make an HTML page of a run's evaluations.",
 }
 """Command -> one line of help.

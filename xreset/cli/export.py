@@ -1,4 +1,4 @@
-"""``xreset export``: lerobot, npz."""
+"""``xreset export``: lerobot, npz, deploy."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from typing import Annotated
 
 import tyro
 
-from xreset.cli._common import Several
+from xreset.cli._common import Name, Several
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import RunError
+from xreset.eval import policy_spec
 from xreset.eval.export import lerobot as dataset
 from xreset.eval.export import recorded
+from xreset.live import deploy as deployment
+from xreset.objects import catalogue
 
 Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
 
@@ -63,6 +66,33 @@ def npz(
     _say(recording, out)
 
 
+def deploy(
+    policy: Name, *, out: Path, robot: str | None = None, objects: Path | None = None, object: Several = ()
+) -> None:
+    """Write a policy for a robot: the network, a contract that says what goes in and out, and a runtime.
+
+    The runtime needs Python, numpy and onnxruntime (docs/live.md).
+
+    Args:
+        policy: Run folder, exported policy (.onnx), or name of a policy that ships with xreset (xreset policies list).
+        out: Folder to write; must not exist.
+        robot: Name or folder of the robot; default: the policy's.
+        objects: Folder of meshes; default: that of the training, else the stand-ins.
+        object: Object whose points the contract lists; give it again for more. Default: the objects of the training.
+    """
+    spec = policy_spec.load_policy(policy, robot=robot)
+    file = spec.exported()
+    listed = catalogue.load_objects(object or spec.objects or (), objects or spec.objects_folder)
+    contract = deployment.export_deploy(file, spec.robot, spec.task, listed, out)
+    shapes = {o.name: "stand-in" if o.source == "stand-in" else "mesh" for o in listed}
+    console = Console()
+    console.print(
+        f"{out}: {spec.name} for {contract['robot']}, {len(contract['joints'])} joints at {contract['rate']:g} Hz"
+    )
+    console.print(f"objects: {', '.join(f'{name} ({shape})' for name, shape in shapes.items())}")
+    console.print(f"Try it: python {out / 'runtime.py'}")
+
+
 def _recording(
     folders: tuple[Path, ...], backends: tuple[str, ...], robot: str | None, objects: Path | None, task: str | None
 ) -> recorded.Recording:
@@ -79,4 +109,4 @@ def _say(recording: recorded.Recording, out: Path) -> None:
     )
 
 
-COMMAND = {"lerobot": lerobot, "npz": npz}
+COMMAND = {"lerobot": lerobot, "npz": npz, "deploy": deploy}

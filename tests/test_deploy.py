@@ -1,0 +1,223 @@
+"""A policy leaves xreset: as a folder that runs without it, and over the network."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+import unittest
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests import toy_grasp
+from tests.command import xreset
+from tests.test_examples import run
+from tests.test_live import Scripted
+from tests.toy_bank import SOUP
+from tests.toy_policy import write_policy
+from xreset.cameras.config import CameraConfig, VisionConfig
+from xreset.demos.synth import synthesize
+from xreset.errors import PolicyError
+from xreset.eval.policy_spec import load_policy
+from xreset.eval.rollout import episode_starts
+from xreset.eval.trial import engine, load_trial
+from xreset.live.deploy import deploy_contract, export_deploy
+from xreset.live.engine import EngineDriver
+from xreset.policy import policy_contract
+from xreset.runtime import LiveError, RemoteController, Runner, load_controller, read_contract
+from xreset.task.config import TaskConfig
+
+POLICY = "soup-can"
+STEPS = 30
+REPLAY = """
+import importlib.util, json, sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("xreset", "torch", "scipy"):
+            raise ImportError(name)
+sys.meta_path.insert(0, Absent())
+folder, recording = sys.argv[1:]
+spec = importlib.util.spec_from_file_location("runtime", folder + "/runtime.py")
+runtime = sys.modules["runtime"] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(runtime)
+import numpy as np
+data = np.load(recording)
+controller = runtime.load_controller(folder)
+name = str(data["object"])
+controller.begin(controller.points(name), data["goal_pos"], data["goal_quat"], data["target"], controller.center(name))
+names = ("joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
+worst = 0.0
+for k in range(len(data["action"])):
+    reading = runtime.Reading(joint_time=0.0, object_time=0.0, **{name: data[name][k] for name in names})
+    controller.step(reading.batched())
+    worst = max(worst, float(np.abs(controller.action - data["action"][k]).max()))
+print(json.dumps({"worst": worst, "modules": sorted({"xreset", "torch", "scipy"} & set(sys.modules))}))
+"""
+
+
+@unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
+class RuntimeTest(unittest.TestCase):
+    def test_it_acts_as_the_evaluation_in_a_process_without_xreset(self):
+        folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        _, out, _ = xreset("export", "deploy", POLICY, "--out", folder / "can")
+        self.assertIn("28 joints at 60 Hz", out)
+        spec = load_policy(POLICY)
+        trial = load_trial(spec, synthesize([SOUP], 1))
+        zero = np.zeros(1, int)
+        frames = []
+        with trial.worlds(engine("mujoco"), torch.zeros(1, dtype=torch.long)) as (env, _):
+            env.reset(start=episode_starts(trial.starts(), zero, zero, seed=0))
+            policy = spec.begin(env)
+            values = {"goal_pos": env.goal_pos, "goal_quat": env.goal_quat, "target": env.joint_target}
+            recording = {name: value[0].numpy().copy() for name, value in values.items()}
+            for _ in range(STEPS):
+                reading = EngineDriver(env).read()
+                action = policy.act(env.get_observations())
+                frames.append({"action": action.numpy(), **vars(reading)})
+                env.advance(action)
+        names = ("action", "joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
+        recording |= {name: np.stack([frame[name][0] for frame in frames]) for name in names}
+        np.savez(folder / "recording.npz", object=SOUP, **recording)
+        command = [sys.executable, "-I", "-c", REPLAY, str(folder / "can"), str(folder / "recording.npz")]
+        found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        self.assertEqual(found["modules"], [])
+        self.assertLess(found["worst"], 1e-5)
+        command = [sys.executable, "-I", str(folder / "can" / "runtime.py")]
+        self.assertIn("a step takes", subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+class ContractTest(unittest.TestCase):
+    def setUp(self):
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+        self.task = TaskConfig()
+        robot = toy_grasp.robot()
+        file = write_policy(self.folder / "toy.onnx", policy_contract(robot, self.task, ("brick",)), value=0.01)
+        self.out = self.folder / "out"
+        self.contract = export_deploy(file, robot, self.task, [toy_grasp.brick()], self.out)
+        self.home = [joint["home"] for joint in self.contract["joints"]]
+
+    def test_it_says_what_goes_in_and_out(self):
+        self.assertEqual(read_contract(self.out), self.contract)
+        self.assertEqual([joint["name"] for joint in self.contract["joints"]], list(toy_grasp.robot().joint_names))
+        self.assertEqual(np.shape(self.contract["objects"]["brick"]["points"]), (64, 3))
+        with self.assertRaisesRegex(PolicyError, "exists already"):
+            export_deploy(self.folder / "toy.onnx", toy_grasp.robot(), self.task, [toy_grasp.brick()], self.out)
+        with self.assertRaisesRegex(LiveError, "has no object 'hat'. Choose from: brick"):
+            load_controller(self.out).points("hat")
+
+    def test_another_version_and_damage_are_one_sentence(self):
+        file = self.out / "contract.json"
+        original = file.read_text()
+        for change, words in (
+            ({"schema": "xreset-deploy/9"}, "has schema 'xreset-deploy/9', this runtime reads 'xreset-deploy/1'"),
+            ({"policy_sha256": "0" * 64}, "has SHA-256 .* the contract names 000000000000"),
+            ({"observation": {"smell": 1}}, "observation options that this runtime does not know: smell"),
+        ):
+            file.write_text(json.dumps(self.contract | change))
+            with self.subTest(words), self.assertRaisesRegex(LiveError, words):
+                load_controller(self.out)
+        file.write_text(original[:100])
+        with self.assertRaisesRegex(LiveError, "is no exported policy"):
+            load_controller(self.out)
+
+    @unittest.skipUnless(find_spec("websockets"), "websockets is not installed")
+    def test_served_it_acts_alike_and_a_lost_server_stops_the_robot(self):
+        from websockets.exceptions import WebSocketException
+        from websockets.sync.client import connect
+
+        from xreset.live.serve import PolicyServer
+
+        server = PolicyServer(self.contract, (self.out / "policy.onnx").read_bytes(), port=0)
+        thread = threading.Thread(target=server.run)
+        thread.start()
+        self.addCleanup(thread.join)
+        self.addCleanup(server.close)
+        brick = self.contract["objects"]["brick"]
+        start = (brick["points"], [0.5, 0.3, 0.2], [1, 0, 0, 0], self.home, brick["center"])
+        local = load_controller(self.out)
+        remote = RemoteController(server.url, timeout=20)
+        driver = Robot(self.home)
+        targets = []
+        for controller in (local, remote):
+            controller.begin(*start)
+            targets.append([controller.step(driver.read().batched()).copy() for _ in range(3)])
+        np.testing.assert_array_equal(*targets)
+        self.assertIn("brick: 5 joint targets", run("12_served_policy", server.url, 3))
+        remote.set_goal([0.5, 0.3, 0.3], [0, 1, 0, 0])
+        with self.assertRaises(WebSocketException):  # a page in a browser
+            connect(server.url, origin="http://elsewhere.example")  # type: ignore[arg-type]
+
+        def close_after_a_second(time, reading):
+            if time > 1:
+                remote.close()
+            return reading
+
+        driver = Robot(self.home, close_after_a_second)
+        with self.assertLogs("xreset"):
+            outcome = Runner(remote, driver).run(10)
+        self.assertEqual((outcome.reason, driver.stops), ("The policy could not act: the server has gone.", 1))
+
+    def test_the_example_of_a_driver(self):
+        rows = 11
+        brick = self.contract["objects"]["brick"]
+        arrays = {"time": np.arange(rows) * 0.05, "frame_offsets": [0, rows], "object_name": ["brick"]}
+        arrays |= {name: np.tile(self.home, (rows, 1)) for name in ("joint_pos", "joint_target")}
+        arrays |= {"object_pos": np.tile(brick["center"], (rows, 1)), "goal_pos": [[0.5, 0.3, 0.2]]}
+        arrays |= {"object_quat_wxyz": np.tile([1, 0, 0, 0], (rows, 1)), "goal_quat_wxyz": [[1, 0, 0, 0]]}
+        np.savez(self.folder / "episodes.npz", **arrays)
+        said = run("11_own_driver", self.out, self.folder / "episodes.npz")
+        self.assertIn("30 steps; stopped because: the recording is over", said)
+        self.assertIn("the robot holds still", said)
+
+    @unittest.skipUnless(find_spec("websockets"), "websockets is not installed")
+    def test_a_wrong_message_gets_a_sentence(self):
+        from xreset.live.serve import _Episode
+
+        episode = _Episode(load_controller(self.out))
+        begin = {"object": "brick", "goal_pos": [0, 0, 1], "goal_quat": [1, 0, 0, 0], "target": self.home}
+        for message, words in (
+            ("{", "is not JSON"),
+            ('{"a":' * 5000, "is not JSON"),
+            ("[]", "one of the keys begin, goal, step"),
+            ({"step": {}}, "no episode yet. Send begin first"),
+            ({"begin": 3}, "begin is not an object"),
+            ({"begin": begin | {"object": ["hat"]}}, "no object"),
+            ({"begin": begin | {"target": [1]}}, r"target has shape \(1,\)"),
+            ({"begin": begin | {"goal_pos": [0, 0, float("nan")]}}, "goal_pos has shape"),
+            ({"begin": begin | {"goal_pos": [0, 0, 10**400]}}, "goal_pos holds something that is not a number"),
+            ({"begin": begin | {"goal_quat": [1, 1, 0, 0]}}, "length 1.414, expected a unit quaternion"),
+        ):
+            text = message if isinstance(message, str) else json.dumps(message)
+            with self.subTest(text[:60]):
+                self.assertRegex(episode.answer(text)["error"], words)
+        self.assertEqual(episode.answer(json.dumps({"begin": begin})), {"begun": True})
+        self.assertIn("joint_pos is missing", episode.answer('{"step": {}}')["error"])
+
+    def test_a_baseline_and_cameras_are_refused(self):
+        code, _, err = xreset("export", "deploy", "zero", "--robot", "openarm", "--out", self.folder / "x")
+        self.assertEqual(code, 1)
+        self.assertIn("The baseline 'zero' is no exported policy", err)
+        seeing = replace(self.task, vision=VisionConfig(cameras=(CameraConfig(),)))
+        with self.assertRaisesRegex(PolicyError, "looks through cameras"):
+            deploy_contract(toy_grasp.robot(), seeing, [])
+
+
+class Robot(Scripted):
+    """The toy gripper at home."""
+
+    def __init__(self, home, fault=lambda time, reading: reading):
+        super().__init__(fault)
+        self.home = np.array(home)
+
+    def read(self):
+        return replace(super().read(), joint_pos=self.home, joint_vel=0 * self.home, tip_force=np.zeros((2, 3)))
+
+
+if __name__ == "__main__":
+    unittest.main()

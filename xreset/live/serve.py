@@ -1,0 +1,183 @@
+"""Serve a policy over a WebSocket: readings in, joint targets out, as JSON.
+
+WebSockets are understood by every language and pass through every proxy. A message has a few hundred numbers, for which
+JSON needs no library and loses no digit. ``docs/live.md`` has the messages.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from threading import BoundedSemaphore
+from typing import Any
+
+import numpy as np
+
+from xreset.errors import XResetError, needs
+from xreset.runtime import LIVE_SCHEMA, Controller, LiveError, OnnxActor, Reading
+
+with needs("websockets", "serve"):
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.server import Server, ServerConnection, serve
+
+_CLIENTS = 8
+"""Clients at the same time: each has a network of its own."""
+_LARGEST = 1 << 20
+"""Bytes of a message."""
+_PATIENCE = 5.0
+"""Time after which a client that does not answer a ping has gone [s]."""
+
+
+class PolicyServer:
+    """Listens until it is closed. Each client has an episode of its own."""
+
+    def __init__(self, contract: dict[str, Any], policy: bytes, *, host: str = "127.0.0.1", port: int = 8765) -> None:
+        """Begin to listen.
+
+        Args:
+            contract: what the policy expects.
+            policy: content of its ONNX file.
+            host: address to listen at. Any other than 127.0.0.1 lets other computers use the policy.
+            port: port to listen at; 0: any that is free.
+
+        Raises:
+            XResetError: the port is taken, or the address is not this machine's.
+        """
+        self._contract = contract
+        self._policy = policy
+        self._places = BoundedSemaphore(_CLIENTS)
+        self._log = logging.getLogger("xreset")
+        try:
+            self._server: Server = serve(
+                self._talk,
+                host,
+                port,
+                origins=[None],  # no page in a browser
+                max_size=_LARGEST,
+                compression=None,
+                ping_interval=_PATIENCE,
+                ping_timeout=_PATIENCE,
+            )
+        except OSError as error:
+            raise XResetError(f"Cannot listen at {host}:{port}: {error.strerror}. Choose another --port.") from error
+        self.url = f"ws://{host}:{self._server.socket.getsockname()[1]}"
+
+    def run(self) -> None:
+        """Serve until :meth:`close`."""
+        self._server.serve_forever()
+
+    def close(self) -> None:
+        """End all connections."""
+        self._server.shutdown()
+
+    def _talk(self, client: ServerConnection) -> None:
+        who = "{}:{}".format(*client.remote_address[:2])
+        if not self._places.acquire(blocking=False):
+            client.send(json.dumps({"error": f"{_CLIENTS} clients are connected, which is the limit."}))
+            return
+        steps = 0
+        try:
+            self._log.warning("%s has connected.", who)
+            episode = _Episode(Controller(self._contract, OnnxActor(self._policy)))
+            client.send(json.dumps({"schema": LIVE_SCHEMA, "contract": self._contract}))
+            for message in client:
+                answer = episode.answer(message)
+                steps += "target" in answer
+                client.send(json.dumps(answer))
+            self._log.warning("%s has left after %d steps.", who, steps)
+        except ConnectionClosed:
+            self._log.warning("%s has gone without a word after %d steps.", who, steps)
+        finally:
+            self._places.release()
+
+
+class _Episode:
+    """Answers the messages of one client."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+        self._has_begun = False
+        self._verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+            "begin": self._begin,
+            "goal": self._goal,
+            "step": self._step,
+        }
+
+    def answer(self, message: str | bytes) -> dict[str, Any]:
+        """Return the answer to a message; what is wrong with it, if it cannot be answered."""
+        try:
+            data = _parsed(message)
+            if not isinstance(data, dict) or len(data) != 1 or not set(data) <= set(self._verbs):
+                raise LiveError(f"A message has one of the keys {', '.join(self._verbs)}.")
+            (verb,) = data
+            if not isinstance(data[verb], dict):
+                raise LiveError(f"{verb} is not an object.")
+            if verb != "begin" and not self._has_begun:
+                raise LiveError("There is no episode yet. Send begin first.")
+            return self._verbs[verb](data[verb])
+        except LiveError as error:
+            return {"error": str(error)}
+
+    def _begin(self, given: dict[str, Any]) -> dict[str, Any]:
+        controller = self._controller
+        contract = controller.contract
+        name = given.get("object")
+        if name is not None:
+            points = controller.points(str(name))
+            center = controller.center(str(name))
+        else:
+            points = _numbers(given, "points", contract["observation"]["cloud_points"], 3)
+            center = _numbers(given, "center", 3) if "center" in given else None
+        target = _numbers(given, "target", len(contract["joints"]))
+        controller.begin(points, _numbers(given, "goal_pos", 3), _quaternion(given, "goal_quat"), target, center)
+        self._has_begun = True
+        return {"begun": True}
+
+    def _goal(self, given: dict[str, Any]) -> dict[str, Any]:
+        self._controller.set_goal(_numbers(given, "goal_pos", 3), _quaternion(given, "goal_quat"))
+        return {"goal": True}
+
+    def _step(self, given: dict[str, Any]) -> dict[str, Any]:
+        contract = self._controller.contract
+        joints = len(contract["joints"])
+        force = None
+        if given.get("tip_force") is not None:
+            force = _numbers(given, "tip_force", len(contract["fingertips"]), 3)
+        reading = Reading(
+            joint_pos=_numbers(given, "joint_pos", joints),
+            joint_vel=_numbers(given, "joint_vel", joints),
+            joint_time=0.0,
+            object_pos=_numbers(given, "object_pos", 3),
+            object_quat=_quaternion(given, "object_quat"),
+            object_time=0.0,
+            tip_force=force,
+        )
+        return {"target": self._controller.step(reading.batched())[0].tolist()}
+
+
+def _parsed(message: str | bytes) -> Any:
+    try:
+        return json.loads(message)
+    except (ValueError, RecursionError) as error:
+        raise LiveError(f"The message is not JSON ({error}).") from error
+
+
+def _numbers(given: dict[str, Any], name: str, *shape: int) -> np.ndarray:
+    """Return an entry of a message as an array of that shape."""
+    try:
+        value = np.array(given[name], dtype=np.float32)
+    except KeyError:
+        raise LiveError(f"{name} is missing.") from None
+    except (TypeError, ValueError, OverflowError):
+        raise LiveError(f"{name} holds something that is not a number.") from None
+    if value.shape != shape or not np.isfinite(value).all():
+        raise LiveError(f"{name} has shape {value.shape}, or a number too large. Expected finite numbers {shape}.")
+    return value
+
+
+def _quaternion(given: dict[str, Any], name: str) -> np.ndarray:
+    value = _numbers(given, name, 4)
+    if abs(np.linalg.norm(value) - 1.0) > 0.01:
+        raise LiveError(f"{name} has length {np.linalg.norm(value):.3f}, expected a unit quaternion (w, x, y, z).")
+    return value

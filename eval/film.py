@@ -29,7 +29,7 @@ def film(
         env: where it plays; all worlds are reset first. :meth:`PolicySpec.make_env` makes one.
         path: file to write.
         world: index of the world to show. The goal is drawn as a translucent object.
-        fps: frames per second.
+        fps: fewest frames per second; there are more if the control rate is no multiple of them.
         size: width and height in pixels, both even.
 
     Raises:
@@ -42,7 +42,7 @@ def film(
         policy = load_policy(policy)
     env.reset()
     player = policy.begin(env)
-    every = max(1, round(1.0 / (fps * env.backend.scene.control_dt)))
+    every = max(1, int(1.0 / (fps * env.backend.scene.control_dt) + 1e-6))
     frames = [env.render(world, size)]
     for step in range(1, env.max_episode_length + 1):
         env.advance(player.act(env.get_observations()))

@@ -562,7 +562,7 @@ class ObjectFrameTest(WithEnv):
         one = self.played(self.specs[0], toy_bank(self.robot), task)
         other = self.played(self.specs[1], self.moved_bank(), task)
         for step, (a, b) in enumerate(zip(one, other, strict=True)):
-            torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5, msg=lambda text, step=step: f"{step}: {text}")
+            torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4, msg=lambda text, step=step: f"{step}: {text}")
         away = self.played(self.specs[0], toy_bank(self.robot), replace(task, object_frame="mesh"))[0]
         self.assertGreater(float((one[0] - away).abs().max()), 0.01)
 

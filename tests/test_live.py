@@ -186,7 +186,7 @@ class FaultTest(unittest.TestCase):
 @unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
 class EngineTest(unittest.TestCase):
     def test_it_observes_and_acts_as_the_environment_bit_for_bit(self):
-        for name in ("paper", "robust", "live"):
+        for name in ("paper", "robust", "live", "published"):
             with self.subTest(name):
                 self._check(evaluation_task(RECIPES[name].config.task))
 

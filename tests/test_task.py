@@ -15,6 +15,7 @@ from tests.toy_robot import toy_hand_arm
 from xreset.checks import from_dict
 from xreset.errors import DemoError, FileFormatError, PolicyError, RunError
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_rotate
+from xreset.learning.recipes import RECIPES
 from xreset.physics import Links, State
 from xreset.policy import OnnxPolicy, RandomPolicy, ZeroPolicy, check_contract, policy_contract
 from xreset.resets.distribution import Reset, ResetDistribution
@@ -80,7 +81,7 @@ class RewardTest(unittest.TestCase):
             "previous_action": torch.zeros(4),
             "out_of_bounds": torch.tensor(False),
         } | changes
-        x = {k: v[None] for k, v in x.items()}
+        x = {k: v if k == "is_arm" else v[None] for k, v in x.items()}
         state = State.at_rest(torch.zeros(1, 4), x.pop("object_pos"), x.pop("object_quat"))
         return compute_reward(RewardInput(state=state, **x), config or RewardConfig())
 
@@ -148,6 +149,34 @@ class RewardTest(unittest.TestCase):
                     rotation_near=near,
                     success=10 if degrees < 15 else 0,
                 )
+
+    def test_the_published_reward(self):
+        """Numbers from the published paper: -2.5 min(P, 3) - 2.5 min(M, 0.5) + G (3 (1.4 - 3 d) + [d <= 0.02] 15 / (1 + 10 d))."""
+        config = RECIPES["published"].config.task.reward
+        points = torch.tensor([[0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05], [0, 0, -0.05]])
+        cases = (
+            (0.15, 0.1, 0.0, True),
+            (0.15, 0.1, 0.015, True),
+            (0.15, 0.1, 0.1, True),
+            (0.25, 0.1, 0.0, False),
+            (0.15, 0.25, 0.0, False),
+            (2.0, 0.9, 0.0, False),
+        )
+        for tips, palm, d, gate in cases:
+            reward = self.reward(
+                config,
+                tip_distance=torch.full((3,), tips),
+                palm_distance=torch.tensor(palm),
+                object_pos=torch.tensor([0.5, 0.3 + d, 0.1]),
+                points=points,
+                is_arm=torch.tensor([True, True, False, False]),
+                action=torch.tensor([0.5, 0, 0.5, 0]),
+            )
+            expected = -2.5 * min(3 * tips, 3) - 2.5 * min(palm, 0.5) - 0.005 * 0.5 - 0.05 * 0.25 - 0.005 * 0.25
+            expected += gate * 3 * (1.4 - 3 * d) + (gate and d <= 0.02) * 15 / (1 + 10 * d)
+            with self.subTest(tips=tips, palm=palm, d=d):
+                self.assertEqual((bool(reward.gate), bool(reward.success)), (gate, gate and d <= 0.02))
+                self.assertAlmostEqual(float(reward.total), 0.01 / 30 * expected, places=6)
 
     def test_the_reward_for_progress_is_no_option_any_more(self):
         old = asdict(RewardConfig()) | {"tracking": "presence", "progress": 8.0, "progress_width": 0.15}
@@ -617,11 +646,28 @@ class ObservationTest(unittest.TestCase):
             self.assertTrue(bool((quat[name][:, 0] >= 0).all()), name)
             torch.testing.assert_close(quat_angle(quat[name], own), torch.zeros(self.N), atol=1e-3, rtol=0)
         torch.testing.assert_close(
-            obs.privileged_group(negated)[:, 9:12].norm(dim=-1), quat_angle(self.x.state.object_quat, self.x.goal_quat)
+            obs.privileged_group(negated, ObservationConfig())[:, 9:12].norm(dim=-1),
+            quat_angle(self.x.state.object_quat, self.x.goal_quat),
         )
 
+    def test_the_published_observation(self):
+        c = RECIPES["published"].config.task.observation
+        widths = obs.layout(28, 5, c)
+        flat = sum(widths["policy"].values()) + sum(widths["proprio"].values())
+        self.assertEqual((flat, flat + widths["perception"]["paired_cloud"]), (72, 648))  # the paper's 648 inputs
+        points = torch.randn(len(self.x.observed_pos), 64, 3, generator=generator())
+        found = obs.policy_group(self.x, c, generator(), points)
+        cloud = quat_rotate(self.x.observed_quat[:, None], points) + self.x.observed_pos[:, None]
+        distance = (self.x.links.pos[:, :, None] - cloud[:, None]).norm(dim=-1).amin(dim=-1)
+        vectors = found[:, :-1].unflatten(1, (-1, 3))
+        torch.testing.assert_close(vectors.norm(dim=-1), distance[:, 1:])
+        torch.testing.assert_close(found[:, -1], distance[:, 0])
+        ends = self.x.links.pos[:, 1:] + vectors
+        gaps = (ends[:, :, None] - cloud[:, None]).norm(dim=-1).amin(dim=-1)
+        self.assertLess(float(gaps.max()), 1e-5)
+
     def test_privileged_group(self):
-        found = obs.privileged_group(self.x)
+        found = obs.privileged_group(self.x, ObservationConfig())
         self.assertEqual(tuple(found.shape), (self.N, 15))
         expected = torch.cat(
             (self.x.state.object_linvel, self.x.state.object_angvel, self.x.goal_pos - self.x.state.object_pos), 1

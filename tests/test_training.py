@@ -119,6 +119,19 @@ class TrainingTest(unittest.TestCase):
         changed = newest(self.train("other", seed=4))["actor_state_dict"]
         self.assertTrue(any(not torch.equal(value, changed[name]) for name, value in one.items()))
 
+    def test_recipes_train(self):
+        """The published one takes the longest steps through the network, so the network is small here."""
+        for name in ("published", "live"):
+            with self.subTest(name):
+                base = RECIPES[name].config
+                small = replace(base.model, lstm=16)
+                config = replace(base, model=small, ppo=replace(base.ppo, mini_epochs=1), iterations=2)
+                out = self.train(f"recipe-{name}", config=config, num_envs=8)
+                content = newest(out)
+                self.assertEqual((content["iteration"], content["env_steps"]), (2, 2 * 8 * config.ppo.horizon))
+                for value in content["actor_state_dict"].values():
+                    self.assertTrue(bool(value.isfinite().all()))
+
     def test_resume_continues_where_it_stopped(self):
         out = self.train("resumed")
         before = newest(out)
@@ -234,11 +247,12 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual(
             replace(robust, task=replace(robust.task, randomization=RandomizationConfig())), RECIPES["minutes"].config
         )
-        random = robust.task.randomization
-        for f in fields(RandomizationConfig):  # all that is off by default is on
-            if getattr(RandomizationConfig(), f.name) in (None, (0.0, 0.0), (1.0, 1.0)):
-                low, high = getattr(random, f.name)
-                self.assertLess(low, high, f.name)
+        random = [RECIPES[name].config.task.randomization for name in ("robust", "live", "published")]
+        for f in fields(RandomizationConfig):  # all that is off by default is on in one of them, except for cameras
+            off = getattr(RandomizationConfig(), f.name)
+            if off in (None, (0.0, 0.0), (1.0, 1.0)) and not f.name.startswith("camera"):
+                ranges = [getattr(each, f.name) or (0.0, 0.0) for each in random]
+                self.assertTrue(any(low < high for low, high in ranges), f.name)
         self.assertEqual(parsed(f"--like={self.out}", "--config.save-interval", "7"), replace(CONFIG, save_interval=7))
         for arguments, problem in (
             (

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from xreset.capture import GraphRunner
 from xreset.faults import FaultRecorder
-from xreset.geometry.rotations import quat_rotate
-from xreset.objects.sampling import center, keypoints, surface_points
+from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
+from xreset.objects.sampling import center, keypoints, metric_points, surface_points
 from xreset.physics import Backend, Parameters, State
 from xreset.plugins import make_backend
 from xreset.resets.bank import ResetBank
@@ -160,6 +160,11 @@ class ManipulationEnv:
         if task.object_frame == "center":
             self._center = per_object(center)
             self._cloud_points = self._cloud_points - self._center[:, None]
+        self._metric_points = None
+        if task.reward.needs_points:
+            self._metric_points = per_object(metric_points)
+            if self._center is not None:
+                self._metric_points = self._metric_points - self._center[:, None]
         lower = self.actions.lower
         upper = self.actions.upper
         self._joint_lower = torch.where(lower.isfinite(), lower, -torch.pi)
@@ -326,6 +331,12 @@ class ManipulationEnv:
         """Return the present physical state and what follows from it."""
         return Reading.of(self.backend, self._surface_points, self._bad_action, self._center)
 
+    def _palm_distance(self, reading: Reading) -> Tensor:
+        """[N] distance from the palm to the object's surface points [m]."""
+        state = reading.state
+        palm = quat_rotate_inverse(state.object_quat, reading.links.pos[:, 0] - state.object_pos)
+        return (self._surface_points - palm[:, None]).norm(dim=-1).amin(dim=-1)
+
     @property
     def task_goal_pos(self) -> Tensor:
         """[N, 3] goal position of the object's origin in the task (``TaskConfig.object_frame``)."""
@@ -454,6 +465,9 @@ class ManipulationEnv:
                 action=self._action,
                 previous_action=self._previous_action,
                 out_of_bounds=lost,
+                palm_distance=self._palm_distance(reading) if self.task.reward.needs_palm else None,
+                points=self._metric_points,
+                is_arm=self.actions.is_arm,
             ),
             self.task.reward,
         )
@@ -558,10 +572,10 @@ class ManipulationEnv:
         history = torch.cat((self._cloud[:, 1:], frame), dim=1)
         self._cloud.copy_(torch.where(self._reset_mask.view(-1, 1, 1, 1), frame, history))
         groups = {
-            "policy": obs.policy_group(x, c, self.generator),
+            "policy": obs.policy_group(x, c, self.generator, self._cloud_points),
             "proprio": self.variation.observed_proprio(obs.proprio_group(x, c, self.generator), self._reset_mask),
             "perception": self._cloud,
-            "privileged": obs.privileged_group(x),
+            "privileged": obs.privileged_group(x, c),
         }
         if self.vision is not None:
             groups["goal"] = obs.goal_group(x, c)

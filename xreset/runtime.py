@@ -74,6 +74,11 @@ def _multiply(a: Array, b: Array) -> Array:
     return np.concatenate((w, _fused(b[:, :1], u, _fused(a[:, :1], v, _cross(u, v)))), axis=1)
 
 
+def _scaled(joints: Array, lower: Array, upper: Array) -> Array:
+    """[N, J] joint positions between their limits, in [-1, 1]."""
+    return np.float32(2.0) * (joints - lower) / (upper - lower) - np.float32(1.0)
+
+
 def _shown(quat: Array, rotation: str) -> Array:
     """[N, 4] or [N, 6] a rotation as the policy observes it."""
     if rotation == "quaternion":
@@ -267,7 +272,7 @@ class OnnxActor:
 _KNOWN = {
     "observation": {
         "cloud_points", "cloud", "cloud_history", "rotation", "cloud_scale", "contact_force_scale", "joint_target",
-        "joint_vel_scale",
+        "joint_vel_scale", "content",
     },
     "action": {"arm_step", "arm_lead", "hand", "hand_step", "hand_lead", "hand_zero"},
 }  # fmt: skip
@@ -420,6 +425,12 @@ class Controller:
         force = reading.tip_force
         if force is None:
             force = np.zeros_like(links.tip_pos)
+        limits = (self._scaled_lower, self._scaled_upper)
+        if o["content"] == "published":
+            joints = [_scaled(reading.joint_pos, *limits), _scaled(self.target, *limits)]
+            return np.concatenate((*self._observe_geometry(reading, links), *joints), axis=1), self._observe_cloud(
+                reading
+            )
         pose = [self._origin(reading.object_pos, reading.object_quat)]
         if o["rotation"] == "to_goal":
             inverse = reading.object_quat * np.array([1, -1, -1, -1], np.float32)
@@ -427,12 +438,11 @@ class Controller:
         else:
             pose += [_shown(reading.object_quat, o["rotation"]), self._goal_pos]
             pose += [_shown(self._goal_quat, o["rotation"])]
-        scaled = np.float32(2.0) * (reading.joint_pos - self._scaled_lower) / (self._scaled_upper - self._scaled_lower)
         parts = [
             *pose,
             np.ones((count, 1), np.float32),  # the share of its weight that the object has
             self.action,
-            scaled - np.float32(1.0),
+            _scaled(reading.joint_pos, *limits),
             np.float32(o["joint_vel_scale"]) * reading.joint_vel,
             links.palm_pos,
             _shown(links.palm_quat, o["rotation"]),
@@ -445,11 +455,25 @@ class Controller:
             parts.append(self.target - reading.joint_pos)
         return np.concatenate(parts, axis=1), self._observe_cloud(reading)
 
+    def _world_points(self, reading: Reading) -> Array:
+        """[N, P, 3] the object's points."""
+        origin = self._origin(reading.object_pos, reading.object_quat)
+        return rotate(reading.object_quat[:, None], self._points) + origin[:, None]
+
+    def _observe_geometry(self, reading: Reading, links: Links) -> tuple[Array, Array]:
+        """Return vectors from the fingertips to the nearest points [N, 3 E], and the palm's least distance [N, 1]."""
+        count = len(self.target)
+        links_pos = np.concatenate((links.palm_pos[:, None], links.tip_pos), axis=1)
+        offsets = self._world_points(reading)[:, None] - links_pos[:, :, None]
+        nearest = np.square(offsets).sum(axis=-1).argmin(axis=-1)
+        vectors = np.take_along_axis(offsets, nearest[:, :, None, None], axis=2)[:, :, 0]
+        x, y, z = np.split(np.square(vectors[:, 0]), 3, axis=1)
+        return vectors[:, 1:].reshape(count, -1), np.sqrt(x + y + z)
+
     def _observe_cloud(self, reading: Reading) -> Array:
         o = self.contract["observation"]
         scale = np.float32(o["cloud_scale"])
-        origin = self._origin(reading.object_pos, reading.object_quat)
-        cloud = rotate(reading.object_quat[:, None], self._points) + origin[:, None]
+        cloud = self._world_points(reading)
         if o["cloud"] == "paired":
             goal = rotate(self._goal_quat[:, None], self._points) + self._goal_pos[:, None]
             return scale * np.concatenate((cloud, goal, goal - cloud), axis=-1)[:, None]

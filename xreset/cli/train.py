@@ -48,8 +48,9 @@ def train(
             is not counted.
         seed: Seed of every random number.
         resume: Continue the run in --out from its newest checkpoint. Reward terms of your own must be named again.
-        like: Where the configuration starts from: a recipe (paper, minutes, robust, live) or another run's folder.
-            Flags change what they name. Reward terms of your own are not taken from a run; name them again.
+        like: Where the configuration starts from: a recipe (paper, published, minutes, robust, live) or another
+            run's folder. Flags change what they name. Reward terms of your own are not taken from a run; name them
+            again.
         weights: Another run's folder: start with the networks of its newest checkpoint, with their standard deviation
             and, if it adapts, their learning rate.
         config: Task, model and algorithm. The defaults shown are those of --like.

@@ -23,6 +23,8 @@ class ModelConfig(Checked):
     lstm: Positive[int] = 512
     """Units of the LSTM."""
     mlp: Widths = (512, 256, 128)
+    critic_mlp: Widths | None = None
+    """Widths of the critic's MLP; None: those of the actor."""
     activation: str = "elu"
     initial_std: Positive[float] = 1.0
     """Initial standard deviation of the Gaussian policy, which does not depend on the state. Not in the paper."""
@@ -37,7 +39,7 @@ class ModelConfig(Checked):
     @property
     def layers(self) -> dict[str, Any]:
         """What two networks must share for one to take over the weights of the other."""
-        names = ("pointnet", "lstm", "mlp", "activation", "normalize_observations", "normalize_returns")
+        names = ("pointnet", "lstm", "mlp", "critic_mlp", "activation", "normalize_observations", "normalize_returns")
         return {name: getattr(self, name) for name in names}
 
 
@@ -121,6 +123,8 @@ def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
         "learn_std": True,
     }
     critic = network.copy()
+    if m.critic_mlp is not None:
+        critic["hidden_dims"] = list(m.critic_mlp)
     if m.normalize_returns:
         critic["class_name"] = "xreset.learning.model:ReturnCritic"
     return {

@@ -90,6 +90,11 @@ class ObservationConfig(Checked):
     no other observation contains it."""
     joint_vel_scale: NotNegative[float] = 0.1
     """Factor on joint velocities [s/rad]."""
+    content: Literal["draft", "published"] = "draft"
+    """What the policy observes besides the points. ``draft``: poses of object and goal, previous action, joints and
+    their velocities, palm, fingertips, forces. ``published``: joint positions and their drives' targets between the
+    joint limits, the vectors from the fingertips to the nearest of the object's points, and the palm's distance to its
+    nearest one [m]. The published paper does not state the form of this geometry; the number of its inputs fits."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
 
     @property
@@ -132,18 +137,45 @@ class RewardConfig(Checked):
     """Weight of a second rotation term, 1 - tanh(angle / ``rotation_near_width``), which pays for the last degrees."""
     rotation_near_width: Positive[float] = 0.3
     """[rad]"""
+    proximity: Finite[float] = 0.0
+    """Weight of the sum over fingertips of their distances to the object's surface points [m], at most
+    ``proximity_cap``. The published paper has -2.5."""
+    proximity_cap: Positive[float] = 3.0
+    """[m] (the published paper)"""
+    palm_proximity: Finite[float] = 0.0
+    """Weight of the palm's distance to the object's surface points [m], at most ``palm_proximity_cap``. The published
+    paper has -2.5."""
+    palm_proximity_cap: Positive[float] = 0.5
+    """[m] (the published paper)"""
+    points: Finite[float] = 0.0
+    """Weight of 1 - d / ``points_zero``, gated, with d the mean distance of 64 surface points to the goal. The
+    published paper's 3 (1.4 - 3 d) is 4.2 with ``points_zero`` 1.4 / 3."""
+    points_zero: Positive[Finite[float]] = 1.4 / 3
+    """Distance d beyond which ``points`` is negative [m]."""
     success: Finite[float] = 10.0
+    success_shape: Literal["pose", "points"] = "pose"
+    """``pose``: paid while position and rotation are within the next two limits (the draft). ``points``: paid times
+    1 / (1 + 10 d) while d, the mean distance of 64 surface points to the goal [m], is at most ``success_position`` (the
+    published paper)."""
     success_position: Positive[float] = 0.02
     """[m] (section V)"""
-    success_rotation: Positive[float] = 0.2617993877991494
+    success_rotation: Annotated[Positive[float], Only("success_shape", "pose")] = 0.2617993877991494
     """[rad], 15 degrees (section V)"""
     action: Finite[float] = -0.005
     action_rate: Finite[float] = -0.005
+    action_rate_arm: Finite[float] | None = None
+    """Weight of the arm's part of ``action_rate``; None: the same. The published paper has -0.05."""
     out_of_bounds: Finite[float] = -500.0
-    contact: Literal["any", "opposing"] = "any"
-    """What opens the gate of ``position``, ``rotation`` and ``success``. ``any``: the thumb and another finger press
-    (the paper). ``opposing``: their forces on the object are more than 90 degrees apart. A hand that presses an object
-    down from above pushes with both in one direction; a hand that holds it does not. ``grasp`` is paid for either."""
+    contact: Literal["any", "opposing", "near"] = "any"
+    """What opens the gate of ``position``, ``rotation``, ``points`` and ``success``. ``any``: the thumb and another
+    finger press (the paper). ``opposing``: their forces on the object are more than 90 degrees apart. A hand that
+    presses an object down from above pushes with both in one direction; a hand that holds it does not. ``near``:
+    fingertips and palm are near the object, whether or not they touch it (the published paper). ``grasp`` is paid for
+    ``any``."""
+    near_tips: Annotated[Positive[float], Only("contact", "near")] = 0.6
+    """Largest sum of the fingertips' distances to the object [m] (the published paper)."""
+    near_palm: Annotated[Positive[float], Only("contact", "near")] = 0.2
+    """Largest distance of the palm to the object [m] (the published paper)."""
     contact_threshold: NotNegative[float] = 0.1
     """Force [N] from which a finger counts as in contact. Not in the paper."""
     raw_actions: bool = False
@@ -154,6 +186,16 @@ class RewardConfig(Checked):
     """Reward terms of the user: ``module:function`` -> weight (:func:`xreset.task.rewards.own_term`)."""
     scale: Positive[Finite[float]] = 0.01
     """Factor on the total (Table VIII)."""
+
+    @property
+    def needs_palm(self) -> bool:
+        """Whether the palm's distance to the object counts."""
+        return self.contact == "near" or self.palm_proximity != 0
+
+    @property
+    def needs_points(self) -> bool:
+        """Whether the mean distance of surface points to the goal counts."""
+        return self.success_shape == "points" or self.points != 0
 
     def __post_init__(self) -> None:
         super().__post_init__()

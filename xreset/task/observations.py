@@ -68,7 +68,8 @@ def layout(
     pose = {"object_pos": 3, f"object_{turn}": width, "goal_pos": 3, f"goal_{turn}": width}
     if c.rotation == "to_goal":
         pose = {"object_pos": 3, "goal_pos": 3, "rotation_to_goal": 6}
-    groups = {
+    perception = {"cloud" if c.cloud == "history" else "paired_cloud": prod(c.cloud_shape)}
+    groups: dict[str, dict[str, int]] = {
         "policy": {
             **pose,
             "gravity_fraction": 1,
@@ -85,8 +86,14 @@ def layout(
             "tip_force": 3 * num_tips,
             **({"joint_target": num_joints} if c.joint_target else {}),
         },
-        "perception": {"cloud" if c.cloud == "history" else "paired_cloud": prod(c.cloud_shape)},
+        "perception": perception,
     }
+    if c.content == "published":
+        groups = {
+            "policy": {"tip_to_object": 3 * num_tips, "palm_distance": 1},
+            "proprio": {"joint_pos": num_joints, "target_pos": num_joints},
+            "perception": perception,
+        }
     if vision is None or not vision.cameras:
         return groups
     return {
@@ -96,11 +103,22 @@ def layout(
     }
 
 
-def policy_group(x: ObservationInput, c: ObservationConfig, generator: torch.Generator) -> Tensor:
+def policy_group(
+    x: ObservationInput, c: ObservationConfig, generator: torch.Generator, points: Tensor | None = None
+) -> Tensor:
     """[N, 15 + J] object pose (noisy), goal pose, gravity fraction, previous action.
 
-    With ``rotation="matrix"`` there are four numbers more, with ``to_goal`` two less.
+    With ``rotation="matrix"`` there are four numbers more, with ``to_goal`` two less. With ``content="published"``,
+    [N, 3 E + 1] vectors from the fingertips to the nearest of the object's ``points`` [N, P, 3] (object frame), and the
+    palm's distance to its nearest one [m].
     """
+    if c.content == "published" and points is not None:
+        cloud = quat_rotate(x.observed_quat[:, None], points) + x.observed_pos[:, None]
+        offsets = cloud[:, None] - x.links.pos[:, :, None]
+        nearest = offsets.square().sum(dim=-1).argmin(dim=-1)
+        vectors = offsets.gather(2, nearest[:, :, None, None].expand(-1, -1, 1, 3))[:, :, 0]
+        palm_distance = vectors[:, 0].square().sum(dim=-1, keepdim=True).sqrt()
+        return torch.cat((vectors[:, 1:].flatten(1), palm_distance), dim=-1)
     noise = c.noise
     pos = x.observed_pos + noise.object_pos * _normal(x.observed_pos, generator)
     turn = quat_from_axis_angle(noise.object_rot * _normal(x.observed_pos, generator))
@@ -121,9 +139,12 @@ def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Ge
     """[N, 2 J + 13 + 6 E] joints, palm, fingertips and limited contact forces.
 
     Joint positions are scaled to [-1, 1] between their limits. Without quaternions there are two numbers more, with
-    ``joint_target`` J more.
+    ``joint_target`` J more. With ``content="published"``, [N, 2 J] positions and drives' targets, both scaled.
     """
     pos = x.state.joint_pos + c.noise.joint_pos * _normal(x.state.joint_pos, generator)
+    if c.content == "published":
+        both = torch.stack((pos, x.joint_target), dim=1)
+        return (2.0 * (both - x.joint_lower) / (x.joint_upper - x.joint_lower) - 1.0).flatten(1)
     vel = x.state.joint_vel + c.noise.joint_vel * _normal(x.state.joint_vel, generator)
     force = (c.contact_force_scale * x.tip_force).clamp(-1.0, 1.0)
     return torch.cat(
@@ -142,8 +163,16 @@ def proprio_group(x: ObservationInput, c: ObservationConfig, generator: torch.Ge
     )
 
 
-def privileged_group(x: ObservationInput) -> Tensor:
-    """[N, 15] object velocities, pose error, least fingertip distance, gravity fraction and reward (critic)."""
+def privileged_group(x: ObservationInput, c: ObservationConfig) -> Tensor:
+    """[N, 15] object velocities, pose error, least fingertip distance, gravity fraction and reward (critic).
+
+    With ``content="published"``, [N, 15 + J + 3 E]: joint velocities and contact forces follow, which the policy does
+    not observe then.
+    """
+    unobserved = ()
+    if c.content == "published":
+        force = (c.contact_force_scale * x.tip_force).clamp(-1.0, 1.0)
+        unobserved = (c.joint_vel_scale * x.state.joint_vel, force.flatten(1))
     rotation_error = quat_to_axis_angle(quat_multiply(x.goal_quat, quat_conjugate(x.state.object_quat)))
     return torch.cat(
         (
@@ -154,6 +183,7 @@ def privileged_group(x: ObservationInput) -> Tensor:
             x.tip_distance.min(dim=-1, keepdim=True).values,
             x.gravity_fraction[:, None],
             x.reward[:, None],
+            *unobserved,
         ),
         dim=-1,
     )

@@ -1,6 +1,12 @@
-"""The object-centric reward of the paper's appendix D.d, a pure function.
+"""The object-centric rewards of both versions of the paper, as a pure function.
 
+The draft (appendix D.d):
 r = r_reach + r_grasp + 4 r_p + 4 r_R + 10 r_success - 0.005 |a_t|^2 - 0.005 |a_t - a_{t-1}|^2 - 500 r_oob
+
+The published paper, with the sum P of the fingertips' distances and the distance M of the palm to the object, the mean
+distance d of surface points to the goal, and G = 1 where P <= 0.6 and M <= 0.2:
+r = -2.5 min(P, 3) - 2.5 min(M, 0.5) + G 3 (1.4 - 3 d) + G [d <= 0.02] 15 / (1 + 10 d) - 0.005 |a_t|^2
+- 0.05 |arm's a_t - a_{t-1}|^2 - 0.005 |hand's a_t - a_{t-1}|^2 - 500 r_oob
 """
 
 from __future__ import annotations
@@ -44,6 +50,12 @@ class RewardInput:
     previous_action: Tensor
     out_of_bounds: Tensor
     """[N] bool"""
+    palm_distance: Tensor | None = None
+    """[N] distance from the palm to the object's surface [m]; None: no term of the configuration needs it."""
+    points: Tensor | None = None
+    """[N, 64, 3] :func:`xreset.objects.sampling.metric_points` of each world's object, in its frame; None: likewise."""
+    is_arm: Tensor | None = None
+    """[J] bool; None: the arm's actions are penalised like the hand's."""
 
     @property
     def object_pos(self) -> Tensor:
@@ -137,11 +149,27 @@ def rotation_closeness(angle: Tensor, c: RewardConfig) -> Tensor:
 def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     """The reward of one control step."""
     grasped = contact_gate(x.tip_force, c.contact_threshold)
-    gate = contact_gate(x.tip_force, c.contact_threshold, opposing=True) if c.contact == "opposing" else grasped
+    gate = grasped
+    if c.contact == "opposing":
+        gate = contact_gate(x.tip_force, c.contact_threshold, opposing=True)
+    if c.contact == "near":
+        gate = (x.tip_distance.sum(dim=-1) <= c.near_tips) & (_given(x.palm_distance) <= c.near_palm)
     position_error = (x.object_pos - x.goal_pos).norm(dim=-1)
     rotation_error = quat_angle(x.object_quat, x.goal_quat)
     success = gate & (position_error < c.success_position) & (rotation_error < c.success_rotation)
     gate_f = gate.to(position_error.dtype)
+    success_reward = c.success * success.to(gate_f.dtype)
+    distance = position_error
+    if c.needs_points:
+        distance = mean_distance(x.object_pos, x.object_quat, x.goal_pos, x.goal_quat, _given(x.points))
+    if c.success_shape == "points":
+        success = gate & (distance <= c.success_position)
+        success_reward = c.success * success.to(gate_f.dtype) / (1.0 + 10.0 * distance)
+    change = (x.action - x.previous_action).square()
+    if c.action_rate_arm is None:
+        action_rate = c.action_rate * change.sum(dim=-1)
+    else:
+        action_rate = (torch.where(_given(x.is_arm), c.action_rate_arm, c.action_rate) * change).sum(dim=-1)
     reach = x.best_reach if c.reach_distance == "best" else x.tip_distance.mean(dim=-1)
     terms = {
         "reach": c.reach * (1.0 - torch.tanh(reach / c.reach_width)),
@@ -150,15 +178,27 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
         "position": c.position * gate_f * (1.0 - torch.tanh(position_error / c.position_width)),
         "rotation": c.rotation * gate_f * rotation_closeness(rotation_error, c),
         "rotation_near": c.rotation_near * gate_f * (1.0 - torch.tanh(rotation_error / c.rotation_near_width)),
-        "success": c.success * success.to(gate_f.dtype),
+        "success": success_reward,
         "action": c.action * x.action.square().sum(dim=-1),
-        "action_rate": c.action_rate * (x.action - x.previous_action).square().sum(dim=-1),
+        "action_rate": action_rate,
         "out_of_bounds": c.out_of_bounds * x.out_of_bounds.to(gate_f.dtype),
     }
+    if c.proximity:
+        terms["proximity"] = c.proximity * x.tip_distance.sum(dim=-1).clamp_max(c.proximity_cap)
+    if c.palm_proximity:
+        terms["palm_proximity"] = c.palm_proximity * _given(x.palm_distance).clamp_max(c.palm_proximity_cap)
+    if c.points:
+        terms["points"] = c.points * gate_f * (1.0 - distance / c.points_zero)
     for name, weight in c.own.items():
         terms[name] = weight * _checked(name, own_term(name)(x), position_error)
     total = c.scale * torch.stack(list(terms.values())).sum(dim=0)
     return Reward(total=total, terms=terms, grasped=grasped, gate=gate, success=success)
+
+
+def _given(value: Tensor | None) -> Tensor:
+    if value is None:
+        raise ValueError("the reward needs palm_distance, points or is_arm with this configuration")
+    return value
 
 
 def _checked(name: str, value: Tensor, like: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from xreset.geometry.shapes import half_spaces, hull, shape_mesh, shell_properti
 from xreset.objects.catalogue import canonical_name, load_object, load_objects, object_names
 from xreset.objects.decompose import Settings, as_solid, decompose, limited_hull
 from xreset.objects.meshes import DEFAULT_DENSITY, add_mesh, import_with_notes, mesh_files, read_mesh
+from xreset.objects.procedural import make_shapes
 from xreset.objects.properties import Properties
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.objects.sampling import bounding_box, keypoints, sample_surface, surface_points, winding_number
@@ -563,3 +564,27 @@ class SpecIsFrozen(unittest.TestCase):
 
 if __name__ == "__main__":
     unittest.main()
+
+
+@CUTS
+class RandomShapes(InFolder):
+    def test_shapes_are_closed_graspable_and_reproducible(self):
+        eight = make_shapes(self.folder / "eight", 8, seed=3)
+        nine = make_shapes(self.folder / "nine", 9, seed=3)
+        self.assertEqual(len({path.stem.split("_")[0] for path in eight}), 8)
+        for path, again in zip(eight, nine, strict=False):
+            self.assertEqual(path.read_bytes(), again.read_bytes())
+            mesh = trimesh.load_mesh(path)
+            self.assertTrue(mesh.is_watertight, path)
+            extents = np.sort(mesh.extents)
+            self.assertLess(extents[0], 0.09, path)
+            self.assertLess(extents[2], 0.24, path)
+            np.testing.assert_allclose(mesh.bounds.mean(axis=0), 0.0, atol=1e-9)
+            self.assertIn("mass", path.with_suffix(".toml").read_text())
+        self.assertNotEqual(nine[0].read_bytes(), nine[8].read_bytes())
+
+    def test_a_folder_is_never_overwritten(self):
+        with self.assertRaisesRegex(ObjectError, "exists. Name a new folder"):
+            make_shapes(self.folder, 1)
+        with self.assertRaisesRegex(ObjectError, "count is 0, expected a number from 1"):
+            make_shapes(self.folder / "none", 0)

@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 
 COMMANDS: dict[str, str] = {
     "demos": "Import, synthesize, select, merge and describe human demonstrations.",
-    "objects": "List objects and import meshes.",
+    "objects": "List objects, import meshes, and make random shapes.",
     "robots": "List, check, import, place and judge robots.",
     "engines": "List, check and compare physics engines, and trace where they diverge.",
     "retarget": "Turn human demonstrations into robot motion.",

@@ -1,4 +1,4 @@
-"""``xreset objects``: list, import."""
+"""``xreset objects``: list, import, make."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rich.table import Table
 from xreset.cli._common import Source
 from xreset.cli._terminal import Console
 from xreset.errors import ObjectError
-from xreset.objects import catalogue, meshes, sampling
+from xreset.objects import catalogue, meshes, procedural, sampling
 from xreset.objects.properties import Properties
 from xreset.pictures import pieces, render
 from xreset.spec import ObjectSpec
@@ -127,4 +127,18 @@ def _cells(obj: ObjectSpec) -> tuple[str, ...]:
     )
 
 
-COMMAND = {"list": list_, "import": import_}
+def make(*, out: Path, count: int = 40, seed: int = 0) -> None:
+    """Make random shapes to train with: boxes, cans, cups, eggs, wedges, bottles, hammers and bananas.
+
+    Demonstrations of them: xreset demos synth --objects FOLDER.
+
+    Args:
+        out: Folder of objects to write; it must not exist.
+        count: Number of shapes.
+        seed: Chooses sizes and masses.
+    """
+    written = procedural.make_shapes(out, count, seed)
+    Console().print(f"{out}: {len(written)} shapes")
+
+
+COMMAND = {"list": list_, "import": import_, "make": make}

@@ -1,0 +1,193 @@
+"""Random everyday shapes, so that a policy learns to grasp shapes and not a few meshes.
+
+Each family is made of convex pieces with random sizes: boxes, cans, cups, eggs, wedges, bottles, hammers and bananas.
+Sizes follow what a human hand holds: the narrowest side is at most 9 cm, the longest at most 24 cm. Lengths in meters,
+z is up, the origin is the centre of the bounding box.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from xreset.errors import ObjectError, needs
+from xreset.geometry.shapes import hull, loft, prism, section, shape_mesh
+from xreset.objects.properties import Properties
+from xreset.spec import Shape
+
+MOST = 10_000
+"""Most shapes of one folder."""
+_DENSITY = (150.0, 900.0)
+"""Mass per volume [kg/m^3]: from a carton of cereal to a full can."""
+_MASS = (0.02, 1.0)
+"""Limits of the mass [kg], near the lightest and heaviest objects of the YCB set that a hand lifts."""
+_X = np.array([1.0, 0.0, 0.0])
+_Y = np.array([0.0, 1.0, 0.0])
+_Z = np.array([0.0, 0.0, 1.0])
+_CORNERS = 24
+"""Points of a cross section."""
+
+
+def make_shapes(out: str | Path, count: int, seed: int = 0) -> list[Path]:
+    """Write random shapes as a folder of objects: ``NAME.obj`` and its mass in ``NAME.toml``.
+
+    The families take turns. The same seed gives the same shapes, and a shape does not depend on ``count``.
+
+    Args:
+        out: folder to make; it must not exist.
+        count: number of shapes.
+        seed: chooses sizes and masses.
+
+    Returns:
+        the meshes, in order.
+
+    Raises:
+        ObjectError: the folder exists, or ``count`` is out of range.
+    """
+    out = Path(out)
+    if not 1 <= count <= MOST:
+        raise ObjectError(f"count is {count}, expected a number from 1 to {MOST}.")
+    if out.exists():
+        raise ObjectError(f"{out} exists. Name a new folder.")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    names = list(_FAMILIES)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as unfinished:
+        folder = Path(unfinished) / "shapes"
+        folder.mkdir()
+        for number in range(count):
+            family = names[number % len(names)]
+            rng = np.random.default_rng([seed, number])
+            _write(folder / f"{family}_{number:04d}.obj", _FAMILIES[family](rng), rng)
+        shutil.move(folder, out)
+    return sorted(out.glob("*.obj"), key=lambda path: path.stem.rpartition("_")[2])
+
+
+def _write(path: Path, pieces: list[Shape], rng: np.random.Generator) -> None:
+    """Write the union of the pieces, and its mass."""
+    import trimesh
+
+    with needs("manifold3d", "objects", ObjectError):
+        import manifold3d  # noqa: F401
+    mesh = trimesh.boolean.union([shape_mesh(piece) for piece in pieces], engine="manifold")
+    mesh.apply_translation(-mesh.bounds.mean(axis=0))
+    low, high = np.log(_DENSITY)
+    mass = float(np.clip(mesh.volume * np.exp(rng.uniform(low, high)), *_MASS))
+    mesh.export(path, digits=12)  # fewer would open seams
+    path.with_suffix(".toml").write_text(Properties(mass=round(mass, 4)).to_toml())
+
+
+# Families -------------------------------------------------------------------------------------------------------------
+
+
+def _box(rng: np.random.Generator) -> list[Shape]:
+    """A box with more or less round edges along its longest side, in one of three orientations."""
+    narrow = rng.uniform(0.025, 0.085)
+    other = rng.uniform(narrow, 0.14)
+    length = rng.uniform(0.03, 0.22)
+    power = rng.uniform(4.0, 20.0)
+    axes = ((_X, _Y, _Z), (_Z, _X, _Y), (_Y, _Z, _X))[rng.integers(3)]
+    rings = []
+    for end in (-0.5, 0.5):
+        rings.append(
+            section(end * length * axes[2], narrow / 2 * axes[0], other / 2 * axes[1], power=power, count=_CORNERS)
+        )
+    return [loft(rings)]
+
+
+def _can(rng: np.random.Generator) -> list[Shape]:
+    """An elliptic cylinder that stands or lies."""
+    a = rng.uniform(0.018, 0.043)
+    b = a * rng.uniform(1.0, 1.5)
+    length = rng.uniform(0.03, 0.2)
+    u, v, along = ((_X, _Y, _Z), (_Y, _Z, _X))[rng.integers(2)]
+    rings = [section(end * length * along, a * v, b * u, count=_CORNERS) for end in (-0.5, 0.5)]
+    return [loft(rings)]
+
+
+def _cup(rng: np.random.Generator) -> list[Shape]:
+    """A solid frustum: a cup without its hollow."""
+    bottom = rng.uniform(0.02, 0.04)
+    top = bottom * rng.uniform(1.05, 1.35)
+    height = rng.uniform(0.05, 0.16)
+    rings = [section(z * _Z, r * _X, r * _Y, count=_CORNERS) for z, r in ((0.0, bottom), (height, top))]
+    return [loft(rings)]
+
+
+def _egg(rng: np.random.Generator) -> list[Shape]:
+    """An ellipsoid whose lowest part is cut off, so that it stands."""
+    a, b, c = rng.uniform(0.022, 0.045, 3)
+    rings = []
+    for z in np.linspace(-0.8, 0.98, 9):
+        r = np.sqrt(1.0 - z * z)
+        rings.append(section(z * c * _Z, r * a * _X, r * b * _Y, count=_CORNERS))
+    return [loft(rings)]
+
+
+def _wedge(rng: np.random.Generator) -> list[Shape]:
+    """A prism over an irregular polygon."""
+    corners = int(rng.integers(3, 8))
+    angles = (np.arange(corners) + rng.uniform(-0.2, 0.2, corners)) * 2 * np.pi / corners
+    radii = rng.uniform(0.028, 0.05, corners)
+    outline = [(r * np.cos(angle), 0.8 * r * np.sin(angle)) for r, angle in zip(radii, angles, strict=True)]
+    return [prism(outline, 0.0, rng.uniform(0.03, 0.15))]
+
+
+def _bottle(rng: np.random.Generator) -> list[Shape]:
+    """A body, a shoulder and a neck."""
+    a = rng.uniform(0.022, 0.04)
+    b = a * rng.uniform(1.0, 1.3)
+    body = rng.uniform(0.07, 0.14)
+    shoulder = rng.uniform(0.015, 0.035)
+    neck = rng.uniform(0.01, 0.04)
+    share = rng.uniform(0.3, 0.6)
+    power = rng.uniform(2.0, 5.0)
+
+    def ring(z: float, size: float, power: float) -> np.ndarray:
+        return section(z * _Z, size * a * _X, size * b * _Y, power=power, count=_CORNERS)
+
+    top = body + shoulder
+    levels = [ring(0.0, 1.0, power), ring(body, 1.0, power), ring(top, share, 2.0), ring(top + neck, share, 2.0)]
+    return [loft(pair) for pair in pairwise(levels)]
+
+
+def _hammer(rng: np.random.Generator) -> list[Shape]:
+    """A lying handle with a block at one end."""
+    length = rng.uniform(0.1, 0.2)
+    radius = rng.uniform(0.01, 0.02)
+    head = rng.uniform((0.02, 0.05, 0.02), (0.04, 0.1, 0.05))
+    rings = [section(x * _X, radius * _Y, radius * _Z, power=3.0, count=_CORNERS) for x in (0.0, length)]
+    corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
+    middle = np.array([length, 0.0, head[2] / 2 - radius])
+    return [loft(rings), hull(corners * head + middle)]
+
+
+def _banana(rng: np.random.Generator) -> list[Shape]:
+    """A lying, bent rod that is thinner at its ends."""
+    thickness = rng.uniform(0.014, 0.022)
+    bend = rng.uniform(0.06, 0.2)
+    angle = rng.uniform(0.08, 0.18) / bend / 2
+
+    def ring(share: float) -> np.ndarray:
+        outward = np.array([np.sin(share * angle), np.cos(share * angle), 0.0])
+        size = thickness * (1.0 - 0.35 * share * share)
+        return section(bend * outward, size * outward, size * _Z, count=12)
+
+    ends = pairwise(np.linspace(-1.0, 1.0, 7))
+    return [loft((ring(start - 0.02), ring(end + 0.02))) for start, end in ends]  # overlapping, so that no seam is open
+
+
+_FAMILIES: dict[str, Callable[[np.random.Generator], list[Shape]]] = {
+    "box": _box,
+    "can": _can,
+    "cup": _cup,
+    "egg": _egg,
+    "wedge": _wedge,
+    "bottle": _bottle,
+    "hammer": _hammer,
+    "banana": _banana,
+}

@@ -21,10 +21,8 @@ if [ -z "$python" ]; then
   exit 1
 fi
 
-stamp=.venv/.xreset-$("$python" -c '
-import hashlib, sys
-content = open("pyproject.toml", "rb").read() + str(sys.version_info[:2]).encode()
-print(hashlib.sha256(content).hexdigest()[:16])')
+lock=ci/locks/py$("$python" -c 'import sys; print("%d%d" % sys.version_info[:2])').txt
+stamp=.venv/.xreset-$(cat pyproject.toml "$lock" | sha256sum | cut -c 1-16)
 if [ ! -e "$stamp" ]; then
   echo "== setting up .venv with $("$python" --version) (once)"
   version=$("$python" -c 'import sys; print(sys.version_info[:2])')
@@ -34,6 +32,9 @@ if [ ! -e "$stamp" ]; then
   [ -x .venv/bin/python ] || "$python" -m venv .venv
   install() { .venv/bin/python -m pip install --quiet --disable-pip-version-check --only-binary :all: "$@"; }
   install torch==2.13.0  # first: what depends on torch then takes this build
+  if [ "$(uname -m)" = x86_64 ]; then
+    install --no-deps --require-hashes -r "$lock"  # the versions with which the tests have passed
+  fi
   install -e '.[all,dev]'
   rm -f .venv/.xreset-*
   touch "$stamp"

@@ -16,18 +16,18 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.demos.archive import Demos
 from xreset.demos.synth import synthesize
 from xreset.errors import XResetError
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
 from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
-from xreset.eval.policy_spec import PolicySpec
+from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.rollout import Episode, Round, episode_of, episode_starts, play_rounds
 from xreset.eval.sensitivity import SWEEPS, Effect, Property
-from xreset.eval.stress import COSTLY, Curve, Point, Stress, amount, curve, draw_curves, plot_size, stressed
-from xreset.eval.trial import Engine, Trial
-from xreset.files import write_json, write_whole
+from xreset.eval.stress import COSTLY, Curve, Point, Stress, amount, chosen, curve, draw_curves, plot_size, stressed
+from xreset.eval.trial import Engine, Trial, engine, load_trial
+from xreset.files import claim_folder, write_json, write_whole
+from xreset.inputs import Data
 from xreset.live.engine import begin, make_controller
 from xreset.live.faults import Faults, FaultyDriver
 from xreset.plugins import backend_class
@@ -137,66 +137,88 @@ class Verdict:
     reasons: tuple[str, ...]
 
 
-def default_demos(policy: PolicySpec, meshes: Path | None = None) -> Demos:
-    """Return two synthetic demonstrations of each object that the policy was trained with.
-
-    Args:
-        policy: no baseline.
-        meshes: folder of meshes; None: that of the policy's training.
-
-    Raises:
-        PolicyError: the policy is a baseline.
-        ObjectError: there is neither a stand-in nor a mesh of an object.
-    """
-    policy.exported()
-    return synthesize(policy.objects or (), 2, meshes=meshes or policy.objects_folder)
-
-
 def rehearse(
-    policy: PolicySpec,
-    trial: Trial,
-    engines: Sequence[Engine],
-    out: Path,
+    policy: str | Path | PolicySpec,
+    demos: str | Path | Data | None = None,
+    engines: str | Sequence[str | Engine] = "mujoco",
     *,
-    properties: Sequence[Property] = PROPERTIES,
-    repetitions: int = 1,
+    faults: Sequence[str] = (),
+    episodes: int = 1,
+    seed: int = 0,
+    robot: str | Path | None = None,
+    objects: str | Path | None = None,
+    num_envs: int = 64,
+    device: str = "cpu",
     real_time: bool = False,
+    out: str | Path | None = None,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> list[Rehearsal]:
-    """Play the same episodes with each fault in each engine, and write ``OUT/BACKEND.json`` and ``OUT/index.html``.
+    """Rehearse a policy for a robot: play the same episodes with each fault in each engine, and write the results.
 
     Args:
-        policy: what is tried; no baseline.
-        trial: what is played, from :func:`~xreset.eval.trial.load_trial`.
-        engines: where it is tried.
-        out: folder for the results.
-        properties: faults and values, of :data:`PROPERTIES`.
-        repetitions: episodes of each demonstration, the same for every fault.
+        policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`; no baseline.
+        demos: demonstrations or retargeted motion, or a file of them: starts and goals. None: two synthetic
+            demonstrations of each of the policy's objects.
+        engines: name of a physics engine, or several.
+        faults: faults to try, as ``NAME`` or ``NAME=VALUE,VALUE...``; default: all of :data:`PROPERTIES`.
+        episodes: episodes of each demonstration, the same for every fault.
+        seed: seed of starts and faults.
+        robot: name or folder of the robot; default: the policy's own.
+        objects: folder of object meshes; default: the folder of the policy's training.
+        num_envs: worlds that run at the same time.
+        device: where GPU engines run: cpu or cuda.
         real_time: whether the simulation waits for the wall clock.
+        out: folder for ``ENGINE.json`` and ``index.html``; default: ``rehearsal`` next to the policy's evaluations.
         progress: called with (engine, episodes done, episodes in all).
+
+    Returns:
+        The results that were written, in the order of the engines. :func:`judge` has the verdict.
 
     Raises:
         PolicyError: the policy is a baseline, or the seed chose this checkpoint.
-        XResetError: a property cannot have a value; nothing was played then.
+        XResetError: a fault is unknown or cannot have a value; nothing was played then.
     """
-    policy.check_seed(trial.seed)
-    actor = OnnxActor(policy.exported().read_bytes())
+    properties = chosen(faults, PROPERTIES)
+    spec = policy if isinstance(policy, PolicySpec) else load_policy(policy, robot=robot, seed=seed)
+    spec.check_seed(seed)
+    actor = OnnxActor(spec.exported().read_bytes())
+    if demos is None:
+        demos = synthesize(spec.objects or (), 2, meshes=objects or spec.objects_folder)
+    trial = load_trial(spec, demos, objects=objects, seed=seed, num_envs=num_envs)
     for prop in properties:
         for value in prop.values:
             _setting(trial, prop, value)
+    wanted = (engines,) if isinstance(engines, str) else engines
+    opened = [engine(each, device=device) if isinstance(each, str) else each for each in wanted]
+    folder = Path(out) if out else spec.folder.parent / "rehearsal"
+    with claim_folder(folder):
+        return _rehearsed(spec, actor, trial, opened, properties, episodes, real_time, folder, progress)
+
+
+def _rehearsed(
+    policy: PolicySpec,
+    actor: OnnxActor,
+    trial: Trial,
+    engines: Sequence[Engine],
+    properties: Sequence[Property],
+    repetitions: int,
+    real_time: bool,
+    out: Path,
+    progress: Callable[[str, int, int], None],
+) -> list[Rehearsal]:
     found: list[Rehearsal] = []
-    for engine in engines:
-        able = backend_class(engine.name).capabilities
+    for place in engines:
+        able = backend_class(place.name).capabilities
         usable = [prop for prop in properties if prop.needs is None or prop.needs in able]
         settings: list[tuple[Property, float]] = []
         for prop in usable:
             settings += [(prop, value) for value in prop.values]
         total = (1 + len(settings)) * repetitions * len(trial.bank.sequence_name)
 
-        def count(done: int, engine: Engine = engine, total: int = total) -> None:
-            progress(engine.name, done, total)
+        def count(done: int, name: str = place.name, total: int = total) -> None:
+            progress(name, done, total)
 
-        player = _Player(actor, engine, repetitions, real_time, count)
+        player = _Player(actor, place, repetitions, real_time, count)
         # Faults of the loop can differ from world to world, so they are played together.
         in_loop = [(prop, value) for prop, value in settings if prop.name in _MAKERS]
         faults = [Faults(), *(_setting(trial, prop, value)[1] for prop, value in in_loop)]
@@ -216,8 +238,8 @@ def rehearse(
             robot=trial.robot.name,
             seed=trial.seed,
             inputs=trial.inputs,
-            backend=engine.name,
-            backend_version=engine.version,
+            backend=place.name,
+            backend_version=place.version,
             episodes=len(nominal),
             task_progress=as_is.task_progress,
             ci95=as_is.ci95,
@@ -226,7 +248,7 @@ def rehearse(
             left_out=tuple(prop.option for prop in properties if prop not in usable),
             stopped=dict(player.stopped),
         )
-        write_json(out / f"{engine.name}.json", asdict(card))
+        write_json(out / f"{place.name}.json", asdict(card))
         found.append(card)
         write_whole(out / "index.html", page(found))
     return found

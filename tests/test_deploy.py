@@ -27,7 +27,7 @@ from xreset.errors import PolicyError
 from xreset.eval.policy_spec import load_policy
 from xreset.eval.rollout import episode_starts
 from xreset.eval.trial import engine, load_trial
-from xreset.live.deploy import deploy_contract, export_deploy
+from xreset.live.deploy import deploy_contract, write_deployed
 from xreset.live.engine import EngineDriver
 from xreset.policy import policy_contract
 from xreset.runtime import LiveError, RemoteController, Runner, load_controller, read_contract
@@ -99,7 +99,7 @@ class ContractTest(unittest.TestCase):
         robot = toy_grasp.robot()
         file = write_policy(self.folder / "toy.onnx", policy_contract(robot, self.task, ("brick",)), value=0.01)
         self.out = self.folder / "out"
-        self.contract = export_deploy(file, robot, self.task, [toy_grasp.brick()], self.out)
+        self.contract = write_deployed(file, robot, self.task, [toy_grasp.brick()], self.out)
         self.home = [joint["home"] for joint in self.contract["joints"]]
 
     def test_it_says_what_goes_in_and_out(self):
@@ -107,7 +107,7 @@ class ContractTest(unittest.TestCase):
         self.assertEqual([joint["name"] for joint in self.contract["joints"]], list(toy_grasp.robot().joint_names))
         self.assertEqual(np.shape(self.contract["objects"]["brick"]["points"]), (64, 3))
         with self.assertRaisesRegex(PolicyError, "exists already"):
-            export_deploy(self.folder / "toy.onnx", toy_grasp.robot(), self.task, [toy_grasp.brick()], self.out)
+            write_deployed(self.folder / "toy.onnx", toy_grasp.robot(), self.task, [toy_grasp.brick()], self.out)
         with self.assertRaisesRegex(LiveError, "has no object 'hat'. Choose from: brick"):
             load_controller(self.out).points("hat")
 

@@ -9,10 +9,13 @@ from xreset.env import ManipulationEnv as ManipulationEnv
 from xreset.env import make_env as make_env
 from xreset.errors import XResetError as XResetError
 from xreset.eval.evaluate import evaluate as evaluate
+from xreset.eval.export.deploy import export_deploy as export_deploy
 from xreset.eval.film import film as film
 from xreset.eval.play.run import play as play
 from xreset.eval.policy_spec import PolicySpec as PolicySpec
 from xreset.eval.policy_spec import load_policy as load_policy
+from xreset.eval.rehearse import Rehearsal as Rehearsal
+from xreset.eval.rehearse import rehearse as rehearse
 from xreset.eval.results import EvalResult as EvalResult
 from xreset.eval.results import Evaluation as Evaluation
 from xreset.eval.trial import Engine as Engine

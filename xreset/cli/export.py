@@ -7,14 +7,13 @@ from typing import Annotated
 
 import tyro
 
+from xreset import runtime
 from xreset.cli._common import Name, Several
 from xreset.cli._terminal import Console, Progress
 from xreset.errors import RunError
-from xreset.eval import policy_spec
+from xreset.eval.export import deploy as deployment
 from xreset.eval.export import lerobot as dataset
 from xreset.eval.export import recorded
-from xreset.live import deploy as deployment
-from xreset.objects import catalogue
 
 Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
 
@@ -80,16 +79,16 @@ def deploy(
         objects: Folder of meshes; default: that of the training, else the stand-ins.
         object: Object whose points the contract lists; give it again for more. Default: the objects of the training.
     """
-    spec = policy_spec.load_policy(policy, robot=robot)
-    file = spec.exported()
-    listed = catalogue.load_objects(object or spec.objects or (), objects or spec.objects_folder)
-    contract = deployment.export_deploy(file, spec.robot, spec.task, listed, out)
-    shapes = {o.name: "stand-in" if o.source == "stand-in" else "mesh" for o in listed}
+    spec = deployment.export_deploy(policy, out, robot=robot, objects=objects, only=object)
+    contract = runtime.read_contract(out)
+    named = []
+    for name, entry in contract["objects"].items():
+        named.append(f"{name} ({'stand-in' if entry['source'] == 'stand-in' else 'mesh'})")
     console = Console()
     console.print(
         f"{out}: {spec.name} for {contract['robot']}, {len(contract['joints'])} joints at {contract['rate']:g} Hz"
     )
-    console.print(f"objects: {', '.join(f'{name} ({shape})' for name, shape in shapes.items())}")
+    console.print(f"objects: {', '.join(named)}")
     console.print(f"Try it: python {out / 'runtime.py'}")
 
 

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from xreset.cli._common import Flat, Name, Several, chosen_engines, engine_bars, usable_engines
 from xreset.cli._terminal import Console
-from xreset.eval import policy_spec, stress, trial
+from xreset.eval import policy_spec
 from xreset.eval import rehearse as rehearsal
 from xreset.eval.setting import Setting
 
@@ -38,24 +38,24 @@ def rehearse(
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: rehearsal/ in the run folder or next to the policy.
     """
-    properties = stress.chosen(fault, rehearsal.PROPERTIES)
     console = Console()
-    spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
-    source = demos or rehearsal.default_demos(spec, setting.objects)
-    played = trial.load_trial(spec, source, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs)
     engines = chosen_engines(backend or usable_engines(console), setting.device)
     if not backend:
         engines = [each for each in engines if each.grasps]
+    spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "rehearsal"
     with engine_bars(console, [e.name for e in engines]) as progress:
         found = rehearsal.rehearse(
             spec,
-            played,
+            demos,
             engines,
-            folder,
-            properties=properties,
-            repetitions=episodes,
+            faults=fault,
+            episodes=episodes,
+            seed=setting.seed,
+            objects=setting.objects,
+            num_envs=setting.num_envs,
             real_time=real_time,
+            out=folder,
             progress=progress,
         )
     table = Table("fault", title=f"{spec.name}: the smallest fault that costs ten points of task progress")

@@ -6,10 +6,8 @@ import logging
 from pathlib import Path
 
 from xreset.cli._common import Name, Several
-from xreset.eval import policy_spec
-from xreset.live import deploy
+from xreset.eval.export import deploy
 from xreset.live import serve as server
-from xreset.objects import catalogue
 
 
 def serve(
@@ -32,11 +30,8 @@ def serve(
         object: Object that clients may name; give it again for more. Default: the objects of the training.
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
-    spec = policy_spec.load_policy(policy, robot=robot)
-    file = spec.exported()
-    listed = catalogue.load_objects(object or spec.objects or (), objects or spec.objects_folder)
-    contract = deploy.deploy_contract(spec.robot, spec.task, listed, file)
-    listening = server.PolicyServer(contract, file.read_bytes(), host=host, port=port)
+    spec, contract = deploy.served(policy, robot=robot, objects=objects, only=object)
+    listening = server.PolicyServer(contract, spec.exported().read_bytes(), host=host, port=port)
     print(f"{spec.name} for {spec.robot.name} at {listening.url}, {contract['rate']:g} steps per second. Ctrl-C ends.")
     if host not in ("127.0.0.1", "localhost", "::1"):
         print("Every computer that reaches this address can use the policy. There is no password.")

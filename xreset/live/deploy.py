@@ -148,7 +148,7 @@ def _chain(robot: RobotSpec) -> dict[str, Any]:
     return {"base": base, "palm": tracked[0], "tips": tracked[1:], "steps": steps}
 
 
-def export_deploy(
+def write_deployed(
     policy: Path, robot: RobotSpec, task: TaskConfig, objects: Sequence[ObjectSpec], out: Path
 ) -> dict[str, Any]:
     """Write ``policy.onnx``, ``contract.json`` and ``runtime.py`` into a new folder; return the contract.

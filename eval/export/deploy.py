@@ -1,0 +1,58 @@
+"""Write policies for robots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from xreset.eval.policy_spec import PolicySpec, load_policy
+from xreset.live.deploy import deploy_contract, write_deployed
+from xreset.objects.catalogue import load_objects
+from xreset.spec import ObjectSpec
+
+
+def export_deploy(
+    policy: str | Path | PolicySpec,
+    out: str | Path,
+    *,
+    robot: str | Path | None = None,
+    objects: str | Path | None = None,
+    only: Sequence[str] = (),
+) -> PolicySpec:
+    """Write a policy for a robot: ``policy.onnx``, ``contract.json`` and ``runtime.py``, which needs numpy and
+    onnxruntime (``docs/live.md``).
+
+    Args:
+        policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`; no baseline.
+        out: folder to write; must not exist, or be empty.
+        robot: name or folder of the robot; default: the policy's own.
+        objects: folder of object meshes; default: the folder of the policy's training, else the stand-ins.
+        only: names of the objects whose points the contract lists; default: the objects of the training.
+
+    Returns:
+        The policy.
+
+    Raises:
+        PolicyError: the policy is a baseline or looks through cameras, or the folder is not empty.
+        ObjectError: there is neither a stand-in nor a mesh of an object.
+    """
+    spec, listed = _with_objects(policy, robot, objects, only)
+    write_deployed(spec.exported(), spec.robot, spec.task, listed, Path(out))
+    return spec
+
+
+def served(
+    policy: str | Path, *, robot: str | Path | None, objects: str | Path | None, only: Sequence[str]
+) -> tuple[PolicySpec, dict]:
+    """Return a policy and its contract, for :class:`xreset.live.serve.PolicyServer`; see :func:`export_deploy`."""
+    spec, listed = _with_objects(policy, robot, objects, only)
+    return spec, deploy_contract(spec.robot, spec.task, listed, spec.exported())
+
+
+def _with_objects(
+    policy: str | Path | PolicySpec, robot: str | Path | None, objects: str | Path | None, only: Sequence[str]
+) -> tuple[PolicySpec, tuple[ObjectSpec, ...]]:
+    spec = policy if isinstance(policy, PolicySpec) else load_policy(policy, robot=robot)
+    spec.exported()
+    folder = Path(objects) if objects else spec.objects_folder
+    return spec, load_objects(only or spec.objects or (), folder)

@@ -1,4 +1,4 @@
-"""The pads of a jaw, which are drawn to the faces of the object that the human holds."""
+"""Jaws: their pads, which are drawn to the faces of the object that the human holds, and the analytic map."""
 
 import dataclasses
 import math
@@ -15,9 +15,11 @@ from xreset.geometry.rotations import quat_from_axis_angle, quat_rotate
 from xreset.geometry.surface import Surface
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.cost import system
+from xreset.retarget.hand.jaw import jaw_keypoints, jaw_state
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.pipeline import RetargetConfig, hand_motions
+from xreset.spec import KEYPOINTS
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=FLOAT)
 
@@ -84,6 +86,37 @@ class PadsTest(unittest.TestCase):
         [(_, targets, _)] = hand_motions(demos, self.model.robot, objects, RetargetConfig(hand=config))
         self.assertFalse(targets.held[0, 0])
         self.assertTrue(targets.held[0, -1])
+
+
+class AnalyticMapTest(unittest.TestCase):
+    def test_a_jaw_s_own_keypoints_give_its_pose_back(self):
+        generator = torch.Generator().manual_seed(0)
+        for name in ("openarm", "ur7e-robotiq"):
+            model = HandModel(robots.load(name))
+            share = torch.rand(1, 5, 1, generator=generator, dtype=FLOAT)
+            joints = model.kinematics.lower + share * (model.kinematics.upper - model.kinematics.lower)
+            pos = torch.randn(1, 5, 3, generator=generator, dtype=FLOAT)
+            quat = quat_from_axis_angle(torch.randn(1, 5, 3, generator=generator, dtype=FLOAT))
+            followed = model.keypoints(joints, pos, quat)
+            state = jaw_state(model, followed)
+            again = model.keypoints(state.joints, state.root_pos, state.root_quat)
+            torch.testing.assert_close(again, followed, atol=5e-4, rtol=0, msg=name)
+
+    def test_a_span_wider_than_the_jaw_keeps_its_middle_and_the_second_jaw_follows_two_fingers(self):
+        model = HandModel(robots.load("ur7e-robotiq"))
+        hand = np.zeros((1, 21, 3))
+        at = {name: hand[0, i] for i, name in enumerate(KEYPOINTS)}
+        at["thumb4"][:] = (-0.1, 0, 0)
+        at["index4"][:] = (0.1, 0, 0.02)
+        at["middle4"][:] = (0.1, 0, -0.02)
+        at["wrist"][:] = (0, 0, 0.2)
+        field = Surface(box_object(((0, 0, 0), (0.05, 0.05, 0.05)))).field
+        targets = hand_targets(torch.as_tensor(jaw_keypoints(model, hand))[None], field)
+        motion = retarget_hand(model, targets, HandConfig(jaw="analytic"))
+        tips = motion.keypoints[0, 0, model.is_tip]
+        self.assertAlmostEqual(motion.joints.item(), 0.0)
+        torch.testing.assert_close(tips[:, 0].abs(), torch.full((2,), 0.0425, dtype=FLOAT), atol=1e-3, rtol=0)
+        torch.testing.assert_close(tips[:, 1:], torch.zeros(2, 2, dtype=FLOAT), atol=1e-3, rtol=0)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.file import Retargeted
 from xreset.retarget.hand.config import HandConfig
+from xreset.retarget.hand.jaw import jaw_keypoints
 from xreset.retarget.hand.model import HandModel, HandTargets
 from xreset.retarget.hand.solve import HandMotion, retarget_hand
 from xreset.retarget.validity import REASONS, Thresholds, classify
@@ -245,6 +246,7 @@ class _Work:
     ) -> None:
         surfaces = {name: Surface(spec) for name, spec in _by_name(demos, objects).items()}
         self._objects = list(surfaces)
+        self._analytic_jaw = config.hand.jaw == "analytic"
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
         self.demos = demos = rest_on_table(demos, objects)
         points, self.touching = human_contacts(demos, surfaces, config.contact_distance)
@@ -287,6 +289,8 @@ class _Work:
             return torch.as_tensor(out)
 
         chosen = {name: values[:, hand.keypoint_indices] for name, values in self._per_keypoint.items()}
+        if self._analytic_jaw and hand.is_jaw:
+            chosen["keypoints"] = jaw_keypoints(hand, self._per_keypoint["keypoints"])
         which = [self._objects.index(name) for name in self.demos.object_name[list(sequences)].tolist()]
         return HandTargets(
             **{name: padded(values) for name, values in (chosen | self._per_frame).items()},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf
-from typing import Annotated
+from typing import Annotated, Literal
 
 from xreset.checks import Checked, Finite, NotNegative, Positive, Rule
 
@@ -21,6 +21,9 @@ Shares = Annotated[
 class HandConfig(Checked):
     """Weights and limits of hand retargeting; weights are the paper's (appendix D.b) unless a field says otherwise."""
 
+    jaw: Literal["optimized", "analytic"] = "optimized"
+    """How a parallel jaw follows: like every hand, by the costs below, or by the published paper's analytic map
+    (:mod:`xreset.retarget.hand.jaw`), which none of them changes. Other hands are always optimized."""
     local_weight: NotNegative[float] = 10.0
     """Bone vectors and bone directions, averaged over the pairs of keypoints."""
     global_weight: NotNegative[float] = 1.0

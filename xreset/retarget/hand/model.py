@@ -121,6 +121,8 @@ class HandModel:
         """[C, 2] pairs of mapped keypoints whose difference is matched."""
         self.home = torch.as_tensor(robot.home[robot.hand_indices], device=self.device)
         """[J] home configuration of the hand."""
+        self.is_jaw = len(self.home) == 1 and len(robot.fingertips) == 2
+        """Whether the hand is a jaw: one joint moves two fingers."""
         upright = self.home.new_tensor([1.0, 0.0, 0.0, 0.0])
         self.at_home = self.keypoints(self.kinematics.clamp(self.home), self.home.new_zeros(3), upright)
         """[P, 3] keypoints at home, in the root's frame."""
@@ -155,9 +157,9 @@ class HandModel:
         it out.
         """
         none = [torch.zeros(0, dtype=torch.long, device=self.device)]
-        fingertips = self.robot.fingertips
-        if len(self.home) != 1 or len(fingertips) != 2:
+        if not self.is_jaw:
             return none
+        fingertips = self.robot.fingertips
         balls = self.balls
         first, second = self.kinematics.points(self.home, [tip.link for tip in fingertips])
         pads = []

@@ -26,6 +26,7 @@ from xreset.geometry.rotations import (
 )
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.cost import HandSystem, system
+from xreset.retarget.hand.jaw import jaw_state
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.least_squares import free_to_move, minimize, solve_chain
 
@@ -60,6 +61,11 @@ def retarget_hand(
     config = config or HandConfig()
     home = targets.keypoints.device
     targets = targets.to(model.device)
+    if config.jaw == "analytic" and model.is_jaw:
+        rows = torch.arange(len(targets.annotated), device=model.device)[:, None]
+        state = jaw_state(model, targets.keypoints[rows, _nearest_annotated(targets.annotated)])
+        cost = targets.keypoints.new_zeros(len(targets.annotated))
+        return HandMotion(**vars(state), keypoints=model.keypoints(**vars(state)), cost=cost).to(home)
     root_pos, root_quat = _align_root(model, targets)
     joints = model.kinematics.clamp(model.home).expand(*targets.annotated.shape, -1)
     state = HandState(joints, root_pos, root_quat)

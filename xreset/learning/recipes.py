@@ -94,7 +94,7 @@ _LIVE = replace(
             observation_latency=(0.0, 6.0),
             proprio_latency=(0.0, 1.0),
             tracker=TrackerConfig(
-                interval=(1.0, 1.5),
+                interval=(1.0, 2.0),
                 jitter=1.0,
                 position_bias=0.005,
                 rotation_bias=radians(3.75),
@@ -108,7 +108,7 @@ _LIVE = replace(
     ),
 )
 """From the published paper's table A3: delays of 133 ms (actions), 200 ms (poses) and 33 ms (joints), errors of poses,
-shifts of goals. There the arm's actions are late by at most 50 ms. The tracker has 20 to 30 poses a second and loses
+shifts of goals. There the arm's actions are late by at most 50 ms. The tracker has 15 or 30 poses a second and loses
 the object for 0.1 to 0.5 s. Lost actions, lost poses and the size of pushes have no source."""
 
 _PUBLISHED = TrainConfig(

@@ -33,7 +33,7 @@ def evaluate(
 
     Args:
         policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`.
-        demos: demonstrations or retargeted motion, or a file of them: starts and goals.
+        demos: demonstrations, retargeted motion or a goal set, or a file of them: starts and goals.
         engines: name of a physics engine, or several.
         episodes: episodes of each demonstration, each with another perturbation of robot and object.
         seed: seed of the perturbations.

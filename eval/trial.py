@@ -22,6 +22,7 @@ from xreset.physics import Backend
 from xreset.plugins import backend_class, device_for, make_backend
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import ResetDistribution
+from xreset.resets.goals import GoalSet
 from xreset.resets.settle import settle_starts
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
@@ -138,13 +139,14 @@ def load_trial(
     seed: int = 0,
     num_envs: int = 64,
     settle: bool = False,
-    accept: tuple[Kind, ...] = ("demos", "motion"),
+    accept: tuple[Kind, ...] = ("demos", "motion", "goals"),
 ) -> Trial:
     """Load what a policy is to play. For the baseline ``ik``, demonstrations are retargeted here.
 
     Args:
         policy: the policy, whose robot and task are taken.
-        source: demonstrations, motion or a bank, or a file of them.
+        source: demonstrations, motion, a bank or a goal set, or a file of them. A goal set's starts are played as they
+            are, because they are perturbed already; only the robot's joints are.
         objects: folder of object meshes; default: the folder of the policy's training.
         seed: seed of the perturbations.
         num_envs: worlds that run at the same time.
@@ -156,17 +158,21 @@ def load_trial(
     inputs = load_inputs(source, robot=policy.robot, objects=folder, accept=accept)
     hashes = {} if policy.hash is None else {"policy": policy.hash}
     if inputs.hash is not None:
-        hashes["resets" if isinstance(inputs.data, ResetBank) else "demos"] = inputs.hash
+        is_bank = isinstance(inputs.data, ResetBank) and not isinstance(inputs.data, GoalSet)
+        hashes["resets" if is_bank else "demos"] = inputs.hash
     bank = inputs.bank
     used = [o for o in inputs.objects if o.name in bank.sequence_object]
     if settle:
         bank, _ = settle_starts(bank, policy.robot, used, num_envs=num_envs)
         hashes["starts"] = "settled"
+    task = evaluation_task(policy.task)
+    if isinstance(inputs.data, GoalSet):
+        task = replace(task, reset=replace(task.reset, spawn_xy=0.0, spawn_yaw=0.0))
     return Trial(
         robot=policy.robot,
         objects=tuple(sorted(used, key=lambda o: o.name)),
         bank=bank,
-        task=evaluation_task(policy.task),
+        task=task,
         seed=seed,
         num_envs=num_envs,
         motion=inputs.motion() if policy.follows_motion else None,

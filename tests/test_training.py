@@ -24,6 +24,7 @@ import numpy as np
 import torch
 
 from tests.toy_bank import SOUP, SPAM, toy_bank
+from tests.toy_goals import toy_goals
 from xreset import robots
 from xreset.cli import main
 from xreset.errors import BackendUnavailableError, FileFormatError, PolicyError, RunError, XResetError
@@ -38,7 +39,8 @@ from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
 from xreset.learning.train import resume, train
 from xreset.plugins import make_backend
 from xreset.policy import OnnxPolicy, check_contract
-from xreset.resets.bank import write_bank
+from xreset.resets.bank import read_bank, write_bank
+from xreset.resets.goals import write_goals
 from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfig
 
 try:
@@ -99,6 +101,31 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual((info.robot, info.resets, info.resets_hash), ("openarm", str(self.bank), file_hash(self.bank)))
         self.assertEqual(info.contract["objects"], [SOUP, SPAM])
         self.assertEqual(info.contract["joint_names"], list(self.robot.joint_names))
+
+    def test_goals_need_no_demonstrations(self):
+        """Every episode begins at home; fine-tuning goes on with the run's networks and configuration; a bank keeps its
+        states and gets the goals in addition."""
+        goals = toy_goals(self.robot)
+        write_goals(self.folder / "goals.npz", goals)
+        options = {"bank": None, "num_envs": 8}
+        info = read_run(self.train("goals", goals=goals, **options))
+        self.assertEqual((info.resets, info.robot), (str(self.folder / "goals" / "goals.npz"), "openarm"))
+        self.assertEqual((CONFIG.task.reset.demo_probability, info.config.task.reset.demo_probability), (0.5, 0.0))
+        file = self.folder / "goals.npz"
+        tuned = self.train("tuned", goals=file, weights=self.out, config=None, **options)
+        info = read_run(tuned)
+        self.assertEqual((info.config.model, info.config.iterations), (CONFIG.model, CONFIG.iterations))
+        self.assertEqual(info.weights, str(latest_checkpoint(self.out)))
+        both = read_bank(read_run(self.train("both", goals=file)).resets)
+        self.assertEqual((both.num_states, len(both.sequence_name), both.object_names), (6, 7, (SOUP, SPAM)))
+        np.testing.assert_array_equal(both.goal_pos[3:], goals.goal_pos)
+        for message, bad in (
+            ("needs a reset bank .--resets., a goal set .--goals., or both", {"bank": None}),
+            ("the goal set for 'ur7e-sharpa'", {"goals": toy_goals(robots.load("ur7e-sharpa"))}),
+            ("different meshes of 005", {"goals": toy_goals(self.robot, object_sources=("abc", "stand-in"))}),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(XResetError, message):
+                self.train("bad", **bad)
 
     def test_checkpoints_and_curves_are_written(self):
         self.assertEqual([c.name for c in checkpoints(self.out)], ["000001.pt", "000002.pt"])

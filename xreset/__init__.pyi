@@ -29,8 +29,13 @@ from xreset.resets.bank import ResetBank as ResetBank
 from xreset.resets.bank import read_bank as read_bank
 from xreset.resets.bank import write_bank as write_bank
 from xreset.resets.config import ClosingConfig as ClosingConfig
+from xreset.resets.config import GoalConfig as GoalConfig
 from xreset.resets.config import SqueezeConfig as SqueezeConfig
 from xreset.resets.filter import make_bank as make_bank
+from xreset.resets.goals import GoalSet as GoalSet
+from xreset.resets.goals import make_goals as make_goals
+from xreset.resets.goals import read_goals as read_goals
+from xreset.resets.goals import write_goals as write_goals
 from xreset.retarget.file import Retargeted as Retargeted
 from xreset.retarget.pipeline import RetargetConfig as RetargetConfig
 from xreset.retarget.pipeline import retarget_demos as retarget_demos

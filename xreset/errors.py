@@ -28,6 +28,10 @@ class DemoError(XResetError):
     """Demonstrations cannot be read, or lack something."""
 
 
+class GoalError(XResetError):
+    """A goal cannot be reached, or a start is not at rest on the table."""
+
+
 class BackendUnavailableError(XResetError):
     """A physics engine cannot be used here: the message says why, and which command fixes it."""
 

@@ -1,9 +1,10 @@
-"""Load what commands work on: demonstrations, retargeted motion or a reset bank, with the robot and the objects."""
+"""Load what commands work on: demonstrations, retargeted motion, a reset bank or a goal set, with the robot and the
+objects."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -19,21 +20,28 @@ from xreset.objects.catalogue import canonical_names, load_objects
 from xreset.records import npz_schema
 from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import ResetBank, check_objects, check_retargeted, check_robot, read_bank, starts_and_goals
+from xreset.resets.goals import SCHEMA as GOALS
+from xreset.resets.goals import GoalSet, checked_goals, read_goals
 from xreset.retarget.file import SCHEMA as MOTION
 from xreset.retarget.file import Retargeted, read_retargeted
 from xreset.retarget.pipeline import rest_on_table, retarget_demos
 from xreset.spec import ObjectSpec, RobotSpec
 
-Kind = Literal["demos", "motion", "bank"]
+Kind = Literal["demos", "motion", "bank", "goals"]
 Data = Demos | Retargeted | ResetBank
 
-_SCHEMAS: dict[Kind, str] = {"demos": DEMOS, "motion": MOTION, "bank": BANK}
-_COMMANDS: dict[Kind, str] = {"demos": "xreset demos", "motion": "xreset retarget", "bank": "xreset resets"}
+_SCHEMAS: dict[Kind, str] = {"demos": DEMOS, "motion": MOTION, "bank": BANK, "goals": GOALS}
+_COMMANDS: dict[Kind, str] = {
+    "demos": "xreset demos",
+    "motion": "xreset retarget",
+    "bank": "xreset resets",
+    "goals": "xreset goals",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inputs:
-    """Demonstrations, motion or a bank, with robot and objects; all checked against one another."""
+    """Demonstrations, motion, a bank or a goal set, with robot and objects; all checked against one another."""
 
     data: Data
     objects: tuple[ObjectSpec, ...]
@@ -86,7 +94,8 @@ class Inputs:
         if isinstance(self.data, Retargeted):
             return self.data
         if isinstance(self.data, ResetBank):
-            raise DemoError(f"{self.name} is a reset bank, which holds no motion. Give the file of xreset retarget.")
+            what = "goal set" if isinstance(self.data, GoalSet) else "reset bank"
+            raise DemoError(f"{self.name} is a {what}, which holds no motion. Give the file of xreset retarget.")
         return retarget_demos(self.data, self.robot, self.objects, progress=progress)
 
 
@@ -96,12 +105,12 @@ def load_inputs(
     robot: str | Path | RobotSpec | None = None,
     objects: str | Path | None = None,
     only: Iterable[str] = (),
-    accept: tuple[Kind, ...] = ("demos", "motion", "bank"),
+    accept: tuple[Kind, ...] = ("demos", "motion", "bank", "goals"),
 ) -> Inputs:
     """Load a file, or take data that are loaded already, with the robot and the objects.
 
     Args:
-        source: file of ``xreset demos``, ``xreset retarget`` or ``xreset resets``, or its content.
+        source: file of ``xreset demos``, ``xreset retarget``, ``xreset resets`` or ``xreset goals``, or its content.
         robot: the robot, its name or its folder; default: the robot that the file names. Demonstrations name none.
         objects: folder of object meshes; default: the built-in stand-ins.
         only: names of the objects to load; demonstrations of other objects are left out. Default: all objects.
@@ -110,6 +119,7 @@ def load_inputs(
     Raises:
         FileFormatError: the file is damaged, of another kind, or for another robot or object geometry.
         DemoError: the demonstrations need an object that is unknown.
+        GoalError: a goal of a goal set is inside the table, or out of the robot's reach.
         XResetError: the robot or an object cannot be used.
     """
     path = None
@@ -139,6 +149,8 @@ def load_inputs(
         robot_name=robot.name if isinstance(robot, RobotSpec) else robot and str(robot),
         loaded_robot=spec,
     )
+    if isinstance(data, GoalSet):
+        return replace(inputs, data=checked_goals(inputs.name, data, inputs.robot, loaded))
     _check(inputs)
     return inputs
 
@@ -151,6 +163,8 @@ def _read(path: Path, accept: tuple[Kind, ...]) -> Data:
         return read_retargeted(path)
     if schema == BANK and "bank" in accept:
         return read_bank(path)
+    if schema == GOALS and "goals" in accept:
+        return read_goals(path)
     expected = " or ".join(f"{_SCHEMAS[kind]!r} ({_COMMANDS[kind]})" for kind in accept)
     raise FileFormatError(f"{path} states schema {schema!r}, expected {expected}.")
 

@@ -26,6 +26,7 @@ COMMANDS: dict[str, str] = {
     "engines": "List, check and compare physics engines, and trace where they diverge.",
     "retarget": "Turn human demonstrations into robot motion.",
     "resets": "Test robot states in physics and keep the stable ones.",
+    "goals": "Give any object goals, without demonstrations.",
     "view": "Show demonstrations, robot motion or a reset bank in a browser, or as pictures.",
     "play": "Play with a policy in a browser: drag the goal, push the robot, change the engine.",
     "train": "Train a policy.",

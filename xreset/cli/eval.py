@@ -27,8 +27,8 @@ def evaluate(
         policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or
             a baseline: zero, random, ik (open-loop kinematic retargeting).
         backend: Physics engine; give it again for more engines. Default: mujoco.
-        demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the
-            path of ik.
+        demos: Demonstrations (xreset demos), retargeted trajectories (xreset retarget) or a goal set (xreset goals):
+            starts and goals, and the path of ik.
         episodes: Episodes per demonstration, each with another perturbation of robot and object.
         settle: Let objects come to rest before episodes begin. Default: the recorded poses, as in the paper, from which
             one object in eight tips or rolls.

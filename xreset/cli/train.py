@@ -13,7 +13,7 @@ from xreset.checks import without_effect
 from xreset.errors import RunError
 from xreset.learning import train as training
 from xreset.learning.config import TrainConfig
-from xreset.learning.recipes import dropped_terms, starting_config
+from xreset.learning.recipes import default_recipe, dropped_terms, starting_config
 
 
 def train(
@@ -21,6 +21,7 @@ def train(
     out: Path,
     robot: str | None = None,
     resets: Path | None = None,
+    goals: Path | None = None,
     objects: Path | None = None,
     backend: str = "mujoco-warp",
     device: str | None = None,
@@ -37,8 +38,10 @@ def train(
 
     Args:
         out: Run folder to make, or to continue.
-        robot: Name or folder of the robot.
+        robot: Name or folder of the robot; with --goals alone, default: the robot of the goal set.
         resets: Reset bank, made by `xreset resets`.
+        goals: Goal set, made by `xreset goals`. With --resets, its starts and goals are added to the demonstrated ones;
+            without, every episode begins at home.
         objects: Folder of real meshes; default: the built-in stand-ins.
         backend: Physics engine to train on.
         device: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
@@ -50,7 +53,7 @@ def train(
         resume: Continue the run in --out from its newest checkpoint. Reward terms of your own must be named again.
         like: Where the configuration starts from: a recipe (paper, published, minutes, robust, live) or another
             run's folder. Flags change what they name. Reward terms of your own are not taken from a run; name them
-            again.
+            again. Default: paper; with --weights and --goals, the run of --weights.
         weights: Another run's folder: start with the networks of its newest checkpoint, with their standard deviation
             and, if it adapts, their learning rate.
         config: Task, model and algorithm. The defaults shown are those of --like.
@@ -62,8 +65,8 @@ def train(
     if resume:
         training.resume(out, iterations=iterations, minutes=minutes, own=config.task.reward.own)
         return
-    if robot is None or resets is None:
-        raise RunError("A new run needs --robot and --resets. To continue the run in --out, add --resume.")
+    if goals is None and (robot is None or resets is None):
+        raise RunError("A new run needs --robot and --resets, or --goals. To continue the run in --out, add --resume.")
     if sentences := without_effect(config, starting_config(like)):
         raise RunError(f"--config.{'; --config.'.join(sentences)}. Omit it, or change the other one.")
     note = dropped_terms(like)
@@ -72,6 +75,7 @@ def train(
     training.train(
         resets,
         out=out,
+        goals=goals,
         config=config,
         robot=robot,
         objects=objects,
@@ -88,6 +92,8 @@ def train(
 def command_for(arguments: list[str]) -> Callable[..., None]:
     """Return :func:`train` with the defaults of ``--like``, which must be known before the other flags are read."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--like", nargs="?")  # a missing value is for the real parser to say
-    like = parser.parse_known_args(arguments)[0].like
-    return partial(train, config=starting_config(like)) if like else train
+    for flag in ("--like", "--weights", "--goals"):
+        parser.add_argument(flag, nargs="?")  # a missing value is for the real parser to say
+    given = parser.parse_known_args(arguments)[0]
+    like = given.like or default_recipe(given.weights if given.goals else None)
+    return train if like == "paper" else partial(train, like=like, config=starting_config(like))

@@ -39,7 +39,7 @@ def view(
     fingertips are blue.
 
     Args:
-        file: Demonstrations, or what `xreset retarget` or `xreset resets` made.
+        file: Demonstrations, or what `xreset retarget`, `xreset resets` or `xreset goals` made.
         demos: Demonstrations of the file, to show the human hand over the robot.
         retargeted: Robot motion of a bank, to show the states that physics rejected.
         objects: Folder of real meshes; default: the built-in stand-ins.

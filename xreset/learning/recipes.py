@@ -207,6 +207,12 @@ RECIPES: dict[str, Recipe] = {
 """Name -> recipe."""
 
 
+def default_recipe(fine_tuned: str | Path | None) -> str:
+    """Return where the configuration comes from if nothing is said: a run that is fine-tuned, else the paper."""
+    is_run = fine_tuned is not None and (Path(fine_tuned) / "run.json").is_file()
+    return str(fine_tuned) if is_run else "paper"
+
+
 def starting_config(like: str) -> TrainConfig:
     """Return the configuration of a recipe, or of a run without the reward terms that its user added.
 

@@ -33,9 +33,9 @@ class RunInfo(Checked):
     robot: str
     """Name or folder, as given."""
     resets: str
-    """Path of the reset bank."""
+    """Path of the reset bank, or of a goal set."""
     resets_hash: str
-    """SHA-256 of the bank."""
+    """SHA-256 of this file."""
     objects: str | None
     """Folder of object meshes; None: the built-in stand-ins."""
     backend: str

@@ -1,4 +1,4 @@
-"""Train a policy: reset bank in, run folder out."""
+"""Train a policy: reset bank or goal set in, run folder out."""
 
 from __future__ import annotations
 
@@ -21,19 +21,21 @@ from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel
-from xreset.learning.recipes import dropped_terms, own_terms_flag, starting_config
+from xreset.learning.recipes import default_recipe, dropped_terms, own_terms_flag, starting_config
 from xreset.learning.run import RunInfo, checkpoints, latest_checkpoint, read_run, write_run
 from xreset.learning.runner import TrainingRunner
 from xreset.plugins import backend_class, device_for
 from xreset.policy import check_contract, policy_contract
-from xreset.resets.bank import ResetBank, write_bank
+from xreset.resets.bank import ResetBank, read_bank, write_bank
+from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
 
 
 def train(
-    bank: str | Path | ResetBank,
+    bank: str | Path | ResetBank | None = None,
     *,
     out: str | Path,
-    recipe: str = "paper",
+    goals: str | Path | GoalSet | None = None,
+    recipe: str | None = None,
     config: TrainConfig | None = None,
     robot: str | Path | None = None,
     objects: str | Path | None = None,
@@ -50,10 +52,13 @@ def train(
     With ``torchrun``, every process simulates ``num_envs`` worlds of its own, each on its own GPU, or all on the CPU.
 
     Args:
-        bank: reset bank, or its file. A bank without a file is written to ``resets.npz`` in the run folder.
+        bank: reset bank, or its file. A bank without a file is written to ``resets.npz`` in the run folder. None: there
+            are no demonstrated states, and every episode begins at home.
         out: run folder to make.
+        goals: goal set, or its file. With a bank, its starts and goals are added to the demonstrated ones.
         recipe: where the configuration comes from: a recipe such as ``minutes``, or another run's folder, without
-            reward terms of the user's own, which must be named in ``config``.
+            reward terms of the user's own, which must be named in ``config``. Default: ``paper``; with ``weights`` and
+            ``goals``, the run of ``weights``.
         config: the whole configuration, instead of a recipe.
         robot: name or folder of the robot; default: the robot that the bank names.
         objects: folder of object meshes; default: the built-in stand-ins.
@@ -76,6 +81,7 @@ def train(
     """
     out = Path(out)
     if config is None:
+        recipe = recipe or default_recipe(weights if goals is not None else None)
         config = starting_config(recipe)
         if note := dropped_terms(recipe):
             print(note, file=sys.stderr)
@@ -88,12 +94,14 @@ def train(
         raise RunError(f"--num-envs is {num_envs}, expected at least 1.")
     if device_for(engine, device) != device:
         raise RunError(f"The engine {engine!r} does not run on {device!r}. Omit --device, or choose another --backend.")
-    if isinstance(bank, ResetBank):
-        file = out / "resets.npz"
-        write_bank(file, bank, config={}, inputs={})
-    else:
-        file = Path(bank)
-    inputs = load_inputs(file, robot=robot, objects=objects, accept=("bank",))
+    file = _file_of(out, bank, goals)
+    inputs = load_inputs(file, robot=robot, objects=objects, accept=("bank", "goals"))
+    if isinstance(inputs.data, GoalSet):
+        config = replace(
+            config,
+            task=replace(config.task, reset=replace(config.task.reset, demo_probability=0.0)),
+            schedule=replace(config.schedule, demo_probability=()),
+        )
     if uses_bank(config) and not inputs.bank.num_states:
         raise RunError(
             f"{file} holds no state to reset to: every candidate was rejected. Look at its reasons (xreset resets), "
@@ -119,6 +127,23 @@ def train(
     )
     _run(out, info, inputs, minutes=minutes, resumed=False)
     return out
+
+
+def _file_of(out: Path, bank: str | Path | ResetBank | None, goals: str | Path | GoalSet | None) -> Path:
+    """Return the file of a bank, of a goal set, or of both together; what has none is written into the run folder."""
+    if bank is not None and goals is not None:
+        bank = bank if isinstance(bank, ResetBank) else read_bank(bank)
+        bank = with_goals(bank, goals if isinstance(goals, GoalSet) else read_goals(goals))
+    given = goals if bank is None else bank
+    if given is None:
+        raise RunError("A training needs a reset bank (--resets), a goal set (--goals), or both.")
+    if isinstance(given, GoalSet):
+        write_goals(out / "goals.npz", given)
+        return out / "goals.npz"
+    if isinstance(given, ResetBank):
+        write_bank(out / "resets.npz", given, config={}, inputs={})
+        return out / "resets.npz"
+    return Path(given)
 
 
 def uses_bank(config: TrainConfig) -> bool:
@@ -172,7 +197,7 @@ def resume(
         )
     if iterations is not None:
         info = replace(info, config=replace(info.config, iterations=iterations))
-    inputs = load_inputs(info.resets, robot=info.robot, objects=info.objects, accept=("bank",))
+    inputs = load_inputs(info.resets, robot=info.robot, objects=info.objects, accept=("bank", "goals"))
     if inputs.hash != info.resets_hash:
         raise RunError(
             f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."

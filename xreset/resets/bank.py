@@ -204,7 +204,7 @@ def read_bank(path: str | Path, *, robot: RobotSpec | None = None) -> ResetBank:
     Raises:
         FileFormatError: the file is damaged, inconsistent, or for another robot.
     """
-    bank = read_record(ResetBank, path, SCHEMA, what="a reset bank", check=_check)
+    bank = read_record(ResetBank, path, SCHEMA, what="a reset bank", check=bank_problem)
     if robot is not None:
         check_robot(
             path, "reset bank", robot, name=bank.robot, joint_names=bank.joint_names, fingerprint=bank.robot_fingerprint
@@ -262,8 +262,8 @@ def _described(source: str) -> str:
     return "the built-in stand-in" if source == "stand-in" else "an imported mesh"
 
 
-def _check(arrays: dict[str, np.ndarray]) -> str | None:
-    """Return what contradicts itself between arrays, or None."""
+def bank_problem(arrays: dict[str, np.ndarray]) -> str | None:
+    """Return what contradicts itself between the arrays of a bank, or None."""
     if problem := unique_problem(arrays["sequence_name"]):
         return problem
     for name in ("frame_index", "rejected_frame_index"):

@@ -39,3 +39,31 @@ class SqueezeConfig(Checked):
     """Normal force of each finger that is at the object [N]. 0: targets are the joints' positions."""
     reach: Positive[Finite[float]] = 0.005
     """A finger nearer than this to the object is at it [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GoalConfig(Checked):
+    """How a goal set is drawn (:mod:`xreset.resets.goals`). Offsets are those of the published paper's evaluation of
+    objects without demonstrations (its table A3); the height of a lift is not in the paper."""
+
+    per_family: Positive[int] = 20
+    """Goals of each object and family."""
+    lift: Positive[Finite[float]] = 0.20
+    """Height of the goal above the start [m]."""
+    angle: NotNegative[float] = 60.0
+    """Angle of the families ``yaw``, ``tilt-x`` and ``tilt-y`` [degrees]."""
+    start_xy: NotNegative[float] = 0.02
+    """Starts are moved by U(-x, x) in both directions [m]."""
+    start_yaw: NotNegative[float] = 25.0
+    """Starts are turned about the vertical by U(-y, y) [degrees]."""
+    goal_xy: NotNegative[float] = 0.03
+    """Goals are moved by U(-x, x) in both directions [m]."""
+    goal_z: NotNegative[float] = 0.05
+    """Goals are moved up or down by U(-z, z) [m]."""
+    goal_yaw: NotNegative[float] = 30.0
+    """Goals are turned about the vertical by U(-y, y) [degrees]."""
+    upright: bool = False
+    """Whether objects start in the resting pose whose mesh direction z points up. Otherwise they start in any of
+    theirs, a broad face more often than a narrow one."""
+    seed: NotNegative[int] = 0
+    """The same seed gives the same goals."""

@@ -16,9 +16,10 @@ from xreset.inputs import Inputs, load_inputs
 from xreset.objects.catalogue import canonical_name
 from xreset.pictures.view.data import Human, View
 from xreset.resets.bank import ResetBank
+from xreset.resets.goals import GoalSet
 from xreset.retarget.file import Retargeted, read_retargeted
 from xreset.retarget.pipeline import RetargetConfig, human_contacts, rest_on_table
-from xreset.spec import ObjectSpec
+from xreset.spec import ObjectSpec, RobotSpec
 
 _BANK_RATE = 5.0
 """States of a bank that are played per second: they are no motion, and are looked at one by one."""
@@ -32,7 +33,7 @@ def load_view(
     robot: str | None = None,
     objects: Path | None = None,
 ) -> View:
-    """Read demonstrations, robot trajectories or a reset bank.
+    """Read demonstrations, robot trajectories, a reset bank or a goal set.
 
     Args:
         path: the file.
@@ -56,6 +57,8 @@ def load_view(
         return _demos_view(data, inputs)
     if isinstance(data, Retargeted):
         view = _retargeted_view(data, inputs)
+    elif isinstance(data, GoalSet):
+        view = _bank_view(_at_home(data, inputs.robot), inputs)
     else:
         view = _bank_view(data, inputs)
         if retargeted is not None:
@@ -141,6 +144,21 @@ def _bank_view(bank: ResetBank, inputs: Inputs) -> View:
         reason=("",) * bank.num_states,
         reasons=(),
         joint_pos=bank.joint_pos,
+    )
+
+
+def _at_home(goals: GoalSet, robot: RobotSpec) -> GoalSet:
+    """Return a goal set with its starts as states, the robot at home."""
+    count = len(goals.sequence_name)
+    return replace(
+        goals,
+        joint_pos=np.tile(robot.home, (count, 1)),
+        object_pos=goals.start_pos,
+        object_quat_wxyz=goals.start_quat_wxyz,
+        object_name=goals.sequence_object,
+        sequence_index=np.arange(count),
+        frame_index=np.zeros(count, dtype=int),
+        post_contact=np.zeros(count, dtype=bool),
     )
 
 

@@ -1,0 +1,139 @@
+"""Goal sets: starts at rest, goals of each family within reach, and what is refused."""
+
+import tempfile
+import unittest
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tests.toy_bank import SOUP
+from tests.toy_goals import toy_goals
+from xreset.description import load_robot
+from xreset.errors import DemoError, FileFormatError, GoalError, ObjectError
+from xreset.eval.policy_spec import load_policy
+from xreset.eval.rollout import roll_out
+from xreset.eval.trial import engine, load_trial
+from xreset.inputs import load_inputs
+from xreset.objects.catalogue import load_object
+from xreset.objects.rest import rest_height
+from xreset.plugins import make_backend
+from xreset.records import npz_schema
+from xreset.resets.config import GoalConfig
+from xreset.resets.goals import FAMILIES, SCHEMA, make_goals, read_goals, write_goals
+
+BANANA = "011_banana"
+EXACT = GoalConfig(per_family=1, start_xy=0.0, start_yaw=0.0, goal_xy=0.0, goal_z=0.0, goal_yaw=0.0)
+
+
+def rotations(quat: np.ndarray) -> Rotation:
+    return Rotation.from_quat(quat, scalar_first=True)
+
+
+class MadeTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        in_this_process = mock.patch("xreset.resets.probe.make_backend", partial(make_backend, workers=0))
+        cls.enterClassContext(in_this_process)
+        cls.robot = load_robot("ur7e-sharpa")
+        cls.banana = load_object(BANANA)
+        cls.exact = make_goals(["banana"], robot=cls.robot, config=EXACT)
+
+    def centers(self, goals, which: str) -> np.ndarray:
+        """[S, 3] centres of mass."""
+        turn = rotations(getattr(goals, f"{which}_quat_wxyz"))
+        return getattr(goals, f"{which}_pos") + turn.apply(self.banana.com)
+
+    def test_starts_are_at_rest_and_goals_are_what_their_family_says(self):
+        goals = self.exact
+        self.assertEqual(goals.family.tolist(), list(FAMILIES))
+        self.assertEqual((goals.num_states, goals.object_names, goals.robot), (0, (BANANA,), "ur7e-sharpa"))
+        np.testing.assert_allclose(goals.start_pos[:, 2], rest_height(self.banana, goals.start_quat_wxyz), atol=2e-3)
+        self.assertTrue((goals.goal_pos[:, 2] > rest_height(self.banana, goals.goal_quat_wxyz)).all())
+        shift = self.centers(goals, "goal") - self.centers(goals, "start")
+        np.testing.assert_allclose(shift[:4], np.tile([0.0, 0.0, 0.2], (4, 1)), atol=1e-5)
+        turn = rotations(goals.goal_quat_wxyz) * rotations(goals.start_quat_wxyz).inv()
+        expected = np.radians(60) * np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0]])
+        np.testing.assert_allclose(np.abs(turn.as_rotvec()[:4]), expected, atol=1e-5)
+
+    def test_offsets_are_those_of_the_published_paper(self):
+        goals = make_goals(["banana"], robot=self.robot, families=["lift"], config=GoalConfig(per_family=8))
+        shift = self.centers(goals, "goal") - self.centers(goals, "start") - [0.0, 0.0, 0.2]
+        self.assertTrue((np.abs(shift) <= [0.05, 0.05, 0.05]).all(), shift)
+        self.assertTrue((np.ptp(shift, axis=0) > 0.01).all(), shift)
+        turn = rotations(goals.goal_quat_wxyz) * rotations(goals.start_quat_wxyz).inv()
+        np.testing.assert_allclose(turn.as_rotvec()[:, :2], 0.0, atol=1e-5)
+        self.assertTrue(10 < np.degrees(turn.magnitude()).max() <= 55)
+        again = make_goals(["banana"], robot=self.robot, families=["lift"], config=GoalConfig(per_family=8))
+        np.testing.assert_array_equal(again.start_pos, goals.start_pos)
+
+    def test_what_cannot_be_is_refused(self):
+        for error, message, options in (
+            (GoalError, "banana: the goal is .* cm inside the table", {"poses": [(0.5, 0.3, 0.0, 1, 0, 0, 0)]}),
+            (GoalError, r"cannot reach 1 of 1 goals .* own_000 at \(1.9,", {"poses": [(1.9, 0.3, 0.3, 1, 0, 0, 0)]}),
+            (GoalError, "is not a pose", {"poses": [(0.5, 0.3, 0.2)]}),
+            (GoalError, "Unknown family 'turn'. Choose from: lift, ", {"families": ["turn"]}),
+            (ObjectError, "Unknown object 'teapot'", {"objects": ["teapot"]}),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(error, message):
+                make_goals(**({"objects": ["banana"], "robot": self.robot} | options))
+
+    def test_a_goal_of_ones_own(self):
+        pose = (0.6, 0.25, 0.3, 1, 0, 0, 0)
+        goals = make_goals(["banana"], robot=self.robot, poses=[pose])
+        self.assertEqual((goals.family.tolist(), goals.sequence_name.tolist()), (["own"], [f"{BANANA}/own_000"]))
+        np.testing.assert_allclose(np.concatenate((goals.goal_pos[0], goals.goal_quat_wxyz[0])), pose, atol=1e-6)
+
+
+class UsedTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.robot = load_robot("ur7e-sharpa")
+
+    def setUp(self):
+        self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
+
+    def test_an_evaluation_plays_the_starts_and_goals_of_the_file(self):
+        goals = toy_goals(self.robot)
+        write_goals(self.folder / "goals.npz", goals)
+        self.assertEqual(npz_schema(self.folder / "goals.npz"), SCHEMA)
+        np.testing.assert_array_equal(read_goals(self.folder / "goals.npz").family, goals.family)
+        policy = load_policy("zero", robot="ur7e-sharpa")
+        policy = replace(
+            policy, task=replace(policy.task, termination=replace(policy.task.termination, episode_seconds=0.1))
+        )
+        trial = load_trial(policy, self.folder / "goals.npz")
+        rollouts = roll_out(policy.start(None), engine("mujoco", workers=0), trial, repetitions=1)
+        self.assertEqual([e.sequence_name for e in rollouts.episodes], goals.sequence_name.tolist())
+        for i, trace in enumerate(rollouts.traces):
+            np.testing.assert_allclose(trace.object_pos[0], goals.start_pos[i], atol=1e-6)
+            np.testing.assert_allclose(trace.goal_pos, goals.goal_pos[i], atol=1e-6)
+            np.testing.assert_allclose(trace.object_pos[-1], goals.start_pos[i], atol=2e-3, err_msg="it is not at rest")
+        with self.assertRaisesRegex(DemoError, "is a goal set, which holds no motion"):
+            load_trial(load_policy("ik", robot="ur7e-sharpa"), goals)
+
+    def test_another_robot_must_reach_the_goals_too(self):
+        goals = load_inputs(toy_goals(load_robot("openarm")), robot=self.robot).data
+        self.assertEqual((goals.robot, goals.joint_names), ("ur7e-sharpa", self.robot.joint_names))
+        far = toy_goals(load_robot("openarm"))
+        far.goal_pos[2] = (1.9, 0.3, 0.3)
+        with self.assertRaisesRegex(GoalError, "1 of 4 goals are out of the reach of ur7e-sharpa, such as .*lift_002"):
+            load_inputs(far, robot=self.robot)
+
+    def test_what_does_not_fit_is_refused(self):
+        low = toy_goals(self.robot).goal_pos - np.float32([0, 0, 0.25])
+        high = toy_goals(self.robot).start_pos + np.float32([0, 0, 0.03])
+        for error, message, changes in (
+            (GoalError, f"{SOUP}/lift_000: the goal is 5.0 cm inside the table", {"goal_pos": low}),
+            (GoalError, "starts 3.0 cm above the table", {"start_pos": high}),
+            (FileFormatError, "an imported mesh of 005_tomato_soup_can", {"object_sources": ("abc", "stand-in")}),
+        ):
+            with self.subTest(message), self.assertRaisesRegex(error, message):
+                load_inputs(toy_goals(self.robot, **changes))
+
+
+if __name__ == "__main__":
+    unittest.main()

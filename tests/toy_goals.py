@@ -1,0 +1,38 @@
+"""A small goal set for tests: soup and spam upright, two goals each, 0.2 m above the start and turned about z."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tests.toy_bank import SOUP, SPAM
+from xreset.objects.catalogue import load_object
+from xreset.objects.rest import rest_height
+from xreset.resets.goals import GoalSet
+from xreset.spec import RobotSpec
+
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def toy_goals(robot: RobotSpec, **changes: Any) -> GoalSet:
+    """Return the goal set; ``changes`` replace fields."""
+    owners = [SOUP, SOUP, SPAM, SPAM]
+    heights = [rest_height(load_object(name), UPRIGHT) for name in owners]
+    start = np.array([[0.5 + 0.03 * i, 0.3, height] for i, height in enumerate(heights)], np.float32)
+    fields: dict[str, Any] = {
+        "robot": robot.name,
+        "robot_fingerprint": robot.fingerprint,
+        "joint_names": robot.joint_names,
+        "joint_pos": np.zeros((0, len(robot.joints)), np.float32),
+        "sequence_name": np.array([f"{name}/lift_{i:03d}" for i, name in enumerate(owners)]),
+        "sequence_object": np.array(owners),
+        "family": np.array(["lift"] * 4),
+        "start_pos": start,
+        "start_quat_wxyz": np.tile(UPRIGHT, (4, 1)).astype(np.float32),
+        "goal_pos": start + np.float32([0.0, 0.0, 0.2]),
+        "goal_quat_wxyz": np.tile([np.cos(0.3), 0.0, 0.0, np.sin(0.3)], (4, 1)).astype(np.float32),
+        "object_names": (SOUP, SPAM),
+        "object_sources": ("stand-in", "stand-in"),
+    }
+    return GoalSet(**(fields | changes))

@@ -1,0 +1,55 @@
+"""``xreset goals``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from xreset.cli._common import Several
+from xreset.cli._terminal import Console, Progress
+from xreset.resets import goals as goal_sets
+from xreset.resets.config import GoalConfig
+
+Pose = tuple[float, float, float, float, float, float, float]
+
+
+def goals(
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
+    *,
+    robot: str,
+    out: Path,
+    objects: Path | None = None,
+    family: Several = (),
+    pose: Annotated[tuple[Pose, ...], tyro.conf.UseAppendAction] = (),
+    draw: GoalConfig = GoalConfig(),  # noqa: B008 (frozen)
+) -> None:
+    """Give objects starts and goals without demonstrations, for `xreset eval --demos` and `xreset train --goals`.
+
+    Objects start at rest on the table. The robot can reach every goal with the grasp that it has at the start.
+
+    Args:
+        names: Objects; default: all.
+        robot: Name or folder of the robot.
+        out: Goal set to write.
+        objects: Folder of real meshes; default: the built-in stand-ins.
+        family: Kind of goal: lift, yaw, tilt-x, tilt-y (lifted, and turned by 60 degrees about an axis of the world) or
+            random; give it again for more. Default: all of them, or none with --pose.
+        pose: Goal of your own: x y z [m] and quaternion w x y z of the mesh frame; give it again for more.
+        draw: Number, sizes, offsets and seed.
+    """
+    console = Console()
+    with Progress(console) as bar:
+        made = goal_sets.make_goals(
+            names, robot=robot, meshes=objects, families=family or None, poses=pose, config=draw,
+            progress=bar.count("goals within reach"),
+        )  # fmt: skip
+    goal_sets.write_goals(out, made, draw)
+    counts = Counter(made.family.tolist())
+    listing = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    console.print(f"{len(made.family)} goals of {len(made.object_names)} objects ({listing}) in {out}")
+
+
+COMMAND = goals

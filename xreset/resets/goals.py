@@ -1,0 +1,412 @@
+"""Goal sets: starts and goals of any object, without demonstrations.
+
+A goal set is a reset bank without states. Each of its S sequences is one episode: a start at rest on the table, and a
+goal that the robot can reach with the grasp that it has at the start (:mod:`xreset.resets.reach`). The families are
+those of the published paper, and goals drawn at random:
+
+- ``lift``: the object is lifted;
+- ``yaw``, ``tilt-x``, ``tilt-y``: it is lifted, and turned by 60 degrees about the world's z, x or y axis;
+- ``random``: any place over the table, and any turn;
+- ``own``: a pose that was given.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from xreset.demos.motion import LIFT
+from xreset.demos.synth import WORKSPACE
+from xreset.description import load_robot
+from xreset.errors import FileFormatError, GoalError
+from xreset.objects.catalogue import load_objects, object_names
+from xreset.objects.rest import rest_height, resting_orientation
+from xreset.records import Field, read_record, write_record
+from xreset.resets.bank import ResetBank, bank_problem, check_objects
+from xreset.resets.config import GoalConfig
+from xreset.resets.reach import Reach
+from xreset.resets.settle import settle_starts
+from xreset.spec import ObjectSpec, RobotSpec
+
+SCHEMA = "xreset-goals/1"
+OWN = "own"
+FAMILIES = ("lift", "yaw", "tilt-x", "tilt-y", "random")
+"""Families of goals that are drawn; goals of the family :data:`OWN` are given."""
+_MIDDLE = tuple(sum(span) / 2 for span in WORKSPACE)
+_TURN_AXES = {"yaw": (0.0, 0.0, 1.0), "tilt-x": (1.0, 0.0, 0.0), "tilt-y": (0.0, 1.0, 0.0)}
+_START_SEED = 42
+_GOAL_SEED = 71
+"""The published paper's seed bases of its start and goal offsets."""
+_DIRECTIONS = 16
+"""Mesh directions, at random, that are turned up to find an object's resting poses."""
+_SAME_POSE = np.cos(np.radians(2.0))
+"""Resting poses whose up directions differ by less are one."""
+_DRAWS = 12
+"""Times that a goal is drawn before it is given up."""
+_HOPELESS = 3
+"""Draws after which a family is given up of which nothing was found."""
+_FLOATING = 0.01
+"""A start is on the table if its lowest point is nearer than this to it [m]."""
+_INSIDE = 0.005
+"""A goal is inside the table if its lowest point is deeper than this [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GoalSet(ResetBank):
+    """Contents of a goal set: starts and goals [S]. It has no states."""
+
+    family: Annotated[np.ndarray, Field(("S",), "U")]
+    """[S] one of :data:`FAMILIES` or :data:`OWN`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Episode:
+    """A start and a goal of one object."""
+
+    obj: ObjectSpec
+    family: str
+    number: int
+    """Of the object and family."""
+    start: np.ndarray
+    """[3] place of the centre of mass."""
+    start_turn: Rotation
+    goal: np.ndarray
+    goal_turn: Rotation
+
+    @property
+    def name(self) -> str:
+        """Name of the sequence."""
+        return f"{self.obj.name}/{self.family}_{self.number:03d}"
+
+
+def make_goals(
+    objects: Iterable[str] | None = None,
+    *,
+    robot: str | Path | RobotSpec,
+    meshes: str | Path | None = None,
+    families: Sequence[str] | None = None,
+    poses: Sequence[Sequence[float]] = (),
+    config: GoalConfig | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> GoalSet:
+    """Draw starts and goals of objects, without demonstrations.
+
+    Objects come to rest in MuJoCo first, so that every start is at rest. The goals of an object do not depend on the
+    other objects.
+
+    Args:
+        objects: names of the objects; None: all.
+        robot: the robot, its name or its folder: its reach decides which goals are kept.
+        meshes: folder of real meshes; None: the built-in stand-ins.
+        families: some of :data:`FAMILIES`; None: all of them, or none if there are ``poses``.
+        poses: goals of your own for every object, each a pose (x, y, z, qw, qx, qy, qz) of its mesh frame.
+        config: number, sizes, offsets and seed.
+        progress: called with (goals found, goals in all).
+
+    Raises:
+        ObjectError: an object is unknown, or has no usable mesh.
+        GoalError: an object does not come to rest, or a goal is inside the table or out of the robot's reach.
+    """
+    config = config or GoalConfig()
+    if families is None:
+        families = () if poses else FAMILIES
+    if unknown := [family for family in families if family not in FAMILIES]:
+        raise GoalError(f"Unknown family {unknown[0]!r}. Choose from: {', '.join(FAMILIES)}.")
+    folder = Path(meshes) if meshes else None
+    specs = load_objects(objects or object_names(folder), folder)
+    spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
+    own = [_own_pose(pose) for pose in poses]
+    for obj in specs:
+        for pos, quat in own:
+            _check_above_table(obj, pos, quat, f"{obj.name}: ")
+    rests = _resting_poses(specs, spec, upright=config.upright)
+    reach = Reach(spec)
+    wanted = list(product(families, range(config.per_family)))
+    wanted += product([OWN], range(len(own)))
+    found: list[_Episode] = []
+    for obj in specs:
+
+        def draw(family: str, number: int, attempt: int, obj: ObjectSpec = obj) -> _Episode:
+            episode = _draw(obj, rests[obj.name], family, number, attempt, config)
+            if family != OWN:
+                return episode
+            pos, quat = own[number]
+            turn = Rotation.from_quat(quat, scalar_first=True)
+            return replace(episode, goal=_center(obj, pos, turn), goal_turn=turn)
+
+        done = len(found)
+        found += _reached(
+            reach, wanted, draw, lambda count, done=done: progress(done + count, len(wanted) * len(specs))
+        )
+        missing = len(wanted) - (len(found) - done)
+        if missing:
+            kept = {(e.family, e.number) for e in found[done:]}
+            family, number = next(item for item in wanted if item not in kept)
+            place = f" at ({', '.join(f'{x:g}' for x in own[number][0])})" if family == OWN else ""
+            raise GoalError(
+                f"{spec.name} cannot reach {missing} of {len(wanted)} goals of {obj.name}, such as "
+                f"{family}_{number:03d}{place}: no grasp holds the object both at its start and there. "
+                "Lower the lift or the angle, leave out the family, or move the goal."
+            )
+    return _goal_set(spec, found)
+
+
+def write_goals(path: str | Path, goals: GoalSet, config: GoalConfig | None = None) -> None:
+    """Write a goal set; see :func:`xreset.records.write_record`."""
+    write_record(path, SCHEMA, goals, config=asdict(config) if config else {}, inputs={})
+
+
+def read_goals(path: str | Path) -> GoalSet:
+    """Read a goal set; ``FileFormatError`` if the file is damaged."""
+    return read_record(GoalSet, path, SCHEMA, what="a goal set", check=bank_problem)
+
+
+def with_goals(bank: ResetBank, goals: GoalSet) -> ResetBank:
+    """Return a bank whose episodes from home also have the starts and goals of a goal set.
+
+    Raises:
+        FileFormatError: the goal set was made for another robot, or with another mesh of an object of the bank.
+    """
+    if bank.robot_fingerprint != goals.robot_fingerprint:
+        raise FileFormatError(
+            f"The bank is for the robot {bank.robot!r}, and the goal set for {goals.robot!r} or another version of it. "
+            f"Make the goal set again: xreset goals --robot {bank.robot}."
+        )
+    sources = dict(zip(bank.object_names, bank.object_sources, strict=True))
+    added = dict(zip(goals.object_names, goals.object_sources, strict=True))
+    for name in sorted(sources.keys() & added.keys()):
+        if sources[name] != added[name]:
+            raise FileFormatError(
+                f"The bank and the goal set were made with different meshes of {name}. Make one again."
+            )
+    names = tuple(sorted(sources | added))
+    per_sequence = (
+        "sequence_name", "sequence_object", "start_pos", "start_quat_wxyz", "goal_pos", "goal_quat_wxyz",
+    )  # fmt: skip
+    joined = {name: np.concatenate((getattr(bank, name), getattr(goals, name))) for name in per_sequence}
+    joined |= {"object_names": names, "object_sources": tuple((sources | added)[name] for name in names)}
+    return replace(bank, **joined)
+
+
+def checked_goals(where: str, goals: GoalSet, robot: RobotSpec, objects: Sequence[ObjectSpec]) -> GoalSet:
+    """Return a goal set for a robot. If it was made for another one, the reach of this robot is tried here.
+
+    Args:
+        where: what messages call the goal set.
+        goals: the goal set.
+        robot: the robot.
+        objects: the objects to check; goals of other objects are not looked at.
+
+    Raises:
+        FileFormatError: an object has another mesh than the one that the goal set was made with.
+        GoalError: a start is not on the table, or a goal is inside it or out of reach.
+    """
+    check_objects(where, goals, tuple(objects))
+    episodes = []
+    for obj in objects:
+        for i in np.flatnonzero(goals.sequence_object == obj.name):
+            name = f"{where}: {goals.sequence_name[i]}: "
+            gap = goals.start_pos[i, 2] - rest_height(obj, goals.start_quat_wxyz[i])
+            if abs(gap) > _FLOATING:
+                side = "above" if gap > 0 else "inside"
+                raise GoalError(f"{name}the object starts {100 * abs(gap):.1f} cm {side} the table, expected at rest.")
+            _check_above_table(obj, goals.goal_pos[i], goals.goal_quat_wxyz[i], name)
+            start_turn = Rotation.from_quat(goals.start_quat_wxyz[i], scalar_first=True)
+            goal_turn = Rotation.from_quat(goals.goal_quat_wxyz[i], scalar_first=True)
+            episode = _Episode(
+                obj=obj,
+                family=str(goals.family[i]),
+                number=int(i),
+                start=_center(obj, goals.start_pos[i], start_turn),
+                start_turn=start_turn,
+                goal=_center(obj, goals.goal_pos[i], goal_turn),
+                goal_turn=goal_turn,
+            )
+            episodes.append(episode)
+    if robot.has_fingerprint(goals.robot_fingerprint) or not episodes:
+        return goals
+    held = _held(Reach(robot), episodes)
+    if not held.all():
+        raise GoalError(
+            f"{where}: {int((~held).sum())} of {len(held)} goals are out of the reach of {robot.name}, such as "
+            f"{goals.sequence_name[episodes[held.argmin()].number]}. Move them, or make a goal set for this robot: "
+            f"xreset goals --robot {robot.name}."
+        )
+    changes = {"robot": robot.name, "robot_fingerprint": robot.fingerprint, "joint_names": robot.joint_names}
+    return replace(goals, joint_pos=np.zeros((0, len(robot.joints)), np.float32), **changes)
+
+
+# Drawing --------------------------------------------------------------------------------------------------------------
+
+
+def _own_pose(pose: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return position [3] and unit quaternion [4] of a pose that a user gave."""
+    values = np.asarray(pose, dtype=float)
+    length = np.linalg.norm(values[3:]) if values.shape == (7,) else 0.0
+    if not np.isfinite(values).all() or not length > 0:
+        raise GoalError(f"The pose {tuple(pose)} is not a pose; expected x, y, z [m] and a quaternion w, x, y, z.")
+    return values[:3], values[3:] / length
+
+
+def _check_above_table(obj: ObjectSpec, pos: np.ndarray, quat: np.ndarray, name: str) -> None:
+    depth = rest_height(obj, quat) - pos[2]
+    if depth > _INSIDE:
+        raise GoalError(f"{name}the goal is {100 * depth:.1f} cm inside the table. Raise it by as much.")
+
+
+def _center(obj: ObjectSpec, pos: np.ndarray, turn: Rotation) -> np.ndarray:
+    """[3] centre of mass of an object whose mesh frame is at a pose."""
+    return pos + turn.apply(obj.com)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Rest:
+    """A resting pose."""
+
+    height: float
+    """Of the centre of mass [m]."""
+    turn: Rotation
+
+
+def _resting_poses(objects: Sequence[ObjectSpec], robot: RobotSpec, *, upright: bool) -> dict[str, list[_Rest]]:
+    """Return the resting poses of each object; one that is more likely is listed more often.
+
+    Raises:
+        GoalError: an object does not come to rest.
+    """
+    episodes: list[_Episode] = []
+    listed: dict[str, list[int]] = {}
+    for obj in objects:
+        random = np.random.default_rng(zlib.crc32(obj.name.encode()))
+        directions = np.array([[0.0, 0.0, 1.0]]) if upright else random.normal(size=(_DIRECTIONS, 3))
+        ups: dict[int, np.ndarray] = {}
+        listed[obj.name] = []
+        for direction in directions:
+            quat = resting_orientation(obj, direction / np.linalg.norm(direction))
+            turn = Rotation.from_quat(quat, scalar_first=True)
+            up = turn.inv().apply((0.0, 0.0, 1.0))
+            known = [row for row, other in ups.items() if other @ up > _SAME_POSE]
+            listed[obj.name].append(known[0] if known else len(episodes))
+            if not known:
+                ups[len(episodes)] = up
+                center = _center(obj, np.array([*_MIDDLE, rest_height(obj, quat)]), turn)
+                place = {"start": center, "start_turn": turn, "goal": center, "goal_turn": turn}
+                episodes.append(_Episode(obj=obj, family="rest", number=len(episodes), **place))
+    settled, settling = settle_starts(_goal_set(robot, episodes), robot, objects)
+    rests: dict[str, list[_Rest]] = {}
+    for obj in objects:
+        rests[obj.name] = []
+        for row in listed[obj.name]:
+            if settling.at_rest[row]:
+                turn = Rotation.from_quat(settled.start_quat_wxyz[row], scalar_first=True)
+                rests[obj.name].append(_Rest(height=_center(obj, settled.start_pos[row], turn)[2], turn=turn))
+        if not rests[obj.name]:
+            raise GoalError(f"{obj.name} does not come to rest on the table: it rolls or falls over in MuJoCo.")
+    return rests
+
+
+def _draw(
+    obj: ObjectSpec, rests: Sequence[_Rest], family: str, number: int, attempt: int, config: GoalConfig
+) -> _Episode:
+    """Draw a start and a goal; nothing else decides what is drawn."""
+    key = [config.seed, zlib.crc32(f"{obj.name} {family}".encode()), number, attempt]
+    random = np.random.default_rng(key)
+    rest = rests[int(random.integers(len(rests)))]
+    (x, y), (goal_x, goal_y) = random.uniform(*np.transpose(WORKSPACE), size=(2, 2))
+    place = np.array([x, y, rest.height])
+    heading = _about_z(random.uniform(0.0, 2.0 * np.pi)) * rest.turn
+    goal = place + np.array([0.0, 0.0, config.lift])
+    turn = Rotation.identity()
+    if family == "random":
+        goal = np.array([goal_x, goal_y, rest.height + random.uniform(*LIFT)])
+        axis = random.normal(size=3)
+        turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * random.uniform(0.0, np.pi))
+    elif family in _TURN_AXES:
+        side = random.choice((-1.0, 1.0))
+        turn = Rotation.from_rotvec(side * np.radians(config.angle) * np.array(_TURN_AXES[family]))
+    at_start = np.random.default_rng([_START_SEED, *key]).uniform(-1.0, 1.0, 3)  # x, y, yaw
+    at_goal = np.random.default_rng([_GOAL_SEED, *key]).uniform(-1.0, 1.0, 4)  # x, y, z, yaw
+    return _Episode(
+        obj=obj,
+        family=family,
+        number=number,
+        start=place + np.array([config.start_xy, config.start_xy, 0.0]) * at_start,
+        start_turn=_about_z(np.radians(config.start_yaw) * at_start[2]) * heading,
+        goal=goal + np.array([config.goal_xy, config.goal_xy, config.goal_z]) * at_goal[:3],
+        goal_turn=_about_z(np.radians(config.goal_yaw) * at_goal[3]) * turn * heading,
+    )
+
+
+def _about_z(angle: float) -> Rotation:
+    return Rotation.from_rotvec((0.0, 0.0, angle))
+
+
+def _reached(
+    reach: Reach,
+    wanted: Sequence[tuple[str, int]],
+    draw: Callable[[str, int, int], _Episode],
+    progress: Callable[[int], None],
+) -> list[_Episode]:
+    """Return an episode for each (family, number), drawn again until its goal is above the table and can be reached;
+    those that never can are missing."""
+    found: dict[tuple[str, int], _Episode] = {}
+    for attempt in range(_DRAWS):
+        left = [item for item in wanted if item not in found]
+        if attempt >= _HOPELESS:
+            known = {family for family, _ in found}
+            left = [item for item in left if item[0] in known]
+        if not left:
+            break
+        drawn = [draw(family, number, attempt) for family, number in left]
+        drawn = [
+            e for e in drawn if e.goal[2] >= rest_height(e.obj, _quat(e.goal_turn)) + e.goal_turn.apply(e.obj.com)[2]
+        ]
+        if drawn:
+            held = _held(reach, drawn)
+            found |= {(e.family, e.number): e for e, holds in zip(drawn, held, strict=True) if holds}
+        progress(len(found))
+    return [found[item] for item in wanted if item in found]
+
+
+def _held(reach: Reach, episodes: Sequence[_Episode]) -> np.ndarray:
+    """[N] bool: whether the robot can hold the object at the start and at the goal of N episodes."""
+    turns = [e.goal_turn * e.start_turn.inv() for e in episodes]
+    start = np.stack([e.start for e in episodes])
+    goal = np.stack([e.goal for e in episodes])
+    return reach.holds(start, goal, Rotation.concatenate(turns))
+
+
+def _quat(turn: Rotation) -> np.ndarray:
+    return turn.as_quat(canonical=True, scalar_first=True)
+
+
+def _goal_set(robot: RobotSpec, episodes: Sequence[_Episode]) -> GoalSet:
+    """Return the episodes as a goal set, with the poses of mesh frames."""
+    sources = {e.obj.name: e.obj.source for e in episodes}
+    names = sorted(sources)
+
+    def pos(center: np.ndarray, turn: Rotation, obj: ObjectSpec) -> np.ndarray:
+        return center - turn.apply(obj.com)
+
+    return GoalSet(
+        robot=robot.name,
+        robot_fingerprint=robot.fingerprint,
+        joint_names=robot.joint_names,
+        joint_pos=np.zeros((0, len(robot.joints)), np.float32),
+        sequence_name=np.array([e.name for e in episodes]),
+        sequence_object=np.array([e.obj.name for e in episodes]),
+        family=np.array([e.family for e in episodes]),
+        start_pos=np.array([pos(e.start, e.start_turn, e.obj) for e in episodes], np.float32),
+        start_quat_wxyz=np.array([_quat(e.start_turn) for e in episodes], np.float32),
+        goal_pos=np.array([pos(e.goal, e.goal_turn, e.obj) for e in episodes], np.float32),
+        goal_quat_wxyz=np.array([_quat(e.goal_turn) for e in episodes], np.float32),
+        object_names=tuple(names),
+        object_sources=tuple(sources[name] for name in names),
+    )

@@ -1,0 +1,85 @@
+"""Whether a robot can hold an object at two poses in the same grasp: at the start of an episode and at its goal.
+
+No grasp is planned. The hand keeps the shape that it has at home, and the point between its thumb and its fingers goes
+to the object's centre. N objects are tried at a time.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from xreset.geometry.rotations import matrix_to_quat
+from xreset.retarget.arm.config import ArmConfig
+from xreset.retarget.arm.model import ArmModel, ArmTargets
+from xreset.retarget.arm.solve import track
+from xreset.retarget.validity import Thresholds, classify
+from xreset.spec import RobotSpec
+from xreset.tensors import one_thread
+
+_TILTS = (0.0, 30.0, -30.0)
+"""Angles by which a grasp's fingers point further down than at home [degrees]."""
+_YAWS = (0.0, 40.0, -40.0, 80.0, -80.0)
+"""Angles by which a grasp is turned about the vertical [degrees]."""
+_LOWEST = 0.05
+"""Least height of the point between the fingers [m]: nearer to the table the shape of a real grasp matters."""
+_THRESHOLDS = Thresholds(wrist_position=0.02, wrist_orientation=float(np.radians(15.0)))
+"""A policy can choose its grasp, so the hand need not be exact."""
+_EFFORT = ArmConfig(restarts=4, branches=2, first_iterations=40, reseeds=0)
+
+
+class Reach:
+    """What one robot can hold."""
+
+    def __init__(self, robot: RobotSpec) -> None:
+        """Prepare the arm, and the grasps to try: home's orientation of the hand first, then others around it."""
+        self._model = ArmModel(robot)
+        home = torch.as_tensor(robot.home)
+        self._hand_joints = home[torch.as_tensor(self._model.hand.joint_indices)]
+        tips = self._model.hand.points(self._hand_joints, [tip.link for tip in robot.fingertips])
+        self._center = (tips[0] + tips[1:].mean(dim=0)).numpy() / 2
+        root = self._model.kinematics.link_poses(home[None], [robot.hand_root])[0, 0, :3, :3]
+        at_home = Rotation.from_matrix(root.numpy())
+        level = np.cross((0.0, 0.0, 1.0), at_home.apply(self._center))
+        level /= max(float(np.linalg.norm(level)), 1e-9)
+        self._grasps: list[Rotation] = []
+        for tilt, yaw in product(np.radians(_TILTS), np.radians(_YAWS)):
+            self._grasps.append(Rotation.from_rotvec((0.0, 0.0, yaw)) * Rotation.from_rotvec(tilt * level) * at_home)
+
+    @one_thread()
+    def holds(self, start: np.ndarray, goal: np.ndarray, turn: Rotation) -> np.ndarray:
+        """[N] bool: whether one of the grasps can be reached both at the start and at the goal.
+
+        Args:
+            start: [N, 3] centre of each object at the start, world frame [m].
+            goal: [N, 3] its centre at the goal.
+            turn: N rotations from the start to the goal.
+        """
+        held = np.zeros(len(start), dtype=bool)
+        quats = turn.as_quat()
+        for grasp in self._grasps:
+            left = np.flatnonzero(~held)
+            if len(left):
+                left = left[self._reached(start[left], Rotation.identity(len(left)) * grasp)]
+            if len(left):
+                held[left] = self._reached(goal[left], Rotation.from_quat(quats[left]) * grasp)
+        return held
+
+    def _reached(self, center: np.ndarray, hand: Rotation) -> np.ndarray:
+        """[N] bool: whether the arm carries the hand to N orientations with the point between its fingers at [N, 3]."""
+        count = len(center)
+        center = np.column_stack((center[:, :2], np.maximum(center[:, 2], _LOWEST)))
+        zero = torch.zeros(count, 1, dtype=torch.float64)
+        targets = ArmTargets(
+            root_pos=torch.as_tensor(center - hand.apply(self._center))[:, None],
+            root_quat=matrix_to_quat(torch.as_tensor(hand.as_matrix()))[:, None],
+            hand_joints=self._hand_joints.expand(count, 1, -1),
+            annotated=torch.ones(count, 1, dtype=torch.bool),
+            hand_error=zero,
+            hand_clearance=zero,
+        )
+        _, measures = track(self._model, targets, _THRESHOLDS, _EFFORT)
+        return (classify(measures, _THRESHOLDS) == 0)[:, 0].numpy()

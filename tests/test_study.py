@@ -191,6 +191,14 @@ class PlanTest(InFolder):
         self.assertFalse(self.out.exists())
         self.assertEqual(len(self.plan((self.folder / "study.toml").read_text(), only=("ik",)).runs), 1)
 
+    def test_objects_that_were_left_out_are_played_if_the_evaluation_says_so(self):
+        for unseen, played in (("false", []), ("true", [("010_potted_meat_can",)])):
+            evaluation = f"[evaluations.eval]\n[evaluations.eval-new]\nobjects = ['spam']\nunseen = {unseen}\n"
+            plan = self.plan(HEAD + DATA + evaluation + RUN + "[runs.a]\nobjects = ['soup']\n")
+            self.assertEqual([s.objects for name, s in plan.steps.items() if name.startswith("eval-new")], played)
+        with self.assertRaisesRegex(FileFormatError, "unseen is true without objects"):
+            self.plan(HEAD + DATA + "[evaluations.eval]\nunseen = true\n" + RUN + "[runs.a]\n")
+
     def test_changes_of_the_recipe_are_flags(self):
         changes = "task.reset = { random_gravity = false, demo_probability = 0.25 }\nmodel.pointnet = [8, 6]\ntask.action.hand_zero = 'middle'\n"
         plan = self.plan(HEAD + DATA + RUN + "[runs.a]\nsteps = 1e6\nnum_envs = 64\n[runs.a.config]\n" + changes)

@@ -121,6 +121,8 @@ class Evaluation(Checked):
     """Data with the starts and goals; None: the data of the policy's training."""
     objects: tuple[str, ...] = ()
     """Only these objects, where a run has them; empty: all objects of the run."""
+    unseen: bool = False
+    """Whether ``objects`` are played by every run, also by those that have not trained with them."""
     per_object: Positive[int] | None = None
     """Largest number of demonstrations of each object; None: all (of the run's own data: as many as in training)."""
     episodes: Positive[int] = 5
@@ -129,6 +131,11 @@ class Evaluation(Checked):
     engines: tuple[str, ...] = ("mujoco", "mujoco-warp", "pybullet", "sapien")
     """Engines that are not installed are left out, with a note."""
     num_envs: Positive[int] = 64
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.unseen and not self.objects:
+            raise ValueError("unseen is true without objects. Name the objects that were left out")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -439,7 +439,7 @@ def _add_evaluation(plan: Plan, run: Run, key: str, training: str | None) -> Non
     evaluation = plan.study.evaluations[key]
     data = evaluation.data or run.runs.data
     wanted = _official_names(f"evaluations.{key}", evaluation.objects, plan.objects[data])
-    objects = [name for name in run.objects if name in wanted]
+    objects = list(wanted) if evaluation.unseen else [name for name in run.objects if name in wanted]
     if not objects:
         return
     per_object = evaluation.per_object

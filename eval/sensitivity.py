@@ -79,6 +79,8 @@ class Property:
     """Field of :class:`~xreset.eval.engines.alteration.Alteration`."""
     what_if: tuple[float, ...] = ()
     """Changes of a usual size, which show how much a skill depends on the property."""
+    of_cameras: bool = False
+    """Whether only policies that see have the property."""
     at_most: str = ""
     """Why the possible change goes farther than the other engine does, so that its cost is a bound; else empty."""
 
@@ -113,6 +115,12 @@ def _drive(part: str, name: str, resolution: float) -> Property:
         altered=field,
         what_if=(0.8,),
     )
+
+
+def _camera(name: str, values: tuple[float, ...], unit: str) -> Property:
+    nominal = 1.0 if unit == "x" else 0.0
+    field = f"camera_{name}"
+    return Property(name=f"camera {name}", task_field=field, values=values, nominal=nominal, unit=unit, of_cameras=True)
 
 
 PROPERTIES = (
@@ -227,6 +235,10 @@ PROPERTIES = (
         unit="control steps",
     ),
     Property(name="force gain", task_field="force_gain", values=(0.5, 2.0)),
+    _camera("shift", (0.01, 0.03), "m"),
+    _camera("turn", (0.035, 0.087), "rad"),
+    _camera("noise", (2.0,), "x"),
+    _camera("latency", (3.0,), "control steps"),
 )
 """In the order of tables."""
 

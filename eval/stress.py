@@ -216,6 +216,10 @@ def stress(
         XResetError: a property cannot have a value; nothing was played then.
     """
     policy.check_seed(trial.seed)
+    if not trial.task.vision.cameras:
+        sweeps = [prop for prop in sweeps if not prop.of_cameras]
+        if not sweeps:
+            raise XResetError(f"The policy {policy.name!r} has no cameras to change. Choose other properties.")
     for prop in sweeps:
         for value in prop.values:
             stressed(trial.task, prop, value)

@@ -1,4 +1,6 @@
 # The names of `import xreset`, for editors and type checkers; __init__.py imports each from here when it is first used.
+from xreset.cameras.config import CameraConfig as CameraConfig
+from xreset.cameras.config import VisionConfig as VisionConfig
 from xreset.demos.archive import Demos as Demos
 from xreset.demos.archive import merge_demos as merge_demos
 from xreset.demos.archive import read_demos as read_demos
@@ -20,6 +22,7 @@ from xreset.eval.results import EvalResult as EvalResult
 from xreset.eval.results import Evaluation as Evaluation
 from xreset.eval.trial import Engine as Engine
 from xreset.learning.config import TrainConfig as TrainConfig
+from xreset.learning.train import distill as distill
 from xreset.learning.train import train as train
 from xreset.objects.catalogue import load_object as load_object
 from xreset.physics import Backend as Backend

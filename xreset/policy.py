@@ -32,8 +32,8 @@ SCHEMA = "xreset-policy/1"
 METADATA_KEY = "xreset"
 """Key of the ONNX metadata entry that holds the contract as JSON."""
 INPUTS = ("flat", "cloud", "h_in", "c_in")
-"""Inputs of the ONNX graph: the observation's groups ``policy`` and ``proprio`` in one, the point clouds, the LSTM's
-state."""
+"""Inputs of the ONNX graph: the two flat groups of ``TaskConfig.policy_groups`` in one, the clouds or images, and the
+LSTM's state."""
 OUTPUTS = ("actions", "h_out", "c_out")
 """Outputs of the ONNX graph: actions, and the LSTM's next state."""
 
@@ -94,6 +94,7 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
         ("another action mapping", asdict(trained.action), asdict(task.action)),
         ("other scales of observations", _scales(trained), _scales(task)),
         ("another frame of objects", *({"object_frame": t.object_frame} for t in (trained, task))),
+        ("other cameras", asdict(trained.vision), asdict(task.vision)),
     ):
         names = [name for name in of_policy | of_task if of_policy.get(name) != of_task.get(name)]
         if names:
@@ -156,7 +157,8 @@ def check_contract_entries(source: str, contract: dict[str, Any]) -> None:
 
 def _is_layout(layout: dict[str, Any]) -> bool:
     """Return whether a value maps groups to the widths of their terms."""
-    if not {"policy", "proprio"} <= set(layout) or not all(isinstance(terms, dict) for terms in layout.values()):
+    is_known = {"policy", "proprio"} <= set(layout) or {"goal", "proprio", "view"} <= set(layout)
+    if not is_known or not all(isinstance(terms, dict) for terms in layout.values()):
         return False
     widths = _widths({"observation_layout": layout}).values()
     return all(type(width) is int and 0 < width < 1 << 20 for width in widths)
@@ -234,11 +236,13 @@ class OnnxPolicy:
     def _try_step(self, path: Path) -> None:
         """Take one step with zeros, so that a policy that cannot act is refused before work begins."""
         task = from_dict(TaskConfig, self.contract["task"], f"{path}: task")
+        self._groups = task.policy_groups
         layout = self.contract["observation_layout"]
         worlds = 2
-        flat = sum(layout["policy"].values()) + sum(layout["proprio"].values())
+        *flat_groups, _ = self._groups
+        flat = sum(sum(layout[name].values()) for name in flat_groups)
         state = (1, worlds, self._lstm_dim)
-        shapes = ((worlds, flat), (worlds, *task.observation.cloud_shape), state, state)
+        shapes = ((worlds, flat), (worlds, *task.picture_shape), state, state)
         feed = {name: np.zeros(shape, np.float32) for name, shape in zip(INPUTS, shapes, strict=True)}
         try:
             outputs: Any = self._session.run(None, feed)
@@ -262,11 +266,12 @@ class OnnxPolicy:
 
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] mean action, on the observations' device."""
-        flat = torch.cat((observations["policy"], observations["proprio"]), dim=-1)
+        *flat_groups, picture = self._groups
+        flat = torch.cat([observations[name] for name in flat_groups], dim=-1)
         shape = (1, len(flat), self._lstm_dim)
         if self._state is None or self._state[0].shape != shape:
             self._state = [np.zeros(shape, dtype=np.float32) for _ in range(2)]
-        values = (flat.cpu().numpy(), observations["perception"].cpu().numpy(), *self._state)
+        values = (flat.cpu().numpy(), observations[picture].cpu().numpy(), *self._state)
         actions, h, c = self._session.run(None, dict(zip(INPUTS, values, strict=True)))
         self._state = [np.array(h), np.array(c)]
         return torch.as_tensor(actions, device=flat.device).clamp(-1.0, 1.0)

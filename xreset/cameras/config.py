@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-import numpy as np
-
 from xreset.checks import Checked, Finite, NotNegative, Positive, Rule, Share
 
 Point = tuple[Finite[float], Finite[float], Finite[float]]
@@ -101,14 +99,3 @@ WRIST = CameraConfig(link="palm", pos=(-0.10, 0.0, 0.06), target=(0.10, 0.0, 0.1
 """A camera behind the palm that looks along the fingers."""
 CAMERAS = {"front": FRONT, "side": SIDE, "wrist": WRIST}
 """Name -> camera."""
-
-
-def look_at(eye: tuple[float, ...], target: tuple[float, ...]) -> np.ndarray:
-    """Return [3, 3] unit vectors to the right, down and forward, as rows; z is up."""
-    forward = np.array(target, dtype=float) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    if np.linalg.norm(right) < 1e-6:  # straight up or down
-        right = np.array([1.0, 0.0, 0.0])
-    right /= np.linalg.norm(right)
-    return np.stack((right, np.cross(forward, right), forward))

@@ -10,7 +10,8 @@ import torch
 import trimesh
 from torch import Tensor
 
-from xreset.cameras.config import CameraConfig, VisionConfig, look_at
+from xreset.cameras.config import CameraConfig, VisionConfig
+from xreset.cameras.pose import mounted_pose
 from xreset.cameras.rays import RayCaster
 from xreset.errors import XResetError
 from xreset.geometry.kinematics import Kinematics
@@ -161,6 +162,11 @@ class Cameras:
         self._view.copy_(torch.where(due, view, self._view))
         return self._view
 
+    def shows_object(self) -> Tensor:
+        """[N] bool: whether the newest images show the object, if they had no errors."""
+        is_object = self.rays.body == self.rays.pose.shape[1] - 1
+        return (is_object & (self._in_range(self.rays.depth) > 0)).flatten(1).any(dim=1)
+
     def _in_range(self, depth: Tensor) -> Tensor:
         return torch.where((depth >= self._near) & (depth <= self._far), depth, 0.0)
 
@@ -203,14 +209,6 @@ def _bend(inverse: Tensor) -> Tensor:
     bend[..., 1:-1] = inverse.diff(n=2).abs()
     bend[..., 1:-1, :] = bend[..., 1:-1, :].maximum(inverse.diff(n=2, dim=-2).abs())
     return bend
-
-
-def mounted_pose(camera: CameraConfig) -> np.ndarray:
-    """Return the pose [4, 4] of a camera in the frame of its link or of the world: x right, y down, z forward."""
-    T = np.eye(4)
-    T[:3, :3] = look_at(camera.pos, camera.target).T
-    T[:3, 3] = camera.pos
-    return T
 
 
 def _set_pose(pose: Tensor, pos: Tensor, quat: Tensor) -> None:

@@ -30,6 +30,7 @@ COMMANDS: dict[str, str] = {
     "view": "Show demonstrations, robot motion or a reset bank in a browser, or as pictures.",
     "play": "Play with a policy in a browser: drag the goal, push the robot, change the engine.",
     "train": "Train a policy.",
+    "distill": "Train a policy that sees, by imitating one that is told the object's pose.",
     "policies": "List the policies that ship with xreset, and shrink exported ones.",
     "eval": "Evaluate a policy or a baseline in one or several engines.",
     "frontier": "Show from which demonstrated states a policy reaches the goal.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from xreset.checks import Checked, NotNegative, Only, Positive, Rule, Share
@@ -20,6 +21,9 @@ class ModelConfig(Checked):
 
     pointnet: Widths = (64, 128, 64)
     """Widths of the per-point MLP 3 -> 64 -> 128 -> 64; the maximum over points is the frame's embedding."""
+    conv: Widths = (16, 32, 32)
+    """Channels of the convolutions for depth images, each of which halves the image; the last width of ``pointnet`` is
+    the images' embedding."""
     lstm: Positive[int] = 512
     """Units of the LSTM."""
     mlp: Widths = (512, 256, 128)
@@ -39,8 +43,8 @@ class ModelConfig(Checked):
     @property
     def layers(self) -> dict[str, Any]:
         """What two networks must share for one to take over the weights of the other."""
-        names = ("pointnet", "lstm", "mlp", "critic_mlp", "activation", "normalize_observations", "normalize_returns")
-        return {name: getattr(self, name) for name in names}
+        names = ("pointnet", "conv", "lstm", "mlp", "critic_mlp", "activation")
+        return {name: getattr(self, name) for name in (*names, "normalize_observations", "normalize_returns")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,8 +107,13 @@ class TrainConfig(Checked):
     """Start the first episodes at random times, so that worlds do not end in step."""
 
 
-def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
-    """Return the nested dictionary that rsl-rl's runner takes; ``num_envs`` counts the worlds of one process."""
+def rsl_rl_config(config: TrainConfig, num_envs: int, teacher: Path | None = None) -> dict[str, Any]:
+    """Return the nested dictionary that rsl-rl's runner takes.
+
+    Args:
+        num_envs: number of worlds of one process.
+        teacher: exported policy to learn from by distillation; None: the rewards teach.
+    """
     m = config.model
     p = config.ppo
     network: dict[str, Any] = {
@@ -125,23 +134,29 @@ def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
     critic = network.copy()
     if m.critic_mlp is not None:
         critic["hidden_dims"] = list(m.critic_mlp)
+    actor = network | {"distribution_cfg": gaussian}
+    vision = config.task.vision
+    if vision.cameras:
+        conv = list(m.conv) if vision.view == "depth" else []
+        actor |= {"class_name": "xreset.learning.model:VisionModel", "conv_dims": conv}
     if m.normalize_returns:
         critic["class_name"] = "xreset.learning.model:ReturnCritic"
-    return {
+    batches = max(1, min(num_envs * p.horizon // p.minibatch_size, num_envs // 2))
+    settings = {
         "num_steps_per_env": p.horizon,
         "save_interval": config.save_interval,
         "obs_groups": {
-            "actor": ["policy", "proprio", "perception"],
+            "actor": list(config.task.policy_groups),
             "critic": ["policy", "proprio", "privileged", "perception"],
         },
-        "actor": network | {"distribution_cfg": gaussian},
+        "actor": actor,
         "critic": critic,
         "algorithm": {
             "class_name": "xreset.learning.ppo:SequencePpo",
             "sequence_length": p.sequence_length,
             "bounds_loss": p.bounds_loss,
             "num_learning_epochs": p.mini_epochs,
-            "num_mini_batches": max(1, min(num_envs * p.horizon // p.minibatch_size, num_envs // 2)),
+            "num_mini_batches": batches,
             "clip_param": p.clip,
             "gamma": p.discount,
             "lam": p.gae_lambda,
@@ -154,3 +169,14 @@ def rsl_rl_config(config: TrainConfig, num_envs: int) -> dict[str, Any]:
             "desired_kl": p.desired_kl,
         },
     }
+    if teacher is not None:
+        settings["algorithm"] = {
+            "class_name": "xreset.learning.distillation:SequenceDistillation",
+            "teacher": teacher,
+            "sequence_length": p.sequence_length,
+            "num_learning_epochs": p.mini_epochs,
+            "num_mini_batches": batches,
+            "learning_rate": p.learning_rate,
+            "max_grad_norm": p.grad_norm,
+        }
+    return settings

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rsl_rl.utils import resolve_class
 from tensordict import TensorDict
 
 from xreset.checks import from_dict
+from xreset.errors import PolicyError
 from xreset.files import atomic_write, code_version, file_hash
 from xreset.learning.checkpoint import read_checkpoint
 from xreset.learning.choice import Choice, read_choice
@@ -23,8 +25,9 @@ from xreset.learning.config import rsl_rl_config
 from xreset.learning.model import PointNetLstmModel
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.learning.shrink import drop_exporter_notes
+from xreset.policies import shipped
 from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS
-from xreset.task.config import ObservationConfig
+from xreset.task.config import TaskConfig
 
 _VERSION_KEY = "xreset-version"
 """Key of the ONNX metadata entry that holds the version and commit of xreset."""
@@ -48,7 +51,7 @@ def export_onnx(
     policy = actor.as_onnx()
     n = 2  # an example batch that is not 1, so that the exporter keeps the world dimension free
     state = torch.zeros(1, n, policy.lstm_dim)
-    example = (torch.zeros(n, policy.flat_dim), torch.zeros(n, *_cloud_shape(contract)), state, state.clone())
+    example = (torch.zeros(n, policy.flat_dim), torch.zeros(n, *_task(contract).picture_shape), state, state.clone())
     worlds = torch.export.Dim("worlds", min=1, max=65536)
     with tempfile.TemporaryDirectory() as folder, _quiet(), torch.no_grad():
         file = Path(folder) / "policy.onnx"
@@ -87,22 +90,22 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _cloud_shape(contract: dict[str, Any]) -> tuple[int, int, int]:
-    where = "the policy's contract: task.observation"
-    return from_dict(ObservationConfig, contract["task"]["observation"], where).cloud_shape
+def _task(contract: dict[str, Any]) -> TaskConfig:
+    return from_dict(TaskConfig, contract["task"], "the policy's contract: task")
 
 
 def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
     """Write the policy of one of a run's checkpoints as an ONNX file."""
     info = read_run(out)
     settings = rsl_rl_config(info.config, info.num_envs)
-    options = {name: value for name, value in settings["actor"].items() if name != "class_name"}
+    actor_class, options = resolve_class(settings["actor"])
     layout = info.contract["observation_layout"]
-    example = {name: torch.zeros(1, sum(layout[name].values())) for name in ("policy", "proprio")}
-    example["perception"] = torch.zeros(1, *_cloud_shape(info.contract))
     groups = {"actor": settings["obs_groups"]["actor"]}
+    *flat, picture = groups["actor"]
+    example = {name: torch.zeros(1, sum(layout[name].values())) for name in flat}
+    example[picture] = torch.zeros(1, *_task(info.contract).picture_shape)
     num_actions = len(info.contract["joint_names"])
-    actor = PointNetLstmModel(TensorDict(example, batch_size=[1]), groups, "actor", num_actions, **options)
+    actor = actor_class(TensorDict(example, batch_size=[1]), groups, "actor", num_actions, **options)
     actor.load_state_dict(read_checkpoint(checkpoint)["actor_state_dict"])
     export_onnx(actor, policy, info.contract, checkpoint=checkpoint)
 
@@ -123,6 +126,25 @@ def ensure_policy(out: Path) -> Path:
     if not policy.exists() or not _is_of(policy, checkpoint, choice):
         export_checkpoint(out, checkpoint, policy)
     return policy
+
+
+def policy_file(policy: str | Path) -> Path:
+    """Return the file of a policy: a run folder's, an exported one, or one that ships with xreset, in this order.
+
+    Raises:
+        PolicyError: there is none of that name.
+    """
+    path = Path(policy)
+    if path.is_dir():
+        return ensure_policy(path)
+    if path.suffix == ".onnx" or path.exists():
+        return path
+    files = shipped()
+    if str(policy) not in files:
+        raise PolicyError(
+            f"Unknown policy {str(policy)!r}. Give a run folder, a .onnx file, or one of: {', '.join(files)}."
+        )
+    return files[str(policy)]
 
 
 def _is_of(policy: Path, checkpoint: Path, choice: Choice | None) -> bool:

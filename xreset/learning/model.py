@@ -1,8 +1,8 @@
 """The paper's network (appendix C, Table VIII): PointNet per cloud frame, LSTM with layer norm, MLP.
 
-Observation groups with two dimensions are flat; groups with four, [N, H, P, K], are cloud histories. Shape letters: N
-worlds (or sequences), T steps of a rollout, L steps of a sequence, H history (or the LSTM's width), P points, K numbers
-per point, D flat width.
+Observation groups with two dimensions are flat; groups with four, [N, H, P, K], are cloud histories, or images. Shape
+letters: N worlds (or sequences), T steps of a rollout, L steps of a sequence, H history (or the LSTM's width), P
+points, K numbers per point, D flat width.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from rsl_rl.models import MLPModel
-from rsl_rl.modules import EmpiricalNormalization, HiddenState
+from rsl_rl.modules import CNN, EmpiricalNormalization, HiddenState
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -51,7 +51,29 @@ class PointNet(nn.Module):
             return self.mlp(cloud).amax(dim=-2).float()
 
 
-def embed_sequences(pointnet: PointNet, cloud: Tensor, first: Tensor) -> Tensor:
+class ImageEncoder(nn.Module):
+    """Embeds images [..., C, H, W] as [..., 1, embedding]: convolutions that halve the image, then one linear layer."""
+
+    def __init__(self, shape: tuple[int, int, int], channels: list[int], embedding: int, activation: str) -> None:
+        """Build for images of a shape (C, H, W)."""
+        super().__init__()
+        kernels = [5, *[3] * (len(channels) - 1)]
+        self.cnn = CNN(
+            shape[1:], shape[0], channels, kernel_size=kernels, stride=2, padding="zeros", activation=activation
+        )
+        width = self.cnn.output_dim
+        assert isinstance(width, int), "a flattened output has one width"
+        self.linear = nn.Linear(width, embedding)
+        self.use_bfloat16 = False
+        """Not used: images are embedded in the precision of the rest."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        """[..., C, H, W] -> [..., 1, embedding]."""
+        embedded = self.linear(self.cnn(images.flatten(0, -4)))
+        return embedded.unflatten(0, images.shape[:-3])[..., None, :]
+
+
+def embed_sequences(pointnet: PointNet | ImageEncoder, cloud: Tensor, first: Tensor) -> Tensor:
     """Return embeddings [L, N, H, embedding] of cloud histories [L, N, H, P, K]; every distinct frame is embedded once.
 
     A step's history is that of the step before, shifted by one, with the newest frame at the end. Where an episode
@@ -113,18 +135,16 @@ class Trunk(nn.Module):
     def __init__(
         self,
         flat_dim: int,
-        cloud_shape: tuple[int, int, int],
-        pointnet_dims: list[int],
+        pointnet: PointNet | ImageEncoder,
+        embedding_dim: int,
         lstm_dim: int,
-        activation: str,
         normalizer: nn.Module,
     ) -> None:
-        """Build normalizer, PointNet, LSTM and layer norm for clouds of shape (H, P, K)."""
+        """Build LSTM and layer norm; ``embedding_dim`` is the width of all embeddings of a step."""
         super().__init__()
-        history, _, point_width = cloud_shape
         self.normalizer = normalizer
-        self.pointnet = PointNet(pointnet_dims, activation, point_width)
-        self.lstm = nn.LSTM(flat_dim + history * pointnet_dims[-1], lstm_dim)
+        self.pointnet = pointnet
+        self.lstm = nn.LSTM(flat_dim + embedding_dim, lstm_dim)
         self.norm = nn.LayerNorm(lstm_dim)
 
     def join(self, flat: Tensor, embeddings: Tensor) -> Tensor:
@@ -178,14 +198,19 @@ class PointNetLstmModel(MLPModel):
         self.cloud_group = next(group for group in obs_groups[obs_set] if obs[group].ndim == 4)
         super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims, activation, False, distribution_cfg)
         normalizer = EmpiricalNormalization(self.obs_dim) if obs_normalization else nn.Identity()
-        cloud_shape = tuple(obs[self.cloud_group].shape[1:])
-        self.trunk = Trunk(self.obs_dim, cloud_shape, list(pointnet_dims), lstm_dim, activation, normalizer)
-        self.trunk.pointnet.use_bfloat16 = bfloat16_clouds
+        encoder, width = self._encoder(obs[self.cloud_group].shape[1:], list(pointnet_dims), activation)
+        encoder.use_bfloat16 = bfloat16_clouds
+        self.trunk = Trunk(self.obs_dim, encoder, width, lstm_dim, normalizer)
         self.state: LstmState | None = None
         self.reuse_embeddings = False
         """Whether successive clouds in a rollout are shifted histories, so that only the newest frame is new."""
         self._embeddings: Tensor | None = None
         self._began: Tensor | None = None
+
+    def _encoder(self, shape: torch.Size, dims: list[int], activation: str) -> tuple[PointNet | ImageEncoder, int]:
+        """Return what embeds clouds of a shape (H, P, K), and the width of all embeddings of a step."""
+        history, _, point_width = shape
+        return PointNet(dims, activation, point_width), history * dims[-1]
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None) -> Tensor:
         """Return the MLP's input: [N, lstm] in a rollout, [T, N, lstm] in an update.
@@ -206,7 +231,7 @@ class PointNetLstmModel(MLPModel):
             return trunk.norm(out[0])
         assert isinstance(hidden_state, tuple), "an update needs the LSTM state of each sequence's start"
         self._embeddings = None  # the weights are about to change
-        joined = trunk.join(flat, embed_sequences(trunk.pointnet, cloud, masks))
+        joined = trunk.join(flat, self._embed_rollout(cloud, masks))
         pieces = hidden_state[0].shape[1] // joined.shape[1]
 
         def cut(value: Tensor) -> Tensor:
@@ -215,6 +240,10 @@ class PointNetLstmModel(MLPModel):
 
         out, _ = run_lstm(trunk.lstm, cut(joined), ~cut(masks), hidden_state)
         return trunk.norm(out).unflatten(1, (pieces, -1)).transpose(0, 1).flatten(0, 1)
+
+    def _embed_rollout(self, cloud: Tensor, first: Tensor) -> Tensor:
+        """Return embeddings [T, N, H, embedding] of cloud histories [T, N, H, P, K] in an update."""
+        return embed_sequences(self.trunk.pointnet, cloud, first)
 
     def _embed(self, cloud: Tensor) -> Tensor:
         """Return embeddings [N, H, embedding] of an environment's cloud histories [N, H, P, K] in a rollout."""
@@ -271,6 +300,27 @@ class PointNetLstmModel(MLPModel):
 
     def _get_latent_dim(self) -> int:
         return self._latent_dim
+
+
+class VisionModel(PointNetLstmModel):
+    """An actor that sees: depth images, or clouds of the points in them, which are not shifted from step to step."""
+
+    def __init__(self, *args: Any, conv_dims: list[int] | tuple[int, ...] = (), **options: Any) -> None:
+        """Build; ``conv_dims`` are the channels of the convolutions, empty for clouds of points."""
+        self._conv_dims = list(conv_dims)
+        super().__init__(*args, **options)
+
+    def _encoder(self, shape: torch.Size, dims: list[int], activation: str) -> tuple[PointNet | ImageEncoder, int]:
+        if not self._conv_dims:
+            return super()._encoder(shape, dims, activation)
+        channels, height, width = shape
+        return ImageEncoder((channels, height, width), self._conv_dims, dims[-1], activation), dims[-1]
+
+    def _embed_rollout(self, cloud: Tensor, first: Tensor) -> Tensor:
+        return self.trunk.pointnet(cloud)
+
+    def _embed(self, cloud: Tensor) -> Tensor:
+        return self.trunk.pointnet(cloud)
 
 
 class ReturnCritic(PointNetLstmModel):

@@ -42,15 +42,9 @@ class SequenceStorage(RolloutStorage):
         self.sequence_length = sequence_length
 
     def minibatch(self, worlds: Tensor) -> Batch:
-        """Return the rollout [T, M, ...] of M worlds [M].
-
-        ``masks`` [T, M] is True where a step is the first of an episode. ``hidden_states`` [1, pieces * M, lstm] are
-        the states that the pieces start with, all worlds of the first piece first.
-        """
-        first = torch.zeros_like(self.dones[:, worlds, 0], dtype=torch.bool)
-        # step 0 starts with the state that was saved there, zeroed where an episode had ended
-        first[1:] = self.dones[:-1, worlds, 0].bool()
-        states = (self._states(self.saved_hidden_state_a, worlds), self._states(self.saved_hidden_state_c, worlds))
+        """Return the rollout [T, M, ...] of M worlds [M], with masks and the actor's states of :meth:`sequences`."""
+        first, state = self.sequences(worlds)
+        states = (state, self._states(self.saved_hidden_state_c, worlds))
         return RolloutStorage.Batch(
             observations=self.observations[:, worlds],
             actions=self.actions[:, worlds],
@@ -62,6 +56,18 @@ class SequenceStorage(RolloutStorage):
             hidden_states=states,  # pyright: ignore[reportArgumentType]
             masks=first,
         )
+
+    def sequences(self, worlds: Tensor) -> tuple[Tensor, tuple[Tensor, ...] | None]:
+        """Return where episodes of M worlds [M] begin, and the actor's memory at the start of each piece.
+
+        Returns:
+            [T, M] bool, True where a step is the first of an episode; and states [1, pieces * M, lstm], all worlds of
+            the first piece first.
+        """
+        first = torch.zeros_like(self.dones[:, worlds, 0], dtype=torch.bool)
+        # step 0 starts with the state that was saved there, zeroed where an episode had ended
+        first[1:] = self.dones[:-1, worlds, 0].bool()
+        return first, self._states(self.saved_hidden_state_a, worlds)
 
     def _states(self, saved: Any, worlds: Tensor) -> tuple[Tensor, ...] | None:
         """[T, 1, N, lstm] each -> [1, pieces * M, lstm] each."""

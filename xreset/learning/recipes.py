@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 from math import pi, radians
 from pathlib import Path
 
+from xreset.cameras.config import VisionConfig
 from xreset.errors import RunError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.run import read_run
+from xreset.learning.schedules import ScheduleConfig
 from xreset.task.config import (
     ActionConfig,
     NoiseConfig,
@@ -250,3 +252,30 @@ def own_terms_flag(own: dict[str, float]) -> str:
     """Return the option of ``xreset train`` that names reward terms of the user's own."""
     terms = [f"{shlex.quote(plain(name))} {weight:g}" for name, weight in own.items()]
     return " ".join(["--config.task.reward.own", *terms])
+
+
+def student_config(teacher: TaskConfig, vision: VisionConfig) -> TrainConfig:
+    """Return the configuration of a distillation.
+
+    Ranges of the cameras: mounts and calibrations err by a centimetre and two degrees, images are up to two control
+    steps (33 ms) older than the newest.
+
+    Args:
+        teacher: the teacher's task, without cameras.
+        vision: the cameras of the student.
+    """
+    randomization = replace(
+        teacher.randomization,
+        camera_shift=(0.0, 0.01),
+        camera_turn=(0.0, radians(2.0)),
+        camera_fov=(0.97, 1.03),
+        camera_noise=(0.5, 2.0),
+        camera_latency=(0.0, 2.0),
+    )
+    return TrainConfig(
+        task=replace(teacher, vision=vision, randomization=randomization, reward=replace(teacher.reward, own={})),
+        model=ModelConfig(pointnet=(64, 128, 128), lstm=256, mlp=(256, 128), initial_std=0.1),
+        ppo=PpoConfig(horizon=24, sequence_length=12, mini_epochs=2, minibatch_size=8192, learning_rate=5e-4),
+        schedule=ScheduleConfig(teacher=((0.0, 1.0), (0.2, 0.0))),
+        iterations=2000,
+    )

@@ -6,6 +6,7 @@ RUN/worlds.pt                the worlds at the newest checkpoint, with which a r
 RUN/lift.json                when success from home passed 1, 10 and 50 %
 RUN/faults.npz               the last worlds whose simulation failed, if the run ended because of too many
 RUN/policy.onnx              the policy, with its contract
+RUN/teacher.onnx             the policy that a distillation learned from
 RUN/choice.json              which checkpoint it is, if ``xreset select`` chose one
 RUN/events.out.tfevents.*    TensorBoard
 RUN/eval/, RUN/report/       made by ``xreset eval`` and ``xreset report``
@@ -24,6 +25,8 @@ from xreset.learning.config import TrainConfig
 from xreset.text import shown
 
 SCHEMA = "xreset-run/1"
+TEACHER = "teacher.onnx"
+"""File of the teacher's policy in the run folder of a distillation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +53,8 @@ class RunInfo(Checked):
     """Path of the checkpoint whose networks the training started with; None: new networks."""
     weights_hash: str | None = None
     """SHA-256 of the checkpoint."""
+    teacher: str | None = None
+    """Name of the policy that a distillation learns from; it is copied to ``teacher.onnx``. None: the rewards teach."""
 
 
 def write_run(folder: Path, info: RunInfo) -> None:

@@ -26,7 +26,7 @@ from xreset.learning.schedules import value_at
 
 
 class TrainingRunner(OnPolicyRunner):
-    """Runs PPO iterations on a :class:`~xreset.env.ManipulationEnv`.
+    """Runs iterations of PPO, or of a distillation, on a :class:`~xreset.env.ManipulationEnv`.
 
     Attributes:
         iteration: number of iterations done.
@@ -35,12 +35,16 @@ class TrainingRunner(OnPolicyRunner):
         processes: this process among those that train together.
     """
 
-    def __init__(self, env: ManipulationEnv, config: TrainConfig, folder: Path) -> None:
-        """Build algorithm and models; rsl-rl's own logging stays off."""
+    def __init__(self, env: ManipulationEnv, config: TrainConfig, folder: Path, *, teacher: Path | None = None) -> None:
+        """Build algorithm and models; rsl-rl's own logging stays off.
+
+        Args:
+            teacher: exported policy to learn from by distillation; None: the rewards teach.
+        """
         self.folder = folder
         self.train_config = config
         torch.set_float32_matmul_precision("highest" if config.ppo.precision == "float32" else "high")
-        settings = rsl_rl_config(config, env.num_envs)
+        settings = rsl_rl_config(config, env.num_envs, teacher)
         super().__init__(env, settings, log_dir=None, device=str(env.device))  # pyright: ignore[reportArgumentType]
         self.world = env
         self.iteration = 0
@@ -140,6 +144,8 @@ class TrainingRunner(OnPolicyRunner):
         """Set what changes during a run to its values at a share of the run."""
         if points := self.train_config.schedule.demo_probability:
             self.world.resets.demo_probability.fill_(value_at(points, progress))
+        if points := self.train_config.schedule.teacher:
+            self.alg.teacher_share = value_at(points, progress)
 
     def _agreed(self, stop: bool) -> bool:
         """Whether any process is to stop: then all do, after the same iteration."""

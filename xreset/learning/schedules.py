@@ -41,6 +41,8 @@ class ScheduleConfig(Checked):
     demo_probability: ShareSchedule = ()
     """Replaces ``task.reset.demo_probability``: demonstrated states teach the first grasp, starts from home are what is
     evaluated."""
+    teacher: ShareSchedule = ()
+    """Share of the worlds in which the teacher acts during a distillation. Empty: none."""
 
 
 def value_at(points: Points, progress: float) -> float:

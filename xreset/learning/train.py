@@ -5,29 +5,32 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 
+from xreset.cameras.config import CAMERAS, CameraConfig, VisionConfig
+from xreset.checks import from_dict
 from xreset.env import make_env
-from xreset.errors import RunError
-from xreset.files import claim_folder, file_hash
+from xreset.errors import PolicyError, RunError, XResetError
+from xreset.files import claim_folder, file_hash, write_whole
 from xreset.inputs import Inputs, load_inputs
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
-from xreset.learning.export import export_onnx
+from xreset.learning.export import export_onnx, policy_file
 from xreset.learning.model import PointNetLstmModel
-from xreset.learning.recipes import default_recipe, dropped_terms, own_terms_flag, starting_config
-from xreset.learning.run import RunInfo, checkpoints, latest_checkpoint, read_run, write_run
+from xreset.learning.recipes import default_recipe, dropped_terms, own_terms_flag, starting_config, student_config
+from xreset.learning.run import TEACHER, RunInfo, checkpoints, latest_checkpoint, read_run, write_run
 from xreset.learning.runner import TrainingRunner
 from xreset.plugins import backend_class, device_for
-from xreset.policy import check_contract, policy_contract
+from xreset.policy import OnnxPolicy, check_contract, policy_contract
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
+from xreset.task.config import TaskConfig
 
 
 def train(
@@ -46,6 +49,7 @@ def train(
     minutes: float = math.inf,
     seed: int = 0,
     weights: str | Path | None = None,
+    teacher: str | Path | None = None,
 ) -> Path:
     """Train a new policy, and export it as ``policy.onnx`` in the run folder.
 
@@ -69,6 +73,7 @@ def train(
         minutes: most time to train now. The run can be continued later.
         seed: seed of every random number.
         weights: another run's folder, whose networks are the start; default: new networks.
+        teacher: policy whose actions the new one learns instead of learning from rewards; see :func:`distill`.
 
     Returns:
         The run folder, which ``xreset.load_policy`` reads.
@@ -110,6 +115,8 @@ def train(
     start = None
     if weights is not None:
         start = _checkpoint_to_start_from(Path(weights), inputs, config)
+    if teacher is not None:
+        _copy_teacher(policy_file(teacher), out, inputs, config)
     info = RunInfo(
         robot=str(inputs.robot_name),
         resets=str(file),
@@ -124,6 +131,7 @@ def train(
         contract=policy_contract(inputs.robot, config.task, tuple(o.name for o in inputs.objects)),
         weights=str(start) if start else None,
         weights_hash=file_hash(start) if start else None,
+        teacher=str(teacher) if teacher else None,
     )
     _run(out, info, inputs, minutes=minutes, resumed=False)
     return out
@@ -144,6 +152,59 @@ def _file_of(out: Path, bank: str | Path | ResetBank | None, goals: str | Path |
         write_bank(out / "resets.npz", given, config={}, inputs={})
         return out / "resets.npz"
     return Path(given)
+
+
+def distill(
+    teacher: str | Path,
+    bank: str | Path | ResetBank,
+    *,
+    out: str | Path,
+    cameras: Sequence[str | CameraConfig] = ("front",),
+    vision: VisionConfig | None = None,
+    config: TrainConfig | None = None,
+    **options: Any,
+) -> Path:
+    """Train a policy that sees, by imitating one that is told the object's pose and shape (DAgger).
+
+    The student gets what its cameras show, the joints and the goal. It learns in the teacher's own task, with cameras.
+
+    Args:
+        teacher: run folder, exported policy (.onnx) or name of a policy that ships with xreset.
+        bank: reset bank, or its file.
+        out: run folder to make.
+        cameras: names of :data:`xreset.cameras.config.CAMERAS`, or cameras.
+        vision: images, their timing and what the student gets of them; its cameras are replaced by ``cameras``.
+        config: the whole configuration, cameras included; default: :func:`xreset.learning.recipes.student_config`.
+        options: keywords of :func:`train`: robot, objects, engine, device, num_envs, iterations, minutes and seed.
+
+    Returns:
+        The run folder, which ``xreset.load_policy`` reads; the teacher is in it as ``teacher.onnx``.
+
+    Raises:
+        PolicyError: the teacher is unknown, sees itself, or is for another robot.
+        XResetError: a camera is unknown or inside a body, no camera ever shows some object, or the renderer cannot
+            start.
+    """
+    if config is None:
+        unknown = [name for name in cameras if isinstance(name, str) and name not in CAMERAS]
+        if unknown:
+            raise XResetError(f"Unknown camera {', '.join(unknown)}. Choose from: {', '.join(CAMERAS)}.")
+        chosen = tuple(CAMERAS[camera] if isinstance(camera, str) else camera for camera in cameras)
+        told = OnnxPolicy(policy_file(teacher)).contract["task"]
+        vision = replace(vision or VisionConfig(), cameras=chosen)
+        config = student_config(from_dict(TaskConfig, told, f"{teacher}: task"), vision)
+    if not config.task.vision.cameras:
+        raise XResetError("A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + ".")
+    return train(bank, out=out, config=config, teacher=teacher, **options)
+
+
+def _copy_teacher(teacher: Path, out: Path, inputs: Inputs, config: TrainConfig) -> None:
+    """Copy the policy of a teacher into a run folder, if it fits the robot and the task."""
+    contract = OnnxPolicy(teacher).contract
+    if contract["task"].get("vision", {}).get("cameras"):
+        raise PolicyError(f"{teacher} sees through cameras itself. Give a teacher that is told pose and shape.")
+    check_contract(str(teacher), contract, inputs.robot, replace(config.task, vision=VisionConfig()))
+    write_whole(out / TEACHER, teacher.read_bytes())
 
 
 def uses_bank(config: TrainConfig) -> bool:
@@ -244,7 +305,9 @@ def _train(processes: Processes, out: Path, info: RunInfo, inputs: Inputs, *, se
     torch.manual_seed(seed)
     scene = (inputs.robot, inputs.objects, inputs.bank)
     with make_env(*scene, config.task, engine=info.backend, num_envs=info.num_envs, device=device, seed=seed) as env:
-        runner = TrainingRunner(env, config, out)
+        if env.vision is not None:
+            env.vision.check_sees_objects()
+        runner = TrainingRunner(env, config, out, teacher=out / TEACHER if info.teacher else None)
         if resumed and checkpoints(out):
             runner.load_checkpoint(latest_checkpoint(out))
         elif info.weights is not None:

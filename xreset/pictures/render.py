@@ -19,7 +19,7 @@ import trimesh
 from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
-from xreset.cameras.config import look_at
+from xreset.cameras.pose import look_at
 from xreset.errors import XResetError
 from xreset.files import write_whole
 from xreset.geometry.kinematics import Kinematics

@@ -441,6 +441,16 @@ class TaskConfig(Checked):
     distance_points: Positive[int] = 256
     """Surface points per object for fingertip distances."""
 
+    @property
+    def policy_groups(self) -> tuple[str, str, str]:
+        """Names of the observation groups that a policy gets: two flat ones, then clouds or images."""
+        return ("goal", "proprio", "view") if self.vision.cameras else ("policy", "proprio", "perception")
+
+    @property
+    def picture_shape(self) -> tuple[int, int, int]:
+        """Shape of the last of these groups for one world."""
+        return self.vision.view_shape if self.vision.cameras else self.observation.cloud_shape
+
     def __post_init__(self) -> None:
         super().__post_init__()
         steps = self.termination.episode_seconds / (self.timestep * self.substeps)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from xreset.cameras.sensor import Cameras
+from xreset.errors import XResetError
 from xreset.physics import Backend, State
 from xreset.task.config import TaskConfig
 from xreset.task.latency import DelayLine
@@ -21,6 +22,7 @@ class Vision:
 
     def __init__(self, backend: Backend, task: TaskConfig) -> None:
         """Allocate, and start the renderer; errors as of :class:`~xreset.cameras.sensor.Cameras`."""
+        self._backend = backend
         self._config = task.randomization
         self._latency = task.vision.latency
         self.cameras = Cameras(backend.scene, backend.object_index, task.vision, scale=task.observation.cloud_scale)
@@ -59,6 +61,24 @@ class Vision:
         world's reset."""
         due = episode_step % self.cameras.config.interval == 0
         self.cameras.aim(state, goal_pos, goal_quat, due)
+
+    def check_sees_objects(self) -> None:
+        """Refuse cameras that show some object in no world.
+
+        Raises:
+            XResetError: names the objects.
+        """
+        shown = self.cameras.shows_object()
+        unseen = []
+        for i, spec in enumerate(self._backend.scene.objects):
+            holds = self._backend.object_index == i
+            if bool(holds.any()) and not bool(shown[holds].any()):
+                unseen.append(spec.name)
+        if unseen:
+            raise XResetError(
+                f"No camera shows {', '.join(unseen)} at the start of any of {len(shown)} episodes. Turn a camera to "
+                "the table (target), widen it (fov), or check what it measures (near, far)."
+            )
 
     def observe(self, fresh: Tensor, generator: torch.Generator) -> Tensor:
         """[N, ...] what the policy sees: :attr:`~xreset.cameras.config.VisionConfig.view_shape`.

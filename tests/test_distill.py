@@ -1,0 +1,151 @@
+"""Distillation: the teacher's network from its file, a student's training, resumed and exported, and refusals."""
+
+import io
+import tempfile
+import unittest
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+
+from tests.toy_bank import toy_bank
+from xreset import robots
+from xreset.cameras.config import FRONT, WRIST, VisionConfig
+from xreset.env import make_env
+from xreset.errors import PolicyError, XResetError
+from xreset.learning.checkpoint import read_checkpoint
+from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
+from xreset.learning.recipes import student_config
+from xreset.learning.run import TEACHER, latest_checkpoint, read_run
+from xreset.learning.schedules import ScheduleConfig
+from xreset.learning.shrink import shrink
+from xreset.learning.teacher import load_teacher
+from xreset.learning.train import distill, resume, train
+from xreset.objects.catalogue import load_objects
+from xreset.plugins import make_backend
+from xreset.policy import OnnxPolicy, check_contract
+from xreset.resets.bank import write_bank
+from xreset.task.config import ObservationConfig, TaskConfig, evaluation_task
+
+try:
+    import xreset.backends.mujoco
+    import xreset.cameras.rays  # noqa: F401
+except (ImportError, XResetError) as error:
+    raise unittest.SkipTest(str(error)) from error
+
+TASK = TaskConfig(observation=ObservationConfig(cloud_points=16, cloud="paired"), distance_points=64)
+SMALL = ModelConfig(pointnet=(8, 6), conv=(4, 4), lstm=12, mlp=(16,), initial_std=0.1)
+IMAGES = VisionConfig(cameras=(FRONT, WRIST), width=16, height=12)
+POINTS = replace(IMAGES, view="points", points=8, goal_image=True)
+
+
+class DistillTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
+        cls.enterClassContext(mock.patch("xreset.env.make_backend", partial(make_backend, workers=0)))
+        cls.robot = robots.load("openarm")
+        cls.bank_of_robot = toy_bank(cls.robot, joint_pos=np.tile(cls.robot.home, (6, 1)).astype(np.float32))
+        cls.bank = cls.folder / "bank.npz"
+        write_bank(cls.bank, cls.bank_of_robot, config={}, inputs={})
+        cls.teacher = cls.folder / "teacher"
+        config = TrainConfig(task=TASK, model=SMALL, ppo=PpoConfig(horizon=8, mini_epochs=1), iterations=1)
+        with redirect_stdout(io.StringIO()):
+            train(cls.bank, out=cls.teacher, config=config, **cls.options())
+            cls.run_folder = cls.distill("images")
+
+    @staticmethod
+    def options() -> dict:
+        return {"engine": "mujoco", "device": "cpu", "num_envs": 4, "seed": 3}
+
+    @classmethod
+    def distill(cls, name: str, vision: VisionConfig = IMAGES, **changes) -> Path:
+        config = student_config(TASK, vision)
+        ppo = replace(config.ppo, horizon=8, sequence_length=4, minibatch_size=16, learning_rate=3e-3)
+        config = replace(config, **({"model": SMALL, "ppo": ppo, "iterations": 2} | changes))
+        return distill(cls.teacher, cls.bank, out=cls.folder / name, config=config, **cls.options())
+
+    @contextmanager
+    def without_export(self):
+        with mock.patch("xreset.learning.train.export_onnx"), redirect_stdout(io.StringIO()):
+            yield
+
+    def env(self, vision: VisionConfig):
+        objects = load_objects(list(self.bank_of_robot.object_names), None)
+        task = replace(evaluation_task(TASK), vision=vision)
+        env = make_env(self.robot, objects, self.bank_of_robot, task, engine="mujoco", num_envs=2)
+        self.addCleanup(env.close)
+        return env
+
+    def test_a_shrunk_file_teaches_too(self):
+        shrink(self.teacher / "policy.onnx", self.folder / "small.onnx")
+        load_teacher(self.folder / "small.onnx")  # which compares its actions with the file's
+
+    def test_the_run_is_a_policy_that_sees(self):
+        info = read_run(self.run_folder)
+        self.assertEqual(info.teacher, str(self.teacher))
+        self.assertEqual((self.run_folder / TEACHER).read_bytes(), (self.teacher / "policy.onnx").read_bytes())
+        policy = OnnxPolicy(self.run_folder / "policy.onnx")
+        self.assertEqual(list(policy.contract["observation_layout"]), ["goal", "proprio", "view"])
+        env = self.env(IMAGES)
+        check_contract("it", policy.contract, self.robot, env.task)
+        policy.begin(env)
+        first = policy.act(env.get_observations())
+        self.assertEqual(first.shape, (2, env.num_actions))
+        blind = env.get_observations()
+        blind["view"] = torch.zeros_like(blind["view"])
+        policy.begin(env)
+        self.assertFalse(torch.allclose(first, policy.act(blind)))
+        told = blind.clone()
+        for name in ("policy", "perception", "privileged"):
+            told[name] = torch.zeros_like(told[name])
+        policy.begin(env)
+        once = policy.act(blind)
+        policy.begin(env)
+        self.assertTrue(torch.equal(once, policy.act(told)))
+        with self.assertRaisesRegex(PolicyError, "other cameras"):
+            check_contract("it", policy.contract, self.robot, replace(env.task, vision=replace(IMAGES, interval=1)))
+
+    def test_a_resumed_run_continues_as_if_it_had_not_stopped(self):
+        still = {
+            "schedule": ScheduleConfig(),
+            "random_episode_start": False,
+        }  # nothing depends on the length of the run
+        with self.without_export():
+            whole = self.distill("whole", iterations=4, save_interval=2, **still)
+            stopped = self.distill("stopped", iterations=2, save_interval=2, **still)
+            resume(stopped, iterations=4)
+        expected, found = (read_checkpoint(latest_checkpoint(run)) for run in (whole, stopped))
+        self.assertEqual(found["iteration"], 4)
+        for name, value in expected["actor_state_dict"].items():
+            torch.testing.assert_close(found["actor_state_dict"][name], value, rtol=0, atol=1e-5, msg=name)
+
+    def test_the_student_learns_the_teachers_actions(self):
+        errors = []
+
+        def note(_log, _iteration, _steps, _elapsed, scalars):
+            errors.append(scalars["loss/behavior"])
+
+        with self.without_export(), mock.patch("xreset.learning.runner.TrainingLog.write", note):
+            self.distill("points", POINTS, iterations=20, save_interval=100)
+        self.assertLess(np.mean(errors[-3:]), 0.5 * np.mean(errors[:3]))
+
+    def test_refusals(self):
+        away = replace(IMAGES, cameras=(replace(FRONT, target=(3.0, 0.2, 0.5)),))
+        with self.without_export():
+            with self.assertRaisesRegex(XResetError, "No camera shows 005_tomato_soup_can, 010_potted_meat_can"):
+                self.distill("away", away)
+            with self.assertRaisesRegex(XResetError, "Unknown camera rear. Choose from: front, side, wrist"):
+                distill(self.teacher, self.bank, out=self.folder / "rear", cameras=("rear",))
+            with self.assertRaisesRegex(PolicyError, "Unknown policy 'nobody'"):
+                distill("nobody", self.bank, out=self.folder / "nobody")
+            with self.assertRaisesRegex(PolicyError, "sees through cameras itself"):
+                distill(self.run_folder, self.bank, out=self.folder / "again", config=student_config(TASK, IMAGES))
+
+
+if __name__ == "__main__":
+    unittest.main()

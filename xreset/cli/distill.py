@@ -1,0 +1,71 @@
+"""``xreset distill``."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from xreset.cameras.config import VisionConfig
+from xreset.cli._common import Name, Several
+from xreset.errors import RunError
+from xreset.learning import train as training
+
+
+def distill(
+    teacher: Name = "",
+    *,
+    out: Path,
+    resets: Path | None = None,
+    robot: str | None = None,
+    objects: Path | None = None,
+    camera: Several = (),
+    vision: VisionConfig = VisionConfig(),  # noqa: B008 (frozen)
+    backend: str = "mujoco-warp",
+    device: str | None = None,
+    num_envs: int = 1024,
+    iterations: int | None = None,
+    minutes: float = math.inf,
+    seed: int = 0,
+    resume: bool = False,
+) -> None:
+    """Train a policy that sees, by imitating one that is told the object's pose and shape.
+
+    Args:
+        teacher: Run folder, exported policy (.onnx), or name of a policy that ships with xreset.
+        out: Run folder to make, or to continue.
+        resets: Reset bank, made by `xreset resets`.
+        robot: Name or folder of the robot; default: the bank's.
+        objects: Folder of real meshes; default: the built-in stand-ins.
+        camera: front, side, or wrist; give it again for two cameras. Default: front.
+        vision: Images, their timing, and what the policy gets of them.
+        backend: Physics engine to train on.
+        device: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
+        num_envs: Worlds to simulate (per GPU).
+        iterations: Iterations in all; default: 2000.
+        minutes: Most time to train now. Then the run stops as with Ctrl-C, and --resume continues it.
+        seed: Seed of every random number.
+        resume: Continue the run in --out from its newest checkpoint.
+    """
+    if resume:
+        training.resume(out, iterations=iterations, minutes=minutes)
+        return
+    if not teacher or resets is None:
+        raise RunError("A new run needs a teacher and --resets. To continue the run in --out, add --resume.")
+    training.distill(
+        teacher,
+        resets,
+        out=out,
+        cameras=camera or ("front",),
+        vision=vision,
+        robot=robot,
+        objects=objects,
+        engine=backend,
+        device=device,
+        num_envs=num_envs,
+        iterations=iterations,
+        minutes=minutes,
+        seed=seed,
+    )
+
+
+COMMAND = distill

@@ -1,0 +1,111 @@
+"""A trained policy as a network that teaches: exported policies hold all weights, so no checkpoint is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from xreset.checks import from_dict
+from xreset.errors import PolicyError
+from xreset.learning.model import PointNetLstmModel
+from xreset.policy import OnnxPolicy
+from xreset.task.config import TaskConfig
+
+if TYPE_CHECKING:
+    from onnx import GraphProto
+
+_FLAT = ["policy", "proprio"]
+_CLOSE = 1e-3
+"""Largest difference between an action of the file and one of the network."""
+
+
+def load_teacher(path: Path) -> PointNetLstmModel:
+    """Return the network of an exported policy, in evaluation mode on the CPU.
+
+    Raises:
+        PolicyError: the file is no policy, or is built in another way than this version exports policies.
+    """
+    import onnx
+
+    policy = OnnxPolicy(path)
+    task = from_dict(TaskConfig, policy.contract["task"], f"{path}: task")
+    layout = policy.contract["observation_layout"]
+    example = {name: torch.randn(2, sum(layout[name].values())) for name in _FLAT}
+    example["perception"] = torch.randn(2, *task.picture_shape)
+    observations = TensorDict(example, batch_size=[2])
+    try:
+        graph = onnx.load(str(path)).graph
+        weights = _weights(graph)
+        activation = next(node.op_type.lower() for node in graph.node if node.op_type in ("Elu", "Relu"))
+        model = PointNetLstmModel(
+            observations,
+            {"actor": [*_FLAT, "perception"]},
+            "actor",
+            len(policy.contract["joint_names"]),
+            hidden_dims=_widths(weights, "mlp.")[:-1],
+            activation=activation,
+            pointnet_dims=_widths(weights, "trunk.pointnet.mlp."),
+            lstm_dim=weights["trunk.lstm.weight_hh_l0"].shape[1],
+        )
+        model.load_state_dict(model.state_dict() | weights)
+        model.eval()
+        with torch.no_grad():
+            difference = (model(observations).clamp(-1, 1) - policy.act(observations)).abs().max()
+    except (KeyError, IndexError, StopIteration, RuntimeError) as error:
+        raise PolicyError(f"{path} cannot teach: its network is not built as xreset exports it ({error}).") from error
+    if not difference < _CLOSE:
+        raise PolicyError(f"{path} cannot teach: rebuilt from its file, its network acts otherwise ({difference:.2g}).")
+    model.reset()
+    return model.requires_grad_(False)
+
+
+def _widths(weights: dict[str, Tensor], prefix: str) -> list[int]:
+    """Return the widths of the linear layers whose names begin with a prefix, in order."""
+    layers = [name for name in weights if name.startswith(prefix) and name.endswith(".bias")]
+    layers.sort(key=lambda name: int(name.split(".")[-2]))
+    return [len(weights[name]) for name in layers]
+
+
+def _weights(graph: GraphProto) -> dict[str, Tensor]:
+    """Return the weights of an exported network by the names of :class:`PointNetLstmModel`."""
+    found = dict(_arrays(graph))
+    weights = {name: value for name, value in found.items() if name.startswith(("trunk.", "mlp."))}
+    for node in graph.node:
+        last = node.input[1] if len(node.input) > 1 else ""
+        if node.op_type == "MatMul" and last in found:  # the exporter has transposed the weights of a linear layer
+            bias = next(
+                other.input[1] for other in graph.node if other.op_type == "Add" and node.output[0] in other.input
+            )
+            weights[bias.removesuffix("bias") + "weight"] = found[last].T
+        if node.op_type == "Div" and last in found:
+            weights["trunk.normalizer._std"] = found[last] - 1e-2  # rsl-rl's eps
+        if node.op_type == "LSTM":
+            input_bias, recurrent_bias = found[node.input[3]].reshape(2, -1)
+            weights["trunk.lstm.bias_ih_l0"] = _reordered(input_bias)
+            weights["trunk.lstm.bias_hh_l0"] = _reordered(recurrent_bias)
+            for name, given in zip(("weight_ih_l0", "weight_hh_l0"), node.input[1:3], strict=True):
+                if given in found:  # of a small network, the exporter has reordered the gates
+                    weights[f"trunk.lstm.{name}"] = _reordered(found[given][0])
+    return weights
+
+
+def _arrays(graph: GraphProto) -> Iterator[tuple[str, Tensor]]:
+    """Yield the names and values of a graph's constants; shrunk ones by the name before."""
+    from onnx import numpy_helper
+
+    for constant in graph.initializer:
+        value = numpy_helper.to_array(constant)
+        if value.dtype in (np.float16, np.float32):
+            yield constant.name.removesuffix("_float16"), torch.tensor(value, dtype=torch.float32)
+
+
+def _reordered(gates: Tensor) -> Tensor:
+    """Return an LSTM's bias or weights in torch's order of gates (input, forget, cell, output) instead of ONNX's."""
+    i, o, f, c = gates.chunk(4)
+    return torch.cat((i, f, c, o))

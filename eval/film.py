@@ -28,7 +28,8 @@ def film(
         policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`.
         env: where it plays; all worlds are reset first. :meth:`PolicySpec.make_env` makes one.
         path: file to write.
-        world: index of the world to show. The goal is drawn as a translucent object.
+        world: index of the world to show. The goal is drawn as a translucent object. Below are the images of the
+            task's cameras.
         fps: fewest frames per second; there are more if the control rate is no multiple of them.
         size: width and height in pixels, both even.
 
@@ -43,9 +44,17 @@ def film(
     env.reset()
     player = policy.begin(env)
     every = max(1, int(1.0 / (fps * env.backend.scene.control_dt) + 1e-6))
-    frames = [env.render(world, size)]
+    frames = [_frame(env, world, size)]
     for step in range(1, env.max_episode_length + 1):
         env.advance(player.act(env.get_observations()))
         if step % every == 0:
-            frames.append(env.render(world, size))
+            frames.append(_frame(env, world, size))
     write_whole(Path(path), encode_mp4(np.stack(frames), 1.0 / (every * env.backend.scene.control_dt)))
+
+
+def _frame(env: ManipulationEnv, world: int, size: tuple[int, int]) -> np.ndarray:
+    """Draw a world, above what the policy's cameras show of it."""
+    picture = env.render(world, size)
+    if env.vision is None:
+        return picture
+    return np.vstack((picture, env.vision.cameras.picture(world, size[0])))

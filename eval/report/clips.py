@@ -6,15 +6,21 @@ import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
+from xreset.cameras.config import VisionConfig
 from xreset.errors import FileFormatError, XResetError, needs
 from xreset.eval.results import Table
 from xreset.eval.rollout import Trace
+from xreset.physics import State
 from xreset.pictures.render import Camera, Renderer, pose_matrix
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
+
+if TYPE_CHECKING:
+    from xreset.cameras.sensor import Cameras
 
 SIZE = (400, 300)
 """Width and height of a film [pixels]; even, because video encoders need it."""
@@ -124,6 +130,24 @@ def count_failures(episodes: Table) -> dict[str, int]:
     return {what: int(rows.sum()) for what, rows in missed.items()}
 
 
+def missed_by_student(student: Table, teacher: Table) -> str:
+    """Return one sentence: which objects a policy misses in episodes that its teacher ends at the goal.
+
+    Args:
+        student: episodes of the policy.
+        teacher: episodes of its teacher from the same starts, in the same engines.
+    """
+    same = ["engine", "sequence_name", "repetition", "object"]
+    both = student.merge(teacher, on=same, suffixes=("", "_teacher"))
+    solved = both[both["reorient_teacher"]]
+    missed = solved[~solved["reorient"]]
+    parts = []
+    for name, count in missed["object"].value_counts().items():
+        parts.append(f"{name} {count} of {int((solved['object'] == name).sum())}")
+    where = f": {', '.join(parts)}" if parts else ""
+    return f"Of {len(solved)} episodes that the teacher ends at the goal, the student misses {len(missed)}{where}."
+
+
 # Drawing --------------------------------------------------------------------------------------------------------------
 
 
@@ -154,13 +178,38 @@ def finite_states(trace: Trace) -> np.ndarray:
     return np.asarray(np.isfinite(state).all(axis=1))
 
 
-def draw_state(renderer: Renderer, trace: Trace, row: int) -> np.ndarray:
-    """Draw one state of a trace, with the goal as a translucent object."""
+def draw_state(renderer: Renderer, trace: Trace, row: int, eyes: Cameras | None = None) -> np.ndarray:
+    """Draw one state of a trace, with the goal as a translucent object, above what the policy's cameras show."""
     pose = pose_matrix(trace.object_pos[row], trace.object_quat[row])
-    return renderer.draw(trace.joint_pos[row], pose, goal_pose=pose_matrix(trace.goal_pos, trace.goal_quat))
+    picture = renderer.draw(trace.joint_pos[row], pose, goal_pose=pose_matrix(trace.goal_pos, trace.goal_quat))
+    if eyes is None:
+        return picture
+    now = (trace.joint_pos[row], trace.object_pos[row], trace.object_quat[row], trace.goal_pos, trace.goal_quat)
+    joints, pos, quat, goal_pos, goal_quat = (torch.as_tensor(value, dtype=torch.float32)[None] for value in now)
+    eyes.aim(State.at_rest(joints, pos, quat), goal_pos, goal_quat, torch.ones(1, dtype=torch.bool))
+    eyes.cast()
+    eyes.observe(torch.Generator().manual_seed(row))
+    return np.vstack((picture, eyes.picture(0, picture.shape[1])))
 
 
-def draw_clip(engine: str, episode: Any, trace: Trace, robot: RobotSpec, obj: ObjectSpec, camera: Camera) -> Clip:
+def policy_cameras(robot: RobotSpec, obj: ObjectSpec, vision: VisionConfig | None) -> Cameras | None:
+    """Return the cameras of a policy that sees, to draw what they show."""
+    if vision is None or not vision.cameras:
+        return None
+    from xreset.cameras.sensor import Cameras  # Warp, which other policies do not need
+
+    return Cameras(SceneSpec(robot=robot, objects=(obj,)), torch.zeros(1, dtype=torch.long), vision)
+
+
+def draw_clip(
+    engine: str,
+    episode: Any,
+    trace: Trace,
+    robot: RobotSpec,
+    obj: ObjectSpec,
+    camera: Camera,
+    eyes: Cameras | None = None,
+) -> Clip:
     """Draw a trace as a film. After a state that is not finite, the film shows the last finite one."""
     interval = float(trace.time[1] - trace.time[0]) if len(trace.time) > 1 else 1.0 / FRAMES_PER_SECOND
     every = max(1, round(1.0 / (FRAMES_PER_SECOND * interval)))
@@ -168,12 +217,12 @@ def draw_clip(engine: str, episode: Any, trace: Trace, robot: RobotSpec, obj: Ob
     last = len(finite) - 1 if finite.all() else max(int(np.argmin(finite)) - 1, 0)
     rows = np.minimum(np.arange(0, len(trace.time), every), last).tolist()
     renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=SIZE, camera=camera)
-    pictures = {row: draw_state(renderer, trace, row) for row in set(rows)}
+    pictures = {row: draw_state(renderer, trace, row, eyes) for row in set(rows)}
     frames = np.stack([pictures[row] for row in rows])
     return Clip(engine=engine, episode=episode, frames=frames, fps=1.0 / (every * interval), finite=bool(finite.all()))
 
 
-def draw_strip(episode: Any, trace: Trace, robot: RobotSpec, obj: ObjectSpec) -> Strip:
+def draw_strip(episode: Any, trace: Trace, robot: RobotSpec, obj: ObjectSpec, eyes: Cameras | None = None) -> Strip:
     """Draw an episode's strip; states that are not finite are grey."""
     camera = camera_for([trace], distance=0.7)
     renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=STRIP_SIZE, camera=camera)
@@ -182,9 +231,9 @@ def draw_strip(episode: Any, trace: Trace, robot: RobotSpec, obj: ObjectSpec) ->
     pictures = []
     for row in rows:
         if finite[row]:
-            pictures.append(draw_state(renderer, trace, row))
+            pictures.append(draw_state(renderer, trace, row, eyes))
         else:
-            pictures.append(np.full((STRIP_SIZE[1], STRIP_SIZE[0], 3), 128, dtype=np.uint8))
+            pictures.append(np.full_like(pictures[0], 128))  # the first state is finite: the episode began with it
     times = tuple(float(trace.time[row]) for row in rows)
     return Strip(episode=episode, picture=np.concatenate(pictures, axis=1), times=times)
 

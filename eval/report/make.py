@@ -102,17 +102,19 @@ def _draw(
     meshes = mesh_folder(objects, data.results[0].objects_folder)
     names = {trace.object for _, trace in missed} | {trace.object for trace in traces.values()}
     loaded = {name: load_object(name, meshes) for name in sorted(names)}
+    vision = data.run.config.task.vision if data.run else None
+    eyes = {name: drawing.policy_cameras(spec, obj, vision) for name, obj in loaded.items()}
     camera = drawing.camera_for(list(traces.values()))
     total = len(traces) + len(missed)
     clips = []
     for engine, trace in traces.items():
         progress(len(clips), total)
         episode = drawing.recorded_episode(data.episodes, engine, sequence)
-        clips.append(drawing.draw_clip(engine, episode, trace, spec, loaded[trace.object], camera))
+        clips.append(drawing.draw_clip(engine, episode, trace, spec, loaded[trace.object], camera, eyes[trace.object]))
     strips = []
     for episode, trace in missed:
         progress(len(clips) + len(strips), total)
-        strips.append(drawing.draw_strip(episode, trace, spec, loaded[trace.object]))
+        strips.append(drawing.draw_strip(episode, trace, spec, loaded[trace.object], eyes[trace.object]))
     progress(total, total)
     return clips, strips
 

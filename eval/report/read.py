@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from xreset.errors import FileFormatError, RunError, XResetError, needs
+from xreset.eval.report.clips import missed_by_student
 from xreset.eval.results import EvalResult, Table, read_evaluation
 from xreset.eval.stress import Stress, read_stress
 from xreset.files import read_json
@@ -19,7 +20,7 @@ from xreset.learning.choice import Choice, read_choice
 from xreset.learning.clock import FILE as LIFT_FILE
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
-from xreset.learning.run import RunInfo, read_run
+from xreset.learning.run import TEACHER, RunInfo, read_run
 from xreset.policies import results_folder, shipped
 from xreset.text import short_name
 
@@ -145,6 +146,14 @@ def collect(folder: Path) -> ReportData:
             trained_with = str(read_json(folder / "run.json", RUN_SCHEMA, keep_version=True).get("xreset"))
         except FileFormatError as error:  # results outlive a change of the training's configuration
             notes.append(f"The training is not described here: {error}")
+    if run is not None and run.teacher is not None:
+        if taught := read_evaluation(folder / "teacher"):
+            notes.append(missed_by_student(evaluation.to_frame(), taught.to_frame()))
+        else:
+            notes.append(
+                "The teacher was not evaluated from the same starts. Make its results first: "
+                f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
+            )
     choice = read_choice(results.parent)
     if choice is not None and choice.policy_hash not in {s.inputs.get("policy") for s in evaluation}:
         choice = None

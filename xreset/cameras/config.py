@@ -26,7 +26,7 @@ class DepthNoise(Checked):
     """Distance between two depths that the camera can tell apart at 1 m [m]."""
     holes: Share[float] = 0.01
     """Share of the pixels that see nothing."""
-    edges: Share[float] = 0.5
+    edges: Share[float] = 0.2
     """Share of the pixels next to an edge that see nothing."""
     edge: Positive[float] = 0.03
     """Step in depth that counts as an edge [m]. A plane has none, however steeply the camera sees it."""

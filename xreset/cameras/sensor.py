@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 import trimesh
+from PIL import Image
 from torch import Tensor
 
 from xreset.cameras.config import CameraConfig, VisionConfig
@@ -161,6 +162,19 @@ class Cameras:
             view = torch.stack(clouds, dim=1)
         self._view.copy_(torch.where(due, view, self._view))
         return self._view
+
+    def picture(self, world: int, width: int) -> np.ndarray:
+        """Return the newest images of a world side by side, [h, width, 3] uint8: near is bright, nothing is black.
+
+        Args:
+            world: index of the world.
+            width: width of the picture in pixels; its height is even.
+        """
+        images = self.image[world]
+        near = torch.where(images > 0, 0.2 + 0.8 * (self._far - images) / (self._far - self._near), 0.0)
+        pixels = Image.fromarray((255 * torch.cat(tuple(near), dim=1)).byte().cpu().numpy())
+        height = 2 * round(width * pixels.height / pixels.width / 2)
+        return np.asarray(pixels.resize((width, height), Image.Resampling.NEAREST).convert("RGB"))
 
     def shows_object(self) -> Tensor:
         """[N] bool: whether the newest images show the object, if they had no errors."""

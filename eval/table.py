@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -67,6 +67,16 @@ VERSIONS = (
     "The others are its draft's."
 )
 """Says of every table which version of the paper a figure refers to."""
+OPEN_LOOP = (
+    "Task progress of ik near 33 % means that the hand gets to the object and does not grasp it. It does not rank "
+    "hands: `xreset robots judge` does."
+)
+"""Says how to read the figure of the baseline ``ik``."""
+
+
+def caption(policies: Iterable[str]) -> str:
+    """Return how to read figures of these policies."""
+    return f"{VERSIONS} {OPEN_LOOP}" if "ik" in policies else VERSIONS
 
 
 def success_text(share: float | None) -> str:
@@ -158,7 +168,7 @@ def results_table(summaries: Sequence[EvalResult]) -> Table:
     first = summaries[0]
     title = f"{first.policy} on {first.robot}\n"
     title += f"{first.episodes} episodes of {len(first.per_demo)} demonstrations, seed {first.seed}"
-    table = Table("", title=title, title_justify="left", caption=VERSIONS, caption_justify="left")
+    table = Table("", title=title, title_justify="left", caption=caption([first.policy]), caption_justify="left")
     table.columns[0].no_wrap = True
     for s in summaries:
         table.add_column(s.backend, justify="right", no_wrap=True)

@@ -19,7 +19,7 @@ from xreset.eval.report.groups import Group, grouped, scores, singles
 from xreset.eval.report.page import headline, page
 from xreset.eval.report.read import ReportData, Training, collect, read_trainings
 from xreset.eval.results import EvalResult, mesh_folder, read_traces
-from xreset.eval.table import VERSIONS, Rows
+from xreset.eval.table import Rows, caption
 from xreset.files import claim_folder, write_whole
 from xreset.objects.catalogue import load_object
 from xreset.text import short_name
@@ -211,7 +211,10 @@ def _captions(trainings: Sequence[Training], groups: Sequence[Group]) -> list[st
             f"From home at full gravity, {count} episodes of each training in each engine. "
             "The 95 % interval is a bootstrap over demonstrations."
         )
-        captions.append(VERSIONS)
+        policies = []
+        for training in trainings:
+            policies += [result.policy for result in training.results.values()]
+        captions.append(caption(policies))
     for group in groups:
         if len(group.members) > 1:
             names = ", ".join(m.label for m in group.members)

@@ -14,7 +14,7 @@ from xreset.eval.report import figures
 from xreset.eval.report.clips import Clip, Strip, count_failures, encode_mp4
 from xreset.eval.report.read import ReportData
 from xreset.eval.results import EvalResult
-from xreset.eval.table import FIGURES, VERSIONS, distance_text
+from xreset.eval.table import FIGURES, caption, distance_text
 from xreset.files import code_version
 from xreset.pictures.render import encode_png
 from xreset.text import short_name
@@ -37,7 +37,7 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) 
         "report.html.j2",
         data=data,
         figures=FIGURES,
-        versions=VERSIONS,
+        versions=caption(result.policy for result in data.results),
         title=data.title,
         headline=headline(data),
         facts=_facts(data),

@@ -13,7 +13,7 @@ from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import paper_training
 from xreset.eval.study.plan import Plan, Run
 from xreset.eval.study.tables import FilledTable, draw, fill
-from xreset.eval.table import VERSIONS, Rows
+from xreset.eval.table import Rows, caption
 from xreset.files import write_whole
 from xreset.learning.clock import Lift, read_lift
 from xreset.text import short_name
@@ -69,7 +69,8 @@ def write_page(plan: Plan, out: Path) -> Page:
         runs=Rows(head=_HEAD, body=tuple(_run_row(run, trained.get(run.name)) for run in plan.runs)),
     )
     compared = _compare(plan, out)
-    write_whole(page.path, render("study.md.j2", plan=plan, compared=compared, versions=VERSIONS, **vars(page)))
+    versions = caption(run.policy for run in plan.runs)
+    write_whole(page.path, render("study.md.j2", plan=plan, compared=compared, versions=versions, **vars(page)))
     return page
 
 

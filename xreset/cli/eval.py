@@ -25,7 +25,8 @@ def evaluate(
 
     Args:
         policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or
-            a baseline: zero, random, ik (open-loop kinematic retargeting).
+            a baseline: zero, random, ik (open-loop kinematic retargeting; near 33 % task progress it gets to the object
+            and does not grasp it).
         backend: Physics engine; give it again for more engines. Default: mujoco.
         demos: Demonstrations (xreset demos), retargeted trajectories (xreset retarget) or a goal set (xreset goals):
             starts and goals, and the path of ik.

@@ -20,6 +20,8 @@ GAP = 0.02
 """Narrower gaps between the shapes of a link count as solid, because no finger fits in [m]."""
 _SPACING = 2.5e-3
 """Grid spacing [m]."""
+_ENTRIES = 4_000_000
+"""Distances of points from planes that are computed at once: 32 MB."""
 _SAMPLES = 2e-3
 """Spacing of samples on the surface of a hull, for the distance of points outside from its edges [m]."""
 
@@ -75,7 +77,10 @@ def _distance_from_hull(shape: Shape, points: np.ndarray) -> np.ndarray:
 
     planes = half_spaces(shape)
     mesh = shape_mesh(shape)
-    distance = (points @ planes[:, :3].T + planes[:, 3]).max(axis=1)  # exact inside, and where a face is nearest
+    parts = []
+    for part in np.array_split(points, len(points) * len(planes) // _ENTRIES + 1):
+        parts.append((part @ planes[:, :3].T + planes[:, 3]).max(axis=1))
+    distance = np.concatenate(parts)  # exact inside, and where a face is nearest
     outside = distance > _SAMPLES / 2
     vertices = subdivide_to_size(mesh.vertices, mesh.faces, _SAMPLES)[0]
     to_samples, _ = cKDTree(vertices).query(points[outside])

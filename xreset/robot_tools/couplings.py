@@ -16,6 +16,7 @@ _OPEN = 3e-3
 """[m] Gap that a loop may have when its joints follow straight lines."""
 _CURVED = 0.05
 """[rad or m] By which a coupling by a curve may be off its straight line."""
+_MOST_LOOPS = 20
 _STILL = 2e-3
 """[rad or m] A joint of a loop that moves by less is fixed."""
 _GAP_WEIGHT = 1e4
@@ -117,14 +118,17 @@ def read_couplings(model: Any, mujoco: Any) -> Couplings:
             tendons.append(target)
         else:
             found.notes.append(f"left out: the actuator {model.actuator(actuator).name!r}, which drives no joint")
-    _read_equalities(model, mujoco, found, lines)
     try:
+        _read_equalities(model, mujoco, found, lines)
         _read_tendons(model, mujoco, found, lines, driven, tendons)
         found.lines = resolved(lines, driven)
-        if loops := _loops(model, mujoco):
+        loops = _loops(model, mujoco)
+        if len(loops) > _MOST_LOOPS:
+            found.problems.append(f"{len(loops)} closed loops, expected {_MOST_LOOPS} at most. Remove bars of linkages")
+        elif loops:
             _close(model, mujoco, found, loops, driven)
-    except ValueError as error:
-        found.problems.append(f"{error}. Remove one of the equalities")
+    except (ValueError, ZeroDivisionError) as error:
+        found.problems.append(f"equalities or tendons that cannot be read ({error}). Remove what couples these joints")
     return found
 
 
@@ -292,6 +296,8 @@ def _close(model: Any, mujoco: Any, found: Couplings, loops: list[_Loop], driven
         joints = _moving(group)
         free = sorted(joints - lines.keys() - found.held.keys())
         sources = {lines[joint].source for joint in joints if joint in lines}
+        if not free:  # equalities of joints close it
+            continue
         if len(sources) != 1:
             drives = ", ".join(_name(model, joint) for joint in sources) or "none"
             found.problems.append(

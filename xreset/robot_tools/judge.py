@@ -374,11 +374,9 @@ def judge_picture(judgement: Judgement, robot: RobotSpec, objects: Sequence[Obje
             camera = Camera(eye=tuple(target + np.array((0.42, -0.42, 0.22))), target=tuple(target))
             pose = pose_matrix(target, moment["object_quat"])
             tile = renderer.draw(moment["joint_pos"], pose, camera=camera)
-            caption = (name, "") if phase == "start" else (phase, _shares(judgement, backends, name, phase))
-            tiles.append(add_caption(tile, caption, 2))
+            caption = [name if phase == "start" else phase]
+            if phase != "start":
+                caption += [f"{backend} {judgement.share(backend, name, phase):.0%}" for backend in backends]
+            tiles.append(add_caption(tile, caption, 1 + len(backends)))
         rows.append(np.hstack(tiles))
     return np.vstack(rows)
-
-
-def _shares(judgement: Judgement, backends: Sequence[str], name: str, phase: str) -> str:
-    return ", ".join(f"{backend} {judgement.share(backend, name, phase):.0%}" for backend in backends)

@@ -1,13 +1,16 @@
-"""The lift clock: when success from home first passed its marks, over restarts too."""
+"""The lift clock: when success from home first passed its marks, over restarts too. Curves that are sent elsewhere."""
 
 from __future__ import annotations
 
 import tempfile
 import unittest
 from pathlib import Path
+from unittest import mock
 
-from xreset.errors import FileFormatError
+from xreset.errors import FileFormatError, XResetError
+from xreset.files import write_json
 from xreset.learning.clock import FILE, Lift, LiftClock, read_lift
+from xreset.learning.curves import CurveFile
 
 
 class LiftClockTest(unittest.TestCase):
@@ -53,6 +56,28 @@ class LiftClockTest(unittest.TestCase):
         (self.folder / FILE).write_text('{"schema": "xreset-lift/1", "passed": 3}')
         with self.assertRaisesRegex(FileFormatError, "passed is 3, expected a list"):
             read_lift(self.folder)
+
+
+class CurvesTest(unittest.TestCase):
+    def test_curves_are_sent_only_if_a_project_is_named(self):
+        online = mock.Mock()
+        with tempfile.TemporaryDirectory() as name, mock.patch.dict("sys.modules", {"wandb": online}):
+            folder = Path(name)
+            CurveFile(folder).close()
+            online.init.assert_not_called()
+            write_json(folder / "run.json", {"a": 1})
+            curves = CurveFile(folder, "project")
+            curves.write(3, {"speed": 2.0})
+            curves.close()
+            self.assertEqual(online.init.call_args.kwargs["project"], "project")
+            self.assertEqual(online.init.call_args.kwargs["config"], {"a": 1})
+            online.init.return_value.log.assert_called_once_with({"speed": 2.0}, step=3)
+            online.init.return_value.finish.assert_called_once_with()
+            with (
+                mock.patch.dict("sys.modules", {"wandb": None}),
+                self.assertRaisesRegex(XResetError, r"xreset\[wandb\]"),
+            ):
+                CurveFile(folder, "project")
 
 
 if __name__ == "__main__":

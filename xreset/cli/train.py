@@ -32,6 +32,7 @@ def train(
     resume: bool = False,
     like: str = "paper",
     weights: Path | None = None,
+    wandb: str | None = None,
     config: TrainConfig = TrainConfig(),  # noqa: B008 (frozen)
 ) -> None:
     """Train a policy.
@@ -56,6 +57,8 @@ def train(
             again. Default: paper; with --weights and --goals, the run of --weights.
         weights: Another run's folder: start with the networks of its newest checkpoint, with their standard deviation
             and, if it adapts, their learning rate.
+        wandb: Project of Weights & Biases to which learning curves are sent as well. Needs the package wandb, and a
+            login.
         config: Task, model and algorithm. The defaults shown are those of --like.
     """
     if resume and like != "paper":
@@ -63,7 +66,7 @@ def train(
     if resume and weights is not None:
         raise RunError("--resume continues with the run's own networks. Omit --weights, or start another run with it.")
     if resume:
-        training.resume(out, iterations=iterations, minutes=minutes, own=config.task.reward.own)
+        training.resume(out, iterations=iterations, minutes=minutes, own=config.task.reward.own, wandb=wandb)
         return
     if goals is None and (robot is None or resets is None):
         raise RunError("A new run needs --robot and --resets, or --goals. To continue the run in --out, add --resume.")
@@ -86,6 +89,7 @@ def train(
         minutes=minutes,
         seed=seed,
         weights=weights,
+        wandb=wandb,
     )
 
 

@@ -25,10 +25,11 @@ class TrainingLog:
     """Sums on the device during an iteration, so that nothing waits for a GPU; one line and one set of curves after
     it."""
 
-    def __init__(self, folder: Path, num_envs: int, device: str, total: int) -> None:
-        """Start a log in a run folder; ``total`` is the number of iterations in all."""
+    def __init__(self, folder: Path, num_envs: int, device: str, total: int, wandb: str | None = None) -> None:
+        """Start a log in a run folder; ``total`` is the number of iterations in all. See :class:`CurveFile` for
+        ``wandb``."""
         self.clock = LiftClock(folder)
-        self._curves = CurveFile(folder)
+        self._curves = CurveFile(folder, wandb)
         self._returns = torch.zeros(num_envs, device=device)
         self._lengths = torch.zeros(num_envs, device=device)
         self._finished = torch.zeros(3, device=device)  # sum of returns, sum of lengths, number of episodes

@@ -33,7 +33,10 @@ class TrainingRunner(OnPolicyRunner):
         env_steps: control steps of all worlds of all processes.
         elapsed: time of all iterations [s].
         processes: this process among those that train together.
+        wandb: project of Weights & Biases to which learning curves are sent; None: they are not sent.
     """
+
+    wandb: str | None = None
 
     def __init__(self, env: ManipulationEnv, config: TrainConfig, folder: Path, *, teacher: Path | None = None) -> None:
         """Build algorithm and models; rsl-rl's own logging stays off.
@@ -89,7 +92,7 @@ class TrainingRunner(OnPolicyRunner):
         obs = env.get_observations()
         log = None
         if self.processes.is_main:
-            log = TrainingLog(self.folder, env.num_envs, str(env.device), total)
+            log = TrainingLog(self.folder, env.num_envs, str(env.device), total, self.wandb)
             log.clock.resume(self.iteration)
             if self._log_state is not None:
                 log.restore(self._log_state)

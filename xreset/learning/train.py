@@ -50,6 +50,7 @@ def train(
     seed: int = 0,
     weights: str | Path | None = None,
     teacher: str | Path | None = None,
+    wandb: str | None = None,
 ) -> Path:
     """Train a new policy, and export it as ``policy.onnx`` in the run folder.
 
@@ -74,6 +75,8 @@ def train(
         seed: seed of every random number.
         weights: another run's folder, whose networks are the start; default: new networks.
         teacher: policy whose actions the new one learns instead of learning from rewards; see :func:`distill`.
+        wandb: project of Weights & Biases to which learning curves and configuration are sent; default: nothing is
+            sent.
 
     Returns:
         The run folder, which ``xreset.load_policy`` reads.
@@ -133,7 +136,7 @@ def train(
         weights_hash=file_hash(start) if start else None,
         teacher=str(teacher) if teacher else None,
     )
-    _run(out, info, inputs, minutes=minutes, resumed=False)
+    _run(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
     return out
 
 
@@ -233,6 +236,7 @@ def resume(
     iterations: int | None = None,
     minutes: float = math.inf,
     own: Mapping[str, float] | None = None,
+    wandb: str | None = None,
 ) -> Path:
     """Continue a run from its newest checkpoint, and export its policy; see :func:`train`.
 
@@ -242,6 +246,7 @@ def resume(
         minutes: most time to train now.
         own: the user's own reward terms with which the run was started. They name code to import, which a file must not
             decide.
+        wandb: as for :func:`train`.
 
     Raises:
         RunError: the run has other reward terms of the user's own, the bank is not the run's, the newest checkpoint
@@ -263,7 +268,7 @@ def resume(
         raise RunError(
             f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."
         )
-    _run(out, info, inputs, minutes=minutes, resumed=True)
+    _run(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
     return out
 
 
@@ -271,7 +276,7 @@ _NO_MEMORY = re.compile("Failed to allocate|out of memory")
 """How Warp reports too little memory, as a ``RuntimeError``."""
 
 
-def _run(out: Path, info: RunInfo, inputs: Inputs, *, minutes: float, resumed: bool) -> None:
+def _run(out: Path, info: RunInfo, inputs: Inputs, *, minutes: float, resumed: bool, wandb: str | None = None) -> None:
     """Train while this process alone writes the folder, and leave the process's global state as it was."""
     if not minutes > 0:
         raise RunError(f"--minutes is {minutes}, expected more than 0.")
@@ -285,7 +290,7 @@ def _run(out: Path, info: RunInfo, inputs: Inputs, *, minutes: float, resumed: b
             undo.enter_context(claim_folder(out))
             undo.enter_context(claim_folder(out / "checkpoints"))
         try:
-            _train(processes, out, info, inputs, seconds=60 * minutes, resumed=resumed)
+            _train(processes, out, info, inputs, seconds=60 * minutes, resumed=resumed, wandb=wandb)
         except (MemoryError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and not _NO_MEMORY.search(str(error)):
                 raise
@@ -296,7 +301,16 @@ def _run(out: Path, info: RunInfo, inputs: Inputs, *, minutes: float, resumed: b
             ) from error
 
 
-def _train(processes: Processes, out: Path, info: RunInfo, inputs: Inputs, *, seconds: float, resumed: bool) -> None:
+def _train(
+    processes: Processes,
+    out: Path,
+    info: RunInfo,
+    inputs: Inputs,
+    *,
+    seconds: float,
+    resumed: bool,
+    wandb: str | None,
+) -> None:
     config = info.config
     device = processes.device(info.device)
     seed = processes.seed(info.seed)
@@ -308,6 +322,7 @@ def _train(processes: Processes, out: Path, info: RunInfo, inputs: Inputs, *, se
         if env.vision is not None:
             env.vision.check_sees_objects()
         runner = TrainingRunner(env, config, out, teacher=out / TEACHER if info.teacher else None)
+        runner.wandb = wandb
         if resumed and checkpoints(out):
             runner.load_checkpoint(latest_checkpoint(out))
         elif info.weights is not None:

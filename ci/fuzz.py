@@ -56,12 +56,12 @@ def _round(
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--reader", help="only this one")
+    parser.add_argument("--reader", nargs="+", help="only these")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     with readers() as found:
-        chosen = {name: reader for name, reader in found.items() if options.reader in (None, name)}
+        chosen = {name: reader for name, reader in found.items() if not options.reader or name in options.reader}
         counts = {name: Counter() for name in chosen}
         broken: dict[str, dict[str, bytes]] = {name: {} for name in chosen}
         slowest = dict.fromkeys(chosen, 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,7 +131,7 @@ def load_policy(policy: str | Path, *, robot: str | Path | None = None, seed: in
         return _baseline(name, robot, seed)
     path = Path(policy)
     objects_folder = None
-    if path.is_dir():
+    if os.path.isdir(path):
         from xreset.learning.export import ensure_policy
 
         run = read_run(path)
@@ -139,7 +140,7 @@ def load_policy(policy: str | Path, *, robot: str | Path | None = None, seed: in
         objects_folder = Path(run.objects) if run.objects else None
         robot = robot or run.robot
         name = path.name
-    elif path.suffix == ".onnx" or path.exists():
+    elif path.suffix == ".onnx" or os.path.exists(path):
         file = path
         folder = path.parent
         name = path.stem

@@ -6,6 +6,7 @@ states.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -319,6 +320,8 @@ def _read_table(folder: Path, result: EvalResult, run: str) -> Table:
 
 def read_results(folder: Path) -> list[EvalResult]:
     """Read the result of every engine in an ``eval`` folder, in order of name."""
+    if not os.path.isdir(folder):
+        return []
     files = [f for f in folder.glob("*.json") if not f.name.endswith(".episodes.json")]
     return [read_result(file) for file in sorted(files, key=lambda f: f.stem)]
 

@@ -1,15 +1,21 @@
-"""Every reader with a valid file, ways to damage it, and what must hold then: an error that the user can mend, or sound content."""
+"""Every reader with a valid file, ways to damage it, and what must hold then: an error that the user can mend, or sound content.
+
+A reader may read several files, of which one is damaged and contradicts the others. It may take the damaged text as the name of a file, or as the
+options of a command.
+"""
 
 from __future__ import annotations
 
 import io
 import json
 import logging
+import os
+import pickle
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +30,7 @@ from tests.toy_bank import SOUP, toy_bank
 from tests.toy_policy import write_policy
 from tests.toy_results import toy_rollouts, toy_summary
 from tests.toy_robot import toy_hand_arm
-from xreset.demos.archive import read_demos, write_demos
+from xreset.demos.archive import merge_demos, read_demos, write_demos
 from xreset.errors import XResetError
 from xreset.files import read_json, write_json
 from xreset.geometry import urdf
@@ -35,7 +41,7 @@ from xreset.resets.bank import read_bank, write_bank
 from xreset.retarget.file import read_retargeted, write_retargeted
 
 SECONDS = 20.0
-"""Longest time that a reader may take over a file of some kilobytes."""
+"""Most time of a processor that a reader may take over a file."""
 
 Damage = Callable[[bytes], bytes]
 
@@ -52,6 +58,8 @@ class Reader:
     """``npz``, ``json``, ``yaml``, ``text`` or ``bytes``: what damage understands of it."""
     may_hold: tuple[str, ...] = ()
     """Fields that may hold numbers that are not finite."""
+    slow: bool = False
+    """Whether the tests try few files."""
 
 
 @contextmanager
@@ -63,6 +71,7 @@ def readers() -> Iterator[dict[str, Reader]]:
 
     from xreset.backends.conformance import SCHEMA as CONFORMANCE
     from xreset.demos.dexycb import _read_extrinsics, _read_meta, _read_npz
+    from xreset.demos.ho3d import _read_frame
     from xreset.demos.keypoints import read_keypoints, read_transform
     from xreset.demos.synth import synthesize
     from xreset.description import load_robot, read_description
@@ -70,12 +79,14 @@ def readers() -> Iterator[dict[str, Reader]]:
     from xreset.eval.engines.page import page
     from xreset.eval.engines.page import read as read_page
     from xreset.eval.report.read import read_scalars, run_facts
-    from xreset.eval.results import read_episodes, read_result, read_traces, write_results
+    from xreset.eval.results import read_episodes, read_evaluation, read_result, read_traces, write_results
     from xreset.eval.study.file import SHIPPED, read_study
     from xreset.learning.clock import LiftClock, read_lift
     from xreset.learning.runner import read_checkpoint
     from xreset.objects.catalogue import load_object
     from xreset.objects.meshes import read_mesh
+    from xreset.objects.properties import properties_of
+    from xreset.pictures.view.load import load_view
     from xreset.policy import OnnxPolicy, policy_contract
     from xreset.robot_tools.sources import read_source
     from xreset.spec import SceneSpec
@@ -211,15 +222,103 @@ def readers() -> Iterator[dict[str, Reader]]:
 
         import trimesh
 
-        for suffix in ("stl", "obj", "ply", "off"):
-            path = add(f"mesh .{suffix}", f"box.{suffix}", read_mesh, "bytes" if suffix == "stl" else "text")
-            trimesh.creation.box((0.1, 0.06, 0.04)).export(path)
+        for suffix in ("stl", "obj", "ply", "off", "glb", "gltf"):
+            kind = {"stl": "bytes", "glb": "bytes", "gltf": "json"}.get(suffix, "text")
+            path = add(f"mesh .{suffix}", f"box.{suffix}", read_mesh, kind)
+            box = trimesh.creation.box((0.1, 0.06, 0.04))
+            content = (trimesh.Scene(box) if suffix.startswith("gl") else box).export(file_type=suffix)
+            if isinstance(content, dict):  # glTF: a text, and a file with the numbers
+                for name, part in content.items():
+                    (folder / name).write_bytes(part)
+                content = content["model.gltf"]
+            path.write_bytes(content.encode() if isinstance(content, str) else content)
+        (folder / "box.toml").write_text("mass = 0.1\ntolerance = 0.002\n")
+        add("properties", "box.toml", lambda p: properties_of(p.with_suffix(".obj")), "text")
+        frame = {"handJoints3D": None, "objRot": np.zeros((3, 1)), "objTrans": np.zeros(3), "objName": SOUP}
+        add("pickle", "0000.pkl", _read_frame, "bytes", ("joints",)).write_bytes(pickle.dumps(frame, protocol=2))
+
+        # several files that contradict each other
+        may = ("hand_keypoints", "wrist_quat_wxyz", "hand_error", "wrist_error")
+        path = add("two archives", "more.npz", lambda p: merge_demos([read_demos(p), toy_demos()]), "npz", may)
+        write_demos(path, toy_demos())
+        path = add(
+            "motion and archive", "seen.npz", lambda p: load_view(p, demos=folder / "demos.npz"), "npz", (*may, "human")
+        )
+        write_retargeted(path, toy_retargeted(openarm), config={}, inputs={})
+        (folder / "both").mkdir()
+        write_results(folder / "both", toy_summary(rollouts=rollouts), rollouts, ("a", "b", "c"))
+        for what, file in (("result and episodes", "mujoco.json"), ("episodes and result", "mujoco.episodes.json")):
+            add(what, f"both/{file}", lambda p: read_evaluation(p.parent) and None, "json")
+
+        # names and options
+        path = add("name of a robot", "robot.txt", lambda p: load_robot(_text(p)), "text", ("hand_keypoints",))
+        path.write_text("openarm")
+        add("name of a mesh", "name.txt", lambda p: _named(folder / "box.obj", p), "text").write_text("a-name")
+        options = [
+            "demos",
+            "select",
+            "demos.npz",
+            "--out",
+            "out.npz",
+            "--per-object",
+            "1",
+            "--objects",
+            "soup",
+            "--share",
+            "0.5",
+        ]
+        add("options of select", "select.json", lambda p: _run(folder, p), "json").write_text(
+            json.dumps({"argv": options})
+        )
+        options = [
+            "objects",
+            "import",
+            "box.obj",
+            "--out",
+            "objects",
+            "--name",
+            "a",
+            "--scale",
+            "1",
+            "--mass",
+            "0.2",
+            "--tolerance",
+            "0.01",
+        ]
+        add("options of import", "import.json", lambda p: _run(folder, p), "json").write_text(
+            json.dumps({"argv": options})
+        )
+        options = [
+            "demos",
+            "synth",
+            "--out",
+            "synth.npz",
+            "--objects",
+            "soup",
+            "--per-object",
+            "1",
+            "--seed",
+            "0",
+            "--fps",
+            "5",
+        ]
+        add("options of synth", "synth.json", lambda p: _run(folder, p), "json").write_text(
+            json.dumps({"argv": options})
+        )
         with_mesh = folder / "meshed" / "robot.urdf"
         with_mesh.parent.mkdir()
         geometry = '<collision><geometry><mesh filename="box.stl"/></geometry></collision>'
         with_mesh.write_text(f'<robot name="x"><link name="a">{geometry}</link></robot>')
         path = add("mesh of a URDF", "meshed/box.stl", lambda p: _fresh_urdf(with_mesh), "bytes")
         path.write_bytes((folder / "box.stl").read_bytes())
+        for what in (
+            "name of a mesh",
+            "options of select",
+            "options of import",
+            "options of synth",
+            "motion and archive",
+        ):
+            found[what] = replace(found[what], slow=True)
         try:
             yield found
         finally:
@@ -231,10 +330,43 @@ def _fresh_urdf(path: Path) -> urdf.RobotTree:
     return urdf.load_urdf(path)
 
 
+def _text(path: Path) -> str:
+    return path.read_bytes().decode("utf-8", "surrogateescape")
+
+
+def _named(source: Path, text: Path) -> None:
+    """Import a mesh whose file has the name that a text file holds."""
+    from xreset.objects.meshes import add_mesh
+
+    with tempfile.TemporaryDirectory() as folder:
+        add_mesh(source, Path(folder), _text(text))
+
+
+def _run(folder: Path, file: Path) -> None:
+    """Run the command whose words a JSON file holds, in a folder that goes."""
+    from tests.data import run
+
+    argv = read_json(file).get("argv")
+    if not isinstance(argv, list) or not argv or argv[0] not in ("demos", "objects"):
+        raise XResetError("no command")
+    here = Path.cwd()
+    with tempfile.TemporaryDirectory() as place:
+        for name in ("demos.npz", "box.obj"):
+            (Path(place) / name).write_bytes((folder / name).read_bytes())
+        os.chdir(place)
+        try:
+            code, said = run(*[word if isinstance(word, str) else json.dumps(word) for word in argv])
+        finally:
+            os.chdir(here)
+    assert "Traceback" not in said, said[-300:]
+    if code:
+        raise XResetError(said[:5000])
+
+
 def outcome(reader: Reader, damaged: bytes) -> str:
     """``refused`` or ``read``; raises ``AssertionError`` if the reader broke, took too long, or took what is wrong."""
     whole = reader.file.read_bytes()
-    began = time.perf_counter()
+    began = time.process_time()
     try:
         reader.file.write_bytes(damaged)
         content = reader.read(reader.file)
@@ -251,7 +383,7 @@ def outcome(reader: Reader, damaged: bytes) -> str:
         assert not problem, f"it took {problem}"
     finally:
         reader.file.write_bytes(whole)
-    seconds = time.perf_counter() - began
+    seconds = time.process_time() - began
     assert seconds < SECONDS, f"it took {seconds:.0f} s"
     return verdict
 
@@ -374,7 +506,16 @@ def _words() -> st.SearchStrategy[Damage]:
 
         return damage
 
-    return st.builds(replaced, st.floats(0, 1, exclude_max=True), st.sampled_from(junk))
+    def grown(at: float) -> Damage:
+        def damage(whole: bytes) -> bytes:
+            lines = whole.splitlines(keepends=True)
+            place = int(at * len(lines))
+            return b"".join([*lines[:place], lines[place] * 20_000, *lines[place + 1 :]]) if lines else whole
+
+        return damage
+
+    where = st.floats(0, 1, exclude_max=True)
+    return st.one_of(*[st.builds(replaced, where, st.sampled_from(junk))] * 9, where.map(grown))
 
 
 def _arrays() -> st.SearchStrategy[Damage]:
@@ -406,6 +547,8 @@ def _arrays() -> st.SearchStrategy[Damage]:
                         )
                     elif how == "text":
                         array = np.full(array.shape, "\x1b[31m[/bold]")
+                    elif how == "grow" and array.dtype.kind != "U" and array.ndim:
+                        array = np.tile(array, (1000,) + (1,) * (array.ndim - 1))
                     elif how == "swap" and len(array.shape) and len(array) > 1:
                         array = array[::-1]
                 except (ValueError, TypeError, OverflowError):
@@ -422,7 +565,7 @@ def _arrays() -> st.SearchStrategy[Damage]:
 
         return damage
 
-    hows = st.sampled_from(("number", "number", "all", "type", "type", "shape", "text", "drop", "swap", "bomb"))
+    hows = st.sampled_from(("number", "number", "all", "type", "type", "shape", "text", "drop", "swap", "bomb", "grow"))
     where = st.floats(0, 1, exclude_max=True)
     return st.builds(changed, where, hows, st.sampled_from(NUMBERS), st.sampled_from(TYPES), where)
 
@@ -446,6 +589,8 @@ def _tree(load: Callable[[Any], Any], dump: Callable[[Any], bytes]) -> st.Search
                 del node[key]
             elif how == "add" and isinstance(node, dict):
                 node["later"] = junk
+            elif how == "grow" and key is not None:
+                node[key] = [node[key]] * 20_000
             elif key is not None:
                 node[key] = junk
             return dump(data)
@@ -453,7 +598,7 @@ def _tree(load: Callable[[Any], Any], dump: Callable[[Any], bytes]) -> st.Search
         return damage
 
     where = st.floats(0, 1, exclude_max=True)
-    hows = st.sampled_from(("replace", "replace", "replace", "drop", "add"))
+    hows = st.sampled_from(("replace", "replace", "replace", "drop", "add", "grow"))
     return st.builds(changed, st.lists(where, min_size=1, max_size=6), hows, st.sampled_from(JUNK))
 
 

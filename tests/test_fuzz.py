@@ -56,7 +56,7 @@ class EveryReader(unittest.TestCase):
         whole = reader.file.read_bytes()
 
         @settings(
-            max_examples=EXAMPLES,
+            max_examples=EXAMPLES // 8 if reader.slow else EXAMPLES,
             deadline=None,
             derandomize=True,
             database=None,

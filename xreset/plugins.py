@@ -7,6 +7,7 @@ and does not affect the others.
 
 from __future__ import annotations
 
+import os
 import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -77,7 +78,7 @@ def robot_folder(name_or_folder: str | Path) -> Path:
     name = str(name_or_folder)
     if name not in plugins(ROBOTS):
         folder = Path(name_or_folder)
-        if folder.is_dir():
+        if os.path.isdir(folder):
             return folder.resolve()
         raise RobotError(f"Unknown robot {name!r}, and no folder has that name. Choose from: {known_plugins(ROBOTS)}.")
     module = load_plugin(ROBOTS, name)

@@ -29,6 +29,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, fields
@@ -220,7 +221,7 @@ def study_path(name: str) -> Path:
     """Return the file of a study, by path or, if the study ships with xreset, by name."""
     path = Path(name)
     shipped = {file.stem: file for file in sorted(SHIPPED.glob("*.toml"))}
-    if path.is_file():
+    if os.path.isfile(path):
         return path
     if name not in shipped:
         raise RunError(f"Unknown study {name!r}. Give a file, or a study that ships with xreset: {', '.join(shipped)}.")

@@ -6,6 +6,7 @@ Lengths in meters, coordinates in the object's mesh frame.
 from __future__ import annotations
 
 import json
+import os
 import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -119,8 +120,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
     """
     import trimesh
 
-    if not path.is_file():
-        raise ObjectError(f"There is no mesh at {path}.")
+    if not os.path.isfile(path):
+        raise ObjectError(f"There is no mesh at {shown(str(path))}.")
     if path.suffix.lower() in _ARCHIVES:
         raise ObjectError(f"{path} is an archive. Unpack it, and give the mesh.")
     try:

@@ -143,9 +143,9 @@ def load_urdf(path: str | Path) -> RobotTree:
         RobotError: the file is missing or damaged, a mesh is missing, the links form no tree, or a joint type is not
             supported.
     """
+    if not os.path.isfile(path):  # Path.is_file() raises OSError for a name that is too long
+        raise RobotError(f"{shown(str(path))} is not a file. Expected a URDF there.")
     path = Path(path).resolve()
-    if not path.is_file():
-        raise RobotError(f"{path} is not a file. Expected a URDF there.")
     if path.stat().st_size > max_bytes() // 16:
         raise RobotError(f"{path} has {path.stat().st_size >> 20} MB, which is too large for a URDF.")
     tree, files = _load(path)
@@ -371,7 +371,7 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
         for each in names:
             for folder in folders:
                 file = Path(os.path.normpath(folder / each))
-                if file.is_relative_to(folders[-1]) and file.is_file():
+                if file.is_relative_to(folders[-1]) and os.path.isfile(file):
                     return file
     except (OSError, ValueError):  # a name that is too long, or contains a zero
         pass

@@ -14,6 +14,7 @@ RUN/eval/, RUN/report/       made by ``xreset eval`` and ``xreset report``
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,7 @@ def read_run(folder: str | Path) -> RunInfo:
     from xreset.policy import check_contract_entries  # imports torch, which --help must not wait for
 
     folder = Path(folder)
-    if not (folder / "run.json").is_file():
+    if not os.path.isfile(folder / "run.json"):
         raise RunError(
             f"{folder} is not a run folder: it has no run.json. Make one with: xreset train --out {folder} ..."
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -81,8 +82,8 @@ def mesh_files(folder: str | Path) -> dict[str, Path]:
     """
     folder = Path(folder)
     expected = "Expected NAME.obj, NAME/textured_simple.obj or NAME/textured.obj."
-    if not folder.is_dir():
-        raise ObjectError(f"There is no folder {folder}. {expected}")
+    if not os.path.isdir(folder):
+        raise ObjectError(f"There is no folder {shown(str(folder))}. {expected}")
     found = {path.stem: path for path in folder.glob("*.obj")}
     for file in ("textured.obj", "textured_simple.obj"):  # the simpler one wins
         found |= {path.parent.name: path for path in folder.glob(f"*/{file}")}
@@ -230,7 +231,7 @@ def add_mesh(
 
 def is_name(text: str) -> bool:
     """Whether a text can be an object's name and a file's."""
-    return bool(text) and text.isascii() and text.replace("_", "").replace("-", "").isalnum()
+    return 0 < len(text) <= 200 and text.isascii() and text.replace("_", "").replace("-", "").isalnum()
 
 
 def read_mesh(path: Path, *, scale: float = 1.0) -> trimesh.Trimesh:

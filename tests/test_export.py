@@ -136,6 +136,7 @@ class LeRobot(Case):
         for words, options in (
             ("is there already", {"folder": self.folder / "eval"}),
             ("must be even", {"size": (321, 240)}),
+            ("Unknown camera rear", {"cameras": ("rear",)}),
         ):
             with self.subTest(words), self.assertRaisesRegex(XResetError, words):
                 write_lerobot(options.pop("folder", self.folder / "set"), recording, **options)
@@ -143,6 +144,17 @@ class LeRobot(Case):
         with self.assertRaisesRegex(XResetError, "no folder"):
             write_lerobot(self.folder / "set", lost)
         self.assertEqual([p.name for p in self.folder.iterdir()], ["eval"])
+
+    @unittest.skipUnless(FILMS, "there is no encoder of films")
+    def test_films_of_depth_cameras(self):
+        recording = read_recorded([self.evaluate()], backends=["sapien"])
+        root = self.folder / "set"
+        write_lerobot(root, recording, size=(64, 48), cameras=("side",))
+        films = sorted(path.parts[-3] for path in root.rglob("*.mp4"))
+        self.assertEqual(films, ["observation.images.depth_side"] * 2 + ["observation.images.front"] * 2)
+        stats = json.loads((root / "meta/stats.json").read_text())["observation.images.depth_side"]
+        self.assertLess(stats["min"][0][0][0], 0.05)  # beyond the table
+        self.assertGreater(stats["max"][0][0][0], 0.4)  # the table
 
     @unittest.skipUnless(LEROBOT and FILMS, "the package lerobot is not installed")
     def test_the_package_reads_it_back(self):

@@ -6,16 +6,19 @@ Shape letters: T frames of an episode, J actuated joints.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from xreset.cameras.config import CAMERAS, VisionConfig
 from xreset.errors import XResetError, needs
 from xreset.eval.export.recorded import Recording
-from xreset.eval.report.clips import draw_state, encode_mp4
+from xreset.eval.report.clips import draw_state, draw_view, encode_mp4, policy_cameras
+from xreset.eval.rollout import Trace
 from xreset.files import atomic_folder, write_json
 from xreset.objects.catalogue import load_object
 from xreset.pictures.render import Renderer
@@ -23,7 +26,12 @@ from xreset.spec import SceneSpec
 
 SCHEMA = "xreset-lerobot/1"
 VERSION = "v3.0"
-VIDEO = "observation.images.front"
+_IMAGES = "observation.images."
+VIDEO = _IMAGES + "front"
+_DEPTH = _IMAGES + "depth_"
+"""Films of depth cameras, followed by the camera's name: near is bright, nothing is black."""
+Painter = Callable[[Trace, int], np.ndarray]
+"""Draws one state of a trace, [H, W, 3]."""
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _ENVIRONMENT = [f"object.{axis}" for axis in _POSE] + [f"goal.{axis}" for axis in _POSE]
 _INDICES = ("frame_index", "episode_index", "index", "task_index")
@@ -42,6 +50,7 @@ def write_lerobot(
     *,
     video: bool = True,
     size: tuple[int, int] = (320, 240),
+    cameras: Sequence[str] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Write a data set; ``docs/rollouts.md`` has its features.
@@ -50,13 +59,18 @@ def write_lerobot(
         folder: folder to write; must not exist, or be empty. It appears whole or not at all.
         video: whether films are drawn: from one camera for all episodes, the goal as a translucent object.
         size: width and height of the films [pixels], even.
+        cameras: names of depth cameras (:data:`xreset.cameras.config.CAMERAS`), each of which gives a film.
         progress: called with (episodes done, episodes in all).
 
     Raises:
-        XResetError: pyarrow or the encoder of films is missing, the folder is not empty, or it cannot be written.
+        XResetError: a camera is unknown, pyarrow or the encoder of films is missing, the folder is not empty, or it
+            cannot be written.
     """
     with needs("pyarrow, which writes LeRobot data sets,", "lerobot"):
         import pyarrow.parquet  # noqa: F401
+    if unknown := set(cameras) - set(CAMERAS):
+        raise XResetError(f"Unknown camera {', '.join(sorted(unknown))}. Choose from: {', '.join(CAMERAS)}.")
+    videos = (VIDEO, *(_DEPTH + name for name in cameras)) if video else ()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise XResetError(f"{folder} is there already. Nothing was changed; choose another --out.")
     if video and (min(size) < 16 or size[0] % 2 or size[1] % 2):
@@ -65,7 +79,7 @@ def write_lerobot(
         )
     try:
         with atomic_folder(folder) as part:
-            _write(part, recording, size if video else None, progress)
+            _write(part, recording, videos, size, progress)
     except OSError as error:
         raise XResetError(
             f"cannot write {folder}: {error.strerror or error}. Nothing was changed; choose another place."
@@ -73,19 +87,23 @@ def write_lerobot(
 
 
 def _write(
-    root: Path, recording: Recording, size: tuple[int, int] | None, progress: Callable[[int, int], None]
+    root: Path,
+    recording: Recording,
+    videos: tuple[str, ...],
+    size: tuple[int, int],
+    progress: Callable[[int, int], None],
 ) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
     count = len(recording.traces)
     offsets = recording.offsets
-    features = _features(recording, size)
+    features = _features(recording, videos, size)
     task_index, tasks = pd.factorize(recording.episodes["task"])
     frames: dict[str, list[np.ndarray]] = {}
     samples: dict[str, list[np.ndarray]] = {}
     rows = []
-    renderers: dict[Any, Renderer] = {}
+    painters: dict[Any, Painter] = {}
     for i, episode in enumerate(recording.episodes.to_dict("records")):
         progress(i, count)
         length = int(offsets[i + 1] - offsets[i])
@@ -113,17 +131,17 @@ def _write(
         }
         for key, values in arrays.items():
             frames.setdefault(key, []).append(values)
-        if size is not None:
+        for video in videos:
             chunk, file = divmod(i, _CHUNK)
-            film = _draw(recording, i, renderers, size)
-            path = root / f"videos/{VIDEO}/chunk-{chunk:03d}/file-{file:03d}.mp4"
+            film = _draw(recording, i, video, painters, size)
+            path = root / f"videos/{video}/chunk-{chunk:03d}/file-{file:03d}.mp4"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(encode_mp4(film, recording.fps, keyframes=_KEYFRAMES))
-            arrays[VIDEO] = film[::10, ::8, ::8].reshape(-1, 3) / 255.0
-            row[f"videos/{VIDEO}/chunk_index"] = chunk
-            row[f"videos/{VIDEO}/file_index"] = file
-            row[f"videos/{VIDEO}/from_timestamp"] = 0.0
-            row[f"videos/{VIDEO}/to_timestamp"] = length / recording.fps
+            arrays[video] = film[::10, ::8, ::8].reshape(-1, 3) / 255.0
+            row[f"videos/{video}/chunk_index"] = chunk
+            row[f"videos/{video}/file_index"] = file
+            row[f"videos/{video}/from_timestamp"] = 0.0
+            row[f"videos/{video}/to_timestamp"] = length / recording.fps
         for key, values in arrays.items():
             samples.setdefault(key, []).append(values)
             row |= {f"stats/{key}/{name}": value for name, value in _stats(key, values).items()}
@@ -168,7 +186,7 @@ def _info(recording: Recording, tasks: int, features: dict[str, Any]) -> dict[st
     }
 
 
-def _features(recording: Recording, size: tuple[int, int] | None) -> dict[str, dict[str, Any]]:
+def _features(recording: Recording, videos: tuple[str, ...], size: tuple[int, int]) -> dict[str, dict[str, Any]]:
     joints = list(recording.robot.joint_names)
     features: dict[str, dict[str, Any]] = {}
     for key, names in (
@@ -177,9 +195,9 @@ def _features(recording: Recording, size: tuple[int, int] | None) -> dict[str, d
         ("action", joints),
     ):
         features[key] = {"dtype": "float32", "shape": [len(names)], "names": names}
-    if size is not None:
-        width, height = size
-        features[VIDEO] = {
+    width, height = size
+    for video in videos:
+        features[video] = {
             "dtype": "video",
             "shape": [height, width, 3],
             "names": ["height", "width", "channels"],
@@ -224,16 +242,26 @@ def _stats(key: str, rows: np.ndarray) -> dict[str, list[Any]]:
     stats = {"min": rows.min(axis=0), "max": rows.max(axis=0), "mean": rows.mean(axis=0), "std": rows.std(axis=0)}
     for name, value in zip(_QUANTILES, np.quantile(rows, list(_QUANTILES.values()), axis=0), strict=True):
         stats[name] = value
-    shape = (3, 1, 1) if key == VIDEO else (-1,)
+    shape = (3, 1, 1) if key.startswith(_IMAGES) else (-1,)
     lists = {name: value.reshape(shape).tolist() for name, value in stats.items()}
     return lists | {"count": [len(rows)]}
 
 
-def _draw(recording: Recording, index: int, renderers: dict[Any, Renderer], size: tuple[int, int]) -> np.ndarray:
+def _draw(
+    recording: Recording, index: int, video: str, painters: dict[Any, Painter], size: tuple[int, int]
+) -> np.ndarray:
     """Return the film [T, H, W, 3] of an episode, always from the same camera, so that episodes can be compared."""
     trace = recording.traces[index]
-    key = (trace.object, recording.meshes[index])
-    if key not in renderers:
-        scene = SceneSpec(robot=recording.robot, objects=(load_object(*key),))
-        renderers[key] = Renderer(scene, size=size)
-    return np.stack([draw_state(renderers[key], trace, row) for row in range(len(trace.time))])
+    named = (trace.object, recording.meshes[index])
+    key = (video, *named)
+    if key not in painters:
+        obj = load_object(*named)
+        if video == VIDEO:
+            renderer = Renderer(SceneSpec(robot=recording.robot, objects=(obj,)), size=size)
+            painters[key] = partial(draw_state, renderer)
+        else:
+            camera = CAMERAS[video.removeprefix(_DEPTH)]
+            eyes = policy_cameras(recording.robot, obj, VisionConfig(cameras=(camera,), width=size[0], height=size[1]))
+            assert eyes is not None, "there is a camera"
+            painters[key] = partial(draw_view, eyes, width=size[0])
+    return np.stack([painters[key](trace, row) for row in range(len(trace.time))])

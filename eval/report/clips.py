@@ -184,12 +184,17 @@ def draw_state(renderer: Renderer, trace: Trace, row: int, eyes: Cameras | None 
     picture = renderer.draw(trace.joint_pos[row], pose, goal_pose=pose_matrix(trace.goal_pos, trace.goal_quat))
     if eyes is None:
         return picture
+    return np.vstack((picture, draw_view(eyes, trace, row, picture.shape[1])))
+
+
+def draw_view(eyes: Cameras, trace: Trace, row: int, width: int) -> np.ndarray:
+    """Draw what cameras of one world show of one state of a trace; see :meth:`Cameras.picture`."""
     now = (trace.joint_pos[row], trace.object_pos[row], trace.object_quat[row], trace.goal_pos, trace.goal_quat)
     joints, pos, quat, goal_pos, goal_quat = (torch.as_tensor(value, dtype=torch.float32)[None] for value in now)
     eyes.aim(State.at_rest(joints, pos, quat), goal_pos, goal_quat, torch.ones(1, dtype=torch.bool))
     eyes.cast()
     eyes.observe(torch.Generator().manual_seed(row))
-    return np.vstack((picture, eyes.picture(0, picture.shape[1])))
+    return eyes.picture(0, width)
 
 
 def policy_cameras(robot: RobotSpec, obj: ObjectSpec, vision: VisionConfig | None) -> Cameras | None:

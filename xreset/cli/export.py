@@ -28,6 +28,7 @@ def lerobot(
     task: str | None = None,
     video: bool = True,
     size: tuple[int, int] = (320, 240),
+    camera: Several = (),
 ) -> None:
     """Write recorded evaluation episodes as a LeRobot data set (v3.0): the first episode of each demonstration and
     engine.
@@ -41,10 +42,12 @@ def lerobot(
         task: The task in words; {object} is replaced by the object's name.
         video: Draw a film of each episode.
         size: Width and height of the films, pixels.
+        camera: Also draw films of this depth camera: front, side or wrist; give it again for more.
     """
     recording = _recording(folders, backend, robot, objects, task)
     with Progress(Console(stderr=True)) as bar:
-        dataset.write_lerobot(out, recording, video=video, size=size, progress=bar.count("writing episodes"))
+        progress = bar.count("writing episodes")
+        dataset.write_lerobot(out, recording, video=video, size=size, cameras=camera, progress=progress)
     _say(recording, out)
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from math import degrees
-from multiprocessing import get_context
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -40,6 +39,12 @@ CURVE_FRAME = 0.25
 CURVE_SECONDS = 10.0
 CURVE_POINTS = 120
 """Most points of a curve."""
+LOOK_AT = np.array((0.57, 0.25, 0.2))
+"""Middle of what happens [m]."""
+RIGHT = np.array((0.79, 0.61, 0.0))
+"""Direction to the right, seen from the camera."""
+NEAR = 0.85
+"""Distance of the camera next to that of other pages."""
 BEHIND = 0.2
 """A delay behind the clock from which the page does not try to catch up [s]."""
 GROWTH = 1.03
@@ -74,11 +79,14 @@ class Page:
         self._turning = False
         self._drawn = self._written = self._due = 0.0
         self._clock = (time.monotonic(), session.time)
-        self._films = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+        self._films = ThreadPoolExecutor(1)
         self._robot: RobotMeshes | None = None
         self._things: list[Any] = []
         self._make_controls()
         self._make_scene()
+        camera = self._server.initial_camera
+        camera.position = NEAR * np.subtract(camera.position, LOOK_AT) + LOOK_AT
+        camera.look_at = LOOK_AT
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._part)
         self._draw()
@@ -111,7 +119,7 @@ class Page:
 
     def close(self) -> None:
         """Stop the server. The session stays open."""
-        self._films.shutdown(cancel_futures=True)
+        self._films.shutdown(wait=False, cancel_futures=True)
         self._server.stop()
 
     def _wish(self, action: Callable[..., Any], *arguments: Any) -> None:
@@ -157,9 +165,10 @@ class Page:
     # Visitors ---------------------------------------------------------------------------------------------------------
 
     def _welcome(self, client: Any) -> None:
-        if client.camera.aspect < 1.0:  # a phone: its controls cover the lower half
-            client.camera.position = (1.5, -1.35, 0.95)
-            client.camera.look_at = (0.55, 0.3, -0.35)
+        if client.camera.aspect < 1.0:  # a phone: its controls cover the lower part
+            below = LOOK_AT - (0.0, 0.0, 0.3)
+            client.camera.position = below + 1.4 * (self._server.initial_camera.position - LOOK_AT)
+            client.camera.look_at = below
         others = len(self._server.get_clients()) - 1
         if others > 0:
             self._tell("A shared robot", f"{others + 1} visitors are here. All of them move the same robot.")
@@ -181,7 +190,7 @@ class Page:
         radius = float(np.ptp(obj.vertices, axis=0).max()) / 2
         middle = (obj.vertices.max(axis=0) + obj.vertices.min(axis=0)) / 2
         body = scene.add_mesh_simple("/object", obj.vertices, obj.faces, color=rgb(OBJECT_COLOR))
-        # Rings turn the goal. The shape itself is dragged.
+        # Rings turn the goal. The shape or, where a hand hides it, the ball next to it is dragged.
         goal = scene.add_transform_controls(
             "/goal", scale=2.4 * radius, disable_axes=True, disable_sliders=True, depth_test=False, line_width=3.5
         )
@@ -193,8 +202,9 @@ class Page:
             opacity=0.4,
             cast_shadow=False,
         )
-        hint = scene.add_label("/hint", "drag me", anchor="bottom-center")
-        self._above = np.array((0.0, 0.0, 1.4 * radius))
+        handle = scene.add_icosphere("/handle", 0.018, rgb(GOAL_COLOR))
+        hint = scene.add_label("/handle/hint", "drag me", position=(0.0, 0.0, 0.02), anchor="bottom-center")
+        self._beside = 1.8 * radius * RIGHT
         points = scene.add_point_cloud(
             "/points", np.zeros((1, 3), np.float32), rgb(TOUCH_COLOR), point_size=0.006, visible=False
         )
@@ -202,11 +212,13 @@ class Page:
         self._robot = robot
         self._body = body
         self._goal = goal
+        self._handle = handle
         self._hint = hint
         self._points = points
-        self._things = [hint, ghost, goal, body, points, *robot.links.values()]
+        self._things = [hint, handle, ghost, goal, body, points, *robot.links.values()]
         goal.on_update(self._turn)
-        ghost.on_drag("left")(self._drag)
+        for part in (ghost, handle):
+            part.on_drag("left")(self._drag)
         self._pull_at(body, None)
         for name, link in robot.links.items():
             self._pull_at(link, name)
@@ -250,7 +262,7 @@ class Page:
             if not self._turning:
                 self._goal.position = env.goal_pos[0].cpu().numpy()
                 self._goal.wxyz = env.goal_quat[0].cpu().numpy()
-                self._hint.position = self._goal.position + self._above
+            self._handle.position = env.goal_pos[0].cpu().numpy() + self._beside
             if self._see.value:
                 self._points.points = session.cloud().astype(np.float32)
         self._drawn = time.monotonic()
@@ -406,8 +418,8 @@ class Page:
             where = f"{100 * last.distance:.1f} cm and {degrees(last.angle):.0f} degrees from the goal."
         if self._paused:
             return f"{where}\n\n{session.engine}, paused"
-        slow = self._factor < 0.9 * self._speed.value
-        return f"{where}\n\n{session.engine}: {self._factor:.2f} x real time{', its best here' if slow else ''}"
+        reason = ", slowed by this machine" if self._factor < 0.9 * self._speed.value else ""
+        return f"{where}\n\n{session.engine}: {self._factor:.2f} x real time{reason}"
 
     # Saving -----------------------------------------------------------------------------------------------------------
 

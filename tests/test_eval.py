@@ -11,20 +11,24 @@ from unittest import mock
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
-from tests.toy_bank import SOUP, SPAM
+from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_results import OBJECTS, toy_rollouts, toy_summary
 from xreset.checks import from_dict
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.evaluate import evaluate
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints, MetricsConfig
-from xreset.eval.policy_spec import PolicySpec
+from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.results import EvalResult, read_results, read_traces, write_results
-from xreset.eval.rollout import Episode
+from xreset.eval.rollout import Episode, roll_out
 from xreset.eval.stats import bootstrap_ci95
 from xreset.eval.table import result_rows
+from xreset.eval.trial import engine, load_trial
 from xreset.files import claim_folder
 from xreset.geometry.rotations import quat_from_axis_angle
+from xreset.objects.catalogue import load_object
+from xreset.objects.sampling import metric_points
 from xreset.physics import Contacts, Health, Links, State
 from xreset.task.config import TaskConfig
 from xreset.task.reading import Reading
@@ -190,6 +194,39 @@ class MetricsTest(unittest.TestCase):
         m.update(both(reading(GOAL), reading(GOAL)), torch.tensor([False, False]))
         torch.testing.assert_close(m.task_progress, torch.tensor([1.0, 0.0]))
         self.assertEqual(m.out_of_bounds.tolist(), [False, True])
+
+
+class RecordedTest(unittest.TestCase):
+    def test_distances_are_those_of_the_recorded_states(self):
+        """Objects fall past their goals. Every control step is recorded here, and numpy computes the distances again."""
+        policy = load_policy("random", robot="ur7e-sharpa")
+        short = replace(policy.task.termination, episode_seconds=0.4)
+        policy = replace(policy, task=replace(policy.task, termination=short))
+        falling = toy_bank(policy.robot)
+        falling.start_pos[:, 2] = (0.30, 0.35, 0.40)
+        falling.goal_pos[:] = (0.51, 0.3, 0.20)
+        falling.goal_quat_wxyz[:] = falling.start_quat_wxyz
+        points = {name: metric_points(load_object(name)) for name in OBJECTS}
+        least = []
+        for seed in range(4):
+            trial = load_trial(policy, falling, seed=seed)
+            with mock.patch("xreset.eval.rollout.TRACE_INTERVAL", 0.0):
+                found = roll_out(policy.start(None), engine("mujoco", workers=0), trial, repetitions=1)
+            for episode, trace in zip(found.episodes, found.traces, strict=True):
+                self.assertEqual(len(trace.time), 25)
+                turn = Rotation.from_quat(trace.object_quat, scalar_first=True)
+                goal = Rotation.from_quat(trace.goal_quat, scalar_first=True)
+                here = np.einsum("tij,pj->tpi", turn.as_matrix(), points[trace.object]) + trace.object_pos[:, None]
+                there = goal.apply(points[trace.object]) + trace.goal_pos
+                distance = np.linalg.norm(here - there, axis=-1).mean(axis=1)
+                expected = (distance.min(), distance[-1], np.linalg.norm(trace.object_pos[-1] - trace.goal_pos))
+                measured = (episode.least_distance, episode.final_distance, episode.final_position_error)
+                np.testing.assert_allclose(measured, expected, atol=5e-6)
+                self.assertAlmostEqual(episode.final_angle, float((turn[-1] * goal.inv()).magnitude()), delta=1e-3)
+                self.assertEqual(episode.published_success, distance.min() <= 0.02)
+                least.append((distance.argmin(), episode.published_success))
+        self.assertTrue(all(0 < step < 24 for step, _ in least), least)
+        self.assertEqual({success for _, success in least}, {True, False})
 
 
 class BootstrapTest(unittest.TestCase):

@@ -45,9 +45,11 @@ class Reach:
         at_home = Rotation.from_matrix(root.numpy())
         level = np.cross((0.0, 0.0, 1.0), at_home.apply(self._center))
         level /= max(float(np.linalg.norm(level)), 1e-9)
-        self._grasps: list[Rotation] = []
+        grasps = []
         for tilt, yaw in product(np.radians(_TILTS), np.radians(_YAWS)):
-            self._grasps.append(Rotation.from_rotvec((0.0, 0.0, yaw)) * Rotation.from_rotvec(tilt * level) * at_home)
+            turned = Rotation.from_rotvec((0.0, 0.0, yaw)) * Rotation.from_rotvec(tilt * level) * at_home
+            grasps.append(turned.as_quat())
+        self._grasps = np.stack(grasps)
 
     @one_thread()
     def holds(self, start: np.ndarray, goal: np.ndarray, turn: Rotation) -> np.ndarray:
@@ -59,13 +61,19 @@ class Reach:
             turn: N rotations from the start to the goal.
         """
         held = np.zeros(len(start), dtype=bool)
-        quats = turn.as_quat()
-        for grasp in self._grasps:
+        turns = turn.as_quat()
+        tried = 0
+        while tried < len(self._grasps) and not held.all():
             left = np.flatnonzero(~held)
-            if len(left):
-                left = left[self._reached(start[left], Rotation.identity(len(left)) * grasp)]
-            if len(left):
-                held[left] = self._reached(goal[left], Rotation.from_quat(quats[left]) * grasp)
+            grasps = self._grasps[tried : tried + max(1, len(self._grasps) // len(left))]  # few objects: many at once
+            tried += len(grasps)
+            rows = np.repeat(left, len(grasps))
+            hands = np.tile(grasps, (len(left), 1))
+            can = self._reached(start[rows], Rotation.from_quat(hands))
+            rows = rows[can]
+            if len(rows):
+                at_goal = Rotation.from_quat(turns[rows]) * Rotation.from_quat(hands[can])
+                held[rows[self._reached(goal[rows], at_goal)]] = True
         return held
 
     def _reached(self, center: np.ndarray, hand: Rotation) -> np.ndarray:

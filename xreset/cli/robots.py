@@ -236,7 +236,8 @@ def judge(
     if fails := found.rows[-1].arm_fails:
         console.print(f"the arm cannot raise or turn the hand that far in {fails} of {found.rows[-1].tried} states")
     if found.without:
-        console.print(f"no accepted state has these objects in the air between thumb and finger: {found.without}")
+        absent = ", ".join(found.without)
+        console.print(f"no accepted state has these objects in the air between thumb and finger: {absent}")
     console.print(
         f"at least half of the states hold, lift and turn these objects in every engine: {', '.join(found.kept) or '-'}"
     )

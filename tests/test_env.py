@@ -369,6 +369,25 @@ class RobustnessTest(WithEnv):
             same = [torch.equal(a, b) for a, b in pairwise(poses)]  # the first pose came with the reset
             self.assertEqual(same, [(step + 2) % period != 0 for step in range(11)])
 
+    def test_a_schedule_scales_all_faults(self):
+        live = RECIPES["live"].config.task
+        tracker = replace(live.randomization.tracker, interval=(1.0, 1.0))
+        faulty = replace(QUIET, randomization=replace(live.randomization, tracker=tracker, hand_latency=(0.0, 4.0)))
+        for scale in (0.0, 0.5):
+            env = self.make(faulty)
+            env.variation.set_fault_scale(scale)
+            env.reset()
+            kept = env.variation.lasting()
+            for name in ("_commands.delay", "_poses.delay", "_proprio.delay", "_lost_actions", "_tracker._bias"):
+                self.assertEqual(bool(kept[name].any()), scale > 0, name)
+            self.assertLessEqual(float(kept["_poses.delay"].max()), scale * 6.0)
+            self.assertLessEqual(float(kept["_pushes.probability"].max()), scale * 0.02)
+            if not scale:
+                for action in self.actions(6):
+                    seen = env.step(action)[0]["policy"][:, :3]
+                    pos = env.backend.state().object_pos
+                    self.assertLess(float((seen - pos).norm(dim=-1).max()), 1e-6)
+
     def test_a_delay_jitters_within_its_range(self):
         env = self.make(self.task(observation_latency=(2.0, 2.0), tracker=TrackerConfig(jitter=3.0)))
         delay = [env.variation._tracker._jittered_delay(env.generator) for _ in range(50)]

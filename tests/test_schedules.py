@@ -3,6 +3,7 @@
 import unittest
 from types import SimpleNamespace
 
+import numpy as np
 import torch
 
 from xreset.learning.config import TrainConfig
@@ -35,6 +36,17 @@ class ScheduleTest(unittest.TestCase):
         runner.train_config = TrainConfig(schedule=ScheduleConfig(demo_probability=((0.0, 1.0), (1.0, 0.0))))
         TrainingRunner._follow_schedule(runner, 0.75)
         self.assertEqual(float(resets.demo_probability), 0.25)
+
+    def test_a_training_moves_its_limit_of_success_and_its_faults(self):
+        set_to = []
+        world = SimpleNamespace(
+            set_success_position=set_to.append, variation=SimpleNamespace(set_fault_scale=set_to.append)
+        )
+        schedule = ScheduleConfig(success_position=((0.0, 0.05), (1.0, 0.01)), faults=((0.0, 0.0), (0.5, 1.0)))
+        runner = SimpleNamespace(world=world, train_config=TrainConfig(schedule=schedule))
+        for progress in (0.25, 1.0):
+            TrainingRunner._follow_schedule(runner, progress)
+        np.testing.assert_allclose(set_to, (0.04, 0.5, 0.01, 1.0))
 
     def test_a_bank_is_needed_where_its_states_are_used(self):
         home = TaskConfig(reset=ResetConfig(demo_probability=0.0))

@@ -81,7 +81,7 @@ class RewardTest(unittest.TestCase):
             "previous_action": torch.zeros(4),
             "out_of_bounds": torch.tensor(False),
         } | changes
-        x = {k: v if k == "is_arm" else v[None] for k, v in x.items()}
+        x = {k: v if k in ("is_arm", "success_position") else v[None] for k, v in x.items()}
         state = State.at_rest(torch.zeros(1, 4), x.pop("object_pos"), x.pop("object_quat"))
         return compute_reward(RewardInput(state=state, **x), config or RewardConfig())
 
@@ -221,6 +221,12 @@ class RewardTest(unittest.TestCase):
         self.assertFalse(success(0.0205, 14.8))
         self.assertFalse(success(0.0195, 15.2))
         self.assertFalse(success(0.0, 0.0, torch.zeros(3, 3)))
+
+    def test_a_schedule_may_change_the_limit_of_success(self):
+        where = torch.tensor([0.5, 0.3, 0.13])
+        for limit, expected in ((0.04, True), (0.01, False)):
+            found = self.reward(object_pos=where, tip_force=self.PRESS, success_position=torch.tensor(limit))
+            self.assertEqual(bool(found.success), expected)
 
     def test_action_penalties(self):
         action, previous = torch.tensor([1.0, -0.5, 0, 0]), torch.tensor([1.0, 0.5, 0.2, 0])

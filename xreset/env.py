@@ -160,6 +160,7 @@ class ManipulationEnv:
         if task.object_frame == "center":
             self._center = per_object(center)
             self._cloud_points = self._cloud_points - self._center[:, None]
+        self._success_position: Tensor | None = None
         self._metric_points = None
         if task.reward.needs_points:
             self._metric_points = per_object(metric_points)
@@ -327,6 +328,12 @@ class ManipulationEnv:
         for name, value in before.items():
             lasting[name][others] = value[others]
 
+    def set_success_position(self, limit: float) -> None:
+        """Replace ``task.reward.success_position`` [m]. The first call must come before the first step."""
+        if self._success_position is None:
+            self._success_position = torch.zeros((), device=self.device)
+        self._success_position.fill_(limit)
+
     def reading(self) -> Reading:
         """Return the present physical state and what follows from it."""
         return Reading.of(self.backend, self._surface_points, self._bad_action, self._center)
@@ -468,6 +475,7 @@ class ManipulationEnv:
                 palm_distance=self._palm_distance(reading) if self.task.reward.needs_palm else None,
                 points=self._metric_points,
                 is_arm=self.actions.is_arm,
+                success_position=self._success_position,
             ),
             self.task.reward,
         )

@@ -145,10 +145,15 @@ class TrainingRunner(OnPolicyRunner):
 
     def _follow_schedule(self, progress: float) -> None:
         """Set what changes during a run to its values at a share of the run."""
-        if points := self.train_config.schedule.demo_probability:
-            self.world.resets.demo_probability.fill_(value_at(points, progress))
-        if points := self.train_config.schedule.teacher:
-            self.alg.teacher_share = value_at(points, progress)
+        schedule = self.train_config.schedule
+        if schedule.demo_probability:
+            self.world.resets.demo_probability.fill_(value_at(schedule.demo_probability, progress))
+        if schedule.success_position:
+            self.world.set_success_position(value_at(schedule.success_position, progress))
+        if schedule.faults:
+            self.world.variation.set_fault_scale(value_at(schedule.faults, progress))
+        if schedule.teacher:
+            self.alg.teacher_share = value_at(schedule.teacher, progress)
 
     def _agreed(self, stop: bool) -> bool:
         """Whether any process is to stop: then all do, after the same iteration."""

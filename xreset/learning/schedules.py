@@ -43,6 +43,12 @@ class ScheduleConfig(Checked):
     evaluated."""
     teacher: ShareSchedule = ()
     """Share of the worlds in which the teacher acts during a distillation. Empty: none."""
+    success_position: ShareSchedule = ()
+    """Replaces ``task.reward.success_position`` [m], such as ``0 0.05 1 0.01``: what counts as success becomes
+    stricter. Evaluations keep their own limits."""
+    faults: ShareSchedule = ()
+    """Factor on the faults of a real loop, such as ``0 0 0.5 1``: all delays, lost actions, errors and losses of the
+    tracker, and the probability of pushes of ``task.randomization``."""
 
 
 def value_at(points: Points, progress: float) -> float:

@@ -56,6 +56,8 @@ class RewardInput:
     """[N, 64, 3] :func:`xreset.objects.sampling.metric_points` of each world's object, in its frame; None: likewise."""
     is_arm: Tensor | None = None
     """[J] bool; None: the arm's actions are penalised like the hand's."""
+    success_position: Tensor | None = None
+    """[] limit of a schedule in place of the configuration's [m]; None: the configuration's."""
 
     @property
     def object_pos(self) -> Tensor:
@@ -156,14 +158,15 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
         gate = (x.tip_distance.sum(dim=-1) <= c.near_tips) & (_given(x.palm_distance) <= c.near_palm)
     position_error = (x.object_pos - x.goal_pos).norm(dim=-1)
     rotation_error = quat_angle(x.object_quat, x.goal_quat)
-    success = gate & (position_error < c.success_position) & (rotation_error < c.success_rotation)
+    success_position = c.success_position if x.success_position is None else x.success_position
+    success = gate & (position_error < success_position) & (rotation_error < c.success_rotation)
     gate_f = gate.to(position_error.dtype)
     success_reward = c.success * success.to(gate_f.dtype)
     distance = position_error
     if c.needs_points:
         distance = mean_distance(x.object_pos, x.object_quat, x.goal_pos, x.goal_quat, _given(x.points))
     if c.success_shape == "points":
-        success = gate & (distance <= c.success_position)
+        success = gate & (distance <= success_position)
         success_reward = c.success * success.to(gate_f.dtype) / (1.0 + 10.0 * distance)
     change = (x.action - x.previous_action).square()
     if c.action_rate_arm is None:

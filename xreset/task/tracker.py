@@ -33,6 +33,8 @@ class Tracker:
         self._wait = zeros() if c.skips_steps else None
         self._last = zeros(7) if c.skips_steps else None
         self._tracker = c
+        self.fault_scale: Tensor | float = 1.0
+        """[] factor on errors and losses of single poses; those of an episode are scaled where they are drawn."""
 
     def lasting(self) -> dict[str, Tensor]:
         """Return all buffers by name, for a snapshot."""
@@ -64,7 +66,7 @@ class Tracker:
             generator: random numbers.
         """
         if self._bias is not None:
-            error = self._bias + self._limits[1] * _symmetric(self._bias, generator)
+            error = self._bias + self.fault_scale * self._limits[1] * _symmetric(self._bias, generator)
             pos = pos + error[:, :3]
             quat = quat_multiply(quat_from_axis_angle(error[:, 3:]), quat)
         if self._wait is not None and self._last is not None:
@@ -72,7 +74,9 @@ class Tracker:
             pose = torch.where(arrives[:, None], torch.cat((pos, quat), dim=-1), self._last)
             self._last.copy_(pose)
             c = self._tracker
-            lost = torch.rand(self._wait.shape, generator=generator, device=generator.device) < c.loss
+            lost = (
+                torch.rand(self._wait.shape, generator=generator, device=generator.device) < c.loss * self.fault_scale
+            )
             pause = sample_range(len(pos), c.loss_steps, generator).round()
             until_next = sample_range(len(pos), c.interval, generator).round() + torch.where(lost, pause, 0.0)
             self._wait.copy_(torch.where(arrives, until_next, self._wait) - 1.0)
@@ -92,7 +96,7 @@ class Tracker:
         jitter = self._tracker.jitter
         if self._delays is None or not jitter:
             return None
-        delay = self._delays.delay + jitter * _symmetric(self._delays.delay, generator)
+        delay = self._delays.delay + self.fault_scale * jitter * _symmetric(self._delays.delay, generator)
         return delay.clamp(0.0, self._config.observation_latency[1])
 
 

@@ -34,6 +34,7 @@ class Variation:
             episode.
         force_gain: [N, 1, 1] factor on the observed forces; None: 1.
         pushes: pushes on object and arm; None: there are none.
+        fault_scale: [] factor on delays, lost actions, faults of the tracker and the probability of pushes; None: 1.
     """
 
     def __init__(self, backend: Backend, config: RandomizationConfig, is_arm: Tensor, proprio_width: int) -> None:
@@ -84,7 +85,15 @@ class Variation:
         )
         self._lost_actions = zeros(1) if config.draws("lost_actions") else None
         self._tracker = Tracker(backend.num_worlds, config, device)
+        self.fault_scale: Tensor | None = None
         self.pushes = Pushes(backend, push, is_arm) if pushed else None
+
+    def set_fault_scale(self, scale: float) -> None:
+        """Set the factor on all faults of a real loop. The first call must come before the first step."""
+        if self.fault_scale is None:
+            self.fault_scale = torch.ones((), device=self._backend.device)
+            self._tracker.fault_scale = self.fault_scale
+        self.fault_scale.fill_(scale)
 
     def lasting(self) -> dict[str, Tensor]:
         """Return all buffers by name, for a snapshot."""
@@ -122,20 +131,23 @@ class Variation:
         drawn = [(samples[name](), kept) for name, kept in self.parameters.items()]
         if self.force_gain is not None:
             drawn.append((sample_range(n, c.force_gain, generator).view(-1, 1, 1), self.force_gain))
+        faults: list[tuple[Tensor, Tensor]] = []
         if self._commands is not None:
             delay = sample_range(n, c.action_latency, generator)
             if c.hand_latency is not None:
                 hand_delay = sample_range(n, c.hand_latency, generator)
                 delay = torch.where(self._is_arm, delay[:, None], hand_delay[:, None])
-            drawn.append((delay, self._commands.delay))
-        drawn += self._tracker.draw(generator)
+            faults.append((delay, self._commands.delay))
+        faults += self._tracker.draw(generator)
         if self._proprio is not None:
-            drawn.append((sample_range(n, c.proprio_latency, generator).round(), self._proprio.delay))
+            faults.append((sample_range(n, c.proprio_latency, generator), self._proprio.delay))
         if self._lost_actions is not None:
-            drawn.append((sample_range(n, c.lost_actions, generator)[:, None], self._lost_actions))
+            faults.append((sample_range(n, c.lost_actions, generator)[:, None], self._lost_actions))
         if self.pushes is not None:
-            drawn.append(self.pushes.draw(generator))
-        return drawn
+            faults.append(self.pushes.draw(generator))
+        if self.fault_scale is not None:
+            faults = [(value * self.fault_scale, kept) for value, kept in faults]
+        return drawn + faults
 
     def begin(self, fresh: Tensor, target: Tensor) -> None:
         """Fill the delay line of the worlds of a mask [N] with the start's joint targets [N, J]."""
@@ -168,7 +180,7 @@ class Variation:
         if self._proprio is None:
             return proprio
         self._proprio.fill(fresh, proprio)
-        return self._proprio.push(proprio)
+        return self._proprio.push(proprio, self._proprio.delay.round())
 
     def scaled_forces(self, force: Tensor) -> Tensor:
         """[N, E, 3] forces as they are observed."""

@@ -48,7 +48,8 @@ class ScheduleConfig(Checked):
     stricter. Evaluations keep their own limits."""
     faults: ShareSchedule = ()
     """Factor on the faults of a real loop, such as ``0 0 0.5 1``: all delays, lost actions, errors and losses of the
-    tracker, and the probability of pushes of ``task.randomization``."""
+    tracker (not its interval), and the probability of pushes of ``task.randomization``. An episode keeps the delays,
+    the biases and the probabilities that it began with."""
 
 
 def value_at(points: Points, progress: float) -> float:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from xreset.geometry.rotations import quat_from_axis_angle, quat_multiply
-from xreset.task.config import RandomizationConfig
+from xreset.task.config import RandomizationConfig, TrackerConfig
 from xreset.task.latency import DelayLine
 from xreset.task.randomization import sample_range
 
@@ -17,14 +17,14 @@ class Tracker:
     def __init__(self, num_worlds: int, config: RandomizationConfig, device: torch.device) -> None:
         """Allocate."""
         self._config = config
-        c = config.tracker if config.enabled else type(config.tracker)()
+        c = config.tracker if config.enabled else TrackerConfig()
 
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(num_worlds, *shape, device=device)
 
-        self._delays = (
-            DelayLine(zeros(7), config.observation_latency[1]) if config.draws("observation_latency") else None
-        )
+        self._delays: DelayLine | None = None
+        if config.draws("observation_latency"):
+            self._delays = DelayLine(zeros(7), config.observation_latency[1])
         self._bias = zeros(6) if c.has_errors else None
         self._limits = torch.tensor(
             [[c.position_bias] * 3 + [c.rotation_bias] * 3, [c.position_noise] * 3 + [c.rotation_noise] * 3],

@@ -23,7 +23,7 @@ from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.file import Retargeted
 from xreset.retarget.hand.config import HandConfig
-from xreset.retarget.hand.jaw import jaw_keypoints
+from xreset.retarget.hand.jaw import contact_shares, jaw_keypoints
 from xreset.retarget.hand.model import HandModel, HandTargets
 from xreset.retarget.hand.solve import HandMotion, retarget_hand
 from xreset.retarget.validity import REASONS, Thresholds, classify
@@ -246,7 +246,7 @@ class _Work:
     ) -> None:
         surfaces = {name: Surface(spec) for name, spec in _by_name(demos, objects).items()}
         self._objects = list(surfaces)
-        self._analytic_jaw = config.hand.jaw == "analytic"
+        self._jaw = config.hand.jaw
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
         self.demos = demos = rest_on_table(demos, objects)
         points, self.touching = human_contacts(demos, surfaces, config.contact_distance)
@@ -263,6 +263,12 @@ class _Work:
             "object_pos": demos.object_pos.astype(np.float64),
             "object_quat": demos.object_quat_wxyz.astype(np.float64),
         }
+        held = self._per_frame["held"]
+        self._contact_shares = np.zeros(self.touching.shape)
+        """[F, 21] see :func:`contact_shares`."""
+        for i in range(demos.num_sequences):
+            rows = demos.frames(i)
+            self._contact_shares[rows] = contact_shares(self.touching[rows], held[rows])
 
     def batches(self, progress: Progress) -> Iterator[tuple[list[int], Callable[[float], None]]]:
         """Iterate over batches of sequences that have a hand, each with a function that reports the share of it that is
@@ -289,8 +295,9 @@ class _Work:
             return torch.as_tensor(out)
 
         chosen = {name: values[:, hand.keypoint_indices] for name, values in self._per_keypoint.items()}
-        if self._analytic_jaw and hand.is_jaw:
-            chosen["keypoints"] = jaw_keypoints(hand, self._per_keypoint["keypoints"])
+        if hand.is_jaw and self._jaw != "fingertips":
+            shares = self._contact_shares if self._jaw == "contacts" else None
+            chosen["keypoints"] = jaw_keypoints(hand, self._per_keypoint["keypoints"], shares)
         which = [self._objects.index(name) for name in self.demos.object_name[list(sequences)].tolist()]
         return HandTargets(
             **{name: padded(values) for name, values in (chosen | self._per_frame).items()},

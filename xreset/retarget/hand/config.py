@@ -21,9 +21,10 @@ Shares = Annotated[
 class HandConfig(Checked):
     """Weights and limits of hand retargeting; weights are the paper's (appendix D.b) unless a field says otherwise."""
 
-    jaw: Literal["optimized", "analytic"] = "optimized"
-    """How a parallel jaw follows: like every hand, by the costs below, or by the published paper's analytic map
-    (:mod:`xreset.retarget.hand.jaw`), which none of them changes. Other hands are always optimized."""
+    jaw: Literal["fingertips", "contacts", "analytic"] = "fingertips"
+    """What a parallel jaw follows (:mod:`xreset.retarget.hand.jaw`). ``fingertips``: the human's, like every hand.
+    ``contacts``: where thumb and fingers touch the held object. ``analytic``: the published paper's map, without the
+    costs below. Other hands ignore it."""
     local_weight: NotNegative[float] = 10.0
     """Bone vectors and bone directions, averaged over the pairs of keypoints."""
     global_weight: NotNegative[float] = 1.0

@@ -61,11 +61,14 @@ def retarget_hand(
     config = config or HandConfig()
     home = targets.keypoints.device
     targets = targets.to(model.device)
-    if config.jaw == "analytic" and model.is_jaw:
+    if model.is_jaw and config.jaw != "fingertips":
         rows = torch.arange(len(targets.annotated), device=model.device)[:, None]
         state = jaw_state(model, targets.keypoints[rows, _nearest_annotated(targets.annotated)])
-        cost = targets.keypoints.new_zeros(len(targets.annotated))
-        return HandMotion(**vars(state), keypoints=model.keypoints(**vars(state)), cost=cost).to(home)
+        own = model.keypoints(**vars(state))
+        if config.jaw == "analytic":
+            return HandMotion(**vars(state), keypoints=own, cost=own.new_zeros(len(own))).to(home)
+        followed = torch.where(model.is_tip[:, None], targets.keypoints, own)
+        targets = replace(targets, keypoints=followed, in_contact=torch.zeros_like(targets.in_contact))
     root_pos, root_quat = _align_root(model, targets)
     joints = model.kinematics.clamp(model.home).expand(*targets.annotated.shape, -1)
     state = HandState(joints, root_pos, root_quat)

@@ -105,10 +105,12 @@ class Page:
         """Fulfil wishes, take a control step if one is due, and wait for the next one."""
         self._fulfil()
         now = time.monotonic()
-        if self._paused or not self._server.get_clients():
+        watched = bool(self._server.get_clients())
+        if self._paused or not watched:
             self._clock = (now, self.session.time)
             self._due = now
-            self._draw()
+            if watched:
+                self._draw()
             time.sleep(FRAME)
             return
         self._step()
@@ -456,7 +458,7 @@ class _Curves:
         self._folder = gui.add_folder(title)
 
     def show(self, times: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
-        """Show values [T, K] of K names over times [T]; curves that are zero throughout are left out of the legend."""
+        """Show values [T, K] of K names over times [T]."""
         data = (times, *np.ascontiguousarray(values.T, dtype=float))
         if tuple(names) == self._names:
             self._plot.data = data

@@ -17,6 +17,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from xreset.errors import BackendUnavailableError, RobotError, XResetError
+from xreset.text import shown
 
 if TYPE_CHECKING:
     from xreset.physics import Backend
@@ -46,7 +47,7 @@ def load_plugin(group: str, name: str) -> Any:
     noun, error_class = _KINDS[group]
     entries = plugins(group)
     if name not in entries:
-        raise error_class(f"Unknown {noun} {name!r}. Choose from: {known_plugins(group)}.")
+        raise error_class(f"Unknown {noun} {shown(name)}. Choose from: {known_plugins(group)}.")
     try:
         return entries[name].load()
     except XResetError:
@@ -80,7 +81,8 @@ def robot_folder(name_or_folder: str | Path) -> Path:
         folder = Path(name_or_folder)
         if os.path.isdir(folder):
             return folder.resolve()
-        raise RobotError(f"Unknown robot {name!r}, and no folder has that name. Choose from: {known_plugins(ROBOTS)}.")
+        known = known_plugins(ROBOTS)
+        raise RobotError(f"Unknown robot {shown(name)}, and no folder has that name. Choose from: {known}.")
     module = load_plugin(ROBOTS, name)
     if not isinstance(module, ModuleType) or not module.__file__:
         raise RobotError(

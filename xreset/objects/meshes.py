@@ -223,7 +223,10 @@ def add_mesh(
         draft = Path(temporary) / target.name
         draft.write_text(text)
         draft.with_suffix(".toml").write_text(known)
-        result = import_with_notes(draft, name, progress=progress)
+        try:
+            result = import_with_notes(draft, name, progress=progress)
+        except ObjectError as error:  # the user knows only the mesh's own name
+            raise ObjectError(str(error).replace(str(draft), str(path))) from error
     write_whole(facts, known)
     write_whole(target, text)
     return result

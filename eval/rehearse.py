@@ -24,7 +24,7 @@ from xreset.eval.plots import COLORS, svg
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.rollout import Episode, Round, episode_of, episode_starts, play_rounds
 from xreset.eval.sensitivity import SWEEPS, Effect, Property
-from xreset.eval.stress import COSTLY, Curve, Point, Stress, amount, chosen, curve, draw_curves, plot_size, stressed
+from xreset.eval.stress import COSTLY, Curve, Point, Stress, chosen, curve, draw_curves, plot_size, stressed
 from xreset.eval.trial import Engine, Trial, engine, load_trial
 from xreset.files import claim_folder, write_json, write_whole
 from xreset.inputs import Data
@@ -266,7 +266,7 @@ def _setting(trial: Trial, prop: Property, value: float) -> tuple[Trial, Faults]
     try:
         return replace(trial, task=stressed(trial.task)), make(value)
     except ValueError as error:
-        raise XResetError(f"{prop.option} {amount(prop.unit, value)} cannot be tried: {error}.") from None
+        raise XResetError(f"{prop.option} {_size(prop.unit, value)} cannot be tried: {error}.") from None
 
 
 class _Player:
@@ -355,12 +355,11 @@ def judge(found: Sequence[Rehearsal]) -> Verdict:
             tried += point is not None
             if point is None or -point.difference <= criterion.most:
                 continue
-            low, high = (100 * bound for bound in point.difference_ci95)
-            fault = f"{criterion.option.replace('-', ' ')} {amount(_unit(criterion), criterion.value)}"
+            low, high = (-100 * bound for bound in reversed(point.difference_ci95))
+            fault = f"{criterion.option.replace('-', ' ')} {_size(_unit(criterion), criterion.value)}"
             text = (
-                f"{card.backend}: {fault} changes "
-                f"task progress by {100 * point.difference:+.1f} points (95 %: {low:+.0f} to {high:+.0f}). "
-                f"A loss of at most {100 * criterion.most:.0f} is wanted."
+                f"{card.backend}: {fault} costs {-100 * point.difference:.1f} points (95 %: {low:.0f} to {high:.0f}). "
+                f"At most {100 * criterion.most:.0f} are wanted."
             )
             if -point.difference_ci95[1] > criterion.most:
                 against.append(text)
@@ -376,6 +375,11 @@ def judge(found: Sequence[Rehearsal]) -> Verdict:
     if tried < len(CRITERIA) * len(found):
         return Verdict(sentence="No verdict: not every fault that decides was tried.", reasons=())
     return Verdict(sentence="Ready for a first, careful trial on a robot.", reasons=())
+
+
+def _size(unit: str, value: float) -> str:
+    """Return a value with its unit, such as ``33 ms`` or ``x 0.7``."""
+    return f"x {value:g}" if unit == "x" else f"{value:g} {unit}"
 
 
 def _unit(criterion: Criterion) -> str:
@@ -420,7 +424,7 @@ def _limit(found: Curve | None) -> str:
     if not values:
         return "none that was tried"
     chance = "" if all(found.is_certain(value) for value in values) else ", or chance"
-    return " and ".join(amount(found.unit, value) for value in values) + chance
+    return " and ".join(_size(found.unit, float(f"{value:.2g}")) for value in values) + chance
 
 
 def page(found: Sequence[Rehearsal]) -> str:
@@ -435,7 +439,7 @@ def page(found: Sequence[Rehearsal]) -> str:
                 if each is not None and point.value != each.nominal:
                     points.setdefault(point.value, [None] * len(found))[i] = point
         for value in sorted(points):
-            rows.append((name.replace("-", " "), amount(unit, value), points[value]))
+            rows.append((name.replace("-", " "), _size(unit, value), points[value]))
     return render(
         "rehearsal.html.j2",
         verdict=judge(found),

@@ -113,7 +113,7 @@ class Stress:
             for value in limits:
                 size = abs(math.log(value)) if curve.unit == "x" else math.inf
                 found = sure if curve.is_certain(value) else perhaps
-                found.append((size, f"{curve.property} {amount(curve.unit, value)}"))
+                found.append((size, f"{curve.property} {_amount(curve.unit, value)}"))
         points = f"{100 * COSTLY:.0f} points"
         parts = [f"{100 * self.task_progress:.0f} %"]
         if sure:
@@ -132,8 +132,7 @@ def _smallest_first(costs: list[tuple[float, str]]) -> str:
     return ", or ".join(text for _, text in ordered)
 
 
-def amount(unit: str, value: float) -> str:
-    """Return a value of a property in words, such as ``x 0.8`` or ``of 33 ms``."""
+def _amount(unit: str, value: float) -> str:
     number = f"{float(f'{value:.2g}'):g}"
     return f"x {number}" if unit == "x" else f"of {number} {unit}"
 
@@ -183,7 +182,7 @@ def stressed(task: TaskConfig, prop: Property | None = None, value: float = 1.0)
     try:
         return replace(task, randomization=replace(still, **{prop.task_field: (value, value)}))
     except ValueError as error:
-        raise XResetError(f"{prop.option} {amount(prop.unit, value)} cannot be tried: {error}.") from None
+        raise XResetError(f"{prop.option} {_amount(prop.unit, value)} cannot be tried: {error}.") from None
 
 
 def stress(

@@ -154,8 +154,8 @@ class ContractTest(unittest.TestCase):
             connect(server.url, origin="http://elsewhere.example")  # type: ignore[arg-type]
 
         def close_after_a_second(time, reading):
-            if time > 1:
-                remote.close()
+            if 1 < time < 1.03:
+                server.close()
             return reading
 
         driver = Robot(self.home, close_after_a_second)

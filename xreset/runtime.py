@@ -511,9 +511,11 @@ class RemoteController(Controller):
         self._timeout = timeout
         try:
             self._socket = connect(url, open_timeout=5, max_size=None, compression=None)
-        except OSError as error:
+        except Exception as error:
             raise LiveError(f"No policy is served at {url} ({error}). Start it: xreset serve POLICY") from error
         hello = self._receive()
+        if "error" in hello:
+            raise LiveError(hello["error"])
         if hello.get("schema") != LIVE_SCHEMA:
             raise LiveError(f"{url} speaks {hello.get('schema')!r}, this runtime speaks {LIVE_SCHEMA!r}.")
         check_contract(hello["contract"], url)
@@ -694,7 +696,8 @@ class Runner:
         self._check(now)
         going = np.isinf(self._stopped_at)
         reading = self._reading
-        if reading is None or not going.any() or np.isinf(reading.object_time[going]).any():
+        has_come = np.isfinite(reading.object_time) & np.isfinite(reading.joint_time) if reading else ~going
+        if reading is None or not going.any() or not has_come[going].all():
             return self._sent
         try:
             target = self.controller.step(reading)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable
-from threading import BoundedSemaphore
 from typing import Any
 
 import numpy as np
@@ -46,7 +45,7 @@ class PolicyServer:
         """
         self._contract = contract
         self._policy = policy
-        self._places = BoundedSemaphore(_CLIENTS)
+        self._clients: set[ServerConnection] = set()
         self._log = logging.getLogger("xreset")
         try:
             self._server: Server = serve(
@@ -58,6 +57,7 @@ class PolicyServer:
                 compression=None,
                 ping_interval=_PATIENCE,
                 ping_timeout=_PATIENCE,
+                close_timeout=1.0,
             )
         except OSError as error:
             raise XResetError(f"Cannot listen at {host}:{port}: {error.strerror}. Choose another --port.") from error
@@ -68,16 +68,19 @@ class PolicyServer:
         self._server.serve_forever()
 
     def close(self) -> None:
-        """End all connections."""
+        """Stop to listen, and end all connections."""
         self._server.shutdown()
+        for client in tuple(self._clients):
+            client.close()
 
     def _talk(self, client: ServerConnection) -> None:
         who = "{}:{}".format(*client.remote_address[:2])
-        if not self._places.acquire(blocking=False):
-            client.send(json.dumps({"error": f"{_CLIENTS} clients are connected, which is the limit."}))
-            return
         steps = 0
         try:
+            if len(self._clients) >= _CLIENTS:
+                client.send(json.dumps({"error": f"{_CLIENTS} clients are connected, which is the limit."}))
+                return
+            self._clients.add(client)
             self._log.warning("%s has connected.", who)
             episode = _Episode(Controller(self._contract, OnnxActor(self._policy)))
             client.send(json.dumps({"schema": LIVE_SCHEMA, "contract": self._contract}))
@@ -89,7 +92,7 @@ class PolicyServer:
         except ConnectionClosed:
             self._log.warning("%s has gone without a word after %d steps.", who, steps)
         finally:
-            self._places.release()
+            self._clients.discard(client)
 
 
 class _Episode:

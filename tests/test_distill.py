@@ -10,6 +10,7 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
+import pandas as pd
 import torch
 
 from tests.toy_bank import toy_bank
@@ -17,6 +18,8 @@ from xreset import robots
 from xreset.cameras.config import FRONT, WRIST, VisionConfig
 from xreset.env import make_env
 from xreset.errors import PolicyError, XResetError
+from xreset.eval.report.clips import missed_by_student
+from xreset.eval.stress import chosen, stressed
 from xreset.learning.checkpoint import read_checkpoint
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.recipes import student_config
@@ -145,6 +148,26 @@ class DistillTest(unittest.TestCase):
                 distill("nobody", self.bank, out=self.folder / "nobody")
             with self.assertRaisesRegex(PolicyError, "sees through cameras itself"):
                 distill(self.run_folder, self.bank, out=self.folder / "again", config=student_config(TASK, IMAGES))
+
+    def test_what_the_teacher_does_better(self):
+        common = {
+            "engine": "mujoco",
+            "sequence_name": list("abcd"),
+            "repetition": 0,
+            "object": ["can", "can", "box", "box"],
+        }
+        teacher = pd.DataFrame(common | {"reorient": [True, True, True, False]})
+        student = pd.DataFrame(common | {"reorient": [True, False, False, False]})
+        self.assertEqual(
+            missed_by_student(student, teacher),
+            "Of 3 episodes that the teacher ends at the goal, the student misses 2: can 1 of 2, box 1 of 1.",
+        )
+
+    def test_a_sweep_moves_cameras_that_are_there(self):
+        (shift,) = chosen(["camera-shift"])
+        self.assertEqual(shift.values, (0.01, 0.03))
+        swept = stressed(evaluation_task(TASK), shift, 0.03)
+        self.assertEqual(swept.randomization.camera_shift, (0.03, 0.03))
 
 
 if __name__ == "__main__":

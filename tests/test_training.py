@@ -297,12 +297,12 @@ class TrainingTest(unittest.TestCase):
                 (
                     "--config.task.action.hand-step",
                     "0.1",
-                    "--config.task.reward.rotation-shape",
-                    "linear",
-                    "--config.task.reward.rotation-width",
-                    "1",
+                    "--config.task.observation.cloud",
+                    "paired",
+                    "--config.task.observation.cloud-history",
+                    "3",
                 ),
-                "hand_step is 0.1, .* hand is relative; it is absolute; --config.task.reward.rotation_width is 1.0, which",
+                "hand_step is 0.1, .* hand is relative; it is absolute; --config.task.observation.cloud_history is 3, which",
             ),
         ):
             with self.subTest(arguments), redirect_stderr(io.StringIO()) as said, self.assertRaises(SystemExit):

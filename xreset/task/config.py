@@ -109,7 +109,14 @@ class ObservationConfig(Checked):
 class RewardConfig(Checked):
     """Weights and widths of the reward (appendix D.d)."""
 
-    REMOVED: ClassVar[dict[str, Any]] = {"tracking": "presence", "progress": 8.0, "progress_width": 0.15}
+    REMOVED: ClassVar[dict[str, Any]] = {
+        "tracking": "presence",
+        "progress": 8.0,
+        "progress_width": 0.15,
+        "rotation_shape": "tanh",
+        "rotation_near": 0.0,
+        "rotation_near_width": 0.3,
+    }
 
     reach: Finite[float] = 1.0
     reach_width: Positive[float] = 0.1
@@ -128,14 +135,7 @@ class RewardConfig(Checked):
     position_width: Positive[float] = 0.2
     """[m]"""
     rotation: Finite[float] = 4.0
-    rotation_shape: Literal["tanh", "linear"] = "tanh"
-    """``tanh``: ``rotation`` times 1 - tanh(angle / ``rotation_width``) (the paper), which is flat beyond a right
-    angle. ``linear``: times 1 - angle / pi, which has the same slope everywhere."""
-    rotation_width: Annotated[Positive[float], Only("rotation_shape", "tanh")] = 1.5
-    """[rad]"""
-    rotation_near: Finite[float] = 0.0
-    """Weight of a second rotation term, 1 - tanh(angle / ``rotation_near_width``), which pays for the last degrees."""
-    rotation_near_width: Positive[float] = 0.3
+    rotation_width: Positive[float] = 1.5
     """[rad]"""
     proximity: Finite[float] = 0.0
     """Weight of the sum over fingertips of their distances to the object's surface points [m], at most

@@ -141,13 +141,6 @@ def mean_distance(pos: Tensor, quat: Tensor, goal_pos: Tensor, goal_quat: Tensor
     return point_distances(pos, quat, goal_pos, goal_quat, points).mean(dim=-1)
 
 
-def rotation_closeness(angle: Tensor, c: RewardConfig) -> Tensor:
-    """[N] 1 at the goal, falling with the angle to it [rad]."""
-    if c.rotation_shape == "linear":
-        return 1.0 - angle / torch.pi
-    return 1.0 - torch.tanh(angle / c.rotation_width)
-
-
 def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
     """The reward of one control step."""
     grasped = contact_gate(x.tip_force, c.contact_threshold)
@@ -179,8 +172,7 @@ def compute_reward(x: RewardInput, c: RewardConfig) -> Reward:
         "reach_near": c.reach_near * (1.0 - torch.tanh(reach / c.reach_near_width)),
         "grasp": c.grasp * grasped.to(gate_f.dtype),
         "position": c.position * gate_f * (1.0 - torch.tanh(position_error / c.position_width)),
-        "rotation": c.rotation * gate_f * rotation_closeness(rotation_error, c),
-        "rotation_near": c.rotation_near * gate_f * (1.0 - torch.tanh(rotation_error / c.rotation_near_width)),
+        "rotation": c.rotation * gate_f * (1.0 - torch.tanh(rotation_error / c.rotation_width)),
         "success": success_reward,
         "action": c.action * x.action.square().sum(dim=-1),
         "action_rate": action_rate,

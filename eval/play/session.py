@@ -164,8 +164,9 @@ class Session:
             XResetError: the engine cannot be used; the session goes on in the present one.
         """
         env = self._make_env(self.policy, self._inputs, name)
-        snapshot = self.env.snapshot()
-        assert env.restore(snapshot), "the worlds differ"
+        if not env.restore(self.env.snapshot()):
+            env.close()
+            raise XResetError(f"The worlds of {name} and {self.engine} differ. Play goes on in {self.engine}.")
         self.env.close()
         self.env = env
         self.engine = name

@@ -257,20 +257,21 @@ def own_terms_flag(own: dict[str, float]) -> str:
 def student_config(teacher: TaskConfig, vision: VisionConfig) -> TrainConfig:
     """Return the configuration of a distillation.
 
-    Ranges of the cameras: mounts and calibrations err by a centimetre and two degrees, images are up to two control
-    steps (33 ms) older than the newest.
+    Ranges of the cameras: mounts and calibrations err by a centimetre and two degrees, images are up to 33 ms older
+    than the newest.
 
     Args:
         teacher: the teacher's task, without cameras.
         vision: the cameras of the student.
     """
+    control_dt = teacher.timestep * teacher.substeps
     randomization = replace(
         teacher.randomization,
         camera_shift=(0.0, 0.01),
         camera_turn=(0.0, radians(2.0)),
         camera_fov=(0.97, 1.03),
         camera_noise=(0.5, 2.0),
-        camera_latency=(0.0, 2.0),
+        camera_latency=(0.0, round(1 / 30 / control_dt, 3)),
     )
     return TrainConfig(
         task=replace(teacher, vision=vision, randomization=randomization, reward=replace(teacher.reward, own={})),

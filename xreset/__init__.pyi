@@ -32,6 +32,7 @@ from xreset.resets.bank import ResetBank as ResetBank
 from xreset.resets.bank import read_bank as read_bank
 from xreset.resets.bank import write_bank as write_bank
 from xreset.resets.config import ClosingConfig as ClosingConfig
+from xreset.resets.config import FilterConfig as FilterConfig
 from xreset.resets.config import GoalConfig as GoalConfig
 from xreset.resets.config import SqueezeConfig as SqueezeConfig
 from xreset.resets.filter import make_bank as make_bank

@@ -69,7 +69,7 @@ def write_page(plan: Plan, out: Path) -> Page:
         runs=Rows(head=_HEAD, body=tuple(_run_row(run, trained.get(run.name)) for run in plan.runs)),
     )
     compared = _compare(plan, out)
-    versions = caption(run.policy for run in plan.runs)
+    versions = caption(run.runs.policy or "" for run in plan.runs)
     write_whole(page.path, render("study.md.j2", plan=plan, compared=compared, versions=versions, **vars(page)))
     return page
 

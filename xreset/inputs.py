@@ -26,6 +26,7 @@ from xreset.retarget.file import SCHEMA as MOTION
 from xreset.retarget.file import Retargeted, read_retargeted
 from xreset.retarget.pipeline import rest_on_table, retarget_demos
 from xreset.spec import ObjectSpec, RobotSpec
+from xreset.text import shown
 
 Kind = Literal["demos", "motion", "bank", "goals"]
 Data = Demos | Retargeted | ResetBank
@@ -166,7 +167,7 @@ def _read(path: Path, accept: tuple[Kind, ...]) -> Data:
     if schema == GOALS and "goals" in accept:
         return read_goals(path)
     expected = " or ".join(f"{_SCHEMAS[kind]!r} ({_COMMANDS[kind]})" for kind in accept)
-    raise FileFormatError(f"{path} states schema {schema!r}, expected {expected}.")
+    raise FileFormatError(f"{path} states schema {shown(schema)}, expected {expected}.")
 
 
 def _object_names(data: Data) -> tuple[str, ...]:

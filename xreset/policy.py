@@ -137,7 +137,7 @@ def check_contract_entries(source: str, contract: dict[str, Any]) -> None:
     """Refuse a contract that lacks an entry or holds one of another type; ``PolicyError``."""
     if contract.get("schema") != SCHEMA:
         raise PolicyError(
-            f"{source} has policy schema {contract.get('schema')!r}, expected {SCHEMA!r}. Export it again."
+            f"{source} has policy schema {shown(contract.get('schema'))}, expected {SCHEMA!r}. Export it again."
         )
     wrong = []
     for name, kind in _ENTRIES.items():

@@ -283,7 +283,7 @@ def check_contract(contract: dict[str, Any], source: str) -> None:
     """Refuse, with ``LiveError``, a contract of another schema or with options that this file does not carry out."""
     if contract.get("schema") != SCHEMA:
         raise LiveError(
-            f"{source} has schema {contract.get('schema')!r}, this runtime reads {SCHEMA!r}. "
+            f"{source} has schema {str(contract.get('schema'))[:60]!r}, this runtime reads {SCHEMA!r}. "
             "Export the policy again and use the runtime.py of the same folder."
         )
     for part, known in _KNOWN.items():
@@ -517,7 +517,7 @@ class RemoteController(Controller):
         if "error" in hello:
             raise LiveError(hello["error"])
         if hello.get("schema") != LIVE_SCHEMA:
-            raise LiveError(f"{url} speaks {hello.get('schema')!r}, this runtime speaks {LIVE_SCHEMA!r}.")
+            raise LiveError(f"{url} speaks {str(hello.get('schema'))[:60]!r}, this runtime speaks {LIVE_SCHEMA!r}.")
         check_contract(hello["contract"], url)
         super().__init__(hello["contract"])
 

@@ -88,7 +88,7 @@ def read(paths: Iterable[Path]) -> Results:
         schema = data.get("schema")
         if schema not in (CONFORMANCE, PARITY):
             raise FileFormatError(
-                f"{path} has the schema {schema!r}, expected {CONFORMANCE} or {PARITY}. Make it again with --json."
+                f"{path} has the schema {shown(schema)}, expected {CONFORMANCE} or {PARITY}. Make it again with --json."
             )
         try:
             alone = Results()

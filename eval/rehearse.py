@@ -23,7 +23,7 @@ from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.rollout import Episode, Round, episode_of, episode_starts, play_rounds
-from xreset.eval.sensitivity import SWEEPS, Effect, Property
+from xreset.eval.sensitivity import SWEEPS, Property
 from xreset.eval.stress import COSTLY, Curve, Point, Stress, chosen, curve, draw_curves, plot_size, stressed
 from xreset.eval.trial import Engine, Trial, engine, load_trial
 from xreset.files import claim_folder, write_json, write_whole
@@ -228,22 +228,15 @@ def _rehearsed(
             if (prop, value) not in episodes:
                 changed, fault = _setting(trial, prop, value)
                 (episodes[prop, value],) = player.play(changed, [fault])
-        as_is = Effect.of(nominal, nominal)
         curves = []
         for prop in usable:
             swept = {value: episodes[prop, value] for value in prop.values}
             curves.append(curve(prop, nominal, swept))
-        card = Rehearsal(
-            policy=policy.name,
-            robot=trial.robot.name,
-            seed=trial.seed,
-            inputs=trial.inputs,
-            backend=place.name,
-            backend_version=place.version,
-            episodes=len(nominal),
-            task_progress=as_is.task_progress,
-            ci95=as_is.ci95,
-            published_success=as_is.published_success,
+        card = Rehearsal.of(
+            policy,
+            trial,
+            place,
+            nominal,
             curves=tuple(curves),
             left_out=tuple(prop.option for prop in properties if prop not in usable),
             stopped=dict(player.stopped),

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 from xreset.checks import from_dict
 from xreset.errors import XResetError
@@ -101,6 +101,29 @@ class Stress:
     curves: tuple[Curve, ...]
     left_out: tuple[str, ...]
     """Properties that the engine cannot set."""
+
+    @classmethod
+    def of(cls, policy: PolicySpec, trial: Trial, place: Engine, nominal: Sequence[Episode], **rest: Any) -> Self:
+        """Return the card of a policy in an engine.
+
+        Args:
+            nominal: episodes with nothing changed.
+            rest: the fields that do not follow from them.
+        """
+        as_is = Effect.of(nominal, nominal)
+        return cls(
+            policy=policy.name,
+            robot=trial.robot.name,
+            seed=trial.seed,
+            inputs=trial.inputs,
+            backend=place.name,
+            backend_version=place.version,
+            episodes=len(nominal),
+            task_progress=as_is.task_progress,
+            ci95=as_is.ci95,
+            published_success=as_is.published_success,
+            **rest,
+        )
 
     def sentence(self) -> str:
         """Return one line: the smallest changes that cost ten points, and how many properties cost less."""
@@ -240,21 +263,8 @@ def stress(
             return episodes
 
         nominal = run(None, 1.0)
-        as_is = Effect.of(nominal, nominal)
-        card = Stress(
-            policy=policy.name,
-            robot=trial.robot.name,
-            seed=trial.seed,
-            inputs=trial.inputs,
-            backend=engine.name,
-            backend_version=engine.version,
-            episodes=len(nominal),
-            task_progress=as_is.task_progress,
-            ci95=as_is.ci95,
-            published_success=as_is.published_success,
-            curves=(),
-            left_out=tuple(prop.option for prop in sweeps if prop not in usable),
-        )
+        left_out = tuple(prop.option for prop in sweeps if prop not in usable)
+        card = Stress.of(policy, trial, engine, nominal, curves=(), left_out=left_out)
         path = out / f"{engine.name}.json"
         write_json(path, asdict(card))
         for prop in usable:

@@ -254,57 +254,13 @@ def readers() -> Iterator[dict[str, Reader]]:
         path = add("name of a robot", "robot.txt", lambda p: load_robot(_text(p)), "text", ("hand_keypoints",))
         path.write_text("openarm")
         add("name of a mesh", "name.txt", lambda p: _named(folder / "box.obj", p), "text").write_text("a-name")
-        options = [
-            "demos",
-            "select",
-            "demos.npz",
-            "--out",
-            "out.npz",
-            "--per-object",
-            "1",
-            "--objects",
-            "soup",
-            "--share",
-            "0.5",
-        ]
-        add("options of select", "select.json", lambda p: _run(folder, p), "json").write_text(
-            json.dumps({"argv": options})
-        )
-        options = [
-            "objects",
-            "import",
-            "box.obj",
-            "--out",
-            "objects",
-            "--name",
-            "a",
-            "--scale",
-            "1",
-            "--mass",
-            "0.2",
-            "--tolerance",
-            "0.01",
-        ]
-        add("options of import", "import.json", lambda p: _run(folder, p), "json").write_text(
-            json.dumps({"argv": options})
-        )
-        options = [
-            "demos",
-            "synth",
-            "--out",
-            "synth.npz",
-            "--objects",
-            "soup",
-            "--per-object",
-            "1",
-            "--seed",
-            "0",
-            "--fps",
-            "5",
-        ]
-        add("options of synth", "synth.json", lambda p: _run(folder, p), "json").write_text(
-            json.dumps({"argv": options})
-        )
+        for command, options in (
+            ("select", "demos select demos.npz --out out.npz --per-object 1 --objects soup --share 0.5"),
+            ("import", "objects import box.obj --out objects --name a --scale 1 --mass 0.2 --tolerance 0.01"),
+            ("synth", "demos synth --out synth.npz --objects soup --per-object 1 --seed 0 --fps 5"),
+        ):
+            path = add(f"options of {command}", f"{command}.json", lambda p: _run(folder, p), "json")
+            path.write_text(json.dumps({"argv": options.split()}))
         with_mesh = folder / "meshed" / "robot.urdf"
         with_mesh.parent.mkdir()
         geometry = '<collision><geometry><mesh filename="box.stl"/></geometry></collision>'

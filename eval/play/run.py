@@ -7,6 +7,7 @@ from pathlib import Path
 from xreset.eval.play.page import Page
 from xreset.eval.play.session import Session
 from xreset.eval.policy_spec import PolicySpec
+from xreset.pictures.view.server import serve_until_interrupted
 from xreset.tensors import one_thread
 
 
@@ -52,11 +53,6 @@ def play(
         try:
             page = Page(session, host=host, port=port)
             print(f"{session.policy.name} plays at {page.url}. Ctrl-C ends.", flush=True)
-            try:
-                page.serve()
-            except KeyboardInterrupt:  # the way to end it, not a failure
-                print("\nclosed.")
-            finally:
-                page.close()
+            serve_until_interrupted(page)
         finally:
             session.close()

@@ -14,6 +14,7 @@ from xreset.eval.report import clips
 from xreset.files import write_whole
 from xreset.pictures import render
 from xreset.pictures.view import data, load, page, picture, sheet
+from xreset.pictures.view.server import serve_until_interrupted
 
 
 def view(
@@ -75,12 +76,7 @@ def _serve(shown: data.View, host: str, port: int, sequence: int | None, frame: 
     print(f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {shown.kind} at {opened.url}", flush=True)
     tunnel = f"ssh -L {number}:localhost:{number} THIS_MACHINE"
     print(f"From another machine: {tunnel}, then open the same address. Ctrl-C ends.", flush=True)
-    try:
-        opened.serve()
-    except KeyboardInterrupt:  # the way to end it, not a failure
-        print("\nclosed.")
-    finally:
-        opened.close()
+    serve_until_interrupted(opened)
 
 
 def _write_png(path: Path, shown: data.View, rows: np.ndarray, frame: int | None) -> None:

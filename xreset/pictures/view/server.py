@@ -55,6 +55,16 @@ def start_server(host: str, port: int, *, label: str) -> Any:
     return server
 
 
+def serve_until_interrupted(page: Any) -> None:
+    """Serve a page until Ctrl-C, then close it. ``page`` has the methods ``serve`` and ``close``."""
+    try:
+        page.serve()
+    except KeyboardInterrupt:  # the way to end it, not a failure
+        print("\nclosed.")
+    finally:
+        page.close()
+
+
 def url_of(server: Any) -> str:
     """Return the address of a server's page, seen from this machine."""
     host = server.get_host()

@@ -13,8 +13,7 @@ from xreset.errors import XResetError
 from xreset.eval.report import clips
 from xreset.files import write_whole
 from xreset.pictures import render
-from xreset.pictures.view import data, load, page, picture, sheet
-from xreset.pictures.view.server import serve_until_interrupted
+from xreset.pictures.view import data, load, page, picture, server, sheet
 
 
 def view(
@@ -76,7 +75,7 @@ def _serve(shown: data.View, host: str, port: int, sequence: int | None, frame: 
     print(f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {shown.kind} at {opened.url}", flush=True)
     tunnel = f"ssh -L {number}:localhost:{number} THIS_MACHINE"
     print(f"From another machine: {tunnel}, then open the same address. Ctrl-C ends.", flush=True)
-    serve_until_interrupted(opened)
+    server.serve_until_interrupted(opened)
 
 
 def _write_png(path: Path, shown: data.View, rows: np.ndarray, frame: int | None) -> None:

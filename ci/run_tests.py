@@ -1,15 +1,21 @@
-"""Runs the unittest suite and ends with one line: ``N passed, N failed, N skipped``.
+"""Runs the unittest suite, one process per core, and ends with one line: ``N passed, N failed, N skipped``.
 
-usage: run_tests.py [-v] [--quick] [MODULE ...]      (default: every tests/test_*.py; --quick: those that take seconds, no physics)
+usage: run_tests.py [--quick] [NAME ...]      (default: every tests/test_*.py; --quick: those that take seconds, no physics)
 """
 
 from __future__ import annotations
 
+import io
+import multiprocessing
 import os
 import signal
 import sys
 import time
 import unittest
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
 
 sys.path.insert(0, os.getcwd())
 
@@ -20,23 +26,26 @@ QUICK = (
 )  # fmt: skip
 """Modules of tests that a change of code is first tried with."""
 
+MOST_PROCESSES = 4
+"""A process of tests takes up to 2 GB."""
+
+
+@dataclass
+class Outcome:
+    """What the tests of one module did."""
+
+    name: str
+    seconds: float
+    passed: int
+    failed: int
+    skipped: list[str]
+    text: str  # what unittest prints, with tracebacks
+
 
 class Result(unittest.TextTestResult):
-    """Counts passes, and remembers how long each test class took."""
+    """Counts passes."""
 
-    def __init__(self, *args, **kwargs):
-        super().__init__(*args, **kwargs)
-        self.passed = 0
-        self.seconds: dict[str, float] = {}
-
-    def startTest(self, test):
-        super().startTest(test)
-        self._began = time.perf_counter()
-
-    def stopTest(self, test):
-        super().stopTest(test)
-        name = type(test).__module__
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - self._began
+    passed = 0
 
     def addSuccess(self, test):
         super().addSuccess(test)
@@ -47,26 +56,68 @@ class Result(unittest.TextTestResult):
         self.passed += 1
 
 
-def main() -> int:
+def restore_interrupts() -> None:
     # What a script starts in the background ignores Ctrl-C, and so would every process that a test starts and interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def run(name: str) -> Outcome:
+    """Run the tests of one module, class or method."""
+    began = time.perf_counter()
+    text = io.StringIO()
+    suite = unittest.TestLoader().loadTestsFromName(name)
+    result = unittest.TextTestRunner(stream=text, resultclass=Result, buffer=True).run(suite)
+    failed = len(result.failures) + len(result.errors) + len(result.unexpectedSuccesses)
+    skipped = [f"skipped {test}: {reason}" for test, reason in result.skipped]
+    return Outcome(name, time.perf_counter() - began, result.passed, failed, skipped, text.getvalue())
+
+
+def run_all(names: list[str], processes: int):
+    """Yield the outcome of each name, in the order in which they end."""
+    if processes == 1:
+        yield from map(run, names)
+        return
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process keeps to its own core
+    spawned = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=spawned, initializer=restore_interrupts) as pool:
+        name_of = {pool.submit(run, name): name for name in names}
+        for done in as_completed(name_of):
+            try:
+                yield done.result()
+            except BrokenProcessPool:
+                yield Outcome(
+                    name_of[done], 0.0, 0, 1, [], "A test process died here, or in a module that ran beside it.\n"
+                )
+
+
+def main() -> int:
+    restore_interrupts()
     arguments = sys.argv[1:]
-    verbosity = 2 if "-v" in arguments else 1
     names = [a for a in arguments if not a.startswith("-")]
     if "--quick" in arguments:
         names += [f"tests.test_{name}" for name in QUICK]
-    loader = unittest.TestLoader()
-    suite = loader.loadTestsFromNames(names) if names else loader.discover("tests", top_level_dir=".")
-    result = unittest.TextTestRunner(resultclass=Result, verbosity=verbosity, buffer=True).run(suite)
-    for test, reason in result.skipped:
-        print(f"skipped {test}: {reason}")
-    for name, seconds in sorted(result.seconds.items(), key=lambda item: -item[1]):
-        print(f"{seconds:7.1f} s  {name}")
-    failed = len(result.failures) + len(result.errors) + len(result.unexpectedSuccesses)
-    if not result.passed and not failed:
+    if not names:
+        names = sorted(f"tests.{file.stem}" for file in Path("tests").glob("test_*.py"))
+    processes = min(len(os.sched_getaffinity(0)), len(names), MOST_PROCESSES)
+    outcomes = []
+    for outcome in run_all(names, processes):
+        outcomes.append(outcome)
+        summary = f"{outcome.passed} passed, {outcome.failed} failed, {len(outcome.skipped)} skipped"
+        print(f"{outcome.seconds:7.1f} s  {outcome.name}: {summary}", flush=True)
+        if outcome.failed:
+            print(outcome.text, flush=True)
+    for outcome in outcomes:
+        print(*outcome.skipped, sep="\n", end="\n" if outcome.skipped else "")
+    passed = sum(outcome.passed for outcome in outcomes)
+    failed = sum(outcome.failed for outcome in outcomes)
+    skipped = sum(len(outcome.skipped) for outcome in outcomes)
+    for outcome in outcomes:
+        if outcome.failed:
+            print(f"failed: {outcome.name}")
+    if not passed and not failed:
         failed = 1
         print("no test ran")
-    print(f"{result.passed} passed, {failed} failed, {len(result.skipped)} skipped")
+    print(f"{passed} passed, {failed} failed, {skipped} skipped")
     return 1 if failed else 0
 
 

@@ -1,6 +1,6 @@
 """A robot of your own under a policy: a driver. This one replays a recorded episode, so no robot moves.
 
-The folder is that of `xreset export deploy`. Its runtime.py needs numpy and onnxruntime, and neither xreset nor torch.
+The folder is that of `xreset export deploy`. Its package runtime needs numpy and onnxruntime, and neither xreset nor torch.
 """
 
 import sys

@@ -19,8 +19,8 @@ def export_deploy(
     objects: str | Path | None = None,
     only: Sequence[str] = (),
 ) -> PolicySpec:
-    """Write a policy for a robot: ``policy.onnx``, ``contract.json`` and ``runtime.py``, which needs numpy and
-    onnxruntime (``docs/live.md``).
+    """Write a policy for a robot: ``policy.onnx``, ``contract.json`` and the package ``runtime``, which needs numpy
+    and onnxruntime (``docs/live.md``).
 
     Args:
         policy: the policy or its name, as for :func:`~xreset.eval.policy_spec.load_policy`; no baseline.

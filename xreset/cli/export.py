@@ -92,7 +92,7 @@ def deploy(
         f"{out}: {spec.name} for {contract['robot']}, {len(contract['joints'])} joints at {contract['rate']:g} Hz"
     )
     console.print(f"objects: {', '.join(named)}")
-    console.print(f"Try it: python {out / 'runtime.py'}")
+    console.print(f"Try it: cd {out} && python -m runtime")
 
 
 def _recording(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,13 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from xreset import runtime
 from xreset.errors import PolicyError
 from xreset.files import atomic_folder, code_version, file_hash, write_json
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import robot_tree
 from xreset.objects.sampling import center, surface_points
 from xreset.policy import policy_contract
+from xreset.runtime import check_contract
+from xreset.runtime import contract as files
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
@@ -66,7 +68,7 @@ def deploy_contract(
     observation = asdict(task.observation)
     observation.pop("noise")
     contract = {
-        "schema": runtime.SCHEMA,
+        "schema": files.SCHEMA,
         "xreset": code_version(),
         "policy_sha256": file_hash(policy) if policy else "",
         "robot": robot.name,
@@ -84,7 +86,7 @@ def deploy_contract(
         "object_frame": task.object_frame,
         "objects": listed,
     }
-    runtime.check_contract(contract, f"The task of {robot.name}")
+    check_contract(contract, f"The task of {robot.name}")
     return contract
 
 
@@ -151,7 +153,7 @@ def _chain(robot: RobotSpec) -> dict[str, Any]:
 def write_deployed(
     policy: Path, robot: RobotSpec, task: TaskConfig, objects: Sequence[ObjectSpec], out: Path
 ) -> dict[str, Any]:
-    """Write ``policy.onnx``, ``contract.json`` and ``runtime.py`` into a new folder; return the contract.
+    """Write ``policy.onnx``, ``contract.json`` and the package ``runtime`` into a new folder; return the contract.
 
     Args:
         policy: exported policy (.onnx).
@@ -168,7 +170,7 @@ def write_deployed(
         raise PolicyError(f"{out} exists already. Choose another --out, or remove it.")
     contract = deploy_contract(robot, task, objects, policy)
     with atomic_folder(out) as folder:
-        (folder / runtime.POLICY).write_bytes(policy.read_bytes())
-        (folder / "runtime.py").write_bytes(Path(runtime.__file__).read_bytes())
-        write_json(folder / runtime.CONTRACT, contract)
+        shutil.copyfile(policy, folder / files.POLICY)
+        shutil.copytree(Path(files.__file__).parent, folder / "runtime", ignore=shutil.ignore_patterns("__pycache__"))
+        write_json(folder / files.CONTRACT, contract)
     return contract

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from xreset.errors import XResetError, needs
-from xreset.runtime import LIVE_SCHEMA, Controller, LiveError, OnnxActor, Reading
+from xreset.runtime import Controller, LiveError, OnnxActor, Reading
+from xreset.runtime.remote import LIVE_SCHEMA
 
 with needs("websockets", "serve"):
     from websockets.exceptions import ConnectionClosed

@@ -1,0 +1,237 @@
+"""From a reading to joint targets, as the environment does it.
+
+Shape letters: N robots that act in step (one, except in rehearsals), J joints, E fingertips, P points.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .contract import POLICY, LiveError, read_contract
+from .driver import Array, Links, Reading
+from .kinematics import Kinematics
+from .rotations import multiply, rotate
+
+
+class OnnxActor:
+    """The network of an exported policy with its recurrent state. It runs on one core, so that its time is even."""
+
+    def __init__(self, content: bytes) -> None:
+        """Load the content of a policy's ONNX file."""
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 3
+        options.intra_op_num_threads = 1
+        try:
+            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        except Exception as error:
+            raise LiveError(f"The policy cannot be read as ONNX: {error}. Export it again.") from error
+        self._inputs = self._session.get_inputs()
+        self._state: list[Array] = []
+
+    def begin(self, robots: int) -> None:
+        """Forget everything."""
+        self._state = [np.zeros((1, robots, given.shape[2]), np.float32) for given in self._inputs[2:]]
+
+    def act(self, flat: Array, cloud: Array) -> Array:
+        """[N, J] actions for observations [N, F] and clouds [N, H, P, K]."""
+        values = (flat, cloud, *self._state)
+        feed = {given.name: value for given, value in zip(self._inputs, values, strict=True)}
+        actions, *self._state = map(np.asarray, self._session.run(None, feed))
+        return np.clip(actions, -1.0, 1.0)
+
+
+class Controller:
+    """Turns readings into joint targets, exactly as the environment does.
+
+    Attributes:
+        contract: what the policy expects.
+        dt: duration of a control step [s].
+        lower: [J] joint limits; -inf for a joint without.
+        upper: [J]
+        step_size: [J] farthest that a relative target moves in a control step; 0 for joints with absolute targets.
+        action: [N, J] the last action.
+        target: [N, J] the present joint targets.
+    """
+
+    def __init__(self, contract: dict[str, Any], actor: OnnxActor | Any = None) -> None:
+        """Prepare.
+
+        Args:
+            contract: what the policy expects.
+            actor: its network.
+        """
+        self.contract = contract
+        self.dt: float = contract["control_dt"]
+        self._actor = actor
+        self._kinematics = Kinematics(contract["kinematics"])
+        joints = contract["joints"]
+
+        def column(name: str, otherwise: float) -> Array:
+            values = [otherwise if joint[name] is None else joint[name] for joint in joints]
+            return np.array(values, dtype=np.float32)
+
+        self.lower = column("lower", -np.inf)
+        self.upper = column("upper", np.inf)
+        self._scaled_lower = column("lower", -np.pi)
+        self._scaled_upper = column("upper", np.pi)
+        self._mapping = {name: column(name, 0.0) for name in ("step", "lead", "zero", "below", "above")}
+        self.step_size = self._mapping["step"]
+        self._is_arm = np.array([joint["group"] == "arm" for joint in joints])
+
+    def begin(
+        self, object_points: Array, goal_pos: Array, goal_quat: Array, target: Array, center: Array | None = None
+    ) -> None:
+        """Begin an episode.
+
+        Args:
+            object_points: [N, P, 3] or [P, 3] points of the object, in its frame; see :meth:`points`.
+            goal_pos: [N, 3] or [3] goal position.
+            goal_quat: [N, 4] or [4] goal orientation.
+            target: [N, J] or [J] present joint targets of the robot.
+            center: [N, 3] or [3] origin that the object has for the policy, in its frame; see :meth:`center`. Needed
+                where the contract's ``object_frame`` is ``center``.
+        """
+        self.target = np.atleast_2d(np.asarray(target, dtype=np.float32))
+        count = len(self.target)
+        expected = self.contract["observation"]["cloud_points"]
+        points = np.asarray(object_points, dtype=np.float32)
+        if points.shape[-2:] != (expected, 3):
+            raise LiveError(f"The object has points of shape {points.shape}, expected ({expected}, 3).")
+        self._center: Array | None = None
+        if self.contract["object_frame"] == "center":
+            if center is None:
+                raise LiveError("This policy needs the center of the object. Give center, as Controller.center does.")
+            self._center = np.broadcast_to(np.asarray(center, dtype=np.float32), (count, 3))
+            points = points - self._center[:, None]
+        self._points = np.broadcast_to(points, (count, expected, 3))
+        self.set_goal(goal_pos, goal_quat)
+        self.action = np.zeros_like(self.target)
+        self._cloud: Array | None = None
+        self._actor.begin(count)
+
+    def set_goal(self, pos: Array, quat: Array) -> None:
+        """Set the goal pose, also while the policy acts; shapes as for :meth:`begin`."""
+        count = len(self.target)
+        self._goal_quat = np.broadcast_to(np.asarray(quat, dtype=np.float32), (count, 4))
+        goal_pos = np.broadcast_to(np.asarray(pos, dtype=np.float32), (count, 3))
+        self._goal_pos = self._origin(goal_pos, self._goal_quat)
+
+    def _origin(self, pos: Array, quat: Array) -> Array:
+        """[N, 3] where the policy's origin of the object is, for poses [N, 3], [N, 4] of the object's frame."""
+        return pos if self._center is None else pos + rotate(quat, self._center)
+
+    def points(self, name: str) -> Array:
+        """[P, 3] points of an object of the contract."""
+        objects = self.contract["objects"]
+        if name not in objects:
+            raise LiveError(f"The contract has no object {name!r}. Choose from: {', '.join(objects)}.")
+        return np.array(objects[name]["points"], dtype=np.float32)
+
+    def center(self, name: str) -> Array:
+        """[3] center of an object of the contract, in its frame."""
+        self.points(name)  # refuses an unknown name
+        return np.array(self.contract["objects"][name]["center"], dtype=np.float32)
+
+    def step(self, reading: Reading) -> Array:
+        """[N, J] new joint targets for a reading with the axis N."""
+        flat, cloud = self.observe(reading)
+        self.action = self._actor.act(flat, cloud)
+        self.target = self._targets(self.action, reading.joint_pos)
+        return self.target
+
+    def observe(self, reading: Reading) -> tuple[Array, Array]:
+        """Return the policy's inputs: [N, F] flat, and the cloud [N, H, P, K]."""
+        o = self.contract["observation"]
+        links = reading.links or self._kinematics.links(reading.joint_pos, reading.joint_vel)
+        count = len(self.target)
+        force = reading.tip_force
+        if force is None:
+            force = np.zeros_like(links.tip_pos)
+        limits = (self._scaled_lower, self._scaled_upper)
+        if o["content"] == "published":
+            joints = [_scaled(reading.joint_pos, *limits), _scaled(self.target, *limits)]
+            flat = np.concatenate((*self._observe_geometry(reading, links), *joints), axis=1)
+            return flat, self._observe_cloud(reading)
+        pose = [self._origin(reading.object_pos, reading.object_quat)]
+        if o["rotation"] == "to_goal":
+            inverse = reading.object_quat * np.array([1, -1, -1, -1], np.float32)
+            pose += [self._goal_pos, _shown(multiply(self._goal_quat, inverse), o["rotation"])]
+        else:
+            pose += [_shown(reading.object_quat, o["rotation"]), self._goal_pos]
+            pose += [_shown(self._goal_quat, o["rotation"])]
+        parts = [
+            *pose,
+            np.ones((count, 1), np.float32),  # the share of its weight that the object has
+            self.action,
+            _scaled(reading.joint_pos, *limits),
+            np.float32(o["joint_vel_scale"]) * reading.joint_vel,
+            links.palm_pos,
+            _shown(links.palm_quat, o["rotation"]),
+            links.palm_linvel,
+            links.palm_angvel,
+            links.tip_pos.reshape(count, -1),
+            np.clip(np.float32(o["contact_force_scale"]) * force, -1.0, 1.0).reshape(count, -1),
+        ]
+        if o["joint_target"]:
+            parts.append(self.target - reading.joint_pos)
+        return np.concatenate(parts, axis=1), self._observe_cloud(reading)
+
+    def _world_points(self, reading: Reading) -> Array:
+        """[N, P, 3] the object's points."""
+        origin = self._origin(reading.object_pos, reading.object_quat)
+        return rotate(reading.object_quat[:, None], self._points) + origin[:, None]
+
+    def _observe_geometry(self, reading: Reading, links: Links) -> tuple[Array, Array]:
+        """Return vectors from the fingertips to the nearest points [N, 3 E], and the palm's least distance [N, 1]."""
+        count = len(self.target)
+        links_pos = np.concatenate((links.palm_pos[:, None], links.tip_pos), axis=1)
+        offsets = self._world_points(reading)[:, None] - links_pos[:, :, None]
+        nearest = np.square(offsets).sum(axis=-1).argmin(axis=-1)
+        vectors = np.take_along_axis(offsets, nearest[:, :, None, None], axis=2)[:, :, 0]
+        x, y, z = np.split(np.square(vectors[:, 0]), 3, axis=1)
+        return vectors[:, 1:].reshape(count, -1), np.sqrt(x + y + z)
+
+    def _observe_cloud(self, reading: Reading) -> Array:
+        o = self.contract["observation"]
+        scale = np.float32(o["cloud_scale"])
+        cloud = self._world_points(reading)
+        if o["cloud"] == "paired":
+            goal = rotate(self._goal_quat[:, None], self._points) + self._goal_pos[:, None]
+            return scale * np.concatenate((cloud, goal, goal - cloud), axis=-1)[:, None]
+        frame = (scale * cloud)[:, None]
+        if self._cloud is None:
+            self._cloud = np.repeat(frame, o["cloud_history"], axis=1)
+        self._cloud = np.concatenate((self._cloud[:, 1:], frame), axis=1)
+        return self._cloud
+
+    def _targets(self, action: Array, joint_pos: Array) -> Array:
+        m = self._mapping
+        new = self.target + m["step"] * action
+        new = np.clip(new, joint_pos - m["lead"], joint_pos + m["lead"])
+        if self.contract["action"]["hand"] == "absolute":
+            hand = m["zero"] + np.where(action < 0, m["below"], m["above"]) * action
+            new = np.where(self._is_arm, new, hand)
+        return np.clip(new, self.lower, self.upper)
+
+
+def load_controller(folder: str | Path) -> Controller:
+    """Return the controller of a folder that ``xreset export deploy`` wrote; ``LiveError`` if it cannot be used."""
+    contract = read_contract(folder)
+    return Controller(contract, OnnxActor((Path(folder) / POLICY).read_bytes()))
+
+
+def _scaled(joints: Array, lower: Array, upper: Array) -> Array:
+    """[N, J] joint positions between their limits, in [-1, 1]."""
+    return np.float32(2.0) * (joints - lower) / (upper - lower) - np.float32(1.0)
+
+
+def _shown(quat: Array, rotation: str) -> Array:
+    """[N, 4] or [N, 6] a rotation as the policy observes it."""
+    if rotation == "quaternion":
+        return np.where(quat[:, :1] < 0, -quat, quat)
+    return rotate(quat[:, None], np.eye(3, dtype=np.float32)[:2]).reshape(len(quat), 6)

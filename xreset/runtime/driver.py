@@ -1,0 +1,88 @@
+"""The interface of a robot: what is read, and what is sent.
+
+Shape letters: N robots that act in step (one, except in rehearsals), J joints, E fingertips. Units are SI and radians,
+quaternions (w, x, y, z), the frame is the world's: z up, the table's top at z = 0, the robot's base as the contract
+says.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Links:
+    """Palm and fingertips in the world frame."""
+
+    palm_pos: Array
+    """[N, 3]"""
+    palm_quat: Array
+    """[N, 4]"""
+    palm_linvel: Array
+    """[N, 3]"""
+    palm_angvel: Array
+    """[N, 3]"""
+    tip_pos: Array
+    """[N, E, 3]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """The newest data of a robot and of an object tracker. A driver of one robot leaves out the axis N."""
+
+    joint_pos: Array
+    """[N, J] in the order of the contract's joints."""
+    joint_vel: Array
+    """[N, J]"""
+    joint_time: float | Array
+    """[N] when the joints were measured, on the driver's clock [s]."""
+    object_pos: Array
+    """[N, 3] origin of the object's mesh frame."""
+    object_quat: Array
+    """[N, 4]"""
+    object_time: float | Array
+    """[N] when the pose was true: the camera's time, not the time of its arrival [s]."""
+    tip_force: Array | None = None
+    """[N, E, 3] force of each fingertip on the object, world frame [N]; None: the robot does not measure it."""
+    links: Links | None = None
+    """Only of an engine; None: they follow from the joints."""
+
+    def batched(self) -> Reading:
+        """Return the reading with the axis N, in float32 (times: float64)."""
+        if np.ndim(self.joint_pos) == 2:
+            return self
+        rows = {}
+        for name, value in vars(self).items():
+            if value is not None:
+                rows[name] = np.asarray(value, dtype=np.float64 if name.endswith("_time") else np.float32)[None]
+        return Reading(**rows)
+
+
+class Driver(ABC):
+    """A robot and an object tracker. No method may block for longer than a small part of a control step."""
+
+    @abstractmethod
+    def read(self) -> Reading:
+        """Return the newest data, however old they are."""
+
+    @abstractmethod
+    def send(self, target: Array) -> None:
+        """Send joint targets [J] (of N robots: [N, J])."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Hold still. The runner calls it once, after it has slowed down, and also when a method has failed."""
+
+    def now(self) -> float:
+        """Return the time on the clock of the readings [s]."""
+        return time.monotonic()
+
+    def wait_until(self, moment: float) -> None:
+        """Return at that time on the clock."""
+        time.sleep(max(0.0, moment - self.now()))

@@ -1,0 +1,89 @@
+"""A policy that another computer runs: the client of ``xreset serve``. It needs websockets."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from .contract import LiveError, check_contract
+from .controller import Controller
+from .driver import Array, Reading
+
+LIVE_SCHEMA = "xreset-live/1"
+"""Schema of the messages of ``xreset serve``."""
+
+
+class RemoteController(Controller):
+    """A policy that ``xreset serve`` runs, perhaps on another computer. It needs websockets on this one."""
+
+    def __init__(self, url: str, timeout: float = 0.5) -> None:
+        """Connect.
+
+        Args:
+            url: address of the server, such as ``ws://127.0.0.1:8765``.
+            timeout: longest time to wait for an answer [s].
+
+        Raises:
+            LiveError: there is no such server, or it is of another version.
+        """
+        from websockets.sync.client import connect
+
+        self._timeout = timeout
+        try:
+            self._socket = connect(url, open_timeout=5, max_size=None, compression=None)
+        except Exception as error:
+            raise LiveError(f"No policy is served at {url} ({error}). Start it: xreset serve POLICY") from error
+        hello = self._receive()
+        if hello.get("schema") != LIVE_SCHEMA:
+            raise LiveError(f"{url} speaks {str(hello.get('schema'))[:60]!r}, this runtime speaks {LIVE_SCHEMA!r}.")
+        check_contract(hello["contract"], url)
+        super().__init__(hello["contract"])
+
+    def begin(
+        self, object_points: Array, goal_pos: Array, goal_quat: Array, target: Array, center: Array | None = None
+    ) -> None:
+        """Begin an episode of one robot."""
+        self.target = np.atleast_2d(np.asarray(target, dtype=np.float32))
+        values = {"points": object_points, "goal_pos": goal_pos, "goal_quat": goal_quat, "target": target}
+        self._ask({"begin": _lists(values | {"center": center})})
+
+    def set_goal(self, pos: Array, quat: Array) -> None:
+        """Set the goal pose."""
+        self._ask({"goal": _lists({"goal_pos": pos, "goal_quat": quat})})
+
+    def step(self, reading: Reading) -> Array:
+        """[1, J] new joint targets for a reading with the axis N."""
+        names = ("joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
+        values = {name: getattr(reading, name) for name in names}
+        found = self._ask({"step": _lists({name: None if v is None else v[0] for name, v in values.items()})})
+        self.target = np.array([found["target"]], dtype=np.float32)
+        return self.target
+
+    def close(self) -> None:
+        """End the connection."""
+        self._socket.close()
+
+    def _ask(self, message: dict[str, Any]) -> dict[str, Any]:
+        try:
+            self._socket.send(json.dumps(message))
+        except Exception as error:
+            raise LiveError("the server has gone") from error
+        return self._receive()
+
+    def _receive(self) -> dict[str, Any]:
+        try:
+            answer = json.loads(self._socket.recv(timeout=self._timeout))
+        except TimeoutError as error:
+            raise LiveError(f"the server has not answered for {self._timeout:g} s") from error
+        except Exception as error:
+            raise LiveError("the server has gone") from error
+        if "error" in answer:
+            raise LiveError(answer["error"])
+        return answer
+
+
+def _lists(values: dict[str, Any]) -> dict[str, Any]:
+    """Return arrays as lists, which JSON can hold; None is left out."""
+    return {name: np.asarray(value).tolist() for name, value in values.items() if value is not None}

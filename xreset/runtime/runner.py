@@ -1,0 +1,220 @@
+"""The loop around a driver: it keeps the policy's rate, and stops the robot softly."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+
+from .controller import Controller
+from .driver import Array, Driver, Links, Reading
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """When a runner stops a robot. None of these numbers was tried on hardware."""
+
+    pose_age: float = 1.0
+    """Oldest pose of the object that the policy may act on [s]."""
+    joint_age: float = 0.1
+    """Oldest joint positions that the policy may act on [s]."""
+    joint_margin: float = 0.1
+    """How far a joint may be beyond its limit [rad, m]."""
+    late: float = 0.5
+    """Longest time that one control step may take [s]."""
+    slow_down: float = 0.25
+    """Time in which targets come to rest [s]."""
+
+
+@dataclass(kw_only=True)
+class Outcome:
+    """What became of a run."""
+
+    reasons: list[str | None]
+    """[N] why each robot was stopped; None: the time was over."""
+    steps: int = 0
+    """Control steps that the policy took."""
+    missed: int = 0
+    """Control steps that were left out, because the one before took too long."""
+    refused: Array = field(default_factory=lambda: np.zeros(0, dtype=int))
+    """[N] poses that were not used: not finite, or with a time stamp that ran backwards."""
+
+    @property
+    def reason(self) -> str | None:
+        """Why the first robot was stopped."""
+        return self.reasons[0]
+
+
+class Runner:
+    """Keeps a policy's rate on a driver, and stops softly when it cannot go on.
+
+    A pose that is late is used until it is ``pose_age`` old. A pose that is not finite, or older than the last one, is
+    ignored. After a fault the targets slow down within ``slow_down``, and then stay.
+    """
+
+    def __init__(self, controller: Controller, driver: Driver, limits: Limits | None = None) -> None:
+        """Prepare a run.
+
+        Args:
+            controller: what acts; its episode has begun.
+            driver: where it acts.
+            limits: when to stop; None: the defaults.
+        """
+        self.controller = controller
+        self.driver = driver
+        self.limits = limits or Limits()
+        count = len(controller.target)
+        self.outcome = Outcome(reasons=[None] * count, refused=np.zeros(count, dtype=int))
+        self._stopped_at = np.full(count, np.inf)
+        self._reading: Reading | None = None
+        self._refusals = ["no newer one has come"] * count
+        self._sent = controller.target
+        self._move = np.zeros_like(self._sent)
+        self._begun = driver.now()
+
+    def run(self, seconds: float = float("inf")) -> Outcome:
+        """Run until the time is over, until every robot has stopped, or until Ctrl-C; then stop the driver."""
+        try:
+            self._loop(self.driver.now() + seconds - self.controller.dt / 2)
+        except KeyboardInterrupt:
+            self._stop_all("Ctrl-C was pressed.")
+            self._loop(float("inf"))
+        finally:
+            self.driver.stop()
+        return self.outcome
+
+    def _loop(self, end: float) -> None:
+        due = self.driver.now()
+        while self.driver.now() < min(end, self._stopped_at.max() + self.limits.slow_down):
+            if not self._tick():
+                return
+            due += self.controller.dt
+            late = self.driver.now() - due
+            if late > 0:
+                self.outcome.missed += 1
+                due += late  # the rate is kept from here on; no step is made up for
+            if late > self.limits.late:
+                self._stop_all(f"A control step took {late:.2f} s too long.")
+            self.driver.wait_until(due)
+
+    def _tick(self) -> bool:
+        """Read, act and send once; return whether the driver still takes targets."""
+        now = self.driver.now()
+        target = self._sent
+        if np.isinf(self._stopped_at).any():
+            target = self._act(now)
+        going = np.isinf(self._stopped_at)[:, None]
+        self._move = np.where(going, target - self._sent, self._move)
+        # A target that moves by steps slows down; one that jumps, as an absolute hand target does, stays.
+        share = np.clip(1.0 - (now - self._stopped_at) / self.limits.slow_down, 0.0, 1.0)[:, None]
+        step = self.controller.step_size
+        slowed = self._sent + (share * np.clip(self._move, -step, step)).astype(np.float32)
+        slowed = np.clip(slowed, self.controller.lower, self.controller.upper)
+        self._sent = np.where(going, target, slowed)
+        try:
+            self.driver.send(self._sent)
+        except Exception as error:
+            self._stop_all(f"The driver could not send targets: {error}.")
+            return False
+        return True
+
+    def _act(self, now: float) -> Array:
+        """Return the policy's targets; where it cannot act, the last ones."""
+        try:
+            self._take(self.driver.read().batched(), now)
+        except Exception as error:
+            self._stop_all(f"The driver could not read: {error}.")
+            return self._sent
+        self._check(now)
+        going = np.isinf(self._stopped_at)
+        reading = self._reading
+        has_come = np.isfinite(reading.object_time) & np.isfinite(reading.joint_time) if reading else ~going
+        if reading is None or not going.any() or not has_come[going].all():
+            return self._sent
+        try:
+            target = self.controller.step(reading)
+        except Exception as error:
+            self._stop_all(f"The policy could not act: {error}.")
+            return self._sent
+        self.outcome.steps += 1
+        sound = np.isfinite(target).all(axis=1)
+        for robot in np.flatnonzero(going & ~sound):
+            self._stop(int(robot), "The policy gave numbers that are not finite.")
+        return np.where(sound[:, None], target, self._sent)
+
+    def _take(self, new: Reading, now: float) -> None:
+        """Keep what is sound of a reading, and the last sound values of the rest."""
+        joints_sound = _finite(new.joint_pos) & _finite(new.joint_vel)
+        if new.tip_force is not None:
+            joints_sound &= _finite(new.tip_force.reshape(len(joints_sound), -1))
+        length = np.linalg.norm(new.object_quat, axis=1)
+        pose_sound = _finite(new.object_pos) & (np.abs(length - 1.0) < 0.01)
+        old = self._reading
+        if old is None:
+            nothing = np.full(len(joints_sound), -np.inf)
+            old = replace(new, joint_time=nothing, object_time=nothing)
+        usable = np.ones_like(pose_sound)
+        for fine, problem in (
+            (new.object_time <= now + 0.1, "newer ones have time stamps ahead of the robot's clock"),
+            (new.object_time >= old.object_time, "the time stamps of newer ones run backwards"),
+            (pose_sound, "newer ones hold numbers that are not finite, or no unit quaternion"),
+        ):
+            usable &= fine
+            for robot in np.flatnonzero(~fine):
+                self._refusals[robot] = problem
+        self.outcome.refused += ~usable
+        for robot in np.flatnonzero(usable & (new.object_time > old.object_time)):
+            self._refusals[robot] = "no newer one has come"
+        joint_names = ("joint_pos", "joint_vel", "joint_time", "tip_force", "links")
+        kept = {name: _rows(joints_sound, getattr(new, name), getattr(old, name)) for name in joint_names}
+        for name in ("object_pos", "object_quat", "object_time"):
+            kept[name] = _rows(usable, getattr(new, name), getattr(old, name))
+        self._reading = Reading(**kept)
+
+    def _check(self, now: float) -> None:
+        """Stop the robots whose data are too old, or whose joints are beyond a limit."""
+        reading = self._reading
+        assert reading is not None
+        limits = self.limits
+        for time_of, limit, text in (
+            (reading.object_time, limits.pose_age, "The pose of the object is {age:.2f} s old: {refusal}."),
+            (reading.joint_time, limits.joint_age, "The joint positions are {age:.2f} s old, or not finite."),
+        ):
+            age = now - np.maximum(time_of, self._begun)
+            for robot in np.flatnonzero(age > limit):
+                self._stop(int(robot), text.format(age=age[robot], refusal=self._refusals[robot]))
+        below = reading.joint_pos < self.controller.lower - limits.joint_margin
+        above = reading.joint_pos > self.controller.upper + limits.joint_margin
+        for robot, joint in np.argwhere(below | above):
+            bound = (self.controller.lower if below[robot, joint] else self.controller.upper)[joint]
+            name = self.controller.contract["joints"][joint]["name"]
+            found = reading.joint_pos[robot, joint]
+            self._stop(int(robot), f"Joint {name} is at {found:.2f}, beyond its limit {bound:.2f}.")
+
+    def _stop_all(self, reason: str) -> None:
+        for robot in range(len(self._stopped_at)):
+            self._stop(robot, reason)
+
+    def _stop(self, robot: int, reason: str) -> None:
+        """Let a robot slow down, unless it does so already."""
+        if np.isinf(self._stopped_at[robot]):
+            self._stopped_at[robot] = self.driver.now()
+            self.outcome.reasons[robot] = reason
+            if len(self._stopped_at) == 1:
+                logging.getLogger("xreset").warning("The robot stops. %s", reason)
+
+
+def _finite(values: Array) -> Array:
+    return np.asarray(np.isfinite(values).all(axis=1))
+
+
+def _rows(chosen: Array, new: Any, old: Any) -> Any:
+    """Return the chosen rows [N] of new values, and the other rows of old ones."""
+    if new is None or chosen.all():
+        return new
+    if isinstance(new, Links):
+        parts = {each.name: _rows(chosen, getattr(new, each.name), getattr(old, each.name)) for each in fields(Links)}
+        return Links(**parts)
+    return np.where(chosen.reshape(-1, *[1] * (new.ndim - 1)), new, old)

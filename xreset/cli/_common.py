@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Annotated, TypeVar
 
 import tyro
-from rich.console import Console
 
 from xreset.cli import INVOCATION
-from xreset.cli._terminal import Progress
+from xreset.cli._terminal import Progress, console
 from xreset.eval import trial
 from xreset.plugins import backend_names, backend_status
 
@@ -29,10 +28,42 @@ Flat = Annotated[_T, tyro.conf.arg(name="")]
 """A dataclass whose fields are options of the command itself."""
 
 
+# Options that several commands share, with their help -----------------------------------------------------------------
+
+_POLICY = "Run folder, exported policy (.onnx), or name of a policy that ships with xreset (xreset policies list)"
+Policy = Annotated[str, tyro.conf.Positional, tyro.conf.arg(help=f"{_POLICY}.")]
+PolicyOrBaseline = Annotated[
+    str,
+    tyro.conf.Positional,
+    tyro.conf.arg(help=f"{_POLICY}; or a baseline: zero, random, ik (open-loop kinematic retargeting)."),
+]
+RobotName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(help="Name of a robot, or a folder with a robot.toml.")]
+Robot = Annotated[str | None, tyro.conf.arg(help="Name or folder of the robot; default: the policy's, or the file's.")]
+Objects = Annotated[Path | None, tyro.conf.arg(help="Folder of real meshes; default: the built-in stand-ins.")]
+TrainedObjects = Annotated[
+    Path | None, tyro.conf.arg(help="Folder of real meshes; default: that of the training, else the stand-ins.")
+]
+Engines = Annotated[
+    tuple[str, ...],
+    tyro.conf.UseAppendAction,
+    tyro.conf.arg(help="Physics engine; give it again for more. Default: mujoco."),
+]
+AllEngines = Annotated[
+    tuple[str, ...],
+    tyro.conf.UseAppendAction,
+    tyro.conf.arg(help="Physics engine; give it again for more. Default: all that can be used here."),
+]
+Device = Annotated[
+    str, tyro.conf.arg(help="Where engines run that can use a GPU: cpu or cuda; the others run on the CPU.")
+]
+Host = Annotated[str, tyro.conf.arg(help="Address to serve at; 0.0.0.0 allows other machines.")]
+Port = Annotated[int, tyro.conf.arg(help="Port to serve at; if it is taken, the next free one.")]
+
+
 @contextmanager
-def engine_bars(console: Console, names: Sequence[str]) -> Iterator[Callable[[str, int, int], None]]:
+def engine_bars(names: Sequence[str]) -> Iterator[Callable[[str, int, int], None]]:
     """Show a progress bar for each engine; yields the function that moves them: (engine, steps done, steps in all)."""
-    with Progress(console) as bar:
+    with Progress() as bar:
         counts = {name: bar.count(name) for name in names}
         yield lambda name, done, total: counts[name](done, total)
 
@@ -42,7 +73,7 @@ def chosen_engines(names: Sequence[str], device: str) -> list[trial.Engine]:
     return [trial.engine(name, device=device) for name in dict.fromkeys(names or ("mujoco",))]
 
 
-def usable_engines(console: Console) -> list[str]:
+def usable_engines() -> list[str]:
     """Return the names of the engines that can be used here, and print why others cannot."""
     statuses = [backend_status(name) for name in backend_names()]
     for status in statuses:

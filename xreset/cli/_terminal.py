@@ -34,16 +34,20 @@ class Console(rich.console.Console):
         super().print(*objects, **options)
 
 
+console = Console()
+"""Where commands print."""
+
+
 class Progress(rich.progress.Progress):
     """Progress bars, which vanish at the end. A log, which cannot show a bar, gets a line every 20 seconds."""
 
-    def __init__(self, console: rich.console.Console) -> None:
+    def __init__(self, where: Console = console) -> None:
         super().__init__(
             rich.progress.TextColumn("{task.description}", style="progress.description", markup=False),
             rich.progress.BarColumn(),
             rich.progress.TaskProgressColumn(),
             rich.progress.TimeRemainingColumn(),
-            console=console,
+            console=where,
             transient=True,
         )
         self._said = perf_counter()

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from xreset.cli._common import Several
-from xreset.cli._terminal import Console
+from xreset.cli._terminal import console
 from xreset.eval import table
 from xreset.eval.report import make
 
@@ -35,7 +35,6 @@ def compare(
         apart: Show runs that differ only in their seed separately.
         out: Folder for compare.png and compare.md.
     """
-    console = Console()
     with console.status("reading"):
         made = make.compare(runs, out, x=x, curves=curve, apart=apart)
     for rows in (made.results, made.lifted, made.different):

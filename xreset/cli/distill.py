@@ -6,20 +6,20 @@ import math
 from pathlib import Path
 
 from xreset.cameras.config import VisionConfig
-from xreset.cli._common import Name, Several
+from xreset.cli._common import Objects, Policy, Robot, Several
 from xreset.errors import RunError
 from xreset.learning import train as training
 
 
 def distill(
-    teacher: Name = "",
+    teacher: Policy = "",
     *,
     out: Path,
     resets: Path | None = None,
-    robot: str | None = None,
-    objects: Path | None = None,
+    robot: Robot = None,
+    objects: Objects = None,
     camera: Several = (),
-    vision: VisionConfig = VisionConfig(),  # noqa: B008 (frozen)
+    vision: VisionConfig = VisionConfig(),
     backend: str = "mujoco-warp",
     device: str | None = None,
     num_envs: int = 1024,
@@ -31,11 +31,8 @@ def distill(
     """Train a policy that sees, by imitating one that is told the object's pose and shape.
 
     Args:
-        teacher: Run folder, exported policy (.onnx), or name of a policy that ships with xreset.
         out: Run folder to make, or to continue.
         resets: Reset bank, made by `xreset resets`.
-        robot: Name or folder of the robot; default: the bank's.
-        objects: Folder of real meshes; default: the built-in stand-ins.
         camera: front, side, or wrist; give it again for two cameras. Default: front.
         vision: Images, their timing, and what the policy gets of them.
         backend: Physics engine to train on.

@@ -4,30 +4,28 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from xreset.cli._common import Flat, Name, Several, engine_bars
-from xreset.cli._terminal import Console
+from xreset.cli._common import Engines, Flat, PolicyOrBaseline, engine_bars
+from xreset.cli._terminal import console
 from xreset.eval import evaluate as evaluation
 from xreset.eval import policy_spec, table
 from xreset.eval.setting import Setting
 
 
 def evaluate(
-    policy: Name,
+    policy: PolicyOrBaseline,
     *,
-    backend: Several = (),
+    backend: Engines = (),
     demos: Path,
     episodes: int = 5,
     settle: bool = False,
-    setting: Flat[Setting] = Setting(),  # noqa: B008
+    setting: Flat[Setting] = Setting(),
     out: Path | None = None,
 ) -> None:
     """Evaluate a policy or a baseline in one or several engines.
 
+    Near 33 % task progress, the baseline ik gets to the object and does not grasp it.
+
     Args:
-        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or
-            a baseline: zero, random, ik (open-loop kinematic retargeting; near 33 % task progress it gets to the object
-            and does not grasp it).
-        backend: Physics engine; give it again for more engines. Default: mujoco.
         demos: Demonstrations (xreset demos), retargeted trajectories (xreset retarget) or a goal set (xreset goals):
             starts and goals, and the path of ik.
         episodes: Episodes per demonstration, each with another perturbation of robot and object.
@@ -38,9 +36,8 @@ def evaluate(
             that ships with xreset, runs/BASELINE-ROBOT/eval for a baseline.
     """
     engines = tuple(dict.fromkeys(backend or ("mujoco",)))
-    console = Console()
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
-    with engine_bars(console, engines) as progress:
+    with engine_bars(engines) as progress:
         summaries = evaluation.evaluate(
             spec, demos, engines, episodes=episodes, settle=settle, out=out, progress=progress, **vars(setting)
         )

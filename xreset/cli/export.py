@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from xreset import runtime
-from xreset.cli._common import Name, Several
-from xreset.cli._terminal import Console, Progress
+from xreset.cli._common import Policy, Robot, Several, Sources, TrainedObjects
+from xreset.cli._terminal import Console, Progress, console
 from xreset.errors import RunError
 from xreset.eval.export import deploy as deployment
 from xreset.eval.export import lerobot as dataset
 from xreset.eval.export import recorded
 
-Folders = Annotated[tuple[Path, ...], tyro.conf.Positional]
-
 
 def lerobot(
-    folders: Folders,
+    folders: Sources,
     *,
     out: Path,
     backend: Several = (),
-    robot: str | None = None,
+    robot: Robot = None,
     objects: Path | None = None,
     task: str | None = None,
     video: bool = True,
@@ -37,7 +32,6 @@ def lerobot(
         folders: Run folders, or folders that xreset eval wrote into.
         out: Folder to write; must not exist.
         backend: Only episodes of this engine; give it again for more. Default: all.
-        robot: Name or folder of the robot; default: as the results name it.
         objects: Folder of meshes; default: as the results name it.
         task: The task in words; {object} is replaced by the object's name.
         video: Draw a film of each episode.
@@ -51,16 +45,13 @@ def lerobot(
     _say(recording, out)
 
 
-def npz(
-    folders: Folders, *, out: Path, backend: Several = (), robot: str | None = None, task: str | None = None
-) -> None:
+def npz(folders: Sources, *, out: Path, backend: Several = (), robot: Robot = None, task: str | None = None) -> None:
     """Write recorded evaluation episodes as plain arrays in one npz file (docs/rollouts.md has the schema).
 
     Args:
         folders: Run folders, or folders that xreset eval wrote into.
         out: File to write.
         backend: Only episodes of this engine; give it again for more. Default: all.
-        robot: Name or folder of the robot; default: as the results name it.
         task: The task in words; {object} is replaced by the object's name.
     """
     recording = _recording(folders, backend, robot, None, task)
@@ -69,17 +60,14 @@ def npz(
 
 
 def deploy(
-    policy: Name, *, out: Path, robot: str | None = None, objects: Path | None = None, object: Several = ()
+    policy: Policy, *, out: Path, robot: Robot = None, objects: TrainedObjects = None, object: Several = ()
 ) -> None:
     """Write a policy for a robot: the network, a contract that says what goes in and out, and a runtime.
 
     The runtime needs Python, numpy and onnxruntime (docs/live.md).
 
     Args:
-        policy: Run folder, exported policy (.onnx), or name of a policy that ships with xreset (xreset policies list).
         out: Folder to write; must not exist.
-        robot: Name or folder of the robot; default: the policy's.
-        objects: Folder of meshes; default: that of the training, else the stand-ins.
         object: Object whose points the contract lists; give it again for more. Default: the objects of the training.
     """
     spec = deployment.export_deploy(policy, out, robot=robot, objects=objects, only=object)
@@ -87,7 +75,6 @@ def deploy(
     named = []
     for name, entry in contract["objects"].items():
         named.append(f"{name} ({'stand-in' if entry['source'] == 'stand-in' else 'mesh'})")
-    console = Console()
     console.print(
         f"{out}: {spec.name} for {contract['robot']}, {len(contract['joints'])} joints at {contract['rate']:g} Hz"
     )
@@ -105,7 +92,7 @@ def _recording(
 
 def _say(recording: recorded.Recording, out: Path) -> None:
     engines = ", ".join(recording.episodes["engine"].unique())
-    Console().print(
+    console.print(
         f"{out}: {len(recording.episodes)} episodes of {recording.robot.name} in {engines},"
         f" {recording.offsets[-1]} frames at {recording.fps:g} per second"
     )

@@ -7,8 +7,8 @@ from typing import Any
 
 from rich.table import Table
 
-from xreset.cli._common import Flat, Name, Several, chosen_engines, engine_bars
-from xreset.cli._terminal import Console
+from xreset.cli._common import Engines, Flat, PolicyOrBaseline, chosen_engines, engine_bars
+from xreset.cli._terminal import console
 from xreset.errors import PolicyError
 from xreset.eval import frontier as frontiers
 from xreset.eval import policy_spec, trial
@@ -16,21 +16,18 @@ from xreset.eval.setting import Setting
 
 
 def frontier(
-    policy: Name,
+    policy: PolicyOrBaseline,
     *,
     resets: Path,
-    backend: Several = (),
+    backend: Engines = (),
     states: int = 400,
-    setting: Flat[Setting] = Setting(),  # noqa: B008
+    setting: Flat[Setting] = Setting(),
     out: Path | None = None,
 ) -> None:
     """Show from which demonstrated states a policy reaches the goal, and so where its training is stuck.
 
     Args:
-        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or
-            the baseline zero or random.
         resets: Reset bank (xreset resets) whose states are tried, at full gravity.
-        backend: Physics engine; give it again for more engines. Default: mujoco.
         states: Number of states to try.
         setting: Robot, meshes, seed of the choice of states, device and worlds.
         out: Folder for the results; default: frontier/ in the run folder or next to the policy.
@@ -38,13 +35,12 @@ def frontier(
     if policy == "ik":
         raise PolicyError("The baseline ik cannot continue from a state. Give a policy, zero or random.")
     engines = chosen_engines(backend, setting.device)
-    console = Console()
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "frontier"
     played = trial.load_trial(
         spec, resets, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs, accept=("bank",)
     )
-    with engine_bars(console, [e.name for e in engines]) as progress:
+    with engine_bars([e.name for e in engines]) as progress:
         results = frontiers.frontier(spec, played, engines, folder, states=states, progress=progress)
     title = f"{spec.name} on {spec.robot.name} continues from {len(results[0]['tried'])} demonstrated states:"
     table = Table(

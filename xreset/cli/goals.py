@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from xreset.cli._common import Several
-from xreset.cli._terminal import Console, Progress
+from xreset.cli._common import Objects, Several
+from xreset.cli._terminal import Progress, console
 from xreset.resets import goals as goal_sets
 from xreset.resets.config import GoalConfig
 
@@ -21,10 +21,10 @@ def goals(
     *,
     robot: str,
     out: Path,
-    objects: Path | None = None,
+    objects: Objects = None,
     family: Several = (),
     pose: Annotated[tuple[Pose, ...], tyro.conf.UseAppendAction] = (),
-    draw: GoalConfig = GoalConfig(),  # noqa: B008 (frozen)
+    draw: GoalConfig = GoalConfig(),
 ) -> None:
     """Give objects starts and goals without demonstrations, for `xreset eval --demos` and `xreset train --goals`.
 
@@ -34,14 +34,12 @@ def goals(
         names: Objects; default: all.
         robot: Name or folder of the robot.
         out: Goal set to write.
-        objects: Folder of real meshes; default: the built-in stand-ins.
         family: Kind of goal: lift, yaw, tilt-x, tilt-y (lifted, and turned by 60 degrees about an axis of the world) or
             random; give it again for more. Default: all of them, or none with --pose.
         pose: Goal of your own: x y z [m] and quaternion w x y z of the mesh frame; give it again for more.
         draw: Number, sizes, offsets and seed.
     """
-    console = Console()
-    with Progress(console) as bar:
+    with Progress() as bar:
         made = goal_sets.make_goals(
             names, robot=robot, meshes=objects, families=family or None, poses=pose, config=draw,
             progress=bar.count("goals within reach"),

@@ -6,14 +6,13 @@ from rich.table import Table
 
 from xreset import policy as policy_files
 from xreset.cli._common import Source
-from xreset.cli._terminal import Console
+from xreset.cli._terminal import console
 from xreset.learning import shrink as shrinking
 from xreset.policies import card, shipped
 
 
 def list_() -> None:
     """List the policies that ship with xreset. Every command that takes a policy takes their names."""
-    console = Console()
     for name, file in shipped().items():
         contract = policy_files.OnnxPolicy(file).contract
         about = card(file)
@@ -45,7 +44,7 @@ def shrink(policy: Source, out: Source) -> None:
         policy.stat().st_size if policy.is_file() else 0
     )  # now, for the output may replace it; of what is no file, shrinking complains
     shrinking.shrink(policy, out)
-    Console().print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, was {before / 1e6:.2f} MB")
+    console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, was {before / 1e6:.2f} MB")
 
 
 COMMAND = {"list": list_, "shrink": shrink}

@@ -6,28 +6,27 @@ from pathlib import Path
 
 from rich.table import Table
 
-from xreset.cli._common import Flat, Name, Several, chosen_engines, engine_bars, usable_engines
-from xreset.cli._terminal import Console
+from xreset.cli._common import Flat, Policy, Several, chosen_engines, engine_bars, usable_engines
+from xreset.cli._terminal import console
 from xreset.eval import policy_spec
 from xreset.eval import rehearse as rehearsal
 from xreset.eval.setting import Setting
 
 
 def rehearse(
-    policy: Name,
+    policy: Policy,
     *,
     demos: Path | None = None,
     backend: Several = (),
     fault: Several = (),
     episodes: int = 1,
     real_time: bool = False,
-    setting: Flat[Setting] = Setting(),  # noqa: B008
+    setting: Flat[Setting] = Setting(),
     out: Path | None = None,
 ) -> None:
     """Rehearse a policy for a robot: late and wrong poses, late actions, lost frames, pushes, one fault at a time.
 
     Args:
-        policy: Run folder, exported policy (.onnx), or name of a policy that ships with xreset (xreset policies list).
         demos: Demonstrations whose starts and goals are played. Default: two synthetic ones of each of the policy's
             objects.
         backend: Physics engine; give it again for more engines. Default: all that can be used here, but on a CPU no
@@ -38,13 +37,12 @@ def rehearse(
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: rehearsal/ in the run folder or next to the policy.
     """
-    console = Console()
-    engines = chosen_engines(backend or usable_engines(console), setting.device)
+    engines = chosen_engines(backend or usable_engines(), setting.device)
     if not backend:
         engines = [each for each in engines if each.grasps]
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "rehearsal"
-    with engine_bars(console, [e.name for e in engines]) as progress:
+    with engine_bars([e.name for e in engines]) as progress:
         found = rehearsal.rehearse(
             spec,
             demos,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from xreset.cli._common import Source
-from xreset.cli._terminal import Console, Progress
+from xreset.cli._common import Robot, Source
+from xreset.cli._terminal import Progress, console
 from xreset.eval import table
 from xreset.eval.report import film as films
 from xreset.eval.report import make
@@ -17,7 +17,7 @@ def report(
     run: Source,
     *,
     out: Path | None = None,
-    robot: str | None = None,
+    robot: Robot = None,
     objects: Path | None = None,
     film: Path | None = None,
 ) -> None:
@@ -27,21 +27,19 @@ def report(
         run: Run folder, folder of results (for example of a baseline), or name of a policy that ships with xreset (then
             runs/NAME).
         out: Folder for index.html and overview.png; default: report/ in the run folder.
-        robot: Name or folder of the robot, for the clips; default: as the results name it.
         objects: Folder of real meshes, for the clips; default: as the results name it.
         film: MP4 to write as well: every object in every engine, next to each other.
     """
     if not run.exists() and str(run) in shipped():
         run = results_folder(str(run))
-    console = Console()
-    with Progress(console) as bar:
+    with Progress() as bar:
         made = make.make_report(run, out, robot=robot, objects=objects, progress=bar.count("drawing clips"))
     console.print(table.results_table(made.results))
     console.print(made.headline)
     for note in made.notes:
         console.print(f"note: {note}", style="yellow")
     if film is not None:
-        with Progress(console) as bar:
+        with Progress() as bar:
             engines, shown = films.make_film(
                 run, film, robot=robot, objects=objects, progress=bar.count("drawing the film")
             )

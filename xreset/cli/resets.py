@@ -33,9 +33,9 @@ def resets(
     objects: Path | None = None,
     num_envs: int = 64,
     device: str = "cpu",
-    limits: Annotated[FilterConfig, tyro.conf.arg(name="filter")] = FilterConfig(),  # noqa: B008 (frozen)
-    closing: ClosingConfig = ClosingConfig(),  # noqa: B008
-    squeeze: SqueezeConfig = SqueezeConfig(),  # noqa: B008
+    limits: Annotated[FilterConfig, tyro.conf.arg(name="filter")] = FilterConfig(),
+    closing: ClosingConfig = ClosingConfig(),
+    squeeze: SqueezeConfig = SqueezeConfig(),
     hold: bool = False,
     settle: bool = False,
 ) -> None:

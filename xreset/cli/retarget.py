@@ -10,8 +10,8 @@ from rich.table import Table
 
 from xreset import description
 from xreset.accounts import accounts_path, described, with_totals, write_accounts
-from xreset.cli._common import Source
-from xreset.cli._terminal import Console, Progress
+from xreset.cli._common import Objects, Source
+from xreset.cli._terminal import Progress, console
 from xreset.demos import align, archive, plausible
 from xreset.files import file_hash
 from xreset.pictures import render
@@ -26,12 +26,12 @@ def retarget(
     *,
     robot: str,
     out: Path,
-    objects: Path | None = None,
+    objects: Objects = None,
     max_per_object: int | None = None,
     picture: Path | None = None,
     device: str = "cpu",
-    hand: HandConfig = HandConfig(),  # noqa: B008 (frozen)
-    arm: ArmConfig = ArmConfig(),  # noqa: B008
+    hand: HandConfig = HandConfig(),
+    arm: ArmConfig = ArmConfig(),
 ) -> None:
     """Turn human demonstrations into robot motion.
 
@@ -39,14 +39,12 @@ def retarget(
         demos: Archive of demonstrations (`xreset demos`).
         robot: Name of a robot, or the folder of its description.
         out: File to write.
-        objects: Folder of real meshes; default: the built-in stand-ins.
         max_per_object: Use only the first sequences of each object, at most this many.
         device: Where hand retargeting runs: cpu or cuda. The arm runs on the CPU.
         hand: Weights of hand retargeting.
         arm: Weights and effort of the arm's inverse kinematics.
         picture: PNG to write: first contact, mid-lift and goal for each object, with the human keypoints.
     """
-    console = Console()
     spec = description.load_robot(robot)
     chosen = archive.read_demos(demos)
     if max_per_object is not None:
@@ -55,7 +53,7 @@ def retarget(
         console.print(f"note: {doubt}", style="yellow")
     specs = archive.demo_objects(chosen, objects)
     config = pipeline.RetargetConfig(hand=hand, arm=arm)
-    with Progress(console) as bar:
+    with Progress() as bar:
         count = bar.count("sequences")
         result = pipeline.retarget_demos(chosen, spec, list(specs.values()), config, progress=count, device=device)
     file.write_retargeted(

@@ -11,8 +11,8 @@ from rich.text import Text
 
 from xreset import __version__, description, inputs
 from xreset.backends import workers
-from xreset.cli._common import Name, Several, Source, this_command, usable_engines
-from xreset.cli._terminal import Console, Progress
+from xreset.cli._common import AllEngines, Device, Objects, Robot, RobotName, Source, this_command, usable_engines
+from xreset.cli._terminal import Progress, console
 from xreset.demos import archive
 from xreset.errors import RobotError
 from xreset.files import write_json
@@ -40,11 +40,11 @@ def list_robots() -> None:
             continue
         joints = f"{len(spec.arm_indices)} + {len(spec.hand_indices)}"
         table.add_row(name, joints, ", ".join(spec.fingertip_names), str(description.robot_folder(name)))
-    Console().print(table)
+    console.print(table)
 
 
 def check(
-    robot: Name,
+    robot: RobotName,
     /,
     *,
     picture: Path | None = None,
@@ -53,12 +53,10 @@ def check(
     """Check a robot, and print all errors and warnings. Exits with 1 after an error.
 
     Args:
-        robot: Name of a robot, or a folder with a robot.toml.
         picture: PNG to write: the robot at home, with the frames of its palm, fingertips and joints.
         engines: Also build the robot in every installed engine (the first time, mujoco-warp compiles for a minute or
             two).
     """
-    console = Console()
     styles = {"ok": "green", "skipped": "dim", "warning": "yellow", "error": "bold red"}
 
     def report(finding: checks.Finding) -> None:
@@ -105,7 +103,6 @@ def import_(
     """
     made = importer.import_robot(arm, hand, out, name=name, flange=flange, offset=offset, rpy=rpy, thumb=thumb)
     render.write_png(out / "robot.png", pictures.robot_picture(description.load_robot(out)))
-    console = Console()
     for title, lines in (("guessed", made.guessed), ("for you to decide", made.to_say)):
         console.print(f"{title}:")
         for line in lines:
@@ -114,14 +111,13 @@ def import_(
     check(str(out), engines=False)
 
 
-def reshape(robot: Name, /, *, shapes: Path, out: Path) -> None:
+def reshape(robot: RobotName, /, *, shapes: Path, out: Path) -> None:
     """Make a copy of a robot with the collision shapes of another URDF or MJCF.
 
     Joints, masses, drives and frames stay the same, so policies of the robot play on the copy. Links are matched by
     name.
 
     Args:
-        robot: Name of a robot, or a folder with a robot.toml.
         shapes: URDF or MJCF with the new shapes, for example of the hand.
         out: Folder to make; its name becomes the robot's name.
     """
@@ -131,32 +127,29 @@ def reshape(robot: Name, /, *, shapes: Path, out: Path) -> None:
 
 
 def place(
-    robot: Name,
+    robot: RobotName,
     /,
     *,
     demos: Path,
-    objects: Path | None = None,
+    objects: Objects = None,
     max_per_object: int = 2,
     processes: int | None = None,
     write: bool = False,
-    search: PlaceConfig = PlaceConfig(),  # noqa: B008  tyro reads flags from the default
+    search: PlaceConfig = PlaceConfig(),
 ) -> None:
     """Find the base placement from which a robot's arm follows most of the demonstrations.
 
     Args:
-        robot: Name of a robot, or a folder with a robot.toml.
         demos: Archive of demonstrations (`xreset demos`).
-        objects: Folder of real meshes; default: the built-in stand-ins.
         max_per_object: Number of sequences of each object, spread over the archive.
         processes: Number of processes, with about 0.5 GB each; default: one for each core, at most 8.
         write: Write the placement and its home into the robot's robot.toml.
         search: Ranges and effort of the search.
     """
-    console = Console()
     spec = description.load_robot(robot)
     chosen = archive.read_demos(demos).select(max_per_object=max_per_object, spread=True)
     specs = list(archive.demo_objects(chosen, objects).values())
-    with Progress(console) as bar:
+    with Progress() as bar:
         paths = pipeline.wrist_paths(chosen, spec, specs, progress=bar.count("hand retargeting"))
         wrists = np.concatenate([path.root_pos[path.annotated].numpy() for path in paths])
         avoid = np.concatenate((wrists, pipeline.rest_on_table(chosen, specs).object_pos))
@@ -192,13 +185,13 @@ def judge(
     bank: Source,
     /,
     *,
-    robot: str | None = None,
-    objects: Path | None = None,
-    backend: Several = (),
+    robot: Robot = None,
+    objects: Objects = None,
+    backend: AllEngines = (),
     states: int = 8,
-    squeeze: SqueezeConfig = SqueezeConfig(force=5.0, reach=0.01),  # noqa: B008  tyro reads flags from the default
+    squeeze: SqueezeConfig = SqueezeConfig(force=5.0, reach=0.01),
     num_envs: int = 32,
-    device: str = "cpu",
+    device: Device = "cpu",
     picture: Path | None = None,
     json: Path | None = None,
 ) -> None:
@@ -210,20 +203,15 @@ def judge(
 
     Args:
         bank: File made by `xreset resets`.
-        robot: Folder of the robot, if it is not one that is known by name.
-        objects: Folder of real meshes; default: the built-in stand-ins.
-        backend: Engine to judge in; give it again for more. Default: all that can be used here.
         states: Number of states of each object: those that grasp most tightly.
         squeeze: How hard fingers press, and which fingers.
         num_envs: Worlds at a time.
-        device: Where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
         picture: PNG to write: the best state of each object at the start and after each phase.
         json: File to write the counts to.
     """
-    console = Console()
     loaded = inputs.load_inputs(bank, robot=robot, objects=objects, accept=("bank",))
-    names = list(dict.fromkeys(backend)) or usable_engines(console)
-    with Progress(console) as bar:
+    names = list(dict.fromkeys(backend)) or usable_engines()
+    with Progress() as bar:
         found = judging.judge(
             loaded.bank, loaded.robot, loaded.objects, names, states=states, squeeze=squeeze, num_envs=num_envs,
             device=device, progress=bar.count(f"states in {', '.join(names)}"),

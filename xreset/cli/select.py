@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.table import Table
 
 from xreset.cli._common import Flat, Several, Source, chosen_engines
-from xreset.cli._terminal import Console
+from xreset.cli._terminal import console
 from xreset.eval import select as selection
 from xreset.eval.setting import Setting
 
@@ -20,7 +20,7 @@ def select(
     backend: Several = (),
     most: int = 8,
     episodes: int = 2,
-    setting: Flat[Setting] = Setting(),  # noqa: B008
+    setting: Flat[Setting] = Setting(),
     starts: int | None = None,
 ) -> None:
     """Choose the checkpoint of a training that is best in its worst engine.
@@ -38,7 +38,6 @@ def select(
         starts: Seed of the starts; default: one that evaluations do not use.
     """
     engines = chosen_engines(backend or ("mujoco", "pybullet", "sapien"), setting.device)
-    console = Console()
 
     def say(name: str, engine: str, score: float | None) -> None:
         if score is not None:

@@ -3,30 +3,26 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
-from xreset.cli._common import Name, Several
+from xreset.cli._common import Policy, Robot, Several, TrainedObjects
 from xreset.eval.export import deploy
 from xreset.live import serve as server
 
 
 def serve(
-    policy: Name,
+    policy: Policy,
     *,
     host: str = "127.0.0.1",
     port: int = 8765,
-    robot: str | None = None,
-    objects: Path | None = None,
+    robot: Robot = None,
+    objects: TrainedObjects = None,
     object: Several = (),
 ) -> None:
     """Serve a policy to a robot's computer over a WebSocket (docs/live.md has the messages).
 
     Args:
-        policy: Run folder, exported policy (.onnx), or name of a policy that ships with xreset (xreset policies list).
         host: Address to listen at. Any other than 127.0.0.1 lets other computers use the policy; there is no password.
         port: Port to listen at.
-        robot: Name or folder of the robot; default: the policy's.
-        objects: Folder of meshes; default: that of the training, else the stand-ins.
         object: Object that clients may name; give it again for more. Default: the objects of the training.
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)

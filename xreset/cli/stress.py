@@ -6,30 +6,27 @@ from pathlib import Path
 
 from rich.table import Table
 
-from xreset.cli._common import Flat, Name, Several, chosen_engines, engine_bars
-from xreset.cli._terminal import Console
+from xreset.cli._common import Engines, Flat, PolicyOrBaseline, Several, chosen_engines, engine_bars
+from xreset.cli._terminal import console
 from xreset.eval import policy_spec, trial
 from xreset.eval import stress as sweeps
 from xreset.eval.setting import Setting
 
 
 def stress(
-    policy: Name,
+    policy: PolicyOrBaseline,
     *,
     demos: Path,
-    backend: Several = (),
+    backend: Engines = (),
     property: Several = (),
     episodes: int = 2,
-    setting: Flat[Setting] = Setting(),  # noqa: B008
+    setting: Flat[Setting] = Setting(),
     out: Path | None = None,
 ) -> None:
     """Measure robustness: the same episodes with changed stiffness, latency, friction, mass and more, one at a time.
 
     Args:
-        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or
-            a baseline (zero, random, ik).
         demos: Demonstrations whose starts and goals are played.
-        backend: Physics engine; give it again for more engines. Default: mujoco.
         property: Property to change, or NAME=VALUE,VALUE... for values of your own; give it again for more. Default:
             all.
         episodes: Episodes of each demonstration, the same for every value.
@@ -38,11 +35,10 @@ def stress(
     """
     properties = sweeps.chosen(property)
     engines = chosen_engines(backend, setting.device)
-    console = Console()
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "stress"
     played = trial.load_trial(spec, demos, objects=setting.objects, seed=setting.seed, num_envs=setting.num_envs)
-    with engine_bars(console, [e.name for e in engines]) as progress:
+    with engine_bars([e.name for e in engines]) as progress:
         found = sweeps.stress(spec, played, engines, folder, sweeps=properties, repetitions=episodes, progress=progress)
     sweeps.write_plot(folder / "stress.png", found, f"{spec.name}: robustness")
     table = Table("property", title=f"{spec.name}: task progress, and its difference to the same episodes (95 %)")

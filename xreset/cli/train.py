@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from xreset.checks import without_effect
+from xreset.cli._common import Objects
 from xreset.errors import RunError
 from xreset.learning import train as training
 from xreset.learning.config import TrainConfig
@@ -22,7 +23,7 @@ def train(
     robot: str | None = None,
     resets: Path | None = None,
     goals: Path | None = None,
-    objects: Path | None = None,
+    objects: Objects = None,
     backend: str = "mujoco-warp",
     device: str | None = None,
     num_envs: int = 4096,
@@ -33,7 +34,7 @@ def train(
     like: str = "paper",
     weights: Path | None = None,
     wandb: str | None = None,
-    config: TrainConfig = TrainConfig(),  # noqa: B008 (frozen)
+    config: TrainConfig = TrainConfig(),
 ) -> None:
     """Train a policy.
 
@@ -43,7 +44,6 @@ def train(
         resets: Reset bank, made by `xreset resets`.
         goals: Goal set, made by `xreset goals`. With --resets, its starts and goals are added to the demonstrated ones;
             without, every episode begins at home.
-        objects: Folder of real meshes; default: the built-in stand-ins.
         backend: Physics engine to train on.
         device: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
         num_envs: Worlds to simulate (per GPU).

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-from xreset.cli._common import Source
-from xreset.cli._terminal import Console, Progress
+from xreset.cli._common import Host, Objects, Port, Robot, Source
+from xreset.cli._terminal import Progress, console
 from xreset.errors import XResetError
 from xreset.eval.report import clips
 from xreset.files import write_whole
@@ -21,12 +21,12 @@ def view(
     *,
     demos: Path | None = None,
     retargeted: Path | None = None,
-    objects: Path | None = None,
-    robot: str | None = None,
+    objects: Objects = None,
+    robot: Robot = None,
     sequence: int | None = None,
     frame: int | None = None,
-    host: str = "127.0.0.1",
-    port: int = 8080,
+    host: Host = "127.0.0.1",
+    port: Port = 8080,
     png: Path | None = None,
     mp4: Path | None = None,
     moments: bool = False,
@@ -42,12 +42,8 @@ def view(
         file: Demonstrations, or what `xreset retarget`, `xreset resets` or `xreset goals` made.
         demos: Demonstrations of the file, to show the human hand over the robot.
         retargeted: Robot motion of a bank, to show the states that physics rejected.
-        objects: Folder of real meshes; default: the built-in stand-ins.
-        robot: Folder of the robot, if it is not one that is known by name.
         sequence: Which sequence, counted from 0. Default: the first; of a bank, all.
         frame: Which frame of the sequence (state of the bank). Default: the first; for --png the middle one.
-        host: Address to serve at; 0.0.0.0 allows other machines.
-        port: Port to serve at; if it is taken, the next free one.
         png: Picture to write, instead of a page.
         mp4: Film of the sequence to write, instead of a page.
         moments: With --png: first contact, mid-lift and goal of one demonstration of each object.
@@ -88,8 +84,7 @@ def _write_png(path: Path, shown: data.View, rows: np.ndarray, frame: int | None
 
 def _write_sheet(path: Path, shown: data.View, *, moments: bool) -> None:
     tiles = sheet.moment_tiles(shown) if moments else sheet.reason_tiles(shown)
-    console = Console()
-    with Progress(console) as bar:
+    with Progress() as bar:
         drawn = sheet.draw_sheet(shown, tiles, progress=bar.count("drawing"))
     render.write_png(path, drawn)
     for tile in tiles:
@@ -101,7 +96,7 @@ def _write_mp4(path: Path, shown: data.View, rows: np.ndarray) -> None:
     if not len(rows):
         raise XResetError("This sequence has no state to film. Choose another one with --sequence.")
     draw = picture.Drawer(shown).draw
-    frames = [draw(int(row)) for row in track(rows, "drawing", console=Console(), transient=True)]
+    frames = [draw(int(row)) for row in track(rows, "drawing", console=console, transient=True)]
     film = clips.encode_mp4(np.stack(frames), shown.rate)
     write_whole(path, film)
     print(f"{len(rows)} frames in {path}")

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from xreset.checks import Options
-from xreset.cli._common import Flat, Name, Several
-from xreset.cli._terminal import Console, Progress
+from xreset.cli._common import Flat, PolicyOrBaseline, Several
+from xreset.cli._terminal import Progress, console
 from xreset.errors import DemoError, XResetError
 from xreset.eval import policy_spec, trial
 from xreset.eval.engines import attribution, attribution_view
@@ -33,14 +33,14 @@ class Played(Options):
 
 
 def attribute(
-    policy: Name,
+    policy: PolicyOrBaseline,
     *,
     played: Flat[Played],
     towards: str,
     backend: str = "mujoco",
     only: Several = (),
     what_if: bool = False,
-    setting: Flat[Setting] = Setting(),  # noqa: B008
+    setting: Flat[Setting] = Setting(),
     out: Path | None = None,
 ) -> None:
     """Find the physical difference between two engines that costs a policy its skill.
@@ -50,8 +50,6 @@ def attribute(
     with one property changed to the value of the other engine, with all properties changed, and in the other engine.
 
     Args:
-        policy: Run folder, exported policy (.onnx), name of a policy that ships with xreset (xreset policies list), or
-            a baseline: zero, random, ik (open-loop kinematic retargeting).
         played: Demonstrations and episodes.
         towards: Engine towards which the properties are changed, usually the one in which the policy does worse.
         backend: Engine in which they are changed.
@@ -62,7 +60,6 @@ def attribute(
     """
     if backend == towards:
         raise XResetError(f"--backend and --towards are both {backend!r}. Choose two engines.")
-    console = Console()
     demos = played.demos
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     a, b = (trial.engine(name, device=setting.device) for name in (backend, towards))
@@ -76,7 +73,7 @@ def attribute(
     objects = tuple(o for o in objects if o.name in played_trial.bank.sequence_object[chosen])
     out = out or spec.folder.parent / "attribute"
     folder = played_trial.objects_folder
-    with Progress(console) as bar:
+    with Progress() as bar:
         task = bar.add_task("", total=None)
         found = attribution.attribute(
             spec, a, b, replace(played_trial, objects=objects),

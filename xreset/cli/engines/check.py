@@ -10,8 +10,8 @@ from rich.text import Text
 
 from xreset import description
 from xreset.backends import conformance, pool
-from xreset.cli._common import Several, this_command, usable_engines
-from xreset.cli._terminal import Console
+from xreset.cli._common import AllEngines, Device, this_command, usable_engines
+from xreset.cli._terminal import console
 from xreset.errors import XResetError
 from xreset.files import code_version, write_json
 from xreset.plugins import backend_class, backend_status, make_backend
@@ -20,9 +20,9 @@ from xreset.spec import SceneSpec
 
 def check(
     *,
-    backend: Several = (),
+    backend: AllEngines = (),
     robot: str | None = None,
-    device: str = "cpu",
+    device: Device = "cpu",
     only: Annotated[tuple[str, ...], tyro.conf.arg(name="check"), tyro.conf.UseAppendAction] = (),
     json: Path | None = None,
     verbose: bool = False,
@@ -30,9 +30,7 @@ def check(
     """Test whether physics engines keep their contract. Exits with 1 if one does not.
 
     Args:
-        backend: Engine to test; give it again for more. Default: all that can be used here.
         robot: Name or folder of the robot to test with. Default: a gripper, with which every check can run.
-        device: Where GPU engines run: cpu or cuda.
         only: Check to run; give it again for more. Default: all.
         json: File to write the results to.
         verbose: Show every measured number, not only the one nearest to its tolerance.
@@ -40,16 +38,15 @@ def check(
     known = [c.name for c in conformance.CHECKS]
     if unknown := sorted(set(only) - set(known)):
         raise XResetError(f"Unknown check {', '.join(unknown)}. Choose from: {', '.join(known)}.")
-    console = Console()
     spec = description.load_robot(robot) if robot else conformance.scene().robot
     runs = []
-    for name in dict.fromkeys(backend) or usable_engines(console):
+    for name in dict.fromkeys(backend) or usable_engines():
         status = backend_status(name)
         used = device if device.split(":")[0] in status.device else "cpu"
         what = f" {status.version}, {spec.name}, {used}: verdict, check, and what came nearest to its tolerance"
         console.print(Text.assemble((name, "bold"), what))
         results = conformance.run(
-            _maker(name, used), robot=spec, only=only or None, report=lambda r: _print(console, r, verbose)
+            _maker(name, used), robot=spec, only=only or None, report=lambda r: _print(r, verbose)
         )
         runs.append(
             {
@@ -96,7 +93,7 @@ _STYLE = {
 }
 
 
-def _print(console: Console, result: conformance.CheckResult, verbose: bool) -> None:
+def _print(result: conformance.CheckResult, verbose: bool) -> None:
     detail = _text(result.worst) if result.measures else result.problem
     verdict = (f"{result.verdict:<16}", _STYLE[result.verdict])
     console.print(Text.assemble("  ", verdict, f" {result.name:<22} {result.seconds:5.1f} s  {detail}"))

@@ -7,8 +7,8 @@ from pathlib import Path
 from rich.table import Table
 from rich.text import Text
 
-from xreset.cli._common import Several, Source, this_command, usable_engines
-from xreset.cli._terminal import Console, Progress
+from xreset.cli._common import AllEngines, Device, Objects, Robot, Several, Source, this_command, usable_engines
+from xreset.cli._terminal import Progress, console
 from xreset.eval import trial
 from xreset.eval.engines import agreement, sources
 from xreset.files import code_version, file_hash, write_json
@@ -17,12 +17,12 @@ from xreset.files import code_version, file_hash, write_json
 def compare(
     motion: Source,
     *,
-    robot: str | None = None,
-    objects: Path | None = None,
+    robot: Robot = None,
+    objects: Objects = None,
     only: Several = (),
-    backend: Several = (),
+    backend: AllEngines = (),
     grasps: int = 48,
-    device: str = "cpu",
+    device: Device = "cpu",
     json: Path | None = None,
 ) -> None:
     """Measure how far physics engines agree with MuJoCo on grasps. Exits with 1 if one misses a target.
@@ -35,18 +35,13 @@ def compare(
     Args:
         motion: File with the grasps: of `xreset retarget` (best, because no engine has chosen them), of `xreset
             resets`, or of `xreset demos`, which is retargeted first.
-        robot: Name or folder of the robot; default: the file's. Demonstrations need it.
-        objects: Folder of real meshes; default: the built-in stand-ins.
         only: Object to use; give it again for more. Default: all objects of the file.
-        backend: Engine to measure; give it again for more. Default: all that can be used here.
         grasps: Number of closings, and of holds.
-        device: Where GPU engines run: cpu or cuda.
         json: File to write the results to.
     """
-    console = Console()
-    names = [name for name in dict.fromkeys(backend) or usable_engines(console) if name != agreement.REFERENCE]
+    names = [name for name in dict.fromkeys(backend) or usable_engines() if name != agreement.REFERENCE]
     engines = [trial.engine(name, device=device) for name in names]
-    with Progress(console) as bar:
+    with Progress() as bar:
         task = bar.add_task("reading")
         spec, loaded, frames = sources.load_frames(
             motion, robot=robot, objects_folder=objects, only=only,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rich.table import Table
 
-from xreset.cli._terminal import Console
+from xreset.cli._terminal import console
 from xreset.plugins import backend_names, backend_status
 
 
@@ -16,7 +16,7 @@ def engines() -> None:
         table.add_row(
             name, status.version or "-", status.device, "yes" if status.reason is None else f"no: {status.reason}"
         )
-    Console().print(table)
+    console.print(table)
 
 
 COMMAND = engines

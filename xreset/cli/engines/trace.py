@@ -9,7 +9,7 @@ from pathlib import Path
 
 from xreset.checks import Options
 from xreset.cli._common import Flat, Several, Source, usable_engines
-from xreset.cli._terminal import Console, Progress
+from xreset.cli._terminal import Progress, console
 from xreset.errors import XResetError
 from xreset.eval import trial
 from xreset.eval.engines import actions, divergence, film, replay, sources, trace_view
@@ -64,8 +64,8 @@ def trace(
     *,
     backend: Several = (),
     reference: str = "mujoco",
-    sequence: Flat[Sequence] = Sequence(),  # noqa: B008
-    place: Flat[Place] = Place(),  # noqa: B008
+    sequence: Flat[Sequence] = Sequence(),
+    place: Flat[Place] = Place(),
     limits: Flat[Limits] = Limits(),
     output: Flat[Output] = Output(),
 ) -> None:
@@ -90,12 +90,11 @@ def trace(
         force=limits.force_threshold,
         contact_time=limits.contact_time,
     )
-    console = Console()
     out = output.out
     base = trial.engine(reference, device=place.device)
-    names = [name for name in dict.fromkeys(backend) or usable_engines(console) if name != reference]
+    names = [name for name in dict.fromkeys(backend) or usable_engines() if name != reference]
     engines = [trial.engine(name, device=place.device) for name in names]
-    with Progress(console) as bar:
+    with Progress() as bar:
         task = bar.add_task("actions", total=None)
 
         def show(what: str) -> Callable[[int, int], None]:

@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from math import degrees
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from rich.table import Table
 
 from xreset.checks import Options
 from xreset.cli._common import Flat, Source, Sources
 from xreset.cli._terminal import Console, Progress
-from xreset.demos import archive, dexycb, ho3d, info, keypoints, mirror, plausible, synth
+from xreset.demos import archive, dexycb, ho3d, keypoints, mirror, plausible, synth
 from xreset.errors import DemoError
 from xreset.files import file_hash
-from xreset.spec import ObjectSpec
 
 Side = Literal["right", "left", "both"]
 
@@ -66,7 +65,6 @@ def import_keypoints(
     units: Literal["m", "mm"] | None = None,
     coordinates: Literal["table", "camera"] | None = None,
     table_from_camera: Path | None = None,
-    quat: Literal["wxyz", "xyzw"] | None = None,
     fps: float | None = None,
     object: str | None = None,
     side: Literal["right", "left"] | None = None,
@@ -84,7 +82,6 @@ def import_keypoints(
         units: Unit of keypoints and object positions.
         coordinates: Frame of all positions: the table's (z up, table top at z = 0) or that of a fixed camera.
         table_from_camera: File with the camera's pose in the table frame: 4x4, metres, as text or npy.
-        quat: Order of quaternions, if the file does not state it.
         fps: Frames per second; files with times are resampled to it.
         object: The grasped object, if the files do not state it.
         side: The hand, if the files do not state it.
@@ -96,7 +93,6 @@ def import_keypoints(
         units=units,
         frame=coordinates,
         table_from_camera=T,
-        quat=quat,
         fps=fps,
         object_name=object,
         side=side,
@@ -248,21 +244,13 @@ def reflect(
     _save(result, out, {"mirrored": True, "tolerance": tolerance}, {"demos": file_hash(file)})
 
 
-def describe(file: Source, *, objects: Path | None = None) -> None:
+def describe(file: Source) -> None:
     """Describe an archive of demonstrations, object by object, and warn of what looks wrong.
 
     Args:
         file: The archive.
-        objects: Folder of meshes; default: the built-in stand-ins. Needed to check whether objects stand on the table.
     """
-    demos = archive.read_demos(file)
-    try:
-        known = archive.demo_objects(demos, objects)
-    except DemoError:
-        if objects is not None:
-            raise
-        known = None
-    _print_summary(demos, file, known)
+    _print_summary(archive.read_demos(file), file)
 
 
 def _sides(side: Side) -> tuple[Literal["right", "left"], ...]:
@@ -281,27 +269,32 @@ def _save(demos: archive.Demos, out: Path, config: dict[str, Any], inputs: dict[
     _print_summary(demos, out)
 
 
-def _print_summary(demos: archive.Demos, path: Path, objects: dict[str, ObjectSpec] | None = None) -> None:
-    columns = ("right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg")
+def _print_summary(demos: archive.Demos, path: Path) -> None:
     table = Table(caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start pose")
     table.add_column("object", no_wrap=True)
-    for column in columns:
+    for column in ("right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg"):
         table.add_column(column, justify="right")
-    for row in info.summarize(demos):
+    for name in sorted(set(demos.object_name.tolist())):
+        own = demos.select(objects=[name])
+        right = np.count_nonzero(own.hand_side == "right")
+        first = own.frame_offsets[:-1]
+        height = own.object_pos[:, 2]
+        lift = np.median(np.maximum.reduceat(height, first) - height[first])
+        distance, angle = map(np.median, plausible.start_to_goal(own))
         table.add_row(
-            row.object_name,
-            str(row.right),
-            str(row.sequences - row.right),
-            str(row.frames),
-            f"{row.hand_frames / row.frames:.0%}",
-            f"{100 * row.lift:.1f}",
-            f"{100 * row.goal_distance:.1f}",
-            f"{degrees(row.goal_angle):.0f}",
+            name,
+            str(right),
+            str(len(own) - right),
+            str(own.num_frames),
+            f"{own.hand_valid.mean():.0%}",
+            f"{100 * lift:.1f}",
+            f"{100 * distance:.1f}",
+            f"{np.degrees(angle):.0f}",
         )
     console = Console()
     console.print(table)
     console.print(f"{path}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second")
-    for doubt in plausible.doubts(demos, objects):
+    for doubt in plausible.doubts(demos):
         console.print(f"note: {doubt}", style="yellow")
 
 

@@ -10,16 +10,14 @@ nor the place of the table.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.demos.archive import Demos, Progress, merge_demos, no_progress
 from xreset.demos.keypoints import Convention, read_transform, sequence_of
-from xreset.demos.pickles import read_pickle
+from xreset.demos.pickles import array_of, read_pickle
 from xreset.errors import DemoError
 from xreset.text import shown
 
@@ -84,67 +82,51 @@ def read_ho3d(
 
 def _read_sequence(folder: Path, fps: float) -> dict[str, np.ndarray]:
     """Return the arrays of a sequence for :func:`sequence_of`, from its first to its last known object pose."""
-    frames = {}
+    paths = {}
     for path in sorted(folder.glob("*.pkl")):
         if not (path.stem.isdecimal() and len(path.stem) < 10):
             raise DemoError(f"{path} is not named by a frame's number, such as 0000.pkl.")
-        frames[int(path.stem)] = _read_frame(path)
-    known = [number for number, frame in frames.items() if frame["pose"] is not None]
+        paths[int(path.stem)] = path
+    frames = {number: _read_frame(path) for number, path in paths.items()}
+    known = [number for number, (_, pose, _) in frames.items() if np.isfinite(pose).all()]
     if not known:
         raise DemoError(f"{folder} has no frame with an object's pose (objRot and objTrans).")
-    frames = {number: frame for number, frame in frames.items() if known[0] <= number <= known[-1]}
-    missing = sorted(set(frames) - set(known))
-    if missing:
-        raise DemoError(
-            f"{folder}: the object's pose is unknown in {len(missing)} frames between others, first in"
-            f" {missing[0]:04d}.pkl."
-        )
-    names = sorted({frame["name"] for frame in frames.values()})
-    if len(names) > 1:
-        raise DemoError(f"{folder}: the object changes within the sequence: {shown(names)}.")
-    arrays = {
+    numbers = [number for number in frames if known[0] <= number <= known[-1]]
+    joints, poses, names = zip(*(frames[number] for number in numbers), strict=True)
+    if len(set(names)) > 1:
+        raise DemoError(f"{folder}: the object changes within the sequence: {shown(sorted(set(names)))}.")
+    return {
         "object": np.array(names[0]),
-        "keypoints": np.stack([frame["joints"] for frame in frames.values()]),
-        "object_pose": np.stack([frame["pose"] for frame in frames.values()]),
+        "keypoints": np.stack(joints),
+        "object_pose": np.stack(poses),
+        "time": (np.array(numbers) - numbers[0]) / fps,  # missing frames are interpolated
     }
-    numbers = np.array(list(frames))
-    if (np.diff(numbers) > 1).any():  # missing frames are interpolated
-        arrays["time"] = (numbers - numbers[0]) / fps
-    return arrays
 
 
-def _read_frame(path: Path) -> dict[str, Any]:
-    """Return joints [21, 3] (NaN if unknown), object pose [4, 4] (None if unknown) and object name."""
+def _read_frame(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return joints [21, 3] and object pose [4, 4], NaN where unknown, and the object's name."""
     data = read_pickle(path)
     lacking = sorted({*_SHAPES, "objName"} - set(data))
     if lacking:
-        raise DemoError(
-            f"{path} lacks {', '.join(lacking)}; it has {shown(sorted(data))}. Is it an annotation of HO-3D?"
-        )
-    if not isinstance(data["objName"], str):
-        raise DemoError(f"{path}: objName is {shown(data['objName'])}, expected a text.")
-    joints, rotation, position = (_numbers(path, data, name) for name in _SHAPES)
-    pose = None
-    if rotation is not None and position is not None:
-        pose = np.eye(4)
-        pose[:3, :3] = _FROM_OPENGL @ Rotation.from_rotvec(rotation).as_matrix()
-        pose[:3, 3] = _FROM_OPENGL @ position
-    points = np.full((21, 3), np.nan) if joints is None else joints @ _FROM_OPENGL
-    return {"joints": points, "pose": pose, "name": data["objName"]}
-
-
-def _numbers(path: Path, data: Mapping[str, Any], name: str) -> np.ndarray | None:
-    value = data[name]
-    shape = _SHAPES[name]
-    if value is None:
-        return None
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fi":
-        raise DemoError(f"{path}: {name} is {shown(value)}, expected numbers {list(shape)}.")
-    if value.size != np.prod(shape) or (value.ndim > 1 and value.shape[0] != shape[0]):
-        hint = ""
-        if name == "handJoints3D" and value.size == 3:
-            hint = " The evaluation split gives the wrist alone. Use the split train."
-        raise DemoError(f"{path}: {name} has shape {list(value.shape)}, expected {list(shape)}.{hint}")
-    if not np.isfinite(value).all():
-        raise DemoError(f"{path}: {name} holds numbers that are not finite.")
-    return value.astype(float).reshape(shape)
+        raise DemoError(f"{path} lacks {', '.join(lacking)}; it has {shown(list(data))}. Is it an annotation of HO-3D?")
+    name = data["objName"]
+    if not isinstance(name, str):
+        raise DemoError(f"{path}: objName is {shown(name)}, expected a text.")
+    numbers = {}
+    for field, shape in _SHAPES.items():
+        numbers[field] = np.full(shape, np.nan)
+        if data[field] is None:
+            continue
+        try:
+            numbers[field] = array_of(data[field]).astype(float).reshape(shape)
+        except Exception as error:  # a damaged array raises any kind of error
+            raise DemoError(
+                f"{path}: {field} is not an array of numbers {list(shape)}. The split evaluation has the wrist alone:"
+                " use train."
+            ) from error
+    pose = np.eye(4)
+    pose[:3, :3] = np.nan
+    if np.isfinite(numbers["objRot"]).all():
+        pose[:3, :3] = _FROM_OPENGL @ Rotation.from_rotvec(numbers["objRot"]).as_matrix()
+    pose[:3, 3] = _FROM_OPENGL @ numbers["objTrans"]
+    return numbers["handJoints3D"] @ _FROM_OPENGL, pose, name

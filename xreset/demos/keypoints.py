@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import csv
 import logging
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+from scipy.interpolate import interp1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from xreset.checks import is_rigid
@@ -32,7 +32,6 @@ from xreset.text import is_plain, shown
 Order = Literal["mano", "mediapipe", "openpose"]
 Unit = Literal["m", "mm"]
 Frame = Literal["table", "camera"]
-Quaternion = Literal["wxyz", "xyzw"]
 Motion = tuple[np.ndarray, np.ndarray, Rotation]
 """Keypoints [F, 21, 3], object positions [F, 3] and F object orientations."""
 
@@ -74,7 +73,6 @@ _FILE = {
     "keypoints": Field(("F", 21, 3), "fi", within=None),
     "object_pose": Field(("F", 4, 4), "fi", required=False),
     "object_pos": Field(("F", 3), "fi", required=False),
-    "object_quat": Field(("F", 4), "fi", required=False),
     "object_quat_wxyz": Field(("F", 4), "fi", required=False),
     "object_quat_xyzw": Field(("F", 4), "fi", required=False),
     "time": Field(("F",), "fi", required=False),
@@ -84,9 +82,7 @@ _FILE = {
 
 _COLUMNS = {
     "keypoints": [f"{'xyz'[axis]}{k}" for k, axis in np.ndindex(21, 3)],
-    "object_pose": [f"object_{row}{column}" for row, column in np.ndindex(3, 4)],
     "object_pos": ["object_x", "object_y", "object_z"],
-    "object_quat": ["object_q0", "object_q1", "object_q2", "object_q3"],
     "object_quat_wxyz": ["object_qw", "object_qx", "object_qy", "object_qz"],
     "time": ["time"],
 }
@@ -105,8 +101,6 @@ class Convention:
     """``table``: z up, table top at z = 0. ``camera``: the frame of a camera that does not move."""
     table_from_camera: np.ndarray | None = None
     """[4, 4] pose of the camera in the table frame [m]; with ``frame="camera"``."""
-    quat: Quaternion | None = None
-    """Order of the object's quaternions, where their names do not say it."""
     fps: float | None = None
     """Frames per second of a file without times; files with times are resampled to it."""
     object_name: str | None = None
@@ -182,8 +176,6 @@ def read_transform(path: str | Path) -> np.ndarray:
             " translation,"
             " with the last row 0 0 0 1."
         )
-    if np.abs(T[:3, 3]).max() > 20:
-        raise DemoError(f"{path} moves by {np.linalg.norm(T[:3, 3]):.0f} m. Its translation must be in metres.")
     return T.astype(float)
 
 
@@ -218,7 +210,7 @@ def _read_csv(path: Path, name: str) -> list[dict[str, np.ndarray]]:
     """Read the sequences of a table with one row for each frame; the frames of a sequence stand together."""
     try:
         if path.stat().st_size > max_bytes():
-            raise DemoError(f"{path} has {path.stat().st_size >> 20} MB. Split it, or set XRESET_MAX_FILE_MB.")
+            raise ValueError(f"it has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows")
         with open(path, newline="", encoding="utf-8-sig") as file:
             header, *lines = csv.reader(file, strict=True)
     except (OSError, ValueError, csv.Error) as error:
@@ -227,37 +219,29 @@ def _read_csv(path: Path, name: str) -> list[dict[str, np.ndarray]]:
     fields = _fields_of(header, path)
     rows = []
     for number, cells in enumerate(lines, start=2):
-        if not any(cell.strip() for cell in cells):
-            continue
         if len(cells) != len(header):
             raise DemoError(f"{path}, line {number}: {len(cells)} cells, expected {len(header)} as in the first line.")
-        row = dict(zip(header, map(str.strip, cells), strict=True))
-        rows.append({"sequence": name, **row, "line": number})
+        rows.append({"sequence": name} | dict(zip(header, map(str.strip, cells), strict=True)))
     if not rows:
         raise DemoError(f"{path} has no line after the names of its columns.")
     sequences = []
     for sequence, part in groupby(rows, key=lambda row: row["sequence"]):
         try:
             sequences.append(_arrays_of(list(part), fields))
-        except DemoError as error:
-            raise DemoError(f"{path}, sequence {sequence}, {error}") from None
+        except (DemoError, ValueError) as error:
+            raise DemoError(f"{path}, sequence {sequence}: {shown(str(error))}.") from None
     return sequences
 
 
 def _fields_of(header: Sequence[str], path: Path) -> list[str]:
     """Return the arrays that the columns hold."""
-    twice = sorted(column for column, count in Counter(header).items() if count > 1)
-    if twice:
-        raise DemoError(f"{path} has columns more than once: {shown(twice)}. Rename them.")
     known = {*_TEXTS, "frame"}
     fields = []
     for field, columns in _COLUMNS.items():
         missing = sorted(set(columns) - set(header))
         if missing and (field == "keypoints" or len(missing) < len(columns)):
             raise DemoError(
-                f"{path} lacks the columns {shown(missing)} of {field}. The first line must name x0, y0, z0 to z20"
-                " and the object's"
-                f" pose (docs/demonstrations.md). Found: {shown(header)}"
+                f"{path} lacks the columns {shown(missing)} of {field} (docs/demonstrations.md). Found: {shown(header)}"
             )
         if not missing:
             fields.append(field)
@@ -265,38 +249,26 @@ def _fields_of(header: Sequence[str], path: Path) -> list[str]:
     unknown = sorted(set(header) - known)
     if unknown:
         logging.getLogger(__name__).warning("%s also has the columns %s, which are ignored.", path, shown(unknown))
+    if len(set(header)) < len(header):
+        raise DemoError(f"{path} has columns of the same name: {shown(sorted(header))}. Rename them.")
     return fields
 
 
-def _arrays_of(rows: Sequence[Mapping[str, Any]], fields: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return the arrays of one sequence, as an npz would hold them."""
+def _arrays_of(rows: Sequence[Mapping[str, str]], fields: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the arrays of one sequence, as an npz would hold them; an empty cell is NaN."""
     arrays = {}
     for text in _TEXTS:
         values = sorted({row[text] for row in rows if text in row})
         if len(values) > 1:
-            raise DemoError(f"the column {text} changes: {shown(values)}. Give each sequence its own name.")
+            raise DemoError(f"the column {text} changes: {shown(values)}")
         if values:
             arrays[text] = np.array(values[0])
     for field in fields:
         numbers: list[float] = []
         for row in rows:
-            numbers.extend(_number(row, column) for column in _COLUMNS[field])
-        shape = (3, 4) if field == "object_pose" else _FILE[field].shape[1:]
-        arrays[field] = np.array(numbers).reshape(-1, *shape)
-    if "object_pose" in arrays:
-        last_row = np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 1))
-        arrays["object_pose"] = np.concatenate((arrays["object_pose"], last_row), axis=1)
+            numbers.extend(float(row[column] or "nan") for column in _COLUMNS[field])
+        arrays[field] = np.array(numbers).reshape(-1, *_FILE[field].shape[1:])
     return arrays
-
-
-def _number(row: Mapping[str, Any], column: str) -> float:
-    cell = row[column]
-    try:
-        return float(cell) if cell else np.nan
-    except ValueError:
-        raise DemoError(
-            f"line {row['line']}, column {column}: {shown(cell)} is not a number. Leave a cell empty if it is unknown."
-        ) from None
 
 
 # One sequence
@@ -325,14 +297,11 @@ def _sequence(arrays: Mapping[str, np.ndarray], convention: Convention) -> Demos
         raise DemoError(problem)
     points[~valid] = np.nan
     points = points[:, ORDERS[convention.order]]
-    pos, turn = _object_pose(arrays, convention)
-    pos = pos * scale
-    if convention.table_from_camera is not None:
-        R = convention.table_from_camera[:3, :3]
-        camera = convention.table_from_camera[:3, 3]
-        points = points @ R.T + camera
-        pos = pos @ R.T + camera
-        turn = Rotation.from_matrix(R) * turn
+    T_table = np.eye(4) if convention.table_from_camera is None else convention.table_from_camera
+    points = points @ T_table[:3, :3].T + T_table[:3, 3]
+    pos, turn = _object_pose(arrays)
+    pos = scale * pos @ T_table[:3, :3].T + T_table[:3, 3]
+    turn = Rotation.from_matrix(T_table[:3, :3]) * turn
     if not _START[0] <= pos[0, 2] <= _START[1]:
         raise DemoError(
             f"the object starts at z = {pos[0, 2]:.3f} m, but it must start on a table whose top is at z = 0. Are"
@@ -374,13 +343,9 @@ def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Ite
     order = ORDERS[convention.order]
     palm = 1e3 * float(np.median(np.linalg.norm(points[:, order[9]] - points[:, 0], axis=1)))
     if not _PALM[0] <= palm <= _PALM[1]:
-        unit = "mm" if convention.units == "m" else "m"
-        in_unit = palm / 1e3 if convention.units == "m" else palm * 1e3
-        fits = f" With --units {unit} it would." if _PALM[0] <= in_unit <= _PALM[1] else ""
         yield (
-            f"from the wrist to the middle finger's knuckle it is {palm:.3g} mm, expected {_PALM[0]:.0f} to"
-            f" {_PALM[1]:.0f} mm.{fits}"
-            " Keypoints must be metric and in space, not those of an image."
+            f"from the wrist to the middle finger's knuckle it is {palm:.3g} mm, expected 60 to 140 mm. Is --units"
+            f" {convention.units} right? Keypoints must be metric and in space, not those of an image."
         )
     lengths = {name: np.median(hand.bone_lengths(points[:, ORDERS[name]]).sum(axis=1)) for name in ORDERS}
     best = min(lengths, key=lambda name: lengths[name])
@@ -419,38 +384,32 @@ def _hand_problems(points: np.ndarray, convention: Convention, side: str) -> Ite
         )
 
 
-def _object_pose(arrays: Mapping[str, np.ndarray], convention: Convention) -> tuple[np.ndarray, Rotation]:
+def _object_pose(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, Rotation]:
     """Return position [F, 3] and orientation of the object, in the file's unit and frame."""
     given = [name for name in _FILE if name.startswith("object_") and name in arrays]
-    if given != ["object_pose"] and not (len(given) == 2 and given[0] == "object_pos"):
+    if given not in (["object_pose"], ["object_pos", "object_quat_wxyz"], ["object_pos", "object_quat_xyzw"]):
         raise DemoError(
             "the object's pose must be given once, as object_pose (matrices) or as object_pos and"
-            " object_quat_wxyz or _xyzw;"
-            f" found {', '.join(given) or 'none'}."
+            f" object_quat_wxyz or _xyzw; found {', '.join(given) or 'none'}."
         )
     name = given[-1]
     values = np.asarray(arrays[name], dtype=float)
-    pos = np.asarray(arrays["object_pos"], dtype=float) if "object_pos" in arrays else values[:, :3, 3]
+    pos = values[:, :3, 3] if name == "object_pose" else np.asarray(arrays["object_pos"], dtype=float)
     if not np.isfinite(values).all() or not np.isfinite(pos).all():
         raise DemoError(
             "the object's pose is unknown in some frames. Remove such frames at the ends, interpolate the others."
         )
     if name == "object_pose":
-        bad = np.array([not is_rigid(T) for T in values])
-        if bad.any():
-            raise DemoError(
-                f"object_pose of frame {np.argmax(bad)} is not a rotation and translation with the last row 0 0 0 1."
-            )
+        wrong = ~np.array([is_rigid(T) for T in values])
+        expected = "a rotation and translation with the last row 0 0 0 1"
+    else:
+        wrong = np.abs(np.linalg.norm(values, axis=1) - 1) > UNIT_TOLERANCE
+        expected = "a unit quaternion"
+    if wrong.any():
+        raise DemoError(f"{name} of frame {np.argmax(wrong)} is not {expected}.")
+    if name == "object_pose":
         return pos, Rotation.from_matrix(values[:, :3, :3])
-    order = convention.quat if name == "object_quat" else name.removeprefix("object_quat_")
-    if order is None:
-        raise DemoError("the file does not state whether object_quat is (w, x, y, z) or (x, y, z, w). Add --quat.")
-    length = np.linalg.norm(values, axis=1)
-    bad = np.abs(length - 1) > UNIT_TOLERANCE
-    if bad.any():
-        frame = int(np.argmax(bad))
-        raise DemoError(f"the quaternion of frame {frame} has length {length[frame]:.4f}, expected 1.")
-    return pos, Rotation.from_quat(values, scalar_first=order == "wxyz")
+    return pos, Rotation.from_quat(values, scalar_first=name == "object_quat_wxyz")
 
 
 def _evenly(arrays: Mapping[str, np.ndarray], convention: Convention, motion: Motion) -> tuple[float, Motion]:
@@ -484,25 +443,19 @@ def _evenly(arrays: Mapping[str, np.ndarray], convention: Convention, motion: Mo
             f"{time[-1] - time[0]:.6g} s at {rate:g} frames per second are more than {MAX_FRAMES} frames."
             " Are the times in seconds? Split the sequence, or lower --fps."
         )
-    at = time[0] + np.arange(int(frames) + 1) / rate
-    after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
-    before = after - 1
-    share = np.clip((at - time[before]) / steps[before], 0.0, 1.0)[:, None]
+    at = np.minimum(time[0] + np.arange(int(frames) + 1) / rate, time[-1])
     points, pos, turn = motion
-    # NaN next to a frame without a hand
-    points = points[before] * (1 - share)[..., None] + points[after] * share[..., None]
-    pos = pos[before] * (1 - share) + pos[after] * share
-    return rate, (points, pos, Slerp(time, turn)(np.clip(at, time[0], time[-1])))
+    # keypoints next to a frame without a hand become NaN
+    points, pos = (interp1d(time, values, axis=0)(at) for values in (points, pos))
+    return rate, (points, pos, Slerp(time, turn)(at))
 
 
 def _wrist(points: np.ndarray, side: str) -> Rotation:
-    """Fit wrist and knuckles of an average hand to keypoints [F, 21, 3] (Kabsch's algorithm); F orientations of MANO's
-    root."""
+    """Fit wrist and knuckles of an average hand to keypoints [F, 21, 3]; F orientations of MANO's root."""
     template = np.concatenate((np.zeros((1, 3)), hand.FINGER_BASES))
     if side == "left":
         template[:, 0] *= -1
+    template -= template.mean(axis=0)
     found = points[:, _KNUCKLES]
-    covariance = np.einsum("ki,fkj->fij", template - template.mean(axis=0), found - found.mean(axis=1, keepdims=True))
-    U, _, Vt = np.linalg.svd(covariance)
-    Vt[:, 2] *= np.linalg.det(U @ Vt)[:, None]
-    return Rotation.from_matrix((U @ Vt).transpose(0, 2, 1))
+    found = found - found.mean(axis=1, keepdims=True)
+    return Rotation.concatenate([Rotation.align_vectors(frame, template)[0] for frame in found])

@@ -530,14 +530,14 @@ class BankTest(InFolder):
                 np.testing.assert_array_equal(getattr(found, name), value, name)
 
     def test_a_bank_without_a_state_still_has_starts_and_goals(self):
-        none = toy_bank(self.robot).select(sequences=np.zeros(3, dtype=bool))
+        none = toy_bank(self.robot).with_states(np.zeros(6, dtype=bool))
         write_bank(self.file, none, config={}, inputs={})
         found = read_bank(self.file, robot=self.robot)
         self.assertEqual((found.num_states, len(found.goal_pos)), (0, 3))
 
-    def test_select(self):
+    def test_some_of_the_states(self):
         bank = toy_bank(self.robot)
-        chosen = bank.select(sequences=np.array([True, False, True]), pre_contact_only=True)
+        chosen = bank.with_states(np.array([True, False, False, False, True, False]))
         np.testing.assert_array_equal(chosen.sequence_index, [0, 2])
         np.testing.assert_array_equal(chosen.frame_index, [3, 5])
         np.testing.assert_array_equal(chosen.joint_pos, bank.joint_pos[[0, 4]])

@@ -117,7 +117,7 @@ class FrontierTest(unittest.TestCase):
 
     def test_a_bank_without_states_is_an_error(self):
         empty = self.folder / "empty.npz"
-        write_bank(empty, self.bank.select(sequences=np.zeros(3, dtype=bool)), config={}, inputs={})
+        write_bank(empty, self.bank.with_states(np.zeros(6, dtype=bool)), config={}, inputs={})
         self.assertEqual(read_bank(empty).num_states, 0)
         with self.assertRaisesRegex(DemoError, "bank holds no state to try"):
             self.run_frontier(empty)

@@ -448,11 +448,11 @@ class ResetTest(WithRobot):
         self.assertEqual(set(((reset.object_pos[:, 0] - 0.6) * 100).round().tolist()), {0.0, 4.0})
 
     def test_an_object_without_states_starts_at_home(self):
-        none = toy_bank(self.robot).select(sequences=np.array([True, False, True]))
+        none = toy_bank(self.robot).with_states(np.array([True, True, False, False, True, True]))
         reset = self.distribution(bank=none, demo_probability=1.0).sample(torch.tensor([0, 1] * 100), generator())
         self.assertEqual(reset.from_bank.tolist(), [True, False] * 100)
         self.assertEqual(set(reset.sequence[1::2].tolist()), {1})
-        empty = toy_bank(self.robot).select(sequences=np.zeros(3, dtype=bool))
+        empty = toy_bank(self.robot).with_states(np.zeros(6, dtype=bool))
         reset = self.distribution(bank=empty, demo_probability=1.0).sample(torch.tensor([0, 1] * 100), generator())
         self.assertFalse(bool(reset.from_bank.any()))
 

@@ -539,7 +539,7 @@ class TrainingTest(unittest.TestCase):
 
     def test_a_bank_without_states_needs_p_zero(self):
         empty = self.folder / "empty.npz"
-        write_bank(empty, toy_bank(self.robot).select(sequences=np.zeros(3, dtype=bool)), config={}, inputs={})
+        write_bank(empty, toy_bank(self.robot).with_states(np.zeros(6, dtype=bool)), config={}, inputs={})
         with self.assertRaisesRegex(RunError, "no state to reset to.*demo-probability 0"):
             self.train("none", bank=empty)
         self.assertFalse((self.folder / "none").exists())

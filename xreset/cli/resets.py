@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from itertools import combinations
 from pathlib import Path
 from typing import Annotated
 
@@ -90,12 +89,10 @@ def resets(
         "settle": settle,
     }
     banks.write_bank(out, bank, config=config, inputs={"retargeted": file_hash(retargeted)})
-    bands = bank.bands()
     write_accounts(
         accounts_path(out),
         of="states tried in physics",
         rows=bank.accounts(),
-        bands=bands,
         pressing=bank.num_pressing,
         **({} if settling is None else {"settled": settling.accounts()}),
         **({"hold": [asdict(row) for row in held]} if hold else {}),
@@ -104,16 +101,12 @@ def resets(
     if settling is not None:
         console.print(settling.summary())
     console.print(_accepted(data, bank, f"{spec.name}: states stable in {', '.join(backends)}"))
-    if closing.spacing is not None:
-        console.print(_closing(bands))
     if squeeze.force > 0:
         console.print(
             f"{bank.num_pressing} of {int(bank.post_contact.sum())} states after contact press with {squeeze.force:g} N"
         )
     if hold:
         console.print(_holding(held, backends))
-        if len(backends) > 1:
-            console.print(_alike(held, backends))
     tried = bank.num_states + len(bank.rejected_reason)
     console.print(f"{bank.num_states} states of {tried} kept in {out}; counts in {accounts_path(out)}")
 
@@ -147,20 +140,6 @@ def _accepted(data: file.Retargeted, bank: banks.ResetBank, title: str) -> Table
     return table
 
 
-def _closing(bands: Sequence[dict]) -> Table:
-    """States by the distance between finger and object."""
-    table = Table(
-        "finger to object", "frames: tried", "accepted", "added: tried", "accepted", title="where the hand closes in"
-    )
-    for band in bands:
-        counts = (band["tried"], band["kept"], band["added"], band["added_kept"])
-        far, near = ("" if edge is None else f"{100 * edge:g}" for edge in (band["nearer"], band["farther"]))
-        table.add_row(
-            f"{far} to {near} cm" if far and near else f"beyond {near} cm" if near else "contact", *map(str, counts)
-        )
-    return table
-
-
 def _holding(held: Sequence[holding.Held], backends: Sequence[str]) -> Table:
     """How many lifted states hold the object, engine by engine."""
     table = Table("object", "lifted", *backends, title="lifted states that hold the object for 1 s at full gravity")
@@ -168,17 +147,6 @@ def _holding(held: Sequence[holding.Held], backends: Sequence[str]) -> Table:
         mine = [row for row in held if row.object_name == name]
         shares = [f"{row.held} ({row.held / row.lifted:.0%})" if row.lifted else "-" for row in mine]
         table.add_row(name, str(mine[0].lifted), *shares)
-    return table
-
-
-def _alike(held: Sequence[holding.Held], backends: Sequence[str]) -> Table:
-    """How many lifted states end alike in two engines."""
-    pairs = list(combinations(backends, 2))
-    table = Table("object", *(f"{a}, {b}" for a, b in pairs), title="of these, held or not held alike")
-    rows = {(row.backend, row.object_name): row for row in held}
-    for name in dict.fromkeys(row.object_name for row in held):
-        shares = [(rows[a, name].alike[b], rows[a, name].lifted) for a, b in pairs]
-        table.add_row(name, *(f"{same} ({same / lifted:.0%})" if lifted else "-" for same, lifted in shares))
     return table
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,10 +25,6 @@ from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec
 
 SCHEMA = "xreset-resets/1"
-
-BANDS = (0.10, 0.05, 0.02, 0.01, 0.001)
-"""Distances [m] from finger to object that divide the bands of :meth:`ResetBank.bands`; below the last one is
-contact."""
 
 
 def _empty(*shape: int, dtype: type = np.float32) -> Any:
@@ -88,9 +83,6 @@ class ResetBank:
     frame_part: Annotated[np.ndarray, Field(("L",), "f", within=(0.0, 1.0))] | None = None
     """[L] how far a state is on the way from its frame to the next, in [0, 1); None: every state is a frame."""
     rejected_frame_part: Annotated[np.ndarray, Field(("C",), "f", within=(0.0, 1.0))] | None = None
-    finger_gap: Annotated[np.ndarray, Field(("L",), "f", within=POSITION)] | None = None
-    """[L] distance of the nearest finger from the object [m] (:mod:`xreset.resets.fingers`)."""
-    rejected_finger_gap: Annotated[np.ndarray, Field(("C",), "f", within=POSITION)] | None = None
 
     @property
     def num_states(self) -> int:
@@ -108,61 +100,24 @@ class ResetBank:
         return int((self.targets != self.joint_pos).any(axis=1).sum())
 
     def accounts(self) -> list[Account]:
-        """Count the demonstrated frames that were kept and lost, by object and phase.
-
-        States between frames are counted by :meth:`bands`.
-        """
-        is_frame = ~self._between_frames
+        """Count the demonstrated frames that were kept and lost, by object and phase; states between frames do not
+        count."""
         object_name = np.concatenate((self.object_name, self.sequence_object[self.rejected_sequence_index]))
         post_contact = np.concatenate((self.post_contact, self.rejected_post_contact))
         lost = np.asarray(self.reason_names)[self.rejected_reason]
         reason = np.concatenate((np.full(self.num_states, ""), lost))
+        is_frame = np.ones(len(reason), dtype=bool)
+        if self.frame_part is not None and self.rejected_frame_part is not None:
+            is_frame = np.concatenate((self.frame_part, self.rejected_frame_part)) == 0
         return accounts(object_name[is_frame], post_contact[is_frame], reason[is_frame])
 
-    def bands(self) -> list[dict[str, Any]]:
-        """Count candidates by their distance from finger to object, the farthest first; empty if it is not known.
-
-        Each entry has ``nearer`` and ``farther``, the limits of the distance [m] (None: no limit, and contact);
-        ``tried`` and ``kept``, which count demonstrated frames; ``added`` and ``added_kept``, which count states
-        between frames (:mod:`xreset.resets.closing`).
-        """
-        if self.finger_gap is None or self.rejected_finger_gap is None:
-            return []
-        gap = np.concatenate((self.finger_gap, self.rejected_finger_gap))
-        accepted = np.arange(len(gap)) < self.num_states
-        added = self._between_frames
-        rows = []
-        for nearer, farther in pairwise((None, *BANDS, None)):
-            inside = (gap < (nearer or np.inf)) & (gap >= (farther or -np.inf))
-            counts = {"tried": ~added, "kept": ~added & accepted, "added": added, "added_kept": added & accepted}
-            limits = {"nearer": nearer, "farther": farther}
-            rows.append(limits | {name: int((inside & chosen).sum()) for name, chosen in counts.items()})
-        return rows
-
-    @property
-    def _between_frames(self) -> np.ndarray:
-        """[L + C] bool: whether a candidate is between two frames; accepted ones come first."""
-        kept = np.zeros(self.num_states) if self.frame_part is None else self.frame_part
-        rejected = np.zeros(len(self.rejected_reason)) if self.rejected_frame_part is None else self.rejected_frame_part
-        return np.concatenate((kept, rejected)) > 0
-
-    def select(self, *, sequences: np.ndarray | None = None, pre_contact_only: bool = False) -> ResetBank:
-        """Return a bank with some of the states; sequences stay listed.
-
-        Args:
-            sequences: [S] bool, the sequences whose states to keep; None: all.
-            pre_contact_only: whether to keep only states before first contact.
-        """
-        keep = np.ones(self.num_states, dtype=bool)
-        if sequences is not None:
-            keep &= sequences[self.sequence_index]
-        if pre_contact_only:
-            keep &= ~self.post_contact
+    def with_states(self, rows: np.ndarray) -> ResetBank:
+        """Return a bank with some of the states, given as a mask [L]; sequences stay listed."""
         changes = {}
         for name, schema in schema_of(ResetBank).items():
             value = getattr(self, name)
             if schema.shape[:1] == ("L",) and value is not None:
-                changes[name] = value[keep]
+                changes[name] = value[rows]
         return replace(self, **changes)
 
 

@@ -9,8 +9,6 @@ judges the new states like the others.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,58 +23,31 @@ TOUCH = 0.002
 MOVED = 0.01
 """An object has been moved once its origin is farther than this from where it started [m]."""
 
-_POSITIONS = ("joint_pos", "palm_pos", "fingertip_pos", "object_pos")
-_ROTATIONS = ("palm_quat_wxyz", "object_quat_wxyz")
-_REPEATED = ("annotated", "valid", "reason", "contact", "hand_error", "wrist_error")
 
-
-class Closing(NamedTuple):
-    """Trajectories with states between frames."""
-
-    retargeted: Retargeted
-    """With more frames, no longer evenly spaced in time. The given frames are unchanged and in their order."""
-    frame: np.ndarray
-    """[F] given frame that each frame is or follows, counted over the given trajectories."""
-    part: np.ndarray
-    """[F] how far each frame is on the way to the next given one, in [0, 1); 0 is the given frame itself."""
-
-
-def with_closing_frames(
+def closing_states(
     retargeted: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec], config: ClosingConfig
-) -> Closing:
-    """Return the same motion with frames added between valid ones where the hand closes in.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Choose the frames of a motion, and states between valid ones where the hand closes in.
 
     That is where a finger is near the object, until the thumb and another finger touch the object or the object has
     been moved. The human's first contact is not the end: there the robot's fingers are usually 5 to 10 mm away.
-    """
-    owner = retargeted.sequence_of_frame
-    if config.spacing is None:
-        return Closing(retargeted, np.arange(len(owner)), np.zeros(len(owner)))
-    before = _frames_to_follow(retargeted, fingers_in(retargeted, robot, objects), config.within)
-    step = retargeted.fingertip_pos[before + 1] - retargeted.fingertip_pos[before]
-    travel = np.linalg.norm(step, axis=-1).max(axis=-1)
-    pieces = np.ones(len(owner), dtype=int)
-    pieces[before] = np.maximum(np.ceil(travel / config.spacing).astype(int), 1)
-    frame = np.repeat(np.arange(len(owner)), pieces)
-    first_row = np.cumsum(pieces) - pieces
-    part = (np.arange(len(frame)) - first_row[frame]) / pieces[frame]
 
-    arrays = {name: getattr(retargeted, name)[frame] for name in _REPEATED}
-    for name in _POSITIONS:
-        arrays[name] = _positions_between(getattr(retargeted, name), frame, part)
-    for name in _ROTATIONS:
-        arrays[name] = _rotations_between(getattr(retargeted, name), frame, part)
-    counts = np.bincount(owner[frame], minlength=len(retargeted.sequence_name))
-    offsets = np.concatenate(([0], np.cumsum(counts)))
-    contact = retargeted.first_contact
-    contact_row = first_row[np.where(contact >= 0, retargeted.frame_offsets[:-1] + contact, 0)]
-    dense = replace(
-        retargeted,
-        frame_offsets=offsets.astype(retargeted.frame_offsets.dtype),
-        first_contact=np.where(contact >= 0, contact_row - offsets[:-1], contact).astype(contact.dtype),
-        **arrays,
-    )
-    return Closing(dense, frame, part)
+    Returns:
+        For each state [M] the frame that it is or follows, ascending, and how far it is on the way to the next frame,
+        in [0, 1); 0 is the frame itself.
+    """
+    pieces = np.ones(len(retargeted.joint_pos), dtype=int)
+    if config.spacing is not None:
+        object_name = retargeted.object_name[retargeted.sequence_of_frame]
+        poses = (retargeted.joint_pos, retargeted.object_pos, retargeted.object_quat_wxyz)
+        fingers = fingers_of(robot, objects, object_name, *poses)
+        before = _frames_to_follow(retargeted, fingers, config.within)
+        step = retargeted.fingertip_pos[before + 1] - retargeted.fingertip_pos[before]
+        travel = np.linalg.norm(step, axis=-1).max(axis=-1)
+        pieces[before] = np.maximum(np.ceil(travel / config.spacing).astype(int), 1)
+    frame = np.repeat(np.arange(len(pieces)), pieces)
+    first = np.cumsum(pieces) - pieces
+    return frame, (np.arange(len(frame)) - first[frame]) / pieces[frame]
 
 
 def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, within: float) -> np.ndarray:
@@ -96,25 +67,17 @@ def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, within: float) -
     return np.flatnonzero(same_sequence & retargeted.valid[:-1] & retargeted.valid[1:] & ~over[:-1] & near)
 
 
-def _positions_between(values: np.ndarray, frame: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """[F, ...] values on straight lines; given frames stay the same bit for bit."""
+def positions_between(values: np.ndarray, frame: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """[M, n] values on straight lines between frames [F, n]; frames stay the same bit for bit."""
     following = values[np.minimum(frame + 1, len(values) - 1)]
-    share = part.reshape(-1, *[1] * (values.ndim - 1))
-    between = values[frame] + share * (following - values[frame])
-    return np.where(share > 0, between, values[frame]).astype(values.dtype)
+    between = values[frame] + part[:, None] * (following - values[frame])
+    return np.where(part[:, None] > 0, between, values[frame])
 
 
-def _rotations_between(quats: np.ndarray, frame: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """[F, 4] quaternions that turn evenly; given frames stay the same bit for bit."""
+def rotations_between(quats: np.ndarray, frame: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """[M, 4] quaternions that turn evenly between frames [F, 4]; frames stay the same bit for bit."""
     first = Rotation.from_quat(quats[frame], scalar_first=True)
     second = Rotation.from_quat(quats[np.minimum(frame + 1, len(quats) - 1)], scalar_first=True)
     step = Rotation.from_rotvec(part[:, None] * (first.inv() * second).as_rotvec())
     between = (first * step).as_quat(scalar_first=True)
-    return np.where(part[:, None] > 0, between, quats[frame]).astype(quats.dtype)
-
-
-def fingers_in(retargeted: Retargeted, robot: RobotSpec, objects: Sequence[ObjectSpec]) -> Fingers:
-    """Measure where the fingers are in every frame [F]."""
-    names = [o.name for o in objects]
-    index = np.array([names.index(str(name)) for name in retargeted.object_name])[retargeted.sequence_of_frame]
-    return fingers_of(robot, objects, index, retargeted.joint_pos, retargeted.object_pos, retargeted.object_quat_wxyz)
+    return np.where(part[:, None] > 0, between, quats[frame])

@@ -133,7 +133,7 @@ class ResetDistribution:
                 f"The reset bank has no demonstration of {', '.join(missing)}; it has {', '.join(bank.object_names)}."
             )
         if config.pre_contact_only:
-            bank = bank.select(pre_contact_only=True)
+            bank = bank.with_states(~bank.post_contact)
         self._grouped_states = _Grouped(bank.object_name, object_names, device)
         self._states = bank_starts(bank, self._grouped_states.rows).to(device)
         self._grouped_sequences = _Grouped(bank.sequence_object, object_names, device)

@@ -17,7 +17,7 @@ from torch import Tensor
 from xreset.errors import DemoError
 from xreset.physics import Backend, State
 from xreset.resets.bank import ResetBank, starts_and_goals
-from xreset.resets.closing import with_closing_frames
+from xreset.resets.closing import closing_states, positions_between, rotations_between
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
 from xreset.resets.probe import probe
@@ -97,19 +97,20 @@ def make_bank(
             "no frame of the retargeted trajectories is valid, so there is no state to try. "
             "Look at the reasons of xreset retarget."
         )
-    dense = with_closing_frames(retargeted, robot, objects, closing or ClosingConfig())
-    motion = dense.retargeted
-    frames = np.flatnonzero(motion.valid)
-    sequence = motion.sequence_of_frame[frames]
-    object_name = np.asarray(motion.object_name)[sequence]
-    used = tuple(o for o in objects if o.name in set(object_name.tolist()))
+    frame, part = closing_states(retargeted, robot, objects, closing or ClosingConfig())
+    valid = retargeted.valid[frame]
+    frame = frame[valid]
+    part = part[valid]
+    sequence = retargeted.sequence_of_frame[frame]
+    post_contact = retargeted.post_contact[frame]
+    object_name = np.asarray(retargeted.object_name)[sequence]
+    used = tuple(o for o in objects if o.name in object_name)
     names = [o.name for o in used]
     object_index = np.array([names.index(name) for name in object_name])
     scene = SceneSpec(robot=robot, objects=used)
-    joint_pos = motion.joint_pos[frames]
-    object_pos = motion.object_pos[frames]
-    object_quat = motion.object_quat_wxyz[frames]
-    fingers = fingers_of(robot, used, object_index, joint_pos, object_pos, object_quat)
+    joint_pos = positions_between(retargeted.joint_pos, frame, part)
+    object_pos = positions_between(retargeted.object_pos, frame, part)
+    object_quat = rotations_between(retargeted.object_quat_wxyz, frame, part)
     target = joint_pos.astype(np.float32)
 
     def try_candidates(rows: np.ndarray, report: Callable[[int], None]) -> np.ndarray:
@@ -136,11 +137,12 @@ def make_bank(
             )
         return reason
 
-    work = len(engines) * len(frames)
-    reason = try_candidates(np.arange(len(frames)), lambda done: progress(done, work))
+    work = len(engines) * len(frame)
+    reason = try_candidates(np.arange(len(frame)), lambda done: progress(done, work))
     if squeeze.force > 0:
-        rows = np.flatnonzero((reason < 0) & motion.post_contact[frames])
-        target[rows] = squeeze_targets(robot, fingers, joint_pos, squeeze)[rows]
+        rows = np.flatnonzero((reason < 0) & post_contact)
+        fingers = fingers_of(robot, used, object_name[rows], joint_pos[rows], object_pos[rows], object_quat[rows])
+        target[rows] = squeeze_targets(robot, fingers, joint_pos[rows], squeeze)
         tried = work
         work += len(engines) * len(rows)
         refused = rows[try_candidates(rows, lambda done: progress(tried + done, work)) >= 0]
@@ -150,16 +152,15 @@ def make_bank(
     keep = reason < 0
     columns = {
         "sequence_index": sequence.astype(np.int32),
-        "frame_index": (dense.frame[frames] - retargeted.frame_offsets[sequence]).astype(np.int32),
-        "post_contact": motion.post_contact[frames],
-        "finger_gap": fingers.nearest.numpy().astype(np.float32),
+        "frame_index": (frame - retargeted.frame_offsets[sequence]).astype(np.int32),
+        "post_contact": post_contact,
     }
-    if dense.part.any():
-        columns["frame_part"] = dense.part[frames].astype(np.float32)
+    if part.any():
+        columns["frame_part"] = part.astype(np.float32)
     kept = {name: values[keep] for name, values in columns.items()}
     rejected = {f"rejected_{name}": values[~keep] for name, values in columns.items()}
     return replace(
-        starts_and_goals(motion, robot, {o.name: o.source for o in objects}),
+        starts_and_goals(retargeted, robot, {o.name: o.source for o in objects}),
         backends=engines,
         joint_pos=joint_pos[keep].astype(np.float32),
         joint_target=target[keep] if squeeze.force > 0 else None,

@@ -53,7 +53,7 @@ class Fingers:
 def fingers_of(
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
-    object_index: np.ndarray,
+    object_name: np.ndarray,
     joint_pos: np.ndarray,
     object_pos: np.ndarray,
     object_quat: np.ndarray,
@@ -62,8 +62,8 @@ def fingers_of(
 
     Args:
         robot: the hand, with its fingertips' contact links.
-        objects: objects of the states.
-        object_index: [M] which of them each state has.
+        objects: geometry of the states' objects.
+        object_name: [M] object of each state.
         joint_pos: [M, J]
         object_pos: [M, 3]
         object_quat: [M, 4]
@@ -78,7 +78,7 @@ def fingers_of(
         finger += [number] * len(tip.contact_links)
     kinematics = Kinematics(robot)
     poses = kinematics.link_poses(q, links)
-    surfaces = {number: Surface(objects[number]) for number in np.unique(object_index).tolist()}
+    surfaces = {obj.name: Surface(obj) for obj in objects if obj.name in object_name}
     gap = q.new_zeros(len(q), len(links))
     point = q.new_zeros(len(q), len(links), 3)
     inward = q.new_zeros(len(q), len(links), 3)
@@ -86,8 +86,8 @@ def fingers_of(
         centers, radii = _balls(kinematics, link)
         R = poses[:, g, :3, :3]
         p = poses[:, g, :3, 3]
-        for number, surface in surfaces.items():
-            mine = torch.as_tensor(object_index == number)
+        for name, surface in surfaces.items():
+            mine = torch.as_tensor(object_name == name)
             world = centers @ R[mine].transpose(-1, -2) + p[mine, None]
             turn = quat[mine, None].expand(-1, len(centers), 4)
             local = quat_rotate_inverse(turn, world - pos[mine, None])

@@ -50,8 +50,6 @@ _SAME_POSE = np.cos(np.radians(2.0))
 """Resting poses whose up directions differ by less are one."""
 _DRAWS = 12
 """Times that a goal is drawn before it is given up."""
-_HOPELESS = 3
-"""Draws after which a family is given up of which nothing was found."""
 _FLOATING = 0.01
 """A start is on the table if its lowest point is nearer than this to it [m]."""
 _INSIDE = 0.005
@@ -359,9 +357,6 @@ def _reached(
     found: dict[tuple[str, int], _Episode] = {}
     for attempt in range(_DRAWS):
         left = [item for item in wanted if item not in found]
-        if attempt >= _HOPELESS:
-            known = {family for family, _ in found}
-            left = [item for item in left if item[0] in known]
         if not left:
             break
         drawn = [draw(family, number, attempt) for family, number in left]

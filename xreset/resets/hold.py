@@ -34,8 +34,6 @@ class Held:
     """``all`` in a sum over objects."""
     lifted: int
     held: int
-    alike: dict[str, int]
-    """Other engine -> number of states that end there as they do here: held or not."""
 
 
 def stays(backend: Backend, start: State) -> Tensor:
@@ -100,7 +98,6 @@ def hold_bank(
     rows = []
     for name in backends:
         for label, mine in groups.items():
-            alike = {other: int(((held[name] == held[other]) & mine).sum()) for other in held if other != name}
             count = int((held[name] & mine).sum())
-            rows.append(Held(backend=name, object_name=label, lifted=int(mine.sum()), held=count, alike=alike))
+            rows.append(Held(backend=name, object_name=label, lifted=int(mine.sum()), held=count))
     return rows

@@ -155,9 +155,10 @@ def judge(
             "xreset resets and xreset retarget."
         )
     names = [spec.name for spec in used]
-    index = np.array([names.index(name) for name in bank.object_name[lifted].tolist()])
+    object_name = bank.object_name[lifted]
+    index = np.array([names.index(name) for name in object_name.tolist()])
     arrays = (bank.joint_pos, bank.object_pos, bank.object_quat_wxyz)
-    fingers = fingers_of(robot, used, index, *(array[lifted] for array in arrays))
+    fingers = fingers_of(robot, used, object_name, *(array[lifted] for array in arrays))
     chosen = _tightest(fingers, index, bank.sequence_index[lifted], states, squeeze.reach)
     if not len(chosen):
         raise RobotError(

@@ -9,7 +9,7 @@ import sys
 import unittest
 from unittest import mock
 
-from xreset.cli import COMMANDS, MOVED, main
+from xreset.cli import COMMANDS, main
 from xreset.cli._terminal import Console, Progress
 from xreset.cli.engines import COMMANDS as ENGINES
 
@@ -111,11 +111,6 @@ class UsageTest(unittest.TestCase):
         self.assertEqual(code, 2)
         self.assertIn("Unknown command 'trian'", err)
         self.assertIn("train", err)
-
-    def test_an_earlier_name_answers_with_the_new_one(self):
-        for old, new in MOVED.items():
-            code, _, err = run(old, "--anything")
-            self.assertEqual((code, new in err), (2, True))
 
     def test_an_error_that_the_user_can_mend_is_one_message(self):
         code, _, err = run("resets", "/nowhere/retargeted.npz", "--out", "/nowhere/bank.npz")

@@ -133,7 +133,7 @@ class ContractTest(unittest.TestCase):
         from xreset.live.serve import PolicyServer
 
         server = PolicyServer(self.contract, (self.out / "policy.onnx").read_bytes(), port=0)
-        thread = threading.Thread(target=server.run)
+        thread = threading.Thread(target=server.serve)
         thread.start()
         self.addCleanup(thread.join)
         self.addCleanup(server.close)

@@ -17,7 +17,6 @@ from unittest import mock
 
 import numpy as np
 import torch
-from PIL import Image
 
 from tests.data import run
 from tests.toy_bank import SOUP, SPAM, toy_bank
@@ -30,7 +29,6 @@ from xreset.pictures.render import write_png
 from xreset.pictures.view.colors import reason_color
 from xreset.pictures.view.load import load_view
 from xreset.pictures.view.picture import Drawer
-from xreset.pictures.view.sheet import moment_tiles, reason_tiles
 from xreset.resets.bank import read_bank, write_bank
 from xreset.retarget.file import Retargeted, write_retargeted
 
@@ -266,10 +264,10 @@ class Data(WithFiles):
 
 
 class Pictures(WithFiles):
-    def draw(self, path: Path, *rows: int, **options) -> list[np.ndarray]:
+    def draw(self, path: Path, *rows: int) -> list[np.ndarray]:
         """Small pictures of rows as integers."""
         drawer = Drawer(load_view(path), size=(160, 120))
-        return [drawer.draw(row, **options).astype(int) for row in rows]
+        return [drawer.draw(row).astype(int) for row in rows]
 
     def test_an_invalid_robot_has_the_color_of_its_reason(self):
         valid, invalid = self.draw(self.retargeted, 0, 1)
@@ -278,15 +276,6 @@ class Pictures(WithFiles):
         wanted = np.array(reason_color("joint limit")) - np.mean(reason_color("joint limit"))
         self.assertGreater(hue @ wanted / np.linalg.norm(hue) / np.linalg.norm(wanted), 0.9)
         self.assertGreater(changed.sum(), 200)
-
-    def test_a_near_picture_shows_hand_and_object(self):
-        sizes = []
-        for near in (False, True):
-            (picture,) = self.draw(self.demos, 2, near=near)
-            orange = (picture[..., 0] - picture[..., 2] > 60) & (picture[..., 1] > 60)
-            sizes.append(orange.sum())
-        self.assertGreater(sizes[1], 3 * sizes[0])
-        self.assertGreater(sizes[0], 0)
 
     def test_demonstrations_have_no_robot_but_a_hand(self):
         yellow = []
@@ -305,60 +294,6 @@ class Pictures(WithFiles):
         code, text = run("view", self.retargeted, "--png", out, "--frame", 4)
         self.assertEqual(code, 1)
         self.assertIn("Frame 4 does not exist", text)
-
-    def test_moments_of_a_demonstration(self):
-        tiles = moment_tiles(load_view(self.retargeted))
-        self.assertEqual([tile.row for tile in tiles], [2, 2, 3, 6, 6, 7])
-        self.assertEqual(tiles[2].caption[:3], (f"{SOUP}: goal", "valid", "sequence 0: demo_a, frame 3"))
-        view = load_view(self.demos)
-        self.assertEqual([tile.row for tile in moment_tiles(view)], [2, 2, 2, 6, 6, 6])  # no hand in the last frame
-        for tile in moment_tiles(replace(view, post_contact=np.zeros(TOTAL, dtype=bool))):
-            self.assertEqual((tile.row, tile.caption[1]), (None, "no example in this file"))
-
-    def test_mid_lift_is_half_way_up(self):
-        many = 20
-        pos = np.tile([0.5, 0.3, 0.05], (many, 1))
-        pos[:, 2] += np.interp(np.arange(many), [0, 5, 15, 20], [0, 0, 0.3, 0.3])
-        touched = np.arange(many) >= 4
-        first = np.zeros(many, int)
-        view = load_view(self.demos)
-        lifted = replace(
-            view,
-            objects=view.objects[:1],
-            sequence=first,
-            frame=np.arange(many),
-            object_index=first,
-            object_pos=pos,
-            reason=("",) * many,
-            human=None,
-            contact=touched,
-            post_contact=touched,
-        )
-        self.assertEqual([tile.row for tile in moment_tiles(lifted)], [4, 10, 19])
-
-    def test_one_example_of_every_reason(self):
-        bank, made_from = self.filtered()
-        tiles = reason_tiles(load_view(bank, retargeted=made_from))
-        self.assertEqual([tile.row for tile in tiles], [1, 5])
-        self.assertEqual(tiles[0].caption[0], "joint velocity: 1 of 6")
-        self.assertEqual([tile.row for tile in reason_tiles(load_view(self.retargeted))], [5, None])
-        with self.assertRaisesRegex(XResetError, "--retargeted"):
-            reason_tiles(load_view(self.bank))
-
-    def test_sheets_from_the_command_line(self):
-        out = self.folder / "sheet.png"
-        code, text = run("view", self.retargeted, "--png", out, "--reasons")
-        self.assertEqual(code, 0, text)
-        self.assertIn("joint limit: 2 of 8; not valid: joint limit; sequence 1: demo_b, frame 1", text)
-        self.assertIn("arm jump: 0 of 8; no example", text)
-        picture = np.asarray(Image.open(out))
-        self.assertEqual(picture.shape, (360 + 5 * 16 + 8, 3 * 420, 3))
-        self.assertGreater(len(np.unique(picture[:360, :420].reshape(-1, 3), axis=0)), 1000)  # a picture
-        self.assertEqual(len(np.unique(picture[:360, 420:840])), 1)  # no example
-        self.assertLess(picture[360:376, 420:840].min(), 100)  # but its caption
-        code, text = run("view", self.retargeted, "--reasons")
-        self.assertEqual(code, 1)
-        self.assertIn("--png", text)
 
     @unittest.skipUnless(find_spec("imageio_ffmpeg"), "imageio-ffmpeg is not installed")
     def test_mp4_from_the_command_line(self):

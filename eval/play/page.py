@@ -20,7 +20,7 @@ from xreset.eval.play.session import Session
 from xreset.eval.plots import COLORS
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, rgb
 from xreset.pictures.view.colors import TOUCH_COLOR
-from xreset.pictures.view.server import RobotMeshes, start_server, url_of
+from xreset.pictures.view.server import RobotMeshes, WebPage
 from xreset.plugins import backend_names, robot_names
 from xreset.policies import shipped
 from xreset.text import short_name
@@ -51,7 +51,7 @@ GROWTH = 1.03
 """Size of the goal next to the object, so that a pointer meets the goal first where both are in one place."""
 
 
-class Page:
+class Page(WebPage):
     """A page at :attr:`url` until :meth:`close`.
 
     The session is used by :meth:`serve` alone. Visitors' wishes wait in a queue until the next control step.
@@ -69,7 +69,7 @@ class Page:
             XResetError: viser is not installed, or the server does not start.
         """
         self.session = session
-        self._server = start_server(host, port, label="xreset play")
+        super().__init__(host, port, "xreset play")
         self._wishes: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._paused = False
         self._factor = 1.0
@@ -90,11 +90,6 @@ class Page:
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._part)
         self._draw()
-
-    @property
-    def url(self) -> str:
-        """Address of the page, seen from this machine."""
-        return url_of(self._server)
 
     def serve(self) -> None:
         """Play until interrupted. While nobody looks, time stands still."""
@@ -122,7 +117,7 @@ class Page:
     def close(self) -> None:
         """Stop the server. The session stays open."""
         self._films.shutdown(wait=False, cancel_futures=True)
-        self._server.stop()
+        super().close()
 
     def _wish(self, action: Callable[..., Any], *arguments: Any) -> None:
         self._wishes.put(lambda: action(*arguments))

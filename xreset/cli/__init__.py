@@ -49,15 +49,6 @@ The module ``xreset.cli.NAME`` has one of: ``COMMAND``, a function or a dictiona
 which makes the function from the arguments, if defaults depend on them; or ``COMMANDS`` of its own, whose modules are
 in its folder."""
 
-MOVED = {
-    "backends": "engines list",
-    "conformance": "engines check",
-    "parity": "engines compare",
-    "trace": "engines trace",
-    "attribute": "engines attribute",
-}
-"""Earlier names of commands -> today's."""
-
 INVOCATION: list[str] = []
 """Arguments of the command that is running."""
 
@@ -75,9 +66,6 @@ def main(argv: list[str] | None = None) -> None:
 
         print(f"xreset {code_version()}")
         return
-    if argv and argv[0] in MOVED:
-        print(f"xreset: {argv[0]} is now called {MOVED[argv[0]]!r}: xreset {MOVED[argv[0]]} --help", file=sys.stderr)
-        raise SystemExit(2)
     INVOCATION[:] = argv
     try:
         _run("", COMMANDS, argv)

@@ -14,8 +14,6 @@ from xreset.cli._common import Objects, Source
 from xreset.cli._terminal import Progress, console
 from xreset.demos import align, archive, plausible
 from xreset.files import file_hash
-from xreset.pictures import render
-from xreset.pictures.view import load, sheet
 from xreset.retarget import collisions, file, pipeline
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.hand.config import HandConfig
@@ -28,7 +26,6 @@ def retarget(
     out: Path,
     objects: Objects = None,
     max_per_object: int | None = None,
-    picture: Path | None = None,
     device: str = "cpu",
     hand: HandConfig = HandConfig(),
     arm: ArmConfig = ArmConfig(),
@@ -43,7 +40,6 @@ def retarget(
         device: Where hand retargeting runs: cpu or cuda. The arm runs on the CPU.
         hand: Weights of hand retargeting.
         arm: Weights and effort of the arm's inverse kinematics.
-        picture: PNG to write: first contact, mid-lift and goal for each object, with the human keypoints.
     """
     spec = description.load_robot(robot)
     chosen = archive.read_demos(demos)
@@ -63,10 +59,6 @@ def retarget(
         inputs={"demos": file_hash(demos), "robot": spec.fingerprint}
         | {f"object {s.name}": s.source for s in specs.values()},
     )
-
-    if picture is not None:
-        shown = load.load_view(out, demos=demos, robot=robot, objects=objects)
-        render.write_png(picture, sheet.draw_sheet(shown, sheet.moment_tiles(shown)))
 
     colliding = collisions.colliding_links(result, spec, config.thresholds)
     write_accounts(

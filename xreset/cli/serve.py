@@ -7,6 +7,7 @@ import logging
 from xreset.cli._common import Policy, Robot, Several, TrainedObjects
 from xreset.eval.export import deploy
 from xreset.live import serve as server
+from xreset.pictures.view import server as pages
 
 
 def serve(
@@ -31,12 +32,7 @@ def serve(
     print(f"{spec.name} for {spec.robot.name} at {listening.url}, {contract['rate']:g} steps per second. Ctrl-C ends.")
     if host not in ("127.0.0.1", "localhost", "::1"):
         print("Every computer that reaches this address can use the policy. There is no password.")
-    try:
-        listening.run()
-    except KeyboardInterrupt:  # the way to end it, not a failure
-        print("\nclosed.")
-    finally:
-        listening.close()
+    pages.serve_until_interrupted(listening)
 
 
 COMMAND = serve

@@ -8,12 +8,12 @@ import numpy as np
 from rich.progress import track
 
 from xreset.cli._common import Host, Objects, Port, Robot, Source
-from xreset.cli._terminal import Progress, console
+from xreset.cli._terminal import console
 from xreset.errors import XResetError
 from xreset.eval.report import clips
 from xreset.files import write_whole
 from xreset.pictures import render
-from xreset.pictures.view import data, load, page, picture, server, sheet
+from xreset.pictures.view import data, load, page, picture, server
 
 
 def view(
@@ -29,8 +29,6 @@ def view(
     port: Port = 8080,
     png: Path | None = None,
     mp4: Path | None = None,
-    moments: bool = False,
-    reasons: bool = False,
 ) -> None:
     """Show demonstrations, robot motion or a reset bank in a browser, or write pictures of them.
 
@@ -46,15 +44,8 @@ def view(
         frame: Which frame of the sequence (state of the bank). Default: the first; for --png the middle one.
         png: Picture to write, instead of a page.
         mp4: Film of the sequence to write, instead of a page.
-        moments: With --png: first contact, mid-lift and goal of one demonstration of each object.
-        reasons: With --png: one example of every reason why a frame or state is not used.
     """
-    if (moments or reasons) and (png is None or (moments and reasons)):
-        raise XResetError("--moments and --reasons need a file with --png, and exclude each other.")
     shown = load.load_view(file, demos=demos, retargeted=retargeted, robot=robot, objects=objects)
-    if png is not None and (moments or reasons):
-        _write_sheet(png, shown, moments=moments)
-        return
     if png is None and mp4 is None:
         _serve(shown, host, port, sequence, frame or 0)
         return
@@ -80,16 +71,6 @@ def _write_png(path: Path, shown: data.View, rows: np.ndarray, frame: int | None
         raise XResetError(f"Frame {chosen} does not exist. Choose one from 0 to {len(rows) - 1}.")
     render.write_png(path, picture.Drawer(shown, size=(960, 720), smooth=True).draw(int(rows[chosen])))
     print("\n".join((*shown.text(int(rows[chosen])), f"picture in {path}")))
-
-
-def _write_sheet(path: Path, shown: data.View, *, moments: bool) -> None:
-    tiles = sheet.moment_tiles(shown) if moments else sheet.reason_tiles(shown)
-    with Progress() as bar:
-        drawn = sheet.draw_sheet(shown, tiles, progress=bar.count("drawing"))
-    render.write_png(path, drawn)
-    for tile in tiles:
-        print("; ".join(tile.caption))
-    print(f"{sum(tile.row is not None for tile in tiles)} pictures in {path}")
 
 
 def _write_mp4(path: Path, shown: data.View, rows: np.ndarray) -> None:

@@ -64,7 +64,7 @@ class PolicyServer:
             raise XResetError(f"Cannot listen at {host}:{port}: {error.strerror}. Choose another --port.") from error
         self.url = f"ws://{host}:{self._server.socket.getsockname()[1]}"
 
-    def run(self) -> None:
+    def serve(self) -> None:
         """Serve until :meth:`close`."""
         self._server.serve_forever()
 

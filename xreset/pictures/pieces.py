@@ -9,9 +9,11 @@ import numpy as np
 
 from xreset.geometry.shapes import shape_mesh
 from xreset.pictures.meshes import OBJECT_COLOR, object_mesh
-from xreset.pictures.render import Camera, draw_bodies
-from xreset.pictures.view.sheet import TILE_SIZE, add_caption
+from xreset.pictures.render import Camera, add_caption, draw_bodies
 from xreset.spec import ObjectSpec
+
+TILE_SIZE = (420, 360)
+"""Width and height of a picture [pixels]."""
 
 
 def draw_pieces(objects: Sequence[ObjectSpec], captions: Sequence[str]) -> np.ndarray:

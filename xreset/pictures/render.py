@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from xreset.cameras.pose import look_at
@@ -50,6 +50,8 @@ _SHADOW_BIAS = 0.0015
 """Distance from a surface at which a ray to the light starts, so that a surface does not shade itself [m]."""
 _NEAR = 0.02
 """Overlays nearer to the camera are not drawn [m]."""
+_LINE = 16
+"""Height of a line of a caption [pixels]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,6 +212,19 @@ def pose_matrix(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
     T[:3, :3] = Rotation.from_quat(np.asarray(quat, dtype=float), scalar_first=True).as_matrix()
     T[:3, 3] = pos
     return T
+
+
+def add_caption(picture: np.ndarray, caption: Sequence[str], lines: int) -> np.ndarray:
+    """Return a picture with text below it, on a white band with room for a number of lines."""
+    height, width, _ = picture.shape
+    image = Image.new("RGB", (width, height + _LINE * lines + _LINE // 2), "white")
+    image.paste(Image.fromarray(picture))
+    pen = ImageDraw.Draw(image)
+    color = "black"
+    for number, line in enumerate(caption):
+        pen.text((6, height + 3 + number * _LINE), line, fill=color, font=ImageFont.load_default(13))
+        color = "dimgray"
+    return np.asarray(image)
 
 
 def write_png(path: str | Path, picture: np.ndarray) -> None:

@@ -30,8 +30,7 @@ from xreset.geometry.rotations import (
     quat_to_axis_angle,
 )
 from xreset.physics import Backend, State
-from xreset.pictures.render import Camera, Renderer, pose_matrix
-from xreset.pictures.view.sheet import add_caption
+from xreset.pictures.render import Camera, Renderer, add_caption, pose_matrix
 from xreset.resets.bank import ResetBank
 from xreset.resets.config import SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets

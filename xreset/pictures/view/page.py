@@ -12,7 +12,7 @@ from xreset.errors import XResetError
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, Color, rgb
 from xreset.pictures.view.colors import CONTACT_COLOR, HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, GOOD, PHASES, View
-from xreset.pictures.view.server import RobotMeshes, start_server, url_of
+from xreset.pictures.view.server import RobotMeshes, WebPage
 from xreset.pictures.view.timeline import bar, legend, mark
 
 _ALL = "all"
@@ -20,7 +20,7 @@ _IDLE = 0.1
 """Time between two checks of the play button [s]."""
 
 
-class Page:
+class Page(WebPage):
     """A page at :attr:`url` until :meth:`close`. All visitors see, and move, the same controls."""
 
     def __init__(
@@ -44,17 +44,12 @@ class Page:
         if not 0 <= frame < len(self._rows):
             raise XResetError(f"There is no frame {frame}: the sequence has {len(self._rows)}, counted from 0.")
         self._lock = threading.RLock()
-        self._server = start_server(host, port, label="xreset view")
+        super().__init__(host, port, "xreset view")
         self._scene = _Scene(view, self._server)
         self._make_controls(sequence)
         self._show_choice()
         self._frame.value = frame
         self.show()
-
-    @property
-    def url(self) -> str:
-        """Address of the page, seen from this machine."""
-        return url_of(self._server)
 
     @property
     def row(self) -> int | None:
@@ -85,10 +80,6 @@ class Page:
                 self._step(1)
             else:
                 time.sleep(_IDLE)
-
-    def close(self) -> None:
-        """Stop the server."""
-        self._server.stop()
 
     def _make_controls(self, sequence: int | None) -> None:
         gui: Any = self._server.gui

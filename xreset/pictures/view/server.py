@@ -21,17 +21,36 @@ from xreset.pictures.render import Camera
 from xreset.spec import RobotSpec, TableSpec
 
 
-def start_server(host: str, port: int, *, label: str) -> Any:
-    """Start a viser server that answers its own page only, and show the table.
+class WebPage:
+    """A page at :attr:`url` until :meth:`close`. It shows the table, and answers its own visitors only."""
 
-    Args:
-        host: address to listen at; 0.0.0.0 for every address of the machine.
-        port: port to listen at; the next free one if it is taken.
-        label: title of the page.
+    def __init__(self, host: str, port: int, label: str) -> None:
+        """Start the server.
 
-    Raises:
-        XResetError: viser is not installed, or the server does not start.
-    """
+        Args:
+            host: address to listen at; 0.0.0.0 for every address of the machine.
+            port: port to listen at; the next free one if it is taken.
+            label: title of the page.
+
+        Raises:
+            XResetError: viser is not installed, or the server does not start.
+        """
+        self._server = _start_server(host, port, label)
+
+    @property
+    def url(self) -> str:
+        """Address of the page, seen from this machine."""
+        host = self._server.get_host()
+        if host in ("0.0.0.0", "127.0.0.1"):
+            host = "localhost"
+        return f"http://{host}:{self._server.get_port()}"
+
+    def close(self) -> None:
+        """Stop the server."""
+        self._server.stop()
+
+
+def _start_server(host: str, port: int, label: str) -> Any:
     with needs("viser, without which --png and --mp4 of xreset view work,", "viewer"):
         import viser
     try:
@@ -55,22 +74,14 @@ def start_server(host: str, port: int, *, label: str) -> Any:
     return server
 
 
-def serve_until_interrupted(page: Any) -> None:
-    """Serve a page until Ctrl-C, then close it. ``page`` has the methods ``serve`` and ``close``."""
+def serve_until_interrupted(server: Any) -> None:
+    """Serve until Ctrl-C, then close. ``server`` has the methods ``serve`` and ``close``."""
     try:
-        page.serve()
+        server.serve()
     except KeyboardInterrupt:  # the way to end it, not a failure
         print("\nclosed.")
     finally:
-        page.close()
-
-
-def url_of(server: Any) -> str:
-    """Return the address of a server's page, seen from this machine."""
-    host = server.get_host()
-    if host in ("0.0.0.0", "127.0.0.1"):
-        host = "localhost"
-    return f"http://{host}:{server.get_port()}"
+        server.close()
 
 
 class RobotMeshes:

@@ -23,8 +23,8 @@ from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.eval.rollout import Episode, Round, episode_of, episode_starts, play_rounds
-from xreset.eval.sensitivity import SWEEPS, Property
-from xreset.eval.stress import COSTLY, Curve, Point, Stress, chosen, curve, draw_curves, plot_size, stressed
+from xreset.eval.sensitivity import SWEEPS, Property, amount, chosen, nominal_task
+from xreset.eval.stress import COSTLY, Curve, Point, Stress, curve, draw_curves, plot_size
 from xreset.eval.trial import Engine, Trial, engine, load_trial
 from xreset.files import claim_folder, write_json, write_whole
 from xreset.inputs import Data
@@ -222,7 +222,7 @@ def _rehearsed(
         # Faults of the loop can differ from world to world, so they are played together.
         in_loop = [(prop, value) for prop, value in settings if prop.name in _MAKERS]
         faults = [Faults(), *(_setting(trial, prop, value)[1] for prop, value in in_loop)]
-        nominal, *others = player.play(replace(trial, task=stressed(trial.task)), faults)
+        nominal, *others = player.play(replace(trial, task=nominal_task(trial.task)), faults)
         episodes = dict(zip(in_loop, others, strict=True))
         for prop, value in settings:
             if (prop, value) not in episodes:
@@ -255,11 +255,11 @@ def _setting(trial: Trial, prop: Property, value: float) -> tuple[Trial, Faults]
     """
     make = _MAKERS.get(prop.name)
     if make is None:
-        return replace(trial, task=stressed(trial.task, prop, value)), Faults()
+        return replace(trial, task=prop.set_in(nominal_task(trial.task), value)), Faults()
     try:
-        return replace(trial, task=stressed(trial.task)), make(value)
+        return replace(trial, task=nominal_task(trial.task)), make(value)
     except ValueError as error:
-        raise XResetError(f"{prop.option} {_size(prop.unit, value)} cannot be tried: {error}.") from None
+        raise XResetError(f"{prop.option} {amount(prop.unit, value)} cannot be tried: {error}.") from None
 
 
 class _Player:
@@ -349,7 +349,7 @@ def judge(found: Sequence[Rehearsal]) -> Verdict:
             if point is None or -point.difference <= criterion.most:
                 continue
             low, high = (-100 * bound for bound in reversed(point.difference_ci95))
-            fault = f"{criterion.option.replace('-', ' ')} {_size(_unit(criterion), criterion.value)}"
+            fault = f"{criterion.option.replace('-', ' ')} {amount(_unit(criterion), criterion.value)}"
             text = (
                 f"{card.backend}: {fault} costs {-100 * point.difference:.1f} points (95 %: {low:.0f} to {high:.0f}). "
                 f"At most {100 * criterion.most:.0f} are wanted."
@@ -368,11 +368,6 @@ def judge(found: Sequence[Rehearsal]) -> Verdict:
     if tried < len(CRITERIA) * len(found):
         return Verdict(sentence="No verdict: not every fault that decides was tried.", reasons=())
     return Verdict(sentence="Ready for a first, careful trial on a robot.", reasons=())
-
-
-def _size(unit: str, value: float) -> str:
-    """Return a value with its unit, such as ``33 ms`` or ``x 0.7``."""
-    return f"x {value:g}" if unit == "x" else f"{value:g} {unit}"
 
 
 def _unit(criterion: Criterion) -> str:
@@ -417,7 +412,7 @@ def _limit(found: Curve | None) -> str:
     if not values:
         return "none that was tried"
     chance = "" if all(found.is_certain(value) for value in values) else ", or chance"
-    return " and ".join(_size(found.unit, float(f"{value:.2g}")) for value in values) + chance
+    return " and ".join(amount(found.unit, float(f"{value:.2g}")) for value in values) + chance
 
 
 def page(found: Sequence[Rehearsal]) -> str:
@@ -432,7 +427,7 @@ def page(found: Sequence[Rehearsal]) -> str:
                 if each is not None and point.value != each.nominal:
                     points.setdefault(point.value, [None] * len(found))[i] = point
         for value in sorted(points):
-            rows.append((name.replace("-", " "), _size(unit, value), points[value]))
+            rows.append((name.replace("-", " "), amount(unit, value), points[value]))
     return render(
         "rehearsal.html.j2",
         verdict=judge(found),

@@ -1,19 +1,22 @@
 """How a change of the world changes a policy's score, and the physical properties that are changed.
 
-Sweeps (:mod:`xreset.eval.stress`) and the attribution to differences of engines
-(:mod:`xreset.eval.engines.attribution`) share both.
+Sweeps (:mod:`xreset.eval.stress`), rehearsals (:mod:`xreset.eval.rehearse`) and the attribution to differences of
+engines (:mod:`xreset.eval.engines.attribution`) share both.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from xreset.errors import XResetError
 from xreset.eval.rollout import Episode
 from xreset.eval.stats import bootstrap_ci95, mean_of_known
 from xreset.physics import Capability
+from xreset.task.config import RandomizationConfig, TaskConfig
 
 Interval = tuple[float, float]
 
@@ -31,10 +34,10 @@ class Effect:
     it."""
 
     @classmethod
-    def of(cls, episodes: Sequence[Episode], nominal: Sequence[Episode], metric: str = "task_progress") -> Effect:
+    def of(cls, episodes: Sequence[Episode], nominal: Sequence[Episode]) -> Effect:
         """Compare episodes one by one; whole demonstrations are drawn for the intervals."""
-        score = np.array([float(getattr(e, metric)) for e in episodes])
-        difference = score - np.array([float(getattr(e, metric)) for e in nominal])
+        score = np.array([e.task_progress for e in episodes])
+        difference = score - np.array([e.task_progress for e in nominal])
         groups = np.array([e.sequence for e in episodes])
         return cls(
             task_progress=float(score.mean()),
@@ -53,11 +56,11 @@ class Effect:
 
 @dataclass(frozen=True, kw_only=True)
 class Property:
-    """One physical property. No task can set one without ``task_field``; one without ``measured`` is not measured."""
+    """One physical property. One without ``values`` is not swept; one without ``measured`` is not compared."""
 
     name: str
     task_field: str = ""
-    """Field of :class:`~xreset.task.config.RandomizationConfig` that a sweep holds at one value."""
+    """Field of :class:`~xreset.task.config.RandomizationConfig` that sets it; default: the name."""
     values: tuple[float, ...] = ()
     """Values of a sweep, ascending, without the nominal one."""
     nominal: float = 1.0
@@ -65,7 +68,7 @@ class Property:
     unit: str = "x"
     """Unit of the values; ``x`` for a factor."""
     needs: Capability | None = None
-    """What an engine must be able to set in a sweep."""
+    """What an engine must be able to set."""
     measured: str = ""
     """Field of :class:`~xreset.eval.engines.measure.Measured`."""
     resolution: float = 0.0
@@ -73,60 +76,74 @@ class Property:
     absolute: bool = False
     shown_unit: str = ""
     """Unit in which the measured number is shown."""
-    scale: float = 1.0
-    """Factor from the measured number to that unit."""
-    altered: str = ""
-    """Field of :class:`~xreset.eval.engines.alteration.Alteration`."""
-    what_if: tuple[float, ...] = ()
-    """Changes of a usual size, which show how much a skill depends on the property."""
     of_cameras: bool = False
     """Whether only policies that see have the property."""
-    at_most: str = ""
-    """Why the possible change goes farther than the other engine does, so that its cost is a bound; else empty."""
 
     @property
     def option(self) -> str:
         """Name of the property in options and in files of sweeps."""
         return self.name.replace(" ", "-")
 
+    @property
+    def field(self) -> str:
+        """Field of the task's randomization."""
+        return self.task_field or self.name.replace(" ", "_")
 
-_SCALES = (0.6, 0.8, 1.25, 1.6)
+    def shown(self, value: float) -> str:
+        """Return a measured number in the unit in which it reads best."""
+        scale = 1e3 if self.shown_unit in ("mm", "ms") else 1.0
+        return f"{value * scale:.3g} {self.shown_unit}".rstrip()
+
+    def set_in(self, task: TaskConfig, value: float) -> TaskConfig:
+        """Return the task with the property at one value.
+
+        Raises:
+            XResetError: the property cannot have the value.
+        """
+        if self.unit == "ms":
+            value /= 1000 * task.timestep * task.substeps  # the task counts control steps
+        try:
+            return replace(task, randomization=replace(task.randomization, **{self.field: (value, value)}))
+        except ValueError as error:
+            raise XResetError(f"{self.option} {amount(self.unit, value)} cannot be tried: {error}.") from None
 
 
-def _friction(name: str) -> Property:
-    return Property(
-        name=f"{name} friction",
-        measured=f"{name}_friction",
-        resolution=0.03,
-        altered=f"{name}_friction",
-        what_if=(0.8,),
-    )
+def amount(unit: str, value: float) -> str:
+    """Return a value with its unit, such as ``33 ms`` or ``x 0.7``."""
+    number = f"{float(f'{value:.3g}'):g}"
+    return f"x {number}" if unit == "x" else f"{number} {unit}"
 
 
 def _drive(part: str, name: str, resolution: float) -> Property:
-    field = f"{part}_{name}"
     return Property(
         name=f"{part} {name}",
-        task_field=field,
-        values=_SCALES,
+        values=(0.6, 0.8, 1.25, 1.6),
         needs="drives",
-        measured=field,
+        measured=f"{part}_{name}",
         resolution=resolution,
-        altered=field,
-        what_if=(0.8,),
+    )
+
+
+def _friction(pair: str, material: str) -> Property:
+    return Property(
+        name=f"{pair} friction",
+        task_field=material,
+        needs="friction",
+        measured=f"{pair}_friction",
+        resolution=0.03,
     )
 
 
 def _camera(name: str, values: tuple[float, ...], unit: str) -> Property:
-    nominal = 1.0 if unit == "x" else 0.0
-    field = f"camera_{name}"
-    return Property(name=f"camera {name}", task_field=field, values=values, nominal=nominal, unit=unit, of_cameras=True)
+    return Property(
+        name=f"camera {name}", values=values, nominal=1.0 if unit == "x" else 0.0, unit=unit, of_cameras=True
+    )
 
 
 PROPERTIES = (
-    _friction("tip"),
-    _friction("link"),
-    _friction("table"),
+    _friction("tip", "elastomer"),
+    _friction("link", "metal"),
+    _friction("table", "table"),
     Property(
         name="object friction",
         task_field="friction",
@@ -135,33 +152,15 @@ PROPERTIES = (
         unit="coefficient",
         needs="friction",
     ),
-    Property(
-        name="hand friction",
-        task_field="hand_friction",
-        values=(0.4, 0.8),
-        nominal=0.1,
-        unit="coefficient",
-        needs="friction",
-    ),
+    Property(name="hand friction", values=(0.4, 0.8), nominal=0.1, unit="coefficient", needs="friction"),
     Property(
         name="torsional friction",
-        task_field="torsional_friction",
         values=(0.0, 0.3, 2.0),
         needs="torsional_friction",
         measured="torsional_friction",
         resolution=5e-5,
         absolute=True,
         shown_unit="mm",
-        scale=1e3,
-        altered="torsional_friction",
-        what_if=(0.0, 2.0),
-    ),
-    Property(
-        name="patch torsional friction",
-        measured="patch_torsional_friction",
-        resolution=0.05,
-        absolute=True,
-        at_most="changed in every contact, where the engines differ only beside a second point",
     ),
     Property(
         name="object mass",
@@ -170,79 +169,75 @@ PROPERTIES = (
         needs="object_mass",
         measured="mass",
         resolution=0.005,
-        altered="mass",
-        what_if=(1.2,),
     ),
-    Property(
-        name="object inertia",
-        task_field="object_inertia",
-        values=(0.5, 2.0),
-        needs="object_inertia",
-        measured="inertia",
-        resolution=0.02,
-        altered="inertia",
-        what_if=(1.2,),
-    ),
-    Property(
-        name="object com",
-        task_field="object_com",
-        values=(0.005, 0.01, 0.02),
-        nominal=0.0,
-        unit="m",
-        needs="object_com",
-    ),
+    Property(name="object inertia", values=(0.5, 2.0), needs="object_inertia", measured="inertia", resolution=0.02),
+    Property(name="object com", values=(0.005, 0.01, 0.02), nominal=0.0, unit="m", needs="object_com"),
     _drive("arm", "stiffness", 0.02),
     _drive("arm", "damping", 0.02),
     _drive("hand", "stiffness", 0.03),
     _drive("hand", "damping", 0.02),
-    Property(name="effort", task_field="effort", values=(0.4, 0.6, 0.8), needs="drives"),
+    Property(name="effort", values=(0.4, 0.6, 0.8), needs="drives"),
+    Property(name="timestep", measured="timestep", resolution=0.05, shown_unit="ms"),
+    Property(name="contact softness", measured="contact_give", resolution=2e-5, absolute=True, shown_unit="mm"),
     Property(
-        name="timestep",
-        measured="timestep",
-        resolution=0.05,
-        shown_unit="ms",
-        scale=1e3,
-        altered="timestep",
-        what_if=(0.5,),
-    ),
-    Property(
-        name="contact softness",
-        measured="contact_give",
-        resolution=2e-5,
-        absolute=True,
-        shown_unit="mm",
-        scale=1e3,
-        altered="contact_time",
-        what_if=(1.5,),
-    ),
-    Property(
-        name="latency",
+        name="action latency",
+        values=(0.5, 1.0, 2.0),
+        nominal=0.0,
+        unit="control steps",
         measured="delay",
         resolution=0.5,
         absolute=True,
         shown_unit="control steps",
-        altered="delay",
-        what_if=(1,),
     ),
-    Property(
-        name="action latency", task_field="action_latency", values=(0.5, 1.0, 2.0), nominal=0.0, unit="control steps"
-    ),
-    Property(
-        name="observation latency",
-        task_field="observation_latency",
-        values=(0.5, 1.0, 2.0),
-        nominal=0.0,
-        unit="control steps",
-    ),
-    Property(name="force gain", task_field="force_gain", values=(0.5, 2.0)),
+    Property(name="observation latency", values=(0.5, 1.0, 2.0), nominal=0.0, unit="control steps"),
+    Property(name="force gain", values=(0.5, 2.0)),
     _camera("shift", (0.01, 0.03), "m"),
     _camera("turn", (0.035, 0.087), "rad"),
     _camera("noise", (2.0,), "x"),
-    _camera("latency", (3.0,), "control steps"),
+    _camera("latency", (50.0,), "ms"),
 )
 """In the order of tables."""
 
-SWEEPS = tuple(p for p in PROPERTIES if p.task_field)
+SWEEPS = tuple(p for p in PROPERTIES if p.values)
 """The properties that can be swept."""
 COMPARED = {p.name: p for p in PROPERTIES if p.measured}
 """The properties in which engines are compared, by name."""
+
+
+def chosen(wanted: Sequence[str], properties: Sequence[Property] = SWEEPS) -> tuple[Property, ...]:
+    """Return some of the properties, by ``NAME`` or ``NAME=VALUE,VALUE...``; all if nothing is wanted.
+
+    Raises:
+        XResetError: a property is unknown, or a value is impossible.
+    """
+    known = {prop.option: prop for prop in properties}
+    found = []
+    for text in wanted:
+        name, _, values = text.partition("=")
+        if name not in known:
+            raise XResetError(f"Unknown property {name!r}. Choose from: {', '.join(known)}.")
+        prop = known[name]
+        if values:
+            prop = replace(prop, values=_values(text, values, prop))
+        found.append(prop)
+    return tuple(found or properties)
+
+
+def _values(text: str, values: str, prop: Property) -> tuple[float, ...]:
+    try:
+        numbers = sorted({float(v) for v in values.split(",")} - {prop.nominal})
+    except ValueError:
+        raise XResetError(f"{text!r} holds values that are no numbers. Write {prop.option}=VALUE,VALUE...") from None
+    if not numbers or not all(0 <= v < math.inf for v in numbers):
+        raise XResetError(f"{text!r}: expected finite values of at least 0, other than the nominal {prop.nominal:g}.")
+    return tuple(numbers)
+
+
+def nominal_task(task: TaskConfig) -> TaskConfig:
+    """Return an evaluation's task in which :meth:`Property.set_in` can set properties: nothing is drawn at random."""
+    r = task.randomization
+    middle = sum(r.friction) / 2
+    still = RandomizationConfig(
+        friction=(middle, middle), mass_scale=(1.0, 1.0), elastomer=r.elastomer, metal=r.metal, table=r.table
+    )
+    return replace(task, randomization=still)

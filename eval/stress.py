@@ -18,11 +18,10 @@ from xreset.errors import XResetError
 from xreset.eval.plots import COLORS, picture
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.rollout import Episode, roll_out
-from xreset.eval.sensitivity import SWEEPS, Effect, Interval, Property
+from xreset.eval.sensitivity import SWEEPS, Effect, Interval, Property, amount, nominal_task
 from xreset.eval.trial import Engine, Trial
 from xreset.files import read_json, write_json
 from xreset.plugins import backend_class
-from xreset.task.config import RandomizationConfig, TaskConfig
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -136,7 +135,7 @@ class Stress:
             for value in limits:
                 size = abs(math.log(value)) if curve.unit == "x" else math.inf
                 found = sure if curve.is_certain(value) else perhaps
-                found.append((size, f"{curve.property} {_amount(curve.unit, value)}"))
+                found.append((size, f"{curve.property} {amount(curve.unit, value)}"))
         points = f"{100 * COSTLY:.0f} points"
         parts = [f"{100 * self.task_progress:.0f} %"]
         if sure:
@@ -153,59 +152,6 @@ class Stress:
 def _smallest_first(costs: list[tuple[float, str]]) -> str:
     ordered = sorted(costs, key=lambda cost: cost[0])
     return ", or ".join(text for _, text in ordered)
-
-
-def _amount(unit: str, value: float) -> str:
-    number = f"{float(f'{value:.2g}'):g}"
-    return f"x {number}" if unit == "x" else f"of {number} {unit}"
-
-
-def chosen(wanted: Sequence[str], properties: Sequence[Property] = SWEEPS) -> tuple[Property, ...]:
-    """Return some of the properties, by ``NAME`` or ``NAME=VALUE,VALUE...``; all if nothing is wanted.
-
-    Raises:
-        XResetError: a property is unknown, or a value is impossible.
-    """
-    known = {prop.option: prop for prop in properties}
-    found = []
-    for text in wanted:
-        name, _, values = text.partition("=")
-        if name not in known:
-            raise XResetError(f"Unknown property {name!r}. Choose from: {', '.join(known)}.")
-        prop = known[name]
-        if values:
-            prop = replace(prop, values=_values(text, values, prop))
-        found.append(prop)
-    return tuple(found or properties)
-
-
-def _values(text: str, values: str, prop: Property) -> tuple[float, ...]:
-    try:
-        numbers = sorted({float(v) for v in values.split(",")} - {prop.nominal})
-    except ValueError:
-        raise XResetError(f"{text!r} holds values that are no numbers. Write {prop.option}=VALUE,VALUE...") from None
-    if not numbers or not all(0 <= v < math.inf for v in numbers):
-        raise XResetError(f"{text!r}: expected finite values of at least 0, other than the nominal {prop.nominal:g}.")
-    return tuple(numbers)
-
-
-def stressed(task: TaskConfig, prop: Property | None = None, value: float = 1.0) -> TaskConfig:
-    """Return an evaluation's task with one property at a value and nothing drawn at random; None: with nothing changed.
-
-    Raises:
-        XResetError: the property cannot have the value.
-    """
-    r = task.randomization
-    middle = sum(r.friction) / 2
-    still = RandomizationConfig(
-        friction=(middle, middle), mass_scale=(1.0, 1.0), elastomer=r.elastomer, metal=r.metal, table=r.table
-    )
-    if prop is None:
-        return replace(task, randomization=still)
-    try:
-        return replace(task, randomization=replace(still, **{prop.task_field: (value, value)}))
-    except ValueError as error:
-        raise XResetError(f"{prop.option} {_amount(prop.unit, value)} cannot be tried: {error}.") from None
 
 
 def stress(
@@ -242,9 +188,10 @@ def stress(
         sweeps = [prop for prop in sweeps if not prop.of_cameras]
         if not sweeps:
             raise XResetError(f"The policy {policy.name!r} has no cameras to change. Choose other properties.")
+    task = nominal_task(trial.task)
     for prop in sweeps:
         for value in prop.values:
-            stressed(trial.task, prop, value)
+            prop.set_in(task, value)
     found = []
     for engine in engines:
         able = backend_class(engine.name).capabilities
@@ -256,7 +203,7 @@ def stress(
             prop: Property | None, value: float, engine: Engine = engine, total: int = total
         ) -> tuple[Episode, ...]:
             nonlocal done
-            changed = replace(trial, task=stressed(trial.task, prop, value))
+            changed = replace(trial, task=task if prop is None else prop.set_in(task, value))
             episodes = roll_out(policy.start(trial.motion), engine, changed, repetitions=repetitions).episodes
             done += 1
             progress(engine.name, done, total)

@@ -14,8 +14,8 @@ from tests.command import xreset
 from tests.toy_bank import SOUP
 from tests.toy_results import episodes
 from xreset.errors import XResetError
-from xreset.eval.sensitivity import SWEEPS
-from xreset.eval.stress import Curve, Stress, chosen, curve, read_stress, stressed
+from xreset.eval.sensitivity import SWEEPS, chosen, nominal_task
+from xreset.eval.stress import Curve, Stress, curve, read_stress
 from xreset.files import write_json
 from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
 
@@ -25,7 +25,7 @@ class StressedTest(unittest.TestCase):
         task = evaluation_task(
             TaskConfig(randomization=RandomizationConfig(arm_stiffness=(0.5, 2.0), friction=(0.4, 0.8), metal=0.2))
         )
-        plain = stressed(task).randomization
+        plain = nominal_task(task).randomization
         self.assertEqual(
             (plain.friction, plain.mass_scale, plain.arm_stiffness, plain.metal),
             ((0.6000000000000001,) * 2, (1, 1), (1, 1), 0.2),
@@ -33,10 +33,11 @@ class StressedTest(unittest.TestCase):
         self.assertTrue(plain.enabled and not plain.scales_drives)
         for prop in SWEEPS:
             value = prop.values[0]
-            found = stressed(task, prop, value).randomization
-            self.assertEqual(getattr(found, prop.task_field), (value, value))
-            self.assertEqual(replace(found, **{prop.task_field: getattr(plain, prop.task_field)}), plain)
-            self.assertEqual(stressed(task, prop, value).reset, task.reset)
+            found = prop.set_in(nominal_task(task), value)
+            set_to = 3.0 if prop.unit == "ms" else value  # 50 ms are three control steps
+            np.testing.assert_allclose(getattr(found.randomization, prop.field), (set_to, set_to))
+            self.assertEqual(replace(found.randomization, **{prop.field: getattr(plain, prop.field)}), plain)
+            self.assertEqual(found.reset, task.reset)
 
     def test_values_of_ones_own(self):
         (prop,) = chosen(["arm-stiffness=2,0.5,1"])
@@ -54,12 +55,12 @@ class StressedTest(unittest.TestCase):
                 chosen([text])
         (late,) = chosen(["action-latency=300"])
         with self.assertRaisesRegex(
-            XResetError, "action-latency of 300 control steps cannot be tried: .* fewer than the 300 of an episode"
+            XResetError, "action-latency 300 control steps cannot be tried: .* fewer than the 300 of an episode"
         ):
-            stressed(TaskConfig(), late, 300.0)
+            late.set_in(TaskConfig(), 300.0)
         (light,) = chosen(["object-mass=0"])
         with self.assertRaisesRegex(XResetError, "object-mass x 0 cannot be tried: mass_scale begins with 0"):
-            stressed(TaskConfig(), light, 0.0)
+            light.set_in(TaskConfig(), 0.0)
 
 
 class CurveTest(unittest.TestCase):
@@ -100,7 +101,7 @@ class CurveTest(unittest.TestCase):
         self.assertEqual((scattered.is_certain(scattered.upper), stiffness.is_certain(stiffness.lower)), (False, True))
         self.assertEqual(
             replace(card, curves=(stiffness, late, harmless, soft, scattered)).sentence(),
-            "mujoco, 4 episodes: 80 %; 10 points less with hand-stiffness x 0.9, or arm-stiffness x 0.74, or action-latency of 0.67 "
+            "mujoco, 4 episodes: 80 %; 10 points less with hand-stiffness x 0.9, or arm-stiffness x 0.74, or action-latency 0.667 "
             "control steps; perhaps 10 points less, within chance, with force-gain x 1.5; fewer than 10 points less with 1 of 5 "
             "properties, as far as was tried.",
         )

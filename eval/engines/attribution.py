@@ -7,30 +7,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
 from xreset.errors import XResetError
-from xreset.eval.engines.alteration import (
-    SOFTEST,
-    Alteration,
-    altered_engine,
-    change_towards,
-    has_contact_dial,
-    no_contact_dial,
-)
 from xreset.eval.engines.measure import Measured, measure
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.rollout import Episode, roll_out
-from xreset.eval.sensitivity import COMPARED, Effect
+from xreset.eval.sensitivity import COMPARED, Effect, Property, nominal_task
 from xreset.eval.trial import Engine, Trial
+from xreset.plugins import backend_class
+from xreset.task.config import TaskConfig
 
-SCHEMA = "xreset-attribution/1"
+SCHEMA = "xreset-attribution/2"
 
-Kind = Literal["as it is", "towards", "at most", "all", "what if", "other"]
+Kind = Literal["as it is", "towards", "all", "other"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,13 +32,9 @@ class Row:
     """One run of the policy."""
 
     kind: Kind
-    """``as it is``: A. ``towards``: one property changed to B's value. ``at most``: one property changed farther than
-    that, because there is no finer dial. ``all``: all properties of kind ``towards``. ``what if``: a change of a usual
-    size. ``other``: B.
-    """
+    """``as it is``: A. ``towards``: one property changed to B's value. ``all``: all of them. ``other``: B."""
     name: str
     """Property, or engine."""
-    alteration: Alteration
     episodes: tuple[Episode, ...]
     effect: Effect
     """Against A as it is."""
@@ -78,25 +68,19 @@ class Attribution:
 
     def costs(self) -> Row | None:
         """Return the property that brings about most of the gap when it is changed to B's value; None if none does for
-        sure.
-
-        A property whose cost is only a bound is named only where no other matters.
-        """
-        if not self.gap.is_certain:
-            return None
+        sure."""
         found = []
         for row in self.rows:
-            if row.kind in ("towards", "at most") and row.effect.is_certain and self.share(row) > 0:
+            if row.kind == "towards" and row.effect.is_certain and self.share(row) > 0:
                 found.append(row)
-        return max(found, key=lambda row: (row.kind == "towards", self.share(row)), default=None)
+        return max(found, key=self.share, default=None)
 
     def as_dict(self) -> dict[str, Any]:
         """Return JSON-able content."""
         properties = []
-        for name, compared in COMPARED.items():
-            values = [getattr(m, compared.measured) * compared.scale for m in (self.measured_a, self.measured_b)]
-            a, b = [float(f"{value:.6g}") if math.isfinite(value) else None for value in values]
-            properties.append({"name": name, "unit": compared.shown_unit, "a": a, "b": b})
+        for name, prop in COMPARED.items():
+            a, b = [_number(getattr(m, prop.measured)) for m in (self.measured_a, self.measured_b)]
+            properties.append({"name": name, "a": a, "b": b, "not_tried": self.skipped.get(name)})
         costly = self.costs()
         return {
             "schema": SCHEMA,
@@ -105,35 +89,23 @@ class Attribution:
             "episodes": len(self.rows[0].episodes),
             "properties": properties,
             "rows": [self._row(row) for row in self.rows],
-            "skipped": [{"name": name, "reason": reason} for name, reason in self.skipped.items()],
             "costs_most": None if costly is None else costly.name,
         }
 
     def _row(self, row: Row) -> dict[str, Any]:
-        share = self.share(row)
-        effect = row.effect
+        metrics = ("approach", "grasp", "reorient", "reorientation_progress", "nonfinite", "overflow", "out_of_bounds")
+        means = {metric: round(row.mean(metric), 6) for metric in metrics}
         return {
             "kind": row.kind,
             "name": row.name,
-            "alteration": asdict(row.alteration),
-            "task_progress": _interval(effect.task_progress, effect.ci95),
-            "approach_rate": round(row.mean("approach"), 6),
-            "grasp_rate": round(row.mean("grasp"), 6),
-            "reorient_rate": round(row.mean("reorient"), 6),
-            "reorientation_progress": round(row.mean("reorientation_progress"), 6),
-            "published_success_rate": row.effect.published_success,
-            "difference": _interval(effect.difference, effect.difference_ci95),
-            "share_of_gap": None if math.isnan(share) else round(share, 6),
-            "health": {
-                "nonfinite": sum(e.nonfinite for e in row.episodes),
-                "overflow": sum(e.overflow for e in row.episodes),
-                "out_of_bounds": sum(e.out_of_bounds for e in row.episodes),
-            },
+            **vars(row.effect),
+            "share_of_gap": _number(self.share(row)),
+            **means,
         }
 
 
-def _interval(mean: float, ci95: tuple[float, float]) -> dict[str, Any]:
-    return {"mean": round(mean, 6), "ci95": [round(x, 6) for x in ci95]}
+def _number(value: float) -> float | None:
+    return float(f"{value:.6g}") if math.isfinite(value) else None
 
 
 def attribute(
@@ -145,7 +117,6 @@ def attribute(
     episodes: int,
     sequences: np.ndarray | None = None,
     only: Sequence[str] = (),
-    what_if: bool = False,
     progress: Callable[[str, int, int], None] = lambda run, done, total: None,
 ) -> Attribution:
     """Measure both engines, and play the policy in A, in A changed towards B, and in B.
@@ -158,7 +129,6 @@ def attribute(
         episodes: episodes of each demonstration.
         sequences: indices of the demonstrations to play; None: all.
         only: names of the properties to try; empty: all.
-        what_if: also try the properties in which A and B do not differ, with changes of a usual size.
         progress: called with (name of the run, control steps done, control steps in all).
 
     Raises:
@@ -167,52 +137,91 @@ def attribute(
     policy.check_seed(trial.seed)
     if unknown := sorted(set(only) - set(COMPARED)):
         raise XResetError(f"Unknown property {', '.join(unknown)}. Choose from: {', '.join(COMPARED)}.")
-    scene = trial.nominal_scene
     progress(f"measuring {a.name}", 0, 0)
-    measured_a = measure(a, scene)
+    measured_a = measure(a, trial.nominal_scene)
     progress(f"measuring {b.name}", 0, 0)
-    measured_b = measure(b, scene)
+    measured_b = measure(b, trial.nominal_scene)
     rows: list[Row] = []
 
-    def run(kind: Kind, name: str, engine: Engine, alteration: Alteration) -> None:
-        label = name if kind in ("as it is", "other") else f"{a.name}, {kind} {name}"
-        altered = altered_engine(engine, alteration)
+    def run(kind: Kind, name: str, engine: Engine, task: TaskConfig) -> None:
+        label = name if kind in ("as it is", "other") else f"{a.name}, {name}"
         player = policy.start(trial.motion)
         played = roll_out(
-            player, altered, trial, repetitions=episodes, only=sequences, progress=partial(progress, label)
+            player,
+            engine,
+            replace(trial, task=task),
+            repetitions=episodes,
+            only=sequences,
+            progress=partial(progress, label),
         ).episodes
-        nominal = rows[0].episodes if rows else played
-        effect = Effect.of(played, nominal)
-        rows.append(Row(kind=kind, name=name, alteration=alteration, episodes=played, effect=effect))
+        effect = Effect.of(played, rows[0].episodes if rows else played)
+        rows.append(Row(kind=kind, name=name, episodes=played, effect=effect))
 
-    run("as it is", a.name, a, Alteration())
-    everything = Alteration()
-    changed = 0
+    nominal = nominal_task(trial.task)
+    run("as it is", a.name, a, nominal)
+    everything = nominal
     skipped: dict[str, str] = {}
-    for name, compared in COMPARED.items():
+    for name, prop in COMPARED.items():
         if only and name not in only:
             skipped[name] = "not asked for"
             continue
-        change = change_towards(name, measured_a, measured_b, a.name, scene)
-        if isinstance(change, Alteration):
-            run("at most" if compared.at_most else "towards", name, a, change)
-            if not compared.at_most:
-                everything = everything.and_(change)
-                changed += 1
+        x = getattr(measured_a, prop.measured)
+        y = getattr(measured_b, prop.measured)
+        change = change_towards(prop, x, y, nominal, a.name)
+        if isinstance(change, str):
+            skipped[name] = change
             continue
-        skipped[name] = change
-        for usual in compared.what_if if what_if else ():
-            if compared.altered == "contact_time" and not has_contact_dial(a.name):
-                skipped[f"{name}, what if"] = no_contact_dial(a.name)
-            else:
-                run("what if", name, a, Alteration(**{compared.altered: usual}))  # pyright: ignore[reportArgumentType]
+        run("towards", name, a, change)
+        both = change_towards(prop, x, y, everything, a.name)
+        assert not isinstance(both, str), "a property can be changed alone, but not with others"
+        everything = both
+    changed = len(rows) - 1
     if changed > 1:
-        if has_contact_dial(
-            a.name
-        ):  # changes that each fit may together ask for stiffer contacts than the engine allows
-            everything = replace(everything, contact_time=max(everything.contact_time, SOFTEST))
         run("all", f"all {changed} at once", a, everything)
-    run("other", b.name, b, Alteration())
+    run("other", b.name, b, nominal)
     return Attribution(
         a=a.name, b=b.name, measured_a=measured_a, measured_b=measured_b, rows=tuple(rows), skipped=skipped
     )
+
+
+def change_towards(prop: Property, a: float, b: float, task: TaskConfig, engine: str) -> TaskConfig | str:
+    """Return the task in which a property of engine A has the value of engine B, or why there is none.
+
+    A pair's friction is the mean of two materials, of which the one that is not the object's is changed. Other
+    properties are changed by the factor B / A. MuJoCo's contacts, which count time in timesteps, become stiffer with a
+    finer timestep.
+
+    Args:
+        prop: what is changed.
+        a: value that was measured in A.
+        b: value that was measured in B.
+        task: what is played, from :func:`~xreset.eval.sensitivity.nominal_task`.
+        engine: name of A.
+    """
+    unknown = [which for which, value in (("A", a), ("B", b)) if not math.isfinite(value)]
+    if unknown:
+        return f"could not be measured in {' and '.join(unknown)}"
+    if abs(a - b) < prop.resolution * (1.0 if prop.absolute else max(abs(a), abs(b))):
+        return "the same in both, as far as is measured"
+    if prop.needs is not None and prop.needs not in backend_class(engine).capabilities:
+        return f"cannot be set in {engine}"
+    match prop.name:
+        case "contact softness":
+            return "follows from each engine's solver, so it cannot be changed"
+        case "action latency":
+            return prop.set_in(task, b - a) if b > a else "targets that come late cannot be made to come earlier"
+        case "timestep":
+            substeps = max(1, round(task.substeps * a / b))
+            if substeps == task.substeps:
+                return f"with {substeps} physics steps per control step, no other timestep comes nearer"
+            return replace(task, timestep=task.timestep * task.substeps / substeps, substeps=substeps)
+    if a <= 0:
+        return f"there is none in {engine}, so no factor leads to the other value"
+    ratio = max(b, 0.0) / a
+    if prop.needs != "friction":
+        return prop.set_in(task, ratio)
+    material = task.randomization.friction[0]
+    other = ratio * (material + getattr(task.randomization, prop.field)) - material
+    if other < 0:
+        return "less than half of the object's own coefficient, which no other material gives"
+    return replace(task, randomization=replace(task.randomization, **{prop.field: other}))

@@ -1,4 +1,4 @@
-"""The physics that an engine really has, measured through the interface by eight short experiments at once.
+"""The physics that an engine really has, measured through the interface by short experiments.
 
 Nothing here knows any engine, so plugins and altered engines are measured alike. Gravity is off except where an object
 rests on the table.
@@ -39,10 +39,6 @@ class Measured:
     """Pair friction of object and table."""
     torsional_friction: float
     """Torsional friction of object and table touching in one point [m]; NaN where it stops the object at once."""
-    patch_torsional_friction: float
-    """Share of it that is left where a second point, 2 mm beside the one that presses, comes as near as 0.5 mm to the
-    table; NaN where there is none to begin with.
-    """
     mass: float
     """Share of the object's mass."""
     inertia: float
@@ -89,22 +85,16 @@ _TOP_HEIGHT = 0.04
 _TOP_RADIUS = 0.02
 _TOP_INERTIA = (1.0, 1.0, 1e-3)
 """[kg m^2] The cone can hardly fall, and turns easily."""
-_SECOND_POINT = (2e-3, 0.0, 5e-4)
-"""[m] PhysX takes two points that are 1 mm apart for one."""
-_LEAST_TORSION = 1e-4
-"""[m] Torsional friction below this counts as none."""
 
 _SLAB = 0
 _PADDLE = 1
 _THING = 2
 _TOP = 3
-_TOP_OF_TWO = 4
 _WORLDS = {
     "slide x": _SLAB,
     "slide xy": _SLAB,
     "load": _SLAB,
-    "one point": _TOP,
-    "two points": _TOP_OF_TWO,
+    "spin": _TOP,
     "tip": _PADDLE,
     "link": _PADDLE,
     "force": _THING,
@@ -125,9 +115,7 @@ def measure(engine: Engine, scene: SceneSpec) -> Measured:
       v1^2) / (2 g (d + v0 h / 2)) with h the step of the integration. (Its deceleration does not tell it: MuJoCo's
       contacts lift what slides, so it patters.)
     - A top that can hardly fall spins on its point: what it loses, I dw, tells the torsional friction, I dw / int(N) dt
-      with the load's impulse from the momentum (contacts may patter). A second one has another point beside the first
-      that does not reach the table: there some engines let sliding friction act at both points, instead of torsional
-      friction at one.
+      with the load's impulse from the momentum (contacts may patter).
     - A slab at rest is loaded with ten times its weight: how much it gives.
     - A paddle that can hardly turn is pressed onto a fingertip, and onto the farthest other link, with 3 N and then
       pulled sideways with three times what friction should carry: the friction is the ratio of the impulses that were
@@ -159,9 +147,7 @@ class _Bench:
         squares = np.square(_SLAB_HALF)
         slab = _block("slab", inertia=_SLAB_MASS / 3 * (sum(h * h for h in _SLAB_HALF) - squares))
         paddle = _block("paddle", inertia=np.ones(3))
-        top = _top("top", [(0.0, 0.0, 0.0)])
-        two = _top("top with two points", [(0.0, 0.0, 0.0), _SECOND_POINT])
-        self.scene = replace(scene, objects=(slab, paddle, self._thing, top, two))
+        self.scene = replace(scene, objects=(slab, paddle, self._thing, _top()))
         self._presses = {"tip": _reachable(scene, tip=True), "link": _reachable(scene, tip=False)}
         self._dt = scene.timestep
         self._place = free_place(scene)
@@ -181,7 +167,7 @@ class _Bench:
     def run(self, backend: Backend) -> dict[str, Tensor]:
         """Play all experiments; returns the worlds' states [T, N, ...] after each physics step, the start first."""
         start = self._start()
-        grounded = [index in (_SLAB, _TOP, _TOP_OF_TWO) for index in _WORLDS.values()]
+        grounded = [index in (_SLAB, _TOP) for index in _WORLDS.values()]
         backend.set_object_gravity(torch.tensor(grounded).float().to(backend.device))
         backend.set_state(start.to(backend.device))
         targets = start.joint_target.clone()
@@ -220,8 +206,6 @@ class _Bench:
             turned = quat_rotate_inverse(quat, log["object_angvel"][_PUSH_STEPS, _AT[name]]).numpy()
             shares.append(self._torques[i] * t / float(turned @ self._axes[i]) / self._principal[i])
         inertia = float(np.median(shares)) / mass
-        point = inertia * self._torsion(log, _AT["one point"])
-        patch = inertia * self._torsion(log, _AT["two points"])
         height = log["object_pos"][:, _AT["load"], 2]
         stiffness, damping, delay = self._drives(log)
         arm = self._robot.arm_indices
@@ -230,8 +214,7 @@ class _Bench:
             tip_friction=self._pulled(log, "tip", mass),
             link_friction=self._pulled(log, "link", mass),
             table_friction=(self._slid(log, _AT["slide x"], step) + self._slid(log, _AT["slide xy"], step)) / 2,
-            torsional_friction=point,
-            patch_torsional_friction=patch / point if point > _LEAST_TORSION else float("nan"),
+            torsional_friction=inertia * self._torsion(log),
             mass=mass,
             inertia=inertia,
             arm_stiffness=_median(stiffness[arm]),
@@ -261,11 +244,12 @@ class _Bench:
         way = (log["object_pos"][-1, world, :2] - log["object_pos"][0, world, :2]).norm()
         return float((_SPEED**2 - end**2) / (2 * GRAVITY * (way + _SPEED * step / 2)))
 
-    def _torsion(self, log: dict[str, Tensor], world: int) -> float:
+    def _torsion(self, log: dict[str, Tensor]) -> float:
         """Return the torsional friction [m] from the spin that a top has lost, if its inertia at its mass is as stated.
 
         It is measured while the top has half of its spin; NaN if friction takes that in one step.
         """
+        world = _AT["spin"]
         spin = log["object_angvel"][:, world, 2]
         steps = int((spin > spin[0] / 2).long().cumprod(0).sum()) - 1
         if steps < 1:
@@ -350,11 +334,11 @@ def _block(name: str, *, inertia: np.ndarray) -> ObjectSpec:
     return replace(block, com=np.zeros(3), inertia=np.diag(inertia))
 
 
-def _top(name: str, points: Sequence[Sequence[float]]) -> ObjectSpec:
-    """Return a cone upside down, with these points [m] at its lower end. Origin and centre of mass are on the floor."""
+def _top() -> ObjectSpec:
+    """Return a cone upside down. Its origin and its centre of mass are its point."""
     angle = np.arange(8) * np.pi / 4
     rim = np.stack((_TOP_RADIUS * np.cos(angle), _TOP_RADIUS * np.sin(angle), np.full(8, _TOP_HEIGHT)), axis=1)
-    cone = solid(name, _SLAB_MASS, (hull(np.concatenate((np.array(points), rim))),))
+    cone = solid("top", _SLAB_MASS, (hull(np.concatenate((np.zeros((1, 3)), rim))),))
     return replace(cone, com=np.zeros(3), inertia=np.diag(_TOP_INERTIA))
 
 

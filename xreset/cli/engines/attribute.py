@@ -39,7 +39,6 @@ def attribute(
     towards: str,
     backend: str = "mujoco",
     only: Several = (),
-    what_if: bool = False,
     setting: Flat[Setting] = Setting(),
     out: Path | None = None,
 ) -> None:
@@ -54,7 +53,6 @@ def attribute(
         towards: Engine towards which the properties are changed, usually the one in which the policy does worse.
         backend: Engine in which they are changed.
         only: Property to change; give it again for more. Default: all in which the engines differ.
-        what_if: Also change properties in which the engines agree, by a usual amount.
         setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
         out: Folder for attribution.json and attribution.png; default: attribute/ next to the policy's results.
     """
@@ -77,7 +75,7 @@ def attribute(
         task = bar.add_task("", total=None)
         found = attribution.attribute(
             spec, a, b, replace(played_trial, objects=objects),
-            episodes=played.episodes, sequences=chosen, only=only, what_if=what_if,
+            episodes=played.episodes, sequences=chosen, only=only,
             progress=lambda run, done, total: bar.update(task, description=run, completed=done, total=total or None),
         )  # fmt: skip
     count = f"{len(found.rows[0].episodes)} episodes of {len(chosen)} demonstrations, seed {setting.seed}"

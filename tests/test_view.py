@@ -29,7 +29,7 @@ from xreset.pictures.render import write_png
 from xreset.pictures.view.colors import reason_color
 from xreset.pictures.view.load import load_view
 from xreset.pictures.view.picture import Drawer
-from xreset.resets.bank import read_bank, write_bank
+from xreset.resets.bank import write_bank
 from xreset.retarget.file import Retargeted, write_retargeted
 
 FRAMES = 4
@@ -115,37 +115,6 @@ class WithFiles(unittest.TestCase):
         write_retargeted(path, data, config={}, inputs={})
         return path
 
-    def filtered(self) -> tuple[Path, Path]:
-        """A bank, made of toy trajectories: frame 2 of sequence 0 and frame 3 of sequence 1 were rejected."""
-        data = toy_retargeted(self.robot)
-        data.joint_pos[:, 0] += 0.01 * np.arange(TOTAL)
-        made_from = self.write(data, "source")
-        bank = self.folder / "filtered.npz"
-        kept = np.array([0, 3, 4, 6])
-        lost = np.array([2, 7])
-        changes = {
-            "joint_pos": data.joint_pos[kept],
-            "object_pos": data.object_pos[kept],
-            "object_quat_wxyz": data.object_quat_wxyz[kept],
-            "object_name": OBJECTS[kept // FRAMES],
-            "sequence_index": kept // FRAMES,
-            "frame_index": kept % FRAMES,
-            "post_contact": kept % FRAMES >= 2,
-            "sequence_name": NAMES,
-            "sequence_object": OBJECTS,
-            "start_pos": data.object_pos[[0, 4]],
-            "start_quat_wxyz": data.object_quat_wxyz[[0, 4]],
-            "goal_pos": data.goal_pos,
-            "goal_quat_wxyz": data.goal_quat_wxyz,
-            "rejected_sequence_index": lost // FRAMES,
-            "rejected_frame_index": lost % FRAMES,
-            "rejected_post_contact": lost % FRAMES >= 2,
-            "rejected_reason": np.array([0, 1]),
-            "reason_names": ("joint velocity", "overflow"),
-        }
-        write_bank(bank, toy_bank(self.robot, **changes), config={}, inputs={})
-        return bank, made_from
-
 
 class Data(WithFiles):
     def test_trajectories_beyond_the_joints_limits_are_refused(self):
@@ -210,28 +179,6 @@ class Data(WithFiles):
         with self.assertRaisesRegex(XResetError, "demo_c"):
             load_view(self.bank, demos=swapped)
 
-    def test_states_that_physics_rejected(self):
-        bank, made_from = self.filtered()
-        view = load_view(bank, retargeted=made_from)
-        np.testing.assert_array_equal(view.sequence, [0, 0, 0, 1, 1, 1])
-        np.testing.assert_array_equal(view.frame, [0, 2, 3, 0, 2, 3])
-        self.assertEqual(view.reason, ("", "joint velocity", "", "", "", "overflow"))
-        self.assertEqual(view.text(1)[:2], ("rejected: joint velocity", SOUP))
-        self.assertEqual(view.text(5)[:2], ("rejected: overflow", SPAM))
-        trajectories = load_view(made_from)
-        rows = [0, 2, 3, 4, 6, 7]
-        np.testing.assert_allclose(view.joint_pos, trajectories.joint_pos[rows], atol=1e-6)
-        np.testing.assert_allclose(view.object_pos, trajectories.object_pos[rows], atol=1e-6)
-        part = np.array([0, 0.5, 0, 0])
-        joint_pos = read_bank(bank).joint_pos + part[:, None]
-        rejected_part = np.array([0.0, 0.25])
-        between = replace(read_bank(bank), joint_pos=joint_pos, frame_part=part, rejected_frame_part=rejected_part)
-        write_bank(bank, between, config={}, inputs={})
-        view = load_view(bank, retargeted=made_from)  # whole frames only
-        np.testing.assert_array_equal(view.sequence, [0, 0, 1, 1])
-        np.testing.assert_array_equal(view.frame, [0, 2, 0, 2])
-        self.assertEqual(view.reason, ("", "joint velocity", "", ""))
-
     def test_bank(self):
         view = load_view(self.bank)
         np.testing.assert_array_equal(view.choose(), range(6))
@@ -243,14 +190,11 @@ class Data(WithFiles):
     def test_wrong_use_is_explained(self):
         text = self.folder / "text.npz"
         text.write_text("hello")
-        _, made_from = self.filtered()
         for words, kind, use in (
             ("there is no|There is no", FileFormatError, lambda: load_view(self.folder / "none.npz")),
             ("npz", FileFormatError, lambda: load_view(text)),
             ("demonstrations only", XResetError, lambda: load_view(self.demos, demos=self.demos)),
             ("robot", FileFormatError, lambda: load_view(self.bank, robot="ur7e-sharpa")),
-            ("was not made from", XResetError, lambda: load_view(self.bank, retargeted=made_from)),
-            ("not a reset bank", XResetError, lambda: load_view(made_from, retargeted=made_from)),
             ("no sequence 2", XResetError, lambda: load_view(self.retargeted).choose(sequence=2)),
             (SPAM, XResetError, lambda: load_view(self.bank).choose(object_name="cup")),
             (

@@ -20,7 +20,6 @@ def view(
     file: Source,
     *,
     demos: Path | None = None,
-    retargeted: Path | None = None,
     objects: Objects = None,
     robot: Robot = None,
     sequence: int | None = None,
@@ -39,13 +38,12 @@ def view(
     Args:
         file: Demonstrations, or what `xreset retarget`, `xreset resets` or `xreset goals` made.
         demos: Demonstrations of the file, to show the human hand over the robot.
-        retargeted: Robot motion of a bank, to show the states that physics rejected.
         sequence: Which sequence, counted from 0. Default: the first; of a bank, all.
         frame: Which frame of the sequence (state of the bank). Default: the first; for --png the middle one.
         png: Picture to write, instead of a page.
         mp4: Film of the sequence to write, instead of a page.
     """
-    shown = load.load_view(file, demos=demos, retargeted=retargeted, robot=robot, objects=objects)
+    shown = load.load_view(file, demos=demos, robot=robot, objects=objects)
     if png is None and mp4 is None:
         _serve(shown, host, port, sequence, frame or 0)
         return

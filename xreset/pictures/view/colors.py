@@ -15,7 +15,6 @@ GOOD_COLOR: Color = (0.30, 0.70, 0.35)
 """Valid frames on the time line."""
 
 REASON_COLORS: dict[str, Color] = {
-    # retargeting
     "not annotated": (0.55, 0.55, 0.55),
     "hand error": (0.58, 0.20, 0.75),
     "joint limit": (0.50, 0.30, 0.12),
@@ -24,13 +23,6 @@ REASON_COLORS: dict[str, Color] = {
     "arm jump": (0.90, 0.75, 0.05),
     "table collision": (0.86, 0.13, 0.13),
     "self collision": (0.95, 0.35, 0.60),
-    # physics filter
-    "out of bounds": (0.35, 0.35, 0.35),
-    "object linear velocity": (0.12, 0.30, 0.85),
-    "object angular velocity": (0.58, 0.20, 0.75),
-    "joint velocity": (0.90, 0.75, 0.05),
-    "not finite": (0.05, 0.05, 0.05),
-    "overflow": (0.50, 0.30, 0.12),
 }
 """Reason -> color of its frames on the time line, and of the robot in these frames."""
 

@@ -22,7 +22,6 @@ GOOD: dict[Kind, str] = {
     "reset states": "stable in physics",
 }
 """Name of a row without a reason against it."""
-_BAD: dict[Kind, str] = {"demonstrations": "", "robot trajectories": "not valid: ", "reset states": "rejected: "}
 Phase = Literal["before contact", "after contact"]
 PHASES: tuple[Phase, ...] = ("before contact", "after contact")
 BONES = np.column_stack((PARENTS, np.arange(1, 21)))
@@ -132,14 +131,16 @@ class View:
     def text(self, row: int) -> tuple[str, ...]:
         """Return lines that describe a row, the most important one first."""
         sequence = int(self.sequence[row])
-        reason = self.reason[row]
+        state = GOOD[self.kind]
+        if reason := self.reason[row]:
+            state = reason if self.robot is None else f"not valid: {reason}"
         phase: str = PHASES[int(self.post_contact[row])]
         if self.contact[row] and self.kind != "reset states":
             phase += ", human touches"
             if self.human is not None:
                 phase += f" ({self.human.touching[row].sum()} keypoints)"
         lines = [
-            _BAD[self.kind] + reason if reason else GOOD[self.kind],
+            state,
             self.objects[self.object_index[row]].name,
             f"sequence {sequence}: {self.sequence_name[sequence]}",
             f"frame {int(self.frame[row])}",

@@ -17,7 +17,7 @@ from xreset.objects.catalogue import canonical_name
 from xreset.pictures.view.data import Human, View
 from xreset.resets.bank import ResetBank
 from xreset.resets.goals import GoalSet
-from xreset.retarget.file import Retargeted, read_retargeted
+from xreset.retarget.file import Retargeted
 from xreset.retarget.pipeline import RetargetConfig, human_contacts, rest_on_table
 from xreset.spec import ObjectSpec, RobotSpec
 
@@ -29,7 +29,6 @@ def load_view(
     path: Path,
     *,
     demos: Path | None = None,
-    retargeted: Path | None = None,
     robot: str | None = None,
     objects: Path | None = None,
 ) -> View:
@@ -38,7 +37,6 @@ def load_view(
     Args:
         path: the file.
         demos: demonstrations that trajectories or a bank were made from: shows the human hand too.
-        retargeted: robot trajectories that a bank was made from: shows the states too that physics rejected.
         robot: name or folder of the robot; default: the one that the file names.
         objects: folder of real meshes; None for the stand-ins.
 
@@ -47,10 +45,6 @@ def load_view(
     """
     inputs = load_inputs(path, robot=robot, objects=objects)
     data = inputs.data
-    if retargeted is not None and not isinstance(data, ResetBank):
-        raise XResetError(
-            f"{path} is not a reset bank. Omit --retargeted, which shows what physics rejected of a bank."
-        )
     if isinstance(data, Demos):
         if demos is not None or robot is not None:
             raise XResetError(f"{path} holds demonstrations only. Omit --demos and --robot, or give a retargeted file.")
@@ -60,11 +54,9 @@ def load_view(
     elif isinstance(data, GoalSet):
         view = _bank_view(_at_home(data, inputs.robot), inputs)
     else:
+        if not data.num_states:
+            raise XResetError(f"{path} holds no state: physics rejected all of them.")
         view = _bank_view(data, inputs)
-        if retargeted is not None:
-            view = _with_rejected(path, view, data, retargeted)
-        elif not data.num_states:
-            raise XResetError(f"{path} holds no state: physics rejected all of them. Add --retargeted to see them.")
     if demos is not None:
         view = replace(view, human=_human_of(path, demos, view))
     return view
@@ -160,46 +152,6 @@ def _at_home(goals: GoalSet, robot: RobotSpec) -> GoalSet:
         frame_index=np.zeros(count, dtype=int),
         post_contact=np.zeros(count, dtype=bool),
     )
-
-
-def _with_rejected(path: Path, view: View, bank: ResetBank, retargeted: Path) -> View:
-    """Add the states that physics rejected to a bank's view, each in its place within its sequence."""
-    data = read_retargeted(retargeted)
-    kept = _whole_frames(bank.frame_part, bank.num_states)
-    lost = _whole_frames(bank.rejected_frame_part, len(bank.rejected_reason))
-    sequence = np.concatenate((bank.sequence_index[kept], bank.rejected_sequence_index[lost]))
-    frame = np.concatenate((bank.frame_index[kept], bank.rejected_frame_index[lost]))
-    post_contact = np.concatenate((bank.post_contact[kept], bank.rejected_post_contact[lost]))
-    reason = [""] * len(kept) + [bank.reason_names[number] for number in bank.rejected_reason[lost].tolist()]
-    same = data.sequence_name.tolist() == bank.sequence_name.tolist() and data.joint_names == bank.joint_names
-    if same:
-        rows = data.frame_offsets[sequence] + frame
-        same = bool(len(rows)) and rows.max() < len(data.valid)
-    if not same or not np.allclose(data.joint_pos[rows[: len(kept)]], bank.joint_pos[kept], atol=1e-6):
-        raise XResetError(f"{path} was not made from {retargeted}: sequences or states differ.")
-    order = np.lexsort((frame, sequence))
-    rows = rows[order]
-    return replace(
-        view,
-        sequence=sequence[order],
-        frame=frame[order],
-        object_index=_object_index(bank.sequence_object, view.objects)[sequence[order]],
-        object_pos=data.object_pos[rows],
-        object_quat=data.object_quat_wxyz[rows],
-        contact=post_contact[order],
-        post_contact=post_contact[order],
-        reason=tuple(reason[row] for row in order),
-        reasons=bank.reason_names,
-        joint_pos=data.joint_pos[rows],
-        fingertips=data.fingertip_pos[rows],
-        hand_error=data.hand_error[rows],
-        wrist_error=data.wrist_error[rows],
-    )
-
-
-def _whole_frames(part: np.ndarray | None, count: int) -> np.ndarray:
-    """Return the rows of states that are frames; states between frames are not in the file of trajectories."""
-    return np.arange(count) if part is None else np.flatnonzero(part == 0)
 
 
 def _human(demos: Demos, objects: Sequence[ObjectSpec]) -> tuple[Demos, Human]:

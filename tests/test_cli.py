@@ -130,7 +130,7 @@ class UsageTest(unittest.TestCase):
             (r"--num-envs is 0, expected a whole number from 1", ("train", "--out", "x", "--num-envs", "0")),
             (r"--num-envs is -3, expected", ("resets", "none.npz", "--out", "x.npz", "--num-envs", "-3")),
             (r"--iterations is 0, expected", ("train", "--out", "x", "--iterations", "0")),
-            (r"--joint-threshold is not a number", ("engines", "trace", "none.npz", "--joint-threshold", "nan")),
+            (r"--minutes is not a number", ("train", "--out", "x", "--minutes", "nan")),
             (r"Unknown device 'quantum'; expected cpu, cuda or", ("train", "--out", "x", "--device", "quantum")),
             (
                 r"Unknown device 'quantum'; expected cpu, cuda or",

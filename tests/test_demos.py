@@ -324,7 +324,7 @@ class DexYCB(InFolder):
 
     def test_incomplete(self):
         for changes, message in (
-            ({"num_frames": self.demos.num_frames + 1}, r"pose_y has shape .* but meta\.yml asks for"),
+            ({"num_frames": self.demos.num_frames + 1}, r"frames of meta\.yml: array .pose_y. has shape"),
             ({"serials": ["000000000000"]}, "no camera of meta.yml"),
             ({"ycb_grasp_ind": 2}, "ycb_grasp_ind is 2"),
         ):

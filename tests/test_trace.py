@@ -338,7 +338,6 @@ class CommandTest(unittest.TestCase):
         np.savez(wrong, schema="xreset-replays/1")
         for message, *arguments in (
             ("there is no", missing),
-            ("thresholds must be above 0", missing, "--force-threshold", "0"),
             ("expected a whole number from 0", missing, "--episode", "-1"),
             ("Unknown backend 'havok'", missing, "--backend", "havok"),
             ("expected 'xreset-demos/1'", wrong),

@@ -136,25 +136,6 @@ def read_npz(
     return arrays
 
 
-def read_arrays(path: str | Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read some arrays of numbers of a file that others made, which states no schema; sizes are checked before anything
-    is unpacked.
-
-    Raises:
-        FileFormatError: the file is damaged, too large, or lacks one of them.
-    """
-    path = Path(path)
-    must_exist(path, "npz file")
-    with _archive(path, "cannot be read") as archive:
-        members = _members(archive)
-        if missing := [name for name in names if name not in members]:
-            raise FileFormatError(f"{path} has no array {', '.join(missing)}.")
-        arrays = _read(path, archive, members, names)
-    if wrong := [name for name in names if arrays[name].dtype.kind not in "fi"]:
-        raise FileFormatError(f"{path} has no numbers in {', '.join(wrong)}.")
-    return arrays
-
-
 def npz_schema(path: str | Path) -> str:
     """Return the schema that an npz file states; its reader checks all the rest.
 

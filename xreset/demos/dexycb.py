@@ -27,7 +27,7 @@ from xreset.demos.archive import SIDES, Demos, Progress, merge_demos, no_progres
 from xreset.errors import DemoError, FileFormatError
 from xreset.objects.catalogue import canonical_names
 from xreset.objects.ycb import NAME_OF_ID
-from xreset.records import read_arrays
+from xreset.records import Field, read_npz
 from xreset.text import is_plain, shown
 
 FPS = 30.0
@@ -244,14 +244,9 @@ def _read_npz(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> list[np.ndar
     """Return arrays of these names and shapes, as floats."""
     if not path.is_file():
         raise DemoError(f"There is no {path}; the sequence is incomplete. Unpack it again.")
+    schema = {name: Field(shape, "fi", within=None) for name, shape in shapes.items()}
     try:
-        arrays = read_arrays(path, tuple(shapes))
+        arrays = read_npz(path, None, schema, what="a file of DexYCB with the frames of meta.yml")
     except FileFormatError as error:
-        raise DemoError(f"{error} It is damaged or not DexYCB's; unpack it again.") from error
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape:
-            raise DemoError(
-                f"{path}: {name} has shape {arrays[name].shape}, but meta.yml asks for {shape}. Is it a file of"
-                " another sequence?"
-            )
+        raise DemoError(f"{error} Unpack the sequence again.") from error
     return [arrays[name].astype(float) for name in shapes]

@@ -5,7 +5,6 @@ import json
 import os
 import unittest
 import zipfile
-from dataclasses import replace
 from types import SimpleNamespace
 from unittest import mock
 
@@ -29,6 +28,8 @@ from xreset.task.config import RandomizationConfig
 from xreset.task.randomization import own_friction
 
 Z = np.array([0.0, 0.0, 1.0])
+BOX = trimesh.creation.box((0.1, 0.06, 0.04))
+RING = trimesh.creation.annulus(0.036, 0.04, 0.02, sections=32)
 CUTS = unittest.skipUnless(importlib.util.find_spec("manifold3d"), "manifold3d is not installed")
 
 
@@ -39,15 +40,11 @@ def distance_to_pieces(points, obj):
 
 
 class Names(unittest.TestCase):
-    def test_the_papers_nine_objects(self):
+    def test_other_spellings(self):
         papers = ("cheez-its", "soup", "mustard", "tuna", "spam", "banana", "pitcher", "powerdrill", "scissors")
         self.assertEqual(tuple(canonical_name(name) for name in papers), object_names())
-
-    def test_other_spellings(self):
         for name in ("035_power_drill", "power_drill", "Power Drill"):
             self.assertEqual(canonical_name(name), "035_power_drill")
-
-    def test_unknown_object_lists_what_exists(self):
         with self.assertRaisesRegex(ObjectError, r"'teapot'.*003_cracker_box \(cheez-its\).*037_scissors"):
             load_object("teapot")
 
@@ -84,7 +81,7 @@ class StandIns(unittest.TestCase):
                 real = trimesh.load(folder / f"{name}.obj", process=False)
                 obj = load_object(name)
                 np.testing.assert_allclose(np.array(bounding_box(obj)), real.bounds, atol=0.005)
-                points, normals = sample_surface(obj, 6000)
+                points, _, normals = sample_surface(obj.vertices, obj.faces, 6000)
                 points = points[winding_number(points + 2e-4 * normals, obj.vertices, obj.faces) < 0.5]
                 real_points, _ = trimesh.sample.sample_surface(real, 12000, seed=0)
                 self.assertLess(cKDTree(real_points).query(points)[0].mean(), 0.0035)
@@ -93,12 +90,6 @@ class StandIns(unittest.TestCase):
 
 
 class Geometry(unittest.TestCase):
-    def test_hull_faces_point_outward(self):
-        points = np.random.default_rng(0).normal(size=(40, 3))
-        mesh = shape_mesh(hull(points))
-        self.assertTrue(mesh.is_volume)
-        self.assertAlmostEqual(mesh.volume, trimesh.Trimesh(points).convex_hull.volume, places=9)
-
     def test_hull_within_a_tolerance_has_few_points(self):
         directions = np.random.default_rng(0).normal(size=(5000, 3))
         points = directions / np.linalg.norm(directions, axis=1, keepdims=True) * (0.03, 0.02, 0.01)
@@ -122,7 +113,7 @@ class Geometry(unittest.TestCase):
 
     def test_limited_hull_keeps_the_shape(self):
         sphere = trimesh.creation.icosphere(4, 0.05)
-        mesh = shape_mesh(limited_hull(sphere.vertices, 64))
+        mesh = shape_mesh(limited_hull(sphere.vertices))
         self.assertEqual(len(mesh.vertices), 64)
         self.assertGreater(mesh.volume / sphere.volume, 0.9)
         self.assertTrue(mesh.is_volume)
@@ -144,7 +135,7 @@ class Sampling(unittest.TestCase):
         obj = load_object("soup")
         points = surface_points(obj, 64)
         nearest = cKDTree(points).query(points, k=2)[0][:, 1]
-        everywhere, _ = sample_surface(obj, 4000, seed=5)
+        everywhere, _, _ = sample_surface(obj.vertices, obj.faces, 4000, seed=5)
         self.assertGreater(nearest.min(), 0.008)
         self.assertLess(cKDTree(points).query(everywhere)[0].max(), 0.02)
 
@@ -197,96 +188,75 @@ class MeshImport(InFolder):
         mesh.export(path)
         return path
 
-    def bracket(self):
-        """An L of two bars, closed and concave."""
-        outline = [(0, 0), (0.1, 0), (0.1, 0.03), (0.03, 0.03), (0.03, 0.1), (0, 0.1)]
-        vertices = np.concatenate([np.insert(outline, 2, z, axis=1) for z in (0.0, 0.02)])
-        cap = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)])
-        i = np.arange(6)
-        j = (i + 1) % 6
-        sides = np.concatenate((np.stack((i, j, j + 6), axis=1), np.stack((i, j + 6, i + 6), axis=1)))
-        return trimesh.Trimesh(vertices, np.concatenate((cap[:, ::-1], cap + 6, sides)))
+    def load(self, mesh, name="thing", facts=""):
+        path = self.write(mesh, name)
+        path.with_suffix(".toml").write_text(facts)
+        return import_with_notes(path, name)
 
     def test_convex_mesh_is_one_hull_with_mass_by_density(self):
-        path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)))
-        result = import_with_notes(path, "thing")
+        result = self.load(BOX)
         self.assertEqual(len(result.obj.pieces), 1)
         self.assertAlmostEqual(result.obj.mass, DEFAULT_DENSITY * 0.1 * 0.06 * 0.04)
-        np.testing.assert_allclose(
-            np.diag(result.obj.inertia), result.obj.mass / 12 * np.array([0.0052, 0.0116, 0.0136]), rtol=1e-6
-        )
+        expected = result.obj.mass / 12 * np.array([0.0052, 0.0116, 0.0136])
+        np.testing.assert_allclose(np.diag(result.obj.inertia), expected, rtol=1e-6)
         self.assertIn("mass is unknown", result.notes[0])
         self.assertEqual(result.mass_source, "500 kg/m^3")
-        self.assertEqual(import_with_notes(path, "thing", mass=0.2).obj.mass, 0.2)
-
-    def test_published_mass_by_name(self):
-        path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)), "025_mug")
-        result = import_with_notes(path, "025_mug")
-        self.assertEqual((result.obj.mass, result.mass_source), (0.118, "published (YCB)"))
-        self.assertEqual(result.notes, ())
+        self.assertEqual(self.load(BOX, facts="mass = 0.2").obj.mass, 0.2)
+        mug = self.load(BOX, "025_mug")
+        self.assertEqual((mug.obj.mass, mug.mass_source, mug.notes), (0.118, "published (YCB)", ()))
 
     @CUTS
     def test_concave_mesh_is_cut_and_cached(self):
-        path = self.write(self.bracket())
-        first = import_with_notes(path, "bracket", mass=0.1)
-        self.assertFalse(first.cached)
-        self.assertGreaterEqual(len(first.obj.pieces), 2)
-        volume = sum(shape_mesh(piece).volume for piece in first.obj.pieces)
-        self.assertAlmostEqual(volume / (0.0051 * 0.02), 1.0, delta=0.05)
-        np.testing.assert_allclose(
-            first.obj.com[:2], (0.003 * 0.05 + 0.0021 * 0.015) / 0.0051, atol=1e-6
-        )  # two rectangles
-        self.assertGreater(
-            distance_to_pieces(np.array([[0.07, 0.07, 0.01]]), first.obj)[0], 0.02
-        )  # the notch stays open
-        second = import_with_notes(path, "bracket", mass=0.1)
-        self.assertTrue(second.cached)
-        for a, b in zip(first.obj.pieces, second.obj.pieces, strict=True):
-            np.testing.assert_allclose(shape_mesh(a).bounds, shape_mesh(b).bounds, atol=1e-12)
-
+        first = self.load(RING).obj
+        self.assertGreaterEqual(len(first.pieces), 4)
+        volume = sum(shape_mesh(piece).volume for piece in first.pieces)
+        self.assertAlmostEqual(volume / RING.volume, 1.0, delta=0.1)
+        np.testing.assert_allclose(first.com, 0, atol=1e-9)
+        self.assertGreater(distance_to_pieces(np.zeros((1, 3)), first)[0], 0.03)  # the hole stays open
         (file,) = (self.folder / "cache" / "objects").glob("*.npz")
-        file.write_bytes(file.read_bytes()[:100])
-        self.assertFalse(import_with_notes(path, "bracket", mass=0.1).cached)  # a damaged cache is made again
-        self.assertTrue(import_with_notes(path, "bracket", mass=0.1).cached)
+        for content, cuts in ((file.read_bytes(), 0), (file.read_bytes()[:100], 1)):  # a damaged cache is made again
+            file.write_bytes(content)
+            with mock.patch("xreset.objects.cache.decompose", wraps=decompose) as cut:
+                again = self.load(RING).obj
+            self.assertEqual(cut.call_count, cuts)
+            for a, b in zip(first.pieces, again.pieces, strict=True):
+                np.testing.assert_allclose(shape_mesh(a).bounds, shape_mesh(b).bounds, atol=1e-12)
+        with mock.patch("xreset.objects.cache.distributions", return_value=[mock.Mock(version="99")]):
+            self.load(BOX)
+        self.load(BOX)  # the cache knows the version of the cutter
+        self.assertEqual(len(list(file.parent.glob("*.npz"))), 3)
 
     def test_without_manifold3d_the_error_names_the_remedy(self):
-        path = self.write(self.bracket())
         with (
             mock.patch.dict("sys.modules", {"manifold3d": None}),
             self.assertRaisesRegex(ObjectError, r"pip install 'xreset\[objects\]'"),
         ):
-            import_with_notes(path, "bracket")
+            self.load(RING)
 
     def test_an_unwritable_cache_does_no_harm(self):
         (self.folder / "file").write_text("")
         with mock.patch.dict(os.environ, {"XRESET_CACHE": str(self.folder / "file")}):
-            result = import_with_notes(self.write(trimesh.creation.box((0.1, 0.1, 0.1))), "thing")
-        self.assertEqual(len(result.obj.pieces), 1)
-
-    def test_open_mesh_uses_its_hull_and_says_so(self):
-        box = trimesh.creation.box((0.1, 0.1, 0.1)).subdivide().subdivide()
-        path = self.write(trimesh.Trimesh(box.vertices, box.faces[:-1]))
-        result = import_with_notes(path, "thing", mass=1.0)
-        self.assertIn("not closed", result.notes[0])
-        np.testing.assert_allclose(np.diag(result.obj.inertia), 0.01 / 6, rtol=1e-6)
+            self.assertEqual(len(self.load(BOX).obj.pieces), 1)
 
     @CUTS
-    def test_a_concave_mesh_with_a_hole_is_filled(self):
-        whole = self.bracket().subdivide().subdivide()
-        path = self.write(trimesh.Trimesh(whole.vertices, whole.faces[1:]))
-        result = import_with_notes(path, "thing", mass=1.0)
-        self.assertIn("(1 hole, the widest 25 mm): its holes were filled", result.notes[0])
-        np.testing.assert_allclose(result.obj.com[:2], (0.003 * 0.05 + 0.0021 * 0.015) / 0.0051, atol=5e-4)
+    def test_open_meshes_are_closed_and_it_is_said(self):
+        box = trimesh.creation.box((0.1, 0.1, 0.1)).subdivide().subdivide()
+        result = self.load(trimesh.Trimesh(box.vertices, box.faces[:-1]), facts="mass = 1.0")
+        self.assertIn("not closed", result.notes[0])
+        np.testing.assert_allclose(np.diag(result.obj.inertia), 0.01 / 6, rtol=1e-6)
+        whole = RING.subdivide()
+        result = self.load(trimesh.Trimesh(whole.vertices, whole.faces[1:]), facts="mass = 1.0")
+        self.assertRegex(result.notes[0], r"\(1 hole, the widest \d+ mm\): its holes were filled")
+        np.testing.assert_allclose(result.obj.com, 0, atol=5e-4)
 
     def test_a_hollow_objects_mass_is_on_its_surface(self):
         mesh = trimesh.creation.icosphere(4, 0.1)
         com, inertia = shell_properties(mesh.vertices + np.array([1, 2, 3]), mesh.faces, 0.3)
         np.testing.assert_allclose(com, (1, 2, 3), atol=1e-9)
         np.testing.assert_allclose(inertia, 2 / 3 * 0.3 * 0.01 * np.eye(3), rtol=0.005, atol=1e-8)
-        found = import_with_notes(self.write(mesh), "ball", mass=0.3).obj  # 0.3 kg in 4.2 l
-        np.testing.assert_allclose(np.diag(found.inertia), 0.002, rtol=0.005)
-        found = import_with_notes(self.folder / "thing.obj", "ball", mass=3.0).obj
-        np.testing.assert_allclose(np.diag(found.inertia), 0.012, rtol=0.01)  # solid: 2/5 m r^2
+        for mass, moment in ((0.3, 0.002), (3.0, 0.012)):  # 0.3 kg in 4.2 l is a shell; 3 kg is solid: 2/5 m r^2
+            found = self.load(mesh, facts=f"mass = {mass}").obj
+            np.testing.assert_allclose(np.diag(found.inertia), moment, rtol=0.01)
 
     def test_a_mesh_in_millimetres_with_what_it_is_made_of(self):
         path = self.write(trimesh.creation.box((100, 60, 40)))
@@ -312,7 +282,7 @@ class MeshImport(InFolder):
 
     def test_nothing_is_written_before_the_mesh_is_cut(self):
         """So a command that is killed while it cuts can be repeated."""
-        path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)))
+        path = self.write(BOX)
         out = self.folder / "objects"
         with mock.patch("xreset.objects.meshes.cached_pieces") as cut:
             cut.side_effect = lambda *_: self.assertFalse(out.exists()) or exec("raise KeyboardInterrupt")
@@ -329,9 +299,7 @@ class MeshImport(InFolder):
         path = self.write(trimesh.creation.revolve(np.array(half), sections=24))
         plain = import_with_notes(path, "bottle")
         self.assertEqual(len(plain.obj.pieces), 1)
-        self.assertRegex(
-            plain.hollows(), r"its convex hull fills hollows up to \d\.\d mm deep, the deepest at \(.*, 1\d\d\) mm"
-        )
+        self.assertRegex(plain.hollows(), r"its convex hull fills hollows up to \d\.\d mm deep")
         found = add_mesh(path, self.folder / "objects", "bottle")
         self.assertGreater(len(found.obj.pieces), 1)
         self.assertLessEqual(found.deviation, 0.002)
@@ -341,8 +309,7 @@ class MeshImport(InFolder):
         self.assertLess(distance_to_pieces(neck, plain.obj)[0], -0.003)
 
     def test_archives_are_refused_or_bounded(self):
-        box = trimesh.creation.box((0.1, 0.06, 0.04))
-        content = self.write(box).read_bytes() + b"#" * (2 << 20)
+        content = self.write(BOX).read_bytes() + b"#" * (2 << 20)
         for name in ("mesh.zip", "mesh.3mf"):
             with zipfile.ZipFile(self.folder / name, "w", zipfile.ZIP_DEFLATED) as archive:
                 archive.writestr("mesh.obj", content)
@@ -371,13 +338,6 @@ class MeshImport(InFolder):
         ):
             read_mesh(self.folder / "copies.glb")
 
-    def test_the_cache_knows_the_version_of_the_cutter(self):
-        path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)))
-        import_with_notes(path, "thing")
-        self.assertTrue(import_with_notes(path, "thing").cached)
-        with mock.patch("xreset.objects.cache.version", return_value="99"):
-            self.assertFalse(import_with_notes(path, "thing").cached)
-
     def test_the_command_puts_a_mesh_into_a_folder_and_draws_it(self):
         path = self.write(trimesh.creation.box((100, 60, 40)), "a brick")
         out = self.folder / "objects"
@@ -394,7 +354,7 @@ class MeshImport(InFolder):
             self.assertIn(words, said)
 
     def test_what_an_object_is_made_of_is_checked(self):
-        path = self.write(trimesh.creation.box((0.1, 0.06, 0.04)))
+        path = self.write(BOX)
         for text, words in (
             ("mass = -1", "mass is -1.0"),
             ("mass = 1\ndensity = 2", "one follows"),
@@ -412,11 +372,9 @@ class MeshImport(InFolder):
         torch.testing.assert_close(own_friction([None, 0.95, 0.35], c), torch.tensor([[0.0], [0.1], [-0.2]]))
 
     def test_mesh_inside_out(self):
-        box = trimesh.creation.box((0.1, 0.1, 0.1))
-        result = import_with_notes(self.write(trimesh.Trimesh(box.vertices, box.faces[:, ::-1])), "thing", mass=1.0)
+        result = self.load(trimesh.Trimesh(BOX.vertices, BOX.faces[:, ::-1]), facts="mass = 1.0")
         self.assertEqual(result.notes, ())
-        corners = result.obj.vertices[result.obj.faces]
-        self.assertGreater(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])), 0)
+        self.assertGreater(trimesh.Trimesh(result.obj.vertices, result.obj.faces, process=False).volume, 0)
 
     def test_bad_meshes(self):
         box = trimesh.creation.box((0.1, 0.1, 0.1))
@@ -491,12 +449,10 @@ class ThinWalls(unittest.TestCase):
         ring = trimesh.creation.torus(0.024, 0.004, major_sections=24, minor_sections=8, transform=turn)
         bore = trimesh.creation.cylinder(0.038, 0.3, sections=40)
         mug = trimesh.boolean.union([cup, trimesh.boolean.difference([ring, bore])])
-        seen = []
-        pieces = decompose(mug, progress=lambda parts, worst: seen.append((parts, worst)))
+        pieces = decompose(mug)
         self.assertLess(max(self.off(mug, pieces)), 0.0021)
         self.assertLess(pieces.deviation, 0.002)
         self.assertLess(len(pieces.shapes), 40)
-        self.assertGreater(len(seen), 5)
         self.assertGreater(self.room(np.array([0, 0, 0.05]), pieces), 0.030)  # the cup's inner radius is 36.5 mm
         self.assertGreater(
             self.room(np.array([0.051, 0, 0.045]), pieces), 0.008
@@ -534,36 +490,19 @@ class ThinWalls(unittest.TestCase):
         self.assertGreater(self.room(np.array([0, 0, 0.02]), pieces), 0.012)  # 20 mm above the bottom
         self.assertLess(pieces.deviation, 0.002)
 
-    def test_as_many_pieces_as_allowed_and_no_more(self):
-        ring = trimesh.creation.annulus(0.036, 0.04, 0.02, sections=32)
-        few = decompose(ring, Settings(max_pieces=6))
-        self.assertLessEqual(len(few.shapes), 6)
-        self.assertGreater(few.deviation, 0.002)
-        self.assertLess(decompose(ring).deviation, 0.002)
-
-    def test_cutting_stops_after_so_many_triangles_at_the_same_pieces(self):
-        ring = trimesh.creation.annulus(0.03, 0.04, 0.05, sections=24)
-        whole = decompose(ring)
-        short = decompose(ring, Settings(effort=5_000))
-        again = decompose(ring, Settings(effort=5_000))
-        self.assertEqual((whole.finished, short.finished), (True, False))
+    def test_limits_of_pieces_and_effort(self):
+        whole = decompose(RING)
         self.assertLess(whole.deviation, 0.002)
-        self.assertGreater(short.deviation, 0.002)
+        self.assertTrue(whole.finished)
+        few = decompose(RING, Settings(max_pieces=6))
+        self.assertLessEqual(len(few.shapes), 6)
+        short = decompose(RING, Settings(effort=5_000))
+        again = decompose(RING, Settings(effort=5_000))
+        self.assertFalse(short.finished)
+        for stopped in (few, short):
+            self.assertGreater(stopped.deviation, 0.002)
         for one, other in zip(short.shapes, again.shapes, strict=True):
             np.testing.assert_array_equal(one.geometry.vertices, other.geometry.vertices)
-
-
-class SpecIsFrozen(unittest.TestCase):
-    def test_the_cached_stand_in_is_shared_but_cannot_be_reassigned(self):
-        obj = load_object("soup")
-        with self.assertRaises(AttributeError):
-            obj.mass = 1.0  # type: ignore[misc]
-        self.assertEqual(replace(obj, mass=1.0).mass, 1.0)
-        self.assertEqual(load_object("soup").mass, 0.349)
-
-
-if __name__ == "__main__":
-    unittest.main()
 
 
 @CUTS
@@ -588,3 +527,7 @@ class RandomShapes(InFolder):
             make_shapes(self.folder, 1)
         with self.assertRaisesRegex(ObjectError, "count is 0, expected a number from 1"):
             make_shapes(self.folder / "none", 0)
+
+
+if __name__ == "__main__":
+    unittest.main()

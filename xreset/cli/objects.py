@@ -72,33 +72,28 @@ def import_(
     else:
         files = {name or path.stem: path}
     console = Console()
-    table = _table("mass from", "deviation, mm", "time")
+    table = _table("mass from", "deviation, mm")
     found = []
-    notes = []
     with console.status("") as status:
         for object_name, file in files.items():
-
-            def progress(parts: int, worst: float, object_name: str = object_name) -> None:
-                status.update(f"{object_name}: {parts} parts, the worst {1e3 * worst:.1f} mm off the surface")
-
             status.update(f"{object_name} ({file})")
             if out is None:
-                result = meshes.import_with_notes(file, object_name, progress=progress)
+                result = meshes.import_with_notes(file, object_name)
             else:
-                result = meshes.add_mesh(file, out, object_name, scale=scale, properties=properties, progress=progress)
-            seconds = "cached" if result.cached else f"{result.seconds:.1f} s"
-            table.add_row(*_cells(result.obj), result.mass_source, f"{1e3 * result.deviation:.1f}", seconds)
-            notes += [f"{object_name}: {note}" for note in (*result.notes, result.hollows()) if note]
+                result = meshes.add_mesh(file, out, object_name, scale=scale, properties=properties)
+            table.add_row(*_cells(result.obj), result.mass_source, f"{1e3 * result.deviation:.1f}")
             found.append(result)
     console.print(table)
-    for note in notes:
-        console.print(note)
+    for result in found:
+        for note in (*result.notes, result.hollows()):
+            if note:
+                console.print(f"{result.obj.name}: {note}")
     if png is not None:
-        captions = [
-            f"{r.obj.name}: {len(r.obj.pieces)} pieces, at most {1e3 * r.deviation:.1f} mm off the surface"
-            for r in found
-        ]
-        render.write_png(png, pieces.draw_pieces([r.obj for r in found], captions))
+        captions = []
+        for result in found:
+            deviation = f"at most {1e3 * result.deviation:.1f} mm off the surface"
+            captions.append(f"{result.obj.name}: {len(result.obj.pieces)} pieces, {deviation}")
+        render.write_png(png, pieces.draw_pieces([result.obj for result in found], captions))
         console.print(f"{png}: meshes and their pieces")
 
 

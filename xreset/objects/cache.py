@@ -7,15 +7,15 @@ import json
 import os
 from contextlib import suppress
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from xreset.errors import FileFormatError, ObjectError, XResetError
 from xreset.geometry.shapes import hull
-from xreset.objects.decompose import Pieces, Progress, Settings, decompose
+from xreset.objects.decompose import Pieces, Settings, decompose
 from xreset.records import POSITION, Field, read_npz, write_npz
 
 if TYPE_CHECKING:
@@ -29,42 +29,34 @@ _NUMBERS = {
     "inertia": Field((3, 3), "f"),
 }
 SCHEMA = {"vertices": Field(("V", 3), "f", within=POSITION), "offsets": Field(("K+1",), "i"), **_NUMBERS}
-_ALGORITHM = 1
+_ALGORITHM = 2
 """Raise it when :mod:`xreset.objects.decompose` gives other pieces than before."""
 
 
-def cached_pieces(mesh: trimesh.Trimesh, source: str, settings: Settings, progress: Progress) -> Pieces:
+def cached_pieces(mesh: trimesh.Trimesh, source: str, settings: Settings) -> Pieces:
     """Return the pieces of a mesh, from the cache if they are there. An unfinished decomposition is not kept.
 
     Args:
         source: SHA-256 of the mesh's file.
     """
-    config = asdict(settings)
-    try:
-        cutter = version("manifold3d")
-    except PackageNotFoundError:
-        cutter = "none"
-    identity = json.dumps([SCHEMA_NAME, source, config, _ALGORITHM, cutter], sort_keys=True)
+    cutter = [found.version for found in distributions(name="manifold3d")]
+    identity = json.dumps([SCHEMA_NAME, source, asdict(settings), _ALGORITHM, cutter])
     path = cache_folder() / "objects" / f"{hashlib.sha256(identity.encode()).hexdigest()}.npz"
     if path.is_file():
         try:
             arrays = read_npz(path, SCHEMA_NAME, SCHEMA, what="cached convex pieces")
             shapes = tuple(hull(part) for part in np.split(arrays["vertices"], arrays["offsets"][1:-1]))
-            deviation = float(arrays["deviation"])
-            volume = float(arrays["volume"])
-            com = arrays["com"]
-            inertia = arrays["inertia"]
-            return Pieces(shapes=shapes, deviation=deviation, volume=volume, com=com, inertia=inertia, cached=True)
+            numbers: dict[str, Any] = {name: arrays[name][()] for name in _NUMBERS}
+            return Pieces(shapes=shapes, **numbers)
         except (FileFormatError, ObjectError):
             path.unlink(missing_ok=True)  # damaged: make it again
-    pieces = decompose(mesh, settings, progress)
+    pieces = decompose(mesh, settings)
     parts = [np.asarray(piece.geometry.vertices) for piece in pieces.shapes]
-    offsets = np.cumsum([0, *map(len, parts)])
-    arrays = {"vertices": np.concatenate(parts), "offsets": offsets}
+    arrays = {"vertices": np.concatenate(parts), "offsets": np.cumsum([0, *map(len, parts)])}
     arrays |= {name: np.asarray(getattr(pieces, name)) for name in _NUMBERS}
     if pieces.finished:
         with suppress(XResetError):  # a cache that cannot be written costs time, nothing else
-            write_npz(path, SCHEMA_NAME, arrays, config=config, inputs={"mesh": source})
+            write_npz(path, SCHEMA_NAME, arrays, inputs={"mesh": source})
     return pieces
 
 

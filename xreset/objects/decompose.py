@@ -19,6 +19,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from xreset.errors import ObjectError, needs
 from xreset.geometry.shapes import half_spaces, hull, mass_properties, shape_mesh
+from xreset.objects.sampling import sample_surface
 from xreset.spec import Shape
 
 if TYPE_CHECKING:
@@ -31,6 +32,10 @@ _CROSSES = ((0, 1), (0, 2), (1, 2), (3, 4), (3, 5), (4, 5))
 """Pairs of directions whose middle planes are tried together: halves of a ring are as convex as the ring, quarters are
 not."""
 _DIAGONALS = np.array([(1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)]) / np.sqrt(3)
+WALL = 0.001
+"""Thickness of the wall that stands for a sheet [m]."""
+_MAX_VERTICES = 64
+"""Most vertices of a piece."""
 _SPECK = 1e-11
 """Smaller parts are dropped: a cube of 0.2 mm [m^3]."""
 _SMALL_HOLE = 0.03
@@ -57,8 +62,6 @@ class Settings:
 
     max_pieces: int = 128
     """If the tolerance asks for more, pieces deviate more."""
-    max_vertices: int = 64
-    """Most vertices of each piece."""
     hull_depth: float = 0.05
     """A mesh is one convex piece if no point of its hull is farther from its surface than this fraction of its bounding
     box's diagonal; 0: than the tolerance.
@@ -68,14 +71,6 @@ class Settings:
     """
     tolerance: float = 0.002
     """Largest deviation of the pieces from the surface of a mesh that is more than one piece [m]."""
-
-    @staticmethod
-    def within(tolerance: float | None) -> Settings:
-        """Return the settings for pieces that deviate by at most the tolerance [m]; None: the default."""
-        return Settings() if tolerance is None else Settings(hull_depth=0.0, tolerance=tolerance)
-
-    thickness: float = 0.001
-    """Thickness of the sheet that stands for a mesh that is not closed [m]."""
     effort: int = 12_000_000
     """Triangles that cutting may handle in all, about 50 s of one core; the pieces so far are taken then. It is a count
     and not a time, so that the pieces of a mesh, and with them its physics, are the same on every machine."""
@@ -94,18 +89,11 @@ class Pieces:
     """[3] center of mass of the solid."""
     inertia: np.ndarray
     """[3, 3] about it, of 1 kg of uniform density [m^2]."""
-    cached: bool = False
     finished: bool = True
     """Whether the effort sufficed."""
 
 
-Progress = Callable[[int, float], None]
-"""Called with the number of parts so far and the largest deviation from the surface [m]."""
-
-
-def decompose(
-    mesh: trimesh.Trimesh, settings: Settings = Settings(), progress: Progress = lambda parts, worst: None
-) -> Pieces:
+def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
     """Return convex pieces that together have the mesh's shape.
 
     Args:
@@ -120,41 +108,27 @@ def decompose(
     finished = True
     depth = settings.hull_depth * np.linalg.norm(mesh.extents) or settings.tolerance
     if surface.deviation(around.vertices, around.faces) <= depth:
-        shapes: Sequence[Shape] = [limited_hull(mesh.vertices, settings.max_vertices)]
+        shapes = [limited_hull(mesh.vertices)]
         piece = shape_mesh(shapes[0])
         deviation = surface.deviation(piece.vertices, piece.faces)
         solid = mesh if mesh.is_volume else around
-        vertices = np.asarray(solid.vertices)
-        faces = np.asarray(solid.faces)
+        volume = solid.volume
+        com, inertia = mass_properties(np.asarray(solid.vertices), np.asarray(solid.faces), 1.0)
     else:
-        cutter = _Cutter(as_solid(mesh, settings.thickness), settings, progress)
+        cutter = _Cutter(as_solid(mesh), settings)
         shapes, deviation = cutter.shapes()
         finished = cutter.effort > 0
         surface = cutter.surface
-        vertices = surface.vertices
-        faces = surface.faces
-    com, inertia = mass_properties(vertices, faces, 1.0)
-    corners = vertices[faces]
-    volume = float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
+        volume = surface.solid.volume()
+        com, inertia = mass_properties(surface.vertices, surface.faces, 1.0)
     return Pieces(
         shapes=tuple(shapes),
         deviation=max(deviation, surface.uncovered(shapes)),
-        volume=volume,
+        volume=float(volume),
         com=com,
         inertia=inertia,
         finished=finished,
     )
-
-
-def deepest_hollow(mesh: trimesh.Trimesh, shapes: Sequence[Shape]) -> np.ndarray:
-    """Return the point [3] of the pieces that is farthest from the surface of the mesh, of many that are tried [m]."""
-    surface = _Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    points = []
-    for shape in shapes:
-        piece = shape_mesh(shape)
-        points.append(_samples(np.asarray(piece.vertices), np.asarray(piece.faces), 4000)[0])
-    tried = np.concatenate(points)
-    return tried[surface.distance(tried).argmax()]
 
 
 def openings(mesh: trimesh.Trimesh) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -169,11 +143,11 @@ def openings(mesh: trimesh.Trimesh) -> list[tuple[np.ndarray, np.ndarray]]:
 # Solids
 
 
-def as_solid(mesh: trimesh.Trimesh, thickness: float = Settings.thickness) -> Manifold:
+def as_solid(mesh: trimesh.Trimesh) -> Manifold:
     """Return the mesh as a solid that can be cut.
 
-    Small holes of an open mesh are capped. If that does not make it a volume, each triangle becomes a plate of the
-    thickness [m], its sides along the normals of its corners, and the space that the plates enclose is filled: a sheet
+    Small holes of an open mesh are capped. If that does not make it a volume, each triangle becomes a plate as thick as
+    ``WALL``, its sides along the normals of its corners, and the space that the plates enclose is filled: a sheet
     becomes a wall, a scan with cracks a solid, half the thickness larger.
 
     Raises:
@@ -193,8 +167,8 @@ def as_solid(mesh: trimesh.Trimesh, thickness: float = Settings.thickness) -> Ma
     mesh = mesh.copy()
     trimesh.repair.fix_winding(mesh)
     corners = mesh.vertices[mesh.faces]
-    corner_sides = thickness / 2 * mesh.vertex_normals[mesh.faces]
-    face_sides = thickness / 2 * mesh.face_normals[:, None]
+    corner_sides = WALL / 2 * mesh.vertex_normals[mesh.faces]
+    face_sides = WALL / 2 * mesh.face_normals[:, None]
     plates = np.concatenate(
         (corners + corner_sides, corners - corner_sides, corners + face_sides, corners - face_sides), axis=1
     )
@@ -240,7 +214,7 @@ class _Surface:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self.vertices = vertices
         self.faces = faces
-        points, face = _samples(vertices, faces, 60_000)
+        points, face, _ = sample_surface(vertices, faces, 60_000)
         face_of_vertex = np.zeros(len(vertices), dtype=np.int64)
         face_of_vertex[faces] = np.arange(len(faces))[:, None]  # any one of its triangles
         self._points = np.concatenate((vertices, points))
@@ -253,7 +227,7 @@ class _Surface:
 
     def quick_deviation(self, vertices: np.ndarray, faces: np.ndarray) -> float:
         """Return the largest distance from a few points of another surface to the nearest of many of this one [m]."""
-        points, _ = _samples(vertices, faces, 400)
+        points, _, _ = sample_surface(vertices, faces, 400)
         return float(self.distance(np.concatenate((vertices, points))).max())
 
     def deviation(self, vertices: np.ndarray, faces: np.ndarray) -> float:
@@ -299,11 +273,9 @@ class _Surface:
     def uncovered(self, shapes: Sequence[Shape]) -> float:
         """Return the distance of its worst point from all pieces: exact next to a face, too small next to an edge
         [m]."""
-        distance = np.full(len(self._points), np.inf)
-        for shape in shapes:
-            planes = half_spaces(shape)
-            np.minimum(distance, (self._points @ planes[:, :3].T + planes[:, 3]).max(axis=1), out=distance)
-        return float(distance.max().clip(0.0))
+        planes = [half_spaces(shape) for shape in shapes]
+        distances = [(self._points @ plane[:, :3].T + plane[:, 3]).max(axis=1) for plane in planes]
+        return float(np.min(distances, axis=0).max().clip(0.0))
 
 
 class _Solid(_Surface):
@@ -328,83 +300,71 @@ class _Cutter:
     """One decomposition of a solid. Pieces are made of the solid with fewer triangles, and measured on the whole one in
     the end."""
 
-    def __init__(self, whole: Manifold, settings: Settings, progress: Progress) -> None:
+    def __init__(self, whole: Manifold, settings: Settings) -> None:
         self.surface = _Solid(whole)
         self.effort = settings.effort
         """Triangles that may still be handled."""
         self._solid = _Solid(whole.simplify(_QUICK * settings.tolerance / 10))
         self._settings = settings
-        self._progress = progress
 
     def shapes(self) -> tuple[list[Shape], float]:
         """Return the pieces and their largest deviation [m]."""
-        pieces = [part.hull() for part in self._parts()]
-        tolerance = max(_QUICK * self._settings.tolerance, *(self._solid.excess(piece, quick=True) for piece in pieces))
+        most = self._settings.max_pieces
+        tolerance = _QUICK * self._settings.tolerance
+        parts = [part for part in self._solid.solid.decompose() if part.volume() > _SPECK]
+        parts, _ = self._cut_worst(parts, self._quick_excess, self._best_cut, tolerance, int(2 * _FEW * most))
+        pieces = [part.hull() for part in parts]
+        tolerance = max(tolerance, *(self._solid.excess(piece, quick=True) for piece in pieces))
         pieces = self._joined(pieces, tolerance)
-        while len(pieces) > _FEW * self._settings.max_pieces and self.effort > 0:
+        while len(pieces) > _FEW * most and self.effort > 0:
             tolerance *= 1.1
-            self._progress(len(pieces), tolerance)
             pieces = self._joined(pieces, tolerance)
-        return self._cut_again(pieces)
+        pieces, deviation = self._cut_worst(pieces, self._excess, self._cut_piece, self._settings.tolerance, most)
+        return [_shape(piece) for piece in pieces], deviation
 
     def _spend(self, *solids: Manifold) -> None:
         self.effort -= sum(solid.num_tri() for solid in solids)
 
-    def _parts(self) -> list[Manifold]:
-        """Return parts of the solid whose hulls keep to its surface: the worst one is cut first."""
+    def _cut_worst(
+        self,
+        parts: Sequence[Manifold],
+        excess: Callable[[Manifold], float],
+        cut: Callable[[Manifold], list[Manifold]],
+        tolerance: float,
+        most: int,
+    ) -> tuple[list[Manifold], float]:
+        """Cut the part with the largest excess until none exceeds the tolerance, or there would be too many.
+
+        Returns:
+            The parts, and the largest excess that is left [m].
+        """
+        count = itertools.count()
         queue: list[tuple[float, int, Manifold]] = []
-        done: list[Manifold] = []
-        count = itertools.count()
-
-        def add(part: Manifold) -> None:
-            self._spend(self._solid.solid, part)
-            excess = self._solid.excess(part.hull(), quick=True)
-            if excess <= _QUICK * self._settings.tolerance:
-                done.append(part)
-            else:
-                heapq.heappush(queue, (-excess, next(count), part))
-
-        for part in self._solid.solid.decompose():
-            add(part)
-        while queue and len(queue) + len(done) < 2 * _FEW * self._settings.max_pieces and self.effort > 0:
-            excess, _, worst = heapq.heappop(queue)
-            self._progress(len(queue) + len(done) + 1, -excess)
-            parts = self._best_cut(worst)
-            if len(parts) < 2:
-                done.append(worst)
-                continue
-            for part in parts:
-                add(part)
-        return done + [part for _, _, part in queue]
-
-    def _cut_again(self, pieces: Sequence[Manifold]) -> tuple[list[Shape], float]:
-        """Cut the pieces again that deviate too much, the worst first; return all as shapes, and their largest
-        deviation [m]."""
-        hull_points = _manifold3d().Manifold.hull_points
-        queue: list[tuple[float, int, Manifold, Shape]] = []
-        done: list[tuple[float, int, Manifold, Shape]] = []
-        count = itertools.count()
-
-        def add(piece: Manifold) -> None:
-            self._spend(self.surface.solid)
-            shape = limited_hull(_arrays(piece)[0], self._settings.max_vertices)
-            excess = self.surface.excess(hull_points(shape.geometry.vertices), quick=False)
-            heapq.heappush(queue, (-excess, next(count), piece, shape))
-
-        for piece in pieces:
-            add(piece)
-        while queue and -queue[0][0] > self._settings.tolerance and self.effort > 0:
+        whole: list[tuple[float, int, Manifold]] = []
+        for part in parts:
+            heapq.heappush(queue, (-excess(part), next(count), part))
+        while queue and -queue[0][0] > tolerance and self.effort > 0:
             worst = heapq.heappop(queue)
-            others = len(queue) + len(done)
-            self._progress(others + 1, -worst[0])
-            parts = self._best_cut(worst[2] ^ self._solid.solid)
-            if 1 < len(parts) <= self._settings.max_pieces - others:
-                for part in parts:
-                    add(part.hull())
+            smaller = cut(worst[2])
+            if 1 < len(smaller) <= most - len(queue) - len(whole):
+                for part in smaller:
+                    heapq.heappush(queue, (-excess(part), next(count), part))
             else:
-                done.append(worst)
-        made = sorted(done + queue, key=lambda entry: entry[1])
-        return [shape for *_, shape in made], max(-excess for excess, *_ in made)
+                whole.append(worst)
+        made = sorted(whole + queue, key=lambda entry: entry[1])
+        return [part for *_, part in made], max(-excess for excess, *_ in made)
+
+    def _quick_excess(self, part: Manifold) -> float:
+        self._spend(self._solid.solid, part)
+        return self._solid.excess(part.hull(), quick=True)
+
+    def _excess(self, piece: Manifold) -> float:
+        self._spend(self.surface.solid)
+        limited = _manifold3d().Manifold.hull_points(_shape(piece).geometry.vertices)
+        return self.surface.excess(limited, quick=False)
+
+    def _cut_piece(self, piece: Manifold) -> list[Manifold]:
+        return [part.hull() for part in self._best_cut(piece ^ self._solid.solid)]
 
     def _best_cut(self, part: Manifold) -> list[Manifold]:
         """Return the parts by the planes that take away most of the hulls' volume for each further part; one if none
@@ -492,20 +452,6 @@ def _arrays(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts).astype(np.int64)
 
 
-def _samples(vertices: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points [count, 3] uniform over the triangles' area, the same for the same mesh, and the triangle of each
-    [count]."""
-    rng = np.random.default_rng(0)
-    a, b, c = vertices[faces].swapaxes(0, 1)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    face = rng.choice(len(faces), count, p=area / area.sum())
-    u, v = rng.random((2, count, 1))
-    fold = u + v > 1
-    u = np.where(fold, 1 - u, u)
-    v = np.where(fold, 1 - v, v)
-    return a[face] + u * (b - a)[face] + v * (c - a)[face], face
-
-
 def _manifold3d() -> Any:
     with needs("manifold3d, which cuts concave meshes,", "objects", ObjectError):
         import manifold3d
@@ -515,18 +461,22 @@ def _manifold3d() -> Any:
 # Hulls
 
 
-def limited_hull(points: np.ndarray, max_vertices: int) -> Shape:
-    """Return the convex hull of points [V, 3]; if it has more vertices, the hull of those that matter most.
+def _shape(piece: Manifold) -> Shape:
+    return limited_hull(_arrays(piece)[0])
+
+
+def limited_hull(points: np.ndarray) -> Shape:
+    """Return the convex hull of points [V, 3]; if it has more than 64 vertices, the hull of those that matter most.
 
     Vertices are chosen one after another, each the one farthest outside the hull of those before.
     """
     full = hull(points)
     vertices = np.asarray(full.geometry.vertices)
-    if len(vertices) <= max_vertices:
+    if len(vertices) <= _MAX_VERTICES:
         return full
     along = vertices @ np.vstack((np.eye(3), _DIAGONALS)).T
     chosen = np.unique((along.argmin(axis=0), along.argmax(axis=0))).tolist()
-    while len(chosen) < max_vertices:
+    while len(chosen) < _MAX_VERTICES:
         inner = ConvexHull(vertices[chosen], qhull_options="QJ")  # joggled: the first few may be coplanar
         outside = (vertices @ inner.equations[:, :3].T + inner.equations[:, 3]).max(axis=1)
         outside[chosen] = -np.inf

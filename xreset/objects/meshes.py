@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import tempfile
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ from xreset.errors import ObjectError
 from xreset.files import file_hash, write_whole
 from xreset.geometry.shapes import load_mesh, shell_properties
 from xreset.objects.cache import cached_pieces
-from xreset.objects.decompose import Progress, Settings, deepest_hollow, openings
+from xreset.objects.decompose import WALL, Settings, openings
 from xreset.objects.properties import Properties, properties_of
 from xreset.objects.ycb import MASSES
 from xreset.spec import ObjectSpec
@@ -48,9 +48,6 @@ class Import:
     obj: ObjectSpec
     notes: tuple[str, ...]
     """Assumptions."""
-    seconds: float
-    cached: bool
-    """Whether the convex pieces came from the cache."""
     deviation: float
     """Largest distance between the pieces' surface and the mesh's [m]."""
     mass_source: str
@@ -60,14 +57,11 @@ class Import:
         """Return a sentence about what the pieces fill or leave out; empty if they keep to the surface."""
         if self.deviation <= _FEW_MM:
             return ""
-        import trimesh
-
-        mesh = trimesh.Trimesh(self.obj.vertices, self.obj.faces, process=False)
-        x, y, z = 1e3 * deepest_hollow(mesh, self.obj.pieces)
-        pieces = f"its {len(self.obj.pieces)} pieces fill" if len(self.obj.pieces) > 1 else "its convex hull fills"
+        count = len(self.obj.pieces)
+        pieces = f"its {count} pieces fill" if count > 1 else "its convex hull fills"
         return (
-            f"{pieces} hollows up to {1e3 * self.deviation:.1f} mm deep, the deepest at "
-            f"({x:.0f}, {y:.0f}, {z:.0f}) mm. `tolerance = 0.002` in {self.obj.name}.toml keeps them open"
+            f"{pieces} hollows up to {1e3 * self.deviation:.1f} mm deep. `tolerance = 0.002` in {self.obj.name}.toml"
+            " keeps them open"
         )
 
 
@@ -100,9 +94,7 @@ def import_mesh(path: str | Path, name: str) -> ObjectSpec:
     return result.obj
 
 
-def import_with_notes(
-    path: str | Path, name: str, *, mass: float | None = None, progress: Progress = lambda parts, worst: None
-) -> Import:
+def import_with_notes(path: str | Path, name: str) -> Import:
     """Read a mesh, cut it into convex pieces and compute its mass properties.
 
     A closed mesh whose mass is that of no solid (below 120 kg/m^3) is a shell: its mass is spread evenly over its
@@ -111,36 +103,34 @@ def import_with_notes(
     Args:
         path: mesh file, in metres, in the frame of the object's poses; NAME.toml next to it may state its properties
             (:mod:`xreset.objects.properties`).
-        name: the object's name; the masses of the YCB object set are known by name.
-        mass: mass [kg]; None: from NAME.toml, else the published one, else by density.
-        progress: see :func:`xreset.objects.decompose.decompose`.
+        name: the object's name; the masses of the YCB object set are known by name. Others are
+            found by density.
 
     Raises:
         ObjectError: the file is missing, damaged, empty or flat, or not in metres.
     """
-    start = time.perf_counter()
     path = Path(path)
     mesh = read_mesh(path)
     own = properties_of(path)
     source = file_hash(path)
     try:
-        pieces = cached_pieces(mesh, source, Settings.within(own.tolerance), progress)
+        settings = Settings() if own.tolerance is None else Settings(hull_depth=0.0, tolerance=own.tolerance)
+        pieces = cached_pieces(mesh, source, settings)
     except QhullError as error:
         raise ObjectError(f"{path} spans no volume: it is flat, or damaged. A solid object is needed.") from error
     notes = []
     if not mesh.is_volume:
-        thickness = Settings().thickness
         widths = [1e3 * np.ptp(mesh.vertices[loop], axis=0).max() for loop, _ in openings(mesh)]
         problem = "the mesh is not closed"
         if widths:
             problem += f" ({len(widths)} hole{'s' * (len(widths) > 1)}, the widest {max(widths):.0f} mm)"
         if len(pieces.shapes) == 1:
             notes.append(f"{problem}: volume, center of mass and inertia are those of its convex hull")
-        elif pieces.volume < 1.5 * mesh.area * thickness:
-            notes.append(f"{problem}: it is taken as a wall {1e3 * thickness:g} mm thick")
+        elif pieces.volume < 1.5 * mesh.area * WALL:
+            notes.append(f"{problem}: it is taken as a wall {1e3 * WALL:g} mm thick")
         else:
             notes.append(f"{problem}: its holes were filled")
-    mass = mass or own.mass
+    mass = own.mass
     mass_source = "stated"
     if mass is None and own.density is None and name in MASSES:
         mass = MASSES[name]
@@ -161,8 +151,6 @@ def import_with_notes(
         inertia = pieces.inertia * mass
     if not pieces.finished:
         notes.append("cutting took too long and was stopped: a mesh with fewer triangles would fit better")
-    if len(pieces.shapes) > 1 and pieces.deviation > _FEW_MM:
-        notes.append(f"its pieces deviate by up to {1e3 * pieces.deviation:.1f} mm from its surface")
     obj = ObjectSpec(
         name=name,
         pieces=pieces.shapes,
@@ -174,15 +162,7 @@ def import_with_notes(
         source=source,
         friction=own.friction,
     )
-    seconds = time.perf_counter() - start
-    return Import(
-        obj=obj,
-        notes=tuple(notes),
-        seconds=seconds,
-        cached=pieces.cached,
-        deviation=pieces.deviation,
-        mass_source=mass_source,
-    )
+    return Import(obj=obj, notes=tuple(notes), deviation=pieces.deviation, mass_source=mass_source)
 
 
 def add_mesh(
@@ -192,7 +172,6 @@ def add_mesh(
     *,
     scale: float = 1.0,
     properties: Properties | None = None,
-    progress: Progress = lambda parts, worst: None,
 ) -> Import:
     """Import a mesh of any format and scale, and put it with its properties as ``NAME.obj`` and ``NAME.toml`` into a
     folder.
@@ -205,7 +184,7 @@ def add_mesh(
             is then written.
         XResetError: the files cannot be written.
     """
-    if not is_name(name):
+    if not re.fullmatch("[A-Za-z0-9_-]{1,200}", name):
         raise ObjectError(f"{shown(name)} cannot be an object's name. Use letters, digits, - and _.")
     target = folder / f"{name}.obj"
     facts = target.with_suffix(".toml")
@@ -224,17 +203,12 @@ def add_mesh(
         draft.write_text(text)
         draft.with_suffix(".toml").write_text(known)
         try:
-            result = import_with_notes(draft, name, progress=progress)
+            result = import_with_notes(draft, name)
         except ObjectError as error:  # the user knows only the mesh's own name
             raise ObjectError(str(error).replace(str(draft), str(path))) from error
     write_whole(facts, known)
     write_whole(target, text)
     return result
-
-
-def is_name(text: str) -> bool:
-    """Whether a text can be an object's name and a file's."""
-    return 0 < len(text) <= 200 and text.isascii() and text.replace("_", "").replace("-", "").isalnum()
 
 
 def read_mesh(path: Path, *, scale: float = 1.0) -> trimesh.Trimesh:

@@ -24,7 +24,7 @@ def surface_points(obj: ObjectSpec, count: int = 64, seed: int = 0) -> np.ndarra
     Uniform samples by area, without those inside the solid (where pieces of a stand-in overlap), thinned by
     farthest-point selection.
     """
-    points, normals = sample_surface(obj, max(_CANDIDATES_PER_POINT * count, 256), seed)
+    points, _, normals = sample_surface(obj.vertices, obj.faces, max(_CANDIDATES_PER_POINT * count, 256), seed)
     outside = winding_number(points + _PROBE * normals, obj.vertices, obj.faces) < 0.5
     return farthest_points(points[outside], count)
 
@@ -34,10 +34,13 @@ def metric_points(obj: ObjectSpec) -> np.ndarray:
     return surface_points(obj, METRIC_POINTS)
 
 
-def sample_surface(obj: ObjectSpec, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return points [count, 3] uniform over the triangles' area, and their outward normals [count, 3]."""
+def sample_surface(
+    vertices: np.ndarray, faces: np.ndarray, count: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points [count, 3] uniform over the triangles' area, the triangle of each [count], and the triangles' unit
+    normals there [count, 3]."""
     rng = np.random.default_rng(seed)
-    first, second, third = obj.vertices[obj.faces].swapaxes(0, 1)
+    first, second, third = vertices[faces].swapaxes(0, 1)
     u = second - first
     v = third - first
     cross = np.cross(u, v)
@@ -47,7 +50,7 @@ def sample_surface(obj: ObjectSpec, count: int, seed: int = 0) -> tuple[np.ndarr
     fold = a + b > 1  # fold the parallelogram onto the triangle
     a = np.where(fold, 1 - a, a)
     b = np.where(fold, 1 - b, b)
-    return first[face] + a * u[face] + b * v[face], cross[face] / double_area[face, None]
+    return first[face] + a * u[face] + b * v[face], face, cross[face] / double_area[face, None]
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from xreset.geometry.rotations import quat_from_axis_angle, quat_rotate
 from xreset.geometry.surface import Surface
 from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.cost import system
-from xreset.retarget.hand.jaw import contact_shares, jaw_keypoints, jaw_state
+from xreset.retarget.hand.jaw import jaw_keypoints, jaw_state
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.pipeline import RetargetConfig, hand_motions
@@ -117,18 +117,6 @@ class AnalyticMapTest(unittest.TestCase):
         self.assertAlmostEqual(motion.joints.item(), 0.0)
         torch.testing.assert_close(tips[:, 0].abs(), torch.full((2,), 0.0425, dtype=FLOAT), atol=1e-3, rtol=0)
         torch.testing.assert_close(tips[:, 1:], torch.zeros(2, 2, dtype=FLOAT), atol=1e-3, rtol=0)
-
-    def test_a_jaw_follows_what_touches_the_held_object(self):
-        model = HandModel(robots.load("openarm"))
-        hand = np.arange(63.0).reshape(1, 21, 3)
-        touching = np.zeros((4, 21), dtype=bool)
-        touching[1:, [KEYPOINTS.index(name) for name in ("wrist", "thumb3", "middle2", "ring2")]] = True
-        shares = contact_shares(touching, held=np.array([False, True, True, True]))
-        wrist, thumb, finger = jaw_keypoints(model, hand, shares[None])[0]
-        at = {name: hand[0, i] for i, name in enumerate(KEYPOINTS)}
-        np.testing.assert_allclose(wrist, at["wrist"])
-        np.testing.assert_allclose(thumb, at["thumb3"])
-        np.testing.assert_allclose(finger, (at["middle2"] + at["ring2"]) / 2)
 
 
 if __name__ == "__main__":

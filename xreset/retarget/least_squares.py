@@ -25,7 +25,6 @@ def minimize(
     iterations: int,
     *,
     damping_range: tuple[float, float] = (0.0, inf),
-    progress: Callable[[int], None] = lambda _: None,
 ) -> tuple[Any, Tensor]:
     """Take damped Gauss-Newton steps; a problem keeps those that lower its cost, and takes no more time when it is
     done.
@@ -38,7 +37,6 @@ def minimize(
             next step.
         iterations: most steps.
         damping_range: smallest and largest damping.
-        progress: called before each step with the number of steps done.
 
     Returns:
         The best x found, and its cost [B].
@@ -50,8 +48,7 @@ def minimize(
     now = x
     here = evaluate(x, rows)
     cost = here.cost.clone()
-    for iteration in range(iterations):
-        progress(iteration)
+    for _ in range(iterations):
         trial = step(now, here, damping)
         there = evaluate(trial, rows)
         better = there.cost < here.cost

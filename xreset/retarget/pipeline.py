@@ -23,7 +23,7 @@ from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.file import Retargeted
 from xreset.retarget.hand.config import HandConfig
-from xreset.retarget.hand.jaw import contact_shares, jaw_keypoints
+from xreset.retarget.hand.jaw import jaw_keypoints
 from xreset.retarget.hand.model import HandModel, HandTargets
 from xreset.retarget.hand.solve import HandMotion, retarget_hand
 from xreset.retarget.validity import REASONS, Thresholds, classify
@@ -38,7 +38,7 @@ _FINGERS = slice(5, None)
 """Keypoints of the other fingers."""
 
 Progress = Callable[[float, int], None]
-"""Called with the sequences done and the sequences in all."""
+"""Called with the sequences done and the sequences in all, after each batch."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +92,7 @@ def retarget_demos(
     objects: Sequence[ObjectSpec],
     config: RetargetConfig | None = None,
     *,
-    progress: Callable[[float, int], None] = lambda done, total: None,
+    progress: Progress = lambda done, total: None,
     device: str = "cpu",
 ) -> Retargeted:
     """Retarget demonstrations. Sequences are independent of one another, and only the arguments decide the result.
@@ -113,31 +113,18 @@ def retarget_demos(
         RobotError: the robot's description does not allow retargeting.
     """
     config = config or RetargetConfig()
-    work = _Work(demos, objects, config)
-    demos = work.demos
+    human = _HumanMotion(demos, objects, config.contact_distance)
+    demos = human.demos
     hand = HandModel(robot, device=device)
     arm = ArmModel(robot)
     joint_pos = np.tile(robot.home, (demos.num_frames, 1))
     reason = np.full(demos.num_frames, REASONS.index("not annotated"), dtype=np.int32)
     hand_error = np.full(demos.num_frames, np.inf)
     wrist_error = np.full(demos.num_frames, np.inf)
-    for sequences, report in work.batches(progress):
-        targets = work.hand_targets(hand, sequences)
+    for sequences, targets, motion in _hand_motions(human, hand, config.hand, progress):
+        path = _arm_targets(hand, arm, targets, motion)
         with one_thread():
-            motion = retarget_hand(
-                hand,
-                targets,
-                config.hand,
-                lambda share, report=report: report(0.5 * share),
-            )
-            path = _arm_targets(hand, arm, targets, motion)
-            joints, measures = track(
-                arm,
-                path,
-                config.thresholds,
-                config.arm,
-                lambda share, report=report: report(0.5 + 0.5 * share),
-            )
+            joints, measures = track(arm, path, config.thresholds, config.arm)
         full = arm.full(joints, path.hand_joints)
         reasons = classify(measures, config.thresholds)
         for slot, sequence in enumerate(sequences):
@@ -148,10 +135,9 @@ def retarget_demos(
             reason[rows] = reasons[slot, own]
             hand_error[rows][annotated] = path.hand_error[slot, own][annotated]
             wrist_error[rows][annotated] = measures.wrist_position[slot, own][annotated]
-        report(1.0)
 
     links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
-    contact = np.asarray(work.touching.any(axis=1))
+    contact = np.asarray(human.touching.any(axis=1))
     first_contact = np.full(demos.num_sequences, -1, dtype=np.int32)
     for sequence in range(demos.num_sequences):
         own = contact[demos.frames(sequence)]
@@ -199,13 +185,8 @@ def hand_motions(
     """Retarget the hand alone, in batches: sequences, the hand's targets, its motion. Arguments as in
     :func:`retarget_demos`."""
     config = config or RetargetConfig()
-    work = _Work(demos, objects, config)
-    hand = HandModel(robot, device=device)
-    for sequences, report in work.batches(progress):
-        targets = work.hand_targets(hand, sequences)
-        with one_thread():
-            motion = retarget_hand(hand, targets, config.hand, report)
-        yield sequences, targets, motion
+    human = _HumanMotion(demos, objects, config.contact_distance)
+    return _hand_motions(human, HandModel(robot, device=device), config.hand, progress)
 
 
 def wrist_paths(
@@ -235,57 +216,24 @@ def _by_name(demos: Demos, objects: Sequence[ObjectSpec]) -> dict[str, ObjectSpe
     return {name: given[name] for name in needed}
 
 
-class _Work:
-    """Demonstrations on the table, the contacts of their hands, and the batches in which they are retargeted."""
+class _HumanMotion:
+    """Demonstrations on the table, and the contacts of their hands."""
 
-    def __init__(
-        self,
-        demos: Demos,
-        objects: Sequence[ObjectSpec],
-        config: RetargetConfig,
-    ) -> None:
+    def __init__(self, demos: Demos, objects: Sequence[ObjectSpec], contact_distance: float) -> None:
         surfaces = {name: Surface(spec) for name, spec in _by_name(demos, objects).items()}
         self._objects = list(surfaces)
-        self._jaw = config.hand.jaw
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
         self.demos = demos = rest_on_table(demos, objects)
-        points, self.touching = human_contacts(demos, surfaces, config.contact_distance)
+        points, self.touching = human_contacts(demos, surfaces, contact_distance)
         """Contact points [F, 21, 3] of the human keypoints, and which of them [F, 21] touch the object."""
         keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0)
-        self._per_keypoint = {
-            "keypoints": keypoints.astype(np.float64),
-            "contact_points": points,
-            "in_contact": self.touching,
-        }
-        self._per_frame = {
-            "annotated": demos.hand_valid,
-            "held": self.touching[:, _THUMB].any(axis=1) & self.touching[:, _FINGERS].any(axis=1),
-            "object_pos": demos.object_pos.astype(np.float64),
-            "object_quat": demos.object_quat_wxyz.astype(np.float64),
-        }
-        held = self._per_frame["held"]
-        self._contact_shares = np.zeros(self.touching.shape)
-        """[F, 21] see :func:`contact_shares`."""
-        for i in range(demos.num_sequences):
-            rows = demos.frames(i)
-            self._contact_shares[rows] = contact_shares(self.touching[rows], held[rows])
+        self._keypoints = keypoints.astype(np.float64)
+        self._contact_points = points
 
-    def batches(self, progress: Progress) -> Iterator[tuple[list[int], Callable[[float], None]]]:
-        """Iterate over batches of sequences that have a hand, each with a function that reports the share of it that is
-        done."""
-        demos = self.demos
-        todo = [i for i in range(demos.num_sequences) if demos.hand_valid[demos.frames(i)].any()]
-        for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
-            sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
-
-            def report(share: float, start: int = begin, size: int = len(sequences)) -> None:
-                progress(start + share * size, len(todo))
-
-            yield sequences, report
-
-    def hand_targets(self, hand: HandModel, sequences: Sequence[int]) -> HandTargets:
+    def hand_targets(self, hand: HandModel, sequences: Sequence[int], jaw: str) -> HandTargets:
         """Return the targets of some sequences, padded with frames that are not annotated."""
-        rows = [self.demos.frames(i) for i in sequences]
+        demos = self.demos
+        rows = [demos.frames(i) for i in sequences]
         frames = max(row.stop - row.start for row in rows)
 
         def padded(values: np.ndarray) -> Tensor:
@@ -294,16 +242,37 @@ class _Work:
                 out[slot, : row.stop - row.start] = values[row]
             return torch.as_tensor(out)
 
-        chosen = {name: values[:, hand.keypoint_indices] for name, values in self._per_keypoint.items()}
-        if hand.is_jaw and self._jaw != "fingertips":
-            shares = self._contact_shares if self._jaw == "contacts" else None
-            chosen["keypoints"] = jaw_keypoints(hand, self._per_keypoint["keypoints"], shares)
-        which = [self._objects.index(name) for name in self.demos.object_name[list(sequences)].tolist()]
+        keypoints = self._keypoints[:, hand.keypoint_indices]
+        if hand.is_jaw and jaw == "analytic":
+            keypoints = jaw_keypoints(hand, self._keypoints)
+        held = self.touching[:, _THUMB].any(axis=1) & self.touching[:, _FINGERS].any(axis=1)
+        which = [self._objects.index(name) for name in demos.object_name[list(sequences)].tolist()]
         return HandTargets(
-            **{name: padded(values) for name, values in (chosen | self._per_frame).items()},
+            keypoints=padded(keypoints),
+            annotated=padded(demos.hand_valid),
+            contact_points=padded(self._contact_points[:, hand.keypoint_indices]),
+            in_contact=padded(self.touching[:, hand.keypoint_indices]),
+            held=padded(held),
+            object_pos=padded(demos.object_pos.astype(np.float64)),
+            object_quat=padded(demos.object_quat_wxyz.astype(np.float64)),
             object_index=torch.tensor(which),
             fields=self._fields,
         )
+
+
+def _hand_motions(
+    human: _HumanMotion, hand: HandModel, config: HandConfig, progress: Progress
+) -> Iterator[tuple[list[int], HandTargets, HandMotion]]:
+    """Retarget the hand in batches of those sequences that have a hand."""
+    demos = human.demos
+    todo = [i for i in range(demos.num_sequences) if demos.hand_valid[demos.frames(i)].any()]
+    for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
+        sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
+        targets = human.hand_targets(hand, sequences, config.jaw)
+        with one_thread():
+            motion = retarget_hand(hand, targets, config)
+        yield sequences, targets, motion
+        progress(begin + len(sequences), len(todo))
 
 
 def _arm_targets(hand: HandModel, arm: ArmModel, targets: HandTargets, motion: HandMotion) -> ArmTargets:

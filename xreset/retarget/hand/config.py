@@ -21,10 +21,9 @@ Shares = Annotated[
 class HandConfig(Checked):
     """Weights and limits of hand retargeting; weights are the paper's (appendix D.b) unless a field says otherwise."""
 
-    jaw: Literal["fingertips", "contacts", "analytic"] = "fingertips"
-    """What a parallel jaw follows (:mod:`xreset.retarget.hand.jaw`). ``fingertips``: the human's, like every hand.
-    ``contacts``: where thumb and fingers touch the held object. ``analytic``: the published paper's map, without the
-    costs below. Other hands ignore it."""
+    jaw: Literal["fingertips", "analytic"] = "fingertips"
+    """What a parallel jaw follows. ``fingertips``: the human's, like every hand. ``analytic``: the published paper's
+    map (:mod:`xreset.retarget.hand.jaw`), without the costs below. Other hands ignore it."""
     local_weight: NotNegative[float] = 10.0
     """Bone vectors and bone directions, averaged over the pairs of keypoints."""
     global_weight: NotNegative[float] = 1.0

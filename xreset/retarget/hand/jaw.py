@@ -1,9 +1,5 @@
-"""Maps from a human hand to a parallel jaw: the jaw's axis from the thumb to what opposes it, its opening their
-distance, its approach along the palm.
-
-The published paper's analytic map (Table A1) takes the thumb's tip and the middle of the opposing fingertips, and knows
-nothing of the object. A hand that wraps around a handle opposes its thumb with whole fingers, so a map that is then
-optimized takes where thumb and fingers touch the object they hold.
+"""The published paper's analytic map from a human hand to a parallel jaw (Table A1): the jaw's axis from the thumb's tip
+to the middle of the opposing fingertips, its opening their distance, its approach along the palm.
 
 Shape letters: S sequences padded to T frames, F frames, P mapped keypoints.
 """
@@ -20,45 +16,21 @@ from xreset.retarget.hand.model import HandModel, HandState
 from xreset.spec import KEYPOINTS
 
 _OPPOSING = ("index4", "middle4")
-"""Fingertips that oppose the thumb in the analytic map."""
-_BASES = tuple(KEYPOINTS.index(name) for name in KEYPOINTS if name == "wrist" or name.endswith("1"))
-"""Keypoints that do not move against the palm."""
-_THUMB = np.array([name.startswith("thumb") for name in KEYPOINTS])
+"""Fingertips that oppose the thumb."""
 _OPENINGS = 1025
 """Joint positions among which the one with the wanted opening is chosen."""
-_TOUCHING = 0.5
-"""Sum of a side's contact shares below which its fingertips are followed instead."""
 
 
-def jaw_keypoints(model: HandModel, keypoints: np.ndarray, contact_shares: np.ndarray | None = None) -> np.ndarray:
-    """[F, P, 3] what a jaw follows of human keypoints [F, 21, 3]: its fingertips follow the thumb and what opposes it.
-
-    Args:
-        model: the jaw.
-        keypoints: human keypoints.
-        contact_shares: [F, 21] of :func:`contact_shares`. None: the thumb's tip and the middle of the opposing ones.
-    """
-    tips = np.array([name in ("thumb4", *_OPPOSING) for name in KEYPOINTS])
+def jaw_keypoints(model: HandModel, keypoints: np.ndarray) -> np.ndarray:
+    """[F, P, 3] what a jaw follows of human keypoints [F, 21, 3]: its fingertips follow the thumb's tip and the middle of
+    the opposing fingertips."""
     chosen = keypoints[:, model.keypoint_indices]
-    for tip, side in zip(model.robot.fingertips, (_THUMB, ~_THUMB), strict=True):
-        weights = np.broadcast_to(tips & side, keypoints.shape[:2]).astype(float)
-        if contact_shares is not None:
-            touching = contact_shares * side
-            weights = np.where(touching.sum(axis=1, keepdims=True) < _TOUCHING, weights, touching)
-        point = np.einsum("fk,fkx->fx", weights, keypoints) / weights.sum(axis=1, keepdims=True)
+    for tip, followed in zip(model.robot.fingertips, (("thumb4",), _OPPOSING), strict=True):
+        weights = np.array([[name in followed for name in KEYPOINTS]], dtype=float)
+        point = np.einsum("fk,fkx->fx", np.broadcast_to(weights, keypoints.shape[:2]), keypoints) / len(followed)
         follower = np.array(model.names) == tip.keypoint
         chosen = np.where(follower[:, None], point[:, None], chosen)
     return chosen
-
-
-def contact_shares(touching: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """[21] share of the frames with a held object [T] in which each keypoint touches it [T, 21].
-
-    One set of shares for a whole motion makes the points that oppose each other points of the hand, which do not jump.
-    """
-    shares = touching[held].mean(axis=0) if held.any() else np.zeros(touching.shape[1])
-    shares[list(_BASES)] = 0.0
-    return shares
 
 
 def jaw_state(model: HandModel, keypoints: Tensor) -> HandState:

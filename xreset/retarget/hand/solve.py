@@ -11,7 +11,6 @@ Shape letters: S sequences padded to T frames, P mapped keypoints, J hand joints
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -45,7 +44,6 @@ def retarget_hand(
     model: HandModel,
     targets: HandTargets,
     config: HandConfig | None = None,
-    progress: Callable[[float], None] = lambda share: None,
 ) -> HandMotion:
     """Find hand motions that minimize the cost; sequences are independent of one another.
 
@@ -53,7 +51,6 @@ def retarget_hand(
         model: the hand; its device does the work.
         targets: what to follow; a sequence must have at least one annotated frame.
         config: weights and limits.
-        progress: called with the fraction of iterations that is done.
 
     Returns:
         The motions, on the targets' device.
@@ -61,51 +58,25 @@ def retarget_hand(
     config = config or HandConfig()
     home = targets.keypoints.device
     targets = targets.to(model.device)
-    if model.is_jaw and config.jaw != "fingertips":
+    if model.is_jaw and config.jaw == "analytic":
         rows = torch.arange(len(targets.annotated), device=model.device)[:, None]
         state = jaw_state(model, targets.keypoints[rows, _nearest_annotated(targets.annotated)])
-        own = model.keypoints(**vars(state))
-        if config.jaw == "analytic":
-            return HandMotion(**vars(state), keypoints=own, cost=own.new_zeros(len(own))).to(home)
-        followed = torch.where(model.is_tip[:, None], targets.keypoints, own)
-        targets = replace(targets, keypoints=followed, in_contact=torch.zeros_like(targets.in_contact))
+        keypoints = model.keypoints(**vars(state))
+        return HandMotion(**vars(state), keypoints=keypoints, cost=keypoints.new_zeros(len(keypoints))).to(home)
     root_pos, root_quat = _align_root(model, targets)
     joints = model.kinematics.clamp(model.home).expand(*targets.annotated.shape, -1)
     state = HandState(joints, root_pos, root_quat)
-    stages = []
     if config.clearance_weight:
         for share in config.clearance_growth:
-            weight = share * config.clearance_weight
-            stages.append(
-                replace(
-                    config,
-                    clearance_weight=weight,
-                    iterations=config.growth_iterations,
-                )
+            stage = replace(
+                config, clearance_weight=share * config.clearance_weight, iterations=config.growth_iterations
             )
-    stages.append(config)
-    steps = sum(stage.iterations for stage in stages)
-    cost = root_pos.new_zeros(len(root_pos))
-    before = 0
-    for stage in stages:
-        state, cost = _minimize(
-            model,
-            targets,
-            stage,
-            state,
-            lambda n, done=before: progress((done + n) / steps),
-        )
-        before += stage.iterations
+            state, _ = _minimize(model, targets, stage, state)
+    state, cost = _minimize(model, targets, config, state)
     return HandMotion(**vars(state), keypoints=model.keypoints(**vars(state)), cost=cost).to(home)
 
 
-def _minimize(
-    model: HandModel,
-    targets: HandTargets,
-    config: HandConfig,
-    start: HandState,
-    progress: Callable[[int], None],
-) -> tuple[HandState, Tensor]:
+def _minimize(model: HandModel, targets: HandTargets, config: HandConfig, start: HandState) -> tuple[HandState, Tensor]:
     """Return the best state that is found from a first guess, and its cost [S]."""
 
     def evaluate(state: HandState, rows: Tensor) -> HandSystem:
@@ -114,17 +85,11 @@ def _minimize(
     def step(state: HandState, here: HandSystem, damping: Tensor) -> HandState:
         return _moved(model, state, _limited_step(model, state, here, damping))
 
-    def done(
-        _before: HandState,
-        _after: HandState,
-        cost: Tensor,
-        tried: Tensor,
-        damping: Tensor,
-    ) -> Tensor:
+    def done(_before: HandState, _after: HandState, cost: Tensor, tried: Tensor, damping: Tensor) -> Tensor:
         gain = (cost - tried) / cost.clamp_min(1e-12)
         return ((tried < cost) & (gain < config.tolerance)) | (damping > 1e6)
 
-    return minimize(start, evaluate, step, done, config.iterations, progress=progress)
+    return minimize(start, evaluate, step, done, config.iterations)
 
 
 def _align_root(model: HandModel, targets: HandTargets) -> tuple[Tensor, Tensor]:

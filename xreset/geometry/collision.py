@@ -1,7 +1,7 @@
 """How far a robot is from the table and from itself.
 
 The table needs no collision library: the lowest point of a convex shape is one of a few support points, less a radius.
-Self-collision asks coal (signed distance, nearest points), but only for pairs of shapes whose bounding spheres are
+Self-collision asks coal for signed distances, but only for pairs of shapes whose bounding spheres are
 near.
 
 Shape letters: B configurations, L links, G shapes, H support points, A pairs of shapes that are near each other.
@@ -10,7 +10,6 @@ Shape letters: B configurations, L links, G shapes, H support points, A pairs of
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
@@ -86,8 +85,7 @@ def height_above_table(points: Tensor, radii: Tensor, table: TableSpec) -> Tenso
     return (z - radii).masked_fill(off_x | off_y, float("inf"))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Approaches:
+class Approaches(NamedTuple):
     """Pairs of shapes that are near each other (length A)."""
 
     configuration: np.ndarray
@@ -96,10 +94,6 @@ class Approaches:
     """[A, 2] indices of the two links in the kinematics' order."""
     distance: np.ndarray
     """[A] signed distance [m], negative where they overlap."""
-    points: np.ndarray
-    """[A, 2, 3] nearest points on the two shapes, world frame."""
-    normal: np.ndarray
-    """[A, 3] unit vector from the first shape to the second: moving the second along it separates them."""
 
 
 class SelfCollision:
@@ -184,8 +178,6 @@ class SelfCollision:
         request.enable_signed_distance = True
         result = self._coal.DistanceResult()
         rows = []
-        points = []
-        normals = []
         first, second = self._pairs.T
         reach = self._radius[first] + self._radius[second] + margin
         for begin in range(0, len(link_poses) if len(self._pairs) else 0, _POSES_PER_CHUNK):
@@ -207,21 +199,8 @@ class SelfCollision:
                 if distance < margin:
                     i, j = self._pairs[pair]
                     rows.append((begin + b, self._link[i], self._link[j], distance))
-                    points.append(
-                        (
-                            np.array(result.getNearestPoint1()),
-                            np.array(result.getNearestPoint2()),
-                        )
-                    )
-                    normals.append(np.array(result.normal))
         table = np.array(rows).reshape(-1, 4)
-        return Approaches(
-            configuration=table[:, 0].astype(np.int64),
-            links=table[:, 1:3].astype(np.int64),
-            distance=table[:, 3],
-            points=np.array(points).reshape(-1, 2, 3),
-            normal=np.array(normals).reshape(-1, 3),
-        )
+        return Approaches(table[:, 0].astype(np.int64), table[:, 1:3].astype(np.int64), table[:, 3])
 
     def clearance(self, link_poses: np.ndarray, margin: float) -> np.ndarray:
         """[B] smallest signed distance between two shapes, at most ``margin``; arguments as in :meth:`near`."""

@@ -20,11 +20,9 @@ class ArmConfig(Checked):
     """Squared change of the joints since the frame before [1/rad^2]; the paper's lambda_s, whose value it does not
     give."""
     collision_weight: NotNegative[float] = 1000.0
-    """Squared intrusion into the margins [1/m^2]."""
+    """Squared intrusion into the margin above the table [1/m^2]."""
     table_margin: Finite[float] = 0.002
     """Height that the robot keeps above the table [m]."""
-    self_margin: Finite[float] = 0.010
-    """Distance that the robot's links keep from each other [m]."""
     restarts: Positive[int] = 32
     """Starts of the first and of the last frame: the home configuration, then random ones."""
     branches: Positive[int] = 4

@@ -101,8 +101,6 @@ class ArmModel:
         """Links whose motion the arm's joints determine: the hand root, which carries the hand, then the arm's
         links."""
         carrier_of = {link: 0 if link in in_hand else self.carriers.index(link) for link in names}
-        self.carrier_of = torch.tensor(list(carrier_of.values()))
-        """[L] index of the carrier of every link."""
         self.arm_collision = SelfCollision(robot, self.kinematics, moved_by_arm=True)
         """Distances that the arm's joints change."""
         self._hand_collision = SelfCollision(robot, self.hand, only=robot.self_collision_links)
@@ -175,7 +173,7 @@ class ArmModel:
         poses = self.hand.link_poses(hand_joints.flatten(0, -2)).numpy()
         return torch.as_tensor(self._hand_collision.clearance(poses, _SEARCH)).view(hand_joints.shape[:-1])
 
-    def full(self, arm: Tensor, hand_joints: Tensor) -> Tensor:
+    def full(self, arm: Tensor, hand_joints: Tensor | float) -> Tensor:
         """[..., J] all joints in joint order."""
         q = arm.new_zeros(*arm.shape[:-1], len(self.robot.joints))
         q[..., self.arm] = arm

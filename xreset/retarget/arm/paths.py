@@ -7,7 +7,6 @@ support points.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,9 +17,6 @@ from xreset.retarget.arm.cost import Frame, solve, system
 from xreset.retarget.arm.model import ArmModel, ArmTargets, arm_jump, measure
 from xreset.retarget.validity import Thresholds, classify
 from xreset.tensors import Tensors
-
-Progress = Callable[[float], None]
-"""Called with the fraction that is done."""
 
 _HOME_BIAS = 1e-3
 """Preference among solutions of the first frame for those near home [1/rad^2]."""
@@ -92,54 +88,25 @@ class ArmProblem:
             pos=self.targets.root_pos[:, t],
             quat=self.targets.root_quat[:, t],
             hand_poses=self.hand_poses[:, t],
-            hand_joints=self.targets.hand_joints[:, t],
             previous=previous,
         )
 
 
-def follow(
-    problem: ArmProblem,
-    start: Tensor,
-    progress: Progress,
-    *,
-    self_collision: bool = False,
-) -> Tensor:
+def follow(problem: ArmProblem, start: Tensor) -> Tensor:
     """[S, T, n] joints along the path, every frame started from the one before; the first from ``start`` [S, n]."""
     model = problem.model
     config = problem.config
     frames = problem.hand_poses.shape[1]
-    frame = problem.frame(0, None)
-    path = [
-        solve(
-            model,
-            frame,
-            start,
-            config,
-            config.first_iterations,
-            self_collision=self_collision,
-        )
-    ]
-    progress(1 / frames)
+    path = [solve(model, problem.frame(0, None), start, config, config.first_iterations)]
     for t in range(1, frames):
-        frame = problem.frame(t, path[-1])
-        path.append(
-            solve(
-                model,
-                frame,
-                path[-1],
-                config,
-                config.iterations,
-                self_collision=self_collision,
-            )
-        )
-        progress((t + 1) / frames)
+        path.append(solve(model, problem.frame(t, path[-1]), path[-1], config, config.iterations))
     return torch.stack(path, dim=1)
 
 
-def branches(problem: ArmProblem, progress: Progress) -> Paths:
+def branches(problem: ArmProblem) -> Paths:
     """Return the paths from distinct solutions of the first frame."""
     starts = _first_frames(problem)  # [S, K, n]
-    paths = follow(problem.repeated(starts.shape[1]), starts.flatten(0, 1), progress)
+    paths = follow(problem.repeated(starts.shape[1]), starts.flatten(0, 1))
     return problem.examined(paths.unflatten(0, starts.shape[:2]))
 
 
@@ -152,14 +119,14 @@ def best(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
     return paths.joints[torch.arange(len(which)), which], worth
 
 
-def repaired(problem: ArmProblem, known: Paths, missed: Tensor, progress: Progress) -> Tensor:
+def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:
     """[S, T, n] the best path from pieces of the ``known`` paths and of new ones.
 
     The new paths lead both ways from some of the frames that are ``missed`` [S, T], solved again: a path from either
     end may be stuck at a limit there, on the wrong side of the arm's null space.
     """
     config = problem.config
-    owner, paths = _reseeded(problem, missed, progress)
+    owner, paths = _reseeded(problem, missed)
     count = torch.bincount(owner, minlength=len(missed))
     column = torch.arange(len(owner)) - (count.cumsum(0) - count)[owner]
     # Sequences with fewer new paths than others repeat a known one.
@@ -179,7 +146,7 @@ def repaired(problem: ArmProblem, known: Paths, missed: Tensor, progress: Progre
     )
 
 
-def _reseeded(problem: ArmProblem, missed: Tensor, progress: Progress) -> tuple[Tensor, Tensor]:
+def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
     """Follow paths both ways from distinct solutions of missed frames [S, T] that can be solved.
 
     Returns the sequences [B] of the paths, ascending, and the paths [B, T, n].
@@ -202,11 +169,7 @@ def _reseeded(problem: ArmProblem, missed: Tensor, progress: Progress) -> tuple[
         return owner, paths
     steps = torch.arange(int(torch.maximum(seed, frames - 1 - seed).max()) + 1)
     both_ways = torch.cat((seed[:, None] + steps, seed[:, None] - steps)).clamp(0, frames - 1)  # [2B, N] frames
-    followed = follow(
-        problem.select(owner.repeat(2)[:, None], both_ways),
-        start.repeat(2, 1),
-        progress,
-    )
+    followed = follow(problem.select(owner.repeat(2)[:, None], both_ways), start.repeat(2, 1))
     row = torch.arange(len(owner)).repeat(2)
     for step in reversed(steps.tolist()):  # the first visit of a frame is the one that stays
         paths[row, both_ways[:, step]] = followed[:, step]
@@ -232,15 +195,8 @@ def _first_frames(problem: ArmProblem) -> Tensor:
     )
     frame = problem.repeated(config.restarts).frame(0, None)
     start = start.repeat(sequences, 1)
-    solved = solve(
-        model,
-        frame,
-        start,
-        config,
-        config.first_iterations,
-        self_collision=False,
-    )
-    cost = system(model, frame, solved, config, self_collision=False).cost
+    solved = solve(model, frame, start, config, config.first_iterations)
+    cost = system(model, frame, solved, config).cost
     shape = (sequences, config.restarts)
     solved = solved.unflatten(0, shape)
     order = (cost.view(shape) + _HOME_BIAS * (solved - home).square().sum(-1)).argsort(dim=1)

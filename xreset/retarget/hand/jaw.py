@@ -1,5 +1,7 @@
-"""The published paper's analytic map from a human hand to a parallel jaw (Table A1): the jaw's axis from the thumb's tip
-to the middle of the opposing fingertips, its opening their distance, its approach along the palm.
+"""The published paper's analytic map from a human hand to a parallel jaw (Table A1).
+
+The jaw's axis goes from the thumb's tip to the middle of the opposing fingertips, its opening is their distance, and
+its approach is along the palm.
 
 Shape letters: S sequences padded to T frames, F frames, P mapped keypoints.
 """
@@ -22,8 +24,8 @@ _OPENINGS = 1025
 
 
 def jaw_keypoints(model: HandModel, keypoints: np.ndarray) -> np.ndarray:
-    """[F, P, 3] what a jaw follows of human keypoints [F, 21, 3]: its fingertips follow the thumb's tip and the middle of
-    the opposing fingertips."""
+    """[F, P, 3] what a jaw follows of human keypoints [F, 21, 3]: the thumb's tip, and the middle of the opposing
+    fingertips."""
     chosen = keypoints[:, model.keypoint_indices]
     for tip, followed in zip(model.robot.fingertips, (("thumb4",), _OPPOSING), strict=True):
         weights = np.array([[name in followed for name in KEYPOINTS]], dtype=float)

@@ -22,7 +22,7 @@ class InputsTest(unittest.TestCase):
     def setUpClass(cls):
         folder = Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
         cls.robot = robots.load("ur7e-sharpa")
-        cls.demos = synthesize([SPAM, SOUP], 1, seed=0)
+        cls.demos = synthesize([SPAM, SOUP], 1, seed=0, fps=8.0)
         cls.demos_file = folder / "demos.npz"
         write_demos(cls.demos_file, cls.demos)
         cls.bank_file = folder / "resets.npz"

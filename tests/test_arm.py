@@ -209,11 +209,11 @@ class DirectionTest(unittest.TestCase):
         return classify(track(self.model, targets, thresholds, config)[1], thresholds)[0] == 0
 
     def test_both_ends_are_tried(self):
-        for targets in (self.targets, self.targets.map(lambda x: x.flip(1))):  # forwards alone: none of the first
+        for targets in (self.targets, self.targets.reversed()):  # forwards alone: none of the first
             self.assertGreaterEqual(int(self.valid(targets).sum()), 8)
 
     def test_frames_between_two_bad_ends_are_found_from_the_middle(self):
-        both = ArmTargets.cat((self.targets, self.targets.map(lambda x: x.flip(1))), dim=1)
+        both = ArmTargets.cat((self.targets, self.targets.reversed()), dim=1)
         self.assertFalse(self.valid(both, reseeds=0).any())
         found = self.valid(both, reseeds=2)
         self.assertGreaterEqual(int(found.sum()), 16)

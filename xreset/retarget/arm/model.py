@@ -48,6 +48,10 @@ class ArmTargets(Tensors):
     hand_clearance: Tensor
     """[S, T] smallest signed distance between the hand's own shapes [m]; the arm cannot change it."""
 
+    def reversed(self) -> ArmTargets:
+        """Return the path from the last frame to the first."""
+        return self.map(lambda x: x.flip(1))
+
 
 @dataclass(frozen=True, kw_only=True)
 class LowPoints(Tensors):

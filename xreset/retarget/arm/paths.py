@@ -34,6 +34,10 @@ class Paths(Tensors):
     """[S, K, T] bool: valid if the joints do not jump there. A jump depends on the frame before, and so on the
     direction and on where paths are spliced; everything else depends on the frame alone and is measured once."""
 
+    def reversed(self) -> Paths:
+        """Return the paths from the last frame to the first."""
+        return self.map(lambda x: x.flip(2))
+
 
 @dataclass(frozen=True, kw_only=True)
 class ArmProblem:
@@ -53,6 +57,14 @@ class ArmProblem:
     def repeated(self, count: int) -> ArmProblem:
         """Return the problem with every sequence repeated, copies next to each other: [S count, ...]."""
         return self.select(torch.arange(len(self.hand_poses)).repeat_interleave(count))
+
+    def reversed(self) -> ArmProblem:
+        """Return the problem from the last frame to the first."""
+        return replace(
+            self,
+            targets=self.targets.reversed(),
+            hand_poses=self.hand_poses.flip(1),
+        )
 
     def reasons(self, joints: Tensor) -> Tensor:
         """[S, T] reason of each frame of the paths [S, T, n], 0 where valid: see
@@ -98,13 +110,13 @@ def branches(problem: ArmProblem) -> Paths:
     return problem.examined(paths.unflatten(0, starts.shape[:2]))
 
 
-def best(problem: ArmProblem, paths: Paths) -> Tensor:
-    """Return the path [S, T, n] that is worth most: see the config."""
+def best(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
+    """Return the path [S, T, n] that is worth most, and its worth [S]: see the config."""
     jump = arm_jump(paths.joints, problem.targets.annotated[:, None])
     valid = (paths.sound & (jump <= problem.thresholds.arm_jump)).sum(-1)
     detour = (paths.joints - problem.model.home).square().sum(-1).mean(-1)
-    which = (valid - problem.config.detour_cost * detour).argmax(dim=1)
-    return paths.joints[torch.arange(len(which)), which]
+    worth, which = (valid - problem.config.detour_cost * detour).max(dim=1)
+    return paths.joints[torch.arange(len(which)), which], worth
 
 
 def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:

@@ -7,8 +7,9 @@ paper, appendix D.b).
 by Levenberg-Marquardt with projected steps (``cost``), frame after frame, batched over sequences (``paths``).
 
 The first frame starts from random restarts. The best few distinct solutions are all followed, and the one with most
-valid frames wins, because the first frame does not show which branch lasts. Where the wrist is missed, some of those
-frames are solved again and followed both ways, and all paths are spliced into one.
+valid frames wins, because the first frame does not show which branch lasts. Where a frame fails, the same is tried
+backwards from the last frame: the branch that reaches the goal may look worse than others at the start. Where the wrist
+is still missed, some of those frames are solved again and followed both ways, and all paths are spliced into one.
 
 Shape letters: S sequences, T frames, K paths of a sequence, C sequences to improve, n arm joints.
 """
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets, measure
-from xreset.retarget.arm.paths import ArmProblem, best, branches, repaired
+from xreset.retarget.arm.paths import ArmProblem, Paths, best, branches, repaired
 from xreset.retarget.validity import REASONS, Measures, Thresholds
 
 _WRIST_MISSED = ("joint limit", "wrist position", "wrist orientation")
@@ -48,8 +49,30 @@ def track(
         thresholds=thresholds,
         config=config or ArmConfig(),
     )
-    paths = branches(problem)
-    joints = best(problem, paths)
+    forwards = branches(problem)
+    joints, worth = best(problem, forwards)
+    failing = (problem.reasons(joints) > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
+    if len(failing):
+        part = problem.select(failing)
+        joints[failing] = _rescued(part, forwards[failing], joints[failing], worth[failing])
+    return joints, measure(model, targets, joints)
+
+
+def _rescued(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -> Tensor:
+    """[S, T, n] better paths than ``joints`` [S, T, n], where there are any, for sequences with frames that fail.
+
+    Args:
+        problem: the problem of these sequences.
+        paths: their paths from the first frame.
+        joints: the best of those.
+        worth: [S] its worth.
+    """
+    if problem.targets.annotated.shape[1] > 1:
+        turned = problem.reversed()
+        backwards = branches(turned)
+        back, other = best(turned, backwards)
+        joints = torch.where((other > worth)[:, None, None], back.flip(1), joints)
+        paths = Paths.cat((paths, backwards.reversed()), dim=1)
     if problem.config.reseeds:
         reason = problem.reasons(joints)
         missed = torch.isin(reason, torch.tensor([REASONS.index(name) for name in _WRIST_MISSED]))
@@ -59,4 +82,4 @@ def track(
             new = repaired(part, paths[rows], missed[rows])
             better = (part.reasons(new) == 0).sum(1) > (reason[rows] == 0).sum(1)
             joints[rows[better]] = new[better]
-    return joints, measure(model, targets, joints)
+    return joints

@@ -76,7 +76,7 @@ class PageTest(unittest.TestCase):
     def test_every_public_name_is_in_the_reference(self):
         import xreset
 
-        headings = set(re.findall(r"heading: xreset\.(\w+)", (ROOT / "docs/reference.md").read_text()))
+        headings = set(re.findall(r"^::: xreset\.(\w+)$", (ROOT / "docs/reference.md").read_text(), re.MULTILINE))
         self.assertEqual(headings, {*xreset.__all__})
 
 

@@ -86,18 +86,18 @@ class Archive(InFolder):
         for demos, message in (
             (
                 self.changed("hand_keypoints", (begin + 3, 8, 1), np.nan),
-                "hand_keypoints is not finite in frame 3 of sequence 1",
+                "hand_keypoints is not finite.* First in frame 3 of sequence 1",
             ),
             (
                 self.changed("wrist_quat_wxyz", begin + 4, np.nan),
-                "wrist_quat_wxyz is not finite in frame 4 of sequence 1",
+                "wrist_quat_wxyz is not a unit .* frame 4 of sequence 1",
             ),
-            (self.changed("object_pos", (begin, 2), np.inf), "object_pos is not finite in frame 0 of sequence 1"),
+            (self.changed("object_pos", (begin, 2), np.inf), "object_pos is not finite.* frame 0 of sequence 1"),
             (
                 self.changed("object_quat_wxyz", end - 1, (1, 1, 0, 0)),
-                r"length 1.4142 in frame \d+ of sequence 1 .* unit",
+                r"not a unit quaternion.* frame \d+ of sequence 1",
             ),
-            (self.changed("object_pos", (begin, 2), 200), "object_pos is 200 m away in frame 0 of sequence 1"),
+            (self.changed("object_pos", (begin, 2), 200), "object_pos is .* more than 100 m .*frame 0 of sequence 1"),
             (self.changed("hand_side", 2, "Right"), r"sequence 2 .* hand_side 'Right', expected 'right' or 'left'"),
             (self.changed("frame_offsets", 2, 0), "frame_offsets must increase"),
             (self.changed("frame_offsets", -1, 5), "expected 0 to"),
@@ -118,7 +118,7 @@ class Archive(InFolder):
             arrays = dict(file)
         arrays["hand_keypoints"][7, 0, 0] = np.nan
         np.savez(bad, **arrays)
-        words = r"bad\.npz.*hand_keypoints is not finite in frame 7 of sequence 0 \(synthetic/005"
+        words = r"bad\.npz.*hand_keypoints is not finite.* in frame 7 of sequence 0 \(synthetic/005"
         with self.assertRaisesRegex(FileFormatError, words):
             read_demos(bad)
         arrays.pop("hand_valid")
@@ -297,8 +297,8 @@ class DexYCB(InFolder):
     def labels(self, serial, frame):
         return self.sequence / serial / f"labels_{frame:06d}.npz"
 
-    def check(self, **options):
-        read = read_dexycb(self.folder, **options)
+    def check(self):
+        read = read_dexycb(self.folder)
         self.assertEqual(read.sequence_name.tolist(), ["20200709-subject-01/20200709_141754"])
         self.assertEqual((read.object_name[0], read.hand_side[0], read.fps), ("010_potted_meat_can", "right", 30.0))
         self.assertEqual(read.hand_valid.tolist(), [False] + [True] * (self.demos.num_frames - 1))
@@ -308,25 +308,24 @@ class DexYCB(InFolder):
         self.assertLess(angles(read.object_quat_wxyz, self.demos.object_quat_wxyz).max(), 1e-5)
         self.assertLess(angles(read.wrist_quat_wxyz[1:], self.demos.wrist_quat_wxyz[1:]).max(), 1e-5)
 
-    def refused(self, message, **options):
+    def refused(self, message, root=None):
         with self.subTest(message), self.assertRaisesRegex(DemoError, message):
-            read_dexycb(**{"root": self.folder, **options})
+            read_dexycb(root or self.folder)
 
     def test_reads_back_the_table_frame(self):
         self.check()
         for frame in (4, 6, 7, 8):  # the other camera fills in
             self.labels(self.SERIALS[0], frame).unlink()
-        self.check(objects=["spam"], sides=["right"])
-        self.refused(r"None of the 1 sequences.*010_potted_meat_can \(right\)", objects=["soup"])
-        self.refused("None of the 1 sequences", sides=["left"])
-        with self.assertRaises(ObjectError):
-            read_dexycb(self.folder, objects=["teapot"])
+        self.check()
 
     def test_incomplete(self):
         for changes, message in (
             ({"num_frames": self.demos.num_frames + 1}, r"frames of meta\.yml: array .pose_y. has shape"),
             ({"serials": ["000000000000"]}, "no camera of meta.yml"),
-            ({"ycb_grasp_ind": 2}, "ycb_grasp_ind is 2"),
+            ({"ycb_grasp_ind": 2}, "not a meta.yml of DexYCB.*list index out of range"),
+            ({"mano_sides": ["up"]}, "side is out of range"),
+            ({"num_frames": "many"}, "invalid literal for int"),
+            ({"ycb_ids": [2, 99]}, "KeyError"),
         ):
             self.write_meta(**changes)
             self.refused(message)
@@ -348,8 +347,10 @@ class DexYCB(InFolder):
         marker = self.folder / "marker"
         for tag in (f"!!python/object/apply:os.mkdir ['{marker}']", "!!python/name:os.system"):
             (self.sequence / "meta.yml").write_text(f"extrinsics: {tag}\n")
-            self.refused("not valid YAML")
+            self.refused("not a meta.yml")
         self.assertFalse(marker.exists())
+        (self.sequence / "meta.yml").write_text("[" * 5000)
+        self.refused("not valid YAML")
 
 
 class RealData(unittest.TestCase):
@@ -592,12 +593,10 @@ class Commands(InFolder):
 
     def test_import(self):
         file = self.folder / "demos.npz"
-        code, out = run(
-            "demos", "import", "dexycb", data_dir() / "dexycb_layout", "--out", file, "--objects", "cheez-its"
-        )
+        code, out = run("demos", "import", "dexycb", data_dir() / "dexycb_layout", "--out", file)
         self.assertEqual(code, 0, out)
-        self.assertEqual(read_demos(file).object_name.tolist(), ["003_cracker_box"] * 2)
-        self.assertIn("2 sequences", out)
+        self.assertEqual(sorted(read_demos(file).hand_side.tolist()), ["left", "right", "right"])
+        self.assertIn("3 sequences", out)
 
     def test_errors_leave_no_file(self):
         file = self.folder / "demos.npz"

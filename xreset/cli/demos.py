@@ -21,24 +21,16 @@ from xreset.files import file_hash
 Side = Literal["right", "left", "both"]
 
 
-def import_dexycb(
-    folder: Source,
-    *,
-    out: Path,
-    objects: tuple[str, ...] = (),
-    side: Side = "both",
-) -> None:
+def import_dexycb(folder: Source, *, out: Path) -> None:
     """Read DexYCB in its own layout and write an archive of demonstrations.
 
     Args:
         folder: The folder that holds the subjects' folders and `calibration`.
         out: Archive to write.
-        objects: Only sequences that grasp one of these objects; default: all.
-        side: Only sequences of this hand.
     """
     with _progress("reading DexYCB") as progress:
-        demos = dexycb.read_dexycb(folder, objects=objects or None, sides=_sides(side), progress=progress)
-    _save(demos, out, {"dataset": "dexycb", "objects": list(objects), "side": side})
+        demos = dexycb.read_dexycb(folder, progress=progress)
+    _save(demos, out, {"dataset": "dexycb"})
 
 
 def import_ho3d(folder: Source, *, out: Path, fps: float, cameras: Path) -> None:
@@ -52,9 +44,7 @@ def import_ho3d(folder: Source, *, out: Path, fps: float, cameras: Path) -> None
         cameras: File with the camera's pose in the table frame (4x4, metres, as text or npy; x right, y down, z
             forward) for all sequences; or a folder with SEQUENCE.txt, where sequences without one are left out.
     """
-    with _progress("reading HO-3D") as progress:
-        demos = ho3d.read_ho3d(folder, fps=fps, cameras=cameras, progress=progress)
-    _save(demos, out, {"dataset": "ho3d", "fps": fps})
+    _save(ho3d.read_ho3d(folder, fps=fps, cameras=cameras), out, {"dataset": "ho3d", "fps": fps})
 
 
 def import_keypoints(
@@ -98,8 +88,7 @@ def import_keypoints(
         side=side,
         subject=subject,
     )
-    with _progress("reading keypoints") as progress:
-        demos = keypoints.read_keypoints(path, convention, progress=progress)
+    demos = keypoints.read_keypoints(path, convention)
     config = {"dataset": "keypoints", **vars(convention), "table_from_camera": None if T is None else T.tolist()}
     _save(demos, out, config, {"keypoints": file_hash(path)} if path.is_file() else {})
 
@@ -125,13 +114,15 @@ def synthesize(
         side: Hand.
         meshes: Folder of real meshes, with z up; default: the built-in stand-ins.
     """
+    parts = []
     with _progress("making demonstrations") as progress:
-        demos = archive.merge_demos(
-            [
-                synth.synthesize(objects or None, per_object, seed, fps=fps, side=s, meshes=meshes, progress=progress)
-                for s in _sides(side)
-            ]
-        )
+        for hand in ("right", "left"):
+            if side in (hand, "both"):
+                part = synth.synthesize(
+                    objects or None, per_object, seed, fps=fps, side=hand, meshes=meshes, progress=progress
+                )
+                parts.append(part)
+    demos = archive.merge_demos(parts)
     config = {"objects": list(objects), "per_object": per_object, "seed": seed, "fps": fps, "side": side}
     _save(demos, out, config)
 
@@ -223,8 +214,8 @@ def reflect(
 ) -> None:
     """Mirror demonstrations of left hands, so that a right-handed robot can train on them.
 
-    Only objects that are their own mirror image within the tolerance can be mirrored; the table shows which are left
-    out.
+    Only objects that are their own mirror image within the tolerance can be mirrored; the others are
+    listed.
 
     Args:
         file: Archive with left hands.
@@ -234,12 +225,9 @@ def reflect(
     """
     demos = archive.read_demos(file).select(sides=["left"])
     symmetries = {name: mirror.symmetry(spec) for name, spec in archive.demo_objects(demos, objects).items()}
-    table = Table("object", "distance to its reflection [mm]", "mirrored")
     for name, found in sorted(symmetries.items()):
-        table.add_row(
-            name, f"{1e3 * found.deviation:.1f}", "yes" if found.deviation <= tolerance else "no: not symmetric enough"
-        )
-    Console().print(table)
+        verdict = "mirrored" if found.deviation <= tolerance else "left out: not symmetric enough"
+        Console().print(f"{name}: {1e3 * found.deviation:.1f} mm from its reflection, {verdict}")
     result = mirror.mirrored(demos, symmetries, tolerance=tolerance)
     _save(result, out, {"mirrored": True, "tolerance": tolerance}, {"demos": file_hash(file)})
 
@@ -251,10 +239,6 @@ def describe(file: Source) -> None:
         file: The archive.
     """
     _print_summary(archive.read_demos(file), file)
-
-
-def _sides(side: Side) -> tuple[Literal["right", "left"], ...]:
-    return ("right", "left") if side == "both" else (side,)
 
 
 @contextmanager

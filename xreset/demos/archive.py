@@ -7,7 +7,7 @@ x, y, z). Poses are in the table frame: z up, table top at z = 0, the person at 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -143,27 +143,20 @@ class Demos(ObjectMotions):
             DemoError: unknown index, name, object, side or subject (the message names all of them), a share that is
                 none, or nothing is left.
         """
-        chosen = np.arange(self.num_sequences)
+        chosen = np.arange(len(self))
         if indices is not None:
             chosen = np.asarray(list(indices), dtype=np.int64)
-        if ((chosen < 0) | (chosen >= self.num_sequences)).any():
-            raise DemoError(
-                f"Unknown sequence index in {chosen.tolist()}: there are {self.num_sequences} sequences, counted from"
-                " 0."
-            )
-        if names is not None:
-            chosen = self._having("sequence_name", names, chosen)
+        if ((chosen < 0) | (chosen >= len(self))).any():
+            raise DemoError(f"Unknown sequence index in {chosen.tolist()}: there are {len(self)} sequences.")
         if objects is not None:
-            known = sorted(set(self.object_name.tolist()))
             try:
-                objects = canonical_names(objects, known)
+                objects = canonical_names(objects, sorted(set(self.object_name.tolist())))
             except ObjectError as error:
                 raise DemoError(f"The demonstrations lack an object: {error}") from None
-            chosen = self._having("object_name", objects, chosen)
-        if sides is not None:
-            chosen = self._having("hand_side", sides, chosen)
-        if subjects is not None:
-            chosen = self._having("subject", subjects, chosen)
+        wanted = {"sequence_name": names, "object_name": objects, "hand_side": sides, "subject": subjects}
+        for field, values in wanted.items():
+            if values is not None:
+                chosen = chosen[np.isin(getattr(self, field)[chosen], self._known(field, values))]
         if share is not None and not 0 < share <= 1:
             raise DemoError(f"The share is {share:g}, expected a number above 0 and at most 1.")
         if max_per_object is not None or share is not None:
@@ -189,15 +182,14 @@ class Demos(ObjectMotions):
             raise DemoError("Every sequence meets the conditions, so that none is left for the other part. Add one.")
         return kept, self.select(indices=others)
 
-    def _having(self, field: str, wanted: Iterable[str], chosen: np.ndarray) -> np.ndarray:
-        """Return those of the chosen sequences whose field has one of the wanted values."""
-        values = getattr(self, field)
+    def _known(self, field: str, wanted: Iterable[str]) -> list[str]:
+        """Return the wanted values of a field, all of which exist."""
         wanted = list(wanted)
-        known = sorted(set(values.tolist()))
+        known = sorted(set(getattr(self, field).tolist()))
         missing = [name for name in wanted if name not in known]
         if missing:
             raise DemoError(f"The demonstrations have no {field} {', '.join(missing)}. Choose from: {shown(known)}.")
-        return chosen[np.isin(values[chosen], wanted)]
+        return wanted
 
     def _few_per_object(
         self, chosen: np.ndarray, most: int, share: float, spread: bool, seed: int | None
@@ -315,19 +307,16 @@ def _without_repeats(parts: Sequence[Demos]) -> list[Demos]:
             first = owners.setdefault(name, number)
             if first == number:
                 new.append(i)
-            elif not _is_same(parts[first].select(names=[name]), part.select(indices=[i])):
+            elif _content(parts[first].select(names=[name])) != _content(part.select(indices=[i])):
                 raise DemoError(f"There are two different sequences of the name {name!r}. Rename one.")
         if new:
-            kept.append(part if len(new) == len(part) else part.select(indices=new))
+            kept.append(part.select(indices=new))
     return kept
 
 
-def _is_same(a: Demos, b: Demos) -> bool:
-    same = [np.array_equal(getattr(a, name), getattr(b, name)) for name in _PER_SEQUENCE]
-    for name in _PER_FRAME:
-        is_float = getattr(a, name).dtype.kind == "f"
-        same.append(np.array_equal(getattr(a, name), getattr(b, name), equal_nan=is_float))
-    return all(same)
+def _content(demos: Demos) -> list[Any]:
+    texts = [getattr(demos, name).tolist() for name in _PER_SEQUENCE]
+    return texts + [getattr(demos, name).tobytes() for name in _PER_FRAME]
 
 
 def read_demos(path: str | Path) -> Demos:
@@ -400,45 +389,37 @@ def _problem(arrays: Mapping[str, Any]) -> str | None:
         return "subjects and T_level_from_table belong together, but one of them is missing."
     if level is not None and not all(is_rigid(T) for T in np.asarray(level, dtype=float)):
         return "T_level_from_table has a matrix that is not a rotation and translation."
-    for bad, values, sentence in _frame_checks(arrays):
+    for problem, wrong in _wrong_in_frames(arrays).items():
+        bad = wrong.reshape(len(wrong), -1).any(axis=1)
         if bad.any():
             frame = int(np.argmax(bad))
             sequence = int(np.searchsorted(offsets, frame, side="right")) - 1
-            place = f"frame {frame - offsets[sequence]} of sequence {sequence} ({names[sequence]!s})"
-            return sentence.format(place=place, value=float(values[frame]))
+            return f"{problem} First in frame {frame - offsets[sequence]} of sequence {sequence} ({names[sequence]!s})."
     return None
 
 
-def _frame_checks(arrays: Mapping[str, Any]) -> Iterator[tuple[np.ndarray, np.ndarray, str]]:
-    """Yield the frames that are wrong [F] bool, a number of each frame [F], and a sentence, one check after another."""
+def _wrong_in_frames(arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return a sentence for each kind of problem -> [F, ...] bool, where it occurs."""
     valid = np.asarray(arrays["hand_valid"])
-    pos = arrays["object_pos"]
-    quat = arrays["object_quat_wxyz"]
     # the values of the hand's arrays do not matter in frames without a hand
     hand = np.where(valid[:, None, None], arrays["hand_keypoints"], 0.0)
     wrist = np.where(valid[:, None], arrays["wrist_quat_wxyz"], [1.0, 0.0, 0.0, 0.0])
-    hint = " If the hand is unknown there, set hand_valid to False."
-    yield _any(~np.isfinite(pos)), valid, "object_pos is not finite in {place}."
-    yield _any(~np.isfinite(quat)), valid, "object_quat_wxyz is not finite in {place}."
-    yield _any(~np.isfinite(hand)), valid, "hand_keypoints is not finite in {place}." + hint
-    yield _any(~np.isfinite(wrist)), valid, "wrist_quat_wxyz is not finite in {place}." + hint
-    for name, quats in (("object_quat_wxyz", quat), ("wrist_quat_wxyz", wrist)):
-        length = np.linalg.norm(quats, axis=1)
-        sentence = " has length {value:.4f} in {place}, expected unit quaternions."
-        yield np.abs(length - 1) > UNIT_TOLERANCE, length, name + sentence
-    reach = np.abs(pos).max(axis=1)
-    yield reach > POSITION[1], reach, "object_pos is {value:.4g} m away in {place}, expected metres in the table frame."
-    size = np.linalg.norm(hand[:, 1:] - hand[:, :1], axis=2).max(axis=1)
-    sentence = "hand_keypoints are up to {value:.4g} m from the wrist in {place}, expected the metres of a hand."
-    yield size > _HAND, size, sentence + " Are these millimetres?"
-    reach = np.abs(hand).max(axis=(1, 2))
-    yield (
-        reach > POSITION[1],
-        reach,
-        "hand_keypoints are {value:.4g} m away in {place}, expected metres in the table frame.",
-    )
+    with np.errstate(invalid="ignore"):
+        size = np.linalg.norm(hand[:, 1:] - hand[:, :1], axis=2)
+    hint = "If the hand is unknown there, set hand_valid to False."
+    far = f"not finite, or more than {POSITION[1]:g} m from the table."
+    problems = {
+        f"object_pos is {far}": _beyond(arrays["object_pos"], POSITION[1]),
+        f"hand_keypoints is not finite. {hint}": ~np.isfinite(hand),
+        f"hand_keypoints are more than {_HAND} m from the wrist. Are these millimetres?": _beyond(size, _HAND),
+        f"hand_keypoints is {far}": _beyond(hand, POSITION[1]),
+    }
+    for name, quats, advice in (("object_quat_wxyz", arrays["object_quat_wxyz"], ""), ("wrist_quat_wxyz", wrist, hint)):
+        off = _beyond(np.linalg.norm(quats, axis=1) - 1, UNIT_TOLERANCE)
+        problems[f"{name} is not a unit quaternion. {advice}".strip()] = off
+    return problems
 
 
-def _any(wrong: np.ndarray) -> np.ndarray:
-    """[F] bool: whether anything in a frame is wrong."""
-    return np.asarray(wrong.reshape(len(wrong), -1).any(axis=1))
+def _beyond(values: np.ndarray, limit: float) -> np.ndarray:
+    """Return where values are larger than the limit, or NaN."""
+    return ~(np.abs(values) <= limit)

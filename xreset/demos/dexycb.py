@@ -13,7 +13,7 @@ The world frame is the master camera's; the table frame is the AprilTag's. Objec
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,14 +25,11 @@ from scipy.spatial.transform import Rotation
 from xreset.checks import is_rigid
 from xreset.demos.archive import SIDES, Demos, Progress, merge_demos, no_progress, one_sequence
 from xreset.errors import DemoError, FileFormatError
-from xreset.objects.catalogue import canonical_names
 from xreset.objects.ycb import NAME_OF_ID
 from xreset.records import Field, read_npz
-from xreset.text import is_plain, shown
+from xreset.text import shown
 
 FPS = 30.0
-_MAX_FRAMES = 100_000
-"""An hour of frames; DexYCB's sequences have 72."""
 _MAX_YAML_BYTES = 1 << 20
 _Poses = Mapping[str, np.ndarray]
 """Camera serial, or ``apriltag`` -> pose [4, 4] in the world frame."""
@@ -56,45 +53,27 @@ class _Sequence:
         return f"{self.folder.parent.name}/{self.folder.name}"
 
 
-def read_dexycb(
-    root: str | Path,
-    *,
-    objects: Iterable[str] | None = None,
-    sides: Iterable[str] = SIDES,
-    progress: Progress = no_progress,
-) -> Demos:
+def read_dexycb(root: str | Path, *, progress: Progress = no_progress) -> Demos:
     """Read all sequences below a DexYCB folder, in the table frame.
 
     Args:
         root: the folder that holds the subjects' folders and ``calibration``.
-        objects: only sequences that grasp one of these (official names or the paper's).
-        sides: only sequences of these hands.
         progress: called with (sequences done, sequences in all, name) before each sequence is read.
 
     Raises:
         DemoError: the folder is not in DexYCB's layout, or parts of a sequence are missing or contradict each other.
-        ObjectError: a name in ``objects`` is not one of DexYCB's.
     """
     root = Path(root)
-    names = NAME_OF_ID.values()
-    wanted = set(names) if objects is None else set(canonical_names(objects, names))
     found = [_read_meta(path) for path in sorted(root.glob("*/*/meta.yml"))]
     if not found:
         raise DemoError(
             f"There is no DexYCB sequence in {root}: expected SUBJECT/SEQUENCE/meta.yml below it, such as"
             " 20200709-subject-01/20200709_141754/meta.yml. Give the folder that holds the subjects' folders."
         )
-    sides = set(sides)
-    chosen = [sequence for sequence in found if sequence.side in sides and sequence.object_name in wanted]
-    if not chosen:
-        known = ", ".join(sorted({f"{sequence.object_name} ({sequence.side})" for sequence in found}))
-        raise DemoError(
-            f"None of the {len(found)} sequences in {root} has the requested objects and hands. Choose from: {known}."
-        )
     calibrations: dict[str, _Poses] = {}
     parts = []
-    for done, sequence in enumerate(chosen):
-        progress(done, len(chosen), sequence.name)
+    for done, sequence in enumerate(found):
+        progress(done, len(found), sequence.name)
         if sequence.extrinsics not in calibrations:
             calibrations[sequence.extrinsics] = _read_extrinsics(root, sequence.extrinsics)
         parts.append(_read(sequence, calibrations[sequence.extrinsics]))
@@ -162,36 +141,28 @@ def _read_joints(sequence: _Sequence, frame: int, extrinsics: _Poses) -> np.ndar
 
 def _read_meta(path: Path) -> _Sequence:
     meta = _read_yaml(path)
-
-    def value(key: str, fits: Callable[[Any], bool], expected: str) -> Any:
-        if key not in meta:
-            raise DemoError(f"{path} has no {key}. Is it a DexYCB meta.yml?")
-        if not fits(meta[key]):
-            raise DemoError(f"{path}: {key} is {shown(meta[key])}, expected {expected}.")
-        return meta[key]
-
-    ids = value("ycb_ids", lambda x: isinstance(x, list) and all(type(i) is int for i in x), "a list of numbers")
-    index = value("ycb_grasp_ind", lambda x: type(x) is int and 0 <= x < len(ids), f"0 to {len(ids) - 1}")
-    frames = value("num_frames", lambda x: type(x) is int and 0 < x <= _MAX_FRAMES, f"1 to {_MAX_FRAMES}")
-    (side,) = value("mano_sides", lambda x: x in (["right"], ["left"]), "one of right and left")
-    serials = value("serials", lambda x: isinstance(x, list) and all(map(_is_name, x)), "a list of cameras")
-    extrinsics = value("extrinsics", lambda x: isinstance(x, str | int), "the name of a calibration")
-    if ids[index] not in NAME_OF_ID:
-        raise DemoError(f"{path}: the grasped object has YCB id {ids[index]}, expected 1 to {len(NAME_OF_ID)}.")
-    return _Sequence(
-        folder=path.parent,
-        extrinsics=str(extrinsics),
-        side=side,
-        object_name=NAME_OF_ID[ids[index]],
-        object_index=index,
-        num_objects=len(ids),
-        num_frames=frames,
-        serials=tuple(map(str, serials)),
-    )
-
-
-def _is_name(value: Any) -> bool:
-    return isinstance(value, str | int) and is_plain(str(value))
+    try:
+        ids = [int(number) for number in meta["ycb_ids"]]
+        index = int(meta["ycb_grasp_ind"])
+        frames = int(meta["num_frames"])
+        (side,) = meta["mano_sides"]
+        if index < 0 or frames < 1 or side not in SIDES:
+            raise ValueError("a number or a side is out of range")
+        return _Sequence(
+            folder=path.parent,
+            extrinsics=str(meta["extrinsics"]),
+            side=side,
+            object_name=NAME_OF_ID[ids[index]],
+            object_index=index,
+            num_objects=len(ids),
+            num_frames=frames,
+            serials=tuple(map(str, meta["serials"])),
+        )
+    except (LookupError, TypeError, ValueError) as error:
+        raise DemoError(
+            f"{path} is not a meta.yml of DexYCB, with extrinsics, mano_sides, num_frames, serials, ycb_grasp_ind and"
+            f" ycb_ids: {shown(error)}."
+        ) from error
 
 
 def _read_extrinsics(root: Path, name: str) -> _Poses:
@@ -201,29 +172,22 @@ def _read_extrinsics(root: Path, name: str) -> _Poses:
         raise DemoError(f"{path} has no pose 'apriltag' under 'extrinsics': without it the table frame is unknown.")
     poses = {}
     for key, values in entries.items():
-        numbers = isinstance(values, list | tuple) and all(type(x) in (int, float) and abs(x) < 1e6 for x in values)
-        if not numbers or len(values) != 12:
-            raise DemoError(
-                f"{path}: the pose {shown(key)} is {shown(values)}, expected the 12 numbers of a 3x4 matrix."
-            )
         T = np.eye(4)
-        T[:3] = np.asarray(values, dtype=float).reshape(3, 4)
+        try:
+            T[:3] = np.array([float(value) for value in values]).reshape(3, 4)
+        except (TypeError, ValueError):
+            T[:] = np.nan
         if not is_rigid(T):
             raise DemoError(
-                f"{path}: the pose {shown(key)} is not a rotation and translation: it is scaled, mirrored or damaged."
+                f"{path}: the pose {shown(key)} is {shown(values)}, expected the 12 numbers of a rotation and a"
+                " translation (3x4)."
             )
         poses[str(key)] = T
     return poses
 
 
-class _Loader(yaml.SafeLoader):
-    """Plain YAML and ``!!python/tuple``, which DexYCB's calibration uses; every other tag is refused."""
-
-
-_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _Loader.construct_sequence)
-
-
 def _read_yaml(path: Path) -> dict[str, Any]:
+    """Return what a YAML file holds; numbers stay texts, and tags, which may name code, have no effect."""
     if not path.is_file():
         raise DemoError(
             f"There is no {path}; the DexYCB folder is incomplete. Unpack its calibration archive next to the"
@@ -232,7 +196,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > _MAX_YAML_BYTES:
             raise ValueError("it has more than a megabyte")
-        data = yaml.load(path.read_text(), Loader=_Loader)
+        data = yaml.load(path.read_text(), Loader=yaml.BaseLoader)
     except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise DemoError(f"{path} is not valid YAML: {shown(str(error) or 'it is nested too deeply')}") from error
     if not isinstance(data, dict):

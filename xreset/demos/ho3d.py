@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.demos.archive import Demos, Progress, merge_demos, no_progress
+from xreset.demos.archive import Demos, merge_demos
 from xreset.demos.keypoints import Convention, read_transform, sequence_of
 from xreset.demos.pickles import array_of, read_pickle
 from xreset.errors import DemoError
@@ -31,7 +31,6 @@ def read_ho3d(
     *,
     fps: float,
     cameras: str | Path,
-    progress: Progress = no_progress,
 ) -> Demos:
     """Read the training sequences below an HO-3D folder that have a camera pose.
 
@@ -41,7 +40,6 @@ def read_ho3d(
         cameras: a file with the camera's pose in the table frame for all sequences (x right, y down, z forward; see
             :func:`xreset.demos.keypoints.read_transform`), or a folder with ``SEQUENCE.txt`` or ``.npy``, where
             sequences without one are omitted.
-        progress: called with (sequences done, sequences in all, name) before each is read.
 
     Raises:
         DemoError: the folder is not in this layout, or a sequence contradicts itself.
@@ -63,9 +61,8 @@ def read_ho3d(
             f" {folders[0].parent.name}.txt."
         )
     parts = []
-    for done, (folder, pose) in enumerate(poses.items()):
+    for folder, pose in poses.items():
         name = folder.parent.name
-        progress(done, len(poses), name)
         convention = Convention(
             order="mano",
             units="m",

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from xreset.checks import is_rigid
 from xreset.demos import hand
-from xreset.demos.archive import SIDES, Demos, Progress, merge_demos, no_progress, one_sequence
+from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
 from xreset.errors import DemoError
 from xreset.files import max_bytes
 from xreset.objects.catalogue import official_name
@@ -114,14 +114,9 @@ class Convention:
 def read_keypoints(
     path: str | Path,
     convention: Convention | None = None,
-    *,
-    progress: Progress = no_progress,
 ) -> Demos:
     """Read a tracker's sequences: an npz (one sequence), a CSV (one, or several with a column ``sequence``), or a
     folder of them.
-
-    Args:
-        progress: called with (files done, files in all, name) before each file is read.
 
     Returns:
         The demonstrations in metres and in the table frame. The wrist's orientation is that of five keypoints (wrist
@@ -145,9 +140,8 @@ def read_keypoints(
                 f"There is no .npz and no .csv file below {path}. Give a folder with a file for each sequence."
             )
     parts = []
-    for done, file in enumerate(files):
+    for file in files:
         name = file.relative_to(folder).with_suffix("").as_posix()
-        progress(done, len(files), name)
         sequences = _read_csv(file, name) if file.suffix == ".csv" else [_read_npz(file, name)]
         for arrays in sequences:
             parts.append(sequence_of(arrays, f"{file}, sequence {arrays['sequence']}", convention))

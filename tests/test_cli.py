@@ -10,7 +10,6 @@ import unittest
 from unittest import mock
 
 from xreset.cli import COMMANDS, main
-from xreset.cli._terminal import Console, Progress
 from xreset.cli.engines import COMMANDS as ENGINES
 
 HEAVY = (
@@ -163,17 +162,6 @@ class UsageTest(unittest.TestCase):
         self.assertEqual(code, 1)
         self.assertIn("red", err)
         self.assertNotIn("\x1b", err)
-
-    def test_progress_shows_in_a_log(self):
-        out = io.StringIO()
-        clock = mock.patch("xreset.cli._terminal.perf_counter", side_effect=[0.0, 10.0, 21.0, 25.0])
-        with clock, Progress(Console(file=out)) as bar:
-            task = bar.add_task("[placements]", total=4)
-            for done in (1, 2, 3):
-                bar.update(task, completed=done)
-        self.assertEqual(
-            [line for line in out.getvalue().splitlines() if "%" in line and "━" not in line], ["[placements]: 50 %"]
-        )
 
     def test_an_engine_that_does_not_exist(self):
         code, _, err = run("engines", "check", "--backend", "bulet")

@@ -7,14 +7,11 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
-from time import perf_counter
 from typing import Any
 
 import rich.console
 import rich.progress
 from rich.text import Text
-
-_LOG_SECONDS = 20.0
 
 
 class Console(rich.console.Console):
@@ -39,7 +36,7 @@ console = Console()
 
 
 class Progress(rich.progress.Progress):
-    """Progress bars, which vanish at the end. A log, which cannot show a bar, gets a line every 20 seconds."""
+    """Progress bars, which vanish at the end."""
 
     def __init__(self, where: Console = console) -> None:
         super().__init__(
@@ -50,15 +47,6 @@ class Progress(rich.progress.Progress):
             console=where,
             transient=True,
         )
-        self._said = perf_counter()
-
-    def update(self, task_id: rich.progress.TaskID, **changes: Any) -> None:
-        """See :meth:`rich.progress.Progress.update`."""
-        super().update(task_id, **changes)
-        if not self.console.is_terminal and (now := perf_counter()) - self._said > _LOG_SECONDS:
-            self._said = now
-            task = self._tasks[task_id]
-            self.console.print(f"{task.description}: {task.percentage:.0f} %")
 
     def count(self, what: str) -> Callable[[float, float], None]:
         """Add a bar; returns the function that moves it: (done, in all)."""

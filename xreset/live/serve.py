@@ -21,8 +21,6 @@ with needs("websockets", "serve"):
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.server import Server, ServerConnection, serve
 
-_CLIENTS = 8
-"""Clients at the same time: each has a network of its own."""
 _LARGEST = 1 << 20
 """Bytes of a message."""
 _PATIENCE = 5.0
@@ -76,22 +74,16 @@ class PolicyServer:
 
     def _talk(self, client: ServerConnection) -> None:
         who = "{}:{}".format(*client.remote_address[:2])
-        steps = 0
         try:
-            if len(self._clients) >= _CLIENTS:
-                client.send(json.dumps({"error": f"{_CLIENTS} clients are connected, which is the limit."}))
-                return
             self._clients.add(client)
             self._log.warning("%s has connected.", who)
             episode = _Episode(Controller(self._contract, OnnxActor(self._policy)))
             client.send(json.dumps({"schema": LIVE_SCHEMA, "contract": self._contract}))
             for message in client:
-                answer = episode.answer(message)
-                steps += "target" in answer
-                client.send(json.dumps(answer))
-            self._log.warning("%s has left after %d steps.", who, steps)
+                client.send(json.dumps(episode.answer(message)))
+            self._log.warning("%s has left.", who)
         except ConnectionClosed:
-            self._log.warning("%s has gone without a word after %d steps.", who, steps)
+            self._log.warning("%s has gone without a word.", who)
         finally:
             self._clients.discard(client)
 

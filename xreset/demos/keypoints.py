@@ -200,69 +200,49 @@ def _read_npz(path: Path, name: str) -> dict[str, np.ndarray]:
     return {"sequence": np.array(name)} | read_npz(path, None, _FILE, what="a tracker's keypoints")
 
 
-def _read_csv(path: Path, name: str) -> list[dict[str, np.ndarray]]:
-    """Read the sequences of a table with one row for each frame; the frames of a sequence stand together."""
+def _read_csv(path: Path, name: str) -> Iterator[dict[str, np.ndarray]]:
+    """Yield the arrays of each sequence of a table with one row for each frame, as an npz would hold them; an empty
+    cell is NaN. The frames of a sequence stand together."""
+    arrays: dict[str, np.ndarray] = {}
     try:
         if path.stat().st_size > max_bytes():
             raise ValueError(f"it has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows")
         with open(path, newline="", encoding="utf-8-sig") as file:
-            header, *lines = csv.reader(file, strict=True)
+            rows = [row for row in csv.reader(file, strict=True) if row]
+        columns = list(zip(*rows, strict=True))
+        table = {column.strip(): cells for column, *cells in columns}
+        if len(table) < len(columns):
+            raise ValueError("several columns have the same name")
+        if len(rows) < 2:
+            raise ValueError("it has no frame")
+        for field, names in _COLUMNS.items():
+            missing = sorted(set(names) - set(table))
+            if not missing:
+                numbers = np.column_stack([_numbers(table.pop(column)) for column in names])
+                arrays[field] = numbers.reshape(-1, *_FILE[field].shape[1:])
+            elif field == "keypoints" or len(missing) < len(names):
+                raise ValueError(f"it lacks the columns {shown(missing)} of {field} (docs/demonstrations.md)")
     except (OSError, ValueError, csv.Error) as error:
         raise DemoError(f"{path} cannot be read as a CSV table: {error}.") from error
-    header = [cell.strip() for cell in header]
-    fields = _fields_of(header, path)
-    rows = []
-    for number, cells in enumerate(lines, start=2):
-        if len(cells) != len(header):
-            raise DemoError(f"{path}, line {number}: {len(cells)} cells, expected {len(header)} as in the first line.")
-        rows.append({"sequence": name} | dict(zip(header, map(str.strip, cells), strict=True)))
-    if not rows:
-        raise DemoError(f"{path} has no line after the names of its columns.")
-    sequences = []
-    for sequence, part in groupby(rows, key=lambda row: row["sequence"]):
-        try:
-            sequences.append(_arrays_of(list(part), fields))
-        except (DemoError, ValueError) as error:
-            raise DemoError(f"{path}, sequence {sequence}: {shown(str(error))}.") from None
-    return sequences
-
-
-def _fields_of(header: Sequence[str], path: Path) -> list[str]:
-    """Return the arrays that the columns hold."""
-    known = {*_TEXTS, "frame"}
-    fields = []
-    for field, columns in _COLUMNS.items():
-        missing = sorted(set(columns) - set(header))
-        if missing and (field == "keypoints" or len(missing) < len(columns)):
-            raise DemoError(
-                f"{path} lacks the columns {shown(missing)} of {field} (docs/demonstrations.md). Found: {shown(header)}"
-            )
-        if not missing:
-            fields.append(field)
-            known.update(columns)
-    unknown = sorted(set(header) - known)
+    texts = {text: table.pop(text) for text in _TEXTS if text in table}
+    unknown = sorted(set(table) - {"frame"})
     if unknown:
         logging.getLogger(__name__).warning("%s also has the columns %s, which are ignored.", path, shown(unknown))
-    if len(set(header)) < len(header):
-        raise DemoError(f"{path} has columns of the same name: {shown(sorted(header))}. Rename them.")
-    return fields
+    frames = range(len(rows) - 1)
+    sequences = texts.pop("sequence", [name] * len(frames))
+    for sequence, part in groupby(frames, key=sequences.__getitem__):
+        own = list(part)
+        found = {"sequence": np.array(sequence)} | {field: values[own] for field, values in arrays.items()}
+        for text, cells in texts.items():
+            values = {cells[frame].strip() for frame in own}
+            if len(values) > 1:
+                raise DemoError(f"{path}, sequence {sequence}: the column {text} changes: {shown(sorted(values))}.")
+            found[text] = np.array(values.pop())
+        yield found
 
 
-def _arrays_of(rows: Sequence[Mapping[str, str]], fields: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return the arrays of one sequence, as an npz would hold them; an empty cell is NaN."""
-    arrays = {}
-    for text in _TEXTS:
-        values = sorted({row[text] for row in rows if text in row})
-        if len(values) > 1:
-            raise DemoError(f"the column {text} changes: {shown(values)}")
-        if values:
-            arrays[text] = np.array(values[0])
-    for field in fields:
-        numbers: list[float] = []
-        for row in rows:
-            numbers.extend(float(row[column] or "nan") for column in _COLUMNS[field])
-        arrays[field] = np.array(numbers).reshape(-1, *_FILE[field].shape[1:])
-    return arrays
+def _numbers(cells: Sequence[str]) -> np.ndarray:
+    return np.array([float(cell.strip() or "nan") for cell in cells])
 
 
 # One sequence
@@ -417,7 +397,7 @@ def _evenly(arrays: Mapping[str, np.ndarray], convention: Convention, motion: Mo
         return rate, motion
     time = np.asarray(arrays["time"], dtype=float)
     steps = np.diff(time)
-    if len(time) < 2 or not np.isfinite(time).all() or (steps <= 0).any():
+    if len(time) < 2 or not (steps > 0).all():
         raise DemoError("time must increase from frame to frame.")
     own = 1 / float(np.median(steps))
     if not 2 <= own <= RATE[1] or (own > 500 and convention.fps is None):

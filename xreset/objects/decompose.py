@@ -312,15 +312,16 @@ class _Cutter:
         most = self._settings.max_pieces
         tolerance = _QUICK * self._settings.tolerance
         parts = [part for part in self._solid.solid.decompose() if part.volume() > _SPECK]
-        parts, _ = self._cut_worst(parts, self._quick_excess, self._best_cut, tolerance, int(2 * _FEW * most))
-        pieces = [part.hull() for part in parts]
+        cut = self._cut_worst(parts, self._quick_excess, self._best_cut, tolerance, int(2 * _FEW * most))
+        pieces = [part.hull() for *_, part in cut]
         tolerance = max(tolerance, *(self._solid.excess(piece, quick=True) for piece in pieces))
         pieces = self._joined(pieces, tolerance)
         while len(pieces) > _FEW * most and self.effort > 0:
             tolerance *= 1.1
             pieces = self._joined(pieces, tolerance)
-        pieces, deviation = self._cut_worst(pieces, self._excess, self._cut_piece, self._settings.tolerance, most)
-        return [_shape(piece) for piece in pieces], deviation
+        cut = self._cut_worst(pieces, self._excess, self._cut_piece, self._settings.tolerance, most)
+        cut.sort(key=lambda entry: entry[1])
+        return [_shape(piece) for *_, piece in cut], max(-excess for excess, *_ in cut)
 
     def _spend(self, *solids: Manifold) -> None:
         self.effort -= sum(solid.num_tri() for solid in solids)
@@ -332,27 +333,34 @@ class _Cutter:
         cut: Callable[[Manifold], list[Manifold]],
         tolerance: float,
         most: int,
-    ) -> tuple[list[Manifold], float]:
+    ) -> list[tuple[float, int, Manifold]]:
         """Cut the part with the largest excess until none exceeds the tolerance, or there would be too many.
 
         Returns:
-            The parts, and the largest excess that is left [m].
+            The negative excess that is left [m], a running number, and the part, of all parts.
         """
         count = itertools.count()
         queue: list[tuple[float, int, Manifold]] = []
         whole: list[tuple[float, int, Manifold]] = []
+
+        def add(part: Manifold) -> None:
+            entry = (-excess(part), next(count), part)
+            if -entry[0] > tolerance:
+                heapq.heappush(queue, entry)
+            else:
+                whole.append(entry)
+
         for part in parts:
-            heapq.heappush(queue, (-excess(part), next(count), part))
-        while queue and -queue[0][0] > tolerance and self.effort > 0:
+            add(part)
+        while queue and len(queue) + len(whole) < most and self.effort > 0:
             worst = heapq.heappop(queue)
             smaller = cut(worst[2])
             if 1 < len(smaller) <= most - len(queue) - len(whole):
                 for part in smaller:
-                    heapq.heappush(queue, (-excess(part), next(count), part))
+                    add(part)
             else:
                 whole.append(worst)
-        made = sorted(whole + queue, key=lambda entry: entry[1])
-        return [part for *_, part in made], max(-excess for excess, *_ in made)
+        return whole + queue
 
     def _quick_excess(self, part: Manifold) -> float:
         self._spend(self._solid.solid, part)

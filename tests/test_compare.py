@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from torch.utils.tensorboard import SummaryWriter
 
 from tests.test_cli import run
 from tests.toy_results import ENGINES, InFolder, rollouts_with, toy_rollouts
@@ -22,7 +23,6 @@ from xreset.eval.stats import bootstrap_ci95, crossed_bootstrap_ci95, wilson_ci9
 from xreset.eval.table import escape
 from xreset.learning.clock import Lift, LiftClock, Passing
 from xreset.learning.config import TrainConfig
-from xreset.learning.curves import CurveFile
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
 
 WORLDS, HORIZON = 64, 16
@@ -160,9 +160,10 @@ class ReadTest(Compared):
     def test_event_files_whose_head_or_tail_is_cut(self):
         """Cut anywhere: the head is missed, what is left of a tail is read as it was."""
         a = self.write_run("a")
-        curves = CurveFile(a)
+        curves = SummaryWriter(str(a))
         for step in range(1, 5):
-            curves.write(step, {"task/success": step / 8, "task/grasped": 0.5})
+            curves.add_scalar("task/success", step / 8, step)
+            curves.add_scalar("task/grasped", 0.5, step)
         curves.close()
         (file,) = a.glob("events*")
         whole = file.read_bytes()

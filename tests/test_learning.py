@@ -138,23 +138,6 @@ class ModelTest(unittest.TestCase):
             self.assertLess(float((found - expected).norm()), 0.01 * float(expected.norm()))
             self.assertGreater(float((found - expected).norm()), 0.0)
 
-    def test_reused_embeddings_are_those_of_the_whole_history(self):
-        first = firsts((3, 0), (6, 2))
-        dones = first.roll(-1, dims=0)
-        plain, reusing, obs = make_model(), make_model(), with_real_history(observations(T, N), first)
-        reusing.reuse_embeddings = True
-        for t in range(T):
-            torch.testing.assert_close(reusing(obs[t]), plain(obs[t]))
-            for model in (plain, reusing):
-                model.reset(dones[t])
-        with torch.no_grad():
-            for model in (plain, reusing):
-                model(
-                    obs, masks=first, hidden_state=(torch.zeros(1, N, 12), torch.zeros(1, N, 12))
-                )  # as an update does
-                model.trunk.pointnet.mlp[0].weight.mul_(2.0)
-        torch.testing.assert_close(reusing(obs[T - 1]), plain(obs[T - 1]))
-
     def test_gradients_do_not_cross_an_episode_end(self):
         model, obs = make_model(), observations(T, N)
         obs["policy"].requires_grad_(True)
@@ -445,8 +428,10 @@ class ConfigTest(unittest.TestCase):
     def test_removed_options_are_ignored_where_they_were_off(self):
         """Files of earlier versions hold them."""
         data = asdict(TrainConfig())
-        data["model"] |= {"initial_hand_std": None, "synergy_std": None}
+        data["model"] |= {"initial_hand_std": None, "synergy_std": None, "activation": "elu"}
         data["ppo"]["critic_learning_rate"] = None
+        data["schedule"]["demo_probability"] = []
+        data["random_episode_start"] = True
         self.assertEqual(from_dict(TrainConfig, data), TrainConfig())
         data["model"]["synergy_std"] = 0.4
         with self.assertRaisesRegex(FileFormatError, r"model\.synergy_std is 0\.4\. This option was removed"):

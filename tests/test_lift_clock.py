@@ -7,10 +7,12 @@ import unittest
 from pathlib import Path
 from unittest import mock
 
+import torch
+
 from xreset.errors import FileFormatError, XResetError
 from xreset.files import write_json
 from xreset.learning.clock import FILE, Lift, LiftClock, read_lift
-from xreset.learning.curves import CurveFile
+from xreset.learning.log import TrainingLog
 
 
 class LiftClockTest(unittest.TestCase):
@@ -61,23 +63,30 @@ class LiftClockTest(unittest.TestCase):
 class CurvesTest(unittest.TestCase):
     def test_curves_are_sent_only_if_a_project_is_named(self):
         online = mock.Mock()
+        log = {
+            "task/success_from_home": torch.tensor(0.5),
+            "task/grasped": torch.ones(()),
+            "task/success": torch.ones(()),
+        }
         with tempfile.TemporaryDirectory() as name, mock.patch.dict("sys.modules", {"wandb": online}):
             folder = Path(name)
-            CurveFile(folder).close()
-            online.init.assert_not_called()
             write_json(folder / "run.json", {"a": 1})
-            curves = CurveFile(folder, "project")
-            curves.write(3, {"speed": 2.0})
-            curves.close()
+            for project in (None, "project"):
+                curves = TrainingLog(folder, 2, "cpu", 5, project)
+                curves.add(torch.ones(2), torch.zeros(2), log)
+                curves.write(3, 10, 1.0, {"speed/env_steps_per_second": 2.0})
+                curves.close(stopped=False)
+                self.assertEqual(online.init.called, project is not None)
             self.assertEqual(online.init.call_args.kwargs["project"], "project")
             self.assertEqual(online.init.call_args.kwargs["config"], {"a": 1})
-            online.init.return_value.log.assert_called_once_with({"speed": 2.0}, step=3)
+            sent = online.init.return_value.log.call_args
+            self.assertEqual((sent.args[0]["task/success_from_home"], sent.kwargs), (0.5, {"step": 3}))
             online.init.return_value.finish.assert_called_once_with()
             with (
                 mock.patch.dict("sys.modules", {"wandb": None}),
                 self.assertRaisesRegex(XResetError, r"xreset\[wandb\]"),
             ):
-                CurveFile(folder, "project")
+                TrainingLog(folder, 2, "cpu", 5, "project")
 
 
 if __name__ == "__main__":

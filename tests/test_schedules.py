@@ -4,13 +4,10 @@ import unittest
 from types import SimpleNamespace
 
 import numpy as np
-import torch
 
 from xreset.learning.config import TrainConfig
 from xreset.learning.runner import TrainingRunner
 from xreset.learning.schedules import ScheduleConfig, value_at
-from xreset.learning.train import uses_bank
-from xreset.task.config import ResetConfig, TaskConfig
 
 
 class ScheduleTest(unittest.TestCase):
@@ -26,16 +23,7 @@ class ScheduleTest(unittest.TestCase):
                 self.subTest(points=points),
                 self.assertRaisesRegex(ValueError, "each share greater than the one before"),
             ):
-                ScheduleConfig(demo_probability=points)
-
-    def test_a_training_moves_the_share_of_demonstrated_states(self):
-        resets = SimpleNamespace(demo_probability=torch.tensor(0.5))
-        runner = SimpleNamespace(world=SimpleNamespace(resets=resets), train_config=TrainConfig())
-        TrainingRunner._follow_schedule(runner, 0.5)
-        self.assertEqual(float(resets.demo_probability), 0.5)
-        runner.train_config = TrainConfig(schedule=ScheduleConfig(demo_probability=((0.0, 1.0), (1.0, 0.0))))
-        TrainingRunner._follow_schedule(runner, 0.75)
-        self.assertEqual(float(resets.demo_probability), 0.25)
+                ScheduleConfig(faults=points)
 
     def test_a_training_moves_its_limit_of_success_and_its_faults(self):
         set_to = []
@@ -47,13 +35,6 @@ class ScheduleTest(unittest.TestCase):
         for progress in (0.25, 1.0):
             TrainingRunner._follow_schedule(runner, progress)
         np.testing.assert_allclose(set_to, (0.04, 0.5, 0.01, 1.0))
-
-    def test_a_bank_is_needed_where_its_states_are_used(self):
-        home = TaskConfig(reset=ResetConfig(demo_probability=0.0))
-        later = ScheduleConfig(demo_probability=((0.0, 0.0), (1.0, 0.5)))
-        self.assertTrue(uses_bank(TrainConfig()))
-        self.assertFalse(uses_bank(TrainConfig(task=home)))
-        self.assertTrue(uses_bank(TrainConfig(task=home, schedule=later)))
 
 
 if __name__ == "__main__":

@@ -76,7 +76,6 @@ class RewardTest(unittest.TestCase):
             "goal_quat": IDENTITY,
             "start_pos": torch.tensor([0.5, 0.3, 0.1]),
             "start_quat": IDENTITY,
-            "keypoints": torch.tensor([[0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05], [0, 0, 0.0]]),
             "action": torch.zeros(4),
             "previous_action": torch.zeros(4),
             "out_of_bounds": torch.tensor(False),

@@ -8,7 +8,6 @@ import os
 import resource
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import threading
@@ -153,9 +152,9 @@ class TrainingTest(unittest.TestCase):
                 base = RECIPES[name].config
                 small = replace(base.model, lstm=16)
                 config = replace(base, model=small, ppo=replace(base.ppo, mini_epochs=1), iterations=2)
-                out = self.train(f"recipe-{name}", config=config, num_envs=8)
+                out = self.train(f"recipe-{name}", config=config)
                 content = newest(out)
-                self.assertEqual((content["iteration"], content["env_steps"]), (2, 2 * 8 * config.ppo.horizon))
+                self.assertEqual((content["iteration"], content["env_steps"]), (2, 2 * 4 * config.ppo.horizon))
                 for value in content["actor_state_dict"].values():
                     self.assertTrue(bool(value.isfinite().all()))
 
@@ -171,67 +170,6 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual(
             set(steps), {3 * 2 * 2}
         )  # iterations x epochs x minibatches: the optimiser was not started anew
-
-    def test_resume_goes_on_in_the_middle_of_episodes(self):
-        """Two iterations and one more are three in one go, up to the engine's warm start and the single precision of the saved state."""
-        config = replace(CONFIG, iterations=3)
-        runs = whole, parts, worldless = (
-            self.train("whole", config=config),
-            self.train("parts"),
-            self.train("worldless"),
-        )
-        (worldless / "worlds.pt").write_bytes(b"damaged")
-        self.assertNotIn("episodes start again", self.resume(parts, iterations=3))
-        self.assertIn("episodes start again", self.resume(worldless, iterations=3))
-
-        one, two = newest(whole), newest(parts)
-        for name, value in one["actor_state_dict"].items():
-            torch.testing.assert_close(two["actor_state_dict"][name], value, rtol=1e-3, atol=3e-3, msg=name)
-        self.assertEqual((two["iteration"], two["learning_rate"]), (3, one["learning_rate"]))
-
-        worlds = [torch.load(run / "worlds.pt", weights_only=True) for run in runs]
-        self.assertEqual([content["iteration"] for content in worlds], [3, 3, 3])
-        one, two, other = (content["processes"][0]["env"] for content in worlds)
-        self.assertTrue(torch.equal(one["env._episode_length"], two["env._episode_length"]))
-        self.assertFalse(
-            torch.equal(one["env._episode_length"], other["env._episode_length"])
-        )  # new episodes, at random times
-        for name, atol in (
-            ("state.joint_pos", 2e-3),
-            ("state.object_pos", 1e-4),
-            ("env._cloud", 1e-4),
-            ("env.goal_pos", 0.0),
-        ):
-            torch.testing.assert_close(two[name], one[name], rtol=0, atol=atol, msg=name)
-        one, two, _ = (content["log"] for content in worlds)
-        torch.testing.assert_close(two["lengths"], one["lengths"])
-        self.assertEqual(len(two["recent"]), 3)
-
-    def test_a_killed_run_loses_no_more_than_the_last_save_interval(self):
-        out = self.folder / "killed"
-        flags = (
-            f"--out {out} --robot openarm --resets {self.bank} --backend mujoco --device cpu --num-envs 8 "
-            "--config.save-interval 2 --config.task.observation.cloud-points 16 --config.task.distance-points 64 "
-            "--config.model.pointnet 8 6 --config.model.lstm 12 --config.model.mlp 16 --config.ppo.minibatch-size 32"
-        )
-        command = [sys.executable, "-m", "xreset", "train", *flags.split()]
-        with subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-        ) as process:
-            self.addCleanup(process.kill)
-            end = time.monotonic() + 120
-            while len(checkpoints(out)) < 3 and process.poll() is None and time.monotonic() < end:
-                time.sleep(0.02)
-            os.killpg(process.pid, signal.SIGKILL)  # the engine's workers too
-        self.assertEqual(process.returncode, -signal.SIGKILL)
-        before = newest(out)  # whole, however the run ended
-        self.assertGreaterEqual(before["iteration"], 6)
-        self.assertEqual(before["env_steps"], before["iteration"] * 16 * 8)
-        resume(out, iterations=before["iteration"] + 1)
-        after = newest(out)
-        self.assertEqual(after["iteration"], before["iteration"] + 1)
-        self.assertEqual(after["env_steps"], before["env_steps"] + 16 * 8)
-        self.assertTrue((out / "policy.onnx").is_file())
 
     def test_the_same_ctrl_c_told_twice_is_one(self):
         with _stop_on_interrupt() as stop:
@@ -255,11 +193,10 @@ class TrainingTest(unittest.TestCase):
 
         threading.Thread(target=interrupt, daemon=True).start()
         endless = replace(CONFIG, iterations=100000, save_interval=100000)
-        train(self.bank, out=out, **self.options(config=endless))
+        self.train("stopped", config=endless)
         content = newest(out)
         self.assertGreater(content["iteration"], 0)
         self.assertEqual(latest_checkpoint(out).name, f"{content['iteration']:06d}.pt")
-        self.assertTrue((out / "policy.onnx").is_file())
 
     def test_a_configuration_starts_from_a_recipe_or_from_another_run(self):
         def parsed(*arguments: str) -> TrainConfig:
@@ -496,14 +433,13 @@ class TrainingTest(unittest.TestCase):
             self.train("full", config=config)
         full_at(limits[0])
         self.train("full", config=config)
-        for size, said in ((20_000, r"cannot write .*\.pt"), (200, "cannot write the learning curves.*--resume")):
-            full_at(size)
-            unchanged = mock.patch("xreset.learning.train.write_run")
-            with self.subTest(size), unchanged, self.assertRaisesRegex(XResetError, said):
-                self.resume(out, iterations=3)
-            full_at(limits[0])
-            self.assertEqual(newest(out)["iteration"], 1)
-            self.assertFalse([f.name for f in out.rglob("*.part")])
+        full_at(20_000)
+        unchanged = mock.patch("xreset.learning.train.write_run")
+        with unchanged, self.assertRaisesRegex(XResetError, r"cannot write .*\.pt"):
+            self.resume(out, iterations=3)
+        full_at(limits[0])
+        self.assertEqual(newest(out)["iteration"], 1)
+        self.assertFalse([f.name for f in out.rglob("*.part")])
         self.resume(out, iterations=2)
         self.assertEqual(newest(out)["iteration"], 2)
 
@@ -518,20 +454,6 @@ class TrainingTest(unittest.TestCase):
             broken = mock.patch.object(TrainingRunner, "learn", side_effect=error)
             with self.subTest(error), broken, self.assertRaisesRegex(wanted, said):
                 self.train("memory")
-
-    def test_damaged_worlds_begin_episodes_anew(self):
-        out = self.train("damaged-worlds")
-        whole = torch.load(out / "worlds.pt", weights_only=True)
-        for content in (
-            {"iteration": 10},
-            [],
-            {**whole, "processes": [{}]},
-            {**whole, "processes": [{**whole["processes"][0], "memories": 3}]},
-        ):
-            torch.save(content, out / "worlds.pt")
-            done = len(checkpoints(out))
-            self.resume(out, iterations=done + 1)
-            self.assertEqual(len(checkpoints(out)), done + 1)
 
     def test_a_run_is_never_overwritten(self):
         with self.assertRaisesRegex(RunError, "holds a run already.*--resume"):

@@ -15,8 +15,6 @@ def run(folder: Path, arguments: list[str]) -> None:
     def learn_and_tell(runner: TrainingRunner, *args, **options) -> None:
         begin = {
             "start_actor": {k: v.clone() for k, v in runner.alg.actor.state_dict().items()},
-            "start_random": runner._random_state(),
-            "start_object_pos": runner.env.backend.state().object_pos.clone(),
         }
         learn(runner, *args, **options)
         end = {
@@ -24,9 +22,8 @@ def run(folder: Path, arguments: list[str]) -> None:
             "critic": runner.alg.critic.state_dict(),
             "learning_rate": runner.alg.learning_rate,
             "env_steps": runner.env_steps,
-            "object_pos": runner.env.backend.state().object_pos.clone(),
             "policy_obs": runner.env.get_observations()["policy"],
-            "random": runner._random_state(),
+            "random": runner.world.rng_state(),
         }
         torch.save(begin | end, folder / f"{runner.processes.rank}.pt")
 

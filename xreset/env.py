@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from xreset.capture import GraphRunner
-from xreset.faults import FaultRecorder
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
-from xreset.objects.sampling import center, keypoints, metric_points, surface_points
+from xreset.objects.sampling import center, metric_points, surface_points
 from xreset.physics import Backend, Parameters, State
 from xreset.plugins import make_backend
 from xreset.resets.bank import ResetBank
@@ -119,7 +118,6 @@ class ManipulationEnv:
         gravity_fraction: [N] share of the object's weight that acts.
         nonfinite_count: [] number of episodes that ended because a number was not finite.
         overflow_count: [] number of episodes that ended because the engine dropped contacts.
-        faults: the last worlds that failed, before and after the step in which they failed.
         variation: differences between the worlds, such as masses and delays.
         vision: the cameras; None: the task has none.
     """
@@ -155,7 +153,6 @@ class ManipulationEnv:
 
         self._cloud_points = per_object(lambda o: surface_points(o, task.observation.cloud_points))
         self._surface_points = per_object(lambda o: surface_points(o, task.distance_points))
-        self._keypoints = per_object(lambda o: keypoints(o, task.object_frame))
         self._center = None
         if task.object_frame == "center":
             self._center = per_object(center)
@@ -215,12 +212,6 @@ class ManipulationEnv:
             from xreset.task.vision import Vision  # Warp, which other tasks do not need
 
             self.vision = Vision(self.backend, self.task)
-        # The state before a step is kept in case the step breaks a world.
-        state = self.backend.state()
-        self._state_before = {f.name: getattr(state, f.name).clone() for f in fields(state)}
-        self._worlds = torch.arange(self.num_envs, device=self.device)
-        shapes = {name: tuple(value.shape[1:]) for name, value in self._fault_values(state).items()}
-        self.faults = FaultRecorder(shapes, self.device)
         self._log_names: tuple[str, ...] = ()
         self._log_values = torch.zeros(0, device=self.device)
         self._observations = TensorDict({}, batch_size=[self.num_envs], device=self.device)
@@ -433,8 +424,6 @@ class ManipulationEnv:
     def _process_action(self) -> None:
         """Turn the action into the drives' targets."""
         state = self.backend.state()
-        for name, value in self._state_before.items():
-            value.copy_(getattr(state, name))
         self._bad_action |= ~self._action.isfinite().all(dim=1)
         self._action.nan_to_num_(0.0, 0.0, 0.0)
         if not self.task.reward.raw_actions:
@@ -446,13 +435,12 @@ class ManipulationEnv:
     def _compute_rewards(self) -> tuple[Reading, Reward]:
         """Compute rewards, ends of episodes and the numbers to log."""
         reading = self.reading()
-        # A failed world ends, is counted and recorded, and nothing is learned from it.
+        # A failed world ends and is counted, and nothing is learned from it.
         broken = reading.health.nonfinite
         live = ~self._over
         self._faulty.copy_((broken | reading.health.overflow) & live)
         self.nonfinite_count += (self._faulty & broken).sum()
         self.overflow_count += (self._faulty & ~broken).sum()
-        self.faults.record(self._faulty, self._fault_values(reading.state))
         state = reading.task_state
         lost = out_of_bounds(state.object_pos, self.backend.scene.table, self.task.termination) & ~broken
         reach = reading.tip_distance.mean(dim=-1)
@@ -468,7 +456,6 @@ class ManipulationEnv:
                 goal_quat=self.goal_quat,
                 start_pos=self._task_origin(start_pos, start_quat),
                 start_quat=start_quat,
-                keypoints=self._keypoints,
                 action=self._action,
                 previous_action=self._previous_action,
                 out_of_bounds=lost,
@@ -494,21 +481,6 @@ class ManipulationEnv:
             self._log_values = torch.zeros_like(values)
         self._log_values.copy_(values)
         return reading, reward
-
-    def _fault_values(self, after: State) -> dict[str, Tensor]:
-        """Return what is recorded of a world that fails: name -> [N, ...]."""
-        return {
-            "world": self._worlds,
-            "object_index": self.backend.object_index,
-            "sequence": self.sequence,
-            "from_bank": self.from_bank,
-            "episode_step": self._episode_length,
-            "gravity_fraction": self.gravity_fraction,
-            **self.variation.parameters,
-            "target": self._target,
-            **{f"before_{name}": value for name, value in self._state_before.items()},
-            **{f"after_{name}": getattr(after, name) for name in self._state_before},
-        }
 
     def _sample_resets(self, from_distribution: bool = True) -> None:
         """Draw a start for every world, so that nothing waits for the number of resets; the worlds to reset take it."""

@@ -23,34 +23,16 @@ _KINDS: dict[str, type | tuple[type, ...]] = {
     "env_steps": int,
     "elapsed": (int, float),
     "learning_rate": (int, float),
-    "random": list,
 }
-"""Entries of a checkpoint. ``random`` holds one entry for each process."""
+"""Entries of a checkpoint."""
 
 
-def write_state(path: Path, content: dict[str, Any]) -> None:
-    """Write a file that :func:`read_state` reads; it appears whole or not at all."""
+def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
+    """Write a file that :func:`read_checkpoint` reads; it appears whole or not at all."""
     buffer = io.BytesIO()
     torch.save(content, buffer)
     with atomic_write(path) as file:
         file.write(buffer.getbuffer())
-
-
-def read_state(path: Path, device: str | torch.device = "cpu") -> Any:
-    """Read tensors and plain values.
-
-    Raises:
-        RunError: the file is damaged, or holds something else.
-    """
-    try:
-        return torch.load(path, map_location=device, weights_only=True)
-    except torch.OutOfMemoryError:
-        raise
-    except Exception as error:  # torch's own message advises to load without care
-        raise RunError(
-            f"{path} cannot be read as a checkpoint: it is damaged, or holds more than tensors and plain values. "
-            "Move it away to continue from the one before. Do not use it elsewhere if you do not know where it is from."
-        ) from error
 
 
 def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str, Any]:
@@ -59,12 +41,17 @@ def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str,
     Raises:
         RunError: the file is damaged or not a checkpoint.
     """
-    content = read_state(path, device)
-    missing = [key for key in _KINDS if not isinstance(content, dict) or key not in content]
-    if missing:
-        raise RunError(f"{path} is not a checkpoint of xreset: it has no entry {', '.join(missing)}.")
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except torch.OutOfMemoryError:
+        raise
+    except Exception as error:  # torch's own message advises to load without care
+        raise RunError(
+            f"{path} cannot be read as a checkpoint: it is damaged, or holds more than tensors and plain values. "
+            "Move it away to continue from the one before. Do not use it elsewhere if you do not know where it is from."
+        ) from error
     for key, kind in _KINDS.items():
-        value = content[key]
+        value = content.get(key) if isinstance(content, dict) else None
         is_number = isinstance(value, int | float)
         if not isinstance(value, kind) or isinstance(value, bool) or (is_number and not 0 <= value < math.inf):
             raise RunError(f"{path} is not a checkpoint of xreset: its {key} is {shown(value)}.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -17,7 +17,7 @@ Widths = Annotated[tuple[int, ...], Rule("one width or more, each above 0", lamb
 class ModelConfig(Checked):
     """Actor and critic: PointNet per cloud frame, LSTM with layer norm on its output, MLP."""
 
-    REMOVED: ClassVar[dict[str, Any]] = {"initial_hand_std": None, "synergy_std": None}
+    REMOVED: ClassVar[dict[str, Any]] = {"initial_hand_std": None, "synergy_std": None, "activation": "elu"}
 
     pointnet: Widths = (64, 128, 64)
     """Widths of the per-point MLP 3 -> 64 -> 128 -> 64; the maximum over points is the frame's embedding."""
@@ -29,7 +29,6 @@ class ModelConfig(Checked):
     mlp: Widths = (512, 256, 128)
     critic_mlp: Widths | None = None
     """Widths of the critic's MLP; None: those of the actor."""
-    activation: str = "elu"
     initial_std: Positive[float] = 1.0
     """Initial standard deviation of the Gaussian policy, which does not depend on the state. Not in the paper."""
     normalize_returns: bool = False
@@ -43,8 +42,7 @@ class ModelConfig(Checked):
     @property
     def layers(self) -> dict[str, Any]:
         """What two networks must share for one to take over the weights of the other."""
-        names = ("pointnet", "conv", "lstm", "mlp", "critic_mlp", "activation")
-        return {name: getattr(self, name) for name in (*names, "normalize_observations", "normalize_returns")}
+        return {name: value for name, value in asdict(self).items() if name != "initial_std"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +94,8 @@ class PpoConfig(Checked):
 class TrainConfig(Checked):
     """Configuration of a training run, as saved in the run folder."""
 
+    REMOVED: ClassVar[dict[str, Any]] = {"random_episode_start": True}
+
     task: TaskConfig = field(default_factory=TaskConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     ppo: PpoConfig = field(default_factory=PpoConfig)
@@ -103,8 +103,6 @@ class TrainConfig(Checked):
     iterations: Positive[int] = 10000
     save_interval: Positive[int] = 50
     """Iterations between checkpoints."""
-    random_episode_start: bool = True
-    """Start the first episodes at random times, so that worlds do not end in step."""
 
 
 def rsl_rl_config(config: TrainConfig, num_envs: int, teacher: Path | None = None) -> dict[str, Any]:
@@ -119,7 +117,6 @@ def rsl_rl_config(config: TrainConfig, num_envs: int, teacher: Path | None = Non
     network: dict[str, Any] = {
         "class_name": "xreset.learning.model:PointNetLstmModel",
         "hidden_dims": list(m.mlp),
-        "activation": m.activation,
         "obs_normalization": m.normalize_observations,
         "pointnet_dims": list(m.pointnet),
         "lstm_dim": m.lstm,

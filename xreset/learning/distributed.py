@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 
@@ -64,14 +63,6 @@ class Processes:
             values = values.clone()
             torch.distributed.all_reduce(values)
         return values
-
-    def gather(self, value: Any) -> list[Any]:
-        """Return every process's value, by rank, in the main process; an empty list in the others."""
-        if self.count == 1:
-            return [value]
-        gathered = [None] * self.count if self.is_main else None
-        torch.distributed.gather_object(value, gathered)
-        return gathered or []
 
 
 def leave() -> None:

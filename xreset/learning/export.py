@@ -123,7 +123,7 @@ def ensure_policy(out: Path) -> Path:
     choice = current_choice(out)
     if choice is not None:
         checkpoint = checkpoint.with_name(choice.chosen)
-    if not policy.exists() or not _is_of(policy, checkpoint, choice):
+    if not policy.exists() or not _is_of(policy, checkpoint):
         export_checkpoint(out, checkpoint, policy)
     return policy
 
@@ -147,7 +147,7 @@ def policy_file(policy: str | Path) -> Path:
     return files[str(policy)]
 
 
-def _is_of(policy: Path, checkpoint: Path, choice: Choice | None) -> bool:
+def _is_of(policy: Path, checkpoint: Path) -> bool:
     """Return whether a policy was exported from a checkpoint."""
     import onnx
     from google.protobuf.message import DecodeError
@@ -156,11 +156,7 @@ def _is_of(policy: Path, checkpoint: Path, choice: Choice | None) -> bool:
         entries = {entry.key: entry.value for entry in onnx.load(str(policy), load_external_data=False).metadata_props}
     except DecodeError:
         return False
-    if _CHECKPOINT_KEY in entries:
-        return entries[_CHECKPOINT_KEY] == file_hash(checkpoint)
-    if choice is not None:
-        return file_hash(policy) == choice.policy_hash
-    return policy.stat().st_mtime >= checkpoint.stat().st_mtime  # exported by an earlier version
+    return entries.get(_CHECKPOINT_KEY) == file_hash(checkpoint)
 
 
 def current_choice(out: Path) -> Choice | None:

@@ -24,24 +24,22 @@ LstmState = tuple[Tensor, Tensor]
 class PointNet(nn.Module):
     """Embeds clouds [..., P, K] as [..., dims[-1]]: the same MLP for every point, then the maximum over points."""
 
-    def __init__(self, dims: list[int], activation: str = "elu", point_width: int = 3) -> None:
+    def __init__(self, dims: list[int], point_width: int = 3) -> None:
         """Build the per-point MLP K -> dims[0] -> ..., K being ``point_width``; no activation after the last layer."""
         super().__init__()
-        act = {"elu": nn.ELU, "relu": nn.ReLU}[activation]
         layers: list[nn.Module] = []
         for width_in, width_out in zip([point_width, *dims[:-1]], dims, strict=True):
-            layers += [nn.Linear(width_in, width_out), act()]
+            layers += [nn.Linear(width_in, width_out), nn.ELU()]
         self.mlp = nn.Sequential(*layers[:-1])
         self.use_bfloat16 = False
         """Whether to compute in bfloat16 where the clouds are on a GPU; the result is float32 all the same."""
-        self._fusible = activation == "elu" and len(dims) == 3
 
     def forward(self, cloud: Tensor) -> Tensor:
         """[..., P, K] -> [..., dims[-1]]."""
         if not (self.use_bfloat16 and cloud.is_cuda):
             return self.mlp(cloud).amax(dim=-2)
         linear = [layer for layer in self.mlp if isinstance(layer, nn.Linear)]
-        if self._fusible and importlib.util.find_spec("triton") is not None:
+        if importlib.util.find_spec("triton") is not None:
             from xreset.learning import fused
 
             if fused.supports(cloud.shape[-2], tuple(layer.out_features for layer in linear)):
@@ -54,13 +52,11 @@ class PointNet(nn.Module):
 class ImageEncoder(nn.Module):
     """Embeds images [..., C, H, W] as [..., 1, embedding]: convolutions that halve the image, then one linear layer."""
 
-    def __init__(self, shape: tuple[int, int, int], channels: list[int], embedding: int, activation: str) -> None:
+    def __init__(self, shape: tuple[int, int, int], channels: list[int], embedding: int) -> None:
         """Build for images of a shape (C, H, W)."""
         super().__init__()
         kernels = [5, *[3] * (len(channels) - 1)]
-        self.cnn = CNN(
-            shape[1:], shape[0], channels, kernel_size=kernels, stride=2, padding="zeros", activation=activation
-        )
+        self.cnn = CNN(shape[1:], shape[0], channels, kernel_size=kernels, stride=2, padding="zeros", activation="elu")
         width = self.cnn.output_dim
         assert isinstance(width, int), "a flattened output has one width"
         self.linear = nn.Linear(width, embedding)
@@ -186,7 +182,6 @@ class PointNetLstmModel(MLPModel):
         obs_set: str,
         output_dim: int,
         hidden_dims: list[int] | tuple[int, ...] = (512, 256, 128),
-        activation: str = "elu",
         obs_normalization: bool = True,
         distribution_cfg: dict | None = None,
         pointnet_dims: list[int] | tuple[int, ...] = (64, 128, 64),
@@ -196,21 +191,17 @@ class PointNetLstmModel(MLPModel):
         """Build the model for the observation groups of one set (``actor`` or ``critic``)."""
         self._latent_dim = lstm_dim
         self.cloud_group = next(group for group in obs_groups[obs_set] if obs[group].ndim == 4)
-        super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims, activation, False, distribution_cfg)
+        super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims, "elu", False, distribution_cfg)
         normalizer = EmpiricalNormalization(self.obs_dim) if obs_normalization else nn.Identity()
-        encoder, width = self._encoder(obs[self.cloud_group].shape[1:], list(pointnet_dims), activation)
+        encoder, width = self._encoder(obs[self.cloud_group].shape[1:], list(pointnet_dims))
         encoder.use_bfloat16 = bfloat16_clouds
         self.trunk = Trunk(self.obs_dim, encoder, width, lstm_dim, normalizer)
         self.state: LstmState | None = None
-        self.reuse_embeddings = False
-        """Whether successive clouds in a rollout are shifted histories, so that only the newest frame is new."""
-        self._embeddings: Tensor | None = None
-        self._began: Tensor | None = None
 
-    def _encoder(self, shape: torch.Size, dims: list[int], activation: str) -> tuple[PointNet | ImageEncoder, int]:
+    def _encoder(self, shape: torch.Size, dims: list[int]) -> tuple[PointNet | ImageEncoder, int]:
         """Return what embeds clouds of a shape (H, P, K), and the width of all embeddings of a step."""
         history, _, point_width = shape
-        return PointNet(dims, activation, point_width), history * dims[-1]
+        return PointNet(dims, point_width), history * dims[-1]
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None) -> Tensor:
         """Return the MLP's input: [N, lstm] in a rollout, [T, N, lstm] in an update.
@@ -225,12 +216,11 @@ class PointNetLstmModel(MLPModel):
             if self.state is None:
                 zero = flat.new_zeros(1, flat.shape[0], self._latent_dim)
                 self.state = (zero, zero.clone())
-            joined = trunk.join(flat, self._embed(cloud))[None]
+            joined = trunk.join(flat, trunk.pointnet(cloud))[None]
             keep = torch.ones_like(joined[..., 0], dtype=torch.bool)
             out, self.state = run_lstm(trunk.lstm, joined, keep, self.state)
             return trunk.norm(out[0])
         assert isinstance(hidden_state, tuple), "an update needs the LSTM state of each sequence's start"
-        self._embeddings = None  # the weights are about to change
         joined = trunk.join(flat, self._embed_rollout(cloud, masks))
         pieces = hidden_state[0].shape[1] // joined.shape[1]
 
@@ -245,28 +235,12 @@ class PointNetLstmModel(MLPModel):
         """Return embeddings [T, N, H, embedding] of cloud histories [T, N, H, P, K] in an update."""
         return embed_sequences(self.trunk.pointnet, cloud, first)
 
-    def _embed(self, cloud: Tensor) -> Tensor:
-        """Return embeddings [N, H, embedding] of an environment's cloud histories [N, H, P, K] in a rollout."""
-        known = self._embeddings
-        began = self._began
-        if known is None or not self.reuse_embeddings:
-            embeddings = self.trunk.pointnet(cloud)
-        else:
-            newest = self.trunk.pointnet(cloud[:, -1:])
-            shifted = torch.cat((known[:, 1:], newest), dim=1)
-            embeddings = shifted if began is None else torch.where(began[:, None, None], newest, shifted)
-        self._embeddings = embeddings
-        self._began = None
-        return embeddings
-
     def reset(self, dones: Tensor | None = None, hidden_state: HiddenState = None) -> None:
         """Forget all, take over a state, or zero the state of worlds whose episode has ended ([N] bool or 0/1)."""
         if dones is None:
             self.state = hidden_state  # pyright: ignore[reportAttributeAccessIssue]
-            self._embeddings = None
         elif self.state is not None:
-            self._began = dones != 0
-            keep = (~self._began).to(self.state[0].dtype)[None, :, None]
+            keep = (dones == 0).to(self.state[0].dtype)[None, :, None]
             self.state = (self.state[0] * keep, self.state[1] * keep)
 
     def get_hidden_state(self) -> HiddenState:
@@ -310,16 +284,13 @@ class VisionModel(PointNetLstmModel):
         self._conv_dims = list(conv_dims)
         super().__init__(*args, **options)
 
-    def _encoder(self, shape: torch.Size, dims: list[int], activation: str) -> tuple[PointNet | ImageEncoder, int]:
+    def _encoder(self, shape: torch.Size, dims: list[int]) -> tuple[PointNet | ImageEncoder, int]:
         if not self._conv_dims:
-            return super()._encoder(shape, dims, activation)
+            return super()._encoder(shape, dims)
         channels, height, width = shape
-        return ImageEncoder((channels, height, width), self._conv_dims, dims[-1], activation), dims[-1]
+        return ImageEncoder((channels, height, width), self._conv_dims, dims[-1]), dims[-1]
 
     def _embed_rollout(self, cloud: Tensor, first: Tensor) -> Tensor:
-        return self.trunk.pointnet(cloud)
-
-    def _embed(self, cloud: Tensor) -> Tensor:
         return self.trunk.pointnet(cloud)
 
 

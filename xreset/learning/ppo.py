@@ -253,8 +253,6 @@ class SequencePpo(PPO):
             groups = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
         actor = actor_class(obs, groups, "actor", env.num_actions, **actor_cfg).to(device)
         critic = critic_class(obs, groups, "critic", 1, **critic_cfg).to(device)
-        actor.reuse_embeddings = True
-        critic.reuse_embeddings = True
         length = alg_cfg.pop("sequence_length")
         storage = SequenceStorage(length, "rl", env.num_envs, cfg["num_steps_per_env"], obs, [env.num_actions], device)
         return alg_class(actor, critic, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])

@@ -1,10 +1,8 @@
 """The run folder: the description of a training, its checkpoints and its policy.
 
 RUN/run.json                 everything that the training was started with
-RUN/checkpoints/000050.pt    model, optimizer, random state and counters after 50 iterations
-RUN/worlds.pt                the worlds at the newest checkpoint, with which a resumed run continues its episodes
+RUN/checkpoints/000050.pt    model, optimizer and counters after 50 iterations
 RUN/lift.json                when success from home passed 1, 10 and 50 %
-RUN/faults.npz               the last worlds whose simulation failed, if the run ended because of too many
 RUN/policy.onnx              the policy, with its contract
 RUN/teacher.onnx             the policy that a distillation learned from
 RUN/choice.json              which checkpoint it is, if ``xreset select`` chose one

@@ -13,14 +13,13 @@ from typing import Any
 import torch
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
-from torch import Tensor
 
 from xreset.env import ManipulationEnv
 from xreset.errors import RunError
-from xreset.learning.checkpoint import must_fit, read_checkpoint, read_state, write_state
+from xreset.learning.checkpoint import must_fit, read_checkpoint, write_checkpoint
 from xreset.learning.config import TrainConfig, rsl_rl_config
 from xreset.learning.distributed import Processes
-from xreset.learning.faults import FaultBudget, dump_faults, too_many_faults
+from xreset.learning.faults import FaultBudget
 from xreset.learning.log import TrainingLog
 from xreset.learning.schedules import value_at
 
@@ -53,8 +52,6 @@ class TrainingRunner(OnPolicyRunner):
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0
-        self._log_state: dict[str, Any] | None = None
-        self._worlds_continue = False
         self._faults_before = torch.zeros(2, dtype=torch.long, device=self.device)
 
     def _configure_multi_gpu(self) -> None:
@@ -84,7 +81,7 @@ class TrainingRunner(OnPolicyRunner):
         """
         env = self.world
         total = num_learning_iterations
-        if init_at_random_ep_len and not self._worlds_continue:
+        if init_at_random_ep_len:
             env.episode_length_buf = torch.randint_like(env.episode_length_buf, high=int(env.max_episode_length))
         self.alg.train_mode()
         if self.is_distributed:
@@ -94,8 +91,6 @@ class TrainingRunner(OnPolicyRunner):
         if self.processes.is_main:
             log = TrainingLog(self.folder, env.num_envs, str(env.device), total, self.wandb)
             log.clock.resume(self.iteration)
-            if self._log_state is not None:
-                log.restore(self._log_state)
         saved_at = self.iteration
         steps = self.cfg["num_steps_per_env"] * env.num_envs * self.gpu_world_size
         budget = FaultBudget(steps)
@@ -127,10 +122,10 @@ class TrainingRunner(OnPolicyRunner):
                     }
                     log.write(self.iteration, self.env_steps, self.elapsed, scalars)
                 if self.iteration % self.train_config.save_interval == 0:
-                    self.save_checkpoint(log)
+                    self.save_checkpoint()
                     saved_at = self.iteration
         if self.iteration != saved_at or not self.iteration:
-            self.save_checkpoint(log)
+            self.save_checkpoint()
         if log is not None:
             log.close(stopped=self.iteration < total)
 
@@ -146,8 +141,6 @@ class TrainingRunner(OnPolicyRunner):
     def _follow_schedule(self, progress: float) -> None:
         """Set what changes during a run to its values at a share of the run."""
         schedule = self.train_config.schedule
-        if schedule.demo_probability:
-            self.world.resets.demo_probability.fill_(value_at(schedule.demo_probability, progress))
         if schedule.success_position:
             self.world.set_success_position(value_at(schedule.success_position, progress))
         if schedule.faults:
@@ -159,30 +152,20 @@ class TrainingRunner(OnPolicyRunner):
         """Whether any process is to stop: then all do, after the same iteration."""
         return bool(self.processes.sum(torch.tensor(int(stop), device=self.device)))
 
-    def save_checkpoint(self, log: TrainingLog | None = None) -> None:
-        """Write ``checkpoints/ITERATION.pt`` and ``worlds.pt``. All processes must call it; the main one writes.
-
-        ``worlds.pt`` holds the worlds, the models' memories and the running means of the log: with it a run continues
-        in the middle of its episodes. Only the newest one is kept.
-        """
-        worlds = self.processes.gather(self._worlds_state())
-        random = self.processes.gather(self._random_state())
+    def save_checkpoint(self) -> None:
+        """Write ``checkpoints/ITERATION.pt``, in the main process."""
         if not self.processes.is_main:
             return
-        state = {"iteration": self.iteration, "processes": worlds, "log": None if log is None else log.state()}
-        write_state(self.folder / "worlds.pt", state)
         content = self.alg.save() | {
             "iteration": self.iteration,
             "env_steps": self.env_steps,
             "elapsed": self.elapsed,
             "learning_rate": self.alg.learning_rate,
-            "random": random,
         }
-        write_state(self.folder / "checkpoints" / f"{self.iteration:06d}.pt", content)
+        write_checkpoint(self.folder / "checkpoints" / f"{self.iteration:06d}.pt", content)
 
     def load_checkpoint(self, path: Path) -> None:
-        """Continue from a checkpoint: models, optimizer, counters and random state; the worlds too if ``worlds.pt``
-        fits."""
+        """Continue from a checkpoint: models, optimizer and counters. Episodes begin again."""
         content = read_checkpoint(path, self.device)
         with must_fit(path):
             self.alg.load(content, None, strict=True)
@@ -190,9 +173,6 @@ class TrainingRunner(OnPolicyRunner):
             self.iteration = content["iteration"]
             self.env_steps = content["env_steps"]
             self.elapsed = float(content["elapsed"])
-            if self.processes.rank < len(content["random"]):
-                self._set_random_state(content["random"][self.processes.rank])
-        self._continue_worlds()
 
     def load_networks(self, path: Path) -> None:
         """Start with the actor and the critic of another run's checkpoint, with normalization and standard deviation.
@@ -206,74 +186,25 @@ class TrainingRunner(OnPolicyRunner):
         if self.train_config.ppo.schedule == "adaptive":
             self.alg.learning_rate = content["learning_rate"]
 
-    def _worlds_state(self) -> dict[str, Any]:
-        """Return the state of this process's worlds, and of the models' memories of them."""
-        memories = {"actor": self.alg.actor.get_hidden_state(), "critic": self.alg.critic.get_hidden_state()}
-        return {"env": self.world.snapshot(), "memories": memories}
-
-    def _continue_worlds(self) -> None:
-        """Continue in the middle of episodes if ``worlds.pt`` fits; otherwise the episodes start again."""
-        path = self.folder / "worlds.pt"
-        if not path.exists():
-            return
-        before = self.world.snapshot()
-        models = {"actor": self.alg.actor, "critic": self.alg.critic}
-        try:
-            content = read_state(path, self.device)
-            with must_fit(path):
-                if content["iteration"] != self.iteration or self.processes.rank >= len(content["processes"]):
-                    return
-                mine = content["processes"][self.processes.rank]
-                if not self.world.restore(mine["env"]):
-                    return
-                for name, model in models.items():
-                    model.reset(hidden_state=mine["memories"][name])
-                self._log_state = content["log"]
-            self._worlds_continue = True
-        except RunError:
-            print(f"{path} is damaged or of another run: episodes start again.", flush=True)
-            self.world.restore(before)
-            for model in models.values():
-                model.reset()
-
-    def _random_state(self) -> dict[str, Tensor | None]:
-        """Return the state of the random numbers that this process draws."""
-        return {
-            "env": self.world.rng_state().cpu(),
-            "torch": torch.get_rng_state(),
-            "cuda": torch.cuda.get_rng_state() if torch.cuda.is_available() else None,
-        }
-
-    def _set_random_state(self, state: dict[str, Tensor | None]) -> None:
-        if state["torch"] is not None:
-            torch.set_rng_state(state["torch"].cpu())
-        if state["cuda"] is not None and torch.cuda.is_available():
-            torch.cuda.set_rng_state(state["cuda"].cpu())
-        if state["env"] is not None and state["env"].shape == self.world.rng_state().shape:
-            self.world.set_rng_state(state["env"])
-
     def _check_faults(self, budget: FaultBudget) -> None:
-        """End the run if too many worlds broke, leaving them in ``faults.npz``. Every process comes to the same
-        result."""
+        """End the run if too many worlds broke. Every process comes to the same result."""
         env = self.world
         total = torch.stack((env.nonfinite_count, env.overflow_count))
         nonfinite, overflow = self.processes.sum(total - self._faults_before).tolist()
         self._faults_before = total
         if problem := budget.add(nonfinite, overflow):
-            path = self.folder / (f"faults-{self.processes.rank}.npz" if self.is_distributed else "faults.npz")
-            dump_faults(path, env, self.train_config, iteration=self.iteration)
-            raise too_many_faults(problem, path, self.folder)
+            raise RunError(
+                f"The run ends: {problem}. Look for what the robot or an object does that the engine cannot simulate. "
+                f"Then continue from the last checkpoint: xreset train --out {self.folder} --resume"
+            )
 
     def _check_finite(self, obs: TensorDict) -> None:
         """Refuse observations that are not finite, once per iteration: they come from worlds whose health was sound."""
         for group, value in obs.items():
-            bad = ~value.flatten(1).isfinite().all(dim=1)
-            if bool(bad.any()):
-                worlds = bad.nonzero().squeeze(-1)[:10].tolist()
+            if not bool(value.isfinite().all()):
                 raise RunError(
-                    f"the observation group {group!r} is not finite in {int(bad.sum())} worlds (first: {worlds}) at "
-                    f"iteration {self.iteration}. Continue from the last checkpoint: "
-                    f"xreset train --out {self.folder} --resume"
+                    f"The observation group {group!r} is not finite at iteration {self.iteration}. Continue from the "
+                    f"last checkpoint: xreset train --out {self.folder} --resume"
                 )
 
 

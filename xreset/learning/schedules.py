@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -38,9 +38,8 @@ class ScheduleConfig(Checked):
     to some and more of them have passed.
     """
 
-    demo_probability: ShareSchedule = ()
-    """Replaces ``task.reset.demo_probability``: demonstrated states teach the first grasp, starts from home are what is
-    evaluated."""
+    REMOVED: ClassVar[dict[str, Any]] = {"demo_probability": ()}
+
     teacher: ShareSchedule = ()
     """Share of the worlds in which the teacher acts during a distillation. Empty: none."""
     success_position: ShareSchedule = ()

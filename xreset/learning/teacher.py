@@ -42,14 +42,12 @@ def load_teacher(path: Path) -> PointNetLstmModel:
     try:
         graph = onnx.load(str(path)).graph
         weights = _weights(graph)
-        activation = next(node.op_type.lower() for node in graph.node if node.op_type in ("Elu", "Relu"))
         model = PointNetLstmModel(
             observations,
             {"actor": [*_FLAT, "perception"]},
             "actor",
             len(policy.contract["joint_names"]),
             hidden_dims=_widths(weights, "mlp.")[:-1],
-            activation=activation,
             pointnet_dims=_widths(weights, "trunk.pointnet.mlp."),
             lstm_dim=weights["trunk.lstm.weight_hh_l0"].shape[1],
         )

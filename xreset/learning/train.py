@@ -105,11 +105,8 @@ def train(
     file = _file_of(out, bank, goals)
     inputs = load_inputs(file, robot=robot, objects=objects, accept=("bank", "goals"))
     if isinstance(inputs.data, GoalSet):
-        config = replace(
-            config,
-            task=replace(config.task, reset=replace(config.task.reset, demo_probability=0.0)),
-            schedule=replace(config.schedule, demo_probability=()),
-        )
+        reset = replace(config.task.reset, demo_probability=0.0)
+        config = replace(config, task=replace(config.task, reset=reset))
     if uses_bank(config) and not inputs.bank.num_states:
         raise RunError(
             f"{file} holds no state to reset to: every candidate was rejected. Look at its reasons (xreset resets), "
@@ -212,9 +209,6 @@ def _copy_teacher(teacher: Path, out: Path, inputs: Inputs, config: TrainConfig)
 
 def uses_bank(config: TrainConfig) -> bool:
     """Return whether a training ever starts episodes with states of the bank."""
-    points = config.schedule.demo_probability
-    if points:
-        return any(value > 0 for _, value in points)
     return config.task.reset.demo_probability > 0
 
 
@@ -313,7 +307,9 @@ def _train(
 ) -> None:
     config = info.config
     device = processes.device(info.device)
-    seed = processes.seed(info.seed)
+    begin = latest_checkpoint(out) if resumed and checkpoints(out) else None
+    # a run that continues draws other numbers than it began with
+    seed = processes.seed(info.seed) + (0 if begin is None else int(begin.stem))
     if device.startswith("cuda:"):
         torch.cuda.set_device(device)
     torch.manual_seed(seed)
@@ -323,8 +319,8 @@ def _train(
             env.vision.check_sees_objects()
         runner = TrainingRunner(env, config, out, teacher=out / TEACHER if info.teacher else None)
         runner.wandb = wandb
-        if resumed and checkpoints(out):
-            runner.load_checkpoint(latest_checkpoint(out))
+        if begin is not None:
+            runner.load_checkpoint(begin)
         elif info.weights is not None:
             runner.load_networks(Path(info.weights))
         if processes.is_main:
@@ -337,7 +333,7 @@ def _train(
                 print(f"continuing after iteration {runner.iteration}", flush=True)
             elif resumed:
                 print("there is no checkpoint yet: starting from the beginning", flush=True)
-        runner.learn(config.iterations, init_at_random_ep_len=config.random_episode_start, seconds=seconds)
+        runner.learn(config.iterations, init_at_random_ep_len=True, seconds=seconds)
         if processes.is_main:
             actor = runner.alg.get_policy()
             export_onnx(

@@ -43,8 +43,6 @@ class RewardInput:
     start_pos: Tensor
     """[N, 3] position of the object at the start of the demonstration."""
     start_quat: Tensor
-    keypoints: Tensor
-    """[N, 4, 3] :func:`xreset.objects.keypoints` of each world's object, in its frame."""
     action: Tensor
     """[N, J] this step's action, as it is penalised."""
     previous_action: Tensor

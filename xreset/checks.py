@@ -124,6 +124,15 @@ def is_rigid(T: np.ndarray) -> bool:
 _LARGEST = 2**63 - 1
 
 
+def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Return ``base`` with nested changes."""
+    result = dict(base)
+    for name, value in changes.items():
+        both = isinstance(value, dict) and isinstance(base.get(name), dict)
+        result[name] = merged(base[name], value) if both else value
+    return result
+
+
 def from_dict(cls: type[T], data: Any, where: str = "configuration") -> T:
     """Build a dataclass from nested dictionaries, as :func:`dataclasses.asdict` and JSON make them.
 

@@ -37,7 +37,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from xreset.checks import Checked, Finite, Positive, Rule, from_dict
+from xreset.checks import Checked, Finite, Positive, Rule, from_dict, merged
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.study.paper import METRICS, paper_tables
 from xreset.files import read_toml
@@ -248,15 +248,6 @@ def read_study(path: Path) -> Study:
     for problem in _problems(study):
         raise FileFormatError(f"{path}: {problem}")
     return study
-
-
-def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Return ``base`` with nested changes."""
-    result = dict(base)
-    for name, value in changes.items():
-        both = isinstance(value, dict) and isinstance(base.get(name), dict)
-        result[name] = merged(base[name], value) if both else value
-    return result
 
 
 def _problems(study: Study) -> Iterator[str]:

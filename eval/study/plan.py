@@ -18,10 +18,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from xreset.checks import from_dict
+from xreset.checks import from_dict, merged
 from xreset.demos.archive import read_demos
 from xreset.errors import DemoError, FileFormatError, RunError, XResetError
-from xreset.eval.study.file import Data, Evaluation, Runs, Study, merged
+from xreset.eval.study.file import Data, Evaluation, Runs, Study
 from xreset.eval.study.subset import Subset, refuse_other
 from xreset.files import file_hash, is_claimed
 from xreset.learning.clock import Lift, read_lift

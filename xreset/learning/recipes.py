@@ -1,29 +1,20 @@
-"""Named starting points for a training's configuration; flags change single numbers of them."""
+"""Named starting points for a training's configuration: ``recipes.toml``."""
 
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass, replace
-from math import pi, radians
+import tomllib
+from dataclasses import asdict, dataclass, replace
+from math import radians
 from pathlib import Path
 
 from xreset.cameras.config import VisionConfig
+from xreset.checks import from_dict, merged
 from xreset.errors import RunError
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.run import read_run
 from xreset.learning.schedules import ScheduleConfig
-from xreset.task.config import (
-    ActionConfig,
-    NoiseConfig,
-    ObservationConfig,
-    PushConfig,
-    RandomizationConfig,
-    ResetConfig,
-    RewardConfig,
-    TaskConfig,
-    TerminationConfig,
-    TrackerConfig,
-)
+from xreset.task.config import TaskConfig
 from xreset.text import plain
 
 
@@ -35,177 +26,19 @@ class Recipe:
     about: str
 
 
-_MINUTES = TrainConfig(
-    task=TaskConfig(
-        timestep=1 / 120,
-        substeps=4,
-        action=ActionConfig(hand="relative", arm_step=0.06, hand_step=0.1),
-        observation=ObservationConfig(
-            cloud="paired", rotation="matrix", cloud_scale=5.0, contact_force_scale=0.03, joint_target=True
-        ),
-        reward=RewardConfig(
-            reach_width=0.4, reach_near=1.0, reach_distance="present", contact="opposing", raw_actions=True
-        ),
-    ),
-    model=ModelConfig(initial_std=0.3),
-    ppo=PpoConfig(mini_epochs=3, minibatch_size=16384, precision="bfloat16", desired_kl=0.02, entropy=0.0),
-)
-"""Without the paper's entropy bonus the standard deviation only shrinks. With that and a doubled ``desired_kl`` a
-policy learns in a fraction of the iterations (docs/lab-book.md). With 4,096 worlds an iteration has twelve steps of the
-optimizer. Control at 30 Hz, as in the published paper: two seeds had 4 to 6 points more than at 60 Hz after equal
-minutes, with joint targets that move as fast (docs/lab-book.md)."""
+def _read_recipes() -> dict[str, Recipe]:
+    recipes: dict[str, Recipe] = {}
+    for name, changes in tomllib.loads(_FILE.read_text()).items():
+        about = changes.pop("about")
+        base = changes.pop("extends", None)
+        config = recipes[base].config if base else TrainConfig()
+        config = from_dict(TrainConfig, merged(asdict(config), changes), f"{_FILE}: {name}")
+        recipes[name] = Recipe(config=config, about=about)
+    return recipes
 
-_ROBUST = replace(
-    _MINUTES,
-    task=replace(
-        _MINUTES.task,
-        randomization=RandomizationConfig(
-            arm_stiffness=(0.7, 1.4),
-            arm_damping=(0.7, 1.4),
-            hand_stiffness=(0.7, 1.4),
-            hand_damping=(0.5, 2.0),
-            effort=(0.7, 1.2),
-            action_latency=(0.0, 1.0),
-            observation_latency=(0.0, 1.0),
-            hand_friction=(0.05, 0.6),
-            force_gain=(0.5, 2.0),
-            torsional_friction=(0.25, 2.0),
-            object_inertia=(0.7, 1.4),
-            object_com=(0.0, 0.01),
-        ),
-    ),
-)
-"""Sources of the ranges. Drives: policies that went from simulation to a real hand had factors of 0.75 to 1.5 on
-stiffness and 0.3 to 3 on damping (OpenAI et al. 2018, Learning Dexterous In-Hand Manipulation; Handa et al. 2022,
-DeXtreme, manual randomization), Isaac Lab's dexterous lift has 0.5 to 2 on both. Latency: one control step is 33 ms; in
-DeXtreme a pose is up to two steps of 33 ms old. Hand friction: from bare metal (0.1 in Table IX) to a skin. Torsional
-friction: PhysX leaves 0.3 of it next to a second contact point. The cost of each range for a policy that was trained
-without it: docs/sim-to-sim.md."""
 
-_LIVE = replace(
-    _ROBUST,
-    task=replace(
-        _ROBUST.task,
-        object_frame="center",
-        observation=replace(_ROBUST.task.observation, rotation="to_goal"),
-        reset=replace(_ROBUST.task.reset, goal_xy=0.03, goal_z=0.05, goal_yaw=pi / 6),
-        randomization=replace(
-            _ROBUST.task.randomization,
-            action_latency=(0.0, 4.0),
-            lost_actions=(0.0, 0.2),
-            observation_latency=(0.0, 6.0),
-            proprio_latency=(0.0, 1.0),
-            tracker=TrackerConfig(
-                interval=(1.0, 2.0),
-                jitter=1.0,
-                position_bias=0.005,
-                rotation_bias=radians(3.75),
-                position_noise=0.005,
-                rotation_noise=radians(3.75),
-                loss=0.01,
-                loss_steps=(3.0, 15.0),
-            ),
-            push=PushConfig(probability=(0.002, 0.02), object_velocity=0.5, object_spin=5.0, arm_torque=0.25),
-        ),
-    ),
-)
-"""From the published paper's table A3: delays of 133 ms (actions), 200 ms (poses) and 33 ms (joints), errors of poses,
-shifts of goals. There the arm's actions are late by at most 50 ms. The tracker has 15 or 30 poses a second and loses
-the object for 0.1 to 0.5 s. Lost actions, lost poses and the size of pushes have no source."""
-
-_PUBLISHED = TrainConfig(
-    task=TaskConfig(
-        timestep=1 / 120,
-        substeps=4,
-        object_frame="center",
-        distance_points=64,
-        action=ActionConfig(hand="relative", arm_step=0.0125, hand_step=1 / 24),
-        observation=ObservationConfig(
-            content="published",
-            cloud="paired",
-            cloud_scale=5.0,
-            noise=NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0),
-        ),
-        reward=RewardConfig(
-            reach=0.0,
-            grasp=0.0,
-            position=0.0,
-            rotation=0.0,
-            proximity=-2.5,
-            palm_proximity=-2.5,
-            contact="near",
-            points=4.2,
-            success=15.0,
-            success_shape="points",
-            action_rate_arm=-0.05,
-            scale=0.01 / 30,
-        ),
-        termination=TerminationConfig(episode_seconds=12.0),
-        reset=ResetConfig(
-            demo_probability=0.9,
-            random_gravity=False,
-            home_gravity_std=0.0,
-            training_xy=0.10,
-            goal_xy=0.03,
-            goal_z=0.05,
-            goal_yaw=pi / 6,
-        ),
-        randomization=RandomizationConfig(
-            friction=(0.2, 1.3),
-            object_com=(0.0, 0.01),
-            arm_stiffness=(0.7, 1.3),
-            arm_damping=(0.7, 1.3),
-            hand_stiffness=(0.7, 1.3),
-            hand_damping=(0.7, 1.3),
-            effort=(0.7, 1.3),
-            action_latency=(0.0, 1.5),
-            hand_latency=(0.0, 4.0),
-            observation_latency=(0.0, 6.0),
-            proprio_latency=(0.0, 1.0),
-            tracker=TrackerConfig(
-                position_bias=0.005,
-                rotation_bias=radians(3.75),
-                position_noise=0.005,
-                rotation_noise=radians(3.75),
-            ),
-            push=PushConfig(
-                probability=(0.001, 0.1), object_velocity=1.25, object_spin=30.0, arm_torque=0.5, when="gated"
-            ),
-        ),
-    ),
-    model=ModelConfig(pointnet=(64, 128, 128), critic_mlp=(512, 512, 256), normalize_returns=True),
-    ppo=PpoConfig(horizon=32, sequence_length=32, entropy=0.0, bounds_loss=1e-4, value_loss=4.0),
-)
-"""docs/paper.md has the source of each option, and what the published paper leaves open."""
-
-RECIPES: dict[str, Recipe] = {
-    "paper": Recipe(config=TrainConfig(), about="the paper's tables VIII and IX, for hours on several GPUs"),
-    "minutes": Recipe(
-        config=_MINUTES,
-        about=(
-            "what taught an object alone in minutes on one GPU (docs/lab-book.md): 4,096 worlds, with closing states "
-            "that press"
-        ),
-    ),
-    "robust": Recipe(
-        config=_ROBUST,
-        about="minutes, with random drives, latency, friction of the hand and force readings (docs/sim-to-sim.md)",
-    ),
-    "published": Recipe(
-        config=_PUBLISHED,
-        about=(
-            "the published paper's method (docs/paper.md), for hours on one GPU with 8,192 worlds; its bank needs the "
-            "published filter"
-        ),
-    ),
-    "live": Recipe(
-        config=_LIVE,
-        about=(
-            "robust, for a real loop: late and lost actions, a late and faulty pose tracker, pushes, moved goals; the "
-            "frame of a mesh does not matter"
-        ),
-    ),
-}
+_FILE = Path(__file__).with_name("recipes.toml")
+RECIPES = _read_recipes()
 """Name -> recipe."""
 
 

@@ -38,7 +38,7 @@ class ScheduleConfig(Checked):
     to some and more of them have passed.
     """
 
-    REMOVED: ClassVar[dict[str, Any]] = {"demo_probability": ()}
+    REMOVED: ClassVar[dict[str, Any]] = {"demo_probability": []}
 
     teacher: ShareSchedule = ()
     """Share of the worlds in which the teacher acts during a distillation. Empty: none."""

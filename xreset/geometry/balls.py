@@ -4,7 +4,7 @@ Balls make distances and their derivatives cheap over whole trajectories. They a
 inscribed in other shapes. Smaller balls lie under the surface that those do not reach, and balls of radius 0 stand for
 edges and corners. What the balls miss, the exact checks that follow find (coal, then physics).
 
-Shape letters: Q balls, G links with balls, R guards, K clusters, H pairs of links.
+Shape letters: Q balls, G links with balls, R guards, H pairs of links.
 """
 
 from __future__ import annotations
@@ -39,8 +39,6 @@ STAND_IN = 3.5e-3
 deeper in each other than any ball, and the exact test measures how far two shapes must move to separate. With this
 value the LEAP hand loses 1 % of its frames to that test, without it 90 %."""
 
-_CLUSTER = 16
-"""Most balls in a cluster."""
 _INWARD_STEPS = 8
 """Steps that move a point of a surface inwards from one face after the other."""
 _ROWS = {"cpu": 200_000, "cuda": 8_000_000}
@@ -80,61 +78,13 @@ class Spans(Tensors):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Clusters(Tensors):
-    """Rows of a table that are near each other, each cluster with a ball around it: what is far from that ball is far
-    from all."""
-
-    centers: Tensor
-    """[K, 3] in the link's frame."""
-    radii: Tensor
-    """[K]"""
-    of_link: Spans
-    """[G] the clusters of each link."""
-    spans: Spans
-    """[K] the part of ``rows`` that belongs to each cluster."""
-    rows: Tensor
-    """Rows of the table, cluster after cluster."""
-
-    @staticmethod
-    def of(centers: Sequence[np.ndarray], radii: Sequence[np.ndarray]) -> Clusters:
-        """Cluster balls that are given by link: centers [n, 3] in its frame and radii [n] of rows that follow one
-        another."""
-        own_centers = []
-        own_radii = []
-        rows = []
-        of_link = []
-        first = 0
-        for link_centers, link_radii in zip(centers, radii, strict=True):
-            parts = _halved(link_centers, np.arange(len(link_centers)))
-            of_link.append(parts)
-            for part in parts:
-                rows.append(part + first)
-                own_centers.append(link_centers[part])
-                own_radii.append(link_radii[part])
-            first += len(link_radii)
-        bound_centers, bound_radii = bounding_balls(own_centers, own_radii)
-        return Clusters(
-            centers=bound_centers,
-            radii=bound_radii,
-            of_link=Spans.of(of_link),
-            spans=Spans.of(rows),
-            rows=_joined(rows).long(),
-        )
-
-    def members(self, clusters: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Iterate over all rows of some clusters [C]: see :meth:`Spans.members`."""
-        for position, place in self.spans.members(clusters):
-            yield position, self.rows[place]
-
-
-@dataclass(frozen=True, kw_only=True)
 class Balls(Tensors):
     """Balls fixed to the links of a hand, and those links as solids that the balls of other links stay out of."""
 
     links: tuple[str, ...]
     """Links that carry balls (length G)."""
-    clusters: Clusters
-    """Clusters of the balls."""
+    spans: Spans
+    """[G] the balls of each link."""
     link: Tensor
     """[Q] link of each ball, as an index of ``links``: ascending."""
     centers: Tensor
@@ -149,8 +99,8 @@ class Balls(Tensors):
     """[R] balls that keep out of other links; two of one link are at least :data:`APART` apart."""
     guard_radii: Tensor
     """[R] their radii against other links: larger where they stand for other balls."""
-    guard_clusters: Clusters
-    """Clusters of the guards."""
+    guard_spans: Spans
+    """[G] the guards of each link."""
     fields: DistanceFields
     """Signed distances to the G links, in their frames."""
     link_pairs: Tensor
@@ -171,7 +121,6 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
     radii = []
     fields = []
     guards = []
-    guard_centers = []
     guard_radii = []
     first = 0
     for name in hand.link_names:
@@ -188,7 +137,6 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
         centers.append(own_centers)
         radii.append(own_radii)
         guards.append(chosen + first)
-        guard_centers.append(own_centers[chosen])
         guard_radii.append(own_radii[chosen] + STAND_IN * has_neighbor)
         fields.append(link_field(shapes))
         first += len(own_radii)
@@ -201,7 +149,7 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
     bound_centers, bound_radii = bounding_balls(centers, radii)
     return Balls(
         links=tuple(links),
-        clusters=Clusters.of(centers, radii),
+        spans=Spans.of(radii),
         link=torch.as_tensor(np.repeat(np.arange(len(links)), [len(own) for own in radii])),
         centers=_joined(centers, 3),
         radii=_joined(radii),
@@ -209,7 +157,7 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
         bound_radii=bound_radii,
         guards=_joined(guards).long(),
         guard_radii=_joined(guard_radii),
-        guard_clusters=Clusters.of(guard_centers, guard_radii),
+        guard_spans=Spans.of(guard_radii),
         fields=DistanceFields.join(fields),
         link_pairs=torch.as_tensor(both_ways.reshape(-1, 2)),
     )
@@ -230,16 +178,6 @@ def bounding_balls(centers: Sequence[np.ndarray], radii: Sequence[np.ndarray]) -
         middles.append(middle)
         reaches.append((np.linalg.norm(own_centers - middle, axis=1) + own_radii).max())
     return torch.as_tensor(np.array(middles).reshape(-1, 3)), torch.tensor(reaches, dtype=torch.float64)
-
-
-def _halved(centers: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
-    """Halve some rows of points [n, 3] across their longest side until no part has more than :data:`_CLUSTER`."""
-    if len(rows) <= _CLUSTER:
-        return [rows]
-    axis = np.ptp(centers[rows], axis=0).argmax()
-    ordered = rows[centers[rows, axis].argsort(kind="stable")]
-    half = len(rows) // 2
-    return _halved(centers, np.sort(ordered[:half])) + _halved(centers, np.sort(ordered[half:]))
 
 
 def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray:

@@ -7,7 +7,7 @@ variables.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -77,7 +77,7 @@ def too_near(
 ) -> Distances:
     """Find balls too near to the object, below the table's top, or too deep in each other.
 
-    One ball around each link, then one around each cluster of its balls, rules most of them out.
+    One ball around each link rules most of them out.
 
     Args:
         model: the hand.
@@ -103,19 +103,18 @@ def too_near(
 
 
 def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Iterator[Distances]:
-    def low(centers: Tensor, _: Tensor, limit: Tensor) -> Tensor:
-        return (centers[:, 2] < limit).nonzero()[:, 0]
-
-    candidates = (bounds[..., 2] < model.balls.bound_radii) & considered[:, None]
-    for frame, ball in _near_balls(model, bodies, candidates, low, 0.0):
+    balls = model.balls
+    frames, links = ((bounds[..., 2] < balls.bound_radii) & considered[:, None]).nonzero(as_tuple=True)
+    for position, ball in balls.spans.members(links):
+        frame = frames[position]
         centers = model.ball_centers(bodies, frame, ball)
-        height = height_above_table(centers, model.balls.radii[ball], model.table)
+        height = height_above_table(centers, balls.radii[ball], model.table)
         below = height < 0
         frame = frame[below]
         ball = ball[below]
         centers = centers[below]
         up = centers.new_tensor([0.0, 0.0, 1.0]).expand_as(centers)
-        slope = model.point_slope(bodies, frame, model.balls.link[ball], centers, up)
+        slope = model.point_slope(bodies, frame, balls.link[ball], centers, up)
         yield Distances(frame=frame, value=height[below], slope=slope, number=ball)
 
 
@@ -127,54 +126,20 @@ def _in_object(
     considered: Tensor,
     object_clearance: float,
 ) -> Iterator[Distances]:
-    def near_object(centers: Tensor, frame: Tensor, limit: Tensor) -> Tensor:
-        return objects.nearer(centers, frame, limit)[0]
-
     balls = model.balls
     every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
     distance = objects.fields.box_distance(objects.local(bounds, every), objects.which[every])
     candidates = (distance < balls.bound_radii + object_clearance) & considered[:, None]
-    # Beside an edge, distances from a grid may be wrong by one step of it.
-    margin = object_clearance + objects.fields.spacing
-    for frame, ball in _near_balls(model, bodies, candidates, near_object, margin):
+    frames, links = candidates.nonzero(as_tuple=True)
+    for position, ball in balls.spans.members(links):
+        frame = frames[position]
         centers = model.ball_centers(bodies, frame, ball)
         near, distance, direction = objects.nearer(centers, frame, balls.radii[ball] + object_clearance)
         frame = frame[near]
         ball = ball[near]
         slope = model.point_slope(bodies, frame, balls.link[ball], centers[near], direction)
         value = distance - balls.radii[ball] - object_clearance
-        yield Distances(
-            frame=frame,
-            value=value,
-            slope=slope,
-            number=len(balls.radii) + ball,
-        )
-
-
-def _near_balls(
-    model: HandModel,
-    bodies: Bodies,
-    candidates: Tensor,
-    nearer: Callable[[Tensor, Tensor, Tensor], Tensor],
-    margin: float,
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Iterate over frames [A] and balls [A] whose cluster is nearer to something than ``margin`` [m].
-
-    Args:
-        model: the hand.
-        bodies: its B configurations.
-        candidates: [B, G] bool: the links to look at.
-        nearer: returns the indices of those points [K, 3] in frames [K] that are nearer to it than [K].
-        margin: [m]
-    """
-    clusters = model.balls.clusters
-    frame, group = candidates.nonzero(as_tuple=True)
-    for position, cluster in clusters.of_link.members(group):
-        row = frame[position]
-        centers = model.to_world(bodies, row, group[position], clusters.centers[cluster])
-        near = nearer(centers, row, clusters.radii[cluster] + margin)
-        for within, ball in clusters.members(cluster[near]):
-            yield row[near][within], ball
+        yield Distances(frame=frame, value=value, slope=slope, number=len(balls.radii) + ball)
 
 
 def _in_each_other(
@@ -186,7 +151,6 @@ def _in_each_other(
 ) -> Iterator[Distances]:
     balls = model.balls
     fields = balls.fields
-    clusters = balls.guard_clusters
     a, b = balls.link_pairs.unbind(1)
     reach = balls.bound_radii + STAND_IN - self_depth
     near = (bounds[:, a] - bounds[:, b]).norm(dim=-1) < reach[a] + balls.bound_radii[b]
@@ -203,27 +167,22 @@ def _in_each_other(
     turn = inverse @ bodies.rot[frame, first]
     shift = matvec(inverse, bodies.pos[frame, first] - origin[near])
 
-    for position, cluster in clusters.of_link.members(a[pair]):
-        centers = matvec(turn[position], clusters.centers[cluster]) + shift[position]
-        margin = clusters.radii[cluster] - self_depth + fields.spacing
-        close, _, _ = fields.nearer(centers, b[pair[position]], margin)
-        for within, guard in clusters.members(cluster[close]):
-            owner = position[close][within]
-            centers = matvec(turn[owner], balls.centers[balls.guards[guard]]) + shift[owner]
-            limit = balls.guard_radii[guard] - self_depth
-            deep, distance, away = fields.nearer(centers, b[pair[owner]], limit)
-            owner = owner[deep]
-            guard = guard[deep]
-            solid = b[pair[owner]]
-            ball = balls.guards[guard]
-            row = frame[owner]
-            direction = matvec(bodies.rot[row, model.group_body[solid]], away)
-            centers = model.ball_centers(bodies, row, ball)
-            slope = model.point_slope(bodies, row, balls.link[ball], centers, direction)
-            slope = slope - model.point_slope(bodies, row, solid, centers, direction)
-            value = distance - balls.guard_radii[guard] + self_depth
-            number = 2 * len(balls.radii) + pair[owner] * len(balls.guards) + guard
-            yield Distances(frame=row, value=value, slope=slope, number=number)
+    for position, guard in balls.guard_spans.members(a[pair]):
+        centers = matvec(turn[position], balls.centers[balls.guards[guard]]) + shift[position]
+        limit = balls.guard_radii[guard] - self_depth
+        deep, distance, away = fields.nearer(centers, b[pair[position]], limit)
+        position = position[deep]
+        guard = guard[deep]
+        solid = b[pair[position]]
+        ball = balls.guards[guard]
+        row = frame[position]
+        direction = matvec(bodies.rot[row, model.group_body[solid]], away)
+        centers = model.ball_centers(bodies, row, ball)
+        slope = model.point_slope(bodies, row, balls.link[ball], centers, direction)
+        slope = slope - model.point_slope(bodies, row, solid, centers, direction)
+        value = distance - balls.guard_radii[guard] + self_depth
+        number = 2 * len(balls.radii) + pair[position] * len(balls.guards) + guard
+        yield Distances(frame=row, value=value, slope=slope, number=number)
 
 
 def pad_distances(model: HandModel, bodies: Bodies, objects: Objects, frame: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,13 +15,11 @@ from tests.test_cli import run
 from tests.toy_bank import toy_bank, toy_retargeted
 from xreset.accounts import accounts_path
 from xreset.geometry.kinematics import Kinematics
-from xreset.physics import Health
 from xreset.resets.bank import read_bank, write_bank
 from xreset.resets.closing import closing_states, positions_between, rotations_between
 from xreset.resets.config import ClosingConfig, SqueezeConfig
 from xreset.resets.distribution import ResetDistribution, bank_starts
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
-from xreset.resets.hold import hold_bank
 from xreset.retarget.file import Retargeted, write_retargeted
 from xreset.task.config import ResetConfig
 
@@ -222,29 +220,6 @@ class TargetsTest(unittest.TestCase):
         torch.testing.assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
 
 
-class Held(unittest.TestCase):
-    def test_lifted_states_that_hold_are_counted_in_each_engine(self):
-        bank = toy_bank(ROBOT)  # three states are lifted: soup, spam, soup
-        drops = {"a": [0, 1], "b": []}
-
-        def probe(name, scene, index, start, judge, **_):
-            end = start.object_pos.clone()
-            end[drops[name], 2] -= 0.1
-            sound = torch.zeros(3, dtype=torch.bool)
-            backend = mock.Mock()
-            backend.state.return_value = replace(start, object_pos=end)
-            backend.health.return_value = Health(nonfinite=sound, overflow=sound)
-            return judge(backend, start).numpy()
-
-        with mock.patch("xreset.resets.hold.probe", probe):
-            objects = [replace(toy_grasp.brick(), name=name) for name in bank.object_names]
-            rows = hold_bank(bank, ROBOT, objects, list(drops))
-        found = {(row.backend, row.object_name): (row.held, row.lifted) for row in rows}
-        soup, spam = bank.object_names
-        self.assertEqual((found["a", "all"], found["a", soup], found["a", spam]), ((1, 3), (1, 2), (0, 1)))
-        self.assertEqual(found["b", "all"], (3, 3))
-
-
 class CommandTest(unittest.TestCase):
     def setUp(self):
         try:
@@ -263,28 +238,23 @@ class CommandTest(unittest.TestCase):
 
     def test_everything_at_once(self):
         """Jaws close by 30 mm (33 mm on one side): five states between; held by 2.5 N a side, and not without."""
-        bank, account, out = self.resets("--closing.spacing", "0.0056", "--squeeze.force", "2.5", "--hold")
+        bank, account, out = self.resets("--closing.spacing", "0.0056", "--squeeze.force", "2.5")
         assert bank.frame_part is not None
         np.testing.assert_allclose(bank.frame_part * 6, [0, 1, 2, 3, 4, 5, 0, 0], atol=1e-5)
         self.assertEqual(bank.frame_index.tolist(), [0] * 6 + [1, 2])
         self.assertEqual((bank.targets != bank.joint_pos).any(axis=1).tolist(), [False] * 6 + [True] * 2)
         self.assertEqual(sum(row["total"] for row in account["rows"] if row["phase"] == "both"), 3, "frames only")
         self.assertEqual(account["pressing"], 2)
-        self.assertEqual(
-            [(row["object_name"], row["lifted"], row["held"]) for row in account["hold"]],
-            [("brick", 1, 1), ("all", 1, 1)],
-        )
-        for words in ("2 of 2 states after contact press with 2.5 N", "1 (100%)", "8 states of 8"):
+        for words in ("2 of 2 states after contact press with 2.5 N", "8 states of 8"):
             self.assertIn(words, out)
         with np.load(self.folder / "b.npz") as file:
             config = json.loads(str(file["meta"]))["config"]
         self.assertEqual(config["closing"], {"spacing": 0.0056, "within": 0.1})
         self.assertEqual(config["squeeze"]["force"], 2.5)
 
-    def test_what_only_stands_there_falls(self):
-        bank, account, _ = self.resets("--hold")
+    def test_without_options(self):
+        bank, account, _ = self.resets()
         self.assertEqual((bank.num_states, bank.joint_target, bank.frame_part, account["pressing"]), (3, None, None, 0))
-        self.assertEqual([(row["lifted"], row["held"]) for row in account["hold"]], [(1, 0), (1, 0)])
 
     def test_a_squeeze_that_an_engine_does_not_accept_is_left_out(self):
         still = lambda robot, fingers, joints, config: joints - (np.arange(2) == 1)[:, None]  # noqa: E731

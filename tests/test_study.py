@@ -110,7 +110,7 @@ class FileTest(InFolder):
             ("retarget", ["--objects", "/tmp"]),
             ("retarget", ["--pict", "/tmp/victim.png"]),
             ("retarget", ["-h"]),
-            ("resets", ["--hold", "--out", "/tmp/victim.npz"]),
+            ("resets", ["--settle", "--out", "/tmp/victim.npz"]),
             ("resets", ["--robot", "/tmp"]),
         ):
             text = HEAD + DATA + f"{command} = {json.dumps(options)}\n" + RUN + "[runs.a]\n"
@@ -121,7 +121,10 @@ class FileTest(InFolder):
     def test_options_of_the_configuration_are_passed_on(self):
         for command, options in (
             ("retarget", ["--hand.object-clearance", "-0.001", "--arm.restarts=8", "--hand.jump_limit", "0.2"]),
-            ("resets", ["--closing.spacing", "0.005", "--squeeze.force", "5", "--hold", "--backend", "mujoco"]),
+            (
+                "resets",
+                ["--closing.spacing", "0.005", "--squeeze.force", "5", "--num-envs", "8", "--backend", "mujoco"],
+            ),
         ):
             text = HEAD + DATA + f"{command} = {json.dumps(options)}\n" + RUN + "[runs.a]\n"
             with self.subTest(command):

@@ -74,7 +74,7 @@ def _config_flags(**configs: type) -> set[str]:
 COMMAND_FLAGS = {
     "retarget": _config_flags(hand=HandConfig, arm=ArmConfig) | {"--device"},
     "resets": _config_flags(closing=ClosingConfig, filter=FilterConfig, squeeze=SqueezeConfig)
-    | {"--backend", "--device", "--num-envs", "--hold", "--no-hold"},
+    | {"--backend", "--device", "--num-envs"},
 }
 """Flags that a study file may give to a command. Flags that name files are not among them: a study writes only into
 ``--out``."""

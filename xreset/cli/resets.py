@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -17,8 +16,7 @@ from xreset.files import file_hash
 from xreset.objects import catalogue
 from xreset.resets import bank as banks
 from xreset.resets import filter as trying
-from xreset.resets import hold as holding
-from xreset.resets import settle as settling_starts
+from xreset.resets import settle as settling
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.retarget import file
 
@@ -35,7 +33,6 @@ def resets(
     limits: Annotated[FilterConfig, tyro.conf.arg(name="filter")] = FilterConfig(),
     closing: ClosingConfig = ClosingConfig(),
     squeeze: SqueezeConfig = SqueezeConfig(),
-    hold: bool = False,
     settle: bool = False,
 ) -> None:
     """Try retargeted states in physics and keep the stable ones.
@@ -54,7 +51,6 @@ def resets(
         squeeze: Targets of states after contact that press.
         settle: Let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
             poses, as in the paper, from which one object in eight tips or rolls.
-        hold: Also count, in every engine, which lifted states hold the object for a second at full gravity.
     """
     backends = list(dict.fromkeys(backend)) or ["mujoco"]
     console = Console()
@@ -68,17 +64,11 @@ def resets(
             squeeze=squeeze,
             progress=bar.count(f"states in {', '.join(backends)}"),
         )  # fmt: skip
-        settling = None
+        at_rest = None
         if settle:
-            bank, settling = settling_starts.settle_starts(
+            bank, at_rest = settling.settle_starts(
                 bank, spec, loaded, backends[0], num_envs=num_envs, device=device,
                 progress=bar.count("start poses come to rest"),
-            )  # fmt: skip
-        held = []
-        if hold:
-            held = holding.hold_bank(
-                bank, spec, loaded, backends, num_envs=num_envs, device=device,
-                progress=bar.count("lifted states hold"),
             )  # fmt: skip
     config = {
         "backends": backends,
@@ -94,19 +84,17 @@ def resets(
         of="states tried in physics",
         rows=bank.accounts(),
         pressing=bank.num_pressing,
-        **({} if settling is None else {"settled": settling.accounts()}),
-        **({"hold": [asdict(row) for row in held]} if hold else {}),
     )
 
-    if settling is not None:
-        console.print(settling.summary())
+    if at_rest is not None:
+        console.print(
+            f"{at_rest.sum()} of {len(at_rest)} objects came to rest at the start; the others start as recorded"
+        )
     console.print(_accepted(data, bank, f"{spec.name}: states stable in {', '.join(backends)}"))
     if squeeze.force > 0:
         console.print(
             f"{bank.num_pressing} of {int(bank.post_contact.sum())} states after contact press with {squeeze.force:g} N"
         )
-    if hold:
-        console.print(_holding(held, backends))
     tried = bank.num_states + len(bank.rejected_reason)
     console.print(f"{bank.num_states} states of {tried} kept in {out}; counts in {accounts_path(out)}")
 
@@ -137,16 +125,6 @@ def _accepted(data: file.Retargeted, bank: banks.ResetBank, title: str) -> Table
             f"{row.kept / frames:.0%}" if frames else "-",
             described(row.lost),
         )
-    return table
-
-
-def _holding(held: Sequence[holding.Held], backends: Sequence[str]) -> Table:
-    """How many lifted states hold the object, engine by engine."""
-    table = Table("object", "lifted", *backends, title="lifted states that hold the object for 1 s at full gravity")
-    for name in dict.fromkeys(row.object_name for row in held):
-        mine = [row for row in held if row.object_name == name]
-        shares = [f"{row.held} ({row.held / row.lifted:.0%})" if row.lifted else "-" for row in mine]
-        table.add_row(name, str(mine[0].lifted), *shares)
     return table
 
 

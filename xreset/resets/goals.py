@@ -297,12 +297,12 @@ def _resting_poses(objects: Sequence[ObjectSpec], robot: RobotSpec, *, upright: 
                 center = _center(obj, np.array([*_MIDDLE, rest_height(obj, quat)]), turn)
                 place = {"start": center, "start_turn": turn, "goal": center, "goal_turn": turn}
                 episodes.append(_Episode(obj=obj, family="rest", number=len(episodes), **place))
-    settled, settling = settle_starts(_goal_set(robot, episodes), robot, objects)
+    settled, at_rest = settle_starts(_goal_set(robot, episodes), robot, objects)
     rests: dict[str, list[_Rest]] = {}
     for obj in objects:
         rests[obj.name] = []
         for row in listed[obj.name]:
-            if settling.at_rest[row]:
+            if at_rest[row]:
                 turn = Rotation.from_quat(settled.start_quat_wxyz[row], scalar_first=True)
                 rests[obj.name].append(_Rest(height=_center(obj, settled.start_pos[row], turn)[2], turn=turn))
         if not rests[obj.name]:

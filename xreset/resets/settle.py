@@ -7,12 +7,10 @@ recordings the object tips or rolls by more than 10 degrees before a hand arrive
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from xreset.physics import Backend, State
@@ -30,32 +28,6 @@ ANGULAR_VELOCITY = 0.1
 """Largest angular speed of an object at rest [rad/s]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Settling:
-    """How far the objects of S start poses moved until they were at rest."""
-
-    distance: np.ndarray
-    """[S] [m]"""
-    angle: np.ndarray
-    """[S] [rad]"""
-    at_rest: np.ndarray
-    """[S] bool: whether the object came to rest on the table. Otherwise its start pose stays as it was recorded."""
-
-    def accounts(self) -> list[dict[str, Any]]:
-        """One row for each start pose, for the accounts of a bank."""
-        columns = zip(self.distance.tolist(), np.degrees(self.angle).tolist(), self.at_rest.tolist(), strict=True)
-        return [{"metres": metres, "degrees": degrees, "at_rest": rest} for metres, degrees, rest in columns]
-
-    def summary(self) -> str:
-        """One sentence for a terminal."""
-        turned = self.at_rest & (self.angle > np.radians(10))
-        sentence = f"{len(self.angle)} start poses: {int(turned.sum())} objects turned by more than 10 degrees"
-        moving = int((~self.at_rest).sum())
-        if moving:
-            sentence += f"; {moving} did not come to rest and start as recorded"
-        return sentence + "."
-
-
 def settle_starts(
     bank: ResetBank,
     robot: RobotSpec,
@@ -65,7 +37,7 @@ def settle_starts(
     num_envs: int = 64,
     device: str = "cpu",
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[ResetBank, Settling]:
+) -> tuple[ResetBank, np.ndarray]:
     """Return a bank whose episodes from home begin with objects at rest.
 
     The robot holds its home configuration meanwhile, in which it touches no object.
@@ -78,6 +50,9 @@ def settle_starts(
         num_envs: worlds at a time.
         device: where the engine runs if it can.
         progress: called with (start poses done, start poses in all).
+
+    Returns:
+        The bank, and whether each object came to rest on the table [S]; the others start as recorded.
     """
     names = [o.name for o in objects]
     scene = SceneSpec(robot=robot, objects=tuple(objects))
@@ -100,14 +75,7 @@ def settle_starts(
     at_rest = found[:, 7] > 0
     pos = np.where(at_rest[:, None], found[:, :3], bank.start_pos).astype(np.float32)
     quat = np.where(at_rest[:, None], found[:, 3:7], bank.start_quat_wxyz).astype(np.float32)
-    before = Rotation.from_quat(bank.start_quat_wxyz, scalar_first=True)
-    after = Rotation.from_quat(quat, scalar_first=True)
-    settling = Settling(
-        distance=np.linalg.norm(pos - bank.start_pos, axis=1),
-        angle=(after * before.inv()).magnitude(),
-        at_rest=at_rest,
-    )
-    return replace(bank, start_pos=pos, start_quat_wxyz=quat), settling
+    return replace(bank, start_pos=pos, start_quat_wxyz=quat), at_rest
 
 
 def rest_pose(backend: Backend, start: State) -> Tensor:

@@ -34,12 +34,15 @@ from xreset.pictures.render import Camera, Renderer, add_caption, pose_matrix
 from xreset.resets.bank import ResetBank
 from xreset.resets.config import SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
-from xreset.resets.hold import LIFT, SECONDS
 from xreset.resets.probe import probe
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
 SCHEMA = "xreset-judge/1"
 PHASES = ("hold", "lift", "turn")
+LIFT = 0.01
+"""Height of the object's origin above the demonstration's start from which a state is lifted [m]."""
+SECONDS = 1.0
+"""Time for which a state must hold the object [s]."""
 HEIGHT = 0.10
 """How far the arm raises the hand [m]."""
 TURN = float(np.pi / 4)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain, combinations, product
 
 import mujoco
@@ -28,9 +28,8 @@ from xreset.backends.mjcf_model import (
     locate,
     pos_quat,
 )
-from xreset.backends.rigid import Inertia, Mechanism, mechanism, object_inertia
+from xreset.backends.rigid import Inertia, Mechanism, MovingJoints, mechanism, object_inertia
 from xreset.errors import ObjectError, XResetError
-from xreset.geometry.dynamics import drive_shares
 from xreset.geometry.urdf import Joint
 from xreset.physics import KnownDifference
 from xreset.spec import GRAVITY, Geometry, ObjectSpec, SceneSpec, Shape
@@ -44,8 +43,6 @@ _IMPRATIO = 10.0
 _SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
 _SOLIMP_MIMIC = (0.99, 0.999, 0.001, 0.5, 2.0)
 _STIFF_MIMIC = 0.8  # share of a mimic joint's lag that the next step takes away; its rate goes wholly
-MIN_TIME_CONSTANT_STEPS = 2.0
-"""MuJoCo's smallest time constant of contacts and other constraints, in timesteps."""
 _CONDIM = 4
 _ROLLING = 1e-4  # MuJoCo wants a positive number although condim 4 does not use it
 _ARENA = 16 << 20  # bytes for contacts and constraints of one MjData
@@ -73,22 +70,8 @@ KNOWN_DIFFERENCES = tuple(
 """Checks that both MuJoCo backends miss: at mu = 1.2 and 0.5 m/s, a 40 mm high box was seen to hop by 3.6 mm."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class MujocoSettings:
-    """Dials of both MuJoCo backends."""
-
-    time_constant_steps: float = 2.016
-    """Time constant of contacts (``solref``) in timesteps: as stiff as the timestep allows, with room for rounding."""
-
-    def __post_init__(self) -> None:
-        """Refuse values that MuJoCo would silently raise to its minimum."""
-        if not self.time_constant_steps >= MIN_TIME_CONSTANT_STEPS:
-            raise ValueError(
-                f"time_constant_steps is {self.time_constant_steps}, expected at least {MIN_TIME_CONSTANT_STEPS}"
-            )
-
-
-_DEFAULTS = MujocoSettings()
+_CONTACT_STEPS = 2.016
+"""Time constant of contacts (``solref``) in timesteps: as stiff as the timestep allows, with room for rounding."""
 
 
 def compile_scene(
@@ -97,7 +80,6 @@ def compile_scene(
     *,
     slots_for: Sequence[int] = (),
     sensors: bool = False,
-    settings: MujocoSettings = _DEFAULTS,
 ) -> SceneModel:
     """Return the model of a scene that holds ``scene.objects[object_index]``.
 
@@ -110,15 +92,16 @@ def compile_scene(
         sensors: let the engine itself compute what a backend reports. ``sensordata`` then holds, in this order, the
             tracked links' positions [K, 3], orientations [K, 4], velocities [K, 3] and angular velocities [K, 3]; the
             force of the object on the table [3] and on each fingertip geom [S, 3].
-        settings: further dials.
 
     Raises:
         RobotError: the robot cannot be simulated.
         ObjectError: the object cannot be simulated.
     """
     robot = mechanism(scene.robot)
+    names = [*scene.robot.joint_names, *(mimic.joint for mimic in scene.robot.mimics)]
+    joints = MovingJoints(scene.robot, names)
     spec = _empty_spec(scene)
-    roles = _add_robot(spec, scene, robot, settings)
+    roles = _add_robot(spec, scene, robot)
     spec.worldbody.add_geom(
         name="table",
         type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -126,11 +109,11 @@ def compile_scene(
         pos=(*scene.table.center, -scene.table.half_size[2]),
         contype=0,
         conaffinity=_HIT_OBJECT | _HIT_TABLE,
-        **_contact(scene.friction.table, scene, settings),
+        **_contact(scene.friction.table, scene),
     )
     roles["table"] = TABLE
-    parked = _add_object(spec, scene, object_index, slots_for, settings)
-    _add_drives(spec, scene)
+    parked = _add_object(spec, scene, object_index, slots_for)
+    _add_drives(spec, scene, joints, names)
     sensed = add_sensors(spec, robot, roles) if sensors else []
     try:
         model = spec.compile()
@@ -141,7 +124,8 @@ def compile_scene(
         ) from error
     _let_com_move(model, model.body("object").id)
     model.body_gravcomp[model.body("object").id] = 0.0
-    return locate(scene, robot, model, roles, parked, sensed)
+    joint_ids = np.array([model.joint(name).id for name in names])
+    return locate(scene, robot, joints, model, joint_ids, roles, parked, sensed)
 
 
 # Options --------------------------------------------------------------------------------------------------------------
@@ -163,15 +147,15 @@ def _empty_spec(scene: SceneSpec) -> mujoco.MjSpec:
     return spec
 
 
-def _solref(scene: SceneSpec, settings: MujocoSettings = _DEFAULTS) -> tuple[float, float]:
-    return (settings.time_constant_steps * scene.timestep, 1.0)
+def _solref(scene: SceneSpec) -> tuple[float, float]:
+    return (_CONTACT_STEPS * scene.timestep, 1.0)
 
 
-def _contact(friction: float, scene: SceneSpec, settings: MujocoSettings) -> dict:
+def _contact(friction: float, scene: SceneSpec) -> dict:
     """Contact attributes of a geom."""
     return {
         "friction": (max(friction, MIN_FRICTION), scene.friction.torsional, _ROLLING),
-        "solref": _solref(scene, settings),
+        "solref": _solref(scene),
         "solimp": _SOLIMP,
         "condim": _CONDIM,
     }
@@ -180,7 +164,7 @@ def _contact(friction: float, scene: SceneSpec, settings: MujocoSettings) -> dic
 # Robot ----------------------------------------------------------------------------------------------------------------
 
 
-def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, settings: MujocoSettings) -> dict[str, int]:
+def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism) -> dict[str, int]:
     """Add bodies, joints and geoms; return geom -> role."""
     description = robot.robot
     added: list[mujoco.MjsBody] = []
@@ -219,7 +203,7 @@ def _add_robot(spec: mujoco.MjSpec, scene: SceneSpec, robot: Mechanism, settings
                 contype=self_bit | table_bit,
                 conaffinity=_HIT_OBJECT | self_bit,
                 **_placed(spec, item.shape, name),
-                **_contact(friction, scene, settings),
+                **_contact(friction, scene),
             )
             if self_bit:
                 self_geoms[-1][name] = item.link
@@ -271,19 +255,19 @@ def _limit_self_collision(
             )
 
 
-def _add_drives(spec: mujoco.MjSpec, scene: SceneSpec) -> None:
-    """Add the drives: on joints, and on joints that others follow through a tendon: see :func:`drive_shares`."""
-    robot = scene.robot
-    moving = [*robot.joint_names, *(mimic.joint for mimic in robot.mimics)]
-    offset = np.array([0.0] * len(robot.joints) + [mimic.offset for mimic in robot.mimics])
-    for joint, shares in zip(robot.joints, drive_shares(robot), strict=True):
+def _add_drives(spec: mujoco.MjSpec, scene: SceneSpec, joints: MovingJoints, names: Sequence[str]) -> None:
+    """Add the drives: on joints, and on joints that others follow through a tendon: see
+    :func:`~xreset.geometry.dynamics.drive_shares`."""
+    offset = np.zeros(joints.count)
+    offset[joints.mimic] = joints.offset
+    for joint, shares in zip(scene.robot.joints, joints.shares, strict=True):
         drive = joint.drive
         along = np.flatnonzero(shares)
         shared = len(along) > 1
         if shared:
             tendon = spec.add_tendon(name=joint.name)
-            for i in along:
-                tendon.wrap_joint(moving[i], shares[i])
+            for i in along.tolist():
+                tendon.wrap_joint(names[i], shares[i])
         spec.add_actuator(
             name=joint.name,
             trntype=mujoco.mjtTrn.mjTRN_TENDON if shared else mujoco.mjtTrn.mjTRN_JOINT,
@@ -318,9 +302,7 @@ def _padded(values: Sequence[float], length: int = mujoco.mjNGAIN) -> np.ndarray
 # Object ---------------------------------------------------------------------------------------------------------------
 
 
-def _add_object(
-    spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Sequence[int], settings: MujocoSettings
-) -> set[str]:
+def _add_object(spec: mujoco.MjSpec, scene: SceneSpec, index: int, slots_for: Sequence[int]) -> set[str]:
     """Add the object and empty slots; return the names of the geoms that are parked."""
     thing = scene.objects[index]
     hulls: dict[int, list[str]] = {}
@@ -336,7 +318,7 @@ def _add_object(
     _set_inertia(body, replace(inertia, com=inertia.com + _ASIDE))
     body.add_joint(name="object", type=mujoco.mjtJoint.mjJNT_FREE, align=mujoco.mjtAlignFree.mjALIGNFREE_FALSE)
     parked = set()
-    common = {"contype": _HIT_OBJECT, "conaffinity": 0, **_contact(0.0, scene, settings)}
+    common = {"contype": _HIT_OBJECT, "conaffinity": 0, **_contact(0.0, scene)}
     for kind, geom_type in _GEOM_TYPES.items():
         pieces = [piece for piece in thing.pieces if piece.geometry.kind == kind]
         for slot in range(slots[kind]):

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.backends.rigid import Body, Mechanism
+from xreset.backends.rigid import Body, Mechanism, MovingJoints
 from xreset.spec import SceneSpec
 
 TABLE = -1
@@ -30,20 +30,12 @@ class SceneModel:
 
     scene: SceneSpec
     model: mujoco.MjModel
-    joint_qpos: np.ndarray
-    """[J] addresses in qpos, in joint order."""
-    joint_dof: np.ndarray
-    """[J] addresses in qvel. Actuator i drives joint i."""
-    mimic_qpos: np.ndarray
-    """[Q]"""
-    mimic_dof: np.ndarray
-    """[Q]"""
-    mimic_source: np.ndarray
-    """[Q] index of the source in joint order."""
-    mimic_multiplier: np.ndarray
-    """[Q]"""
-    mimic_offset: np.ndarray
-    """[Q]"""
+    joints: MovingJoints
+    """The actuated joints, then the mimic joints. Actuator i drives actuated joint i."""
+    qpos: np.ndarray
+    """[J + Q] addresses of these joints in qpos."""
+    dof: np.ndarray
+    """[J + Q] addresses of these joints in qvel."""
     link_body: np.ndarray
     """[K] body that each tracked link is part of."""
     link_pos: np.ndarray
@@ -117,7 +109,9 @@ def add_sensors(spec: mujoco.MjSpec, robot: Mechanism, roles: dict[str, int]) ->
 def locate(
     scene: SceneSpec,
     robot: Mechanism,
+    joints: MovingJoints,
     model: mujoco.MjModel,
+    joint_ids: np.ndarray,
     roles: dict[str, int],
     parked: set[str],
     sensed: list[int],
@@ -127,32 +121,26 @@ def locate(
     Args:
         scene: what the model was compiled from.
         robot: its robot.
+        joints: its moving joints.
         model: the compiled model.
+        joint_ids: [J + Q] number of each moving joint in the model.
         roles: geom -> role.
         parked: geoms that are parked.
         sensed: fingertip of each geom that has a contact sensor.
     """
-    names = robot.robot.joint_names
-    mimics = robot.robot.mimics
     geoms = [model.geom(i).name for i in range(model.ngeom)]
     bodies, frames = zip(*(robot.frames[link] for link in robot.robot.tracked_links), strict=True)
 
     def ids(bodies: Iterable[Body]) -> np.ndarray:
         return np.array([model.body(body_name(body)).id for body in bodies], dtype=np.int64)
 
-    joints = np.array([model.joint(name).id for name in names], dtype=np.int64)
-    followers = np.array([model.joint(mimic.joint).id for mimic in mimics], dtype=np.int64)
     free = model.joint("object").id
     return SceneModel(
         scene=scene,
         model=model,
-        joint_qpos=model.jnt_qposadr[joints].astype(np.int64),
-        joint_dof=model.jnt_dofadr[joints].astype(np.int64),
-        mimic_qpos=model.jnt_qposadr[followers].astype(np.int64),
-        mimic_dof=model.jnt_dofadr[followers].astype(np.int64),
-        mimic_source=np.array([names.index(mimic.source) for mimic in mimics], dtype=np.int64),
-        mimic_multiplier=np.array([mimic.multiplier for mimic in mimics], dtype=np.float64),
-        mimic_offset=np.array([mimic.offset for mimic in mimics], dtype=np.float64),
+        joints=joints,
+        qpos=model.jnt_qposadr[joint_ids].astype(np.int64),
+        dof=model.jnt_dofadr[joint_ids].astype(np.int64),
         link_body=ids(robot.bodies[body] for body in bodies),
         link_pos=np.array([T[:3, 3] for T in frames]),
         link_quat=np.array([pos_quat(T)[1] for T in frames]),

@@ -20,27 +20,25 @@ try:
 except ImportError as error:
     raise unavailable("mujoco", "'xreset[mujoco]'", error) from error
 
-from xreset.backends.mjcf import KNOWN_DIFFERENCES, MujocoSettings, compile_scene
+from xreset.backends.mjcf import KNOWN_DIFFERENCES, compile_scene
 from xreset.backends.mjcf_model import MIN_FRICTION, SceneModel
 
 _FULL = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
 """The engine's warnings that a buffer for contacts or constraints was full."""
-
-_DEFAULTS = MujocoSettings()
 
 
 class MujocoWorld(World):
     """One world in MuJoCo.
 
     The engine's step has two halves: what follows from positions and velocities (``mj_step1``: kinematics, contacts),
-    and forces and motion (``mj_step2``). When links are asked for, the first half of the next step is done in advance.
-    The links are then up to date, and nothing is done twice unless a parameter changes before that step.
+    and forces and motion (``mj_step2``). Reading the links does the first half of the next step in advance. The links
+    are then up to date, and nothing is done twice unless a parameter changes before that step.
     """
 
-    def __init__(self, scene: SceneSpec, object_index: int, *, settings: MujocoSettings = _DEFAULTS) -> None:
+    def __init__(self, scene: SceneSpec, object_index: int) -> None:
         if mujoco.get_mju_user_warning() is None:  # the default writes a log file into the current folder
             mujoco.set_mju_user_warning(lambda _: None)
-        self._at = at = _compiled(scene, object_index, settings)
+        self._at = at = _compiled(scene, object_index)
         self._model = model = copy(at.model)  # each world has parameters of its own
         self._data = data = mujoco.MjData(model)
         self._option = model.opt
@@ -49,8 +47,6 @@ class MujocoWorld(World):
         self._silent = self._sensing | mujoco.mjtDisableBit.mjDSBL_SENSOR
         self._option.disableflags = self._silent
         self._ahead = False  # whether the first half of the next step is done, with the present parameters
-        self._links_sensed = False
-        self._contacts_sensed = False
         self._overflowed = False
         self._overflows = 0
 
@@ -61,6 +57,8 @@ class MujocoWorld(World):
         self._wrench = data.xfrc_applied[at.object_body]
         self._object_pos, self._object_quat = np.split(data.qpos[at.object_qpos : at.object_qpos + 7], [3])
         self._object_linvel, self._object_spin = np.split(data.qvel[at.object_dof : at.object_dof + 6], [3])
+        self._joint_qpos = at.qpos[at.joints.driven]
+        self._joint_dof = at.dof[at.joints.driven]
         links = len(at.link_body)
         sizes = np.cumsum((3 * links, 4 * links, 3 * links, 3 * links, 3))
         *link_arrays, self._table_force, tip_forces = np.split(data.sensordata, sizes)
@@ -79,23 +77,18 @@ class MujocoWorld(World):
         mujoco.mj_resetData(self._model, self._data)
         self._overflowed = False
         self._overflows = 0
-        self._qpos[at.joint_qpos] = state["joint_pos"]
-        self._qvel[at.joint_dof] = state["joint_vel"]
-        self._qpos[at.mimic_qpos] = at.mimic_multiplier * state["joint_pos"][at.mimic_source] + at.mimic_offset
-        self._qvel[at.mimic_dof] = at.mimic_multiplier * state["joint_vel"][at.mimic_source]
+        self._qpos[at.qpos], self._qvel[at.dof] = at.joints.spread(state["joint_pos"], state["joint_vel"])
         self._ctrl[:] = state["joint_target"]
         self._object_pos[:] = state["object_pos"]
         self._object_quat[:] = quat = state["object_quat"] / np.linalg.norm(state["object_quat"])
         self._object_linvel[:] = state["object_linvel"]
         self._object_spin[:] = _rotate(quat * np.array([1.0, -1.0, -1.0, -1.0]), state["object_angvel"])
         self._ahead = False
-        self._links_sensed = False
-        self._contacts_sensed = True  # resetting has made them zero
 
     def get_state(self) -> dict[str, np.ndarray]:
         return {
-            "joint_pos": self._qpos.take(self._at.joint_qpos),
-            "joint_vel": self._qvel.take(self._at.joint_dof),
+            "joint_pos": self._qpos.take(self._joint_qpos),
+            "joint_vel": self._qvel.take(self._joint_dof),
             "joint_target": self._ctrl,
             "object_pos": self._object_pos,
             "object_quat": self._object_quat,
@@ -112,24 +105,21 @@ class MujocoWorld(World):
             n -= 1
         if n:
             mujoco.mj_step(self._model, self._data, n)
-        self._ahead = self._links_sensed = self._contacts_sensed = False
+        self._ahead = False
         before = self._overflows
         self._overflows = sum(warning.number for warning in self._full)
         self._overflowed = self._overflows > before
 
-    def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        if not self._links_sensed:
-            self._sense_contacts()  # while the engine's contacts are those of the last step
-            self._with_sensors(mujoco.mj_step1)  # senses the links; contacts sensed before stay
-            self._ahead = True
-            self._links_sensed = True
-        return self._links
-
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        self._sense_contacts()
+        self._with_sensors(mujoco.mj_sensorAcc)
         tip_force = self._sum_by_tip @ self._geom_forces
         # A contact in which no force acts is no touch.
         return tip_force, tip_force.any(axis=1), -self._table_force
+
+    def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        self._with_sensors(mujoco.mj_step1)
+        self._ahead = True
+        return self._links
 
     def health(self, state: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
         """See :meth:`World.health`. Reads the engine's own memory: two arrays, which include the mimic joints."""
@@ -188,12 +178,6 @@ class MujocoWorld(World):
         self._wrench[:3] = force
         self._wrench[3:] = torque
 
-    def _sense_contacts(self) -> None:
-        """Sense the contact forces of the last step, before the first half of the next one replaces the contacts."""
-        if not self._contacts_sensed:
-            self._with_sensors(mujoco.mj_sensorAcc)
-            self._contacts_sensed = True
-
     def _with_sensors(self, stage: Callable[[mujoco.MjModel, mujoco.MjData], None]) -> None:
         self._option.disableflags = self._sensing
         stage(self._model, self._data)
@@ -201,7 +185,7 @@ class MujocoWorld(World):
 
 
 class MujocoBackend(PoolBackend):
-    """MuJoCo on the CPU, worlds in a pool of processes; the keyword ``settings`` takes :class:`MujocoSettings`."""
+    """MuJoCo on the CPU."""
 
     name: ClassVar[str] = "mujoco"
     capabilities: ClassVar[frozenset[Capability]] = frozenset(get_args(Capability))
@@ -213,16 +197,16 @@ class MujocoBackend(PoolBackend):
         return mujoco.__version__
 
 
-_MODELS: WeakValueDictionary[tuple[int, int, MujocoSettings], SceneModel] = WeakValueDictionary()
+_MODELS: WeakValueDictionary[tuple[int, int], SceneModel] = WeakValueDictionary()
 """Compiled models that are in use: compiling takes longer than copying, and the worlds of a process share a scene."""
 
 
-def _compiled(scene: SceneSpec, object_index: int, settings: MujocoSettings) -> SceneModel:
+def _compiled(scene: SceneSpec, object_index: int) -> SceneModel:
     """Return the model of a scene. Scenes hold arrays, so they are told apart by identity and not by content."""
-    key = (id(scene), object_index, settings)
+    key = (id(scene), object_index)
     model = _MODELS.get(key)
     if model is None:
-        model = _MODELS[key] = compile_scene(scene, object_index, sensors=True, settings=settings)
+        model = _MODELS[key] = compile_scene(scene, object_index, sensors=True)
     return model
 
 

@@ -36,7 +36,7 @@ except ImportError as error:
     raise unavailable("mujoco_warp", "'xreset[mujoco-warp]'", error) from error
 
 from xreset.backends import mujoco_warp_kernels as kernels
-from xreset.backends.mjcf import KNOWN_DIFFERENCES, MujocoSettings, compile_scene
+from xreset.backends.mjcf import KNOWN_DIFFERENCES, compile_scene
 from xreset.backends.mjcf_model import MIN_FRICTION
 from xreset.backends.mujoco_warp_setup import (
     announced,
@@ -68,6 +68,9 @@ They, and all that MuJoCo derives from them, must be batched, or every world get
 _VECTORS = {"friction": wp.vec3, "object_com": wp.vec3, "inertia": wp.vec3, "com": wp.vec3, "invweight": wp.vec2}
 """Types of the parameters and nominal values that are no plain numbers, for Warp."""
 
+_SOLVER_ITERATIONS = 8
+"""Most Newton iterations; worlds that have converged stop earlier, but a step waits for the slowest. With 8 the
+conformance checks give the same results as with 30, at 240 and at 120 Hz."""
 _OVERFLOW = int(
     mjw.OverflowType.NEFC
     | mjw.OverflowType.NJMAX_NNZ
@@ -101,11 +104,6 @@ class MujocoWarpBackend(Backend):
         *,
         object_index: Tensor | None = None,
         device: str = "cpu",
-        contacts_per_world: int | None = None,
-        convex_contacts_per_world: int | None = None,
-        constraints_per_world: int | None = None,
-        solver_iterations: int = 8,
-        settings: MujocoSettings | None = None,
     ) -> None:
         """Build the worlds, compile the kernels and capture the CUDA graphs.
 
@@ -114,30 +112,16 @@ class MujocoWarpBackend(Backend):
             num_worlds: see :class:`Backend`.
             object_index: see :class:`Backend`.
             device: ``cuda[:i]`` or ``cpu``.
-            contacts_per_world: contacts are pooled: all worlds together may have N times as many. Pairs of shapes that
-                are near each other count while contacts are being found, so more are needed than touch.
-            convex_contacts_per_world: the same for pairs of a type that overlap and need the general convex algorithm.
-            constraints_per_world: rows of constraints (4 a contact, 1 a dry friction, joint limit or mimic joint) in
-                any one world. None, of any of the three: by the object with the most pieces, see ``contact_room``.
-            solver_iterations: most Newton iterations; worlds that have converged stop earlier, but a step waits for the
-                slowest. With 8 the conformance checks give the same results as with 30, at 240 and at 120 Hz.
-            settings: further dials.
 
         Raises:
             BackendUnavailableError: the device does not exist.
         """
         super().__init__(scene, num_worlds, object_index=object_index, device=existing_device(device))
         held = self.object_index.unique().tolist()
-        scenes = {i: compile_scene(scene, i, slots_for=held, settings=settings or MujocoSettings()) for i in held}
+        scenes = {i: compile_scene(scene, i, slots_for=held) for i in held}
         self._at = at = next(iter(scenes.values()))
-        at.model.opt.iterations = solver_iterations
+        at.model.opt.iterations = _SOLVER_ITERATIONS
         contacts, convex, rows = contact_room(max(len(scene.objects[i].pieces) for i in held))
-        if contacts_per_world is not None:
-            contacts = contacts_per_world
-        if convex_contacts_per_world is not None:
-            convex = convex_contacts_per_world
-        if constraints_per_world is not None:
-            rows = constraints_per_world
         with quiet():
             correct_engine()
             self._warp_device = wp.device_from_torch(self.device)
@@ -149,7 +133,7 @@ class MujocoWarpBackend(Backend):
                 # Overflows are counted, see health(); printing them from the GPU would flood the terminal.
                 self._model.opt.warn_overflow = 0
                 self._data: Any = mjw.make_data(
-                    at.model, nworld=num_worlds, nconmax=contacts, nccdmax=min(convex, contacts), njmax=rows
+                    at.model, nworld=num_worlds, nconmax=contacts, nccdmax=convex, njmax=rows
                 )
                 fill_batched(self._model, scenes, self.object_index, differing)
                 self._allocate()
@@ -181,13 +165,11 @@ class MujocoWarpBackend(Backend):
 
     def set_joint_targets(self, targets: Tensor) -> None:
         self._must_be_open()
-        self._ctrl.copy_(self._checked("joint_target", targets, self.num_worlds))
+        self._ctrl.copy_(self._checked("joint_target", targets, self._ctrl.shape))
 
     def step(self, substeps: int | None = None) -> None:
         self._must_be_open()
-        substeps = self.scene.substeps if substeps is None else substeps
-        if substeps < 1:
-            raise ValueError(f"substeps is {substeps}, expected at least 1")
+        substeps = self._checked_substeps(substeps)
         with self._on_stream():
             for _ in range(substeps):
                 self._run("step")
@@ -213,7 +195,7 @@ class MujocoWarpBackend(Backend):
         for name, value in parameters.given().items():
             present = self._parameters[name]
             mine = self._mask.view(-1, *[1] * (present.ndim - 1))
-            torch.where(mine, self._rows(value, present.shape), present, out=present)
+            torch.where(mine, self._checked(name, value, present.shape), present, out=present)
         for name, value in self._checked_state(state, self.num_worlds).items():
             self._coming[name].copy_(value)
         with self._on_stream():
@@ -238,7 +220,7 @@ class MujocoWarpBackend(Backend):
         self._must_be_open()
         index = self._selected(worlds)
         present = self._parameters[name]
-        present[index] = self._rows(value, (len(index), *present.shape[1:]))
+        present[index] = self._checked(name, value, (len(index), *present.shape[1:]))
         self._mask.zero_()
         self._mask[index] = True
         with self._on_stream():
@@ -246,9 +228,8 @@ class MujocoWarpBackend(Backend):
 
     def set_object_wrench(self, force: Tensor, torque: Tensor) -> None:
         self._must_be_open()
-        shape = (self.num_worlds, 3)
-        wrench = torch.cat((self._rows(force, shape), self._rows(torque, shape)), dim=-1)
-        self._xfrc_applied[:, self._at.object_body] = wrench
+        wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
+        self._xfrc_applied[:, self._at.object_body] = self._checked("wrench", wrench, (self.num_worlds, 6))
 
     def close(self) -> None:
         """Free the worlds' memory once nobody else holds a view of it."""
@@ -267,9 +248,10 @@ class MujocoWarpBackend(Backend):
             return wp.array(values.astype(np.int32), dtype=int)
 
         self._out = kernels.outputs(n, len(robot.joints), len(robot.fingertips))
-        self._addresses = [ints(at.joint_qpos), ints(at.joint_dof)]
-        self._mimic = [ints(at.mimic_qpos), ints(at.mimic_dof), ints(at.mimic_source)]
-        self._mimic += [wp.array(at.mimic_multiplier, dtype=float), wp.array(at.mimic_offset, dtype=float)]
+        joints = at.joints
+        self._addresses = [ints(at.qpos[joints.driven]), ints(at.dof[joints.driven])]
+        self._mimic = [ints(at.qpos[joints.mimic]), ints(at.dof[joints.mimic]), ints(joints.source)]
+        self._mimic += [wp.array(joints.multiplier, dtype=float), wp.array(joints.offset, dtype=float)]
         self._link_arrays = [
             ints(at.link_body),
             wp.array(at.link_pos, dtype=wp.vec3),
@@ -296,7 +278,6 @@ class MujocoWarpBackend(Backend):
 
     def _name_parameters(self) -> None:
         """Name the values that the parameters of the worlds start from, and the present values."""
-        n = self.num_worlds
         body = self._at.object_body
         field = {name: wp.to_torch(getattr(self._model, name)) for name in _SET_PER_WORLD}
         self._drive_fields = [wp.from_torch(field[name]) for name in _DRIVE_FIELDS]
@@ -311,18 +292,7 @@ class MujocoWarpBackend(Backend):
             "drive": torch.stack((gain[:, 0], -bias[:, 2], force_range[:, 1], bias[:, 0]), dim=1),
         }
         self._nominal = {name: value.clone() for name, value in nominal.items()}
-        friction = self.scene.friction
-        pairs = torch.tensor([friction.tip, friction.link, friction.table], device=self.device)
-        one = torch.ones(n, device=self.device)
-        self._parameters: dict[Parameter, Tensor] = {
-            "friction": pairs.repeat(n, 1),
-            "torsional_friction": friction.torsional * one,
-            "object_mass": self._nominal["mass"].clone(),
-            "object_inertia": one.clone(),
-            "object_com": torch.zeros_like(self._nominal["com"]),
-            "object_gravity": one.clone(),
-            "drives": torch.ones(n, 3, len(self.scene.robot.joints), device=self.device),
-        }
+        self._parameters = Parameters.nominal(self.scene, self.object_index).to(self.device).given()
         """The present values of each world."""
 
     def _prepare(self) -> None:
@@ -464,19 +434,10 @@ class MujocoWarpBackend(Backend):
         return torch.as_tensor(worlds, dtype=torch.int64, device=self.device)
 
     def _checked_state(self, state: State, rows: int) -> dict[str, Tensor]:
-        return {field.name: self._checked(field.name, getattr(state, field.name), rows) for field in fields(State)}
-
-    def _checked(self, name: str, value: Tensor, rows: int) -> Tensor:
-        try:
-            return self._rows(value, (rows, *getattr(self._state, name).shape[1:]))
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from None
-
-    def _rows(self, value: Tensor, shape: tuple[int, ...]) -> Tensor:
-        value = torch.as_tensor(value, dtype=torch.float32, device=self.device).detach()
-        if value.shape != shape:
-            raise ValueError(f"found shape {tuple(value.shape)}, expected {tuple(shape)}")
-        return value.contiguous()
+        checked = {}
+        for name, present in self._coming.items():
+            checked[name] = self._checked(name, getattr(state, name), (rows, *present.shape[1:]))
+        return checked
 
     def _must_be_open(self) -> None:
         if self._data is None:

@@ -21,7 +21,6 @@ from torch import Tensor
 from xreset.backends.rigid import Inertia
 from xreset.backends.workers import (
     CONTACT_FIELDS,
-    READINGS,
     STATE_FIELDS,
     Job,
     LocalWorlds,
@@ -39,10 +38,9 @@ from xreset.spec import SceneSpec
 class World(ABC):
     """One world of a scene in one process. Arrays are numpy float64; conventions are those of :class:`Backend`.
 
-    The state is undefined until :meth:`set_state`, which the pool calls first. A world that reports a non-finite state
-    is not stepped again before its state is set. :meth:`links` and :meth:`contacts` are called only where somebody
-    wants them, in any order, once or often: they must move nothing, and describe the last step. No parameter changes
-    between that step and the call.
+    The state is undefined until :meth:`set_state`, which the pool calls first. After each :meth:`set_state` and
+    :meth:`step`, the pool calls :meth:`get_state`, :meth:`health`, :meth:`contacts` and :meth:`links` once, in this
+    order. A world that reports a non-finite state is not stepped again before its state is set.
     """
 
     gravity_fraction = 1.0
@@ -149,9 +147,7 @@ class PoolBackend(Backend):
     A subclass sets ``name``, ``capabilities`` and ``world_class`` and returns its engine's version. Getters return
     views of shared memory; inputs are read at the next step.
 
-    One :meth:`step` is one round trip to each worker, after which state and health are there. Links and contacts cost
-    time to read, so a step brings those that were asked for after the step before. Otherwise, asking for them takes a
-    round trip, once.
+    One :meth:`step` is one round trip to each worker, after which all readings are there.
     """
 
     world_class: ClassVar[type[World]]
@@ -203,11 +199,6 @@ class PoolBackend(Backend):
             self._team = WorkerTeam(jobs, layout)
             self._arrays = self._team.arrays
         self._close = weakref.finalize(self, self._team.close)  # also runs when the interpreter exits
-        self._present = READINGS
-        """Readings that are up to date in the shared arrays."""
-        self._asked = READINGS
-        """Readings that somebody has asked for since the last step: the next step brings them."""
-
         views = {name: torch.from_numpy(array) for name, array in self._arrays.items()}
         self._state = State(**{name: views[name] for name in STATE_FIELDS})
         self._links = Links(**{field.name: views[f"link_{field.name}"] for field in fields(Links)})
@@ -215,18 +206,18 @@ class PoolBackend(Backend):
         self._health = Health(nonfinite=views["nonfinite"], overflow=views["overflow"])
         self._state.map(Tensor.copy_, State.initial(scene, self.object_index))
         try:
-            self._command("build", readings=READINGS)
+            self._command("build")
         except BaseException:
             self.close()
             raise
 
     def set_state(self, state: State, worlds: Tensor | None = None) -> None:
         index = self._selected(worlds)
-        values = {name: self._checked(name, getattr(state, name), len(index)) for name in STATE_FIELDS}
+        values = {name: self._rows(name, getattr(state, name), len(index)) for name in STATE_FIELDS}
         for name, value in values.items():
             self._arrays[name][index] = value
         self._arrays["wrench"][index] = 0.0
-        self._command("set_state", index, readings=self._present)
+        self._command("set_state", index)
 
     def state(self) -> State:
         self._must_be_open()
@@ -234,22 +225,17 @@ class PoolBackend(Backend):
 
     def set_joint_targets(self, targets: Tensor) -> None:
         self._must_be_open()
-        self._arrays["joint_target"][:] = self._checked("joint_target", targets, self.num_worlds)
+        self._arrays["joint_target"][:] = self._rows("joint_target", targets, self.num_worlds)
 
     def step(self, substeps: int | None = None) -> None:
-        substeps = self.scene.substeps if substeps is None else substeps
-        if substeps < 1:
-            raise ValueError(f"substeps is {substeps}, expected at least 1")
-        asked = self._asked
-        self._asked = frozenset()
-        self._command("step", argument=substeps, readings=asked)
+        self._command("step", argument=self._checked_substeps(substeps))
 
     def links(self) -> Links:
-        self._ask("links")
+        self._must_be_open()
         return self._links
 
     def contacts(self) -> Contacts:
-        self._ask("contacts")
+        self._must_be_open()
         return self._contacts
 
     def health(self) -> Health:
@@ -257,8 +243,7 @@ class PoolBackend(Backend):
         return self._health
 
     def mass_properties(self) -> MassProperties:
-        if "mass_properties" not in self.capabilities:
-            return super().mass_properties()
+        self._require("mass_properties")
         self._command("mass_properties")
         found = {name: self._arrays[f"body_{name}"].copy() for name in ("mass", "com", "inertia")}
         return MassProperties(**{name: torch.from_numpy(values) for name, values in found.items()})
@@ -267,7 +252,7 @@ class PoolBackend(Backend):
         self._require("object_wrench")
         self._must_be_open()
         wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
-        self._arrays["wrench"][:] = self._checked("wrench", wrench, self.num_worlds)
+        self._arrays["wrench"][:] = self._rows("wrench", wrench, self.num_worlds)
 
     def close(self) -> None:
         self._close()
@@ -275,21 +260,8 @@ class PoolBackend(Backend):
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         self._require(name)
         index = self._selected(worlds)
-        given = self._checked(name, value, len(index))
-        self._bring(READINGS)  # they describe the last step, and an engine may compute them from its parameters
-        self._arrays[name][index] = given
+        self._arrays[name][index] = self._rows(name, value, len(index))
         self._command("set_parameter", index, name)
-
-    def _ask(self, reading: str) -> None:
-        """Have a reading present, after the next step too."""
-        self._must_be_open()
-        self._bring(frozenset((reading,)))
-        self._asked |= {reading}
-
-    def _bring(self, readings: frozenset[str]) -> None:
-        missing = readings - self._present
-        if missing:
-            self._command("read", readings=missing)
 
     def _selected(self, worlds: Tensor | None) -> np.ndarray:
         if worlds is None:
@@ -299,26 +271,15 @@ class PoolBackend(Backend):
             raise ValueError(f"worlds must be a list of indices in 0..{self.num_worlds - 1}, found {worlds}")
         return index
 
-    def _checked(self, name: str, value: Tensor, rows: int) -> np.ndarray:
-        array = torch.as_tensor(value).numpy(force=True)
-        expected = (rows, *self._arrays[name].shape[1:])
-        if array.shape != expected:
-            raise ValueError(f"{name} has shape {array.shape}, expected {expected}")
-        return array
+    def _rows(self, name: str, value: Tensor, rows: int) -> np.ndarray:
+        """Return what some rows of a shared array are to hold."""
+        return self._checked(name, value, (rows, *self._arrays[name].shape[1:])).numpy()
 
-    def _command(
-        self,
-        method: str,
-        worlds: np.ndarray | None = None,
-        argument: Any = None,
-        readings: frozenset[str] = frozenset(),
-    ) -> None:
-        """Run a command in the workers, and bring readings. Commands that move worlds make other readings stale."""
+    def _command(self, method: str, worlds: np.ndarray | None = None, argument: Any = None) -> None:
+        """Run a command in the workers."""
         self._must_be_open()
-        if method in ("step", "set_state"):
-            self._present = frozenset()
         try:
-            self._team.command(method, worlds, argument, readings)
+            self._team.command(method, worlds, argument)
         except WorldFailure as failure:
             if failure.kind is not None:
                 raise failure.kind(f"world {failure.world}: {failure.message}") from failure
@@ -328,7 +289,6 @@ class PoolBackend(Backend):
         except BaseException:  # after Ctrl-C or a worker's death, nobody knows what has been done
             self.close()
             raise
-        self._present |= readings
 
     def _must_be_open(self) -> None:
         if not self._close.alive:

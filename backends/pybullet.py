@@ -12,13 +12,12 @@ What differs from PyBullet's defaults, and why:
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
@@ -38,7 +37,6 @@ from xreset.backends.bullet_models import (
 )
 from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.rigid import (
-    Arms,
     Inertia,
     TrackedFrames,
     conjugate,
@@ -53,24 +51,12 @@ from xreset.errors import XResetError
 from xreset.physics import Capability, unavailable
 from xreset.spec import GRAVITY, SceneSpec, Shape
 
-
-@dataclass(frozen=True, kw_only=True)
-class PybulletSettings:
-    """Bullet's dials."""
-
-    internal_steps: int = 2
-    """Bullet steps per physics step. Objects creep in a grasp by 2 mm in 2 s with 2, by 4 mm with 1, which is 1.6 times
-    as fast."""
-    solver_iterations: int = 50
-    """Sweeps of the contact solver."""
-    friction_cone: bool = True
-    """Whether friction is limited by a cone instead of a pyramid. With a pyramid objects slide 30 % less far along its
-    diagonals, and Bullet omits torsional friction. Grasps hold equally well with either."""
-    mass_matrix_steps: int = 8
-    """Bullet steps between two updates of the mass matrix that the drives need."""
-
-
-_DEFAULTS = PybulletSettings()
+INTERNAL_STEPS = 2
+"""Bullet steps per physics step. Objects creep in a grasp by 2 mm in 2 s with 2, by 4 mm with 1, which is 1.6 times as
+fast."""
+_SOLVER_ITERATIONS = 50
+_MASS_MATRIX_STEPS = 8
+"""Bullet steps between two updates of the mass matrix that the drives need."""
 _GEOM_INITIALIZE_SAT_FEATURES = 4
 """Bullet's flag of a collision shape, which PyBullet does not name: contacts between polyhedra are found on faces."""
 _FAR = 100.0
@@ -80,10 +66,9 @@ _FAR = 100.0
 class PybulletWorld(World):
     """One world of Bullet, in a client of its own."""
 
-    def __init__(self, scene: SceneSpec, object_index: int, *, settings: PybulletSettings = _DEFAULTS) -> None:
+    def __init__(self, scene: SceneSpec, object_index: int) -> None:
         self._scene = scene
         self._pieces = scene.objects[object_index].pieces
-        self._settings = settings
         self._mechanism = mechanism(scene.robot)
         self._inertia = object_inertia(scene.objects[object_index])
         self._friction = np.array([scene.friction.tip, scene.friction.link, scene.friction.table])
@@ -93,14 +78,13 @@ class PybulletWorld(World):
 
     def _build(self) -> None:
         scene = self._scene
-        settings = self._settings
         self._p = p = _Client()
-        dt = scene.timestep / settings.internal_steps
+        dt = scene.timestep / INTERNAL_STEPS
         p.setPhysicsEngineParameter(
             fixedTimeStep=dt,
             numSubSteps=0,
-            numSolverIterations=settings.solver_iterations,
-            enableConeFriction=int(settings.friction_cone),
+            numSolverIterations=_SOLVER_ITERATIONS,
+            enableConeFriction=1,  # a pyramid lets objects slide 30 % less far along its diagonals
             deterministicOverlappingPairs=1,  # or a world would depend on what was in it before
             enableSAT=1,  # a hull at rest on a face gets all the contacts of that face, instead of one
             enableFileCaching=0,
@@ -126,10 +110,9 @@ class PybulletWorld(World):
         self._remove_defaults(self._table, -1, ())
         self._set_collision_pairs()
 
-        self._drives = BulletDrives(p, self._robot, self._mechanism, dt, settings.mass_matrix_steps)
+        self._drives = BulletDrives(p, self._robot, self._mechanism, dt, _MASS_MATRIX_STEPS)
         self._drives.scale(self._drive_scale)
         self._frames = TrackedFrames(self._mechanism)
-        self._arm = Arms(self._inertia.com[None])
         self._from_principal = conjugate(self._inertia.quat)
         self.set_friction(self._friction)
         self._fresh = True
@@ -156,7 +139,7 @@ class PybulletWorld(World):
         linear, angular = self._p.getBaseVelocity(self._object)
         angvel = np.array(angular)
         self._quat = nearer(multiply(_wxyz(turn), self._from_principal), self._quat)
-        arm = self._arm.turned(self._quat)[0]
+        arm = rotate(self._quat, self._inertia.com)
         position, velocity = self._drives.read()
         return {
             "joint_pos": position[self._drives.driven],
@@ -176,7 +159,7 @@ class PybulletWorld(World):
         weight = np.array([0.0, 0.0, self._inertia.mass * (-GRAVITY * self.gravity_fraction - self._world_gravity)])
         force = (weight + self.force).tolist()
         turned = bool(self.torque.any())
-        for _ in range(n * self._settings.internal_steps):
+        for _ in range(n * INTERNAL_STEPS):
             self._drives.apply()
             com, _ = p.getBasePositionAndOrientation(self._object)
             p.applyExternalForce(self._object, -1, force, com, p.WORLD_FRAME)
@@ -234,15 +217,15 @@ class PybulletWorld(World):
 
         Bullet's bodies have their origin at the centre of mass, so another centre of mass needs a new client.
         """
-        moved = not np.array_equal(inertia.com, self._inertia.com)
-        self._inertia = inertia
-        if moved:
+        if not np.array_equal(inertia.com, self._inertia.com):
             state = self.get_state()
+            self._inertia = inertia
             self._rebuild()
             self.set_state(state)
-        else:
-            self._p.changeDynamics(self._object, -1, mass=inertia.mass)  # also invents an inertia
-            self._p.changeDynamics(self._object, -1, localInertiaDiagonal=inertia.moments)
+            return
+        self._inertia = inertia
+        self._p.changeDynamics(self._object, -1, mass=inertia.mass)  # also invents an inertia
+        self._p.changeDynamics(self._object, -1, localInertiaDiagonal=inertia.moments)
 
     def set_friction(self, friction: np.ndarray) -> None:
         self._friction = friction
@@ -265,7 +248,8 @@ class PybulletWorld(World):
         self._drives.scale(self._drive_scale)
 
     def close(self) -> None:
-        self._p.close()
+        if self._p.isConnected():
+            self._p.disconnect()
 
     def _rebuild(self) -> None:
         """Begin with a new client.
@@ -372,7 +356,7 @@ class PybulletWorld(World):
 
 
 class PybulletBackend(PoolBackend):
-    """N worlds of Bullet; the keyword ``settings`` takes :class:`PybulletSettings`."""
+    """N worlds of Bullet."""
 
     name = "pybullet"
     capabilities = frozenset(get_args(Capability))
@@ -405,12 +389,6 @@ class _Client:
         setattr(self, name, value)
         return value
 
-    def close(self) -> None:
-        """End the simulation. Calling it twice does no harm."""
-        if self._number >= 0:
-            self._engine.disconnect(physicsClientId=self._number)
-            self._number = -1
-
 
 def _xyzw(q: Sequence[float] | np.ndarray) -> tuple[float, float, float, float]:
     return (q[1], q[2], q[3], q[0])
@@ -420,35 +398,21 @@ def _wxyz(q: Sequence[float]) -> np.ndarray:
     return np.array((q[3], q[0], q[1], q[2]))
 
 
+@cache
 def _engine() -> Any:
-    """Return the module ``pybullet``; ``BackendUnavailableError`` if it cannot be imported."""
-    try:
-        with _without_banner():
-            import pybullet
-    except ImportError as error:
-        raise unavailable("pybullet", "'xreset[pybullet]'", error) from error
-    return pybullet
+    """Return the module ``pybullet``; ``BackendUnavailableError`` if it cannot be imported.
 
-
-@contextlib.contextmanager
-def _without_banner() -> Iterator[None]:
-    """Swallow the build time that PyBullet prints on standard error when it is first imported.
-
-    Only then are file descriptors touched, which the whole process shares.
+    PyBullet prints its build time on standard error when it is imported.
     """
-    if "pybullet" in sys.modules:
-        yield
-        return
     sys.stderr.flush()
-    try:
-        saved = os.dup(2)
-    except OSError:  # standard error is closed
-        yield
-        return
+    kept = os.dup(2)
     try:
         with open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), 2)
-        yield
+        import pybullet
+    except ImportError as error:
+        raise unavailable("pybullet", "'xreset[pybullet]'", error) from error
     finally:
-        os.dup2(saved, 2)
-        os.close(saved)
+        os.dup2(kept, 2)
+        os.close(kept)
+    return pybullet

@@ -34,7 +34,7 @@ class Inertia:
     moments: np.ndarray
     """[3] principal moments about the centre of mass [kg m^2]."""
 
-    @property
+    @cached_property
     def matrix(self) -> np.ndarray:
         """[3, 3] inertia about the centre of mass, along the axes of the body's frame [kg m^2]."""
         axes = np.stack([rotate(self.quat, axis) for axis in np.eye(3)])
@@ -167,11 +167,9 @@ class TrackedFrames:
         """[K] index of the body of each tracked link."""
         inertias = [robot.bodies[body].inertia for body in self.bodies]
         com = np.array([np.zeros(3) if inertia is None else inertia.com for inertia in inertias])
-        pos = np.array([T[:3, 3] for T in frames])
-        quat = np.array([matrix_to_quat(T[:3, :3]) for T in frames])
-        self._arms = Arms(np.stack((pos, pos - com), axis=1))
-        self._turns = np.stack([multiply(unit, quat) for unit in np.eye(4)], axis=1)
-        """[K, 4, 4] the product with quat, as a matrix."""
+        self._pos = np.array([T[:3, 3] for T in frames])
+        self._quat = np.array([matrix_to_quat(T[:3, :3]) for T in frames])
+        self._lever = self._pos - com
 
     def locate(
         self, pos: np.ndarray, quat: np.ndarray, com_velocity: np.ndarray, angvel: np.ndarray
@@ -184,8 +182,8 @@ class TrackedFrames:
             com_velocity: [K, 3] velocity of their bodies' centres of mass.
             angvel: [K, 3] angular velocity of their bodies.
         """
-        arm, lever = self._arms.turned(quat).transpose(1, 0, 2)
-        return pos + arm, (quat[:, None] @ self._turns)[:, 0], com_velocity + cross(angvel, lever), angvel
+        velocity = com_velocity + cross(angvel, rotate(quat, self._lever))
+        return pos + rotate(quat, self._pos), multiply(quat, self._quat), velocity, angvel
 
 
 class MovingJoints:
@@ -228,29 +226,6 @@ class MovingJoints:
         v[self.driven] = velocity
         v[self.mimic] = self.multiplier * velocity[self.source]
         return q, v
-
-
-class Arms:
-    """Vectors that are fixed in bodies, rotated into the world every step: as :func:`rotate`, in fewer calls of numpy.
-
-    Turning v by q adds a quadratic form of q to it, which is known once v is: 2 w (u x v) + 2 u x (u x v) for
-    q = (w, u).
-    """
-
-    def __init__(self, vectors: np.ndarray) -> None:
-        """Take vectors [..., A, 3] of bodies [...]."""
-        once = 2.0 * cross(np.eye(3), vectors[..., None, :])
-        forms = np.zeros((*vectors.shape[:-1], 4, 4, 3))
-        forms[..., 0, 1:, :] = once
-        forms[..., 1:, 1:, :] = cross(np.eye(3)[:, None], once[..., None, :, :])
-        products_first = np.moveaxis(forms.reshape(*vectors.shape[:-1], 16, 3), -3, -2)
-        self._vectors = vectors
-        self._forms = products_first.reshape(*vectors.shape[:-2], 16, -1)
-
-    def turned(self, quat: np.ndarray) -> np.ndarray:
-        """Return the vectors [..., A, 3] in the world, given the unit quaternions [..., 4] of their bodies."""
-        products = (quat[..., :, None] * quat[..., None, :]).reshape(*quat.shape[:-1], 1, 16)
-        return self._vectors + (products @ self._forms).reshape(self._vectors.shape)
 
 
 def object_inertia(spec: ObjectSpec) -> Inertia:
@@ -369,10 +344,6 @@ def nearer(q: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return -q if q @ reference < 0 else q
 
 
-_ARM = 1.0
-"""Length [m] that makes torques and forces comparable: longer than an object, so that forces are explained first."""
-
-
 def friction_forces(
     arms: np.ndarray, normal_forces: np.ndarray, coefficients: np.ndarray, force: np.ndarray, torque: np.ndarray
 ) -> np.ndarray:
@@ -380,6 +351,7 @@ def friction_forces(
 
     Of all tangential forces that add up to the wrench (in the sense of least squares) these have the smallest sum of
     (f / (mu N))^2: each contact carries what it can. When a single surface touches the object, their sum is exact.
+    A torque of 1 N m counts as much as a force of 1 N: objects are smaller than 1 m, so forces are explained first.
 
     Args:
         arms: [n, 3] contact points from the centre of mass [m].
@@ -393,6 +365,6 @@ def friction_forces(
     # Row j of contact i: its force if its share is 1 along j, without the part along the normal.
     tangential = np.eye(3) - normals[:, :, None] * normals[:, None, :]
     forces = (limits * coefficients)[:, None, None] * tangential
-    wrenches = np.concatenate([forces, cross(arms[:, None], forces) / _ARM], axis=2).reshape(-1, 6)
-    shares, *_ = np.linalg.lstsq(wrenches.T, np.concatenate([force, torque / _ARM]), rcond=1e-6)
+    wrenches = np.concatenate([forces, cross(arms[:, None], forces)], axis=2).reshape(-1, 6)
+    shares, *_ = np.linalg.lstsq(wrenches.T, np.concatenate([force, torque]), rcond=1e-6)
     return (shares.reshape(-1, 1, 3) @ forces)[:, 0]

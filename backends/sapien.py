@@ -19,7 +19,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, get_args
 
@@ -27,7 +26,6 @@ import numpy as np
 
 from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import (
-    Arms,
     Inertia,
     TrackedFrames,
     cross,
@@ -43,21 +41,11 @@ from xreset.geometry.urdf import Joint
 from xreset.physics import Capability, KnownDifference, unavailable
 from xreset.spec import GRAVITY, Geometry, SceneSpec, Shape
 
-
-@dataclass(frozen=True, kw_only=True)
-class SapienSettings:
-    """PhysX's dials."""
-
-    position_iterations: int = 20
-    """Substeps of the TGS solver. With 10, objects creep out of grasps by centimetres in seconds; 40 is no better and
-    twice as slow."""
-    velocity_iterations: int = 1
-    """Sweeps of the solver over velocities."""
-    contact_offset: float = 0.001
-    """Distance [m] at which contacts are generated."""
-
-
-_DEFAULTS = SapienSettings()
+_POSITION_ITERATIONS = 20
+"""Substeps of the TGS solver. With 10, objects creep out of grasps by centimetres in seconds; 40 is no better and twice
+as slow."""
+_CONTACT_OFFSET = 0.001
+"""Distance [m] at which contacts are generated."""
 _TABLE = -1
 _LINK = -2
 """What a shape belongs to: these, or the index of a fingertip."""
@@ -66,13 +54,11 @@ _LINK = -2
 class SapienWorld(World):
     """One world of PhysX, in a scene of its own."""
 
-    def __init__(self, scene: SceneSpec, object_index: int, *, settings: SapienSettings = _DEFAULTS) -> None:
+    def __init__(self, scene: SceneSpec, object_index: int) -> None:
         self._sapien = sapien = _engine()
-        self._settings = settings
         self._dt = scene.timestep
         self._mechanism = robot = mechanism(scene.robot)
         self._inertia = object_inertia(scene.objects[object_index])
-        self._arm = Arms(self._inertia.com[None])
         self._torsional = scene.friction.torsional
         names = ("tip", "link", "table", "object")
         self._materials = {name: sapien.physx.PhysxMaterial(0.0, 0.0, 0.0) for name in names}
@@ -81,7 +67,7 @@ class SapienWorld(World):
         self._entities: list[Any] = []
         self._scene: Any = None
         self._system: Any = None
-        with _configured(sapien.physx, settings):
+        with _configured(sapien.physx):
             self._add_table(scene)
             self._bodies = self._add_robot()
             self._object = self._add_object(scene.objects[object_index].pieces)
@@ -89,7 +75,6 @@ class SapienWorld(World):
         self._joints = SapienJoints(self._bodies, robot, scene.timestep)
         self._frames = TrackedFrames(robot)
         self._tracked = [self._bodies[i] for i in self._frames.bodies]
-        self._axes = Arms(np.array([rotate(self._inertia.quat, axis) for axis in np.eye(3)]))
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])
         self._last_step: tuple[np.ndarray, ...] | None = None
@@ -117,7 +102,7 @@ class SapienWorld(World):
             "joint_target": self._joints.target,
             "object_pos": pose.p,
             "object_quat": self._quat,
-            "object_linvel": self._object.linear_velocity - cross(omega, self._arm.turned(self._quat)[0]),
+            "object_linvel": self._object.linear_velocity - cross(omega, rotate(self._quat, self._inertia.com)),
             "object_angvel": omega,
         }
 
@@ -153,7 +138,7 @@ class SapienWorld(World):
         owners, points, forces = self._contact_points()
         if owners:
             pose = self._object.entity_pose
-            arms = points - (pose.p + self._arm.turned(pose.q)[0])
+            arms = points - (pose.p + _rotation(pose.q) @ self._inertia.com)
             coefficients = np.array([self._friction[_material(owner)] for owner in owners])
             missing = self._missing_wrench(self._last_step, arms, forces)
             forces = forces + friction_forces(arms, forces, coefficients, *missing)
@@ -177,7 +162,6 @@ class SapienWorld(World):
 
     def set_object_inertia(self, inertia: Inertia) -> None:
         self._inertia = inertia
-        self._arm = Arms(inertia.com[None])
         self._set_inertia(self._object, inertia)
 
     def set_friction(self, friction: np.ndarray) -> None:
@@ -291,7 +275,7 @@ class SapienWorld(World):
         if self._scene:
             for entity in self._entities:
                 self._scene.remove_entity(entity)
-        with _configured(self._sapien.physx, self._settings):
+        with _configured(self._sapien.physx):
             self._system = self._sapien.physx.PhysxCpuSystem()
         self._system.timestep = self._dt
         self._scene = self._sapien.Scene([self._system])
@@ -334,9 +318,9 @@ class SapienWorld(World):
             contact_forces: [n, 3] known forces at these points.
         """
         linvel, angvel, quat, force, torque = last_step
-        axes = self._axes.turned(quat)
+        R = _rotation(quat)
         omega = angvel.astype(np.float64)
-        inertia = (axes.T * self._inertia.moments) @ axes
+        inertia = R @ self._inertia.matrix @ R.T
         gained = self._inertia.mass * (self._object.linear_velocity - linvel) / self._dt
         turned = inertia @ (self._object.angular_velocity - omega) / self._dt + cross(omega, inertia @ omega)
         return gained - force - contact_forces.sum(axis=0), turned - torque - cross(arms, contact_forces).sum(axis=0)
@@ -355,7 +339,7 @@ KNOWN_DIFFERENCES = tuple(
 
 
 class SapienBackend(PoolBackend):
-    """N worlds of PhysX; the keyword ``settings`` takes :class:`SapienSettings`."""
+    """N worlds of PhysX."""
 
     name = "sapien"
     capabilities = frozenset(get_args(Capability))
@@ -379,6 +363,14 @@ def _material(owner: int) -> str:
     return {_TABLE: "table", _LINK: "link"}.get(owner, "tip")
 
 
+def _rotation(quat: np.ndarray) -> np.ndarray:
+    """[3, 3] rotation matrix of a unit quaternion [4], whose products are rounded to its precision."""
+    products = np.outer(quat, quat)
+    squares = products[1:, 1:].astype(np.float64)
+    turn = cross(products[0, 1:], np.eye(3)).T
+    return np.eye(3) + 2.0 * (turn + squares - np.trace(squares) * np.eye(3))
+
+
 def _x_to(axis: np.ndarray) -> np.ndarray:
     """[3, 3] a rotation that turns x into a unit vector: joints, capsules and cylinders are along x in PhysX."""
     other = np.eye(3)[np.abs(axis).argmin()]
@@ -388,7 +380,7 @@ def _x_to(axis: np.ndarray) -> np.ndarray:
 
 
 @contextmanager
-def _configured(physx: Any, settings: SapienSettings) -> Iterator[None]:
+def _configured(physx: Any) -> Iterator[None]:
     """Set the process-wide configuration that systems, bodies and shapes take when they are made; put it back after."""
     scene = physx.get_scene_config()
     body = physx.get_body_config()
@@ -402,11 +394,11 @@ def _configured(physx: Any, settings: SapienSettings) -> Iterator[None]:
         cpu_workers=0,
     )
     physx.set_body_config(
-        solver_position_iterations=settings.position_iterations,
-        solver_velocity_iterations=settings.velocity_iterations,
+        solver_position_iterations=_POSITION_ITERATIONS,
+        solver_velocity_iterations=1,
         sleep_threshold=0.0,
     )
-    physx.set_shape_config(contact_offset=settings.contact_offset, rest_offset=0.0)
+    physx.set_shape_config(contact_offset=_CONTACT_OFFSET, rest_offset=0.0)
     try:
         yield
     finally:

@@ -11,7 +11,6 @@ import contextlib
 import mmap
 import os
 import pickle
-import select
 import signal
 import subprocess
 import sys
@@ -122,9 +121,6 @@ class WorldFailure(Exception):
         self.trace = trace
 
 
-READINGS = frozenset(("links", "contacts"))
-"""What is read from a world only where somebody wants it."""
-
 _MOVING = ("build", "set_state", "step")
 """Commands after which a world reports something else than before."""
 
@@ -146,7 +142,7 @@ class LocalWorlds:
         self._worlds: list[World] = []
         self._inertia_changes: list[dict[str, Any]] = [{} for _ in job.object_index]
 
-    def command(self, method: str, worlds: np.ndarray | None, argument: Any, readings: frozenset[str]) -> None:
+    def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> None:
         """Run one of the methods below for the given worlds (all if None), then publish what they report.
 
         All worlds act before any is published: engine and Python code then take turns in the processor's caches once
@@ -162,13 +158,9 @@ class LocalWorlds:
         try:
             for row in rows:
                 action(row, argument)
-            for row in rows:
-                if method in _MOVING:
-                    self._publish_state(row)
-                if "links" in readings:
-                    self._publish(row, LINK_FIELDS, self._worlds[row].links())
-                if "contacts" in readings:
-                    self._publish(row, CONTACT_FIELDS, self._worlds[row].contacts())
+            if method in _MOVING:
+                for row in rows:
+                    self._publish(row)
         except Exception as error:
             known = isinstance(error, XResetError)
             message = str(error) if known else f"{type(error).__name__}: {error}"
@@ -199,9 +191,6 @@ class LocalWorlds:
         world.set_object_wrench(wrench[:3], wrench[3:])
         world.step(n)
 
-    def _read(self, i: int, _) -> None:
-        """Do nothing: the readings alone are published."""
-
     def _mass_properties(self, i: int, _) -> None:
         for k, body in enumerate(self._worlds[i].mass_properties()):
             self._arrays["body_mass"][i, k] = body.mass
@@ -220,7 +209,7 @@ class LocalWorlds:
         nominal = object_inertia(self._job.scene.objects[self._job.object_index[i]])
         self._worlds[i].set_object_inertia(nominal.changed(**changes))
 
-    def _publish_state(self, i: int) -> None:
+    def _publish(self, i: int) -> None:
         arrays = self._arrays
         if arrays["nonfinite"][i]:  # nothing has moved since that was published
             return
@@ -233,10 +222,9 @@ class LocalWorlds:
             arrays["nonfinite"][i] = True
         if overflow:
             arrays["overflow"][i] = True
-
-    def _publish(self, i: int, names: Sequence[str], values: Sequence[np.ndarray]) -> None:
-        for name, value in zip(names, values, strict=True):
-            self._arrays[name][i] = value
+        readings = (*world.contacts(), *world.links())
+        for name, value in zip((*CONTACT_FIELDS, *LINK_FIELDS), readings, strict=True):
+            arrays[name][i] = value
 
 
 # Worker processes -----------------------------------------------------------------------------------------------------
@@ -271,16 +259,16 @@ class WorkerTeam:
             self.close()
             raise
 
-    def command(self, method: str, worlds: np.ndarray | None, argument: Any, readings: frozenset[str]) -> None:
+    def command(self, method: str, worlds: np.ndarray | None, argument: Any) -> None:
         """Have all workers concerned run a command at the same time, and wait for all of them."""
         asked = []
-        message = pickle.dumps((method, None, argument, readings))
+        message = pickle.dumps((method, None, argument))
         for worker in self._workers:
             if worlds is not None:
                 mine = worlds[(worlds >= worker.first) & (worlds < worker.stop)]
                 if not mine.size:
                     continue
-                message = pickle.dumps((method, mine, argument, readings))
+                message = pickle.dumps((method, mine, argument))
             worker.send(message)
             asked.append(worker)
         failures = []
@@ -306,8 +294,6 @@ class _Worker:
 
     _END_WITHIN = 5.0
     """Seconds that a worker may take to end."""
-    _ANSWER_WITHIN = 600.0
-    """Seconds that a worker may take to answer: building worlds takes some, any other command far less than one."""
 
     def __init__(self, job: Job, memory: int) -> None:
         self.job = job
@@ -333,13 +319,6 @@ class _Worker:
 
     def receive(self, command: str) -> None:
         """Wait for the reply, and raise the failure that it holds."""
-        if not select.select([self._pipe], [], [], self._ANSWER_WITHIN)[0]:
-            self._process.kill()
-            raise XResetError(
-                f"A worker process of the backend {self.job.backend!r} has not answered {command!r} for "
-                f"{self._ANSWER_WITHIN:.0f} s and was ended; it ran worlds {self.first} to {self.stop - 1}. "
-                "workers=0 runs the worlds in this process, where a debugger can see them."
-            )
         try:
             failure = self._pipe.recv_bytes()
         except (EOFError, OSError) as error:
@@ -364,11 +343,10 @@ class _Worker:
         self.wait()
         code = self._process.returncode
         how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        hint = " It may have run out of memory: use fewer worlds or workers." if code == -signal.SIGKILL else ""
         return (
             f"A worker process of the backend {self.job.backend!r} {how} during {command!r}; it ran worlds "
-            f"{self.first} to {self.stop - 1}.{hint} Its messages are on standard error. "
-            "workers=0 runs the worlds in this process, where a debugger can see them."
+            f"{self.first} to {self.stop - 1}. Its messages are on standard error. After SIGKILL, it may have run out "
+            "of memory: use fewer worlds or workers. workers=0 runs the worlds in this process, for a debugger."
         )
 
 

@@ -238,22 +238,21 @@ def _mujoco_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readin
         state = data.qpos.copy(), data.qvel.copy()
         if kind == "state":
             return state
-        world._option.disableflags = world._sensing
-        mujoco.mj_sensorAcc(model, data)
-        world._option.disableflags = world._silent
         return state, data.xpos[bodies], data.xquat[bodies], data.cvel[bodies], world.contacts()
 
     return loop
 
 
 def _pybullet_loop(world: Any, targets: np.ndarray, scene: SceneSpec, kind: Readings) -> Callable[[], object]:
+    from xreset.backends.pybullet import INTERNAL_STEPS
+
     p, drives, tracked = world._p, world._drives, world._frames.bodies
     robot, thing, joints = world._robot, world._object, drives._links
     weight = [0.0, 0.0, -GRAVITY * scene.objects[0].mass]
 
     def loop() -> object:
         drives.target = targets
-        for _ in range(scene.substeps * world._settings.internal_steps):
+        for _ in range(scene.substeps * INTERNAL_STEPS):
             drives.apply()
             com, _ = p.getBasePositionAndOrientation(thing)
             p.applyExternalForce(thing, -1, weight, com, p.WORLD_FRAME)

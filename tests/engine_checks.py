@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import unittest
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -34,8 +35,8 @@ class EngineChecks:
     """Mixed into a ``unittest.TestCase`` that names the backend."""
 
     backend_class: ClassVar[type[PoolBackend]]
-    one_step_options: ClassVar[dict[str, Any]] = {}
-    """Options with which the engine makes a single step per physics step, so that momentum can be balanced."""
+    one_step: ClassVar[AbstractContextManager] = nullcontext()
+    """Makes the engine take a single step per physics step, so that momentum can be balanced."""
 
     def make(self: unittest.TestCase, what: SceneSpec, num_worlds: int = 1, **options) -> PoolBackend:
         backend = self.backend_class(what, num_worlds, workers=0, **options)  # pyright: ignore
@@ -152,7 +153,8 @@ class EngineChecks:
     # Contacts ---------------------------------------------------------------------------------------------------------
 
     def test_contact_forces_explain_the_objects_motion(self):
-        backend, _ = self.grasp(**self.one_step_options)
+        self.enterContext(self.one_step)
+        backend, _ = self.grasp()
         brick = objects()[0]
         backend.set_object_wrench(torch.tensor([[0.5, 0.3, 0.2]]), torch.zeros(1, 3))
         targets = backend.state().joint_target.clone()

@@ -26,7 +26,7 @@ from xreset.backends.mjcf import compile_scene
 from xreset.backends.mjcf_model import OBJECT, OTHER_LINK, TABLE, SceneModel
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.mujoco_warp import MujocoWarpBackend
-from xreset.backends.mujoco_warp_setup import differing_fields
+from xreset.backends.mujoco_warp_setup import contact_room, differing_fields
 from xreset.backends.mujoco_warp_step import ForkedStep, constraints, finish, smooth_dynamics
 from xreset.errors import BackendUnavailableError, ObjectError, RobotError, XResetError
 from xreset.physics import Backend
@@ -74,8 +74,8 @@ class Model(unittest.TestCase):
             self.assertEqual(actuator.gainprm[0], drive.kp)
             self.assertEqual(actuator.biasprm[1:3].tolist(), [-drive.kp, -drive.kd])
             self.assertEqual(actuator.forcerange.tolist(), [-drive.effort, drive.effort])
-            self.assertEqual(model.dof_armature[self.at.joint_dof[i]], drive.armature)
-            self.assertEqual(model.jnt_qposadr[model.joint(joint.name).id], self.at.joint_qpos[i])
+            self.assertEqual(model.dof_armature[self.at.dof[i]], drive.armature)
+            self.assertEqual(model.jnt_qposadr[model.joint(joint.name).id], self.at.qpos[i])
 
     def test_a_drive_at_its_target_rests_and_off_it_pulls_with_its_stiffness_where_joints_are_coupled_too(self):
         at = self.at
@@ -83,8 +83,7 @@ class Model(unittest.TestCase):
         data = mujoco.MjData(at.model)
         q = robot.home + 0.01
         off = np.linspace(-1e-4, 1e-4, len(q))
-        data.qpos[at.joint_qpos] = q
-        data.qpos[at.mimic_qpos] = at.mimic_multiplier * q[at.mimic_source] + at.mimic_offset
+        data.qpos[at.qpos], _ = at.joints.spread(q, np.zeros_like(q))
         data.ctrl[:] = q + off
         mujoco.mj_forward(at.model, data)
         np.testing.assert_allclose(data.actuator_force, off * [joint.drive.kp for joint in robot.joints], atol=1e-9)
@@ -212,29 +211,6 @@ class BothBackends(unittest.TestCase):
         torch.testing.assert_close(*means, atol=0.02, rtol=0.0)
         torch.testing.assert_close(self.warp.contacts().tip_touch, self.c.contacts().tip_touch)
 
-    def test_looking_changes_no_motion(self):
-        """Links take the first half of the next step in advance: looking must not change where the worlds end."""
-        state, _ = grasp(self.bench)
-        pairs = self.scene.friction
-        friction = torch.tensor([[pairs.tip, pairs.link, pairs.table]]).expand(4, 3)
-        self.addCleanup(self.c.set_friction, friction)
-
-        def end(looks: tuple[str, ...]) -> list[torch.Tensor]:
-            self.c.set_friction(friction)
-            self.c.set_state(state)
-            for step in range(6):
-                self.c.step(1 + step % 2)
-                for look in looks:
-                    getattr(self.c, look)()
-                self.c.set_friction(friction * (1.0 + 0.1 * (step % 2)))
-            return everything(self.c)
-
-        expected = end(())
-        for looks in (("links",), ("contacts", "links"), ("links", "contacts")):
-            for a, b in zip(end(looks), expected, strict=True):
-                torch.testing.assert_close(a, b, rtol=0, atol=0)
-        self.assertTrue(bool(self.c.contacts().tip_touch.any()), "nothing was touched")
-
     def test_sensors_change_no_motion(self):
         results = []
         for sensors in (False, True):
@@ -318,7 +294,8 @@ class Limits(unittest.TestCase):
         self.assertIsNone(seen())
 
     def test_warp_counts_contacts_that_found_no_room(self):
-        backend = MujocoWarpBackend(scene(), 4, object_index=torch.zeros(4, dtype=torch.long), contacts_per_world=1)
+        with mock.patch.object(mujoco_warp_backend, "contact_room", return_value=(1, 1, 220)):
+            backend = MujocoWarpBackend(scene(), 4, object_index=torch.zeros(4, dtype=torch.long))
         backend.step(8)
         self.assertTrue(bool(backend.health().overflow.all()))  # the pool is everyone's
         state = snapshot(backend.state())
@@ -334,10 +311,11 @@ class Limits(unittest.TestCase):
         places = product((-0.03, -0.01, 0.01, 0.03), repeat=2)
         feet = [shape("box", (0.002, 0.002, 0.005), (x, y, 0.0)) for x, y in places]
         standing = replace(scene(), objects=(solid("feet", 0.4, tuple(feet)),))
-        for options, overflows in (({}, False), ({"constraints_per_world": 220}, True)):
-            with MujocoWarpBackend(standing, 2, **options) as backend:
+        for pieces, overflows in ((16, False), (1, True)):
+            room = mock.patch.object(mujoco_warp_backend, "contact_room", return_value=contact_room(pieces))
+            with room, MujocoWarpBackend(standing, 2) as backend:
                 backend.step(8)
-                self.assertEqual(backend.health().overflow.tolist(), [overflows] * 2, options)
+                self.assertEqual(backend.health().overflow.tolist(), [overflows] * 2, pieces)
 
     def test_c_reports_the_engine_s_warnings_of_a_full_buffer(self):
         backend = MujocoBackend(scene(), 1, workers=0)

@@ -94,6 +94,22 @@ class Parameters(Tensors):
     drives: Tensor | None = None
     """[N, 3, J] factors."""
 
+    @classmethod
+    def nominal(cls, scene: SceneSpec, object_index: Tensor) -> Self:
+        """Return what the scene states for worlds with these objects [N]."""
+        n = len(object_index)
+        friction = scene.friction
+        masses = torch.tensor([spec.mass for spec in scene.objects])
+        return cls(
+            friction=torch.tensor([friction.tip, friction.link, friction.table]).repeat(n, 1),
+            torsional_friction=torch.full((n,), friction.torsional),
+            object_mass=masses[object_index.cpu()],
+            object_inertia=torch.ones(n),
+            object_com=torch.zeros(n, 3),
+            object_gravity=torch.ones(n),
+            drives=torch.ones(n, 3, len(scene.robot.joints)),
+        )
+
     def given(self) -> dict[Parameter, Tensor]:
         """Return the parameters that are not None, by name."""
         return {name: getattr(self, name) for name in get_args(Parameter) if getattr(self, name) is not None}
@@ -204,18 +220,18 @@ class Backend(ABC):
         """
         if num_worlds < 1:
             raise ValueError(f"num_worlds is {num_worlds}, expected at least 1")
-        if not scene.objects:
+        count = len(scene.objects)
+        if not count:
             raise ValueError("the scene has no object; each world holds exactly one")
         self.scene = scene
         self.num_worlds = num_worlds
         self.device = torch.device(device)
         if object_index is None:
-            object_index = torch.arange(num_worlds) % len(scene.objects)
+            object_index = torch.arange(num_worlds) % count
         self.object_index = torch.as_tensor(object_index, dtype=torch.long).to(self.device)
-        if self.object_index.shape != (num_worlds,) or bool(
-            ((self.object_index < 0) | (self.object_index >= len(scene.objects))).any()
-        ):
-            raise ValueError(f"object_index must be [{num_worlds}] indices below {len(scene.objects)}")
+        valid = (self.object_index >= 0) & (self.object_index < count)
+        if self.object_index.shape != (num_worlds,) or not valid.all():
+            raise ValueError(f"object_index must be [{num_worlds}] indices below {count}")
 
     # Availability ----------------------------------------------------------------------------------------------------
 
@@ -270,7 +286,8 @@ class Backend(ABC):
     def mass_properties(self) -> MassProperties:
         """Masses, centres of mass and inertias read back from the engine; the present ones, of objects whose mass was
         set too."""
-        raise CapabilityError(f"the backend {self.name!r} cannot read back mass properties: trust what the scene says.")
+        self._require("mass_properties")
+        raise NotImplementedError
 
     # Physical parameters: each stays through set_state, except the wrench; CapabilityError where the backend lacks it
 
@@ -352,13 +369,26 @@ class Backend(ABC):
 
     # For implementers ------------------------------------------------------------------------------------------------
 
+    def _checked(self, name: str, value: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """Return values on the backend's device; ``ValueError`` if their shape is another one."""
+        value = torch.as_tensor(value, dtype=torch.float32, device=self.device).detach()
+        if value.shape != shape:
+            raise ValueError(f"{name} has shape {tuple(value.shape)}, expected {tuple(shape)}")
+        return value.contiguous()
+
+    def _checked_substeps(self, substeps: int | None) -> int:
+        """Return the number of physics steps to take; default: one control step."""
+        if substeps is None:
+            return self.scene.substeps
+        if substeps < 1:
+            raise ValueError(f"substeps is {substeps}, expected at least 1")
+        return substeps
+
     def _require(self, capability: Capability) -> None:
         """Raise the error that the contract asks for if a capability is missing."""
         if capability not in self.capabilities:
-            remedy = "build a scene that has it."
-            if capability in ("object_gravity", "object_wrench"):
-                remedy = "use another backend."
-            raise CapabilityError(f"the backend {self.name!r} cannot set {capability.replace('_', ' ')}: {remedy}")
+            what = capability.replace("_", " ")
+            raise CapabilityError(f"The backend {self.name!r} does not support {what}. Use another backend.")
 
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         """Set a physical parameter [M, ...]. Every setter calls this, so a backend overrides either."""

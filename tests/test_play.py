@@ -106,7 +106,7 @@ class Played(unittest.TestCase):
         session.release()
         self.assertTrue(session.lost)
         self.steps(1.5)
-        self.assertTrue(session.away)
+        self.assertTrue(session.away and session.dropped)
         session.begin()
         self.assertFalse(session.away or session.lost)
 

@@ -13,6 +13,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from xreset.errors import XResetError
 from xreset.eval.play.record import draw_film, last_moments, write_trace
@@ -188,11 +189,11 @@ class Page(WebPage):
         middle = (obj.vertices.max(axis=0) + obj.vertices.min(axis=0)) / 2
         body = scene.add_mesh_simple("/object", obj.vertices, obj.faces, color=rgb(OBJECT_COLOR))
         # Rings turn the goal. The shape or, where a hand hides it, the ball next to it is dragged.
-        goal = scene.add_transform_controls(
-            "/goal", scale=2.4 * radius, disable_axes=True, disable_sliders=True, depth_test=False, line_width=3.5
+        rings = scene.add_transform_controls(
+            "/rings", scale=2.4 * radius, disable_axes=True, disable_sliders=True, depth_test=False, line_width=3.5
         )
-        ghost = scene.add_mesh_simple(
-            "/goal/shape",
+        goal = scene.add_mesh_simple(
+            "/goal",
             middle + GROWTH * (obj.vertices - middle),
             obj.faces,
             color=rgb(GOAL_COLOR),
@@ -209,12 +210,13 @@ class Page(WebPage):
         self._robot = robot
         self._body = body
         self._goal = goal
+        self._rings = rings
         self._handle = handle
         self._hint = hint
         self._points = points
-        self._things = [hint, handle, ghost, goal, body, points, *robot.links.values()]
-        goal.on_update(self._turn)
-        for part in (ghost, handle):
+        self._things = [hint, handle, rings, goal, body, points, *robot.links.values()]
+        rings.on_update(self._turn)
+        for part in (goal, handle):
             part.on_drag("left")(self._drag)
         self._pull_at(body, None)
         for name, link in robot.links.items():
@@ -239,11 +241,25 @@ class Page(WebPage):
     async def _turn(self, event: Any) -> None:
         self._holder = event.client_id
         self._turning = event.phase != "end"
-        self._wish(self._move_goal, event.target.position.copy(), event.target.wxyz.copy())
+        rings = Rotation.from_quat(event.target.wxyz, scalar_first=True)
+        if event.phase == "start":
+            self._goal_in_rings = rings.inv() * Rotation.from_quat(self._goal.wxyz, scalar_first=True)
+        turned = rings * self._goal_in_rings
+        self._wish(self._move_goal, self._goal.position.copy(), turned.as_quat(scalar_first=True))
 
     def _move_goal(self, pos: np.ndarray, quat: np.ndarray) -> None:
         self._hint.visible = False
         self.session.move_goal(pos, quat)
+
+    def _towards_visitor(self) -> np.ndarray:
+        """Return an orientation of the rings [4] in which the first visitor sees none of them from its edge."""
+        visitors = list(self._server.get_clients().values())
+        camera = visitors[0].camera if visitors else self._server.initial_camera
+        to_camera = camera.position - self._goal.position
+        corner = np.ones(3)
+        up = (0.0, 0.0, 1.0)
+        rings = Rotation.align_vectors([to_camera, up], [corner, up], weights=[np.inf, 1.0])[0]
+        return rings.as_quat(scalar_first=True)
 
     def _draw(self) -> None:
         """Show the present state."""
@@ -256,10 +272,12 @@ class Page(WebPage):
             self._body.position = state.object_pos[0].cpu().numpy()
             self._body.wxyz = state.object_quat[0].cpu().numpy()
             self._body.visible = not session.away
+            self._goal.position = env.goal_pos[0].cpu().numpy()
+            self._goal.wxyz = env.goal_quat[0].cpu().numpy()
+            self._handle.position = self._goal.position + self._beside
             if not self._turning:
-                self._goal.position = env.goal_pos[0].cpu().numpy()
-                self._goal.wxyz = env.goal_quat[0].cpu().numpy()
-            self._handle.position = env.goal_pos[0].cpu().numpy() + self._beside
+                self._rings.position = self._goal.position
+                self._rings.wxyz = self._towards_visitor()
             if self._see.value:
                 self._points.points = session.cloud().astype(np.float32)
         self._drawn = time.monotonic()
@@ -292,15 +310,15 @@ class Page(WebPage):
             self._policy = gui.add_dropdown("policy", tuple(self._policies))
             names = dict.fromkeys((self.session.policy.robot.name, *robot_names()))
             self._robot_name = gui.add_dropdown("robot", tuple(names))
-        with gui.add_folder("curves", expand_by_default=False):
-            self._see = gui.add_checkbox("the object's points that the policy sees", False)
+        with gui.add_folder("curves", expand_by_default=False) as folder:
+            self._see = gui.add_checkbox("the object's points that the policy sees", False, order=0)
             self._see.on_update(lambda _: setattr(self._points, "visible", self._see.value))
+            self._input = gui.add_dropdown("input", tuple(self.session.inputs), order=3)
             self._curves = [
-                _Curves(gui, "fingertip forces [N]"),
-                _Curves(gui, "terms of the reward"),
-                _Curves(gui, "the policy's inputs", legend=False),
+                _Curves(gui, folder, "fingertip forces [N]", 1),
+                _Curves(gui, folder, "terms of the reward", 2),
+                _Curves(gui, folder, "this input of the policy", 4, legend=False),
             ]
-            self._input = gui.add_dropdown("input", tuple(self.session.inputs))
         with gui.add_folder("save", expand_by_default=False):
             self._seconds = gui.add_slider("seconds", 2, 60, 1, 10)
             film = gui.add_button("Film (mp4)")
@@ -442,15 +460,14 @@ class Page(WebPage):
 
 
 class _Curves:
-    """One plot. It is made anew where the number of its curves changes."""
+    """One plot of the folder "curves". It is made again where its curves change."""
 
-    def __init__(self, gui: Any, title: str, *, legend: bool = True) -> None:
+    def __init__(self, gui: Any, folder: Any, title: str, order: int, *, legend: bool = True) -> None:
         self._gui = gui
-        self._title = title
-        self._legend = legend
+        self._folder = folder
+        self._options = {"title": title, "order": order, "height": 180, "legend": {"show": legend, "live": False}}
         self._names: tuple[str, ...] = ()
         self._plot: Any = None
-        self._folder = gui.add_folder(title)
 
     def show(self, times: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
         """Show values [T, K] of K names over times [T]."""
@@ -464,6 +481,5 @@ class _Curves:
         series: list[dict[str, Any]] = [{"label": "time"}]
         for i, name in enumerate(names):
             series.append({"label": name, "stroke": COLORS[i % len(COLORS)], "width": 1.5})
-        options = {"scales": {"x": {"time": False}}, "legend": {"show": self._legend}, "height": 180}
         with self._folder:
-            self._plot = self._gui.add_uplot(data, tuple(series), **options)
+            self._plot = self._gui.add_uplot(data, tuple(series), scales={"x": {"time": False}}, **self._options)

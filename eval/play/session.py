@@ -230,6 +230,7 @@ class Session:
 
     def _begin(self) -> None:
         self.away = False
+        self._taken = False
         self._homing = False
         self._touched = self.time
         self._pull: _Pull | None = None
@@ -249,7 +250,7 @@ class Session:
             self.begin()
             raise XResetError(f"The simulation in {self.engine} broke down. A new episode has begun.")
         if self.away or reading.state.object_pos[0, 2] < -1.0:
-            self.take_away()  # an object that has fallen off the table does not fall for ever
+            self._remove_object()  # an object that has fallen off the table does not fall for ever
         state = reading.state
         self.terms = tuple(reward.terms)
         moment = Moment(
@@ -277,7 +278,9 @@ class Session:
 
     @property
     def dropped(self) -> bool:
-        """Whether the robot has lost the object or never grasped it, and the user does not hold it either."""
+        """Whether the robot has lost the object or never grasped it, and the user has neither pulled nor taken it."""
+        if self.away:
+            return not self._taken and not self._homing
         long_ago = self.time - self._touched > DROPPED_SECONDS
         return long_ago and self.history[-1].distance > DROPPED_DISTANCE
 
@@ -337,6 +340,10 @@ class Session:
 
     def take_away(self) -> None:
         """Take the object out of everybody's reach, until :meth:`put_back`. The policy observes it there."""
+        self._taken = True
+        self._remove_object()
+
+    def _remove_object(self) -> None:
         self.away = True
         if self._pull is not None and self._pull.link is None:
             self.release()
@@ -352,6 +359,7 @@ class Session:
         home = torch.as_tensor(self.policy.robot.home, dtype=torch.float32, device=env.device)
         if bool(((env.backend.state().joint_pos - home).abs() < NEAR_HOME).all()):
             self._homing = False
+            self._taken = False
             self.away = False
             self._touched = self.time
             pos, quat = env.resets.start_pose(env.sequence)

@@ -63,16 +63,11 @@ class StandIns(unittest.TestCase):
                     if piece.geometry.vertices is not None:
                         self.assertLessEqual(len(piece.geometry.vertices), 64)
 
-    def test_inertia_of_box_and_can_is_the_textbooks(self):
+    def test_inertia_of_a_box_is_the_textbooks(self):
         obj = load_object("cheez-its")
         a, b, c = 2 * np.array(obj.pieces[0].geometry.size)
         expected = obj.mass / 12 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b])
         np.testing.assert_allclose(obj.inertia, expected, rtol=1e-9, atol=1e-12)
-        obj = load_object("soup")
-        radius, half = obj.pieces[0].geometry.size
-        across = obj.mass * (3 * radius**2 + 4 * half**2) / 12
-        expected = [across, across, obj.mass * radius**2 / 2]
-        np.testing.assert_allclose(np.diag(obj.inertia), expected, rtol=0.01)  # the mesh is a prism
 
     def test_close_to_the_real_meshes(self):
         folder = data_dir() / "ycb"
@@ -120,35 +115,28 @@ class Geometry(unittest.TestCase):
 
 
 class Sampling(unittest.TestCase):
-    def test_on_the_outer_surface(self):
+    def test_well_spread_on_the_outer_surface(self):
         for obj in load_objects(["scissors", "mustard", "powerdrill"]):  # whose pieces overlap
             points = surface_points(obj, 64)
             self.assertEqual(points.shape, (64, 3))
             np.testing.assert_allclose(distance_to_pieces(points, obj), 0, atol=1e-4)
-
-    def test_deterministic_and_seeded(self):
-        obj = load_object("banana")
-        np.testing.assert_array_equal(surface_points(obj), surface_points(obj))
-        self.assertFalse(np.array_equal(surface_points(obj), surface_points(obj, seed=1)))
-
-    def test_well_spread(self):
+            np.testing.assert_array_equal(points, surface_points(obj))
+            self.assertFalse(np.array_equal(points, surface_points(obj, seed=1)))
         obj = load_object("soup")
         points = surface_points(obj, 64)
-        nearest = cKDTree(points).query(points, k=2)[0][:, 1]
         everywhere, _, _ = sample_surface(obj.vertices, obj.faces, 4000, seed=5)
-        self.assertGreater(nearest.min(), 0.008)
+        self.assertGreater(cKDTree(points).query(points, k=2)[0][:, 1].min(), 0.008)
         self.assertLess(cKDTree(points).query(everywhere)[0].max(), 0.02)
 
-    def test_keypoints_see_every_rotation(self):
+    def test_keypoints_are_corners_that_span_the_box(self):
         for obj in load_objects(object_names()):
             points = keypoints(obj)
-            self.assertGreater(abs(np.linalg.det(points[1:] - points[0])), 1e-6)  # not coplanar
+            self.assertGreater(
+                abs(np.linalg.det(points[1:] - points[0])), 1e-6
+            )  # not coplanar: they see every rotation
             low, high = bounding_box(obj)
             self.assertTrue((np.isclose(points, low) | np.isclose(points, high)).all())
-        box = keypoints(load_object("cheez-its"))
-        for axis in np.eye(3):
-            moved = Rotation.from_rotvec(np.pi * axis).apply(box - box.mean(axis=0)) + box.mean(axis=0)
-            self.assertGreater(np.linalg.norm(moved - box, axis=1).max(), 0.05)
+            self.assertEqual(len(np.unique(points, axis=0)), 4)
 
 
 class Rest(unittest.TestCase):
@@ -276,14 +264,12 @@ class MeshImport(InFolder):
                 add_mesh(path, out, name, scale=scale)
         self.assertEqual(sorted(p.name for p in out.iterdir()), ["brick.obj", "brick.toml"])
 
-    def test_nothing_is_written_before_the_mesh_is_cut(self):
-        """So a command that is killed while it cuts can be repeated."""
+    def test_a_killed_command_can_be_repeated(self):
         path = self.write(BOX)
         out = self.folder / "objects"
-        with mock.patch("xreset.objects.meshes.cached_pieces") as cut:
-            cut.side_effect = lambda *_: self.assertFalse(out.exists()) or exec("raise KeyboardInterrupt")
-            with self.assertRaises(KeyboardInterrupt):
-                add_mesh(path, out, "brick", properties=Properties(mass=0.2))
+        with mock.patch("xreset.objects.meshes.cached_pieces", side_effect=KeyboardInterrupt):
+            self.assertRaises(KeyboardInterrupt, add_mesh, path, out, "brick")
+        self.assertFalse(out.exists())  # nothing is written before the mesh is cut
         out.mkdir()
         (out / "brick.toml").write_text("mass = 0.2\ntolerance = 0.002\n")  # killed between the two files
         add_mesh(path, out, "brick", properties=Properties(mass=0.2))
@@ -331,24 +317,25 @@ class MeshImport(InFolder):
                 read_mesh(self.folder / name)
 
     def test_the_command_puts_a_mesh_into_a_folder_and_draws_it(self):
-        path = self.write(trimesh.creation.box((100, 60, 40)), "a brick")
+        path = self.write(trimesh.creation.box((100, 60, 40)))
         out = self.folder / "objects"
         png = self.folder / "a.png"
-        into = ("--out", out, "--scale", 0.001)
-        code, said = run("objects", "import", path, *into, "--name", "brick", "--mass", 0.2, "--png", png)
+        command = ("objects", "import", path, "--scale", 0.001, "--mass", 0.2)
+        code, said = run(*command, "--out", out, "--name", "brick", "--png", png)
         self.assertEqual(code, 0, said)
-        self.assertIn("brick", said)
+        self.assertRegex(said, r"brick\W+0.200\W+100x60x40\W+1 hull")
         self.assertTrue(png.read_bytes().startswith(b"\x89PNG"))
         self.assertEqual(load_object("brick", out).mass, 0.2)
-        for words, options in (("Add --out", ()), ("cannot be an object's name", into)):
-            code, said = run("objects", "import", path, *options)
-            self.assertEqual(code, 1)
-            self.assertIn(words, said)
+        code, said = run(*command)
+        self.assertEqual(code, 1)
+        self.assertIn("Add --out", said)
+        code, said = run("objects", "import", out)
+        self.assertIn("brick", said)
 
     def test_what_an_object_is_made_of_is_checked(self):
         path = self.write(BOX)
         for text, words in (
-            ("mass = -1", "mass is -1.0"),
+            ("mass = -1", "mass is -1, expected a number from 0.0001 to 50"),
             ("mass = 1\ndensity = 2", "one follows"),
             ("weight = 1", "unknown: weight|Unknown.*weight"),
             ("friction = 'high'", "friction is 'high'"),

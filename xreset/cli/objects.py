@@ -103,7 +103,6 @@ def _table(*more: str) -> Table:
         table.add_column(column, no_wrap=True)
     for column in ("kg", "size, mm", "pieces"):
         table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("source", overflow="fold")
     for column in more:
         table.add_column(column, justify="right")
     return table
@@ -118,7 +117,6 @@ def _cells(obj: ObjectSpec) -> tuple[str, ...]:
         f"{obj.mass:.3f}",
         "x".join(f"{1000 * length:.0f}" for length in high - low),
         f"{len(obj.pieces)} {' + '.join(sorted(kinds))}",
-        obj.source if obj.source == "stand-in" else f"mesh {obj.source[:8]}",
     )
 
 

@@ -73,7 +73,7 @@ def retarget(
         console.print(
             "List links that meet in every position of their joints under collision.exclude in the robot.toml."
         )
-    for index in np.flatnonzero(align.on_something(align.levelled(chosen), specs)):
+    for index in np.flatnonzero(align.on_something(archive.levelled(chosen), specs)):
         console.print(
             f"{chosen.sequence_name[index]}: the object starts on top of something that is not in the scene; "
             "it was not lowered to the table."

@@ -97,7 +97,7 @@ class Demos(ObjectMotions):
     """[B] the subjects that ``T_level_from_table`` is given for."""
     T_level_from_table: Annotated[np.ndarray, Field(("B", 4, 4), "f", within=POSITION)] | None = None
     """[B, 4, 4] per subject: takes poses to a frame whose z axis is the true table's normal
-    (:func:`xreset.demos.align.levelled`)."""
+    (:func:`levelled`)."""
 
     @property
     def num_sequences(self) -> int:
@@ -254,47 +254,68 @@ def one_sequence(
 
 
 def merge_demos(parts: Sequence[Demos]) -> Demos:
-    """Join several sets of demonstrations, one after another. A sequence that is in several of them is kept once.
+    """Join several sets of demonstrations, one after another, levelled. A sequence that is in several of them is kept
+    once.
 
     Raises:
-        DemoError: there is nothing to join, or the parts contradict each other: in their frame rates, in a sequence of
-            the same name, or in the table of a subject.
+        DemoError: there is nothing to join, or the parts contradict each other: in their frame rates, or in a sequence
+            of the same name.
     """
     if not parts:
         raise DemoError("There are no demonstrations to join.")
     rates = sorted({round(float(part.fps), 3) for part in parts})
     if len(rates) > 1:
         raise DemoError(f"Demonstrations in one file must have one frame rate, but these have the frame rates {rates}.")
-    levels = _levels(parts)
-    parts = _without_repeats(parts)
+    parts = _without_repeats([levelled(part) for part in parts])
     joined = {}
     for name in _PER_SEQUENCE + _PER_FRAME:
         joined[name] = np.concatenate([getattr(part, name) for part in parts])
     demos = Demos(
         frame_offsets=_offsets(np.concatenate([np.diff(part.frame_offsets) for part in parts])),
         fps=parts[0].fps,
-        subjects=np.array(list(levels)) if levels else None,
-        T_level_from_table=np.array(list(levels.values())) if levels else None,
         **joined,
     )
     _check(demos)
     return demos
 
 
-def _levels(parts: Sequence[Demos]) -> dict[str, np.ndarray]:
-    """Return the transforms of all subjects; the identity for subjects of parts without transforms."""
-    levels: dict[str, np.ndarray] = {}
-    if all(part.subjects is None for part in parts):
-        return levels
-    for part in parts:
-        subjects = np.unique(part.subject) if part.subjects is None else part.subjects
-        tables = part.T_level_from_table
-        if tables is None:
-            tables = np.tile(np.eye(4), (len(subjects), 1, 1))
-        for subject, T in zip(subjects.tolist(), tables, strict=True):
-            if not np.array_equal(levels.setdefault(subject, T), T):
-                raise DemoError(f"The subject {subject} has two different transforms in T_level_from_table.")
-    return levels
+def levelled(demos: Demos) -> Demos:
+    """Return the demonstrations in a frame whose z axis is the true table's normal, by ``T_level_from_table`` (the
+    paper, appendix D.a).
+
+    DexYCB's tag plane is tilted by about one degree against the table. Demonstrations without the transforms stay
+    unchanged.
+
+    Raises:
+        DemoError: some subjects have a transform, but another does not.
+    """
+    if demos.T_level_from_table is None or demos.subjects is None:
+        return demos
+    known = demos.subjects.tolist()
+    missing = sorted(set(demos.subject.tolist()) - set(known))
+    if missing:
+        raise DemoError(f"T_level_from_table is given for {', '.join(known)}, but not for {', '.join(missing)}.")
+    subject = np.array([known.index(name) for name in demos.subject.tolist()])
+    T = demos.T_level_from_table[subject[demos.sequence_of_frame]]
+    R = T[:, :3, :3]
+    turn = Rotation.from_matrix(R)
+
+    def rotate(quats: np.ndarray) -> np.ndarray:
+        return (turn * Rotation.from_quat(quats, scalar_first=True)).as_quat(scalar_first=True).astype(quats.dtype)
+
+    kind = demos.object_pos.dtype
+    valid = demos.hand_valid[:, None]
+    wrist = np.where(valid, demos.wrist_quat_wxyz, np.array([1.0, 0.0, 0.0, 0.0], dtype=demos.wrist_quat_wxyz.dtype))
+    keypoints = np.einsum("fij,f...j->f...i", R, demos.hand_keypoints) + T[:, None, :3, 3]
+    return replace(
+        demos,
+        hand_keypoints=keypoints.astype(demos.hand_keypoints.dtype),
+        wrist_quat_wxyz=np.where(valid, rotate(wrist), demos.wrist_quat_wxyz),
+        object_pos=(np.einsum("fij,f...j->f...i", R, demos.object_pos) + T[:, :3, 3]).astype(kind),
+        object_quat_wxyz=rotate(demos.object_quat_wxyz),
+        subjects=None,
+        T_level_from_table=None,
+    )
 
 
 def _without_repeats(parts: Sequence[Demos]) -> list[Demos]:

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from xreset.demos.align import levelled
-from xreset.demos.archive import Demos
+from xreset.demos.archive import Demos, levelled
 from xreset.errors import DemoError
 from xreset.spec import ObjectSpec, TableSpec
 
@@ -103,8 +102,6 @@ def mirrored(demos: Demos, symmetries: Mapping[str, Symmetry], *, tolerance: flo
         wrist_quat_wxyz=wrist.astype(kind),
         object_pos=(pos * _ACROSS + shift).astype(kind),
         object_quat_wxyz=quat.astype(kind),
-        subjects=None,
-        T_level_from_table=None,
     )
 
 

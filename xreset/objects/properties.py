@@ -5,34 +5,32 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
-from xreset.checks import from_dict
+from xreset.checks import Checked, Rule, from_dict
 from xreset.errors import ObjectError
 from xreset.files import read_toml
-from xreset.text import shown
 
-_RANGES = {"mass": (1e-4, 50.0), "density": (1.0, 25_000.0), "friction": (0.05, 3.0), "tolerance": (5e-4, 0.1)}
-"""[kg], [kg/m^3] (osmium has 22,600), coefficient, [m]."""
+
+def _within(low: float, high: float) -> Rule:
+    return Rule(f"a number from {low:g} to {high:g}", lambda value: low <= value <= high)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Properties:
+class Properties(Checked):
     """None: unknown."""
 
-    mass: float | None = None
+    mass: Annotated[float, _within(1e-4, 50.0)] | None = None
     """[kg]"""
-    density: float | None = None
-    """[kg/m^3], of the mesh's volume."""
-    friction: float | None = None
+    density: Annotated[float, _within(1.0, 25_000.0)] | None = None
+    """[kg/m^3], of the mesh's volume; osmium has 22,600."""
+    friction: Annotated[float, _within(0.05, 3.0)] | None = None
     """Coefficient of its material; see :attr:`xreset.spec.ObjectSpec.friction`."""
-    tolerance: float | None = None
+    tolerance: Annotated[float, _within(5e-4, 0.1)] | None = None
     """Largest deviation of the convex pieces from the surface [m]; None: a mesh near its convex hull is one piece."""
 
     def __post_init__(self) -> None:
-        for name, value in self.known.items():
-            low, high = _RANGES[name]
-            if not low <= value <= high:
-                raise ValueError(f"{name} is {shown(value)}, expected a number from {low:g} to {high:g}")
+        super().__post_init__()
         if self.mass is not None and self.density is not None:
             raise ValueError("mass and density are both given; one follows from the other")
 

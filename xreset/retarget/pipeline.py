@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.demos.align import grounded, levelled
-from xreset.demos.archive import Demos
+from xreset.demos.align import grounded
+from xreset.demos.archive import Demos, levelled
 from xreset.errors import DemoError
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat

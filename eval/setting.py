@@ -28,19 +28,3 @@ class Setting(Place):
 
     num_envs: int = 64
     """Worlds that run at the same time."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sequence(Options):
-    """An action sequence of a file."""
-
-    policy: str | None = None
-    """Run folder, exported policy (.onnx), name of a policy that ships with xreset, or a baseline (zero, random, ik)
-    that plays in the reference; its actions are replayed.
-    """
-    object: str | None = None
-    """Object, if the source has several; default: the first."""
-    episode: int = 0
-    """Which of the object's grasps, demonstrations or recorded episodes."""
-    repetition: int = 0
-    """With --policy: which perturbation of the demonstration's start."""

@@ -32,8 +32,8 @@ from xreset.task.randomization import sample_friction
 MakeBackend = Callable[[SceneSpec, int, Tensor], Backend]
 """Makes the worlds of a scene, given their number and the index of the object in each world [N]."""
 
-SAME_EQUATIONS = frozenset({"mujoco-warp"})
-"""Backends that solve the equations of ``mujoco`` in another precision."""
+SLOW_ON_CPU = frozenset({"mujoco-warp"})
+"""Backends that need a GPU to play many episodes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,17 +44,12 @@ class Engine:
     make: MakeBackend
     version: str
     device: str = "cpu"
-    grasps: bool = True
-    """Whether a comparison of engines measures press, closing and hold."""
-    path: bool = False
-    """Whether a comparison of engines measures paths."""
+    slow: bool = False
+    """Whether it is too slow on its device to play many episodes."""
 
 
 def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
     """Return an installed backend.
-
-    A backend that solves the equations of the reference is compared path by path; on the CPU in no other way, because
-    it is slow there.
 
     Args:
         name: name of the backend.
@@ -70,8 +65,7 @@ def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:
     def make(scene: SceneSpec, num_worlds: int, object_index: Tensor) -> Backend:
         return make_backend(name, scene, num_worlds, object_index=object_index, device=used, **options)
 
-    same = name in SAME_EQUATIONS
-    return Engine(name=name, make=make, version=version, device=used, grasps=not same or used != "cpu", path=same)
+    return Engine(name=name, make=make, version=version, device=used, slow=name in SLOW_ON_CPU and used == "cpu")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,19 +13,10 @@ import torch
 
 from tests import toy_grasp
 from tests.command import xreset
-from tests.toy_bank import toy_bank
+from tests.toy_bank import toy_retargeted
 from xreset import robots
 from xreset.errors import DemoError
-from xreset.eval.engines.agreement import (
-    Metric,
-    carried,
-    compare,
-    outcome_metric,
-    palm_distance,
-    path_difference,
-    path_metrics,
-    press_metrics,
-)
+from xreset.eval.engines.agreement import Metric, carried, compare, outcome_metric, palm_distance, press_metrics
 from xreset.eval.engines.episodes import (
     GraspMotion,
     carried_palm,
@@ -35,10 +26,8 @@ from xreset.eval.engines.episodes import (
     squeezed,
     squeezing_state,
 )
-from xreset.eval.engines.grasps import NEAR, Frames, find_grasps
+from xreset.eval.engines.grasps import NEAR, Grasps, find_grasps
 from xreset.eval.engines.recording import Recording
-from xreset.eval.engines.sources import load_frames
-from xreset.eval.engines.trials import ParityConfig
 from xreset.eval.trial import Engine, engine
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_from_axis_angle
@@ -50,7 +39,6 @@ from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
 DT = 1 / 60
 BRISK = GraspMotion(squeeze=16.0, settle=0.1, close=0.3, hold=0.2, lift=0.5, shake=0.4)
-CONFIG = ParityConfig(motion=BRISK, path_time=0.3)
 OFFSETS = ((0.0, 0.0), (0.02, 0.0), (0.0, 0.01), (-0.015, -0.005), (0.03, 0.0))
 """The open hand starts with fingers up to 17 mm inside the can, which every engine resolves in its own way: for MuJoCo against itself."""
 FREE_OFFSETS, FREE_GAP = ((0.03, 0.01), (0.02, 0.02), (0.04, 0.0)), 0.09
@@ -67,10 +55,11 @@ def between(kinematics: Kinematics, q: torch.Tensor) -> torch.Tensor:
     return 0.5 * (points[:, 1:].mean(1) + points[:, 0])
 
 
-def frames_above(
+def grasps_of(
     robot: RobotSpec, thing: ObjectSpec, offsets=OFFSETS, *, gap: float = 0.066, height: float = 0.06
-) -> Frames:
-    """The home pose's hand lowered over an upright object at several places between its fingers, and the same lifted by 0.1 m."""
+) -> Retargeted:
+    """The home pose's hand lowered over an upright object at several places between its fingers: sequences of two
+    frames, the second of which is lifted by 0.1 m."""
     kinematics = Kinematics(robot)
     home = torch.as_tensor(robot.home)[None]
     points = tips(kinematics, home)
@@ -82,21 +71,27 @@ def frames_above(
         return carried_palm(kinematics, q, way)[-1]
 
     low = shifted(q, height - float(between(kinematics, q)[0, 2]))
-    high = shifted(low, 0.1)
-    pos = between(kinematics, low) + torch.nn.functional.pad(torch.tensor(offsets, dtype=torch.float64), (0, 1))
+    both = torch.cat((low, shifted(low, 0.1)))
     upright = np.array([1.0, 0.0, 0.0, 0.0])
-    pos[:, 2] = rest_height(thing, upright)
+    pos = between(kinematics, low) + torch.nn.functional.pad(torch.tensor(offsets, dtype=torch.float64), (0, 1))
+    pos[:, 2] = float(rest_height(thing, upright))
     n = len(offsets)
-    both = torch.cat((pos, pos + torch.tensor([0.0, 0.0, 0.1]))).numpy()
-    return Frames(
-        joint_pos=torch.cat((low.expand(n, -1), high.expand(n, -1))).numpy(),
-        object_pos=both,
-        object_quat=np.tile(upright, (2 * n, 1)),
-        object_name=np.full(2 * n, thing.name),
-        sequence_name=np.tile([f"toy/{i}" for i in range(n)], 2),
-        frame=np.repeat([30, 60], n),
-        start_pos=np.tile(pos.numpy(), (2, 1)),
-        start_quat=np.tile(upright, (2 * n, 1)),
+    joints = both.repeat(n, 1)
+    palm = Kinematics(robot).link_poses(joints, [robot.palm])[:, 0]
+    object_pos = pos.repeat_interleave(2, dim=0)
+    object_pos[1::2, 2] += 0.1
+    return toy_retargeted(
+        robot,
+        [thing.name] * n,
+        list(range(0, 2 * n + 1, 2)),
+        sequence_name=np.array([f"toy/{i}" for i in range(n)]),
+        joint_pos=joints.numpy(),
+        palm_pos=palm[:, :3, 3].numpy(),
+        palm_quat_wxyz=np.tile(upright, (2 * n, 1)),
+        fingertip_pos=tips(kinematics, joints).numpy(),
+        object_pos=object_pos.numpy(),
+        object_quat_wxyz=np.tile(upright, (2 * n, 1)),
+        first_contact=np.zeros(n, dtype=np.int32),
     )
 
 
@@ -123,10 +118,6 @@ def with_squared_friction(base: Engine) -> Engine:
         return backend
 
     return replace(base, name="friction squared", make=make)
-
-
-def heavier(objects: tuple[ObjectSpec, ...]) -> tuple[ObjectSpec, ...]:
-    return tuple(replace(o, mass=2 * o.mass, inertia=2 * o.inertia) for o in objects)
 
 
 def with_drives(robot: RobotSpec, factor: float) -> RobotSpec:
@@ -218,55 +209,63 @@ class Episodes(unittest.TestCase):
 
 class Finding(unittest.TestCase):
     def setUp(self):
-        self.robot, self.can = robots.load("ur7e-sharpa"), load_object("soup")
+        self.robot = robots.load("ur7e-sharpa")
+        self.can = load_object("soup")
+
+    def find(self, motion: Retargeted, *objects: ObjectSpec, count: int = 10, **where) -> Grasps:
+        return find_grasps(motion, self.robot, objects or (self.can,), count, **({"where": "table"} | where))
 
     def test_table_and_air_are_told_apart(self):
-        frames = frames_above(self.robot, self.can)
-        table = find_grasps(frames, self.robot, [self.can], 10, where="table")
-        air = find_grasps(frames, self.robot, [self.can], 10, where="air")
-        self.assertEqual({label.split(":")[1] for label in table.label}, {"30"})
-        self.assertEqual({label.split(":")[1] for label in air.label}, {"60"})
+        motion = grasps_of(self.robot, self.can)
+        table = self.find(motion)
+        air = self.find(motion, where="air")
+        self.assertEqual({label.split(":")[1] for label in table.label}, {"0"})
+        self.assertEqual({label.split(":")[1] for label in air.label}, {"1"})
         self.assertEqual(len(table), 5)
         torch.testing.assert_close(
             air.object_pos[:, 2] - table.object_pos[:, 2], torch.full((5,), 0.1, dtype=torch.float64), atol=6e-4, rtol=0
         )
+        before = replace(motion, first_contact=np.full(5, -1))
+        with self.assertRaisesRegex(DemoError, "no grasp was found in 0 frames after first contact"):
+            self.find(before)
 
     def test_a_hand_that_is_not_at_the_object_grasps_nothing(self):
-        away = frames_above(self.robot, self.can, [(0.0, 0.0), (0.12 + NEAR, 0.0)])
-        self.assertEqual(find_grasps(away, self.robot, [self.can], 10, where="table").label, ("toy/0:30",))
+        away = grasps_of(self.robot, self.can, [(0.0, 0.0), (0.12 + NEAR, 0.0)])
+        self.assertEqual(self.find(away).label, ("toy/0:0",))
         with self.assertRaisesRegex(DemoError, "no grasp was found in 2 frames"):
-            find_grasps(frames_above(self.robot, self.can, [(0.2, 0.0)]), self.robot, [self.can], 10, where="table")
+            self.find(grasps_of(self.robot, self.can, [(0.2, 0.0)]))
 
     def test_a_turned_or_moved_object_is_not_at_rest(self):
-        frames = frames_above(self.robot, self.can, [(0.0, 0.0), (0.0, 0.01), (0.02, 0.0)])
-        start_pos, start_quat = frames.start_pos.copy(), frames.start_quat.copy()
-        start_pos[0, 0] += 0.012
-        start_quat[1] = quat_from_axis_angle(torch.tensor([0.0, 0.0, 0.2])).numpy()
-        moved = replace(frames, start_pos=start_pos, start_quat=start_quat)
-        self.assertEqual(find_grasps(moved, self.robot, [self.can], 10, where="table").label, ("toy/2:30",))
+        motion = grasps_of(self.robot, self.can, [(0.0, 0.0), (0.0, 0.01), (0.02, 0.0)])
+        pos = motion.object_pos.copy()
+        quat = motion.object_quat_wxyz.copy()
+        pos[1] = pos[0] + [0.012, 0.0, 0.0]
+        pos[3] = pos[2]
+        pos[5] = pos[4]
+        quat[3] = quat_from_axis_angle(torch.tensor([0.0, 0.0, 0.2])).numpy()
+        joints = motion.joint_pos.copy()
+        joints[1::2] = joints[::2]
+        found = self.find(replace(motion, object_pos=pos, object_quat_wxyz=quat, joint_pos=joints))
+        self.assertEqual(set(found.label), {"toy/0:0", "toy/1:0", "toy/2:0", "toy/2:1"})
 
     def test_objects_and_sequences_take_turns(self):
-        one, spam = frames_above(self.robot, self.can, [(0.0, 0.0)]), load_object("spam")
-        other = frames_above(self.robot, spam, [(0.0, 0.0)])
-
-        def repeated(frames: Frames, sequences: list[str], numbers: list[int]) -> Frames:
-            rows = np.zeros(len(sequences), dtype=int)  # on the table
-            values = {name: getattr(frames, name)[rows] for name in Frames.__dataclass_fields__}
-            return Frames(**values | {"sequence_name": np.array(sequences), "frame": np.array(numbers)})
-
-        cans, spams = repeated(one, ["a", "a", "a", "b"], [1, 2, 3, 9]), repeated(other, ["c", "c"], [4, 5])
-        joined = Frames(
-            **{
-                name: np.concatenate((getattr(cans, name), getattr(spams, name)))
-                for name in Frames.__dataclass_fields__
-            }
+        spam = load_object("spam")
+        one = grasps_of(self.robot, self.can, [(0.0, 0.0)])
+        other = grasps_of(self.robot, spam, [(0.0, 0.0)])
+        shown = (one, one, one, one, other, other)  # sequences a, a, a, b, c, c
+        motion = toy_retargeted(
+            self.robot,
+            [self.can.name, self.can.name, spam.name],
+            [0, 3, 4, 6],
+            sequence_name=np.array(["a", "b", "c"]),
+            joint_pos=np.stack([m.joint_pos[0] for m in shown]),
+            object_pos=np.stack([m.object_pos[0] for m in shown]),
+            first_contact=np.zeros(3, dtype=int),
         )
-        found = find_grasps(joined, self.robot, [self.can, spam], 6, where="table")
-        self.assertEqual(found.label, ("a:3", "c:5", "b:9", "c:4", "a:2", "a:1"))
+        found = self.find(motion, self.can, spam, count=6)
+        self.assertEqual(found.label, ("a:2", "c:1", "b:0", "c:0", "a:1", "a:0"))
         self.assertEqual(found.object_index.tolist(), [0, 1, 0, 1, 0, 0])
-        self.assertEqual(
-            find_grasps(joined, self.robot, [self.can, spam], 3, where="table").label, ("a:3", "c:5", "b:9")
-        )
+        self.assertEqual(self.find(motion, self.can, spam, count=3).label, ("a:2", "c:1", "b:0"))
 
 
 def recording(**changes: torch.Tensor) -> Recording:
@@ -281,18 +280,16 @@ class Numbers(unittest.TestCase):
         force[:, 0] *= 1.25  # 20 % of the larger
         force[:, 1, 1] = torch.tensor([0.0, 2.0, 0.0])  # turned by a right angle, as strong
         total, tip = press_metrics(recording(tip_force=force), recording(), steps=2)
-        self.assertAlmostEqual(total.measured, 0.1, places=5)  # median of 0.2 and 0
+        self.assertAlmostEqual(total.measured or 0.0, 0.1, places=5)  # median of 0.2 and 0
         self.assertEqual(total.n, 2)
-        self.assertAlmostEqual(tip.measured, 0.2, places=5)  # median of 0.2, 0.2, 0 and sqrt 2
+        self.assertAlmostEqual(tip.measured or 0.0, 0.2, places=5)  # median of 0.2, 0.2, 0 and sqrt 2
         self.assertEqual(tip.n, 4)
-        self.assertAlmostEqual(tip.detail["p90"], float(np.quantile([0.2, 0.2, 0.0, math.sqrt(2)], 0.9)), places=3)
 
     def test_a_finger_that_presses_in_one_engine_only_counts(self):
         force = recording().tip_force.clone()
         force[:, 0, 1] = 0.0
         _, tip = press_metrics(recording(tip_force=force), recording(), steps=3)
         self.assertEqual(tip.n, 4)
-        self.assertEqual(tip.detail["touch_same"], 0.75)
 
     def test_only_the_last_steps_of_a_press_count(self):
         force = recording().tip_force.clone()
@@ -304,8 +301,7 @@ class Numbers(unittest.TestCase):
         none = recording(tip_force=torch.zeros(3, 2, 2, 3))
         for metric in press_metrics(none, none, steps=1):
             self.assertFalse(metric.ok)
-            self.assertIsNone(metric.as_dict()["measured"])
-            self.assertEqual(metric.as_dict()["verdict"], "missed")
+            self.assertIsNone(metric.measured)
 
     def test_outcomes(self):
         high = torch.zeros(3, 2, 3)
@@ -314,11 +310,10 @@ class Numbers(unittest.TestCase):
         self.assertEqual(
             carried(recording(object_pos=high, broken=torch.tensor([True, False])), 0.1).tolist(), [False, False]
         )
-        flags = torch.tensor([True, True, True, False, False])
-        metric = outcome_metric("closing, outcome", flags, torch.tensor([True, True, False, True, False]))
-        self.assertAlmostEqual(metric.measured, 0.6)
-        self.assertFalse(metric.ok)
-        self.assertEqual(metric.detail, {"both": 2, "neither": 1, "only_here": 1, "only_in_reference": 1})
+        metric = outcome_metric(
+            "closing, outcome", [recording(object_pos=high)], [recording(object_pos=high.flip(1))], 0.1
+        )
+        self.assertEqual((metric.measured, metric.n, metric.ok), (0.0, 2, False))
 
     def test_object_in_palm(self):
         quarter = quat_from_axis_angle(torch.tensor([0.0, 0.0, math.pi / 2]))
@@ -335,15 +330,6 @@ class Numbers(unittest.TestCase):
         turned = recording(object_quat=quarter.expand(3, 2, 4))
         torch.testing.assert_close(palm_distance(turned, recording(), corners), torch.full((2,), 0.1 * math.sqrt(2)))
 
-    def test_paths(self):
-        joints, pos = torch.zeros(3, 2, 1), torch.zeros(3, 2, 3)
-        joints[:, 1], pos[2, 1, 0] = -4e-4, 2e-3
-        joint, median, worst = path_metrics(*path_difference(recording(joint_pos=joints, object_pos=pos), recording()))
-        self.assertAlmostEqual(joint.measured, 2e-4)
-        self.assertEqual((median.measured, worst.detail["grasps_above"]), (0.0, 1))
-        self.assertAlmostEqual(worst.measured, 2.0, places=5)
-        self.assertEqual([m.ok for m in (joint, median, worst)], [True, True, False])
-
 
 class Comparing(unittest.TestCase):
     """MuJoCo against MuJoCo with one thing wrong: each metric goes red where it must."""
@@ -355,21 +341,20 @@ class Comparing(unittest.TestCase):
         cls.result = compare(
             robot,
             [can],
-            frames_above(robot, can),
+            grasps_of(robot, can),
             [
-                replace(reference, name="same", path=True),
+                replace(reference, name="same"),
                 with_squared_friction(reference),
                 altered(reference, "drives halved", robot=lambda robot: with_drives(robot, 0.5)),
-                altered(replace(reference, path=True), "mass doubled", objects=heavier),
             ],
             grasps=6,
-            config=CONFIG,
+            tries=BRISK,
             reference=reference,
         )
 
     def metrics(self, name: str) -> dict[str, Metric]:
         tested = next(e for e in self.result.engines if e.engine.name == name)
-        return {metric.name: metric for metric in tested.metrics}
+        return {metric.metric: metric for metric in tested.metrics}
 
     def test_the_same_engine_agrees_exactly(self):
         for name, metric in self.metrics("same").items():
@@ -388,27 +373,20 @@ class Comparing(unittest.TestCase):
             )
 
     def test_the_timestep_matters_little(self):
-        metrics = {metric.name: metric for metric in self.result.floor.metrics}
+        metrics = {metric.metric: metric for metric in self.result.floor.metrics}
         self.assertTrue(metrics["press, total"].ok)
-        self.assertGreater(metrics["press, total"].measured, 0.0)
+        self.assertGreater(metrics["press, total"].measured or 0.0, 0.0)
 
     def test_squared_friction_is_seen(self):
         metrics = self.metrics("friction squared")
         self.assertFalse(metrics["hold, outcome"].ok)
-        self.assertGreater(metrics["hold, outcome"].detail["only_in_reference"], 0)
         self.assertFalse(metrics["closing, outcome"].ok)
 
     def test_halved_drives_are_seen(self):
         metrics = self.metrics("drives halved")
         self.assertFalse(metrics["press, total"].ok)
-        self.assertLess(metrics["press, total"].detail["bias"], -0.3)
+        self.assertGreater(metrics["press, total"].measured or 0.0, 0.3)
         self.assertFalse(metrics["press, fingertip"].ok)
-
-    def test_a_doubled_mass_is_seen(self):
-        metrics = self.metrics("mass doubled")
-        self.assertFalse(metrics["path, object"].ok or metrics["path, object, worst"].ok)
-        self.assertFalse(metrics["path, joints"].ok)
-        self.assertFalse(metrics["hold, object in palm"].ok and metrics["hold, outcome"].ok)
 
     def test_common_states_favour_no_engine(self):
         labels = self.result.hold.label
@@ -436,11 +414,10 @@ class Engines(unittest.TestCase):
         if backend_status(name).reason is not None:
             self.skipTest(f"{name} cannot be used here")
         robot, can = robots.load("ur7e-sharpa"), load_object("soup")
-        frames = frames_above(robot, can, FREE_OFFSETS, gap=FREE_GAP)
-        config = replace(CONFIG, frictions=(0.8,))
+        motion = grasps_of(robot, can, FREE_OFFSETS, gap=FREE_GAP)
         tested, reference = engine(name, workers=0), engine("mujoco", workers=0)
-        result = compare(robot, [can], frames, [tested], grasps=3, config=config, reference=reference)
-        metrics = {metric.name: metric for metric in result.engines[0].metrics}
+        result = compare(robot, [can], motion, [tested], grasps=3, tries=BRISK, reference=reference)
+        metrics = {metric.metric: metric for metric in result.engines[0].metrics}
         for metric in ("press, total", "press, fingertip", "closing, outcome"):  # a few holds near the edge say little
             with self.subTest(metric):
                 self.assertTrue(metrics[metric].ok, metrics[metric])
@@ -457,42 +434,9 @@ class Command(unittest.TestCase):
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
 
     def retargeted(self) -> Path:
-        """A file with the frames of :func:`frames_above`, each a sequence of two."""
-        robot, can = robots.load("ur7e-sharpa"), load_object("soup")
-        frames = frames_above(robot, can, OFFSETS[:3])
-        rows = np.array([0, 3, 1, 4, 2, 5])  # on the table and in the air, in turns
-        kinematics = Kinematics(robot)
-        q = torch.as_tensor(frames.joint_pos[rows])
-        palm = kinematics.link_poses(q, [robot.palm])[:, 0]
         path = self.folder / "retargeted.npz"
-        data = Retargeted(
-            robot=robot.name,
-            robot_fingerprint=robot.fingerprint,
-            sequence_name=np.array(["a", "b", "c"]),
-            object_name=np.array([can.name] * 3),
-            hand_side=np.array(["right"] * 3),
-            frame_offsets=np.array([0, 2, 4, 6], dtype=np.int32),
-            fps=30.0,
-            joint_names=robot.joint_names,
-            joint_pos=q.numpy(),
-            palm_pos=palm[:, :3, 3].numpy(),
-            palm_quat_wxyz=np.tile([1.0, 0, 0, 0], (6, 1)),
-            fingertip_names=robot.fingertip_names,
-            fingertip_pos=tips(kinematics, q).numpy(),
-            object_pos=frames.object_pos[rows],
-            object_quat_wxyz=frames.object_quat[rows],
-            goal_pos=frames.object_pos[rows[1::2]],
-            goal_quat_wxyz=frames.object_quat[rows[1::2]],
-            annotated=np.ones(6, dtype=bool),
-            valid=np.ones(6, dtype=bool),
-            reason=np.zeros(6, dtype=np.int32),
-            reason_names=("valid",),
-            contact=np.ones(6, dtype=bool),
-            first_contact=np.zeros(3, dtype=np.int32),
-            hand_error=np.zeros(6),
-            wrist_error=np.zeros(6),
-        )
-        write_retargeted(path, data, config={}, inputs={})
+        motion = grasps_of(robots.load("ur7e-sharpa"), load_object("soup"), OFFSETS[:3])
+        write_retargeted(path, motion, config={}, inputs={})
         return path
 
     def test_a_file_is_measured_and_the_exit_code_says_the_verdict(self):
@@ -526,18 +470,6 @@ class Command(unittest.TestCase):
                 self.assertEqual(code, 1)
                 self.assertIn("xreset engines compare:", text)
                 self.assertIn(said, text)
-
-    def test_files_that_show_grasps(self):
-        robot, objects, frames = load_frames(self.retargeted())
-        self.assertEqual(
-            (robot.name, [o.name for o in objects], len(frames.frame)), ("ur7e-sharpa", ["005_tomato_soup_can"], 6)
-        )
-        bank = toy_bank(robot)
-        shown = Frames.of(bank)
-        self.assertEqual(shown.sequence_name.tolist(), ["demo_a", "demo_b", "demo_c"])
-        np.testing.assert_array_equal(shown.joint_pos, bank.joint_pos[1::2])
-        np.testing.assert_array_equal(shown.start_pos, bank.start_pos)
-        np.testing.assert_array_equal(shown.frame, [9, 8, 7])
 
 
 if __name__ == "__main__":

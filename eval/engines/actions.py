@@ -8,8 +8,8 @@ joints, P phases.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +20,14 @@ from xreset.description import load_robot
 from xreset.errors import FileFormatError
 from xreset.eval.engines.episodes import GraspMotion, closing_episode
 from xreset.eval.engines.grasps import Grasps
-from xreset.eval.rollout import Progress, Trace, episode_starts, play
-from xreset.eval.trial import Engine, Trial, nominal_scene
+from xreset.eval.engines.recording import Recording
+from xreset.eval.rollout import Trace
+from xreset.eval.trial import nominal_scene
 from xreset.physics import State
-from xreset.policy import Policy
 from xreset.records import JOINT, POSITION, Field, Schema, read_npz, write_npz
 from xreset.resets.bank import check_robot
 from xreset.spec import ObjectSpec, PairFriction, RobotSpec, SceneSpec
-from xreset.task.config import TaskConfig
-from xreset.task.reading import Reading
+from xreset.task.config import EVALUATION_TIMESTEP, TaskConfig
 
 SCHEMA = "xreset-actions/1"
 
@@ -117,72 +116,32 @@ def grasp_and_lift(robot: RobotSpec, thing: ObjectSpec, grasps: Grasps, number: 
     )
 
 
-def play_policy(
-    policy: Policy,
-    engine: Engine,
-    trial: Trial,
-    *,
-    sequence: int,
-    repetition: int = 0,
-    progress: Progress = lambda done, total: None,
-) -> Actions:
-    """Let a policy act through one episode in one engine, and record the drives' targets.
-
-    Args:
-        policy: what acts.
-        engine: where it acts.
-        trial: what it plays.
-        sequence: index of the demonstration.
-        repetition: number of the perturbation of its start, as ``xreset eval`` counts them.
-        progress: called with (control steps done, control steps in all).
-    """
-    bank = trial.bank
-    thing = trial.names.index(str(bank.sequence_object[sequence]))
-    start = episode_starts(trial.starts(), np.array([sequence]), np.array([repetition]), trial.seed)
-    targets: list[torch.Tensor] = []
-    with trial.worlds(engine, torch.tensor([thing])) as (env, points):
-        env.reset(start=start.to(env.device))
-
-        def look(step: int, _: Reading) -> None:
-            if step:
-                targets.append(env.joint_target[0].cpu().clone())
-                progress(step, env.max_episode_length)
-
-        play(policy, env, points, look)
-    played = f"{bank.sequence_name[sequence]} (perturbation {repetition}, seed {trial.seed})"
-    return Actions(
-        scene=replace(trial.nominal_scene, objects=(trial.objects[thing],)),
-        label=f"{policy.name} in {engine.name}, {played}",
-        start=State.at_rest(start.joint_pos, start.object_pos, start.object_quat),
-        joint_target=torch.stack(targets),
-    )
-
-
 def recorded_actions(robot: RobotSpec, thing: ObjectSpec, trace: Trace, *, label: str) -> Actions:
     """Return the actions of an episode that an evaluation has recorded; it began at rest, with the physics of an
     evaluation.
 
     Raises:
-        FileFormatError: the episode was not played at the control rate of the default task.
+        FileFormatError: the trace has no actions, or its control step is no whole number of physics steps.
     """
-    assert trace.joint_target is not None, "the trace holds no actions"
-    scene = nominal_scene(robot, (thing,), TaskConfig())
-    interval = float(trace.time[1] - trace.time[0])
-    length = len(trace.joint_target) * scene.control_dt
-    if not trace.time[-1] <= length + 1e-6 < trace.time[-1] + interval + 1e-6:
+    if trace.joint_target is None:
+        raise FileFormatError("The trace holds states without the actions that led to them. Evaluate again.")
+    steps_per_frame = len(trace.joint_target) // (len(trace.time) - 1)
+    dt = float(trace.time[1] - trace.time[0]) / max(1, steps_per_frame)
+    substeps = round(dt / EVALUATION_TIMESTEP)
+    if abs(substeps * EVALUATION_TIMESTEP - dt) > 1e-5:
         raise FileFormatError(
-            f"{len(trace.joint_target)} actions at {1 / scene.control_dt:.0f} Hz last {length:.2f} s, but the episode "
-            f"lasts {trace.time[-1]:.2f} s: it was played at another control rate. Give --policy instead."
+            f"The episode was played with control steps of {dt:.4g} s, expected a multiple of 1/240 s. Replay another."
         )
     first = [
         torch.as_tensor(x[:1], dtype=torch.float32) for x in (trace.joint_pos, trace.object_pos, trace.object_quat)
     ]
     target = torch.as_tensor(trace.joint_target, dtype=torch.float32)
+    scene = nominal_scene(robot, (thing,), TaskConfig(substeps=substeps))
     return Actions(scene=scene, label=label, start=State.at_rest(*first), joint_target=target)
 
 
-def write_actions(path: str | Path, actions: Actions) -> None:
-    """Write an action sequence; see :func:`xreset.records.write_npz`."""
+def write_actions(path: str | Path, actions: Actions, replays: Mapping[str, Recording] | None = None) -> None:
+    """Write an action sequence, and what engines did with it, by name: the first world of each recording."""
     scene = actions.scene
     friction = scene.friction
     arrays: dict[str, Any] = {
@@ -201,6 +160,11 @@ def write_actions(path: str | Path, actions: Actions) -> None:
     }
     for name, key in _STATE_KEYS.items():
         arrays[key] = getattr(actions.start, name)[0].numpy()
+    if replays:
+        arrays["engine"] = np.array(list(replays))
+        for name in ("joint_pos", "object_pos", "object_quat", "tip_force"):
+            key = "object_quat_wxyz" if name == "object_quat" else name
+            arrays[key] = np.stack([getattr(recording, name)[:, 0].numpy() for recording in replays.values()])
     write_npz(path, SCHEMA, arrays)
 
 

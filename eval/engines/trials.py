@@ -1,12 +1,12 @@
-"""What a comparison tries in every engine: closings, presses, holds and paths.
+"""What a comparison tries in every engine: closings, presses and holds.
 
-Shape letters: G grasps (one per world), M chosen grasps.
+Shape letters: G grasps (one per world).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -18,24 +18,12 @@ from xreset.eval.trial import Engine
 from xreset.physics import State
 from xreset.spec import RobotSpec, SceneSpec
 
-
-@dataclass(frozen=True, kw_only=True)
-class ParityConfig:
-    """What is tried."""
-
-    motion: GraspMotion = field(default_factory=GraspMotion)
-    frictions: tuple[float, ...] = (0.5, 0.8)
-    """Pair frictions of hand and object in the holds."""
-    in_air: float = 1 / 3
-    """Share of the common states that demonstrations show in the air; the others come from closings."""
-    press_mass: float = 1e6
-    """Factor on the mass of an object that nothing shall move."""
-    press_time: float = 0.25
-    """Forces are averaged over the last of these seconds of a press."""
-    path_time: float = 1.0
-    """Length of a path [s]."""
-    path_grasps: int = 16
-    """Largest number of grasps whose paths are compared."""
+FRICTIONS = (0.5, 0.8)
+"""Pair frictions of hand and object in the holds."""
+IN_AIR = 1 / 3
+"""Share of the common states that demonstrations show in the air; the others come from closings."""
+PRESS_MASS = 1e6
+"""Factor on the mass of an object that nothing shall move."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,13 +37,8 @@ class CommonStates:
     start: State
     """[G, ...]"""
 
-    def __getitem__(self, chosen: Tensor) -> CommonStates:
-        """Select grasps [M]."""
-        label = tuple(self.label[i] for i in chosen.tolist())
-        return CommonStates(label=label, object_index=self.object_index[chosen], start=self.start[chosen])
 
-
-def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps, config: ParityConfig) -> tuple[Recording, Recording]:
+def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps, tries: GraspMotion) -> tuple[Recording, Recording]:
     """Close each hand at the scene's frictions.
 
     Returns:
@@ -63,22 +46,22 @@ def try_closings(tested: Engine, scene: SceneSpec, grasps: Grasps, config: Parit
         table.
     """
     dt = scene.control_dt
-    episode = closing_episode(scene.robot, grasps.joint_pos, grasps.object_pos, grasps.object_quat, dt, config.motion)
-    closing = OpenLoopEpisode(start=episode.start, targets=episode.targets[: config.motion.closing_steps(dt)])
+    episode = closing_episode(scene.robot, grasps.joint_pos, grasps.object_pos, grasps.object_quat, dt, tries)
+    closing = OpenLoopEpisode(start=episode.start, targets=episode.targets[: tries.closing_steps(dt)])
     with tested.make(scene, len(grasps), grasps.object_index) as backend:
         whole = play(backend, episode)
         mass = torch.tensor([scene.objects[i].mass for i in grasps.object_index.tolist()], device=backend.device)
-        backend.set_object_mass(config.press_mass * mass)
+        backend.set_object_mass(PRESS_MASS * mass)
         backend.set_object_gravity(torch.zeros_like(mass))
         return play(backend, closing), whole
 
 
-def try_holds(tested: Engine, scene: SceneSpec, common: CommonStates, config: ParityConfig) -> tuple[Recording, ...]:
+def try_holds(tested: Engine, scene: SceneSpec, common: CommonStates, tries: GraspMotion) -> tuple[Recording, ...]:
     """Lift and shake, once with each of the frictions."""
-    episode = lifting_episode(scene.robot, common.start, scene.control_dt, config.motion)
+    episode = lifting_episode(scene.robot, common.start, scene.control_dt, tries)
     recordings = []
     with tested.make(scene, len(common.object_index), common.object_index) as backend:
-        for mu in config.frictions:
+        for mu in FRICTIONS:
             friction = torch.tensor([mu, mu, scene.friction.table], device=backend.device)
             backend.set_friction(friction.repeat(backend.num_worlds, 1))
             recordings.append(play(backend, episode))
@@ -92,7 +75,7 @@ def common_states(
     closings: Mapping[str, Recording],
     count: int,
     dt: float,
-    config: ParityConfig,
+    tries: GraspMotion,
 ) -> CommonStates:
     """Return states that favor no engine: some from demonstrations in the air, the others from the closings of all
     engines in turn.
@@ -106,14 +89,14 @@ def common_states(
         closings: whole closings, by engine.
         count: largest number of states; there are fewer where hands have closed on nothing.
         dt: control step [s].
-        config: share of the states in the air.
+        tries: how grasps are tried.
     """
-    shown = min(round(count * config.in_air), len(air))
-    held = squeezing_state(robot, air.joint_pos[:shown], air.object_pos[:shown], air.object_quat[:shown], config.motion)
+    shown = min(round(count * IN_AIR), len(air))
+    held = squeezing_state(robot, air.joint_pos[:shown], air.object_pos[:shown], air.object_quat[:shown], tries)
     labels = [f"{label} as demonstrated" for label in air.label[:shown]]
     states = [held]
     index = [air.object_index[:shown]]
-    last = config.motion.closing_steps(dt) - 1
+    last = tries.closing_steps(dt) - 1
     names = list(closings)
     for g in range(len(table)):
         first = g % len(names)

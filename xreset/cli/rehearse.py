@@ -29,8 +29,8 @@ def rehearse(
     Args:
         demos: Demonstrations whose starts and goals are played. Default: two synthetic ones of each of the policy's
             objects.
-        backend: Physics engine; give it again for more engines. Default: all that can be used here, but on a CPU no
-            engine that solves another one's equations.
+        backend: Physics engine; give it again for more engines. Default: all that can be used here, but not
+            MuJoCo-Warp on a CPU, where it is slow.
         fault: Fault to try, or NAME=VALUE,VALUE... for values of your own; give it again for more. Default: all.
         episodes: Episodes of each demonstration, the same for every fault.
         real_time: Let the simulation wait for the wall clock.
@@ -39,7 +39,7 @@ def rehearse(
     """
     engines = chosen_engines(backend or usable_engines(), setting.device)
     if not backend:
-        engines = [each for each in engines if each.grasps]
+        engines = [each for each in engines if not each.slow]
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "rehearsal"
     with engine_bars([e.name for e in engines]) as progress:

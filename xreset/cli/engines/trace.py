@@ -2,28 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
-from xreset.checks import Options
 from xreset.cli._common import Flat, Several, Source, usable_engines
 from xreset.cli._terminal import Progress, console
 from xreset.eval import trial
-from xreset.eval.engines import actions, film, replay, sources, trace_view
-from xreset.eval.setting import Place, Sequence
-
-
-@dataclass(frozen=True, kw_only=True)
-class Output(Options):
-    """Files to write."""
-
-    strip: bool = False
-    """Also write strip.png: pictures at several times, one row for each engine."""
-    mp4: bool = False
-    """Also write film.mp4: engines next to each other."""
-    out: Path = Path("runs/trace")
-    """Folder for trace.json, replays.npz, actions.npz and trace.png."""
+from xreset.eval.engines import actions, replay, sources, trace_view
+from xreset.eval.setting import Place
+from xreset.files import write_json
 
 
 def trace(
@@ -31,47 +17,40 @@ def trace(
     *,
     backend: Several = (),
     reference: str = "mujoco",
-    sequence: Flat[Sequence] = Sequence(),
+    object: str | None = None,
+    episode: int = 0,
     place: Flat[Place] = Place(),
-    output: Flat[Output] = Output(),
+    mp4: bool = False,
+    out: Path = Path("runs/trace"),
 ) -> None:
     """Replay the same actions from the same state in several engines, and show when and by how much they diverge.
 
     Args:
-        source: Source of the actions. Demonstrations, robot motion or a reset bank: an open-loop grasp and lift; with
-            --policy, an episode of that policy. The trace of an evaluation (eval/BACKEND.trace.npz): a recorded
-            episode. An actions.npz of this command.
+        source: Source of the actions. Demonstrations or robot motion: an open-loop grasp and lift. The trace of an
+            evaluation (eval/BACKEND.trace.npz): an episode of the policy. An actions.npz of this command.
         backend: Engine to compare with the reference; give it again for more. Default: all that can be used here.
-        reference: Engine that the others are compared with, and in which a policy plays.
-        sequence: The episode or grasp to replay.
+        reference: Engine that the others are compared with.
+        object: Object, if the source has several; default: the first.
+        episode: Which of the object's grasps or recorded episodes.
         place: Robot, meshes, seed, device.
-        output: Files to write.
+        mp4: Also write film.mp4: engines next to each other, the reference first.
+        out: Folder for trace.json, trace.png, and actions.npz: the actions, and what every engine did.
     """
-    out = output.out
     base = trial.engine(reference, device=place.device)
     names = [name for name in dict.fromkeys(backend) or usable_engines() if name != reference]
     engines = [trial.engine(name, device=place.device) for name in names]
     with Progress() as bar:
         task = bar.add_task("actions", total=None)
-
-        def show(what: str) -> Callable[[int, int], None]:
-            return lambda done, total: bar.update(task, description=what, completed=done, total=total)
-
-        if sequence.policy is None:
-            played = sources.from_file(source, sequence, place)
-        else:
-            played = sources.from_policy(source, base, sequence, place, show("policy"))
+        played = sources.from_file(source, place, object, episode)
         result = replay.trace(
-            played, base, engines, seed=place.seed,
-            progress=lambda name: bar.update(task, description=name, completed=0, total=None),
-        )  # fmt: skip
-        actions.write_actions(out / "actions.npz", played)
-        replay.write_trace(out, result)
+            played, base, engines, seed=place.seed, progress=lambda name: bar.update(task, description=name)
+        )
+        replays = {e.name: e.recording for e in (result.reference, *result.engines)}
+        actions.write_actions(out / "actions.npz", played, replays)
+        write_json(out / "trace.json", result.as_dict())
         trace_view.write_plot(out / "trace.png", result)
-        if output.strip:
-            film.write_strip(out / "strip.png", result, progress=show("strip"))
-        if output.mp4:
-            film.write_film(out / "film.mp4", result, progress=show("film"))
+        if mp4:
+            trace_view.write_film(out / "film.mp4", result)
     console.print(trace_view.rich_table(result))
     for sentence in trace_view.sentences(result):
         console.print(sentence)

@@ -8,9 +8,8 @@ from rich.table import Table
 
 from xreset.cli._common import Engines, Flat, PolicyOrBaseline, Several, chosen_engines, engine_bars
 from xreset.cli._terminal import console
-from xreset.eval import policy_spec, trial
+from xreset.eval import policy_spec, sensitivity, trial
 from xreset.eval import stress as sweeps
-from xreset.eval.sensitivity import chosen
 from xreset.eval.setting import Setting
 
 
@@ -34,7 +33,7 @@ def stress(
         setting: Robot, meshes, seed, device and worlds.
         out: Folder for the results; default: stress/ in the run folder or next to the policy.
     """
-    properties = chosen(property)
+    properties = sensitivity.chosen(property)
     engines = chosen_engines(backend, setting.device)
     spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
     folder = out or spec.folder.parent / "stress"

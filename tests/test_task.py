@@ -13,12 +13,12 @@ import torch
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_robot import toy_hand_arm
 from xreset.checks import from_dict
-from xreset.errors import DemoError, FileFormatError, PolicyError, RunError
+from xreset.errors import DemoError, PolicyError, RunError
 from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_rotate
 from xreset.learning.recipes import RECIPES
 from xreset.physics import Links, State
 from xreset.policy import OnnxPolicy, RandomPolicy, ZeroPolicy, check_contract, policy_contract
-from xreset.resets.distribution import Reset, ResetDistribution
+from xreset.resets.distribution import ResetDistribution
 from xreset.spec import TableSpec
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
@@ -36,7 +36,7 @@ from xreset.task.config import (
 from xreset.task.latency import DelayLine
 from xreset.task.randomization import pair_friction, sample_drives, sample_friction, sample_mass_scale
 from xreset.task.rewards import RewardInput, compute_reward, contact_gate
-from xreset.task.terminations import episode_steps, out_of_bounds
+from xreset.task.terminations import out_of_bounds
 
 IDENTITY = torch.tensor([1.0, 0, 0, 0])
 
@@ -92,10 +92,6 @@ class RewardTest(unittest.TestCase):
             self.assertAlmostEqual(float(value), expected.get(name, 0.0), places=5, msg=name)
         self.assertLessEqual(set(expected), set(reward.terms))
         self.assertAlmostEqual(float(reward.total), 0.01 * sum(expected.values()), places=5)
-
-    def test_reach_alone(self):
-        self.assert_terms(self.reward(), reach=1 - math.tanh(2.0))
-        self.assert_terms(self.reward(best_reach=torch.tensor(0.03)), reach=1 - math.tanh(0.3))
 
     def test_reach_may_be_paid_for_the_present_distance(self):
         gone = {"best_reach": torch.tensor(0.01), "tip_distance": torch.tensor([0.1, 0.2, 0.3])}
@@ -160,12 +156,6 @@ class RewardTest(unittest.TestCase):
                 self.assertEqual((bool(reward.gate), bool(reward.success)), (gate, gate and d <= 0.02))
                 self.assertAlmostEqual(float(reward.total), 0.01 / 30 * expected, places=6)
 
-    def test_the_reward_for_progress_is_no_option_any_more(self):
-        old = asdict(RewardConfig()) | {"tracking": "presence", "progress": 8.0, "progress_width": 0.15}
-        self.assertEqual(from_dict(RewardConfig, old), RewardConfig())
-        with self.assertRaisesRegex(FileFormatError, "tracking is 'progress'"):
-            from_dict(RewardConfig, old | {"tracking": "progress"})
-
     def test_a_term_of_the_users_own_is_added(self):
         config = RewardConfig(own={f"{__name__}:height": 0.5})
         reward = self.reward(config, best_reach=torch.tensor(1e3))
@@ -186,11 +176,6 @@ class RewardTest(unittest.TestCase):
         for own in ({"height": 1.0}, {"module:": 1.0}, {"a:b": math.nan}):
             with self.subTest(own), self.assertRaisesRegex(ValueError, "expected module:function and a finite number"):
                 RewardConfig(own=own)
-
-    def test_a_quaternion_and_its_negative_are_one_rotation(self):
-        a = self.reward(tip_force=self.PRESS, object_quat=turned(40))
-        b = self.reward(tip_force=self.PRESS, object_quat=-turned(40))
-        torch.testing.assert_close(a.total, b.total)
 
     def test_success_needs_two_centimetres_and_fifteen_degrees_and_contact(self):
         def success(distance: float, degrees: float, force=self.PRESS) -> bool:
@@ -214,15 +199,6 @@ class RewardTest(unittest.TestCase):
         action, previous = torch.tensor([1.0, -0.5, 0, 0]), torch.tensor([1.0, 0.5, 0.2, 0])
         reward = self.reward(best_reach=torch.tensor(1e3), action=action, previous_action=previous)
         self.assert_terms(reward, action=-0.005 * 1.25, action_rate=-0.005 * 1.04)
-
-    def test_leaving_the_scene(self):
-        self.assert_terms(
-            self.reward(best_reach=torch.tensor(1e3), out_of_bounds=torch.tensor(True)), out_of_bounds=-500
-        )
-
-    def test_weights_and_scale_come_from_the_configuration(self):
-        config = RewardConfig(grasp=3.0, position=0.0, rotation=0.0, success=0.0, reach=0.0, scale=1.0)
-        self.assertAlmostEqual(float(self.reward(config, tip_force=self.PRESS).total), 3.0)
 
     def test_the_contact_gate_needs_the_thumb_and_another_finger(self):
         forces = torch.tensor([[1.0, 0, 0], [0, 1, 1], [1, 0, 1], [1, 1, 0], [0.09, 1, 1], [1, 0.1, 0.1], [0, 0, 0]])
@@ -252,10 +228,6 @@ class TerminationTest(unittest.TestCase):
         ]
         self.assertEqual(out_of_bounds(torch.tensor(inside), table, c).tolist(), [False] * 4)
         self.assertEqual(out_of_bounds(torch.tensor(outside), table, c).tolist(), [True] * 6)
-
-    def test_time_limit(self):
-        self.assertEqual(episode_steps(TerminationConfig(episode_seconds=5.0), 1 / 60), 300)
-        self.assertEqual(episode_steps(TerminationConfig(episode_seconds=1e-3), 1 / 60), 1)
 
 
 class ActionTest(WithRobot):
@@ -332,12 +304,6 @@ class ActionTest(WithRobot):
         again = space.targets(space.action_for(wanted, target), target, target)
         torch.testing.assert_close(again, wanted, atol=1e-5, rtol=0)
 
-    def test_action_for_goes_as_far_as_it_can(self):
-        space = self.space()
-        action = space.action_for(torch.tensor([[0.3, 0, 0, 9, 0, 0, 0]]), torch.zeros(1, 7))
-        self.assertEqual(action[0, 0], 1.0)  # 0.3 away in steps of 0.05
-        self.assertEqual(action[0, 3], 1.0)  # beyond the limit
-
 
 class LatencyTest(unittest.TestCase):
     def test_values_come_late_and_are_mixed_between_whole_steps(self):
@@ -373,10 +339,6 @@ class RandomizationTest(unittest.TestCase):
         self.assertAlmostEqual(float(drawn.min()), 0.5, delta=0.01)
         self.assertAlmostEqual(float(drawn.max()), 1.0, delta=0.01)
 
-    def test_ranges_that_make_no_sense_are_refused(self):
-        with self.assertRaisesRegex(ValueError, r"arm_stiffness is \(1.2, 0.8\), expected two finite numbers"):
-            RandomizationConfig(arm_stiffness=(1.2, 0.8))
-
     def test_a_pairs_friction_is_the_mean_of_its_materials(self):
         c = RandomizationConfig(elastomer=0.8, metal=0.1, table=0.5)
         torch.testing.assert_close(
@@ -392,11 +354,6 @@ class RandomizationTest(unittest.TestCase):
         self.assertAlmostEqual(float(material.mean()), 0.75, delta=0.005)
         few = 2 * sample_friction(1000, replace(c, friction_buckets=2), generator())[:, 2] - c.table
         torch.testing.assert_close(few.mul(1e5).round().unique() / 1e5, torch.tensor([0.625, 0.875]))
-
-    def test_mass_scale(self):
-        scale = sample_mass_scale(20_000, RandomizationConfig(), generator())
-        self.assertTrue(0.7 <= float(scale.min()) < 0.71 and 1.29 < float(scale.max()) <= 1.3)
-        self.assertAlmostEqual(float(scale.mean()), 1.0, delta=0.01)
 
     def test_disabled_means_nominal(self):
         c = RandomizationConfig(enabled=False)
@@ -414,11 +371,6 @@ class ResetTest(WithRobot):
         for p in (0.0, 0.25, 0.5, 1.0):
             reset = self.distribution(demo_probability=p).sample(self.SOUPS, generator())
             self.assertAlmostEqual(float(reset.from_bank.float().mean()), p, delta=0.03 * (0 < p < 1))
-
-    def test_the_share_of_bank_resets_may_change_between_draws(self):
-        resets = self.distribution(demo_probability=0.0)
-        resets.demo_probability.fill_(1.0)
-        self.assertTrue(bool(resets.sample(self.SOUPS, generator()).from_bank.all()))
 
     def test_bank_resets_are_states_of_the_bank(self):
         bank = toy_bank(self.robot)
@@ -535,20 +487,6 @@ class ResetTest(WithRobot):
         self.assertAlmostEqual(float(spread[4]), 0.10, delta=0.005)  # a finger joint
         quiet = self.distribution(demo_probability=0.0, home_noise=False).sample(self.SOUPS[:5], generator())
         torch.testing.assert_close(quiet.joint_pos, torch.full((5, 7), 0.01))
-
-    def test_the_seed_decides(self):
-        distribution = self.distribution()
-        draws = [distribution.sample(self.SOUPS, generator(seed)) for seed in (3, 3, 4)]
-        for name, value in vars(draws[0]).items():
-            self.assertTrue(torch.equal(value, getattr(draws[1], name)), name)
-        self.assertFalse(torch.equal(draws[0].joint_pos, draws[2].joint_pos))
-
-    def test_stack(self):
-        distribution = self.distribution()
-        one, two = (distribution.home(torch.tensor([s]), generator(s)) for s in (0, 1))
-        both = Reset.cat([one, two])
-        self.assertEqual(both.sequence.tolist(), [0, 1])
-        torch.testing.assert_close(both.joint_pos[1:], two.joint_pos)
 
 
 QUIET = NoiseConfig(joint_pos=0.0, joint_vel=0.0, object_pos=0.0, object_rot=0.0, cloud=0.0)

@@ -370,14 +370,6 @@ class ManipulationEnv:
         """[N, J] present drive targets."""
         return self._target
 
-    def rng_state(self) -> Tensor:
-        """State of the random numbers, for a checkpoint."""
-        return self.generator.get_state()
-
-    def set_rng_state(self, state: Tensor) -> None:
-        """Continue with the random numbers of a checkpoint."""
-        self.generator.set_state(state.cpu())
-
     def snapshot(self) -> dict[str, Tensor]:
         """Return the state of all worlds on the CPU, without random numbers and warm starts, for :meth:`restore`."""
         state = self.backend.state()

@@ -157,11 +157,9 @@ def check_contract_entries(source: str, contract: dict[str, Any]) -> None:
 
 def _is_layout(layout: dict[str, Any]) -> bool:
     """Return whether a value maps groups to the widths of their terms."""
-    is_known = {"policy", "proprio"} <= set(layout) or {"goal", "proprio", "view"} <= set(layout)
-    if not is_known or not all(isinstance(terms, dict) for terms in layout.values()):
+    if not all(isinstance(terms, dict) for terms in layout.values()):
         return False
-    widths = _widths({"observation_layout": layout}).values()
-    return all(type(width) is int and 0 < width < 1 << 20 for width in widths)
+    return all(type(width) is int and width > 0 for width in _widths({"observation_layout": layout}).values())
 
 
 def _read_contract(path: Path, metadata: dict[str, str]) -> dict[str, Any]:
@@ -173,10 +171,6 @@ def _read_contract(path: Path, metadata: dict[str, str]) -> dict[str, Any]:
         raise PolicyError(f"{path} holds a contract that is not valid JSON ({error}). Export it again.") from error
     check_contract_entries(str(path), contract)
     return contract
-
-
-_MAX_LSTM = 65536
-"""Units of an LSTM: far more than any policy has, and its state still fits into memory."""
 
 
 class OnnxPolicy:
@@ -217,21 +211,9 @@ class OnnxPolicy:
             raise PolicyError(
                 f"{path} takes the inputs {shown(inputs)}; a policy takes {', '.join(INPUTS)}. Export it again."
             )
-        self._lstm_dim = self._read_lstm_dim(path)
         self._try_step(path)
         self.name = path.stem if path.stem != "policy" else path.resolve().parent.name
         self._state: list[np.ndarray] | None = None
-
-    def _read_lstm_dim(self, path: Path) -> int:
-        """Return the units of the LSTM."""
-        shape = self._session.get_inputs()[2].shape
-        width = shape[2] if len(shape) == 3 else None
-        if not isinstance(width, int) or not 0 < width <= _MAX_LSTM:
-            raise PolicyError(
-                f"{path} has an LSTM state of shape {shown(shape)}, expected (1, worlds, 1 to {_MAX_LSTM}). "
-                "Export it again."
-            )
-        return width
 
     def _try_step(self, path: Path) -> None:
         """Take one step with zeros, so that a policy that cannot act is refused before work begins."""
@@ -240,11 +222,12 @@ class OnnxPolicy:
         layout = self.contract["observation_layout"]
         worlds = 2
         *flat_groups, _ = self._groups
-        flat = sum(sum(layout[name].values()) for name in flat_groups)
-        state = (1, worlds, self._lstm_dim)
-        shapes = ((worlds, flat), (worlds, *task.picture_shape), state, state)
-        feed = {name: np.zeros(shape, np.float32) for name, shape in zip(INPUTS, shapes, strict=True)}
         try:
+            self._lstm_dim: int = self._session.get_inputs()[2].shape[2]
+            flat = sum(sum(layout[name].values()) for name in flat_groups)
+            state = (1, worlds, self._lstm_dim)
+            shapes = ((worlds, flat), (worlds, *task.picture_shape), state, state)
+            feed = {name: np.zeros(shape, np.float32) for name, shape in zip(INPUTS, shapes, strict=True)}
             outputs: Any = self._session.run(None, feed)
         except Exception as error:
             raise PolicyError(f"{path} cannot act: {shown(str(error))}. Export it again.") from error

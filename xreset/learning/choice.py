@@ -4,30 +4,28 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
-from xreset.checks import Checked, NotNegative, Positive, from_dict
+from xreset.checks import Checked, NotNegative, Positive, Rule, from_dict
 from xreset.files import read_json, write_json
 
 FILE = "choice.json"
 SCHEMA = "xreset-choice/1"
 
 
+def _are_shares(values: dict[str, float]) -> bool:
+    return bool(values) and all(0 <= value <= 1 for value in values.values())
+
+
 @dataclass(frozen=True, kw_only=True)
-class Candidate:
+class Candidate(Checked):
     """One checkpoint."""
 
     name: str
     """File name of the checkpoint or policy."""
-    task_progress: dict[str, float]
+    task_progress: Annotated[dict[str, float], Rule("an engine at least, and numbers from 0 to 1", _are_shares)]
     """Engine -> mean over the episodes; without engines in which it was not played because it could no longer be
     chosen."""
-
-    def __post_init__(self) -> None:
-        values = self.task_progress.values()
-        if not values or not all(0 <= value <= 1 for value in values):
-            raise ValueError(
-                f"task_progress is {self.task_progress}, expected an engine at least, and numbers from 0 to 1"
-            )
 
     @property
     def worst(self) -> float:

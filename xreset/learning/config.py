@@ -167,9 +167,14 @@ def rsl_rl_config(config: TrainConfig, num_envs: int, teacher: Path | None = Non
         },
     }
     if teacher is not None:
+        settings["student"] = actor
+        settings["teacher"] = {"class_name": "xreset.learning.teacher:make_teacher", "path": teacher}
+        settings["obs_groups"] |= {
+            "student": settings["obs_groups"]["actor"],
+            "teacher": ["policy", "proprio", "perception"],
+        }
         settings["algorithm"] = {
             "class_name": "xreset.learning.distillation:SequenceDistillation",
-            "teacher": teacher,
             "sequence_length": p.sequence_length,
             "num_learning_epochs": p.mini_epochs,
             "num_mini_batches": batches,

@@ -7,20 +7,14 @@ some worlds, as in :mod:`xreset.learning.ppo`.
 
 from __future__ import annotations
 
-import contextlib
-import io
-from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from rsl_rl.algorithms import Distillation
-from rsl_rl.env import VecEnv
-from rsl_rl.utils import resolve_class, resolve_obs_groups
 from tensordict import TensorDict
 from torch import Tensor
 
-from xreset.learning.ppo import SequenceStorage
-from xreset.learning.teacher import load_teacher
+from xreset.learning.ppo import sequences
 
 
 class SequenceDistillation(Distillation):
@@ -30,21 +24,12 @@ class SequenceDistillation(Distillation):
         teacher_share: share of the worlds in which the teacher acts.
     """
 
-    def __init__(self, *args: Any, num_mini_batches: int, **options: Any) -> None:
+    def __init__(self, *args: Any, sequence_length: int, num_mini_batches: int, **options: Any) -> None:
         """Set up as rsl-rl does."""
         super().__init__(*args, gradient_length=1, **options)
+        self.sequence_length = sequence_length
         self.num_mini_batches = num_mini_batches
         self.teacher_share = 0.0
-
-    @property
-    def actor(self) -> Any:
-        """The student, by the name that it has in a checkpoint."""
-        return self.student
-
-    @property
-    def critic(self) -> Any:
-        """The teacher, whose memory is kept where other trainings keep the critic's."""
-        return self.teacher
 
     def act(self, obs: TensorDict) -> Tensor:
         """[N, J] the actions to take: the student's, and the teacher's in the first of the worlds."""
@@ -52,7 +37,7 @@ class SequenceDistillation(Distillation):
         transition.hidden_states = (self.student.get_hidden_state(), None)
         acted = self.student(obs, stochastic_output=True).detach()
         taught = self.teacher(obs).clamp(-1.0, 1.0).detach()
-        transition.observations = obs.select(*self.storage.observations.keys())
+        transition.observations = obs
         transition.privileged_actions = taught
         led = int(self.teacher_share * len(taught))
         transition.actions = torch.cat((taught[:led], acted[led:]))
@@ -60,13 +45,13 @@ class SequenceDistillation(Distillation):
 
     def update(self) -> dict[str, float]:
         """Learn from the rollout; return the mean squared error of the student's actions."""
-        storage = cast(SequenceStorage, self.storage)
+        storage = self.storage
         memory = self.student.get_hidden_state()
         total = torch.zeros((), device=self.device)
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(storage.num_envs, device=self.device)
             for worlds in order.tensor_split(self.num_mini_batches):
-                first, states = storage.sequences(worlds)
+                first, states = sequences(storage, worlds, self.sequence_length)
                 actions = self.student(storage.observations[:, worlds], masks=first, hidden_state=states)
                 loss = self.loss_fn(actions, storage.privileged_actions[:, worlds])
                 self.optimizer.zero_grad()
@@ -94,18 +79,3 @@ class SequenceDistillation(Distillation):
         self.student.load_state_dict(loaded_dict["actor_state_dict"], strict=strict)
         self.optimizer.load_state_dict(loaded_dict["optimizer_state_dict"])
         return True
-
-    @staticmethod
-    def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> SequenceDistillation:
-        """Build student, teacher, storage and algorithm from the runner's configuration."""
-        alg_class, alg_cfg = resolve_class(cfg["algorithm"])
-        student_class, student_cfg = resolve_class(cfg["actor"])
-        with contextlib.redirect_stdout(io.StringIO()):
-            groups = resolve_obs_groups(obs, cfg["obs_groups"], ["actor"])
-        student = student_class(obs, groups, "actor", env.num_actions, **student_cfg).to(device)
-        teacher = load_teacher(Path(alg_cfg.pop("teacher"))).to(device)
-        length = alg_cfg.pop("sequence_length")
-        seen = obs.select(*groups["actor"])
-        steps = cfg["num_steps_per_env"]
-        storage = SequenceStorage(length, "distillation", env.num_envs, steps, seen, [env.num_actions], device)
-        return alg_class(student, teacher, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])

@@ -247,11 +247,6 @@ class PointNetLstmModel(MLPModel):
         """The LSTM state, each [1, N, lstm]; None before the first step."""
         return self.state
 
-    def detach_hidden_state(self, dones: Tensor | None = None) -> None:
-        """Cut the graph behind the LSTM state."""
-        if self.state is not None:
-            self.state = (self.state[0].detach(), self.state[1].detach())
-
     def update_normalization(self, obs: TensorDict) -> None:
         """Take observations [M, ...] into the running mean and variance."""
         normalizer = self.trunk.normalizer
@@ -262,10 +257,6 @@ class PointNetLstmModel(MLPModel):
 
     def as_onnx(self, verbose: bool = False) -> ExportedPolicy:
         """The deterministic policy as a plain module; see :class:`ExportedPolicy`."""
-        return ExportedPolicy(self)
-
-    def as_jit(self) -> nn.Module:
-        """The same module as for ONNX: state in, state out."""
         return ExportedPolicy(self)
 
     def _get_obs_dim(self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str) -> tuple[list[str], int]:

@@ -8,15 +8,11 @@ every epoch. Returns use the whole horizon.
 
 from __future__ import annotations
 
-import contextlib
-import io
-from typing import Any, cast
+from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
-from rsl_rl.env import VecEnv
 from rsl_rl.storage import RolloutStorage
-from rsl_rl.utils import resolve_class, resolve_obs_groups
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -33,61 +29,57 @@ FASTEST = 1e-2
 """Limits of an adaptive learning rate (rsl-rl's)."""
 
 
-class SequenceStorage(RolloutStorage):
-    """A rollout that is handed out world by world, cut into sequences of fixed length."""
+def minibatch(storage: RolloutStorage, worlds: Tensor, length: int) -> Batch:
+    """Return the rollout [T, M, ...] of M worlds [M], with masks and the models' states of :func:`sequences`."""
+    first, state = sequences(storage, worlds, length)
+    states = (state, _states(storage.saved_hidden_state_c, worlds, length))
+    return RolloutStorage.Batch(
+        observations=storage.observations[:, worlds],
+        actions=storage.actions[:, worlds],
+        values=storage.values[:, worlds],
+        advantages=storage.advantages[:, worlds],
+        returns=storage.returns[:, worlds],
+        old_actions_log_prob=storage.actions_log_prob[:, worlds],
+        old_distribution_params=tuple(p[:, worlds] for p in storage.distribution_params or ()),
+        hidden_states=states,  # pyright: ignore[reportArgumentType]
+        masks=first,
+    )
 
-    def __init__(self, sequence_length: int, *args: Any, **options: Any) -> None:
-        """Allocate; ``sequence_length`` divides the number of steps."""
-        super().__init__(*args, **options)
-        self.sequence_length = sequence_length
 
-    def minibatch(self, worlds: Tensor) -> Batch:
-        """Return the rollout [T, M, ...] of M worlds [M], with masks and the actor's states of :meth:`sequences`."""
-        first, state = self.sequences(worlds)
-        states = (state, self._states(self.saved_hidden_state_c, worlds))
-        return RolloutStorage.Batch(
-            observations=self.observations[:, worlds],
-            actions=self.actions[:, worlds],
-            values=self.values[:, worlds],
-            advantages=self.advantages[:, worlds],
-            returns=self.returns[:, worlds],
-            old_actions_log_prob=self.actions_log_prob[:, worlds],
-            old_distribution_params=tuple(p[:, worlds] for p in self.distribution_params or ()),
-            hidden_states=states,  # pyright: ignore[reportArgumentType]
-            masks=first,
-        )
+def sequences(storage: RolloutStorage, worlds: Tensor, length: int) -> tuple[Tensor, tuple[Tensor, ...] | None]:
+    """Return where episodes of M worlds [M] begin, and the actor's memory at the start of each piece of a length.
 
-    def sequences(self, worlds: Tensor) -> tuple[Tensor, tuple[Tensor, ...] | None]:
-        """Return where episodes of M worlds [M] begin, and the actor's memory at the start of each piece.
+    Returns:
+        [T, M] bool, True where a step is the first of an episode; and states [1, pieces * M, lstm], all worlds of the
+        first piece first.
+    """
+    first = torch.zeros_like(storage.dones[:, worlds, 0], dtype=torch.bool)
+    # step 0 starts with the state that was saved there, zeroed where an episode had ended
+    first[1:] = storage.dones[:-1, worlds, 0].bool()
+    return first, _states(storage.saved_hidden_state_a, worlds, length)
 
-        Returns:
-            [T, M] bool, True where a step is the first of an episode; and states [1, pieces * M, lstm], all worlds of
-            the first piece first.
-        """
-        first = torch.zeros_like(self.dones[:, worlds, 0], dtype=torch.bool)
-        # step 0 starts with the state that was saved there, zeroed where an episode had ended
-        first[1:] = self.dones[:-1, worlds, 0].bool()
-        return first, self._states(self.saved_hidden_state_a, worlds)
 
-    def _states(self, saved: Any, worlds: Tensor) -> tuple[Tensor, ...] | None:
-        """[T, 1, N, lstm] each -> [1, pieces * M, lstm] each."""
-        if saved is None:
-            return None
-        return tuple(state[:: self.sequence_length, 0, worlds].flatten(0, 1)[None] for state in saved)
+def _states(saved: Any, worlds: Tensor, length: int) -> tuple[Tensor, ...] | None:
+    """[T, 1, N, lstm] each -> [1, pieces * M, lstm] each."""
+    if saved is None:
+        return None
+    return tuple(state[::length, 0, worlds].flatten(0, 1)[None] for state in saved)
 
 
 class SequencePpo(PPO):
-    """rsl-rl's PPO with :class:`SequenceStorage` and an update that never waits for a GPU."""
+    """rsl-rl's PPO with an update on sequences that never waits for a GPU."""
 
-    def __init__(self, *args: Any, bounds_loss: float = 0.0, **options: Any) -> None:
+    def __init__(self, *args: Any, sequence_length: int, bounds_loss: float = 0.0, **options: Any) -> None:
         """Set up as rsl-rl does.
 
         Args:
             args: rsl-rl's.
+            sequence_length: steps of a sequence; divides the number of steps of a rollout.
             bounds_loss: weight of the squared excess of the actions' means over :data:`BOUND`.
             options: rsl-rl's.
         """
         super().__init__(*args, **options)
+        self.sequence_length = sequence_length
         self.bounds_loss = bounds_loss
         device = torch.device(self.device)
         on_gpu = device.type == "cuda"
@@ -129,7 +121,7 @@ class SequencePpo(PPO):
 
     def _learn(self) -> None:
         """Take one step of the optimizer on the minibatch of ``_worlds``, and add its losses to ``_sums``."""
-        batch: Batch = cast(SequenceStorage, self.storage).minibatch(self._worlds)
+        batch = minibatch(self.storage, self._worlds, self.sequence_length)
         self.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0], stochastic_output=True)
         log_prob = self.actor.get_output_log_prob(batch.actions)
         values = self.critic(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[1])
@@ -242,17 +234,3 @@ class SequencePpo(PPO):
         super().compute_returns(obs)
         # written in place, where the update's graph reads them
         storage.advantages = advantages.copy_(torch.where(faulty, 0.0, storage.advantages))
-
-    @staticmethod
-    def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> PPO:
-        """Build models, storage and algorithm from the runner's configuration."""
-        alg_class, alg_cfg = resolve_class(cfg["algorithm"])
-        actor_class, actor_cfg = resolve_class(cfg["actor"])
-        critic_class, critic_cfg = resolve_class(cfg["critic"])
-        with contextlib.redirect_stdout(io.StringIO()):
-            groups = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
-        actor = actor_class(obs, groups, "actor", env.num_actions, **actor_cfg).to(device)
-        critic = critic_class(obs, groups, "critic", 1, **critic_cfg).to(device)
-        length = alg_cfg.pop("sequence_length")
-        storage = SequenceStorage(length, "rl", env.num_envs, cfg["num_steps_per_env"], obs, [env.num_actions], device)
-        return alg_class(actor, critic, storage, device=device, **alg_cfg, multi_gpu_cfg=cfg["multi_gpu"])

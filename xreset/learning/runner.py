@@ -6,7 +6,8 @@ import math
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,8 @@ class TrainingRunner(OnPolicyRunner):
         self.train_config = config
         torch.set_float32_matmul_precision("highest" if config.ppo.precision == "float32" else "high")
         settings = rsl_rl_config(config, env.num_envs, teacher)
-        super().__init__(env, settings, log_dir=None, device=str(env.device))  # pyright: ignore[reportArgumentType]
+        with redirect_stdout(StringIO()):  # rsl-rl prints the models
+            super().__init__(env, settings, log_dir=None, device=str(env.device))  # pyright: ignore[reportArgumentType]
         self.world = env
         self.iteration = 0
         self.env_steps = 0

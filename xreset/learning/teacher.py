@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,6 +23,11 @@ if TYPE_CHECKING:
 _FLAT = ["policy", "proprio"]
 _CLOSE = 1e-3
 """Largest difference between an action of the file and one of the network."""
+
+
+def make_teacher(*_: Any, path: Path) -> PointNetLstmModel:
+    """Return :func:`load_teacher`, as rsl-rl makes models."""
+    return load_teacher(path)
 
 
 def load_teacher(path: Path) -> PointNetLstmModel:

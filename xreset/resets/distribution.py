@@ -96,11 +96,7 @@ class _Grouped:
 
 class ResetDistribution:
     """Draws resets for worlds of given objects from a bank. All tensors live on one device; a draw copies nothing to
-    it.
-
-    Attributes:
-        demo_probability: [] share of resets from the bank; a training's schedule writes into it.
-    """
+    it."""
 
     def __init__(
         self,
@@ -126,7 +122,6 @@ class ResetDistribution:
             DemoError: an object of the scene has no demonstration in the bank.
         """
         self.config = config
-        self.demo_probability = torch.tensor(float(config.demo_probability), device=device)
         missing = [name for name in object_names if name not in bank.sequence_object]
         if missing:
             raise DemoError(
@@ -172,7 +167,7 @@ class ResetDistribution:
         home = self.home(sequence, generator)
         if not len(self._states.state):
             return home
-        from_bank = (uniform[:, 0] < self.demo_probability) & (self._grouped_states.count(object_index) > 0)
+        from_bank = (uniform[:, 0] < self.config.demo_probability) & (self._grouped_states.count(object_index) > 0)
         row = self._grouped_states.draw(object_index, uniform[:, 1])
         row = torch.where(from_bank, row, 0)  # a valid row for home worlds; its values are not used
         gravity = uniform[:, 3] if self.config.random_gravity else torch.ones_like(uniform[:, 3])

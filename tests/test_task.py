@@ -702,12 +702,6 @@ class PolicyTest(WithRobot):
             del contract["task"][group][name]
         check_contract("p.onnx", contract, self.robot, self.TASK)
 
-    def test_the_contract_states_the_observations_widths(self):
-        widths = policy_contract(self.robot, self.TASK, ())["observation_layout"]
-        self.assertEqual(sum(widths["policy"].values()), 15 + 7)
-        self.assertEqual(sum(widths["proprio"].values()), 2 * 7 + 13 + 6 * 2)
-        self.assertEqual(widths["perception"]["cloud"], 5 * 64 * 3)
-
     def test_refusals_name_what_differs(self):
         self.refused("another robot: openarm, here it is toy.*--robot openarm", robot="openarm")
         self.refused("schema 'xreset-policy/9', expected 'xreset-policy/1'", schema="xreset-policy/9")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from torch import Tensor
 from xreset.backends.conformance.harness import Bench, Worlds, named, replace_fields, rotation_angle
 from xreset.backends.conformance.results import Measured
 from xreset.backends.conformance.scene import flat_objects
-from xreset.physics import State
+from xreset.physics import Parameter, State
 from xreset.spec import GRAVITY, ObjectSpec, PairFriction, SceneSpec, lowest_point
 
 _SETTLE = 120  # steps
@@ -101,38 +102,31 @@ def object_mass(bench: Bench) -> Measured:
 
 
 def set_as_built(bench: Bench) -> Measured:
-    """Set mass and friction in some worlds and build others with them: sliding objects must do the same in both.
+    """Set mass and friction in some worlds and build others with them: objects must do the same in both.
 
     Masses change by powers of two, which every product and every eigenvector carries without rounding. Contacts make
     much of a last bit, and its rounding depends on the processor's matrix kernels.
     """
-    worlds = bench.worlds()
     factors = torch.tensor([2.0, 0.5, 4.0, 0.25])
     friction = torch.tensor([[0.8, 0.4, 0.3], [0.7, 0.5, 0.9], [0.6, 0.3, 0.45], [0.9, 0.6, 0.2]])
     mass = factors * bench.masses
-    worlds.set_parameter("object_mass", mass)
-    worlds.set_parameter("friction", friction)
     scenes = []
-    for i, thing in enumerate(bench.scene.objects):
+    for i, thing in enumerate(bench.objects):
         built = replace(thing, mass=float(mass[i]), inertia=float(factors[i]) * np.asarray(thing.inertia))
         tip, link, table = friction[i].tolist()
         pairs = PairFriction(tip=tip, link=link, table=table, torsional=bench.scene.friction.torsional)
         scenes.append(replace(bench.scene, objects=(built,), friction=pairs))
-    [errors] = _against_built(bench, worlds, scenes, [_slide])
-    names = [thing.name for thing in bench.scene.objects]
-    return {what: named(names, values) for what, values in errors.items()}
+    return _against_built(bench, {"object_mass": mass, "friction": friction}, scenes, {"sliding": _slide})
 
 
 def object_inertia_set(bench: Bench) -> Measured:
     """Set the inertia of some worlds' objects and build others so: tumbling and sliding must be the same in both."""
     factors = torch.tensor([2.0, 0.5, 4.0, 0.25])
-    worlds = bench.worlds()
-    for rows in ([3, 0], [1, 2]):
-        worlds.set_parameter("object_inertia", factors, rows)
-    built = []
+    scenes = []
     for thing, factor in zip(bench.objects, factors.tolist(), strict=True):
-        built.append(replace(thing, inertia=factor * np.asarray(thing.inertia)))
-    return _tumble_and_slide(bench, worlds, built)
+        built = replace(thing, inertia=factor * np.asarray(thing.inertia))
+        scenes.append(replace(bench.scene, objects=(built,)))
+    return _against_built(bench, {"object_inertia": factors}, scenes, {"tumbling": _tumble, "sliding": _slide})
 
 
 def object_com_set(bench: Bench) -> Measured:
@@ -140,47 +134,38 @@ def object_com_set(bench: Bench) -> Measured:
     offsets = torch.tensor(
         [[0.0078125, 0.0, 0.0], [0.0, -0.0078125, 0.00390625], [0.00390625, 0.00390625, -0.00390625], [0.0, 0.0, 0.0]]
     )
-    worlds = bench.worlds()
-    for rows in ([3, 0], [1, 2]):
-        worlds.set_parameter("object_com", offsets, rows)
-    built = []
+    scenes = []
     for thing, offset in zip(bench.objects, offsets.numpy(), strict=True):
-        built.append(replace(thing, com=np.asarray(thing.com) + offset))
-    return _tumble_and_slide(bench, worlds, built)
-
-
-def _tumble_and_slide(bench: Bench, worlds: Worlds, built: Sequence[ObjectSpec]) -> Measured:
-    """Compare worlds whose objects were changed with worlds that were built with such objects."""
-    scenes = [replace(bench.scene, objects=(thing,)) for thing in built]
-    tumbling, sliding = _against_built(bench, worlds, scenes, [_tumble, _slide])
-    return {
-        "tumbling, pos": np.array(tumbling["pos"]),
-        "tumbling, angle": np.array(tumbling["angle"]),
-        "sliding, pos": np.array(sliding["pos"]),
-        "sliding, force": np.array(sliding["force"]),
-    }
+        built = replace(thing, com=np.asarray(thing.com) + offset)
+        scenes.append(replace(bench.scene, objects=(built,)))
+    return _against_built(bench, {"object_com": offsets}, scenes, {"tumbling": _tumble, "sliding": _slide})
 
 
 def _against_built(
-    bench: Bench, worlds: Worlds, scenes: Sequence[SceneSpec], motions: Sequence[Motion]
-) -> list[dict[str, list[float]]]:
-    """Compare world i with a world built from scene i, after each motion: position, angle, table force per weight."""
+    bench: Bench, parameters: dict[Parameter, Tensor], scenes: Sequence[SceneSpec], motions: dict[str, Motion]
+) -> Measured:
+    """Compare world i, whose parameters are set, with a world built from scene i: place, angle and force per weight."""
+    worlds = bench.worlds()
+    for name, value in parameters.items():
+        for rows in ([3, 0], [1, 2]):
+            worlds.set_parameter(name, value, rows)
     everyone = range(bench.NUM_WORLDS)
-    found = [move(bench, worlds, everyone) for move in motions]
-    errors = [{"pos": [], "angle": [], "force": []} for _ in motions]
+    found = {motion: move(bench, worlds, everyone) for motion, move in motions.items()}
+    errors: dict[str, list[tuple[str, float]]] = defaultdict(list)
     for i, scene in enumerate(scenes):
+        thing = scene.objects[0]
         with bench.other(scene) as other:
-            built = [move(bench, other, [i]) for move in motions]
-        for error, (state, force), (state_built, force_built) in zip(errors, found, built, strict=True):
-            angle = rotation_angle(state.object_quat[i], state_built.object_quat[0])
-            error["pos"].append(_largest(state.object_pos[i] - state_built.object_pos[0]))
-            error["angle"].append(_largest(angle))
-            error["force"].append(_largest(force[i] - force_built[0]) / (GRAVITY * scene.objects[0].mass))
+            for motion, move in motions.items():
+                state, force = found[motion]
+                state_built, force_built = move(bench, other, [i])
+                off = {
+                    "pos": state.object_pos[i] - state_built.object_pos[0],
+                    "angle": rotation_angle(state.object_quat[i], state_built.object_quat[0]),
+                    "force": (force[i] - force_built[0]) / (GRAVITY * thing.mass),
+                }
+                for what, error in off.items():
+                    errors[f"{motion}, {what}"].append((thing.name, float(error.abs().max())))
     return errors
-
-
-def _largest(error: Tensor) -> float:
-    return float(error.abs().double().max())
 
 
 def _slide(bench: Bench, worlds: Worlds, which: Sequence[int]) -> tuple[State, Tensor]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 import torch
@@ -144,19 +145,19 @@ class Bench:
     @property
     def backend(self) -> Backend:
         """The backend of the shared worlds."""
-        if self._shared is None:
-            self._shared = Worlds(self._make(self.scene, self.NUM_WORLDS, object_index=torch.tensor(self.which)))
-        return self._shared.backend
+        return (self._shared or self.worlds()).backend
 
     def worlds(self) -> Worlds:
         """Return the shared worlds in their initial state, with nominal parameters."""
-        device = self.backend.device
+        if self._shared is None:
+            self._shared = Worlds(self._make(self.scene, self.NUM_WORLDS, object_index=torch.tensor(self.which)))
         worlds = self._shared
-        assert worlds is not None
         if worlds.altered:
-            self._set_nominal(worlds)
+            for name, value in Parameters.nominal(self.scene, torch.tensor(self.which)).given().items():
+                if name in worlds.backend.capabilities:
+                    worlds.set_parameter(name, value)
             worlds.altered = False
-        worlds.backend.set_state(self.start().to(device))
+        worlds.set(self.start())
         return worlds
 
     @contextmanager
@@ -207,22 +208,6 @@ class Bench:
         if self._shared is not None:
             self._shared.backend.close()
 
-    def _set_nominal(self, worlds: Worlds) -> None:
-        friction = self.scene.friction
-        one = torch.ones(self.NUM_WORLDS)
-        nominal: dict[Parameter, Tensor] = {
-            "friction": torch.tensor([friction.tip, friction.link, friction.table]).repeat(self.NUM_WORLDS, 1),
-            "torsional_friction": friction.torsional * one,
-            "object_mass": self.masses,
-            "object_inertia": one,
-            "object_com": torch.zeros(self.NUM_WORLDS, 3),
-            "object_gravity": one,
-            "drives": torch.ones(self.NUM_WORLDS, 3, len(self.scene.robot.joints)),
-        }
-        for name, value in nominal.items():
-            if name in worlds.backend.capabilities:
-                worlds.set_parameter(name, value)
-
 
 def free_place(scene: SceneSpec) -> tuple[float, float]:
     """Return a place on the table from which an object can slide, far from the robot's base and its hand at home."""
@@ -231,11 +216,9 @@ def free_place(scene: SceneSpec) -> tuple[float, float]:
     half_x, half_y, _ = scene.table.half_size
     palm = Kinematics(robot).link_poses(torch.as_tensor(robot.home), [robot.palm])[0, :2, 3].numpy()
     avoid = np.stack((palm, np.array(robot.base_pos[:2])))
-    corners = []
-    for side_x in (-1, 1):
-        for side_y in (-1, 1):
-            corners.append((x + side_x * (half_x - 0.25), y + side_y * (half_y - 0.2)))
-    return max(corners, key=lambda corner: float(np.linalg.norm(avoid - np.array(corner), axis=1).min()))
+    xs = (x - (half_x - 0.25), x + (half_x - 0.25))
+    ys = (y - (half_y - 0.2), y + (half_y - 0.2))
+    return max(product(xs, ys), key=lambda corner: float(np.linalg.norm(avoid - np.array(corner), axis=1).min()))
 
 
 def replace_fields(state: State, **changes: Tensor) -> State:

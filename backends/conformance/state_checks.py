@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
+from torch import Tensor
 
-from xreset.backends.conformance.harness import (
-    Bench,
-    random_state,
-    rotation_angle,
-    small_motion,
-    state_errors,
-)
+from xreset.backends.conformance.harness import Bench, random_state, rotation_angle, small_motion, state_errors
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.conformance.scene import reorder_joints
 from xreset.geometry.kinematics import Kinematics
@@ -40,25 +33,15 @@ def links_after_set(bench: Bench) -> Measured:
 
 def links_after_steps(bench: Bench) -> Measured:
     """Move every joint and compare the tracked links with the kinematics of the joint positions on the way."""
-    moved = _moved_by_mimics(bench.scene)
-    return _errors_on_the_way(bench, [i for i in range(len(moved)) if not moved[i]])
+    return _errors_on_the_way(bench, ~_moved_by_mimics(bench.scene))
 
 
 def mimic_joints(bench: Bench) -> Measured:
-    """Do the same for links that a mimic joint moves: it is set exactly, then follows through a stiff coupling."""
+    """Do the same for links that a mimic joint moves, which follows through a stiff coupling."""
     moved = _moved_by_mimics(bench.scene)
-    which = [i for i in range(len(moved)) if moved[i]]
-    if not which:
+    if not moved.any():
         raise Skipped("no tracked link of this robot is moved by a mimic joint")
-    worlds = bench.worlds()
-    state = bench.random_state(seed=10)
-    worlds.set(state)
-    errors = {}
-    for what, error in _link_errors(bench.kinematics, state, worlds.links(), which).items():
-        errors[f"at once, {what}"] = error
-    for what, error in _errors_on_the_way(bench, which).items():
-        errors[f"on the way, {what}"] = error
-    return errors
+    return _errors_on_the_way(bench, moved)
 
 
 def joint_order(bench: Bench) -> Measured:
@@ -90,23 +73,22 @@ def joint_order(bench: Bench) -> Measured:
     }
 
 
-def _link_errors(kinematics: Kinematics, state: State, links: Links, which: Sequence[int] | slice = slice(None)):
-    """Return the errors of the tracked links (all or some) against the project's own kinematics of the same state."""
+def _link_errors(kinematics: Kinematics, state: State, links: Links) -> dict[str, Tensor]:
+    """Return the errors of the tracked links against the project's own kinematics of the same state."""
     q = state.joint_pos.double()
     qd = state.joint_vel.double()[:, None, :, None]
     tracked = kinematics.robot.tracked_links
     poses = kinematics.link_poses(q, tracked)
     jacobian = kinematics.jacobian(q, tracked)
-    errors = {
+    return {
         "pos": links.pos.double() - poses[..., :3, 3],
         "angle": rotation_angle(links.quat, matrix_to_quat(poses[..., :3, :3])),
         "linvel": links.linvel.double() - (jacobian.linear @ qd)[..., 0],
         "angvel": links.angvel.double() - (jacobian.angular @ qd)[..., 0],
     }
-    return {what: error[:, which] for what, error in errors.items()}
 
 
-def _moved_by_mimics(scene: SceneSpec) -> list[bool]:
+def _moved_by_mimics(scene: SceneSpec) -> Tensor:
     """[K] whether a mimic joint moves each tracked link."""
     mimics = {mimic.joint for mimic in scene.robot.mimics}
     joint_above = {joint.child: joint for joint in robot_tree(scene.robot).joints}
@@ -115,19 +97,17 @@ def _moved_by_mimics(scene: SceneSpec) -> list[bool]:
         joint = joint_above.get(link)
         return joint is not None and (joint.name in mimics or moved(joint.parent))
 
-    return [moved(link) for link in scene.robot.tracked_links]
+    return torch.tensor([moved(link) for link in scene.robot.tracked_links])
 
 
-def _errors_on_the_way(bench: Bench, which: list[int]) -> Measured:
+def _errors_on_the_way(bench: Bench, which: Tensor) -> Measured:
     """Return the errors of some tracked links' poses, [T, N, ...], while every joint moves."""
     worlds = bench.worlds()
-    home = torch.as_tensor(bench.scene.robot.home, dtype=torch.float32)
-    worlds.set_targets(home + small_motion(bench.kinematics))
-    pos = []
-    angle = []
+    worlds.set_targets(bench.start().joint_pos + small_motion(bench.kinematics))
+    errors = {"pos": [], "angle": []}
     for _ in range(6):
         worlds.step(4)
-        errors = _link_errors(bench.kinematics, worlds.state(), worlds.links(), which)
-        pos.append(errors["pos"])
-        angle.append(errors["angle"])
-    return {"pos": torch.stack(pos), "angle": torch.stack(angle)}
+        now = _link_errors(bench.kinematics, worlds.state(), worlds.links())
+        for what, rows in errors.items():
+            rows.append(now[what][:, which])
+    return {what: torch.stack(rows) for what, rows in errors.items()}

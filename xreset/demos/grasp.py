@@ -11,7 +11,9 @@ Everything is in a frame with z up and the table at z = 0; the object is its con
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -21,6 +23,7 @@ from xreset.demos import hand
 from xreset.geometry.shapes import half_spaces
 from xreset.spec import ObjectSpec
 
+T = TypeVar("T")
 TIPS = (4, 8, 12, 16, 20)
 """Keypoints of the fingertips, thumb first."""
 SKIN = 0.002
@@ -51,6 +54,9 @@ class Solid:
     """[V, 3]"""
     com: np.ndarray
     """[3]"""
+    pos: np.ndarray
+    """[3] origin of the mesh frame."""
+    rotation: Rotation
 
     @classmethod
     def of(cls, obj: ObjectSpec, pos: np.ndarray, rotation: Rotation) -> Solid:
@@ -60,7 +66,9 @@ class Solid:
             own = half_spaces(piece)
             normals = rotation.apply(own[:, :3])
             planes.append(np.column_stack((normals, own[:, 3] - normals @ pos)))
-        return cls(planes=tuple(planes), vertices=rotation.apply(obj.vertices) + pos, com=rotation.apply(obj.com) + pos)
+        vertices = rotation.apply(obj.vertices) + pos
+        com = rotation.apply(obj.com) + pos
+        return cls(planes=tuple(planes), vertices=vertices, com=com, pos=pos, rotation=rotation)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """[...] signed distance of points [..., 3] to the surface, negative inside; outside it is a lower bound near
@@ -117,6 +125,10 @@ class Contacts:
 class Grasp:
     """A hand that grasps."""
 
+    solid: Solid
+    """What it grasps."""
+    side: str
+    """``right`` or ``left``."""
     wrist_pos: np.ndarray
     """[3]"""
     wrist_rot: Rotation
@@ -140,7 +152,7 @@ def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str = "right") -> li
     found: list[Contacts] = []
     for azimuth in azimuths:
         closing = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        away = np.array([closing[1], -closing[0], 0.0]) * _handedness(side)  # horizontal, away from the hand
+        away = np.array([closing[1], -closing[0], 0.0]) * handedness(side)  # horizontal, away from the hand
         centers = _centers(low, high, closing, away, from_above)
         for tilt in (np.pi / 2,) if from_above else _SIDE_TILTS:
             approach = away * np.cos(tilt) - np.array([0.0, 0.0, np.sin(tilt)])
@@ -149,7 +161,18 @@ def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str = "right") -> li
     return sorted(found, key=lambda contacts: contacts.cost)
 
 
-def _handedness(side: str) -> float:
+def best_of(count: int, make: Callable[[], T], *, is_good: Callable[[T], bool], cost: Callable[[T], float]) -> T:
+    """Return the first good one of at most ``count`` random attempts, or else the one with the lowest cost."""
+    tries = []
+    for _ in range(count):
+        tries.append(make())
+        if is_good(tries[-1]):
+            break
+    return min(tries, key=cost)
+
+
+def handedness(side: str) -> float:
+    """Return 1 for a right hand, -1 for a left one."""
     return 1.0 if side == "right" else -1.0
 
 
@@ -174,7 +197,7 @@ def _contacts_at(
     solid: Solid, centers: np.ndarray, approach: np.ndarray, closing: np.ndarray, side: str, effort: float
 ) -> list[Contacts]:
     """Return the contacts of a hand that closes upon centers [n, 3]; ``effort`` is added to their cost."""
-    up_hand = np.cross(approach, closing) * _handedness(side)  # from the little finger to the thumb's side of the hand
+    up_hand = np.cross(approach, closing) * handedness(side)  # from the little finger to the thumb's side of the hand
     origins = centers[:, None] + _STACK[:, None] * up_hand  # [n, 5, 3]: the lines of the thumb and the fingers
     lines = origins.reshape(-1, 3)
     enter, leave, normal_in, normal_out = solid.crossings(lines, closing)
@@ -289,6 +312,8 @@ def _fit_from(solid: Solid, contacts: Contacts, lean: float, side: str) -> tuple
     points = points_of(fit.x[None])
     flesh, _ = _flesh(points)
     grasp = Grasp(
+        solid=solid,
+        side=side,
         wrist_pos=fit.x[:3],
         wrist_rot=pose * Rotation.from_rotvec(fit.x[3:6]),
         angles=fit.x[6:],

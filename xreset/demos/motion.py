@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.demos import hand
-from xreset.demos.grasp import Grasp, Solid
+from xreset.demos.grasp import Grasp, best_of, handedness
 
 LIFT = (0.14, 0.41)
 """Range of heights to which objects are lifted [m]: the 5th and 95th percentile of 180 right-hand DexYCB sequences."""
@@ -41,6 +41,7 @@ class Timing:
 class HandPath:
     """A hand's motion up to the grasp, [T] frames; the grasp holds to the end."""
 
+    grasp: Grasp
     wrist_pos: np.ndarray
     """[T, 3]"""
     wrist_rot: Rotation
@@ -82,24 +83,15 @@ def object_path(
     return pos + rise[:, None] * (goal - pos), object_rot
 
 
-def clear_approach(
-    solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, side: str, rng: np.random.Generator
-) -> HandPath:
+def clear_approach(grasp: Grasp, timing: Timing, rng: np.random.Generator) -> HandPath:
     """Return the first of some random approaches that stays clear of object and table, or else the one with the largest
-    gap.
-
-    Args:
-        pos: [3] the object's position.
-    """
-    best: HandPath | None = None
-    for _ in range(_TRIES):
-        path = _approach(solid, pos, grasp, timing, side, rng)
-        if best is None or path.gap > best.gap:
-            best = path
-        if path.gap > _CLEAR:
-            break
-    assert best is not None
-    return best
+    gap."""
+    return best_of(
+        _TRIES,
+        lambda: _approach(grasp, timing, rng),
+        is_good=lambda path: path.gap > _CLEAR,
+        cost=lambda path: -path.gap,
+    )
 
 
 def place_hand(pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: str) -> np.ndarray:
@@ -107,14 +99,12 @@ def place_hand(pos: np.ndarray, rotation: Rotation, angles: np.ndarray, side: st
     return np.einsum("nij,nkj->nki", rotation.as_matrix(), hand.keypoints(angles, side)) + pos[:, None]
 
 
-def _approach(
-    solid: Solid, pos: np.ndarray, grasp: Grasp, timing: Timing, side: str, rng: np.random.Generator
-) -> HandPath:
+def _approach(grasp: Grasp, timing: Timing, rng: np.random.Generator) -> HandPath:
     """Move to a place before the object while the hand opens, then forward, then close: minimum-jerk motions that
     overlap."""
     frame = np.arange(timing.frames)
-    mirror = 1.0 if side == "right" else -1.0
-    x = pos[0] - mirror * rng.uniform(-0.05, 0.20)
+    mirror = handedness(grasp.side)
+    x = grasp.solid.pos[0] - mirror * rng.uniform(-0.05, 0.20)
     y = rng.uniform(0.60, 0.80)
     z = grasp.wrist_pos[2] + rng.uniform(0.02, 0.18)
     start = np.array([x, y, z])
@@ -135,9 +125,9 @@ def _approach(
     opening = _minimum_jerk(frame, 0.1 * timing.reach, 0.65 * timing.reach)[:, None]
     closing = _minimum_jerk(frame, 0.8 * timing.reach, timing.close)[:, None]
     angles = hand.RELAXED + opening * (opened - hand.RELAXED) + closing * (grasp.angles - opened)
-    points = place_hand(wrist_pos, wrist_rot, angles, side)[: timing.lift]
-    gap = min(solid.distance(points).min(), points[..., 2].min())
-    return HandPath(wrist_pos=wrist_pos, wrist_rot=wrist_rot, angles=angles, gap=float(gap))
+    points = place_hand(wrist_pos, wrist_rot, angles, grasp.side)[: timing.lift]
+    gap = min(grasp.solid.distance(points).min(), points[..., 2].min())
+    return HandPath(grasp=grasp, wrist_pos=wrist_pos, wrist_rot=wrist_rot, angles=angles, gap=float(gap))
 
 
 def _minimum_jerk(frame: np.ndarray, start: float, end: float) -> np.ndarray:

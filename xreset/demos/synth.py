@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.demos.archive import Demos, merge_demos, no_progress, one_sequence
-from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, plan_contacts
+from xreset.demos.grasp import Contacts, Grasp, Solid, best_of, fit_hand, plan_contacts
 from xreset.demos.motion import clear_approach, object_path, place_hand, random_timing
 from xreset.errors import DemoError
 from xreset.objects.catalogue import load_object, object_names
@@ -44,16 +44,6 @@ _TRIES = 12
 _GRASP_TRIES = 5
 _GOOD_TIP_ERROR = 0.006  # [m]
 _GOOD_PENETRATION = 0.004  # [m]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Rest:
-    """An object at rest on the table, with plans to hold it."""
-
-    rotation: Rotation
-    pos: np.ndarray
-    """[3]"""
-    plans: tuple[Contacts, ...]
 
 
 def synthesize(
@@ -103,23 +93,28 @@ def synthesize(
 
 
 def _sequence(
-    obj: ObjectSpec, starts: Sequence[_Rest], name: str, side: str, fps: float, rng: np.random.Generator
+    obj: ObjectSpec,
+    starts: Sequence[tuple[Solid, list[Contacts]]],
+    name: str,
+    side: str,
+    fps: float,
+    rng: np.random.Generator,
 ) -> Demos:
-    start = starts[int(rng.integers(len(starts)))]
+    resting, plans = starts[int(rng.integers(len(starts)))]
     timing = random_timing(fps, rng)
-    tries = []
-    for _ in range(_GRASP_TRIES):
-        rest, grasp = _grasped(obj, start, side, rng)
-        path = clear_approach(Solid.of(obj, rest.pos, rest.rotation), rest.pos, grasp, timing, side, rng)
-        tries.append((rest, grasp, path))
-        if path.gap > 0:
-            break
-    rest, grasp, path = max(tries, key=lambda tried: tried[2].gap)
-    object_pos, object_rot = object_path(rest.pos, rest.rotation, timing, rng)
+    path = best_of(
+        _GRASP_TRIES,
+        lambda: clear_approach(_grasp(obj, resting, plans, side, rng), timing, rng),
+        is_good=lambda path: path.gap > 0,
+        cost=lambda path: -path.gap,
+    )
+    grasp = path.grasp
+    solid = grasp.solid
+    object_pos, object_rot = object_path(solid.pos, solid.rotation, timing, rng)
     # From the lift on, the hand moves with the object.
-    moved = object_rot * rest.rotation.inv()
+    moved = object_rot * solid.rotation.inv()
     held = (np.arange(timing.frames) >= timing.lift)[:, None]
-    wrist_pos = np.where(held, moved.apply(grasp.wrist_pos - rest.pos) + object_pos, path.wrist_pos)
+    wrist_pos = np.where(held, moved.apply(grasp.wrist_pos - solid.pos) + object_pos, path.wrist_pos)
     wrist_quat = np.where(held, (moved * grasp.wrist_rot).as_quat(), path.wrist_rot.as_quat())
     wrist_rot = Rotation.from_quat(wrist_quat)
     return one_sequence(
@@ -135,44 +130,40 @@ def _sequence(
     )
 
 
-def _start(obj: ObjectSpec, up: np.ndarray, side: str) -> _Rest:
-    """Return the object at rest at the origin, with the best plans to hold it."""
+def _start(obj: ObjectSpec, up: np.ndarray, side: str) -> tuple[Solid, list[Contacts]]:
+    """Return the object at rest at the origin, and the best plans to hold it."""
     quat = resting_orientation(obj, up)
-    upright = Rotation.from_quat(quat, scalar_first=True)
-    pos = np.array([0.0, 0.0, rest_height(obj, quat)])
-    plans = plan_contacts(Solid.of(obj, pos, upright), np.radians(np.arange(0.0, 360.0, 20.0)), side)
+    solid = Solid.of(obj, np.array([0.0, 0.0, rest_height(obj, quat)]), Rotation.from_quat(quat, scalar_first=True))
+    plans = plan_contacts(solid, np.radians(np.arange(0.0, 360.0, 20.0)), side)
     if not plans:
         raise DemoError(
             f"No stable pinch found for {obj.name}: no part within reach of thumb and fingers is narrow enough."
             " Omit this object."
         )
-    good = tuple(plan for plan in plans if plan.cost < plans[0].cost + _NEAR_BEST)
-    return _Rest(rotation=upright, pos=pos, plans=good)
+    return solid, [plan for plan in plans if plan.cost < plans[0].cost + _NEAR_BEST]
 
 
-def _grasped(obj: ObjectSpec, start: _Rest, side: str, rng: np.random.Generator) -> tuple[_Rest, Grasp]:
-    """Return the object at rest somewhere on the table, and a grasp of it."""
-    tries = []
-    for _ in range(_TRIES):
-        plan = start.plans[rng.integers(len(start.plans))]
+def _grasp(obj: ObjectSpec, resting: Solid, plans: Sequence[Contacts], side: str, rng: np.random.Generator) -> Grasp:
+    """Return a grasp of the object somewhere on the table."""
+
+    def attempt() -> Grasp:
+        plan = plans[int(rng.integers(len(plans)))]
         azimuth = rng.uniform(*CLOSING_AZIMUTH)
         if side == "left":
             azimuth = np.pi - azimuth
         yaw = Rotation.from_euler("z", azimuth - np.arctan2(plan.closing[1], plan.closing[0]))
         place = np.array([rng.uniform(*WORKSPACE[0]), rng.uniform(*WORKSPACE[1]), 0.0])
-        rest = replace(start, rotation=yaw * start.rotation, pos=place + start.pos)
         contacts = replace(
             plan,
             points=yaw.apply(plan.points) + place,
             approach=yaw.apply(plan.approach),
             closing=yaw.apply(plan.closing),
         )
-        grasp = fit_hand(Solid.of(obj, rest.pos, rest.rotation), contacts, side)
-        tries.append((rest, grasp))
-        if grasp.tip_error < _GOOD_TIP_ERROR and grasp.penetration < _GOOD_PENETRATION:
-            break
-    return min(tries, key=lambda tried: _badness(tried[1]))
+        return fit_hand(Solid.of(obj, place + resting.pos, yaw * resting.rotation), contacts, side)
 
-
-def _badness(grasp: Grasp) -> float:
-    return grasp.tip_error / _GOOD_TIP_ERROR + grasp.penetration / _GOOD_PENETRATION
+    return best_of(
+        _TRIES,
+        attempt,
+        is_good=lambda grasp: grasp.tip_error < _GOOD_TIP_ERROR and grasp.penetration < _GOOD_PENETRATION,
+        cost=lambda grasp: grasp.tip_error / _GOOD_TIP_ERROR + grasp.penetration / _GOOD_PENETRATION,
+    )

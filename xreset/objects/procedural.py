@@ -7,8 +7,6 @@ z is up, the origin is the centre of the bounding box.
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from xreset.errors import ObjectError, needs
+from xreset.files import atomic_folder
 from xreset.geometry.shapes import hull, loft, prism, section, shape_mesh
 from xreset.objects.properties import Properties
 from xreset.spec import Shape
@@ -54,16 +53,12 @@ def make_shapes(out: str | Path, count: int, seed: int = 0) -> list[Path]:
         raise ObjectError(f"count is {count}, expected a number from 1 to {MOST}.")
     if out.exists():
         raise ObjectError(f"{out} exists. Name a new folder.")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    names = list(_FAMILIES)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as unfinished:
-        folder = Path(unfinished) / "shapes"
-        folder.mkdir()
+    families = list(_FAMILIES)
+    with atomic_folder(out) as folder:
         for number in range(count):
-            family = names[number % len(names)]
+            family = families[number % len(families)]
             rng = np.random.default_rng([seed, number])
             _write(folder / f"{family}_{number:04d}.obj", _FAMILIES[family](rng), rng)
-        shutil.move(folder, out)
     return sorted(out.glob("*.obj"), key=lambda path: path.stem.rpartition("_")[2])
 
 
@@ -182,12 +177,6 @@ def _banana(rng: np.random.Generator) -> list[Shape]:
 
 
 _FAMILIES: dict[str, Callable[[np.random.Generator], list[Shape]]] = {
-    "box": _box,
-    "can": _can,
-    "cup": _cup,
-    "egg": _egg,
-    "wedge": _wedge,
-    "bottle": _bottle,
-    "hammer": _hammer,
-    "banana": _banana,
+    make.__name__.strip("_"): make for make in (_box, _can, _cup, _egg, _wedge, _bottle, _hammer, _banana)
 }
+"""Name -> function that makes a random shape."""

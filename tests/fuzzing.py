@@ -1,7 +1,6 @@
 """Every reader with a valid file, ways to damage it, and what must hold then: an error that the user can mend, or sound content.
 
-A reader may read several files, of which one is damaged and contradicts the others. It may take the damaged text as the name of a file, or as the
-options of a command.
+A reader may read several files, of which one is damaged and contradicts the others.
 """
 
 from __future__ import annotations
@@ -9,7 +8,6 @@ from __future__ import annotations
 import io
 import json
 import logging
-import os
 import pickle
 import tempfile
 import time
@@ -235,7 +233,10 @@ def readers() -> Iterator[dict[str, Reader]]:
         (folder / "box.toml").write_text("mass = 0.1\ntolerance = 0.002\n")
         add("properties", "box.toml", lambda p: properties_of(p.with_suffix(".obj")), "text")
         frame = {"handJoints3D": None, "objRot": np.zeros((3, 1)), "objTrans": np.zeros(3), "objName": SOUP}
-        add("pickle", "0000.pkl", _read_frame, "bytes", ("joints",)).write_bytes(pickle.dumps(frame, protocol=2))
+        path = add(
+            "pickle", "0000.pkl", lambda p: dict(zip(("joints", "pose"), _read_frame(p))), "bytes", ("joints", "pose")
+        )
+        path.write_bytes(pickle.dumps(frame, protocol=2))
 
         # several files that contradict each other
         may = ("hand_keypoints", "wrist_quat_wxyz", "hand_error", "wrist_error")
@@ -250,31 +251,13 @@ def readers() -> Iterator[dict[str, Reader]]:
         for what, file in (("result and episodes", "mujoco.json"), ("episodes and result", "mujoco.episodes.json")):
             add(what, f"both/{file}", lambda p: read_evaluation(p.parent) and None, "json")
 
-        # names and options
-        path = add("name of a robot", "robot.txt", lambda p: load_robot(_text(p)), "text", ("hand_keypoints",))
-        path.write_text("openarm")
-        add("name of a mesh", "name.txt", lambda p: _named(folder / "box.obj", p), "text").write_text("a-name")
-        for command, options in (
-            ("select", "demos select demos.npz --out out.npz --per-object 1 --objects soup --share 0.5"),
-            ("import", "objects import box.obj --out objects --name a --scale 1 --mass 0.2 --tolerance 0.01"),
-            ("synth", "demos synth --out synth.npz --objects soup --per-object 1 --seed 0 --fps 5"),
-        ):
-            path = add(f"options of {command}", f"{command}.json", lambda p: _run(folder, p), "json")
-            path.write_text(json.dumps({"argv": options.split()}))
         with_mesh = folder / "meshed" / "robot.urdf"
         with_mesh.parent.mkdir()
         geometry = '<collision><geometry><mesh filename="box.stl"/></geometry></collision>'
         with_mesh.write_text(f'<robot name="x"><link name="a">{geometry}</link></robot>')
         path = add("mesh of a URDF", "meshed/box.stl", lambda p: _fresh_urdf(with_mesh), "bytes")
         path.write_bytes((folder / "box.stl").read_bytes())
-        for what in (
-            "name of a mesh",
-            "options of select",
-            "options of import",
-            "options of synth",
-            "motion and archive",
-        ):
-            found[what] = replace(found[what], slow=True)
+        found["motion and archive"] = replace(found["motion and archive"], slow=True)
         try:
             yield found
         finally:
@@ -284,39 +267,6 @@ def readers() -> Iterator[dict[str, Reader]]:
 def _fresh_urdf(path: Path) -> urdf.RobotTree:
     urdf._load.cache_clear()  # which goes by the URDF alone
     return urdf.load_urdf(path)
-
-
-def _text(path: Path) -> str:
-    return path.read_bytes().decode("utf-8", "surrogateescape")
-
-
-def _named(source: Path, text: Path) -> None:
-    """Import a mesh whose file has the name that a text file holds."""
-    from xreset.objects.meshes import add_mesh
-
-    with tempfile.TemporaryDirectory() as folder:
-        add_mesh(source, Path(folder), _text(text))
-
-
-def _run(folder: Path, file: Path) -> None:
-    """Run the command whose words a JSON file holds, in a folder that goes."""
-    from tests.data import run
-
-    argv = read_json(file).get("argv")
-    if not isinstance(argv, list) or not argv or argv[0] not in ("demos", "objects"):
-        raise XResetError("no command")
-    here = Path.cwd()
-    with tempfile.TemporaryDirectory() as place:
-        for name in ("demos.npz", "box.obj"):
-            (Path(place) / name).write_bytes((folder / name).read_bytes())
-        os.chdir(place)
-        try:
-            code, said = run(*[word if isinstance(word, str) else json.dumps(word) for word in argv])
-        finally:
-            os.chdir(here)
-    assert "Traceback" not in said, said[-300:]
-    if code:
-        raise XResetError(said[:5000])
 
 
 def outcome(reader: Reader, damaged: bytes) -> str:

@@ -13,7 +13,6 @@ import torch
 
 from tests.toy_bank import toy_bank
 from xreset import robots
-from xreset.errors import RunError
 from xreset.learning.distributed import Processes
 from xreset.learning.run import checkpoints
 from xreset.resets.bank import write_bank
@@ -102,10 +101,6 @@ class Environment(unittest.TestCase):
         fifth = self.of(RANK="5", LOCAL_RANK="1", WORLD_SIZE="8")
         self.assertEqual((fifth.is_main, fifth.device("cuda:0"), fifth.device("cpu")), (False, "cuda:1", "cpu"))
         self.assertNotEqual(fifth.seed(0), self.of(RANK="4", LOCAL_RANK="0", WORLD_SIZE="8").seed(0))
-
-    def test_contradictions(self):
-        with self.assertRaisesRegex(RunError, "contradict"):
-            self.of(RANK="2", LOCAL_RANK="0", WORLD_SIZE="2")
 
 
 if __name__ == "__main__":

@@ -368,8 +368,6 @@ class ConfigTest(unittest.TestCase):
         cfg = rsl_rl_config(TrainConfig(), 4096)
         self.assertEqual(cfg["algorithm"]["num_mini_batches"], 2)
         self.assertEqual((cfg["num_steps_per_env"], cfg["algorithm"]["sequence_length"]), (16, 4))
-        free = rsl_rl_config(TrainConfig(ppo=PpoConfig(clip_values=False)), 4096)
-        self.assertEqual([c["algorithm"]["use_clipped_value_loss"] for c in (cfg, free)], [True, False])
 
     def test_numbers_that_make_no_sense_are_refused(self):
         for make, problem in (
@@ -399,8 +397,13 @@ class ConfigTest(unittest.TestCase):
     def test_removed_options_are_ignored_where_they_were_off(self):
         """Files of earlier versions hold them."""
         data = asdict(TrainConfig())
-        data["model"] |= {"initial_hand_std": None, "synergy_std": None, "activation": "elu"}
-        data["ppo"]["critic_learning_rate"] = None
+        data["model"] |= {
+            "initial_hand_std": None,
+            "synergy_std": None,
+            "activation": "elu",
+            "normalize_observations": True,
+        }
+        data["ppo"] |= {"critic_learning_rate": None, "clip_values": True}
         data["schedule"]["demo_probability"] = []
         data["random_episode_start"] = True
         self.assertEqual(from_dict(TrainConfig, data), TrainConfig())

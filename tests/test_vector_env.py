@@ -65,21 +65,6 @@ class VectorEnvTest(WithEnv):
                 [str(w.message) for w in found if not any(word in str(w.message) for word in expected)], []
             )
 
-    def test_the_batch_is_what_gymnasium_makes_of_the_single_spaces(self):
-        envs = self.vector_env(0.5)
-        self.assertEqual(
-            envs.observation_space, gymnasium.vector.utils.batch_space(envs.single_observation_space, envs.num_envs)
-        )
-        self.assertEqual(envs.action_space, gymnasium.vector.utils.batch_space(envs.single_action_space, envs.num_envs))
-        first, _ = envs.reset(seed=0)
-        kept = {name: value.copy() for name, value in first.items()}
-        _, reward, terminated, truncated, _ = envs.step(envs.action_space.sample())
-        for values, kind in ((reward, np.floating), (terminated, np.bool_), (truncated, np.bool_)):
-            self.assertEqual(values.shape, (envs.num_envs,))
-            self.assertTrue(np.issubdtype(values.dtype, kind), values.dtype)
-        for name, value in first.items():  # what was returned is not written to again
-            np.testing.assert_array_equal(value, kept[name])
-
     def test_episodes_are_truncated_and_begin_anew_a_step_later(self):
         env = self.vector_env(0.1)
         first, _ = env.reset(seed=0)

@@ -17,7 +17,12 @@ Widths = Annotated[tuple[int, ...], Rule("one width or more, each above 0", lamb
 class ModelConfig(Checked):
     """Actor and critic: PointNet per cloud frame, LSTM with layer norm on its output, MLP."""
 
-    REMOVED: ClassVar[dict[str, Any]] = {"initial_hand_std": None, "synergy_std": None, "activation": "elu"}
+    REMOVED: ClassVar[dict[str, Any]] = {
+        "initial_hand_std": None,
+        "synergy_std": None,
+        "activation": "elu",
+        "normalize_observations": True,
+    }
 
     pointnet: Widths = (64, 128, 64)
     """Widths of the per-point MLP 3 -> 64 -> 128 -> 64; the maximum over points is the frame's embedding."""
@@ -33,11 +38,7 @@ class ModelConfig(Checked):
     """Initial standard deviation of the Gaussian policy, which does not depend on the state. Not in the paper."""
     normalize_returns: bool = False
     """Whether the critic learns returns in units of their running standard deviation
-    (:class:`xreset.learning.model.ReturnCritic`), as the paper's library can. It changes the meaning of
-    ``clip_values``: returns of trained policies are between 0 and 20."""
-    normalize_observations: bool = True
-    """Whether flat observations (not clouds) are normalized by running means. Not in the paper; usual in its
-    library."""
+    (:class:`xreset.learning.model.ReturnCritic`), as the paper's library can."""
 
     @property
     def layers(self) -> dict[str, Any]:
@@ -49,7 +50,7 @@ class ModelConfig(Checked):
 class PpoConfig(Checked):
     """Proximal policy optimization."""
 
-    REMOVED: ClassVar[dict[str, Any]] = {"critic_learning_rate": None}
+    REMOVED: ClassVar[dict[str, Any]] = {"critic_learning_rate": None, "clip_values": True}
 
     horizon: Positive[int] = 16
     """Control steps per world and iteration."""
@@ -74,9 +75,6 @@ class PpoConfig(Checked):
     explores nothing. The paper's library uses 1e-4."""
     value_loss: NotNegative[float] = 1.0
     """Weight of the value loss. Not in the paper."""
-    clip_values: bool = True
-    """Whether values, too, move by at most ``clip`` per iteration. A critic then needs about a hundred iterations to
-    learn the range of returns of a trained policy. Not in the paper; usual where returns are normalized."""
     grad_norm: Positive[float] = 1.0
     precision: Literal["float32", "tf32", "bfloat16"] = "tf32"
     """Arithmetic of matrix products on a GPU. ``bfloat16``: factors of point-cloud encoder and LSTM in bfloat16 (sums
@@ -117,7 +115,6 @@ def rsl_rl_config(config: TrainConfig, num_envs: int, teacher: Path | None = Non
     network: dict[str, Any] = {
         "class_name": "xreset.learning.model:PointNetLstmModel",
         "hidden_dims": list(m.mlp),
-        "obs_normalization": m.normalize_observations,
         "pointnet_dims": list(m.pointnet),
         "lstm_dim": m.lstm,
         "bfloat16_clouds": p.precision == "bfloat16",
@@ -158,7 +155,6 @@ def rsl_rl_config(config: TrainConfig, num_envs: int, teacher: Path | None = Non
             "gamma": p.discount,
             "lam": p.gae_lambda,
             "value_loss_coef": p.value_loss,
-            "use_clipped_value_loss": p.clip_values,
             "entropy_coef": p.entropy,
             "learning_rate": p.learning_rate,
             "max_grad_norm": p.grad_norm,

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import torch
 
-from xreset.errors import RunError
-
 SEED_STRIDE = 7919
 """Difference between the seeds of two processes, so that each simulates other episodes."""
 
@@ -24,18 +22,10 @@ class Processes:
 
     @classmethod
     def of_environment(cls) -> Processes:
-        """Read what ``torchrun`` has put into the environment; without it there is one process.
-
-        Raises:
-            RunError: the variables contradict one another.
-        """
+        """Read what ``torchrun`` has put into the environment; without it there is one process."""
         rank = int(os.environ.get("RANK", 0))
         local_rank = int(os.environ.get("LOCAL_RANK", 0))
         count = int(os.environ.get("WORLD_SIZE", 1))
-        if not 0 <= local_rank <= rank < count:
-            raise RunError(
-                f"RANK={rank}, LOCAL_RANK={local_rank}, WORLD_SIZE={count} contradict one another. Start with torchrun."
-            )
         return cls(rank=rank, local_rank=local_rank, count=count)
 
     @property

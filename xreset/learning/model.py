@@ -134,7 +134,7 @@ class Trunk(nn.Module):
         pointnet: PointNet | ImageEncoder,
         embedding_dim: int,
         lstm_dim: int,
-        normalizer: nn.Module,
+        normalizer: EmpiricalNormalization,
     ) -> None:
         """Build LSTM and layer norm; ``embedding_dim`` is the width of all embeddings of a step."""
         super().__init__()
@@ -182,7 +182,6 @@ class PointNetLstmModel(MLPModel):
         obs_set: str,
         output_dim: int,
         hidden_dims: list[int] | tuple[int, ...] = (512, 256, 128),
-        obs_normalization: bool = True,
         distribution_cfg: dict | None = None,
         pointnet_dims: list[int] | tuple[int, ...] = (64, 128, 64),
         lstm_dim: int = 512,
@@ -192,7 +191,7 @@ class PointNetLstmModel(MLPModel):
         self._latent_dim = lstm_dim
         self.cloud_group = next(group for group in obs_groups[obs_set] if obs[group].ndim == 4)
         super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims, "elu", False, distribution_cfg)
-        normalizer = EmpiricalNormalization(self.obs_dim) if obs_normalization else nn.Identity()
+        normalizer = EmpiricalNormalization(self.obs_dim)
         encoder, width = self._encoder(obs[self.cloud_group].shape[1:], list(pointnet_dims))
         encoder.use_bfloat16 = bfloat16_clouds
         self.trunk = Trunk(self.obs_dim, encoder, width, lstm_dim, normalizer)
@@ -250,10 +249,9 @@ class PointNetLstmModel(MLPModel):
     def update_normalization(self, obs: TensorDict) -> None:
         """Take observations [M, ...] into the running mean and variance."""
         normalizer = self.trunk.normalizer
-        if isinstance(normalizer, EmpiricalNormalization):
-            std = normalizer._std  # rsl-rl replaces this tensor; captured updates read it where it is
-            normalizer.update(torch.cat([obs[group] for group in self.obs_groups], dim=-1))
-            normalizer._std = std.copy_(normalizer._std)
+        std = normalizer._std  # rsl-rl replaces this tensor; captured updates read it where it is
+        normalizer.update(torch.cat([obs[group] for group in self.obs_groups], dim=-1))
+        normalizer._std = std.copy_(normalizer._std)
 
     def as_onnx(self, verbose: bool = False) -> ExportedPolicy:
         """The deterministic policy as a plain module; see :class:`ExportedPolicy`."""

@@ -149,8 +149,6 @@ class SequencePpo(PPO):
         """Return the mean squared error of values, in units of the returns' deviation if the critic knows it."""
         unit = self.critic.return_std if isinstance(self.critic, ReturnCritic) else 1.0
         error = (values - batch.returns) / unit
-        if not self.use_clipped_value_loss:
-            return error.square().mean()
         near = batch.values + unit * ((values - batch.values) / unit).clamp(-self.clip_param, self.clip_param)
         return torch.max(error.square(), ((near - batch.returns) / unit).square()).mean()
 

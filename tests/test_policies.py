@@ -22,9 +22,7 @@ from xreset import policies, robots
 from xreset.demos.archive import write_demos
 from xreset.demos.synth import synthesize
 from xreset.errors import PolicyError
-from xreset.eval.engines.sources import from_policy
 from xreset.eval.policy_spec import load_policy
-from xreset.eval.setting import Place, Sequence
 from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel
 from xreset.learning.shrink import shrink
@@ -250,9 +248,6 @@ class ShippedTest(WithPolicy):
         code, out, err = run("report", "skilled")
         self.assertEqual((code, err), (0, ""))
         self.assertTrue(Path("runs/skilled/report/index.html").is_file(), out)
-        with mock.patch("xreset.eval.engines.sources.play_policy") as play:
-            from_policy(Path("demos.npz"), mock.Mock(), Sequence(policy="skilled"), Place())
-        self.assertEqual(play.call_args.args[0].name, "skilled")
 
 
 if __name__ == "__main__":

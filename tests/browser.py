@@ -24,6 +24,12 @@ _FLAGS = (
     "--enable-unsafe-swiftshader",  # WebGL without a GPU
     "--remote-debugging-port=0", "--window-size=640,600",
 )  # fmt: skip
+INPUT = (
+    "document.getElementById([...document.querySelectorAll('label')].find(e => e.textContent === '{label}').htmlFor)"
+)
+"""Control of a page of viser, by its label."""
+_BUTTON = "[...document.querySelectorAll('button')].find(e => e.textContent === '{label}')"
+_OPTION = "[...document.querySelectorAll('[role=option]')].find(e => e.textContent === '{label}' && e.offsetParent)"
 _KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "ArrowDown": 40, "Enter": 13, "End": 35, "Home": 36}
 
 
@@ -119,13 +125,29 @@ class Browser:
         )
 
         def still() -> list[float] | None:
-            first = self.evaluate(at)
+            try:
+                first = self.evaluate(at)
+            except AssertionError:  # not there yet
+                return None
             time.sleep(0.1)
             return first if first[2] and self.evaluate(at) == first else None
 
         x, y, _ = wait_until(still, f"{element} to stay where it is")
         for kind in ("mousePressed", "mouseReleased"):
             self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+
+    def press(self, button: str) -> None:
+        """Click a button of viser."""
+        self.click(_BUTTON.format(label=button))
+
+    def choose(self, label: str, option: str) -> None:
+        """Open a drop-down of viser and click one of its options."""
+        self.click(INPUT.format(label=label))
+        self.click(_OPTION.format(label=option))
+
+    def text(self) -> str:
+        """The text of the page."""
+        return self.evaluate("document.body?.innerText ?? ''")
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 5) -> None:
         """Move the mouse to a point, press it, and release it at another one, in pixels."""

@@ -13,13 +13,8 @@ from tests.browser import Browser, find_chromium, wait_until
 from xreset.eval.play.session import Session
 from xreset.tensors import one_thread
 
-INPUT = (
-    "document.getElementById([...document.querySelectorAll('label')].find(e => e.textContent === '{label}').htmlFor)"
-)
-OPTION = "[...document.querySelectorAll('[role=option]')].find(e => e.textContent === '{label}' && e.offsetParent)"
 FOLDER = "[...document.querySelectorAll('.mantine-Paper-root')].find(e => e.textContent.trim() === '{label}')"
 HEIGHTS = "[...document.querySelectorAll('.u-wrap')].map(e => e.getBoundingClientRect().height)"
-BUTTON = "[...document.querySelectorAll('button')].find(e => e.textContent === '{label}')"
 
 
 @unittest.skipUnless(find_spec("viser"), "viser is not installed")
@@ -43,7 +38,7 @@ class InTheBrowser(unittest.TestCase):
         self.browser.problems.clear()
         self.browser.resize(1000, 500)  # wide, because the controls cover 320 pixels on the right
         self.browser.open(self.page.url)
-        self.until(lambda: "real time" in self.text(), "the page to play")
+        self.until(lambda: "real time" in self.browser.text(), "the page to play")
         self.until(self.shows_the_object, "the object to be drawn")
         self.addCleanup(self.browser.open, "about:blank")
 
@@ -55,9 +50,6 @@ class InTheBrowser(unittest.TestCase):
             return condition()
 
         return wait_until(holds, what, seconds=90)
-
-    def text(self) -> str:
-        return self.browser.evaluate("document.body?.innerText ?? ''")
 
     def shows_the_object(self) -> bool:
         """Whether the page has pixels of the object's color."""
@@ -87,7 +79,7 @@ class InTheBrowser(unittest.TestCase):
         self.assertFalse(self.page._hint.visible)
         self.assertGreater(session.history[-1].distance, 0.1)
         self.assertLess(self.pass_time(4.0).distance, 0.05)
-        self.until(lambda: "At the goal" in self.text(), "the page to say so")
+        self.until(lambda: "At the goal" in self.browser.text(), "the page to say so")
 
         links = []
         session.grab = lambda link, at: links.append(link)
@@ -97,9 +89,9 @@ class InTheBrowser(unittest.TestCase):
         self.until(lambda: links, "the arm to be pulled")
         self.assertIn(links[0], self.page._robot.links)
 
-        self.browser.click(BUTTON.format(label="Take the object away"))
-        self.until(lambda: "The object is away" in self.text(), "the object to be away")
-        self.browser.click(BUTTON.format(label="Put the object back"))
+        self.browser.press("Take the object away")
+        self.until(lambda: "The object is away" in self.browser.text(), "the object to be away")
+        self.browser.press("Put the object back")
         self.until(lambda: session._homing, "the robot to go home")
         problems = [text for text in self.browser.problems if "passive event listener" not in text]  # viser's own
         self.assertEqual(problems, [])
@@ -125,9 +117,8 @@ class InTheBrowser(unittest.TestCase):
 
         self.browser.click(FOLDER.format(label="curves"))
         self.until(lambda: len(h := self.browser.evaluate(HEIGHTS)) == 3 and min(h) > 100, "three curves to be drawn")
-        self.browser.click(INPUT.format(label="engine"))
-        self.browser.click(OPTION.format(label="pybullet"))
-        self.until(lambda: "pybullet:" in self.text(), "another engine to play")
+        self.browser.choose("engine", "pybullet")
+        self.until(lambda: "pybullet:" in self.browser.text(), "another engine to play")
 
 
 if __name__ == "__main__":

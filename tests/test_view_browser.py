@@ -9,19 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.browser import Browser, find_chromium, wait_until
+from tests.browser import INPUT, Browser, find_chromium, wait_until
 from tests.test_view import toy_demos, toy_retargeted
 from xreset import robots
 from xreset.demos.archive import write_demos
 from xreset.pictures.view.load import load_view
 from xreset.retarget.file import write_retargeted
 
-INPUT = (
-    "document.getElementById([...document.querySelectorAll('label')].find(e => e.textContent === '{label}').htmlFor)"
-)
 SLIDER = INPUT + ".querySelector('[role=slider]')"
-BUTTON = "[...document.querySelectorAll('button')].find(e => e.textContent === '{label}')"
-OPTION = "[...document.querySelectorAll('[role=option]')].find(e => e.textContent === '{label}' && e.offsetParent)"
 
 
 @unittest.skipUnless(find_spec("viser"), "viser is not installed")
@@ -48,7 +43,9 @@ class InTheBrowser(unittest.TestCase):
         self.browser.problems.clear()
         self.addCleanup(self.browser.open, "about:blank")  # first: a page without its server is a problem
         self.browser.open(page.url)
-        self.until(lambda: self.exists(INPUT.format(label="sequence")) and "1 of" in self.text(), "the controls")
+        self.until(
+            lambda: self.exists(INPUT.format(label="sequence")) and "1 of" in self.browser.text(), "the controls"
+        )
         return page
 
     def until(self, condition, what: str):
@@ -56,22 +53,10 @@ class InTheBrowser(unittest.TestCase):
         try:
             wait_until(condition, what, seconds=60)
         except AssertionError as error:
-            raise AssertionError(f"{error}; the page says: {self.text()!r}") from None
+            raise AssertionError(f"{error}; the page says: {self.browser.text()!r}") from None
 
     def exists(self, element: str) -> bool:
         return self.browser.evaluate(f"(() => {{ try {{ return !!{element} }} catch {{ return false }} }})()")
-
-    def text(self) -> str:
-        return self.browser.evaluate("document.body.innerText")
-
-    def choose(self, label: str, option: str) -> None:
-        """Open a drop-down and click one of its options."""
-        self.browser.click(INPUT.format(label=label))
-        self.until(lambda: self.exists(OPTION.format(label=option)), f"the option {option}")
-        self.browser.click(OPTION.format(label=option))
-
-    def press(self, button: str) -> None:
-        self.browser.click(BUTTON.format(label=button))
 
     def orange_pixels(self) -> int:
         """How much of the page has the object's colour."""
@@ -94,30 +79,19 @@ class InTheBrowser(unittest.TestCase):
         self.until(
             lambda: np.allclose(can.position, page.view.object_pos[1], rtol=0, atol=1e-6), "the can to move to frame 1"
         )
-        self.until(lambda: "not valid: joint limit" in self.text(), "the reason in the browser")
-        self.assertIn("joint limit 1", self.text())
+        self.until(lambda: "not valid: joint limit" in self.browser.text(), "the reason in the browser")
+        self.assertIn("joint limit 1", self.browser.text())
         self.browser.key("End")
         self.until(
             lambda: page.row == 3 and not page._scene._keypoints.visible, "the last frame, where no hand is annotated"
         )
-        self.choose("sequence", "1: demo_b")
+        self.browser.choose("sequence", "1: demo_b")
         self.until(
             lambda: [body.visible for body in page._scene._objects] == [False, True], "the other sequence's object"
         )
         self.assertEqual(page.row, 4)
-        self.until(lambda: "sequence 1: demo_b" in self.text(), "its name in the browser")
+        self.until(lambda: "sequence 1: demo_b" in self.browser.text(), "its name in the browser")
         self.assertGreater(self.orange_pixels(), 20, "the object is not to be seen")
-        self.assert_no_problem()
-
-    def test_only_frames_with_one_reason(self):
-        page = self.open(self.retargeted)
-        self.choose("sequence", "all")
-        self.until(lambda: len(page._rows) == 8, "all sequences")
-        self.choose("state", "joint limit (2)")
-        self.until(lambda: page._rows.tolist() == [1, 5], "the frames with that reason")
-        self.assertTrue(self.exists("document.querySelector('div[title=\"joint limit\"]')"))
-        self.press("previous")
-        self.until(lambda: page.row == 5, "the last frame with that reason")
         self.assert_no_problem()
 
 

@@ -9,7 +9,7 @@ Shape letters: Q balls, G links with balls, R guards, H pairs of links.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence, Sized
+from collections.abc import Iterable, Sequence, Sized
 from dataclasses import dataclass
 from itertools import product
 
@@ -41,8 +41,6 @@ value the LEAP hand loses 1 % of its frames to that test, without it 90 %."""
 
 _INWARD_STEPS = 8
 """Steps that move a point of a surface inwards from one face after the other."""
-_ROWS = {"cpu": 200_000, "cuda": 8_000_000}
-"""Rows that are processed at once: on a CPU as many as fit its caches."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,21 +58,12 @@ class Spans(Tensors):
         counts = torch.tensor([len(group) for group in groups], dtype=torch.long)
         return Spans(start=counts.cumsum(0) - counts, count=counts)
 
-    def members(self, groups: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Iterate over all rows of some groups [C], in pieces that bound the memory.
-
-        Each piece has, for A rows, the positions [A] in ``groups``, ascending, and the rows [A].
-        """
-        device = groups.device
+    def members(self, groups: Tensor) -> tuple[Tensor, Tensor]:
+        """Return all A rows of some groups [C]: the positions [A] in ``groups``, ascending, and the rows [A]."""
         counts = self.count[groups]
-        ends = counts.cumsum(0)
-        piece = (ends - 1).div(_ROWS[device.type], rounding_mode="floor")
-        _, sizes = torch.unique_consecutive(piece, return_counts=True)
-        for positions in torch.arange(len(groups), device=device).split(sizes.tolist()):
-            position = torch.repeat_interleave(positions, counts[positions])
-            begin = ends - counts
-            within = torch.arange(len(position), device=device) - begin[position] + begin[positions[0]]
-            yield position, self.start[groups][position] + within
+        position = torch.repeat_interleave(counts)
+        within = torch.arange(len(position), device=groups.device) - (counts.cumsum(0) - counts)[position]
+        return position, self.start[groups][position] + within
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,8 +72,8 @@ class Balls(Tensors):
 
     links: tuple[str, ...]
     """Links that carry balls (length G)."""
-    spans: Spans
-    """[G] the balls of each link."""
+    slices: tuple[slice, ...]
+    """Balls of each link (length G)."""
     link: Tensor
     """[Q] link of each ball, as an index of ``links``: ascending."""
     centers: Tensor
@@ -99,8 +88,8 @@ class Balls(Tensors):
     """[R] balls that keep out of other links; two of one link are at least :data:`APART` apart."""
     guard_radii: Tensor
     """[R] their radii against other links: larger where they stand for other balls."""
-    guard_spans: Spans
-    """[G] the guards of each link."""
+    guard_slices: tuple[slice, ...]
+    """Guards of each link (length G)."""
     fields: DistanceFields
     """Signed distances to the G links, in their frames."""
     link_pairs: Tensor
@@ -149,7 +138,7 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
     bound_centers, bound_radii = bounding_balls(centers, radii)
     return Balls(
         links=tuple(links),
-        spans=Spans.of(radii),
+        slices=_slices(radii),
         link=torch.as_tensor(np.repeat(np.arange(len(links)), [len(own) for own in radii])),
         centers=_joined(centers, 3),
         radii=_joined(radii),
@@ -157,10 +146,16 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
         bound_radii=bound_radii,
         guards=_joined(guards).long(),
         guard_radii=_joined(guard_radii),
-        guard_spans=Spans.of(guard_radii),
+        guard_slices=_slices(guard_radii),
         fields=DistanceFields.join(fields),
         link_pairs=torch.as_tensor(both_ways.reshape(-1, 2)),
     )
+
+
+def _slices(parts: Sequence[np.ndarray]) -> tuple[slice, ...]:
+    """Return where each part is among the rows of all parts."""
+    ends = np.cumsum([len(part) for part in parts], dtype=int).tolist()
+    return tuple(slice(end - len(part), end) for part, end in zip(parts, ends, strict=True))
 
 
 def _joined(parts: Sequence[np.ndarray], *shape: int) -> Tensor:

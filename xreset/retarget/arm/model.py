@@ -143,24 +143,14 @@ class ArmModel:
         middle = shift + matvec(turn, self._middles)  # [B, G, 3]
         height = pos[:, self._carrier, 2] + (rot[:, self._carrier, 2] * middle).sum(-1)
         frame, link = (height - self._reach < below).nonzero(as_tuple=True)
-        none = frame.new_zeros(0)
-        found = [
-            LowPoints(
-                frame=none,
-                carrier=none,
-                height=pos.new_zeros(0),
-                lever=pos.new_zeros(0, 3),
-            )
-        ]
-        for position, point in self._spans.members(link):
-            row = frame[position]
-            own = link[position]
-            carrier = self._carrier[own]
-            local = shift[row, own] + matvec(turn[row, own], self._points[point])
-            lever = matvec(rot[row, carrier], local)
-            heights = height_above_table(lever + pos[row, carrier], self._radii[point], self.table)
-            found.append(LowPoints(frame=row, carrier=carrier, height=heights, lever=lever)[heights < below])
-        low = LowPoints.cat(found)
+        position, point = self._spans.members(link)
+        row = frame[position]
+        own = link[position]
+        carrier = self._carrier[own]
+        local = shift[row, own] + matvec(turn[row, own], self._points[point])
+        lever = matvec(rot[row, carrier], local)
+        heights = height_above_table(lever + pos[row, carrier], self._radii[point], self.table)
+        low = LowPoints(frame=row, carrier=carrier, height=heights, lever=lever)[heights < below]
         low = low[low.height.argsort(stable=True)]
         key = low.frame * len(self.carriers) + low.carrier
         order = key.argsort(stable=True)

@@ -93,29 +93,30 @@ def too_near(
         *_in_object(model, bodies, bounds, objects, considered, object_clearance),
         *_in_each_other(model, bodies, bounds, considered, self_depth),
     )
-    if not found:
-        none = bounds.new_zeros(0, len(model.home) + 6)
-        rows = none[:, 0].long()
-        return Distances(frame=rows, value=none[:, 0], slope=none, number=rows)
     together = Distances.cat(found)
     order = together.number.argsort(stable=True)
     return together[order[together.frame[order].argsort(stable=True)]]
 
 
+def _moved(rot: Tensor, pos: Tensor, points: Tensor) -> Tensor:
+    """[B, N, 3] points [N, 3] in each of the poses rot [B, 3, 3], pos [B, 3]."""
+    x, y, z = rot[:, None].unbind(-1)
+    return x * points[:, :1] + y * points[:, 1:2] + z * points[:, 2:] + pos[:, None]
+
+
 def _below_table(model: HandModel, bodies: Bodies, bounds: Tensor, considered: Tensor) -> Iterator[Distances]:
     balls = model.balls
-    frames, links = ((bounds[..., 2] < balls.bound_radii) & considered[:, None]).nonzero(as_tuple=True)
-    for position, ball in balls.spans.members(links):
-        frame = frames[position]
-        centers = model.ball_centers(bodies, frame, ball)
-        height = height_above_table(centers, balls.radii[ball], model.table)
-        below = height < 0
-        frame = frame[below]
-        ball = ball[below]
-        centers = centers[below]
+    candidates = (bounds[..., 2] < balls.bound_radii) & considered[:, None]
+    for link, own in enumerate(balls.slices):
+        frames = candidates[:, link].nonzero()[:, 0]
+        body = model.group_body[link]
+        centers = _moved(bodies.rot[frames, body], bodies.pos[frames, body], balls.centers[own])
+        height = height_above_table(centers, balls.radii[own], model.table)
+        row, ball = (height < 0).nonzero(as_tuple=True)
+        centers = centers[row, ball]
         up = centers.new_tensor([0.0, 0.0, 1.0]).expand_as(centers)
-        slope = model.point_slope(bodies, frame, balls.link[ball], centers, up)
-        yield Distances(frame=frame, value=height[below], slope=slope, number=ball)
+        slope = model.point_slope(bodies, frames[row], body, centers, up)
+        yield Distances(frame=frames[row], value=height[row, ball], slope=slope, number=own.start + ball)
 
 
 def _in_object(
@@ -130,16 +131,19 @@ def _in_object(
     every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
     distance = objects.fields.box_distance(objects.local(bounds, every), objects.which[every])
     candidates = (distance < balls.bound_radii + object_clearance) & considered[:, None]
-    frames, links = candidates.nonzero(as_tuple=True)
-    for position, ball in balls.spans.members(links):
-        frame = frames[position]
-        centers = model.ball_centers(bodies, frame, ball)
-        near, distance, direction = objects.nearer(centers, frame, balls.radii[ball] + object_clearance)
+    for link, own in enumerate(balls.slices):
+        frames = candidates[:, link].nonzero()[:, 0]
+        body = model.group_body[link]
+        radii = balls.radii[own]
+        centers = _moved(bodies.rot[frames, body], bodies.pos[frames, body], balls.centers[own]).flatten(0, 1)
+        frame = frames.repeat_interleave(len(radii))
+        limit = (radii + object_clearance).repeat(len(frames))
+        near, distance, direction = objects.nearer(centers, frame, limit)
         frame = frame[near]
-        ball = ball[near]
-        slope = model.point_slope(bodies, frame, balls.link[ball], centers[near], direction)
-        value = distance - balls.radii[ball] - object_clearance
-        yield Distances(frame=frame, value=value, slope=slope, number=len(balls.radii) + ball)
+        ball = near % len(radii)
+        slope = model.point_slope(bodies, frame, body, centers[near], direction)
+        value = distance - radii[ball] - object_clearance
+        yield Distances(frame=frame, value=value, slope=slope, number=len(balls.radii) + own.start + ball)
 
 
 def _in_each_other(
@@ -167,21 +171,24 @@ def _in_each_other(
     turn = inverse @ bodies.rot[frame, first]
     shift = matvec(inverse, bodies.pos[frame, first] - origin[near])
 
-    for position, guard in balls.guard_spans.members(a[pair]):
-        centers = matvec(turn[position], balls.centers[balls.guards[guard]]) + shift[position]
-        limit = balls.guard_radii[guard] - self_depth
-        deep, distance, away = fields.nearer(centers, b[pair[position]], limit)
-        position = position[deep]
-        guard = guard[deep]
-        solid = b[pair[position]]
-        ball = balls.guards[guard]
-        row = frame[position]
-        direction = matvec(bodies.rot[row, model.group_body[solid]], away)
-        centers = model.ball_centers(bodies, row, ball)
-        slope = model.point_slope(bodies, row, balls.link[ball], centers, direction)
+    for link, own in enumerate(balls.guard_slices):
+        mine = (a[pair] == link).nonzero()[:, 0]
+        body = model.group_body[link]
+        guards = balls.guards[own]
+        radii = balls.guard_radii[own]
+        centers = _moved(turn[mine], shift[mine], balls.centers[guards]).flatten(0, 1)
+        limit = (radii - self_depth).repeat(len(mine))
+        deep, distance, away = fields.nearer(centers, b[pair[mine]].repeat_interleave(len(radii)), limit)
+        mine = mine[deep.div(len(radii), rounding_mode="floor")]
+        guard = deep % len(radii)
+        solid = model.group_body[b[pair[mine]]]
+        row = frame[mine]
+        direction = matvec(bodies.rot[row, solid], away)
+        centers = model.ball_centers(bodies, row, guards[guard])
+        slope = model.point_slope(bodies, row, body, centers, direction)
         slope = slope - model.point_slope(bodies, row, solid, centers, direction)
-        value = distance - balls.guard_radii[guard] + self_depth
-        number = 2 * len(balls.radii) + pair[position] * len(balls.guards) + guard
+        value = distance - radii[guard] + self_depth
+        number = 2 * len(balls.radii) + pair[mine] * len(balls.guards) + own.start + guard
         yield Distances(frame=row, value=value, slope=slope, number=number)
 
 
@@ -202,6 +209,6 @@ def pad_distances(model: HandModel, bodies: Bodies, objects: Objects, frame: Ten
     frame = frame.repeat_interleave(count)
     centers = model.ball_centers(bodies, frame, ball)
     distance, direction = objects.signed_distance(centers, frame)
-    slope = model.point_slope(bodies, frame, model.balls.link[ball], centers, direction)
+    slope = model.point_slope(bodies, frame, model.group_body[model.balls.link[ball]], centers, direction)
     value = distance - model.balls.radii[ball]
     return value.view(-1, count), slope.view(-1, count, slope.shape[-1])

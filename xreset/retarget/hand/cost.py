@@ -31,7 +31,7 @@ from xreset.retarget.hand.config import HandConfig
 from xreset.retarget.hand.model import Bodies, HandModel, HandState, HandTargets
 from xreset.tensors import Tensors
 
-_FRAMES_PER_CHUNK = {"cpu": 256, "cuda": 8192}
+_FRAMES_PER_CHUNK = {"cpu": 256, "cuda": 2048}
 """On a CPU as many as fit its caches; on a GPU enough to fill it."""
 
 

@@ -205,18 +205,14 @@ class HandModel:
 
     def ball_centers(self, bodies: Bodies, frame: Tensor, ball: Tensor) -> Tensor:
         """[..., 3] centers in the world of balls [...] in frames [...]."""
-        return self.to_world(bodies, frame, self.balls.link[ball], self.balls.centers[ball])
-
-    def to_world(self, bodies: Bodies, frame: Tensor, group: Tensor, points: Tensor) -> Tensor:
-        """[..., 3] points [..., 3] of links [...] with balls in frames [...], in the world."""
-        body = self.group_body[group]
-        return bodies.pos[frame, body] + matvec(bodies.rot[frame, body], points)
+        body = self.group_body[self.balls.link[ball]]
+        return bodies.pos[frame, body] + matvec(bodies.rot[frame, body], self.balls.centers[ball])
 
     def point_slope(
         self,
         bodies: Bodies,
         frame: Tensor,
-        group: Tensor,
+        body: Tensor,
         point: Tensor,
         direction: Tensor,
     ) -> Tensor:
@@ -225,19 +221,17 @@ class HandModel:
         Args:
             bodies: links of the hand.
             frame: [A]
-            group: [A] the point's link, among the links with balls.
+            body: [A] or [] the point's link, as an index of ``bodies``.
             point: [A, 3] in the world.
             direction: [A, 3] unit vectors n.
         """
-        body = self.group_body[group]
         lever = torch.linalg.cross(point - bodies.pos[frame, body], direction)
         along = direction[:, None] @ bodies.linear[frame, body] + lever[:, None] @ bodies.angular[frame, body]
         return along[:, 0]
 
 
 def predicted_gigabytes(model: HandModel) -> float:
-    """Return an upper bound of the memory that hand retargeting on the CPU needs [GB]: all balls of 256 frames are near
-    something."""
+    """Return an upper bound of the memory that hand retargeting on the CPU needs [GB]."""
     return 0.5 + 256 * 400e-9 * len(model.balls.radii)
 
 

@@ -22,8 +22,7 @@ from xreset.geometry.rotations import quat_multiply
 from xreset.plugins import robot_folder
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
-from xreset.retarget.arm.paths import splice, spread_over
-from xreset.retarget.arm.solve import track
+from xreset.retarget.arm.solve import splice, spread_over, track
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools.check import check_description
 from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search, write_placement

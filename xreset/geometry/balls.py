@@ -9,7 +9,7 @@ Shape letters: Q balls, G links with balls, R guards, H pairs of links.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence, Sized
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -41,29 +41,6 @@ value the LEAP hand loses 1 % of its frames to that test, without it 90 %."""
 
 _INWARD_STEPS = 8
 """Steps that move a point of a surface inwards from one face after the other."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Spans(Tensors):
-    """Groups of consecutive rows of a table (G groups)."""
-
-    start: Tensor
-    """[G] first row of each group."""
-    count: Tensor
-    """[G] number of its rows."""
-
-    @staticmethod
-    def of(groups: Iterable[Sized]) -> Spans:
-        """Return the spans of groups whose members follow one another."""
-        counts = torch.tensor([len(group) for group in groups], dtype=torch.long)
-        return Spans(start=counts.cumsum(0) - counts, count=counts)
-
-    def members(self, groups: Tensor) -> tuple[Tensor, Tensor]:
-        """Return all A rows of some groups [C]: the positions [A] in ``groups``, ascending, and the rows [A]."""
-        counts = self.count[groups]
-        position = torch.repeat_interleave(counts)
-        within = torch.arange(len(position), device=groups.device) - (counts.cumsum(0) - counts)[position]
-        return position, self.start[groups][position] + within
 
 
 @dataclass(frozen=True, kw_only=True)

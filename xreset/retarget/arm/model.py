@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import RobotError
-from xreset.geometry.balls import Spans, bounding_balls
+from xreset.geometry.balls import bounding_balls
 from xreset.geometry.collision import (
     SelfCollision,
     height_above_table,
@@ -112,7 +112,8 @@ class ArmModel:
         self._carrier = torch.tensor([carrier_of[link] for link in links], dtype=torch.long)
         """[G] carrier of each link with support points."""
         rows = [(np.array(support.links) == link).nonzero()[0] for link in links]
-        self._spans = Spans.of(rows)
+        self._count = torch.tensor([len(own) for own in rows], dtype=torch.long)
+        """[G] number of support points of each link; those of one link follow one another."""
         order = np.concatenate([np.zeros(0, dtype=int), *rows])
         self._points = torch.as_tensor(support.points[order])
         self._radii = torch.as_tensor(support.radii[order])
@@ -143,7 +144,10 @@ class ArmModel:
         middle = shift + matvec(turn, self._middles)  # [B, G, 3]
         height = pos[:, self._carrier, 2] + (rot[:, self._carrier, 2] * middle).sum(-1)
         frame, link = (height - self._reach < below).nonzero(as_tuple=True)
-        position, point = self._spans.members(link)
+        count = self._count[link]
+        position = torch.repeat_interleave(count)
+        before = self._count.cumsum(0)[link] - count.cumsum(0)
+        point = torch.arange(len(position)) + before[position]
         row = frame[position]
         own = link[position]
         carrier = self._carrier[own]

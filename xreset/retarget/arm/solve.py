@@ -4,28 +4,104 @@ paper, appendix D.b).
     q_t = argmin  50 |p(q) - p_t|^2 + 10 d_R(R(q), R_t)^2 + lambda_s |q - q_{t-1}|^2 + E_coll(q),   within the joint
     limits,
 
-by Levenberg-Marquardt with projected steps (``cost``), frame after frame, batched over sequences (``paths``).
+by Levenberg-Marquardt with projected steps (``cost``), frame after frame, batched over sequences.
 
 The first frame starts from random restarts. The best few distinct solutions are all followed, and the one with most
 valid frames wins, because the first frame does not show which branch lasts. Where a frame fails, the same is tried
 backwards from the last frame: the branch that reaches the goal may look worse than others at the start. Where the wrist
 is still missed, some of those frames are solved again and followed both ways, and all paths are spliced into one.
 
-Shape letters: S sequences, T frames, K paths of a sequence, C sequences to improve, n arm joints.
+Shape letters: S sequences, T frames, K paths of a sequence, B paths of all, C chosen frames, n arm joints, G links with
+support points.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from xreset.retarget.arm.config import ArmConfig
-from xreset.retarget.arm.model import ArmModel, ArmTargets, measure
-from xreset.retarget.arm.paths import ArmProblem, Paths, best, branches, repaired
-from xreset.retarget.validity import REASONS, Measures, Thresholds
+from xreset.retarget.arm.cost import Frame, solve, system
+from xreset.retarget.arm.model import ArmModel, ArmTargets, arm_jump, measure
+from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
+from xreset.tensors import Tensors
 
 _WRIST_MISSED = ("joint limit", "wrist position", "wrist orientation")
 """Reasons of frames whose wrist is not where it should be."""
+_HOME_BIAS = 1e-3
+"""Preference among solutions of the first frame for those near home [1/rad^2]."""
+_DISTINCT = 0.5
+"""Solutions of the first frame differ if a joint differs by this much [rad or m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Paths(Tensors):
+    """Paths of the arm's joints, and which of their frames are good."""
+
+    joints: Tensor
+    """[S, K, T, n]"""
+    sound: Tensor
+    """[S, K, T] bool: valid if the joints do not jump there. A jump depends on the frame before, and so on the
+    direction and on where paths are spliced; everything else depends on the frame alone and is measured once."""
+
+    def reversed(self) -> Paths:
+        """Return the paths from the last frame to the first."""
+        return self.map(lambda x: x.flip(2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmProblem:
+    """Targets that paths are searched for."""
+
+    model: ArmModel
+    targets: ArmTargets
+    hand_poses: Tensor
+    """[S, T, G, 4, 4] see :meth:`ArmModel.hand_poses`; computed once from the targets."""
+    thresholds: Thresholds
+    config: ArmConfig
+
+    def select(self, *index: Tensor) -> ArmProblem:
+        """Return the problem of some sequences, or of some frames of them: every tensor is indexed alike."""
+        return replace(self, targets=self.targets[index], hand_poses=self.hand_poses[index])
+
+    def repeated(self, count: int) -> ArmProblem:
+        """Return the problem with every sequence repeated, copies next to each other: [S count, ...]."""
+        return self.select(torch.arange(len(self.hand_poses)).repeat_interleave(count))
+
+    def reversed(self) -> ArmProblem:
+        """Return the problem from the last frame to the first."""
+        return replace(
+            self,
+            targets=self.targets.reversed(),
+            hand_poses=self.hand_poses.flip(1),
+        )
+
+    def reasons(self, joints: Tensor) -> Tensor:
+        """[S, T] reason of each frame of the paths [S, T, n], 0 where valid: see
+        :func:`~xreset.retarget.validity.classify`."""
+        return classify(measure(self.model, self.targets, joints), self.thresholds)
+
+    def examined(self, joints: Tensor) -> Paths:
+        """Return the paths [S, K, T, n], with a check of their frames."""
+        measures = measure(
+            self.model,
+            self.repeated(joints.shape[1]).targets,
+            joints.flatten(0, 1),
+        )
+        no_jumps = replace(measures, arm_jump=torch.zeros_like(measures.arm_jump))
+        sound = classify(no_jumps, self.thresholds) == 0
+        return Paths(joints=joints, sound=sound.view(joints.shape[:3]))
+
+    def frame(self, t: int, previous: Tensor | None) -> Frame:
+        """Return the problem of one frame, given the joints [S, n] of the frame before."""
+        return Frame(
+            pos=self.targets.root_pos[:, t],
+            quat=self.targets.root_quat[:, t],
+            hand_poses=self.hand_poses[:, t],
+            previous=previous,
+        )
 
 
 def track(
@@ -83,3 +159,181 @@ def _rescued(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -
             better = (part.reasons(new) == 0).sum(1) > (reason[rows] == 0).sum(1)
             joints[rows[better]] = new[better]
     return joints
+
+
+def follow(problem: ArmProblem, start: Tensor) -> Tensor:
+    """[S, T, n] joints along the path, every frame started from the one before; the first from ``start`` [S, n]."""
+    model = problem.model
+    config = problem.config
+    frames = problem.hand_poses.shape[1]
+    path = [solve(model, problem.frame(0, None), start, config, config.first_iterations)]
+    for t in range(1, frames):
+        path.append(solve(model, problem.frame(t, path[-1]), path[-1], config, config.iterations))
+    return torch.stack(path, dim=1)
+
+
+def branches(problem: ArmProblem) -> Paths:
+    """Return the paths from distinct solutions of the first frame."""
+    starts = _first_frames(problem)  # [S, K, n]
+    paths = follow(problem.repeated(starts.shape[1]), starts.flatten(0, 1))
+    return problem.examined(paths.unflatten(0, starts.shape[:2]))
+
+
+def best(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
+    """Return the path [S, T, n] that is worth most, and its worth [S]: see the config."""
+    jump = arm_jump(paths.joints, problem.targets.annotated[:, None])
+    valid = (paths.sound & (jump <= problem.thresholds.arm_jump)).sum(-1)
+    detour = (paths.joints - problem.model.home).square().sum(-1).mean(-1)
+    worth, which = (valid - problem.config.detour_cost * detour).max(dim=1)
+    return paths.joints[torch.arange(len(which)), which], worth
+
+
+def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:
+    """[S, T, n] the best path from pieces of the ``known`` paths and of new ones.
+
+    The new paths lead both ways from some of the frames that are ``missed`` [S, T], solved again: a path from either
+    end may be stuck at a limit there, on the wrong side of the arm's null space.
+    """
+    config = problem.config
+    owner, paths = _reseeded(problem, missed)
+    count = torch.bincount(owner, minlength=len(missed))
+    column = torch.arange(len(owner)) - (count.cumsum(0) - count)[owner]
+    # Sequences with fewer new paths than others repeat a known one.
+    new = known.joints[:, :1].repeat(1, int(count.max()), 1, 1)
+    new[owner, column] = paths
+    known = Paths.cat((known, problem.examined(new)), dim=1)
+
+    annotated = problem.targets.annotated
+    detour = config.detour_cost * (known.joints - problem.model.home).square().sum(-1) * annotated[:, None]
+    return splice(
+        known.joints,
+        worth=known.sound.to(known.joints.dtype),
+        cost=detour / annotated.sum(1)[:, None, None],
+        annotated=annotated,
+        jump=problem.thresholds.arm_jump,
+        switch_cost=config.switch_cost,
+    )
+
+
+def _reseeded(problem: ArmProblem, missed: Tensor) -> tuple[Tensor, Tensor]:
+    """Follow paths both ways from distinct solutions of missed frames [S, T] that can be solved.
+
+    Returns the sequences [B] of the paths, ascending, and the paths [B, T, n].
+    """
+    owner, seed = spread_over(missed, problem.config.reseeds)
+    alone = problem.select(owner[:, None], seed[:, None])  # [C, 1, ...]
+    starts = _first_frames(alone)  # [C, K, n]
+    count = starts.shape[1]
+    is_new = torch.ones(starts.shape[:2], dtype=torch.bool)
+    is_new[:, 1:] = (starts[:, 1:] != starts[:, :-1]).any(-1)  # frames with fewer solutions repeat the last one
+    start = starts.flatten(0, 1)
+    kept = (alone.repeated(count).reasons(start[:, None])[:, 0] == 0) & is_new.flatten()
+    start = start[kept]
+    owner = owner.repeat_interleave(count)[kept]
+    seed = seed.repeat_interleave(count)[kept]
+
+    frames = missed.shape[1]
+    paths = start.new_zeros(len(owner), frames, start.shape[1])
+    if not len(seed):
+        return owner, paths
+    steps = torch.arange(int(torch.maximum(seed, frames - 1 - seed).max()) + 1)
+    both_ways = torch.cat((seed[:, None] + steps, seed[:, None] - steps)).clamp(0, frames - 1)  # [2B, N] frames
+    followed = follow(problem.select(owner.repeat(2)[:, None], both_ways), start.repeat(2, 1))
+    row = torch.arange(len(owner)).repeat(2)
+    for step in reversed(steps.tolist()):  # the first visit of a frame is the one that stays
+        paths[row, both_ways[:, step]] = followed[:, step]
+    return owner, paths
+
+
+def _first_frames(problem: ArmProblem) -> Tensor:
+    """[S, K, n] distinct solutions of the first frame: the one that home leads to, then the best others; the last one
+    fills up."""
+    model = problem.model
+    config = problem.config
+    home = model.home
+    sequences = len(problem.hand_poses)
+    generator = torch.Generator().manual_seed(config.seed)  # every sequence gets the same starts
+    spread = torch.rand(config.restarts, len(home), generator=generator, dtype=home.dtype) * 2.0 - 1.0
+    spread[0] = 0.0
+    lower = torch.maximum(model.lower, home - torch.pi)
+    upper = torch.minimum(model.upper, home + torch.pi)
+    start = torch.where(
+        spread < 0,
+        home + spread * (home - lower),
+        home + spread * (upper - home),
+    )
+    frame = problem.repeated(config.restarts).frame(0, None)
+    start = start.repeat(sequences, 1)
+    solved = solve(model, frame, start, config, config.first_iterations)
+    cost = system(model, frame, solved, config).cost
+    shape = (sequences, config.restarts)
+    solved = solved.unflatten(0, shape)
+    order = (cost.view(shape) + _HOME_BIAS * (solved - home).square().sum(-1)).argsort(dim=1)
+    number = min(config.branches, config.restarts)
+    chosen = []
+    for solutions, ranking in zip(solved, order, strict=True):
+        kept = [solutions[0]]  # the one that home leads to
+        for candidate in solutions[ranking]:
+            if len(kept) < number and all((candidate - other).abs().max() > _DISTINCT for other in kept):
+                kept.append(candidate)
+        kept += [kept[-1]] * number
+        chosen.append(torch.stack(kept[:number]))
+    return torch.stack(chosen) if chosen else home.new_zeros(0, number, len(home))
+
+
+def splice(
+    paths: Tensor,
+    *,
+    worth: Tensor,
+    cost: Tensor,
+    annotated: Tensor,
+    jump: float,
+    switch_cost: float,
+) -> Tensor:
+    """Return the best path that follows one of the given ones in every frame, by dynamic programming over the frames.
+
+        maximize sum_t worth[k_t, t] [not a jump at t] - cost[k_t, t] - switch_cost [k_t != k_{t-1}]
+
+    A jump is a joint's change by more than ``jump`` since an annotated frame before.
+
+    Args:
+        paths: [S, K, T, n] joints.
+        worth: [S, K, T] of a frame of a path, if the joints do not jump there.
+        cost: [S, K, T] of a frame of a path, jump or not.
+        annotated: [S, T] bool.
+        jump: [rad or m].
+        switch_cost: cost of a change from one path to another.
+
+    Returns:
+        [S, T, n] joints.
+    """
+    sequences, number, frames, _ = paths.shape
+    switch = switch_cost * (1.0 - torch.eye(number, dtype=paths.dtype))
+    value = worth[:, :, 0] - cost[:, :, 0]
+    came_from: list[Tensor] = []
+    for t in range(1, frames):
+        change = (paths[:, None, :, t] - paths[:, :, None, t - 1]).abs().amax(-1)  # [S, K before, K now]
+        jumps = (change > jump) & annotated[:, t - 1, None, None]
+        total = value[:, :, None] - switch + worth[:, None, :, t] * (~jumps).to(paths.dtype)
+        most, before = total.max(dim=1)
+        value = most - cost[:, :, t]
+        came_from.append(before)
+    rows = torch.arange(sequences)
+    chosen = [value.argmax(dim=1)]
+    for before in reversed(came_from):
+        chosen.append(before[rows, chosen[-1]])
+    return paths[rows[:, None], torch.stack(chosen[::-1], dim=1), torch.arange(frames)]
+
+
+def spread_over(flags: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Choose at most ``count`` of the set frames of each row of ``flags`` [S, T], evenly spread: rows [C], ascending,
+    and frames [C]."""
+    rows: list[Tensor] = []
+    frames: list[Tensor] = []
+    for row, flagged in enumerate(flags):
+        places = flagged.nonzero()[:, 0]
+        number = min(count, len(places))
+        chosen = places[((torch.arange(number) + 0.5) * len(places) / max(number, 1)).long()]
+        frames.append(chosen)
+        rows.append(torch.full_like(chosen, row))
+    return torch.cat(rows), torch.cat(frames)

@@ -34,13 +34,9 @@ class AccountsTest(unittest.TestCase):
         self.assertEqual((before.phase, after.phase, both.phase), ("pre-contact", "post-contact", "both"))
         self.assertEqual((after.total, both.total), (self.post.sum(), 200))
         self.assertEqual(both.kept, (self.reason == "").sum())
-
-    def test_without_a_reason(self):
-        both = with_totals(self.rows)[-1]
         annotated = both.without("not annotated")
         self.assertEqual(annotated.total, (self.reason != "not annotated").sum())
         self.assertEqual(annotated.share, both.kept / annotated.total)
-        self.assertEqual(annotated.without("no such reason"), annotated)
 
     def test_reasons_are_listed_by_frequency(self):
         self.assertRegex(described(with_totals(self.rows)[-1].lost), r"^jump \d+, ")

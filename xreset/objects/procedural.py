@@ -79,19 +79,19 @@ def _write(path: Path, pieces: list[Shape], rng: np.random.Generator) -> None:
 # Families -------------------------------------------------------------------------------------------------------------
 
 
+def _rod(start: np.ndarray, end: np.ndarray, u: np.ndarray, v: np.ndarray, power: float = 2.0) -> Shape:
+    """Return a straight rod whose cross sections are superellipses with half axes u and v."""
+    return loft([section(place, u, v, power=power, count=_CORNERS) for place in (start, end)])
+
+
 def _box(rng: np.random.Generator) -> list[Shape]:
     """A box with more or less round edges along its longest side, in one of three orientations."""
     narrow = rng.uniform(0.025, 0.085)
     other = rng.uniform(narrow, 0.14)
     length = rng.uniform(0.03, 0.22)
     power = rng.uniform(4.0, 20.0)
-    axes = ((_X, _Y, _Z), (_Z, _X, _Y), (_Y, _Z, _X))[rng.integers(3)]
-    rings = []
-    for end in (-0.5, 0.5):
-        rings.append(
-            section(end * length * axes[2], narrow / 2 * axes[0], other / 2 * axes[1], power=power, count=_CORNERS)
-        )
-    return [loft(rings)]
+    u, v, along = ((_X, _Y, _Z), (_Z, _X, _Y), (_Y, _Z, _X))[rng.integers(3)]
+    return [_rod(-0.5 * length * along, 0.5 * length * along, narrow / 2 * u, other / 2 * v, power)]
 
 
 def _can(rng: np.random.Generator) -> list[Shape]:
@@ -100,8 +100,7 @@ def _can(rng: np.random.Generator) -> list[Shape]:
     b = a * rng.uniform(1.0, 1.5)
     length = rng.uniform(0.03, 0.2)
     u, v, along = ((_X, _Y, _Z), (_Y, _Z, _X))[rng.integers(2)]
-    rings = [section(end * length * along, a * v, b * u, count=_CORNERS) for end in (-0.5, 0.5)]
-    return [loft(rings)]
+    return [_rod(-0.5 * length * along, 0.5 * length * along, a * v, b * u)]
 
 
 def _cup(rng: np.random.Generator) -> list[Shape]:
@@ -155,10 +154,10 @@ def _hammer(rng: np.random.Generator) -> list[Shape]:
     length = rng.uniform(0.1, 0.2)
     radius = rng.uniform(0.01, 0.02)
     head = rng.uniform((0.02, 0.05, 0.02), (0.04, 0.1, 0.05))
-    rings = [section(x * _X, radius * _Y, radius * _Z, power=3.0, count=_CORNERS) for x in (0.0, length)]
+    handle = _rod(0.0 * _X, length * _X, radius * _Y, radius * _Z, 3.0)
     corners = np.array(list(np.ndindex(2, 2, 2))) - 0.5
     middle = np.array([length, 0.0, head[2] / 2 - radius])
-    return [loft(rings), hull(corners * head + middle)]
+    return [handle, hull(corners * head + middle)]
 
 
 def _banana(rng: np.random.Generator) -> list[Shape]:

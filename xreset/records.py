@@ -113,9 +113,9 @@ def read_npz(
     must_exist(path, what)
     own = dict(schema)
     with _archive(path, f"cannot be read as {what}") as archive:
-        members = _members(archive)
+        members = archive.sizes
         if schema_name is not None:
-            check_schema(path, _stated_schema(archive, members), schema_name)
+            check_schema(path, archive.stated_schema(), schema_name)
             own |= {"schema": Field((), "U"), "meta": Field((), "U", required=False)}
         missing = [name for name, field in own.items() if field.required and name not in members]
         if missing:
@@ -123,7 +123,7 @@ def read_npz(
                 f"{path} is not valid as {what}: it has no array {missing[0]!r}; "
                 f"found {', '.join(sorted(set(members) - {'schema'}))}."
             )
-        arrays = _read(path, archive, members, [name for name in own if name in members])
+        arrays = archive.read([name for name in own if name in members])
     problem = _wrong_shape(arrays, own) or _wrong_value(arrays, schema)
     if problem is None and check is not None:
         problem = check(arrays)
@@ -145,18 +145,20 @@ def npz_schema(path: str | Path) -> str:
     path = Path(path)
     must_exist(path, "one of xreset's npz files")
     with _archive(path, "is not one of xreset's npz files") as archive:
-        stated = _stated_schema(archive, _members(archive))
+        stated = archive.stated_schema()
     if stated is None:
         raise FileFormatError(f"{path} is not one of xreset's npz files: it states no schema. Is it the right file?")
     return stated
 
 
 @contextmanager
-def _archive(path: Path, failure: str) -> Iterator[zipfile.ZipFile]:
+def _archive(path: Path, failure: str) -> Iterator[_Archive]:
     """Open an npz file; whatever zipfile, zlib and numpy raise at damage becomes one error."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            yield archive
+        with zipfile.ZipFile(path) as file:
+            sizes = {member.filename.removesuffix(".npy"): member.file_size for member in file.infolist()}
+        with np.load(path, allow_pickle=False) as arrays:
+            yield _Archive(path, arrays, sizes)
     except XResetError:
         raise
     except Exception as error:
@@ -168,40 +170,32 @@ class _BadArray(ValueError):
     """An array of an npz file does not hold numbers or text."""
 
 
-def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    return {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+@dataclass(frozen=True)
+class _Archive:
+    path: Path
+    arrays: Mapping[str, Any]
+    sizes: Mapping[str, int]
+    """Size of each array in the archive, unpacked [bytes]."""
 
+    def stated_schema(self) -> str | None:
+        if self.sizes.get("schema", 1 << 20) > 4096:
+            return None
+        array = self.arrays["schema"]
+        is_text = isinstance(array, np.ndarray) and array.dtype.kind == "U" and not array.shape
+        return str(array) if is_text else None
 
-def _read(
-    path: Path, archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo], names: Sequence[str]
-) -> dict[str, np.ndarray]:
-    """Read arrays as native int64, float32, float64, bool or text."""
-    _check_size(path, {name: members[name].file_size for name in names})
-    sizes = {}
-    arrays = {}
-    for name in names:
-        array = _read_array(archive, members[name])
-        sizes[name] = array.size * _item_size(array)
-        _check_size(path, sizes)
-        arrays[name] = _native(name, array)
-    return arrays
-
-
-def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    with archive.open(member) as stream:
-        try:
-            array = np.lib.format.read_array(stream, allow_pickle=False)
-        except ValueError as error:
-            if "allow_pickle" not in str(error):
-                raise
-            raise _BadArray(f"{member.filename} holds Python objects, and objects are never read") from error
-        stream.read(1)  # at the end the checksum is compared
-    return array
-
-
-def _item_size(array: np.ndarray) -> int:
-    """Return the size [bytes] of an item as :func:`_native` gives it."""
-    return max(array.dtype.itemsize, {"i": 8, "u": 8, "f": 4}.get(array.dtype.kind, 1))
+    def read(self, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Read arrays as native int64, float32, float64, bool or text."""
+        _check_size(self.path, {name: self.sizes[name] for name in names})
+        sizes = {}
+        arrays = {}
+        for name in names:
+            array = np.asanyarray(self.arrays[name])
+            # the size of an item as _native gives it
+            sizes[name] = array.size * max(array.dtype.itemsize, {"i": 8, "u": 8, "f": 4}.get(array.dtype.kind, 1))
+            _check_size(self.path, sizes)
+            arrays[name] = _native(name, array)
+        return arrays
 
 
 def _check_size(path: Path, sizes: Mapping[str, int]) -> None:
@@ -225,16 +219,6 @@ def _native(name: str, array: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore"):  # becomes infinite, which is found later
             return array.astype(np.float32 if array.dtype.itemsize <= 4 else np.float64)
     return array.astype(array.dtype.newbyteorder("="))
-
-
-def _stated_schema(archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo]) -> str | None:
-    member = members.get("schema")
-    if member is None or member.file_size > 4096:
-        return None
-    array = _read_array(archive, member)
-    if array.dtype.kind != "U" or array.shape:
-        return None
-    return str(array)
 
 
 def _wrong_shape(arrays: Mapping[str, np.ndarray], schema: Schema) -> str | None:

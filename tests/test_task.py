@@ -34,7 +34,7 @@ from xreset.task.config import (
     evaluation_task,
 )
 from xreset.task.latency import DelayLine
-from xreset.task.randomization import pair_friction, sample_friction, sample_mass_scale
+from xreset.task.randomization import pair_friction, sample_friction
 from xreset.task.rewards import RewardInput, compute_reward, contact_gate
 from xreset.task.terminations import out_of_bounds
 
@@ -343,7 +343,6 @@ class RandomizationTest(unittest.TestCase):
     def test_disabled_means_nominal(self):
         c = RandomizationConfig(enabled=False)
         torch.testing.assert_close(sample_friction(3, c, generator()), pair_friction(torch.full((3,), 0.75), c))
-        torch.testing.assert_close(sample_mass_scale(3, c, generator()), torch.ones(3))
 
 
 class ResetTest(WithRobot):

@@ -162,6 +162,21 @@ def _is_layout(layout: dict[str, Any]) -> bool:
     return all(type(width) is int and width > 0 for width in _widths({"observation_layout": layout}).values())
 
 
+def observation_shapes(contract: dict[str, Any], source: str) -> dict[str, tuple[int, ...]]:
+    """Return the shape of one world's observations, by group, in the order of ``TaskConfig.policy_groups``.
+
+    Raises:
+        PolicyError: the contract, which is of ``source``, does not state the width of a group.
+    """
+    task = from_dict(TaskConfig, contract["task"], f"{source}: task")
+    layout = contract["observation_layout"]
+    *flat, picture = task.policy_groups
+    if missing := [name for name in flat if name not in layout]:
+        raise PolicyError(f"{source} does not state what it observes of {', '.join(missing)}. Export it again.")
+    widths = {name: (sum(layout[name].values()),) for name in flat}
+    return widths | {picture: task.picture_shape}
+
+
 def _read_contract(path: Path, metadata: dict[str, str]) -> dict[str, Any]:
     if METADATA_KEY not in metadata:
         raise PolicyError(f"{path} is an ONNX file without xreset's contract: it was not exported by xreset.")
@@ -217,16 +232,14 @@ class OnnxPolicy:
 
     def _try_step(self, path: Path) -> None:
         """Take one step with zeros, so that a policy that cannot act is refused before work begins."""
-        task = from_dict(TaskConfig, self.contract["task"], f"{path}: task")
-        self._groups = task.policy_groups
-        layout = self.contract["observation_layout"]
+        observed = observation_shapes(self.contract, str(path))
+        self._groups = tuple(observed)
+        *flat, picture = observed.values()
         worlds = 2
-        *flat_groups, _ = self._groups
         try:
             self._lstm_dim: int = self._session.get_inputs()[2].shape[2]
-            flat = sum(sum(layout[name].values()) for name in flat_groups)
             state = (1, worlds, self._lstm_dim)
-            shapes = ((worlds, flat), (worlds, *task.picture_shape), state, state)
+            shapes = ((worlds, sum(width for (width,) in flat)), (worlds, *picture), state, state)
             feed = {name: np.zeros(shape, np.float32) for name, shape in zip(INPUTS, shapes, strict=True)}
             outputs: Any = self._session.run(None, feed)
         except Exception as error:

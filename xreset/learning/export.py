@@ -16,18 +16,16 @@ import torch
 from rsl_rl.utils import resolve_class
 from tensordict import TensorDict
 
-from xreset.checks import from_dict
 from xreset.errors import PolicyError
 from xreset.files import atomic_write, code_version, file_hash
 from xreset.learning.checkpoint import read_checkpoint
 from xreset.learning.choice import Choice, read_choice
 from xreset.learning.config import rsl_rl_config
-from xreset.learning.model import PointNetLstmModel
+from xreset.learning.model import ExportedPolicy, PointNetLstmModel
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.learning.shrink import drop_exporter_notes
 from xreset.policies import shipped
-from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS
-from xreset.task.config import TaskConfig
+from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS, observation_shapes
 
 _VERSION_KEY = "xreset-version"
 """Key of the ONNX metadata entry that holds the version and commit of xreset."""
@@ -48,10 +46,11 @@ def export_onnx(
     """
     import onnx
 
-    policy = actor.as_onnx()
+    policy = ExportedPolicy(actor)
+    *_, picture = observation_shapes(contract, str(path)).values()
     n = 2  # an example batch that is not 1, so that the exporter keeps the world dimension free
     state = torch.zeros(1, n, policy.lstm_dim)
-    example = (torch.zeros(n, policy.flat_dim), torch.zeros(n, *_task(contract).picture_shape), state, state.clone())
+    example = (torch.zeros(n, policy.flat_dim), torch.zeros(n, *picture), state, state.clone())
     worlds = torch.export.Dim("worlds", min=1, max=65536)
     with tempfile.TemporaryDirectory() as folder, _quiet(), torch.no_grad():
         file = Path(folder) / "policy.onnx"
@@ -90,22 +89,14 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _task(contract: dict[str, Any]) -> TaskConfig:
-    return from_dict(TaskConfig, contract["task"], "the policy's contract: task")
-
-
 def export_checkpoint(out: Path, checkpoint: Path, policy: Path) -> None:
     """Write the policy of one of a run's checkpoints as an ONNX file."""
     info = read_run(out)
     settings = rsl_rl_config(info.config, info.num_envs)
     actor_class, options = resolve_class(settings["actor"])
-    layout = info.contract["observation_layout"]
-    groups = {"actor": settings["obs_groups"]["actor"]}
-    *flat, picture = groups["actor"]
-    example = {name: torch.zeros(1, sum(layout[name].values())) for name in flat}
-    example[picture] = torch.zeros(1, *_task(info.contract).picture_shape)
-    num_actions = len(info.contract["joint_names"])
-    actor = actor_class(TensorDict(example, batch_size=[1]), groups, "actor", num_actions, **options)
+    shapes = observation_shapes(info.contract, str(out))
+    example = TensorDict({name: torch.zeros(1, *shape) for name, shape in shapes.items()}, batch_size=[1])
+    actor = actor_class(example, {"actor": list(shapes)}, "actor", len(info.contract["joint_names"]), **options)
     actor.load_state_dict(read_checkpoint(checkpoint)["actor_state_dict"])
     export_onnx(actor, policy, info.contract, checkpoint=checkpoint)
 

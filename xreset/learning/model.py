@@ -253,10 +253,6 @@ class PointNetLstmModel(MLPModel):
         normalizer.update(torch.cat([obs[group] for group in self.obs_groups], dim=-1))
         normalizer._std = std.copy_(normalizer._std)
 
-    def as_onnx(self, verbose: bool = False) -> ExportedPolicy:
-        """The deterministic policy as a plain module; see :class:`ExportedPolicy`."""
-        return ExportedPolicy(self)
-
     def _get_obs_dim(self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str) -> tuple[list[str], int]:
         flat = [group for group in obs_groups[obs_set] if obs[group].ndim == 2]
         return flat, sum(obs[group].shape[-1] for group in flat)

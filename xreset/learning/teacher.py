@@ -11,16 +11,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from xreset.checks import from_dict
 from xreset.errors import PolicyError
 from xreset.learning.model import PointNetLstmModel
-from xreset.policy import OnnxPolicy
-from xreset.task.config import TaskConfig
+from xreset.policy import OnnxPolicy, observation_shapes
 
 if TYPE_CHECKING:
     from onnx import GraphProto
 
-_FLAT = ["policy", "proprio"]
 _CLOSE = 1e-3
 """Largest difference between an action of the file and one of the network."""
 
@@ -39,17 +36,14 @@ def load_teacher(path: Path) -> PointNetLstmModel:
     import onnx
 
     policy = OnnxPolicy(path)
-    task = from_dict(TaskConfig, policy.contract["task"], f"{path}: task")
-    layout = policy.contract["observation_layout"]
-    example = {name: torch.randn(2, sum(layout[name].values())) for name in _FLAT}
-    example["perception"] = torch.randn(2, *task.picture_shape)
-    observations = TensorDict(example, batch_size=[2])
+    shapes = observation_shapes(policy.contract, str(path))
+    observations = TensorDict({name: torch.randn(2, *shape) for name, shape in shapes.items()}, batch_size=[2])
     try:
         graph = onnx.load(str(path)).graph
         weights = _weights(graph)
         model = PointNetLstmModel(
             observations,
-            {"actor": [*_FLAT, "perception"]},
+            {"actor": list(shapes)},
             "actor",
             len(policy.contract["joint_names"]),
             hidden_dims=_widths(weights, "mlp.")[:-1],

@@ -107,7 +107,7 @@ def train(
     if isinstance(inputs.data, GoalSet):
         reset = replace(config.task.reset, demo_probability=0.0)
         config = replace(config, task=replace(config.task, reset=reset))
-    if uses_bank(config) and not inputs.bank.num_states:
+    if config.task.reset.demo_probability and not inputs.bank.num_states:
         raise RunError(
             f"{file} holds no state to reset to: every candidate was rejected. Look at its reasons (xreset resets), "
             "or train without it: --config.task.reset.demo-probability 0"
@@ -205,11 +205,6 @@ def _copy_teacher(teacher: Path, out: Path, inputs: Inputs, config: TrainConfig)
         raise PolicyError(f"{teacher} sees through cameras itself. Give a teacher that is told pose and shape.")
     check_contract(str(teacher), contract, inputs.robot, replace(config.task, vision=VisionConfig()))
     write_whole(out / TEACHER, teacher.read_bytes())
-
-
-def uses_bank(config: TrainConfig) -> bool:
-    """Return whether a training ever starts episodes with states of the bank."""
-    return config.task.reset.demo_probability > 0
 
 
 def _checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) -> Path:

@@ -10,7 +10,13 @@ from math import isfinite
 from typing import Annotated, Any, ClassVar, Literal
 
 from xreset.cameras.config import VisionConfig
-from xreset.checks import Checked, Finite, NotNegative, Only, Positive, Range, Share
+from xreset.checks import Checked, Finite, NotNegative, Only, Positive, Range, Rule, Share
+
+PositiveRange = Annotated[Range, Rule("factors above 0", lambda x: x[0] > 0)]
+
+
+def _are_own_terms(own: dict[str, float]) -> bool:
+    return all(all(name.partition(":")[::2]) and isfinite(weight) for name, weight in own.items())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +188,9 @@ class RewardConfig(Checked):
     """Whether ``action`` and ``action_rate`` penalise actions as the policy gave them, instead of limited to [-1, 1].
     Beyond the limit noise explores nothing, and only a penalty of the raw action pulls the mean back (as in Isaac Lab's
     action terms)."""
-    own: dict[str, float] = field(default_factory=dict)
+    own: Annotated[dict[str, float], Rule("module:function and a finite number", _are_own_terms)] = field(
+        default_factory=dict
+    )
     """Reward terms of the user: ``module:function`` -> weight (:func:`xreset.task.rewards.own_term`)."""
     scale: Positive[Finite[float]] = 0.01
     """Factor on the total (Table VIII)."""
@@ -196,14 +204,6 @@ class RewardConfig(Checked):
     def needs_points(self) -> bool:
         """Whether the mean distance of surface points to the goal counts."""
         return self.success_shape == "points" or self.points != 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, weight in self.own.items():
-            if not all(name.partition(":")[::2]) or not isfinite(weight):
-                raise ValueError(
-                    f"own holds {name!r} with weight {weight}, expected module:function and a finite number"
-                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -305,7 +305,9 @@ class TrackerConfig(Checked):
 class PushConfig(Checked):
     """Pushes on object and arm, each during one control step. All are off by default."""
 
-    probability: Range = (0.001, 0.1)
+    probability: Annotated[
+        tuple[float, float], Rule("two numbers above 0 and at most 1", lambda x: 0 < x[0] <= x[1] <= 1)
+    ] = (0.001, 0.1)
     """Range of the probability of a push per control step. Each episode draws one, log-uniformly."""
     object_velocity: NotNegative[float] = 0.0
     """Largest change of the object's velocity [m/s], in any direction, by a force at its centre of mass."""
@@ -317,11 +319,6 @@ class PushConfig(Checked):
     when: Literal["always", "gated"] = "always"
     """``gated``: the object is pushed only while the gate of the reward is open (``task.reward.contact``). Pushes on
     the arm are never gated."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.probability[0] <= self.probability[1] <= 1:
-            raise ValueError(f"probability is {self.probability}, expected two numbers above 0 and at most 1")
 
     @property
     def moves_object(self) -> bool:
@@ -349,11 +346,11 @@ class RandomizationConfig(Checked):
     """Coefficient of every other link's material."""
     table: NotNegative[float] = 0.5
     """Coefficient of the table's material. Not in the paper."""
-    mass_scale: Range = (0.7, 1.3)
+    mass_scale: PositiveRange = (0.7, 1.3)
     """Range of the factor on the object's mass."""
     torsional_friction: Range = (1.0, 1.0)
     """Range of the factor on the torsional friction of the object's pairs."""
-    object_inertia: Range = (1.0, 1.0)
+    object_inertia: PositiveRange = (1.0, 1.0)
     """Range of the factor on the object's inertia, in addition to the factor on its mass."""
     object_com: Range = (0.0, 0.0)
     """Range of the distance [m] by which the object's centre of mass is moved, in any direction."""
@@ -374,7 +371,7 @@ class RandomizationConfig(Checked):
     their mean over the step; a physics step is 1 / ``substeps`` of a control step."""
     hand_latency: Range | None = None
     """The same for the hand, drawn apart from the arm's; None: the hand has the arm's delay."""
-    lost_actions: Range = (0.0, 0.0)
+    lost_actions: Annotated[Range, Rule("shares of at most 1", lambda x: x[1] <= 1)] = (0.0, 0.0)
     """Range of the share of actions that do not arrive: the targets stay where they are. Each episode draws one."""
     observation_latency: Range = (0.0, 0.0)
     """Range of the delay of the observed object pose and cloud [control steps]."""
@@ -399,11 +396,6 @@ class RandomizationConfig(Checked):
         super().__post_init__()
         if self.tracker.jitter and not self.observation_latency[1]:
             raise ValueError("tracker.jitter changes observation_latency, which is 0. Set observation_latency")
-        if self.lost_actions[1] > 1:
-            raise ValueError(f"lost_actions goes up to {self.lost_actions[1]:g}, expected a share of at most 1")
-        for name in ("mass_scale", "object_inertia"):
-            if not getattr(self, name)[0] > 0:
-                raise ValueError(f"{name} begins with {getattr(self, name)[0]}, expected factors above 0")
 
     def draws(self, *names: str) -> bool:
         """Whether one of these ranges differs from its default."""

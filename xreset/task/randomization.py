@@ -50,11 +50,6 @@ def sample_range(count: int, limits: tuple[float, float], generator: torch.Gener
     return low + (high - low) * torch.rand(count, generator=generator, device=generator.device)
 
 
-def sample_mass_scale(count: int, c: RandomizationConfig, generator: torch.Generator) -> Tensor:
-    """[M] factor on the object's mass; 1 if disabled."""
-    return sample_range(count, c.mass_scale if c.enabled else (1.0, 1.0), generator)
-
-
 def sample_offset(count: int, limits: tuple[float, float], generator: torch.Generator) -> Tensor:
     """[M, 3] vectors in any direction, of uniform lengths of a range."""
     direction = torch.randn(count, 3, generator=generator, device=generator.device)

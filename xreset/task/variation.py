@@ -19,7 +19,6 @@ from xreset.task.randomization import (
     own_friction,
     sample_drives,
     sample_friction,
-    sample_mass_scale,
     sample_offset,
     sample_range,
 )
@@ -113,6 +112,7 @@ class Variation:
         """Draw for every world; return pairs of the drawn values [N, ...] and the buffer that they belong to."""
         c = self._config
         n = self._backend.num_worlds
+        mass_scale = c.mass_scale if c.enabled else (1.0, 1.0)
 
         def friction() -> Tensor:
             drawn = sample_friction(n, c, generator) + self._own_friction
@@ -120,7 +120,7 @@ class Variation:
 
         samples: dict[str, Callable[[], Tensor]] = {
             "friction": friction,
-            "object_mass": lambda: self._nominal_mass * sample_mass_scale(n, c, generator),
+            "object_mass": lambda: self._nominal_mass * sample_range(n, mass_scale, generator),
             "drives": lambda: sample_drives(self._is_arm, n, c, generator),
             "torsional_friction": lambda: (
                 self._backend.scene.friction.torsional * sample_range(n, c.torsional_friction, generator)

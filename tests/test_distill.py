@@ -23,11 +23,11 @@ from xreset.learning.checkpoint import read_checkpoint
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.recipes import student_config
 from xreset.learning.run import TEACHER, latest_checkpoint, read_run
-from xreset.learning.shrink import shrink
 from xreset.learning.teacher import load_teacher
 from xreset.learning.train import distill, resume, train
 from xreset.objects.catalogue import load_objects
 from xreset.plugins import make_backend
+from xreset.policies import shipped
 from xreset.policy import OnnxPolicy, check_contract
 from xreset.resets.bank import write_bank
 from xreset.task.config import ObservationConfig, TaskConfig, evaluation_task
@@ -82,9 +82,9 @@ class DistillTest(unittest.TestCase):
         self.addCleanup(env.close)
         return env
 
-    def test_a_shrunk_file_teaches_too(self):
-        shrink(self.teacher / "policy.onnx", self.folder / "small.onnx")
-        load_teacher(self.folder / "small.onnx")  # which compares its actions with the file's
+    def test_every_policy_that_ships_can_teach(self):
+        for file in shipped().values():  # in float16, and of a history of clouds
+            load_teacher(file)  # which compares its actions with the file's
 
     def test_the_run_is_a_policy_that_sees(self):
         info = read_run(self.run_folder)

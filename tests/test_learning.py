@@ -8,7 +8,6 @@ from pathlib import Path
 from unittest import mock
 
 import torch
-from rsl_rl.algorithms import PPO
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
@@ -201,13 +200,11 @@ class StorageTest(unittest.TestCase):
         bias: float = 0.0,
         device: str = "cpu",
         capture: bool = True,
-        beside: bool = True,
         **ppo,
     ) -> tuple[SequencePpo, torch.Tensor, torch.Tensor]:
         """The algorithm, and the mean actions before and after it, on an environment whose reward is -|action - target|.
 
-        ``bias`` is added to the first policy's means; without ``capture`` a GPU is given every kernel of an update by itself, without
-        ``beside`` values are computed before the step.
+        ``bias`` is added to the first policy's means; without ``capture`` a GPU is given every kernel of an update by itself.
         """
 
         class Bandit:
@@ -221,7 +218,6 @@ class StorageTest(unittest.TestCase):
         obs = observations(64).to(device)
         alg = SequencePpo.construct_algorithm(obs, Bandit(), rsl_rl_config(config, 64) | {"multi_gpu": None}, device)
         alg._graphs.active &= capture
-        alg._beside = alg._beside if beside else None
         alg.actor.mlp[-1].bias.data += bias
         obs["perception"] = obs["perception"][:, -1:].expand(-1, 5, -1, -1)  # a scene in which nothing moves
         before = alg.actor(obs).detach()
@@ -259,37 +255,6 @@ class StorageTest(unittest.TestCase):
             self.assertTrue(two._graphs._graphs)
             self.assertGreater(float((plain - before).abs().mean()), 0.05)
             torch.testing.assert_close(captured, plain, rtol=0.0, atol=tolerance)
-
-    def test_acting_is_rsl_rl_s(self):
-        one, two = (self.bandit(iterations=1)[0] for _ in range(2))
-        obs = observations(64)
-        for t in range(4):
-            recorded = []
-            for alg, act in ((one, SequencePpo.act), (two, PPO.act)):
-                torch.manual_seed(t)
-                with torch.no_grad():
-                    act(alg, obs)
-                recorded.append(
-                    {
-                        name: value
-                        for name, value in vars(alg.transition).items()
-                        if value is not None and name != "observations"
-                    }
-                )
-                done = torch.arange(64) % 4 == t
-                alg.process_env_step(obs, torch.ones(64), done, {"time_outs": done.float()})
-            torch.testing.assert_close(*recorded, rtol=0, atol=0)
-        torch.testing.assert_close(one.storage.rewards, two.storage.rewards, rtol=0, atol=0)
-
-    @unittest.skipUnless(
-        torch.cuda.is_available(), "there is no CUDA device: values are computed beside the step on GPUs only"
-    )
-    def test_values_beside_the_step_are_those_in_front_of_it(self):
-        stored = []
-        for beside in (True, False):
-            alg = self.bandit(iterations=3, device="cuda", beside=beside, schedule="fixed", learning_rate=1e-9)[0]
-            stored.append((alg.storage.values.clone(), alg.storage.actions.clone(), alg.storage.returns.clone()))
-        torch.testing.assert_close(*stored)
 
     def test_a_bounds_loss_pulls_means_back_from_beyond_the_limits(self):
         _, before, free = self.bandit(iterations=5, bias=3.0, target=3.0)

@@ -1,4 +1,4 @@
-"""Policies as files: stored in half the size, and found by the name under which they ship."""
+"""Policies as files, and found by the name under which they ship."""
 
 import contextlib
 import json
@@ -12,7 +12,7 @@ from unittest import mock
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 from tensordict import TensorDict
 
 from tests.test_cli import run
@@ -25,7 +25,6 @@ from xreset.errors import PolicyError
 from xreset.eval.policy_spec import load_policy
 from xreset.learning.export import export_onnx
 from xreset.learning.model import PointNetLstmModel
-from xreset.learning.shrink import shrink
 from xreset.policy import OnnxPolicy, policy_contract
 from xreset.task.config import ObservationConfig, TaskConfig, TerminationConfig
 
@@ -62,47 +61,9 @@ class WithPolicy(unittest.TestCase):
         return TensorDict({k: torch.randn(batch, *w, generator=g) for k, w in widths.items()}, batch_size=[batch])
 
 
-class ShrinkTest(WithPolicy):
-    @classmethod
-    def setUpClass(cls):
-        super().setUpClass()
-        cls.small = cls.folder / "small.onnx"
-        shrink(cls.file, cls.small)
-
-    def test_matrices_alone_are_rounded(self):
-        self.assertEqual(OnnxPolicy(self.small).contract, OnnxPolicy(self.file).contract)
-        self.assertNotIn(b".py", self.small.read_bytes())
-        model = onnx.load(str(self.small))
-        onnx.checker.check_model(model, full_check=True)
-        kept = {w.name: w for w in onnx.load(str(self.file)).graph.initializer}
-        halved = 0
-        for weights in model.graph.initializer:
-            exact = kept[weights.name.removesuffix("_float16")]
-            matrix = exact.data_type == TensorProto.FLOAT and len(exact.dims) == 2 and min(exact.dims) > 1
-            self.assertEqual(weights.data_type, TensorProto.FLOAT16 if matrix else exact.data_type, weights.name)
-            rounded = numpy_helper.to_array(exact).astype(np.float16) if matrix else numpy_helper.to_array(exact)
-            np.testing.assert_array_equal(numpy_helper.to_array(weights), rounded)
-            halved += matrix
-        self.assertEqual(halved, 2 + 2 + 3)  # PointNet, LSTM, MLP
-
-    def test_refusals(self):
-        out = self.folder / "none.onnx"
-        with self.assertRaisesRegex(PolicyError, "no weight matrix in float32: it was shrunk before"):
-            shrink(self.small, out)
-        with self.assertRaisesRegex(PolicyError, "no policy file"):
-            shrink(self.folder / "missing.onnx", out)
-        model = onnx.load(str(self.file))
-        weights = next(w for w in model.graph.initializer if w.name == "mlp.0.weight")
-        weights.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weights) * 1e6, weights.name))
-        large = self.folder / "large.onnx"
-        large.write_bytes(model.SerializeToString())
-        with self.assertRaisesRegex(PolicyError, r"weights up to \S+ in mlp\.0\.weight, float16 ends at 65504"):
-            shrink(large, out)
-        weights.CopyFrom(numpy_helper.from_array(np.full(tuple(weights.dims), np.nan, dtype=np.float32), weights.name))
-        large.write_bytes(model.SerializeToString())
-        with self.assertRaisesRegex(PolicyError, "gives numbers that are not finite"):
-            shrink(large, out)
-        self.assertFalse(out.exists())
+class OnnxPolicyTest(WithPolicy):
+    def test_nothing_of_the_exporting_machine_is_in_the_file(self):
+        self.assertNotIn(b".py", self.file.read_bytes())
 
     def test_what_cannot_act_is_refused_before_work_begins(self):
         """One step with zeros at loading: whatever the graph is like, evaluation meets no surprise."""
@@ -162,14 +123,6 @@ class ShrinkTest(WithPolicy):
         damaged.write_bytes(other.SerializeToString())
         with self.assertRaisesRegex(PolicyError, r"takes the inputs \(.x.,\); a policy takes flat, cloud, h_in, c_in"):
             OnnxPolicy(damaged)
-
-    def test_the_command_says_both_sizes_and_may_replace_its_input(self):
-        file = self.folder / "mine.onnx"
-        file.write_bytes(self.file.read_bytes())
-        code, out, _ = run("policies", "shrink", str(file), str(file))
-        self.assertEqual(code, 0)
-        self.assertRegex(out, r"mine\.onnx: 0\.\d\d MB, was 0\.\d\d MB")
-        self.assertEqual(file.read_bytes(), self.small.read_bytes())
 
 
 class ShippedTest(WithPolicy):

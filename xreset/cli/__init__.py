@@ -31,7 +31,7 @@ COMMANDS: dict[str, str] = {
     "play": "Play with a policy in a browser: drag the goal, push the robot, change the engine.",
     "train": "Train a policy.",
     "distill": "Train a policy that sees, by imitating one that is told the object's pose.",
-    "policies": "List the policies that ship with xreset, and shrink exported ones.",
+    "policies": "List the policies that ship with xreset.",
     "eval": "Evaluate a policy or a baseline in one or several engines.",
     "frontier": "Show from which demonstrated states a policy reaches the goal.",
     "stress": "Measure robustness: change stiffness, latency, friction and more, one at a time.",

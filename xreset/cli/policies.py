@@ -1,13 +1,11 @@
-"""``xreset policies``: the cards of those that ship with xreset, and exported ones as files."""
+"""``xreset policies``: the cards of those that ship with xreset."""
 
 from __future__ import annotations
 
 from rich.table import Table
 
 from xreset import policy as policy_files
-from xreset.cli._common import Source
 from xreset.cli._terminal import console
-from xreset.learning import shrink as shrinking
 from xreset.policies import card, shipped
 
 
@@ -33,18 +31,4 @@ def list_() -> None:
         console.print(table)
 
 
-def shrink(policy: Source, out: Source) -> None:
-    """Store a policy's weights in float16, which halves the file. The policy still computes in float32.
-
-    Args:
-        policy: Exported policy (.onnx).
-        out: File to write.
-    """
-    before = (
-        policy.stat().st_size if policy.is_file() else 0
-    )  # now, for the output may replace it; of what is no file, shrinking complains
-    shrinking.shrink(policy, out)
-    console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, was {before / 1e6:.2f} MB")
-
-
-COMMAND = {"list": list_, "shrink": shrink}
+COMMAND = {"list": list_}

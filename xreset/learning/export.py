@@ -10,7 +10,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from rsl_rl.utils import resolve_class
@@ -23,9 +23,11 @@ from xreset.learning.choice import Choice, read_choice
 from xreset.learning.config import rsl_rl_config
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
-from xreset.learning.shrink import drop_exporter_notes
 from xreset.policies import shipped
 from xreset.policy import INPUTS, METADATA_KEY, OUTPUTS, observation_shapes
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
 
 _VERSION_KEY = "xreset-version"
 """Key of the ONNX metadata entry that holds the version and commit of xreset."""
@@ -66,13 +68,21 @@ def export_onnx(
             verbose=False,
         )
         model = onnx.load(str(file))
-    drop_exporter_notes(model)
+    _drop_exporter_notes(model)
     entries = {METADATA_KEY: json.dumps(contract, sort_keys=True), _VERSION_KEY: code_version()}
     if checkpoint is not None:
         entries[_CHECKPOINT_KEY] = file_hash(checkpoint)
     onnx.helper.set_model_props(model, entries)
     with atomic_write(path) as out:
         out.write(model.SerializeToString())
+
+
+def _drop_exporter_notes(model: ModelProto) -> None:
+    """Remove, in place, the exporter's notes on nodes and values: lines of source code with paths of its machine."""
+    graph = model.graph
+    for noted in (graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        del noted.metadata_props[:]
+        noted.doc_string = ""
 
 
 @contextlib.contextmanager

@@ -87,7 +87,6 @@ class SequencePpo(PPO):
         self._rate = torch.tensor(self.learning_rate, device=device, dtype=torch.float32 if on_gpu else torch.float64)
         self._sums = torch.zeros(4, device=device)
         self._worlds = torch.zeros(count // self.num_mini_batches, dtype=torch.long, device=device)
-        self._beside = torch.cuda.Stream(device) if on_gpu else None
         self._graphs = GraphRunner(device)
         self._graphs.active &= not self.is_multi_gpu and count % self.num_mini_batches == 0  # all minibatches alike
 
@@ -178,39 +177,17 @@ class SequencePpo(PPO):
                 state["step"] = state["step"].to(self.device)
 
     def act(self, obs: TensorDict) -> Tensor:
-        """Sample actions. The first step of a run starts from a zero LSTM state, which is stored like any other.
-
-        As rsl-rl does; but on a GPU the values, which no action needs, are computed on a second stream, next to what
-        follows until :meth:`process_env_step`.
-        """
-        actor = self.actor
-        critic = self.critic
-        for model in (actor, critic):
-            if model.is_recurrent and model.get_hidden_state() is None:
+        """Sample actions. The first step of a run starts from a zero LSTM state, which is stored like any other."""
+        for model in (self.actor, self.critic):
+            if model.get_hidden_state() is None:
                 with torch.no_grad():
                     model(obs)
                 h, c = model.get_hidden_state()  # pyright: ignore[reportGeneralTypeIssues]
                 model.reset(hidden_state=(torch.zeros_like(h), torch.zeros_like(c)))
-        step = self.transition
-        step.observations = obs
-        step.hidden_states = (actor.get_hidden_state(), critic.get_hidden_state())
-        if self._beside is not None:
-            self._beside.wait_stream(torch.cuda.current_stream())
-            # what was allocated on one stream must not be freed while another one reads it
-            self._needed = vars(critic).copy()
-        actions = actor(obs, stochastic_output=True).detach()
-        step.actions = actions
-        step.actions_log_prob = actor.get_output_log_prob(actions).detach()
-        step.distribution_params = tuple(p.detach() for p in actor.output_distribution_params)
-        with torch.cuda.stream(self._beside):
-            step.values = critic(obs).detach()
-        return actions
+        return super().act(obs)
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
         """Record one environment step; ``extras["faulty"]`` [N] bool marks worlds whose step teaches nothing."""
-        if self._beside is not None:
-            torch.cuda.current_stream().wait_stream(self._beside)
-            self._needed = {}
         step = self.storage.step
         if not step:
             steps = self.storage.num_transitions_per_env

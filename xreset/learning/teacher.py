@@ -93,7 +93,7 @@ def _weights(graph: GraphProto) -> dict[str, Tensor]:
 
 
 def _arrays(graph: GraphProto) -> Iterator[tuple[str, Tensor]]:
-    """Yield the names and values of a graph's constants; shrunk ones by the name before."""
+    """Yield the names and values of a graph's constants; those stored in float16 by the name before."""
     from onnx import numpy_helper
 
     for constant in graph.initializer:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from xreset.backends.rigid import Inertia, Mechanism, rotate
+from xreset.backends.rigid import OTHER_LINK, Inertia, Mechanism, rotate
 from xreset.geometry.urdf import Joint
 from xreset.spec import Shape
 
@@ -26,8 +26,8 @@ class Part:
     link: str
     """URDF link whose shapes the part has."""
     shapes: tuple[Shape, ...]
-    tip: int | None
-    """Index of the fingertip that the part belongs to."""
+    owner: int
+    """Index of the fingertip that the part belongs to, or ``OTHER_LINK``."""
 
 
 def is_hull(shapes: Sequence[Shape]) -> bool:
@@ -53,7 +53,9 @@ def robot_parts(robot: Mechanism) -> list[Part]:
     for i, body in enumerate(robot.bodies):
         for link in dict.fromkeys((body.name, *(item.link for item in body.shapes))):
             groups = link_groups([item.shape for item in body.shapes if item.link == link])
-            parts = [Part(body=i, link=link, shapes=group, tip=robot.tip_of.get(link)) for group in groups]
+            parts = [
+                Part(body=i, link=link, shapes=group, owner=robot.tip_of.get(link, OTHER_LINK)) for group in groups
+            ]
             if link == body.name:
                 moving.append(parts.pop(0))
             fixed += parts

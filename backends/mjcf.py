@@ -20,15 +20,13 @@ import numpy as np
 
 from xreset.backends.mjcf_model import (
     MIN_FRICTION,
-    OTHER_LINK,
-    TABLE,
     SceneModel,
     add_sensors,
     body_name,
     locate,
     pos_quat,
 )
-from xreset.backends.rigid import Inertia, Mechanism, MovingJoints, mechanism, object_inertia
+from xreset.backends.rigid import OTHER_LINK, TABLE, Inertia, Mechanism, MovingJoints, mechanism, object_inertia
 from xreset.errors import ObjectError, XResetError
 from xreset.geometry.urdf import Joint
 from xreset.physics import KnownDifference

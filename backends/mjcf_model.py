@@ -9,13 +9,11 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xreset.backends.rigid import Body, Mechanism, MovingJoints
+from xreset.backends.rigid import OTHER_LINK, TABLE, Body, Mechanism, MovingJoints
 from xreset.spec import SceneSpec
 
-TABLE = -1
-OTHER_LINK = -2
 OBJECT = -3
-"""Values of :attr:`SceneModel.geom_role` next to the fingertip indices 0..E-1."""
+"""Value of :attr:`SceneModel.geom_role` next to what touches an object."""
 
 MIN_FRICTION = 1e-4
 """Sliding friction of the object's own geoms, and the smallest of any pair."""

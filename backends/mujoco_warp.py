@@ -152,12 +152,12 @@ class MujocoWarpBackend(Backend):
     def set_state(self, state: State, worlds: Tensor | None = None) -> None:
         self._must_be_open()
         index = self._selected(worlds)
-        new = self._checked_state(state, len(index))
-        if not len(index):
-            return
+        for name, value in self._checked_state(state, len(index)).items():
+            self._coming[name][index] = value
+        self._mask.zero_()
+        self._mask[index] = True
         with self._on_stream():
-            self._write_state(index.contiguous(), self._everything[: len(index)], new)
-            self._run("refresh")
+            self._run("begin")
 
     def state(self) -> State:
         self._must_be_open()
@@ -270,10 +270,8 @@ class MujocoWarpBackend(Backend):
         self._links = Links(**{field.name: view[f"link_{field.name}"] for field in fields(Links)})
         self._contacts = Contacts(**{field.name: view[field.name] for field in fields(Contacts)})
         self._every_world = torch.arange(n, device=self.device)
-        self._everything = torch.ones(n, dtype=torch.bool, device=self.device)
-        self._mask = torch.zeros_like(self._everything)
+        self._mask = torch.zeros(n, dtype=torch.bool, device=self.device)
         self._coming = {field.name: torch.zeros_like(view[field.name]) for field in fields(State)}
-        self._coming["object_quat"][:, 0] = 1.0
         self._name_parameters()
 
     def _name_parameters(self) -> None:
@@ -301,15 +299,13 @@ class MujocoWarpBackend(Backend):
         Even on the CPU a graph saves most of the time.
         """
         step = partial(engine_step(self._warp_device, self._model), self._model, self._data)
-        begin = partial(self._write_state, self._every_world, self._mask, self._coming)
         # The kinematics of the present positions are always there: a step begins after them, and all that changes them
         # ends with them.
         kinematics = partial(mjw.fwd_kinematics, self._model, self._data)
         sequences: dict[str, tuple[Callable[[], None], ...]] = {
-            "refresh": (kinematics, self._read_motion),
             "step": (step, kinematics),
             "read": (self._read_contacts, self._read_motion),
-            "begin": (begin, self._write_parameters, kinematics, self._read_motion),
+            "begin": (self._write_state, self._write_parameters, kinematics, self._read_motion),
             "parameters": (self._write_parameters, kinematics),
         }
         for part in chain.from_iterable(sequences.values()):
@@ -390,21 +386,20 @@ class MujocoWarpBackend(Backend):
             ],
         )
 
-    def _write_state(self, worlds: Tensor, chosen: Tensor, new: dict[str, Tensor]) -> None:
-        """Write the chosen ones of M new states into ``worlds`` [M]."""
+    def _write_state(self) -> None:
+        """Write the coming state of the worlds of the mask."""
         d = self._data
         out = self._out
         at = self._at
         values = []
-        for name, value in new.items():
+        for name, value in self._coming.items():
             vector = {"object_quat": wp.quat}.get(name, wp.vec3) if name.startswith("object") else None
             values.append(wp.from_torch(value, dtype=vector))
         wp.launch(
             kernels.write_state,
-            dim=len(worlds),
+            dim=self.num_worlds,
             inputs=[
-                wp.from_torch(worlds),
-                wp.from_torch(chosen),
+                wp.from_torch(self._mask),
                 *values,
                 *self._addresses,
                 *self._mimic,

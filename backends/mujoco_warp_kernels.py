@@ -14,7 +14,8 @@ from typing import Any
 
 import warp as wp
 
-from xreset.backends.mjcf_model import OBJECT, TABLE
+from xreset.backends.mjcf_model import OBJECT
+from xreset.backends.rigid import TABLE
 
 _OBJECT = wp.constant(OBJECT)
 _TABLE = wp.constant(TABLE)
@@ -44,8 +45,7 @@ def _conjugate(q: wp.quat) -> wp.quat:
 
 @wp.kernel(enable_backward=False)
 def write_state(
-    # The new state of M worlds; only the chosen ones take it.
-    worlds: wp.array[wp.int64],
+    # The new state of each world; only the chosen ones take it.
     chosen: wp.array[wp.bool],
     joint_pos: wp.array2d[float],
     joint_vel: wp.array2d[float],
@@ -78,25 +78,24 @@ def write_state(
     table_force: wp.array[wp.vec3],
 ):
     """Set the state of some worlds and clear what remains of their past."""
-    m = wp.tid()
-    if not chosen[m]:
+    world = wp.tid()
+    if not chosen[world]:
         return
-    world = int(worlds[m])
     for j in range(joint_qpos.shape[0]):
-        qpos[world, joint_qpos[j]] = joint_pos[m, j]
-        qvel[world, joint_dof[j]] = joint_vel[m, j]
-        ctrl[world, j] = joint_target[m, j]
+        qpos[world, joint_qpos[j]] = joint_pos[world, j]
+        qvel[world, joint_dof[j]] = joint_vel[world, j]
+        ctrl[world, j] = joint_target[world, j]
     for i in range(mimic_qpos.shape[0]):
         j = mimic_source[i]
-        qpos[world, mimic_qpos[i]] = mimic_multiplier[i] * joint_pos[m, j] + mimic_offset[i]
-        qvel[world, mimic_dof[i]] = mimic_multiplier[i] * joint_vel[m, j]
-    quat = object_quat[m]
+        qpos[world, mimic_qpos[i]] = mimic_multiplier[i] * joint_pos[world, j] + mimic_offset[i]
+        qvel[world, mimic_dof[i]] = mimic_multiplier[i] * joint_vel[world, j]
+    quat = object_quat[world]
     length = wp.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
     unit = wp.quat(quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length)
-    turn = _rotate(_conjugate(unit), object_angvel[m])  # a free joint's angular velocity is in the body's frame
+    turn = _rotate(_conjugate(unit), object_angvel[world])  # a free joint's angular velocity is in the body's frame
     for k in range(3):
-        qpos[world, object_qpos + k] = object_pos[m][k]
-        qvel[world, object_dof + k] = object_linvel[m][k]
+        qpos[world, object_qpos + k] = object_pos[world][k]
+        qvel[world, object_dof + k] = object_linvel[world][k]
         qvel[world, object_dof + 3 + k] = turn[k]
     for k in range(4):
         qpos[world, object_qpos + 3 + k] = unit[k]

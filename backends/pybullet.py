@@ -37,6 +37,8 @@ from xreset.backends.bullet_models import (
 )
 from xreset.backends.pool import PoolBackend, World, is_finite
 from xreset.backends.rigid import (
+    OTHER_LINK,
+    TABLE,
     Inertia,
     TrackedFrames,
     conjugate,
@@ -46,6 +48,7 @@ from xreset.backends.rigid import (
     nearer,
     object_inertia,
     rotate,
+    sum_contacts,
 )
 from xreset.errors import XResetError
 from xreset.physics import Capability, unavailable
@@ -177,10 +180,7 @@ class PybulletWorld(World):
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.contacts`. The forces are those of the last internal step."""
-        tips = len(self._scene.robot.fingertips)
-        tip_force = np.zeros((tips, 3))
-        tip_touch = np.zeros(tips, dtype=bool)
-        table_force = np.zeros(3)
+        found = []
         # All contacts: when asked for a body, PyBullet swaps the two bodies and the normal, but not the friction.
         for contact in () if self._fresh else self._p.getContactPoints():
             _, first, second, first_link, second_link, _, _, normal, _, press, *friction = contact
@@ -194,11 +194,10 @@ class PybulletWorld(World):
                 body = first
                 link = first_link
             if body == self._table:
-                table_force += force
-            elif (tip := self._parts[link].tip) is not None and press > 0:
-                tip_force[tip] += force
-                tip_touch[tip] = True
-        return tip_force, tip_touch, table_force
+                found.append((TABLE, force))
+            elif press > 0:
+                found.append((self._parts[link].owner, force))
+        return sum_contacts(len(self._scene.robot.fingertips), found)
 
     def mass_properties(self) -> list[Inertia]:
         """See :meth:`World.mass_properties`. The object is loaded in the frame of its inertia."""
@@ -234,7 +233,7 @@ class PybulletWorld(World):
             self._set_surface(self._object, piece, 1.0, 0.0)
         self._set_surface(self._table, -1, table, self._torsional)
         for i, part in enumerate(self._parts):
-            self._set_surface(self._robot, i, link if part.tip is None else tip, self._torsional)
+            self._set_surface(self._robot, i, link if part.owner == OTHER_LINK else tip, self._torsional)
 
     def _set_surface(self, body: int, link: int, friction: float, torsional: float) -> None:
         self._p.changeDynamics(body, link, lateralFriction=friction, spinningFriction=torsional)

@@ -7,7 +7,7 @@ need every step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -290,6 +290,28 @@ def _fused_inertia(robot: RobotSpec, links: list[Link], frames: dict[str, tuple[
             r = point - com  # parallel axes
             inertia += R @ link.inertia @ R.T + link.mass * (r @ r * np.eye(3) - np.outer(r, r))
     return principal(mass, com, inertia, RobotError, f"robot {robot.name!r}: the link {links[0].name!r}")
+
+
+# Contacts -------------------------------------------------------------------------------------------------------------
+
+TABLE = -1
+OTHER_LINK = -2
+"""What touches the object: these, or the index of a fingertip."""
+
+
+def sum_contacts(tips: int, contacts: Iterable[tuple[int, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return tip force [E, 3], tip touch [E] and table force [3], given what touches the object and with which
+    force."""
+    tip_force = np.zeros((tips, 3))
+    tip_touch = np.zeros(tips, dtype=bool)
+    table_force = np.zeros(3)
+    for owner, force in contacts:
+        if owner == TABLE:
+            table_force += force
+        elif owner >= 0:
+            tip_force[owner] += force
+            tip_touch[owner] = True
+    return tip_force, tip_touch, table_force
 
 
 # Few quaternions ------------------------------------------------------------------------------------------------------

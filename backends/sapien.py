@@ -26,6 +26,8 @@ import numpy as np
 
 from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import (
+    OTHER_LINK,
+    TABLE,
     Inertia,
     TrackedFrames,
     cross,
@@ -35,6 +37,7 @@ from xreset.backends.rigid import (
     nearer,
     object_inertia,
     rotate,
+    sum_contacts,
 )
 from xreset.backends.sapien_robot import OBJECT_BIT, TABLE_BIT, SapienJoints, self_collision_bits
 from xreset.geometry.urdf import Joint
@@ -46,9 +49,6 @@ _POSITION_ITERATIONS = 20
 as slow."""
 _CONTACT_OFFSET = 0.001
 """Distance [m] at which contacts are generated."""
-_TABLE = -1
-_LINK = -2
-"""What a shape belongs to: these, or the index of a fingertip."""
 
 
 class SapienWorld(World):
@@ -130,11 +130,8 @@ class SapienWorld(World):
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         tips = len(self._mechanism.robot.fingertips)
-        tip_force = np.zeros((tips, 3))
-        tip_touch = np.zeros(tips, dtype=bool)
-        table_force = np.zeros(3)
         if self._last_step is None:
-            return tip_force, tip_touch, table_force
+            return sum_contacts(tips, ())
         owners, points, forces = self._contact_points()
         if owners:
             pose = self._object.entity_pose
@@ -142,13 +139,7 @@ class SapienWorld(World):
             coefficients = np.array([self._friction[_material(owner)] for owner in owners])
             missing = self._missing_wrench(self._last_step, arms, forces)
             forces = forces + friction_forces(arms, forces, coefficients, *missing)
-        for owner, force in zip(owners, forces, strict=True):
-            if owner == _TABLE:
-                table_force += force
-            elif owner >= 0:
-                tip_force[owner] += force
-                tip_touch[owner] = True
-        return tip_force, tip_touch, table_force
+        return sum_contacts(tips, zip(owners, forces, strict=True))
 
     def mass_properties(self) -> list[Inertia]:
         found = []
@@ -185,7 +176,7 @@ class SapienWorld(World):
     def _add_table(self, scene: SceneSpec) -> None:
         body = self._sapien.physx.PhysxRigidStaticComponent()
         shape = Shape(geometry=Geometry(kind="box", size=scene.table.half_size))
-        self._attach(body, shape, _TABLE, (TABLE_BIT, OBJECT_BIT))
+        self._attach(body, shape, TABLE, (TABLE_BIT, OBJECT_BIT))
         self._add(body, "table", self._sapien.Pose([*scene.table.center, -scene.table.half_size[2]]))
 
     def _add_object(self, pieces: Sequence[Shape]) -> Any:
@@ -207,7 +198,7 @@ class SapienWorld(World):
             for part in body.shapes:
                 bits, partner_bits = self_bits.get(part.link, (0, 0))
                 table_bit = 0 if part.link in robot.table_exclude else TABLE_BIT
-                owner = self._mechanism.tip_of.get(part.link, _LINK)
+                owner = self._mechanism.tip_of.get(part.link, OTHER_LINK)
                 self._attach(link, part.shape, owner, (bits, partner_bits | OBJECT_BIT | table_bit))
             if body.inertia is not None:
                 self._set_inertia(link, body.inertia)
@@ -360,7 +351,7 @@ _NO_LIMIT = 1e3
 
 def _material(owner: int) -> str:
     """Return the material of what a shape belongs to."""
-    return {_TABLE: "table", _LINK: "link"}.get(owner, "tip")
+    return {TABLE: "table", OTHER_LINK: "link"}.get(owner, "tip")
 
 
 def _rotation(quat: np.ndarray) -> np.ndarray:

@@ -136,29 +136,22 @@ _SELF_BITS = range(2, 32)
 def self_collision_bits(robot: Mechanism) -> dict[str, tuple[int, int]]:
     """Return link -> first and second group, such that exactly the links that may collide with each other do.
 
-    A bit means "this link collides with those": one link has it in its first group, its partners in their second group.
-    The link with most partners left takes the next bit, until every pair is covered.
+    Each link has a bit of its own in the first group, and those of its partners in the second group.
 
     Raises:
-        XResetError: the 30 bits do not suffice.
+        XResetError: the robot has more links than there are bits.
     """
     links = robot.robot.self_collision_links
-    partners = {}
-    for a in links:
-        partners[a] = {b for b in links if robot.may_collide(a, b)}
-    first = dict.fromkeys(links, 0)
-    second = dict.fromkeys(links, 0)
-    bits = iter(_SELF_BITS)
-    while any(partners.values()):
-        bit = next(bits, None)
-        if bit is None:
-            raise XResetError(
-                f"Robot {robot.robot.name!r}: {len(links)} links collide with one another in more ways than PhysX's "
-                f"{len(_SELF_BITS)} collision bits can say. Shorten self_collision_links (31 links always fit)."
-            )
-        hub = max(partners, key=lambda link: len(partners[link]))
-        first[hub] |= 1 << bit
-        for partner in partners.pop(hub):
-            second[partner] |= 1 << bit
-            partners[partner].discard(hub)
-    return {link: (first[link], second[link]) for link in links}
+    if len(links) > len(_SELF_BITS):
+        raise XResetError(
+            f"Robot {robot.robot.name!r}: {len(links)} links may collide with one another, and PhysX has bits for "
+            f"{len(_SELF_BITS)}. Shorten self_collision_links."
+        )
+    groups = {}
+    for link, bit in zip(links, _SELF_BITS, strict=False):
+        partners = 0
+        for other, other_bit in zip(links, _SELF_BITS, strict=False):
+            if robot.may_collide(link, other):
+                partners |= 1 << other_bit
+        groups[link] = (1 << bit, partners)
+    return groups

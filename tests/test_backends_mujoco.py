@@ -23,11 +23,12 @@ from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench, snapshot
 from xreset.backends.conformance.scene import gripper, objects, scene, shape, solid
 from xreset.backends.mjcf import compile_scene
-from xreset.backends.mjcf_model import OBJECT, OTHER_LINK, TABLE, SceneModel
+from xreset.backends.mjcf_model import OBJECT, SceneModel
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.mujoco_warp import MujocoWarpBackend
 from xreset.backends.mujoco_warp_setup import contact_room, differing_fields
 from xreset.backends.mujoco_warp_step import ForkedStep, constraints, finish, smooth_dynamics
+from xreset.backends.rigid import OTHER_LINK, TABLE
 from xreset.errors import BackendUnavailableError, ObjectError, RobotError, XResetError
 from xreset.physics import Backend
 from xreset.plugins import device_for

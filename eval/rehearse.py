@@ -17,22 +17,22 @@ from pathlib import Path
 import numpy as np
 
 from xreset.demos.synth import synthesize
+from xreset.env import ManipulationEnv
 from xreset.errors import XResetError
 from xreset.eval.metrics import EpisodeMetrics, MetricsConfig
 from xreset.eval.pages import render
 from xreset.eval.plots import COLORS, svg
 from xreset.eval.policy_spec import PolicySpec, load_policy
-from xreset.eval.rollout import Episode, Round, episode_of, episode_starts, play_rounds
+from xreset.eval.rollout import Episode, episode_of, episode_starts, play_rounds
 from xreset.eval.sensitivity import SWEEPS, Property, amount, chosen, nominal_task
-from xreset.eval.stress import COSTLY, Curve, Point, Stress, curve, draw_curves, plot_size
+from xreset.eval.stress import COSTLY, Point, Stress, by_property, draw_curves, plot_size, sweep
 from xreset.eval.trial import Engine, Trial, engine, load_trial
 from xreset.files import claim_folder, write_json, write_whole
 from xreset.inputs import Data
 from xreset.live.engine import begin, make_controller
 from xreset.live.faults import Faults, FaultyDriver
-from xreset.plugins import backend_class
 from xreset.resets.distribution import Reset
-from xreset.runtime import Controller, OnnxActor, Runner
+from xreset.runtime import OnnxActor, Runner
 from xreset.task.terminations import out_of_bounds
 
 SCHEMA = "xreset-rehearsal/1"
@@ -66,35 +66,41 @@ def _published(share: float) -> Faults:
     )
 
 
-def _fault(name: str, unit: str, *values: float, needs_wrench: bool = False) -> Property:
-    return Property(name=name, unit=unit, values=values, nominal=0.0, needs="object_wrench" if needs_wrench else None)
+@dataclass(frozen=True, kw_only=True)
+class Fault(Property):
+    """A fault between policy and robot, and what makes it of a value in the property's unit."""
+
+    make: Callable[[float], Faults]
+    nominal: float = 0.0
 
 
-LOOP: dict[Property, Callable[[float], Faults]] = {
-    _fault("tracker interval", "ms", 33, 67, 100): lambda x: Faults(tracker_interval=x / 1000),
-    _fault("pose delay", "ms", 33, 100, 200): lambda x: _tracked(pose_delay=x / 1000, pose_jitter=0.2 * x / 1000),
-    _fault("position noise", "mm", 5, 10): lambda x: _tracked(position_noise=x / 1000),
-    _fault("position bias", "mm", 5, 10): lambda x: _tracked(position_bias=x / 1000),
-    _fault("angle noise", "degrees", 3.75, 7.5): lambda x: _tracked(angle_noise=x * _DEGREE),
-    _fault("angle bias", "degrees", 3.75, 7.5): lambda x: _tracked(angle_bias=x * _DEGREE),
-    _fault("lost frames", "s", 0.25, 0.5): lambda x: _tracked(lost_frames=x),
-    _fault("action delay", "ms", 17, 33, 67, 133): lambda x: Faults(arm_delay=x / 1000, hand_delay=x / 1000),
-    _fault("missed deadlines", "% of the steps", 5, 20): lambda x: Faults(missed_deadlines=x / 100),
-    _fault("object push", "m/s", 0.25, 0.5, 1.0, needs_wrench=True): lambda x: Faults(object_push=x),
-    _fault("arm push", "of the torque", 0.25, 0.5, 1.0): lambda x: Faults(arm_push=x),
-    _fault("published faults", "times their ranges", 0.5, 1.0, needs_wrench=True): _published,
-}
-"""Faults of the loop, and what makes them of a value in the property's unit."""
-_MAKERS = {prop.name: make for prop, make in LOOP.items()}
+def _fault(name: str, unit: str, values: tuple[float, ...], make: Callable[[float], Faults]) -> Fault:
+    pushes_object = name in ("object push", "published faults")
+    return Fault(name=name, unit=unit, values=values, make=make, needs="object_wrench" if pushes_object else None)
 
 
-def _physical() -> tuple[Property, ...]:
-    by_name = {prop.name: prop for prop in SWEEPS}
-    gain = replace(by_name["force gain"], values=(0.0, 0.5, 2.0))
-    return by_name["object mass"], by_name["object friction"], gain
-
-
-PROPERTIES = (*LOOP, *_physical())
+LOOP = (
+    _fault("tracker interval", "ms", (33, 67, 100), lambda x: Faults(tracker_interval=x / 1000)),
+    _fault("pose delay", "ms", (33, 100, 200), lambda x: _tracked(pose_delay=x / 1000, pose_jitter=0.2 * x / 1000)),
+    _fault("position noise", "mm", (5, 10), lambda x: _tracked(position_noise=x / 1000)),
+    _fault("position bias", "mm", (5, 10), lambda x: _tracked(position_bias=x / 1000)),
+    _fault("angle noise", "degrees", (3.75, 7.5), lambda x: _tracked(angle_noise=x * _DEGREE)),
+    _fault("angle bias", "degrees", (3.75, 7.5), lambda x: _tracked(angle_bias=x * _DEGREE)),
+    _fault("lost frames", "s", (0.25, 0.5), lambda x: _tracked(lost_frames=x)),
+    _fault("action delay", "ms", (17, 33, 67, 133), lambda x: Faults(arm_delay=x / 1000, hand_delay=x / 1000)),
+    _fault("missed deadlines", "% of the steps", (5, 20), lambda x: Faults(missed_deadlines=x / 100)),
+    _fault("object push", "m/s", (0.25, 0.5, 1.0), lambda x: Faults(object_push=x)),
+    _fault("arm push", "of the torque", (0.25, 0.5, 1.0), lambda x: Faults(arm_push=x)),
+    _fault("published faults", "times their ranges", (0.5, 1.0), _published),
+)
+"""Faults of the loop."""
+_PHYSICAL = {prop.name: prop for prop in SWEEPS}
+PROPERTIES: tuple[Property, ...] = (
+    *LOOP,
+    _PHYSICAL["object mass"],
+    _PHYSICAL["object friction"],
+    replace(_PHYSICAL["force gain"], values=(0.0, 0.5, 2.0)),
+)
 """All that is tried, in the order of the page. The physical properties are those of :mod:`xreset.eval.sensitivity`; a
 force gain of 0 is a robot that does not measure forces."""
 
@@ -108,23 +114,14 @@ class Rehearsal(Stress):
     """Why the runner stopped robots, and how many episodes it stopped for this reason."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Criterion:
-    """What a policy may lose at most, to be tried on a robot."""
-
-    option: str
-    value: float
-    most: float
-    """Points of task progress, as a share."""
-
-
 CRITERIA = (
-    Criterion(option="pose-delay", value=200, most=0.03),
-    Criterion(option="action-delay", value=67, most=0.04),
-    Criterion(option="action-delay", value=133, most=0.10),
-    Criterion(option="published-faults", value=1.0, most=0.10),
+    ("pose-delay", 200, 0.03),
+    ("action-delay", 67, 0.04),
+    ("action-delay", 133, 0.10),
+    ("published-faults", 1.0, 0.10),
 )
-"""The ranges are those of the published training; the bounds are this project's choice."""
+"""Fault, its value, and the share of task progress that it may cost at most. The ranges are those of the published
+training; the bounds are this project's choice."""
 LEAST = 0.5
 """Task progress without faults, below which a policy is not worth a robot."""
 
@@ -169,7 +166,7 @@ def rehearse(
         device: where GPU engines run: cpu or cuda.
         real_time: whether the simulation waits for the wall clock.
         out: folder for ``ENGINE.json`` and ``index.html``; default: ``rehearsal`` next to the policy's evaluations.
-        progress: called with (engine, episodes done, episodes in all).
+        progress: called with (engine, runs done, runs in all).
 
     Returns:
         The results that were written, in the order of the engines. :func:`judge` has the verdict.
@@ -191,145 +188,84 @@ def rehearse(
     wanted = (engines,) if isinstance(engines, str) else engines
     opened = [engine(each, device=device) if isinstance(each, str) else each for each in wanted]
     folder = Path(out) if out else spec.folder.parent / "rehearsal"
-    with claim_folder(folder):
-        return _rehearsed(spec, actor, trial, opened, properties, episodes, real_time, folder, progress)
-
-
-def _rehearsed(
-    policy: PolicySpec,
-    actor: OnnxActor,
-    trial: Trial,
-    engines: Sequence[Engine],
-    properties: Sequence[Property],
-    repetitions: int,
-    real_time: bool,
-    out: Path,
-    progress: Callable[[str, int, int], None],
-) -> list[Rehearsal]:
     found: list[Rehearsal] = []
-    for place in engines:
-        able = backend_class(place.name).capabilities
-        usable = [prop for prop in properties if prop.needs is None or prop.needs in able]
-        settings: list[tuple[Property, float]] = []
-        for prop in usable:
-            settings += [(prop, value) for value in prop.values]
-        total = (1 + len(settings)) * repetitions * len(trial.bank.sequence_name)
+    with claim_folder(folder):
+        for place in opened:
+            stopped: Counter[str] = Counter()
 
-        def count(done: int, name: str = place.name, total: int = total) -> None:
-            progress(name, done, total)
-
-        player = _Player(actor, place, repetitions, real_time, count)
-        # Faults of the loop can differ from world to world, so they are played together.
-        in_loop = [(prop, value) for prop, value in settings if prop.name in _MAKERS]
-        faults = [Faults(), *(_setting(trial, prop, value)[1] for prop, value in in_loop)]
-        nominal, *others = player.play(replace(trial, task=nominal_task(trial.task)), faults)
-        episodes = dict(zip(in_loop, others, strict=True))
-        for prop, value in settings:
-            if (prop, value) not in episodes:
+            def play(
+                prop: Property | None, value: float, place: Engine = place, stopped: Counter[str] = stopped
+            ) -> tuple[Episode, ...]:
                 changed, fault = _setting(trial, prop, value)
-                (episodes[prop, value],) = player.play(changed, [fault])
-        curves = []
-        for prop in usable:
-            swept = {value: episodes[prop, value] for value in prop.values}
-            curves.append(curve(prop, nominal, swept))
-        card = Rehearsal.of(
-            policy,
-            trial,
-            place,
-            nominal,
-            curves=tuple(curves),
-            left_out=tuple(prop.option for prop in properties if prop not in usable),
-            stopped=dict(player.stopped),
-        )
-        write_json(out / f"{place.name}.json", asdict(card))
-        found.append(card)
-        write_whole(out / "index.html", page(found))
+                return _play(actor, place, changed, fault, episodes, real_time, stopped)
+
+            card = sweep(Rehearsal, spec, trial, place, properties, play, folder, progress)
+            card = replace(card, stopped=dict(stopped))
+            write_json(folder / f"{place.name}.json", asdict(card))
+            found.append(card)
+            write_whole(folder / "index.html", page(found))
     return found
 
 
-def _setting(trial: Trial, prop: Property, value: float) -> tuple[Trial, Faults]:
+def _setting(trial: Trial, prop: Property | None, value: float) -> tuple[Trial, Faults]:
     """Return what is played with one property at a value.
 
     Raises:
         XResetError: the property cannot have the value.
     """
-    make = _MAKERS.get(prop.name)
-    if make is None:
-        return replace(trial, task=prop.set_in(nominal_task(trial.task), value)), Faults()
+    task = nominal_task(trial.task)
+    if prop is None:
+        return replace(trial, task=task), Faults()
+    if not isinstance(prop, Fault):
+        return replace(trial, task=prop.set_in(task, value)), Faults()
     try:
-        return replace(trial, task=nominal_task(trial.task)), make(value)
+        return replace(trial, task=task), prop.make(value)
     except ValueError as error:
         raise XResetError(f"{prop.option} {amount(prop.unit, value)} cannot be tried: {error}.") from None
 
 
-class _Player:
-    """Plays episodes through the loop in one engine."""
+def _play(
+    actor: OnnxActor,
+    engine: Engine,
+    trial: Trial,
+    fault: Faults,
+    repetitions: int,
+    real_time: bool,
+    stopped: Counter[str],
+) -> tuple[Episode, ...]:
+    """Play every demonstration through the loop with a fault; count in ``stopped`` why the runner stopped robots."""
+    bank = trial.bank
+    sequence = np.repeat(np.arange(len(bank.sequence_name)), repetitions)
+    repetition = np.tile(np.arange(repetitions), len(bank.sequence_name))
+    objects = [trial.names.index(name) for name in bank.sequence_object[sequence]]
+    starts = trial.starts()
+    found: dict[int, Episode] = {}
 
-    def __init__(
-        self,
-        actor: OnnxActor,
-        engine: Engine,
-        repetitions: int,
-        real_time: bool,
-        count: Callable[[int], None],
-    ) -> None:
-        self._actor = actor
-        self._engine = engine
-        self._repetitions = repetitions
-        self._real_time = real_time
-        self._count = count
-        self._done = 0
-        self.stopped: Counter[str] = Counter()
+    def start(items: np.ndarray) -> Reset:
+        return episode_starts(starts, sequence[items], repetition[items], trial.seed)
 
-    def play(self, trial: Trial, faults: Sequence[Faults]) -> list[tuple[Episode, ...]]:
-        """Play every demonstration with each of the faults; return the episodes of each."""
-        bank = trial.bank
-        demonstrations = np.repeat(np.arange(len(bank.sequence_name)), self._repetitions)
-        sequence = np.tile(demonstrations, len(faults))
-        repetition = np.tile(np.arange(self._repetitions), len(sequence) // self._repetitions)
-        objects = [trial.names.index(name) for name in bank.sequence_object[sequence]]
-        starts = trial.starts()
-        found: dict[int, Episode] = {}
-        controller = None
+    with closing(play_rounds(engine, trial, objects, start)) as rounds:
+        for r in rounds:
+            env = r.env
+            controller = make_controller(env, actor)
+            begin(controller, env)
+            result = EpisodeMetrics(env.reading(), env.goal_pos, env.goal_quat, r.points, MetricsConfig())
 
-        def start(items: np.ndarray) -> Reset:
-            return episode_starts(starts, sequence[items], repetition[items], trial.seed)
+            def look(step: int, env: ManipulationEnv = env, result: EpisodeMetrics = result) -> None:
+                reading = env.reading()
+                table = env.backend.scene.table
+                result.update(reading, out_of_bounds(reading.task_state.object_pos, table, env.task.termination))
 
-        with closing(play_rounds(self._engine, trial, objects, start)) as rounds:
-            for r in rounds:
-                if controller is None:
-                    controller = make_controller(r.env, self._actor)
-                begin(controller, r.env)
-                of_items = [faults[item // len(demonstrations)] for item in r.items]
-                seeds = [(trial.seed, int(sequence[item]), int(repetition[item])) for item in r.items]
-                result = self._play_round(r, controller, of_items, seeds)
-                for world in r.fresh:
-                    item = int(r.items[world])
-                    found[item] = episode_of(result, world, bank, int(sequence[item]), int(repetition[item]))
-                self._done += len(r.fresh)
-                self._count(self._done)
-        ordered = [found[item] for item in sorted(found)]
-        size = len(demonstrations)
-        return [tuple(ordered[i * size : (i + 1) * size]) for i in range(len(faults))]
-
-    def _play_round(
-        self, r: Round, controller: Controller, faults: list[Faults], seeds: Sequence[Sequence[int]]
-    ) -> EpisodeMetrics:
-        env = r.env
-        result = EpisodeMetrics(env.reading(), env.goal_pos, env.goal_quat, r.points, MetricsConfig())
-
-        def look(step: int) -> None:
-            reading = env.reading()
-            table = env.backend.scene.table
-            result.update(reading, out_of_bounds(reading.task_state.object_pos, table, env.task.termination))
-
-        driver = FaultyDriver(env, faults, seeds, look, real_time=self._real_time)
-        outcome = Runner(controller, driver).run(env.max_episode_length * controller.dt)
-        for world in r.fresh:
-            reason = outcome.reasons[world]
-            if reason is not None:
-                self.stopped[re.sub(r"-?\d+\.\d+", "...", reason)] += 1
-        return result
+            seeds = [(trial.seed, int(sequence[item]), int(repetition[item])) for item in r.items]
+            driver = FaultyDriver(env, [fault] * env.num_envs, seeds, look, real_time=real_time)
+            outcome = Runner(controller, driver).run(env.max_episode_length * controller.dt)
+            for world in r.fresh:
+                item = int(r.items[world])
+                found[item] = episode_of(result, world, bank, int(sequence[item]), int(repetition[item]))
+                reason = outcome.reasons[world]
+                if reason is not None:
+                    stopped[re.sub(r"-?\d+\.\d+", "...", reason)] += 1
+    return tuple(found[item] for item in sorted(found))
 
 
 def judge(found: Sequence[Rehearsal]) -> Verdict:
@@ -343,21 +279,22 @@ def judge(found: Sequence[Rehearsal]) -> Verdict:
     for card in found:
         if card.task_progress < LEAST:
             against.append(f"{card.backend}: only {100 * card.task_progress:.0f} % without any fault.")
-        for criterion in CRITERIA:
-            point = _point(card, criterion)
-            tried += point is not None
-            if point is None or -point.difference <= criterion.most:
-                continue
-            low, high = (-100 * bound for bound in reversed(point.difference_ci95))
-            fault = f"{criterion.option.replace('-', ' ')} {amount(_unit(criterion), criterion.value)}"
-            text = (
-                f"{card.backend}: {fault} costs {-100 * point.difference:.1f} points (95 %: {low:.0f} to {high:.0f}). "
-                f"At most {100 * criterion.most:.0f} are wanted."
-            )
-            if -point.difference_ci95[1] > criterion.most:
-                against.append(text)
-            else:
-                unsure.append(text)
+        curves = {each.property: each for each in card.curves}
+        for option, value, most in CRITERIA:
+            for point in curves[option].points if option in curves else ():
+                if point.value != value:
+                    continue
+                tried += 1
+                if -point.difference <= most:
+                    continue
+                low, high = (-100 * bound for bound in reversed(point.difference_ci95))
+                text = (
+                    f"{card.backend}: {option.replace('-', ' ')} {amount(curves[option].unit, value)} costs "
+                    f"{-100 * point.difference:.1f} points (95 %: {low:.0f} to {high:.0f}). "
+                    f"At most {100 * most:.0f} are wanted."
+                )
+                reasons = against if low > 100 * most else unsure
+                reasons.append(text)
     if against:
         return Verdict(sentence="Not ready for a robot.", reasons=(*against, *unsure))
     if unsure:
@@ -370,64 +307,25 @@ def judge(found: Sequence[Rehearsal]) -> Verdict:
     return Verdict(sentence="Ready for a first, careful trial on a robot.", reasons=())
 
 
-def _unit(criterion: Criterion) -> str:
-    return next(prop.unit for prop in PROPERTIES if prop.option == criterion.option)
-
-
-def _point(card: Stress, criterion: Criterion) -> Point | None:
-    for each in card.curves:
-        for point in each.points:
-            if each.property == criterion.option and point.value == criterion.value:
-                return point
-    return None
-
-
-def limits(found: Sequence[Rehearsal]) -> list[tuple[str, list[str]]]:
+def limits(found: Sequence[Stress]) -> list[tuple[str, list[str]]]:
     """Return name and, for each engine, the smallest value in words of every fault that costs ten points."""
     rows = []
-    for name in _names(found):
-        rows.append((name.replace("-", " "), [_limit(each) for each in _curves(found, name)]))
+    for name, curves in by_property(found).items():
+        rows.append((name.replace("-", " "), [each.costs() if each else "cannot be set" for each in curves]))
     return rows
-
-
-def _names(found: Sequence[Rehearsal]) -> list[str]:
-    names: dict[str, None] = {}
-    for card in found:
-        names |= dict.fromkeys(each.property for each in card.curves)
-    return list(names)
-
-
-def _curves(found: Sequence[Rehearsal], name: str) -> list[Curve | None]:
-    """Return the curve of a property in each engine; None where the engine cannot set it."""
-    by_name = []
-    for card in found:
-        by_name.append({each.property: each for each in card.curves}.get(name))
-    return by_name
-
-
-def _limit(found: Curve | None) -> str:
-    if found is None:
-        return "cannot be set"
-    values = [value for value in (found.lower, found.upper) if value is not None]
-    if not values:
-        return "none that was tried"
-    chance = "" if all(found.is_certain(value) for value in values) else ", or chance"
-    return " and ".join(amount(found.unit, float(f"{value:.2g}")) for value in values) + chance
 
 
 def page(found: Sequence[Rehearsal]) -> str:
     """Return the page of a rehearsal, in HTML."""
     rows = []
-    for name in _names(found):
-        curves = _curves(found, name)
-        unit = next(each.unit for each in curves if each is not None)
-        points: dict[float, list[Point | None]] = {}
+    for name, curves in by_property(found).items():
+        points: dict[str, list[Point | None]] = {}
         for i, each in enumerate(curves):
-            for point in () if each is None else each.points:
-                if each is not None and point.value != each.nominal:
-                    points.setdefault(point.value, [None] * len(found))[i] = point
-        for value in sorted(points):
-            rows.append((name.replace("-", " "), amount(unit, value), points[value]))
+            for point in each.points if each else ():
+                if each and point.value != each.nominal:
+                    points.setdefault(amount(each.unit, point.value), [None] * len(found))[i] = point
+        for size, cells in points.items():
+            rows.append((name.replace("-", " "), size, cells))
     return render(
         "rehearsal.html.j2",
         verdict=judge(found),

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, TypeVar
 
 from xreset.checks import from_dict
 from xreset.errors import XResetError
@@ -53,22 +53,13 @@ class Curve:
     upper: float | None
     """The same above the nominal value."""
 
-    def tolerated(self) -> str:
-        """Return the range in which fewer than ten points are lost, as far as was tried."""
-        low = self.points[0].value
-        high = self.points[-1].value
-        words = []
-        if self.lower is not None:
-            words.append(f"from {self.lower:.2g}")
-        elif low < self.nominal:
-            words.append(f"from {low:g} or less")
-        if self.upper is not None:
-            words.append(f"up to {self.upper:.2g}")
-        elif high > self.nominal:
-            words.append(f"up to {high:g} or more")
-        if self.unit != "x":
-            words.append(self.unit)
-        return " ".join(words)
+    def costs(self) -> str:
+        """Return the values nearest to the nominal one that cost ten points, in words."""
+        values = [value for value in (self.lower, self.upper) if value is not None]
+        if not values:
+            return "none that was tried"
+        chance = "" if all(self.is_certain(value) for value in values) else ", or chance"
+        return " and ".join(amount(self.unit, float(f"{value:.2g}")) for value in values) + chance
 
     def is_certain(self, limit: float) -> bool:
         """Whether the loss at the first value beyond a limit is more than chance."""
@@ -101,57 +92,8 @@ class Stress:
     left_out: tuple[str, ...]
     """Properties that the engine cannot set."""
 
-    @classmethod
-    def of(cls, policy: PolicySpec, trial: Trial, place: Engine, nominal: Sequence[Episode], **rest: Any) -> Self:
-        """Return the card of a policy in an engine.
 
-        Args:
-            nominal: episodes with nothing changed.
-            rest: the fields that do not follow from them.
-        """
-        as_is = Effect.of(nominal, nominal)
-        return cls(
-            policy=policy.name,
-            robot=trial.robot.name,
-            seed=trial.seed,
-            inputs=trial.inputs,
-            backend=place.name,
-            backend_version=place.version,
-            episodes=len(nominal),
-            task_progress=as_is.task_progress,
-            ci95=as_is.ci95,
-            published_success=as_is.published_success,
-            **rest,
-        )
-
-    def sentence(self) -> str:
-        """Return one line: the smallest changes that cost ten points, and how many properties cost less."""
-        sure: list[tuple[float, str]] = []
-        perhaps: list[tuple[float, str]] = []
-        harmless = 0
-        for curve in self.curves:
-            limits = [value for value in (curve.lower, curve.upper) if value is not None]
-            harmless += not limits
-            for value in limits:
-                size = abs(math.log(value)) if curve.unit == "x" else math.inf
-                found = sure if curve.is_certain(value) else perhaps
-                found.append((size, f"{curve.property} {amount(curve.unit, value)}"))
-        points = f"{100 * COSTLY:.0f} points"
-        parts = [f"{100 * self.task_progress:.0f} %"]
-        if sure:
-            parts.append(f"{points} less with {_smallest_first(sure)}")
-        if perhaps:
-            parts.append(f"perhaps {points} less, within chance, with {_smallest_first(perhaps)}")
-        if harmless:
-            parts.append(
-                f"fewer than {points} less with {harmless} of {len(self.curves)} properties, as far as was tried"
-            )
-        return f"{self.backend}, {self.episodes} episodes: {'; '.join(parts)}."
-
-
-def _smallest_first(costs: list[tuple[float, str]]) -> str:
-    ordered = sorted(costs, key=lambda cost: cost[0])
-    return ", or ".join(text for _, text in ordered)
+Card = TypeVar("Card", bound=Stress)
 
 
 def stress(
@@ -192,34 +134,70 @@ def stress(
     for prop in sweeps:
         for value in prop.values:
             prop.set_in(task, value)
+
     found = []
     for engine in engines:
-        able = backend_class(engine.name).capabilities
-        usable = [prop for prop in sweeps if prop.needs is None or prop.needs in able]
-        total = 1 + sum(len(prop.values) for prop in usable)
-        done = 0
 
-        def run(
-            prop: Property | None, value: float, engine: Engine = engine, total: int = total
-        ) -> tuple[Episode, ...]:
-            nonlocal done
+        def play(prop: Property | None, value: float, engine: Engine = engine) -> tuple[Episode, ...]:
             changed = replace(trial, task=task if prop is None else prop.set_in(task, value))
-            episodes = roll_out(policy.start(trial.motion), engine, changed, repetitions=repetitions).episodes
+            return roll_out(policy.start(trial.motion), engine, changed, repetitions=repetitions).episodes
+
+        found.append(sweep(Stress, policy, trial, engine, sweeps, play, out, progress))
+    return found
+
+
+def sweep(
+    card_type: type[Card],
+    policy: PolicySpec,
+    trial: Trial,
+    engine: Engine,
+    properties: Sequence[Property],
+    play: Callable[[Property | None, float], Sequence[Episode]],
+    out: Path,
+    progress: Callable[[str, int, int], None],
+) -> Card:
+    """Play episodes with each value of the properties that an engine can set, and write the card after each property.
+
+    Args:
+        card_type: type of the card.
+        policy: named in the card.
+        trial: named in the card.
+        engine: where episodes are played.
+        properties: properties and values.
+        play: plays the episodes with one property at a value; with None: with nothing changed.
+        out: folder of the card.
+        progress: called with (engine, runs done, runs in all).
+    """
+    able = backend_class(engine.name).capabilities
+    usable = [prop for prop in properties if prop.needs is None or prop.needs in able]
+    total = 1 + sum(len(prop.values) for prop in usable)
+    done = 1
+    nominal = play(None, 1.0)
+    progress(engine.name, done, total)
+    as_is = Effect.of(nominal, nominal)
+    card = card_type(
+        policy=policy.name,
+        robot=trial.robot.name,
+        seed=trial.seed,
+        inputs=trial.inputs,
+        backend=engine.name,
+        backend_version=engine.version,
+        episodes=len(nominal),
+        task_progress=as_is.task_progress,
+        ci95=as_is.ci95,
+        published_success=as_is.published_success,
+        curves=(),
+        left_out=tuple(prop.option for prop in properties if prop not in usable),
+    )
+    for prop in usable:
+        swept = {}
+        for value in prop.values:
+            swept[value] = play(prop, value)
             done += 1
             progress(engine.name, done, total)
-            return episodes
-
-        nominal = run(None, 1.0)
-        left_out = tuple(prop.option for prop in sweeps if prop not in usable)
-        card = Stress.of(policy, trial, engine, nominal, curves=(), left_out=left_out)
-        path = out / f"{engine.name}.json"
-        write_json(path, asdict(card))
-        for prop in usable:
-            swept = {value: run(prop, value) for value in prop.values}
-            card = replace(card, curves=(*card.curves, curve(prop, nominal, swept)))
-            write_json(path, asdict(card))
-        found.append(card)
-    return found
+        card = replace(card, curves=(*card.curves, curve(prop, nominal, swept)))
+        write_json(out / f"{engine.name}.json", asdict(card))
+    return card
 
 
 def read_stress(folder: Path, policy: str | None = None) -> tuple[Stress, ...]:
@@ -237,7 +215,7 @@ def read_stress(folder: Path, policy: str | None = None) -> tuple[Stress, ...]:
     return tuple(card for card in found if policy is None or card.inputs.get("policy", policy) == policy)
 
 
-def curve(prop: Property, nominal: Sequence[Episode], swept: dict[float, tuple[Episode, ...]]) -> Curve:
+def curve(prop: Property, nominal: Sequence[Episode], swept: dict[float, Sequence[Episode]]) -> Curve:
     """Compare the episodes of each value with the nominal ones."""
     every = {prop.nominal: nominal} | swept
     points = []
@@ -270,36 +248,38 @@ def write_plot(path: Path, found: Sequence[Stress], title: str) -> None:
         figure.suptitle(f"{title}\n{note}", fontsize="medium", fontweight="bold")
 
 
-def _names(found: Sequence[Stress]) -> list[str]:
-    names: list[str] = []
-    for card in found:
-        names += [curve.property for curve in card.curves if curve.property not in names]
-    return names
+def by_property(found: Sequence[Stress]) -> dict[str, list[Curve | None]]:
+    """Return the curve of each property in each engine; None where the engine cannot set it."""
+    curves: dict[str, list[Curve | None]] = {}
+    for i, card in enumerate(found):
+        for each in card.curves:
+            curves.setdefault(each.property, [None] * len(found))[i] = each
+    return curves
+
+
+_COLUMNS = 4
 
 
 def plot_size(found: Sequence[Stress]) -> tuple[float, float]:
     """Return the size of the drawing of :func:`draw_curves` [inches]."""
-    columns = min(4, len(_names(found)))
-    rows = math.ceil(len(_names(found)) / columns)
-    return max(2.9 * columns, 5.0), 0.8 + 2.3 * rows
+    count = len(by_property(found))
+    return max(2.9 * min(_COLUMNS, count), 5.0), 0.8 + 2.3 * math.ceil(count / _COLUMNS)
 
 
 def draw_curves(figure: Figure, found: Sequence[Stress]) -> None:
     """Draw task progress against each property, a line for each engine."""
-    names = _names(found)
-    columns = min(4, len(names))
-    rows = math.ceil(len(names) / columns)
-    axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
-    for ax in axes.flat[len(names) :]:
+    curves = by_property(found)
+    columns = min(_COLUMNS, len(curves))
+    axes = figure.subplots(math.ceil(len(curves) / columns), columns, squeeze=False, sharey=True)
+    for ax in axes.flat[len(curves) :]:
         ax.set_visible(False)
-    for ax, name in zip(axes.flat, names, strict=False):
+    for ax, name in zip(axes.flat, curves, strict=False):
         ax.set_title(name)
         ax.set_ylim(0, 100)
-        for card, color in zip(found, COLORS, strict=False):
+        for card, each, color in zip(found, curves[name], COLORS, strict=False):
             ax.axhline(100 * (card.task_progress - COSTLY), color=color, linewidth=0.7, linestyle="--")
-            for curve in card.curves:
-                if curve.property == name:
-                    _draw(ax, card, curve, color)
+            if each is not None:
+                _draw(ax, card, each, color)
     axes[0, 0].legend(loc="lower left", fontsize=8)
     for row in axes:
         row[0].set_ylabel("task progress [%]")

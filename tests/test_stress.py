@@ -83,28 +83,14 @@ class CurveTest(unittest.TestCase):
         self.assertAlmostEqual(stiffness.lower, 0.8 - 0.3 * 0.05 / 0.25)
         self.assertIsNone(stiffness.upper)
         np.testing.assert_allclose(stiffness.points[0].difference_ci95, (-0.3, -0.3), atol=1e-9)
-        card = Stress(
-            backend="mujoco",
-            backend_version="4",
-            episodes=4,
-            task_progress=0.8,
-            ci95=(0.7, 0.9),
-            curves=(stiffness,),
-            left_out=(),
-        )
-        self.assertEqual(card.sentence(), "mujoco, 4 episodes: 80 %; 10 points less with arm-stiffness x 0.74.")
+        self.assertEqual(stiffness.costs(), "x 0.74")
         late = swept("action-latency", **{"v1.0": -0.15, "v2.0": -0.3})
         harmless = swept("object-mass", **{"v0.5": 0.0, "v2.0": 0.0})
-        soft = replace(stiffness, property="hand-stiffness", lower=0.9)
         scattered = swept("force-gain", **{"v2.0": [-0.6, -0.6, 0.2, 0.2]})
         assert scattered.upper is not None
         self.assertEqual((scattered.is_certain(scattered.upper), stiffness.is_certain(stiffness.lower)), (False, True))
-        self.assertEqual(
-            replace(card, curves=(stiffness, late, harmless, soft, scattered)).sentence(),
-            "mujoco, 4 episodes: 80 %; 10 points less with hand-stiffness x 0.9, or arm-stiffness x 0.74, or action-latency 0.667 "
-            "control steps; perhaps 10 points less, within chance, with force-gain x 1.5; fewer than 10 points less with 1 of 5 "
-            "properties, as far as was tried.",
-        )
+        self.assertEqual(scattered.costs(), "x 1.5, or chance")
+        self.assertEqual((late.costs(), harmless.costs()), ("0.67 control steps", "none that was tried"))
 
     def test_cards_of_another_policy_are_left_out(self):
         card = Stress(

@@ -14,6 +14,7 @@ from xreset.eval.report import figures
 from xreset.eval.report.clips import Clip, Strip, count_failures, encode_mp4
 from xreset.eval.report.read import ReportData
 from xreset.eval.results import EvalResult
+from xreset.eval.stress import by_property
 from xreset.eval.table import FIGURES, caption, distance_text
 from xreset.files import code_version
 from xreset.pictures.render import encode_png
@@ -26,13 +27,9 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) 
     first = data.engines[0]
     failures = count_failures(data.episodes_in(first))
     demonstrations: dict[str, list[Any]] = {}
-    stressed: dict[str, list[Any]] = {}
     for i, result in enumerate(data.results):
         for row in result.per_demo:
             demonstrations.setdefault(row.sequence, [None] * len(data.results))[i] = row
-    for i, card in enumerate(data.stress):
-        for curve in card.curves:
-            stressed.setdefault(curve.property, [None] * len(data.stress))[i] = curve
     return render(
         "report.html.j2",
         data=data,
@@ -51,7 +48,7 @@ def page(data: ReportData, clips: Sequence[Clip], strips: Sequence[Strip] = ()) 
         png=lambda strip: _base64(encode_png(strip.picture)),
         failures={what: count for what, count in failures.items() if count},
         charts=_charts(data),
-        stressed=stressed,
+        stressed=by_property(data.stress),
         demonstrations=demonstrations,
         inputs=_inputs(data),
     )

@@ -61,7 +61,6 @@ def stress(
             table.add_row("" if i else named, amount, *cells, end_section=i == len(values) - 1)
     console.print(table)
     for result in found:
-        console.print(result.sentence())
         if result.left_out:
             console.print(f"left out in {result.backend}, which cannot set them: {', '.join(result.left_out)}")
     console.print(f"results and picture in {folder}")

@@ -376,6 +376,9 @@ class NpzTest(InFolder):
             self.read()
         with mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="10"):
             self.read()
+        self.write(offsets=np.zeros(1_500_000, dtype=np.int8))  # becomes int64
+        with mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="9"), self.refused("take 11 MB unpacked"):
+            self.read()
         with (
             mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="many"),
             self.assertRaisesRegex(XResetError, "expected a whole number"),

@@ -321,6 +321,8 @@ class DexYCB(InFolder):
         text = self.calibration.read_text()
         self.calibration.write_text(text.replace("apriltag", "tag"))
         self.refused("no pose 'apriltag'")
+        self.calibration.write_text(text.replace("tuple\n  - ", "tuple\n  - 7"))
+        self.refused("expected the 12 numbers of a rotation")
         self.calibration.unlink()
         self.refused("calibration")
         self.refused("no DexYCB sequence", root=self.folder / "calibration")

@@ -425,11 +425,13 @@ def _evenly(arrays: Mapping[str, np.ndarray], convention: Convention, motion: Mo
 
 
 def _wrist(points: np.ndarray, side: str) -> Rotation:
-    """Fit wrist and knuckles of an average hand to keypoints [F, 21, 3]; F orientations of MANO's root."""
+    """Fit wrist and knuckles of an average hand to keypoints [F, 21, 3] (Kabsch's algorithm); F orientations of MANO's
+    root."""
     template = np.concatenate((np.zeros((1, 3)), hand.FINGER_BASES))
     if side == "left":
         template[:, 0] *= -1
-    template -= template.mean(axis=0)
     found = points[:, _KNUCKLES]
-    found = found - found.mean(axis=1, keepdims=True)
-    return Rotation.concatenate([Rotation.align_vectors(frame, template)[0] for frame in found])
+    covariance = np.einsum("ki,fkj->fij", template - template.mean(axis=0), found - found.mean(axis=1, keepdims=True))
+    U, _, Vt = np.linalg.svd(covariance)
+    Vt[:, 2] *= np.linalg.det(U @ Vt)[:, None]
+    return Rotation.from_matrix((U @ Vt).transpose(0, 2, 1))

@@ -23,13 +23,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from xreset.geometry import shapes
 from xreset.geometry.urdf import Joint, Link, RobotTree
-from xreset.geometry.urdf_writer import axes, box, capsule, cylinder, fixed, frame, inertia_matrix, pose, urdf_text
-from xreset.spec import MimicSpec
+from xreset.geometry.urdf_writer import axes, fixed, frame, pose, urdf_text
+from xreset.spec import Geometry, MimicSpec, Shape
 
 Figures = dict[str, Any]
-SHAPES = {"box": box, "capsule": capsule, "cylinder": cylinder}
 SHARED = {"arm_of": ("base", "arm"), "hand_of": ("palm", "hand", "frames", "rotor")}
 """What a robot takes from another one."""
 
@@ -49,42 +50,36 @@ def robot_tree(figures: Figures) -> RobotTree:
     """Return the links and joints of a robot."""
     base = figures["base"]
     palm = figures["palm"]
+    mimics = {mimic["joint"]: MimicSpec(**mimic) for mimic in figures.get("mimics", [])}
     links = [_link(base)]
     joints = []
     parent = base["name"]
     for part in figures["arm"]:
         links.append(_link(part))
-        joints.append(_joint(part, parent))
+        joints.append(_joint(part, parent, mimics))
         parent = part["name"]
     links.append(_link(palm))
     joints.append(fixed(parent, palm["name"], _pose(palm)))
     for part in figures["hand"]:
         links.append(_link(part, figures.get("rotor", 0.0)))
-        joints.append(_joint(part, part["parent"]))
+        joints.append(_joint(part, part["parent"], mimics))
     for name, (link, position, x, z) in figures["frames"].items():
         links.append(frame(name))
         joints.append(fixed(link, name, pose(position) @ axes(x=x, z=z)))
     return RobotTree(name=figures["name"], root=base["name"], links=tuple(links), joints=tuple(joints))
 
 
-def efforts(figures: Figures) -> dict[str, float]:
-    """Return the effort limit of each joint that has a drive."""
-    parts = [*figures["arm"], *figures["hand"]]
-    return {part["joint"]: part["effort"] for part in parts if "effort" in part}
-
-
 def robot_urdf(folder: str) -> str:
     """Return the text of a robot's ``robot.urdf``."""
     figures = read_figures(folder)
-    mimics = [MimicSpec(**mimic) for mimic in figures.get("mimics", [])]
-    return urdf_text(robot_tree(figures), efforts(figures), mimics=mimics, comment=figures["comment"])
+    return urdf_text(robot_tree(figures), figures["comment"])
 
 
 def _pose(part: Figures) -> np.ndarray:
     return pose(part["xyz"], rpy=part.get("rpy", (0, 0, 0)), quat=part.get("quat"))
 
 
-def _joint(part: Figures, parent: str) -> Joint:
+def _joint(part: Figures, parent: str, mimics: dict[str, MimicSpec]) -> Joint:
     lower, upper = part["range"]
     return Joint(
         name=part["joint"],
@@ -96,20 +91,36 @@ def _joint(part: Figures, parent: str) -> Joint:
         lower=lower,
         upper=upper,
         velocity=part["velocity"],
+        effort=part.get("effort", 0.0),
+        mimic=mimics.get(part["joint"]),
     )
 
 
 def _link(part: Figures, rotor: float = 0.0) -> Link:
     moments = part["inertia"]
-    inertia = np.diag(moments) if len(moments) == 3 else inertia_matrix(*moments)
+    inertia = np.diag(moments[:3])
+    if len(moments) == 6:
+        inertia = np.array(moments)[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
     R = pose(rpy=part.get("inertia_rpy", (0, 0, 0)), quat=part.get("inertia_quat"))[:3, :3]
     return Link(
         name=part["name"],
         mass=part["mass"],
         com=np.array(part["com"], dtype=float),
         inertia=R @ inertia @ R.T + rotor * np.eye(3),
-        collisions=tuple(SHAPES[kind](*values) for kind, *values in part.get("shapes", [])),
+        collisions=tuple(_shape(*values) for values in part.get("shapes", [])),
     )
+
+
+def _shape(kind: Any, first: list[float], second: list[float], radius: float = 0.0) -> Shape:
+    """Make a box from edge lengths and center, or a cylinder or capsule from the ends of its axis and its radius."""
+    if kind == "box":
+        return shapes.box(second, first)
+    axis = np.subtract(second, first)
+    length = float(np.linalg.norm(axis))
+    T = np.eye(4)
+    T[:3, :3] = Rotation.align_vectors(axis / length, [0, 0, 1])[0].as_matrix()
+    T[:3, 3] = np.add(first, second) / 2
+    return Shape(geometry=Geometry(kind=kind, size=(radius, length / 2)), T_body_shape=T)
 
 
 if __name__ == "__main__":

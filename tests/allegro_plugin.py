@@ -54,9 +54,7 @@ def write_plugin(site: Path) -> None:
     module = site / "allegro_plugin"
     module.mkdir(parents=True)
     (module / "__init__.py").write_text('"""The Allegro hand, flying freely."""\n')
-    (module / "robot.urdf").write_text(
-        urdf_text(flying(hand), efforts(hand), comment=f"The {_PACKAGE} package's Allegro hand on six joints.")
-    )
+    (module / "robot.urdf").write_text(urdf_text(flying(hand), f"The {_PACKAGE} package's Allegro hand on six joints."))
     (module / "robot.toml").write_text(description(hand))
     metadata = site / "allegro_plugin-1.0.dist-info"
     metadata.mkdir()

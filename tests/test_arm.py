@@ -49,10 +49,6 @@ def wrists_around_home(robot, count: int) -> ArmTargets:
     return arm_targets(model, joints)
 
 
-def _die(_trial, status: int) -> None:
-    os._exit(status)
-
-
 class PlaceTest(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
@@ -125,11 +121,8 @@ class PlaceTest(unittest.TestCase):
         self.assertEqual((first.best, first.own), (second.best, second.own))
 
     def test_a_process_that_is_killed_is_an_error(self):
-        trial = placing._Trial(
-            robot=self.robot, config=CONFIG, tried=self.wrists, kept=self.wrists, paths=[self.wrists]
-        )
-        with self.assertRaisesRegex(RobotError, "was killed; is there memory"), placing._mapper(trial, 2) as each:
-            list(each(_die, [9]))
+        with self.assertRaisesRegex(RobotError, "was killed; is there memory"), placing._mapper(2) as each:
+            list(each(os._exit, [9]))
 
     def test_a_candidate_that_cannot_come_in_is_given_up(self):
         whole = self.reach(self.own)

@@ -96,7 +96,7 @@ class UrdfTest(unittest.TestCase):
         joints = [fixed("base", link.name, pose((1, 2, 3), rpy=(0.1, 0.2, 0.3))) for link in links[1:]]
         tree = RobotTree(name="toy", root="base", links=tuple(links), joints=tuple(joints))
         path = self.folder / "robot.urdf"
-        path.write_text(urdf_text(tree, {}, comment="made by --hand"))
+        path.write_text(urdf_text(tree, "made by --hand"))
         write_meshes(tree, self.folder)
         read = load_urdf(path)
         self.assertEqual(read.link_names, tree.link_names)

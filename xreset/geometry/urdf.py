@@ -22,7 +22,7 @@ import numpy as np
 from xreset.errors import ObjectError, RobotError
 from xreset.files import max_bytes
 from xreset.geometry.shapes import hull, load_mesh, shape_mesh
-from xreset.spec import Geometry, RobotSpec, Shape
+from xreset.spec import Geometry, MimicSpec, RobotSpec, Shape
 from xreset.text import is_plain, shown
 
 if TYPE_CHECKING:
@@ -74,6 +74,10 @@ class Joint:
     """Upper position limit [rad or m]; inf for a continuous joint."""
     velocity: float
     """Largest speed [rad/s or m/s]; inf where the URDF gives none."""
+    effort: float = 0.0
+    """Largest torque [N m] or force [N]; 0 where the URDF gives none."""
+    mimic: MimicSpec | None = None
+    """How it follows another joint, as the URDF has it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +95,11 @@ class RobotTree:
         """Names of all links, root first."""
         return tuple(link.name for link in self.links)
 
+    @property
+    def mimics(self) -> tuple[MimicSpec, ...]:
+        """How joints follow others, as the URDF has it."""
+        return tuple(joint.mimic for joint in self.joints if joint.mimic is not None)
+
     def link(self, name: str) -> Link:
         """Return the link of that name, or raise ``RobotError``."""
         return self._named("link", self.links, name)
@@ -105,6 +114,14 @@ class RobotTree:
                 return part
         known = ", ".join(part.name for part in parts)
         raise RobotError(f"robot {self.name!r} has no {kind} {name!r}. Choose from: {known}.")
+
+    def below(self, root: str) -> list[str]:
+        """Return the link ``root`` and all links that it carries."""
+        found = [root]
+        for joint in self.joints:
+            if joint.parent in found:
+                found.append(joint.child)
+        return found
 
     def moving_ancestor(self, name: str) -> str:
         """Return the link of the rigid body of a link: itself, or the nearest ancestor that a joint moves (or the
@@ -394,12 +411,21 @@ def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:
     lower = -math.inf
     upper = math.inf
     velocity = math.inf
+    effort = 0.0
     limit = joint.limit
     if limit is not None:
+        if limit.effort is not None and 0 < limit.effort < math.inf:
+            effort = float(limit.effort)
         velocity = math.inf if limit.velocity is None else float(limit.velocity)
         if kind != "continuous":
             lower = 0.0 if limit.lower is None else float(limit.lower)
             upper = 0.0 if limit.upper is None else float(limit.upper)
+    mimic = None
+    if joint.mimic is not None:
+        numbers = {name: float(getattr(joint.mimic, name)) for name in ("multiplier", "offset")}
+        if not np.isfinite(list(numbers.values())).all():
+            raise RobotError(f"{path}: joint {name!r} follows another by a number that is not finite.")
+        mimic = MimicSpec(joint=name, source=joint.mimic.joint, **numbers)
     return Joint(
         name=name,
         type="revolute" if kind == "continuous" else kind,
@@ -410,4 +436,6 @@ def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:
         lower=lower,
         upper=upper,
         velocity=velocity,
+        effort=effort,
+        mimic=mimic,
     )

@@ -7,9 +7,8 @@ reading are inverse.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
@@ -17,9 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from xreset.geometry import shapes
 from xreset.geometry.urdf import Joint, Link, RobotTree
-from xreset.spec import Geometry, MimicSpec, Shape
 
 FRAME_MASS = 1e-4
 """Mass of a link that is only a frame [kg]; some engines invent a mass of 1 kg for a link that has none."""
@@ -52,54 +49,9 @@ def axes(*, x: Sequence[float], z: Sequence[float]) -> np.ndarray:
     return T
 
 
-def inertia_matrix(ixx: float, ixy: float, ixz: float, iyy: float, iyz: float, izz: float) -> np.ndarray:
-    """[3, 3] symmetric matrix from its six figures in the order of a URDF."""
-    return np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
-
-
-def box(size: Sequence[float], center: Sequence[float] = (0, 0, 0)) -> Shape:
-    """Make a box of full edge lengths ``size`` [m]."""
-    return shapes.box(center, size)
-
-
-def capsule(start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
-    """Make a capsule whose axis runs from ``start`` to ``end`` [m]; the round ends lie beyond them."""
-    return _between("capsule", start, end, radius)
-
-
-def cylinder(start: Sequence[float], end: Sequence[float], radius: float) -> Shape:
-    """Make a cylinder whose axis runs from ``start`` to ``end`` [m]."""
-    return _between("cylinder", start, end, radius)
-
-
-def _between(
-    kind: Literal["capsule", "cylinder"],
-    start: Sequence[float],
-    end: Sequence[float],
-    radius: float,
-) -> Shape:
-    a = np.array(start, dtype=float)
-    b = np.array(end, dtype=float)
-    length = float(np.linalg.norm(b - a))
-    direction = (b - a) / length
-    turn = np.cross([0.0, 0, 1], direction)
-    sine = float(np.linalg.norm(turn))
-    T = np.eye(4)
-    T[:3, 3] = (a + b) / 2
-    if sine > 1e-9:
-        T[:3, :3] = Rotation.from_rotvec(turn / sine * math.atan2(sine, direction[2])).as_matrix()
-    return Shape(geometry=Geometry(kind=kind, size=(radius, length / 2)), T_body_shape=T)
-
-
 def frame(name: str) -> Link:
     """Make a link that is only a frame: no shape, and a mass too small to matter."""
-    return Link(
-        name=name,
-        mass=FRAME_MASS,
-        com=np.zeros(3),
-        inertia=np.eye(3) * FRAME_INERTIA,
-        collisions=(),
-    )
+    return Link(name=name, mass=FRAME_MASS, com=np.zeros(3), inertia=np.eye(3) * FRAME_INERTIA, collisions=())
 
 
 def fixed(parent: str, child: str, T_parent_child: np.ndarray) -> Joint:
@@ -117,20 +69,11 @@ def fixed(parent: str, child: str, T_parent_child: np.ndarray) -> Joint:
     )
 
 
-def urdf_text(
-    tree: RobotTree,
-    effort: Mapping[str, float],
-    *,
-    mimics: Sequence[MimicSpec] = (),
-    comment: str = "",
-) -> str:
+def urdf_text(tree: RobotTree, comment: str = "") -> str:
     """Return the text of a tree's URDF.
 
     Args:
         tree: links and joints.
-        effort: largest torque [N m] or force [N] of each moving joint that has a drive; the others (mimic joints) get
-            0.
-        mimics: joints that follow another.
         comment: source of the figures, written at the top.
 
     Returns:
@@ -139,7 +82,6 @@ def urdf_text(
     robot = Element("robot", name=tree.name)
     for link in tree.links:
         _add_link(robot, link)
-    by_joint = {mimic.joint: mimic for mimic in mimics}
     for joint in tree.joints:
         element = SubElement(robot, "joint", name=joint.name, type=joint.type)
         _add_origin(element, joint.T_parent_joint)
@@ -148,23 +90,16 @@ def urdf_text(
         if joint.type == "fixed":
             continue
         _add(element, "axis", xyz=joint.axis)
-        drive = effort.get(joint.name, 0.0)
         _add(
             element,
             "limit",
             lower=joint.lower,
             upper=joint.upper,
-            effort=drive,
+            effort=joint.effort,
             velocity=joint.velocity,
         )
-        if mimic := by_joint.get(joint.name):
-            _add(
-                element,
-                "mimic",
-                joint=mimic.source,
-                multiplier=mimic.multiplier,
-                offset=mimic.offset,
-            )
+        if mimic := joint.mimic:
+            _add(element, "mimic", joint=mimic.source, multiplier=mimic.multiplier, offset=mimic.offset)
     ElementTree.indent(robot)
     comment = comment.replace("--", "- -")  # XML allows no -- in a comment
     head = "".join(f"  {line}\n" for line in comment.splitlines())
@@ -195,17 +130,8 @@ def _add_link(robot: Element, link: Link) -> None:
     inertial = SubElement(element, "inertial")
     _add(inertial, "origin", xyz=link.com)
     _add(inertial, "mass", value=link.mass)
-    (ixx, ixy, ixz), (_, iyy, iyz), (_, _, izz) = link.inertia
-    _add(
-        inertial,
-        "inertia",
-        ixx=ixx,
-        ixy=ixy,
-        ixz=ixz,
-        iyy=iyy,
-        iyz=iyz,
-        izz=izz,
-    )
+    moments = dict(zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), link.inertia[np.triu_indices(3)], strict=True))
+    _add(inertial, "inertia", **moments)
     for number, shape in enumerate(link.collisions):
         collision = SubElement(element, "collision")
         _add_origin(collision, shape.T_body_shape)

@@ -12,20 +12,20 @@ import numpy as np
 import torch
 
 from xreset.description import DESCRIPTION, load_robot
-from xreset.errors import BackendUnavailableError, RobotError, XResetError
+from xreset.errors import BackendUnavailableError, XResetError
 from xreset.geometry.collision import SelfCollision, height_above_table, table_points
 from xreset.geometry.dynamics import damping_ratio, drive_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import surface_of
-from xreset.geometry.urdf import Link, RobotTree, find_mesh, parse_xml, robot_tree
+from xreset.geometry.urdf import Link, RobotTree, robot_tree
+from xreset.objects.catalogue import load_object
 from xreset.physics import Backend
 from xreset.plugins import backend_names, make_backend, robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
-from xreset.robot_tools.draft import below
+from xreset.robot_tools.draft import link_places
 from xreset.robot_tools.opposition import opposition, opposition_scores
-from xreset.robot_tools.sources import largest_moment, read_source
-from xreset.spec import Geometry, MimicSpec, ObjectSpec, RobotSpec, SceneSpec, Shape, TableSpec
-from xreset.text import shown
+from xreset.robot_tools.sources import largest_moment
+from xreset.spec import RobotSpec, SceneSpec, TableSpec
 
 Level = Literal["ok", "skipped", "warning", "error"]
 
@@ -76,8 +76,6 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
         f"{len(spec.arm_indices)} arm joints, {len(spec.hand_indices)} hand joints, {len(spec.fingertips)} fingertips"
     )
     found = [Finding("ok", "description", f"{folder / DESCRIPTION}: {counts}")]
-    if missing := _missing_meshes(spec.urdf):
-        return None, [*found, *(Finding("error", "meshes", problem) for problem in missing)]
     try:
         tree = robot_tree(spec)
     except XResetError as error:
@@ -95,7 +93,7 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
         return spec, [*found, Finding("skipped", "home", "fix the errors above first")]
     ratio = damping_ratio(spec, spec.home)
     found += _topic("drives", _drives(spec), f"damping ratios at home are {ratio.min():.2f}..{ratio.max():.2f}")
-    found += _topic("frames", _frames(spec), "the palm frame is in the palm, and looks along the fingers")
+    found += _topic("frames", _frames(spec, tree), "the palm frame is in the palm, and looks along the fingers")
     found += _topic("fingers", _fingers(spec, tree), "the thumb can oppose every other fingertip")
     found += _home(spec)
     found.append(_size(spec))
@@ -111,7 +109,7 @@ def check_engine(spec: RobotSpec, backend: str) -> Finding:
     configuration."""
     topic = f"engine {backend}"
     try:
-        with make_backend(backend, SceneSpec(robot=spec, objects=(_probe(),)), 1) as engine:
+        with make_backend(backend, SceneSpec(robot=spec, objects=(load_object("soup"),)), 1) as engine:
             problem = _links_disagree(spec, engine) or _does_not_hold(spec, engine)
     except BackendUnavailableError as error:
         return Finding("skipped", topic, str(error))
@@ -154,36 +152,17 @@ Problems = Iterator[tuple[Level, str]]
 
 
 def _topic(topic: str, problems: Problems, otherwise: str) -> list[Finding]:
-    found = []
-    try:
-        for level, message in problems:
-            found.append(Finding(level, topic, message))
-    except XResetError as error:  # a check that asks for what the URDF lacks must not hide the others
-        found.append(Finding("error", topic, str(error)))
+    found = [Finding(level, topic, message) for level, message in problems]
     return found or [Finding("ok", topic, otherwise)]
 
 
 # Description against URDF ---------------------------------------------------------------------------------------------
 
 
-def _missing_meshes(urdf: Path) -> list[str]:
-    """Name every mesh of a collision shape that does not exist (reading the URDF stops at the first)."""
-    try:
-        xml = parse_xml(urdf)
-    except RobotError:
-        return []  # reading the URDF says so
-    problems = {}
-    for mesh in xml.iterfind(".//collision//mesh"):
-        name = mesh.get("filename", "")
-        if not find_mesh(name, urdf):
-            problems[name] = f"{urdf.name} uses {shown(name)}, which is not in its folders. Put it there."
-    return list(problems.values())
-
-
 def _joints(spec: RobotSpec, tree: RobotTree) -> Problems:
     known = {joint.name: joint for joint in tree.joints}
     moving = [joint.name for joint in tree.joints if joint.type != "fixed"]
-    inside = set(below(tree, spec.hand_root)) - {spec.hand_root}
+    inside = set(tree.below(spec.hand_root)[1:])
     for joint in spec.joints:
         found = known.get(joint.name)
         if found is None:
@@ -209,15 +188,11 @@ def _joints(spec: RobotSpec, tree: RobotTree) -> Problems:
 
 def _mimics(spec: RobotSpec, tree: RobotTree) -> Problems:
     known = {joint.name: joint for joint in tree.joints if joint.type != "fixed"}
-    tags = {mimic.joint: mimic for mimic in read_source(spec.urdf).mimics}
     for mimic in spec.mimics:
-        tag = tags.pop(mimic.joint, mimic)
         own = known.get(mimic.joint)
         source = known.get(mimic.source)
         if own is None:
             yield "error", f"{mimic.joint!r} is not a moving joint of the URDF."
-        elif tag != mimic:
-            yield "error", f"{mimic.joint!r} = {_line(mimic)} in the description, but {_line(tag)} in the URDF."
         elif source is not None:
             low, high = sorted(mimic.multiplier * limit + mimic.offset for limit in (source.lower, source.upper))
             if low < own.lower - _LIMIT_SLACK or high > own.upper + _LIMIT_SLACK:
@@ -227,13 +202,6 @@ def _mimics(spec: RobotSpec, tree: RobotTree) -> Problems:
                     f"{own.lower:.4g}..{own.upper:.4g}: the two would hold each other up. Widen its limits, or narrow "
                     "those of the source.",
                 )
-    for tag in tags.values():
-        text = f"the URDF lets {tag.joint!r} mimic {tag.source!r}, but the description has no such entry in mimics."
-        yield "error", text
-
-
-def _line(mimic: MimicSpec) -> str:
-    return f"{mimic.multiplier:g} {mimic.source} + {mimic.offset:g}"
 
 
 def _links(spec: RobotSpec, tree: RobotTree) -> Problems:
@@ -247,16 +215,12 @@ def _links(spec: RobotSpec, tree: RobotTree) -> Problems:
     wanted["collision.self"] = [*spec.self_collision_links]
     wanted["collision.exclude"] = [link for pair in spec.collision_exclude for link in pair]  # noqa: XR002
     wanted["collision.table_exclude"] = [*spec.table_exclude]
-    absent = False
-    for where, links in wanted.items():
-        for link in links:
-            if link not in known:
-                absent = True
-                yield "error", f"{where}: the URDF has no link {link!r}."
+    absent = [(where, link) for where, links in wanted.items() for link in links if link not in known]  # noqa: XR002
+    for where, link in absent:
+        yield "error", f"{where}: the URDF has no link {link!r}. Choose from: {', '.join(known)}."
     if absent:
-        yield "error", f"the URDF's links are {', '.join(known)}."
         return
-    inside = set(below(tree, spec.hand_root)) - {spec.hand_root}
+    inside = set(tree.below(spec.hand_root)[1:])
     for tip in spec.fingertips:
         if not any(known[link].collisions for link in tip.contact_links):
             links = ", ".join(tip.contact_links)
@@ -293,13 +257,11 @@ def _inertias(tree: RobotTree) -> Problems:
             continue
         moments = np.linalg.eigvalsh(link.inertia)
         listed = ", ".join(f"{moment:.3g}" for moment in moments)
-        if moments[0] <= 0:
-            yield "error", f"{name!r} has the principal moments {listed} kg m^2; expected positive ones."
-        elif moments[2] > (moments[0] + moments[1]) * (1 + _ROUNDING):
+        if moments[0] <= 0 or moments[2] > (moments[0] + moments[1]) * (1 + _ROUNDING):
             yield (
                 "error",
-                f"{name!r} has the principal moments {listed} kg m^2: the largest exceeds the sum of the others, "
-                "which no solid body has.",
+                f"{name!r} has the principal moments {listed} kg m^2. Expected those of a solid body: positive ones, "
+                "the largest at most the sum of the others.",
             )
         elif link.collisions and moments[2] > largest_moment(link):
             yield (
@@ -345,22 +307,19 @@ def _drives(spec: RobotSpec) -> Problems:
             )
 
 
-def _frames(spec: RobotSpec) -> Problems:
-    kinematics = Kinematics(spec)
-    poses = dict(zip(kinematics.link_names, kinematics.link_poses(torch.tensor(spec.home)).numpy(), strict=True))
-    palm = poses[spec.palm]
-    away = np.array([poses[tip.link][:3, 3] - palm[:3, 3] for tip in spec.fingertips])
-    along = away[1:].mean(axis=0) @ palm[:3, :3] if len(away) > 1 else np.zeros(3)
+def _frames(spec: RobotSpec, tree: RobotTree) -> Problems:
+    places = link_places(spec, {})
+    palm = np.linalg.inv(places[spec.palm])
+    tips = np.array([(palm @ places[tip.link])[:3, 3] for tip in spec.fingertips])
+    along = tips[1:].mean(axis=0) if len(tips) > 1 else tips[0]
     longest = int(np.abs(along).argmax())
-    ahead = away.mean(axis=0) @ palm[:3, 0]
-    if longest != 0:
+    if longest != 0 or tips[:, 0].mean() <= 0:
         axis = ("-" if along[longest] < 0 else "") + "xyz"[longest]
-        text = "its x should point towards them, z out of its inner side."
-        yield "warning", f"the fingers lie along {axis} of the palm {spec.palm!r}: {text}"
-    elif ahead <= 0:
-        text = "its x should point towards the fingers."
-        yield "warning", f"the fingertips lie {-ahead:.3f} m behind the palm {spec.palm!r}: {text}"
-    tree = kinematics.tree
+        yield (
+            "warning",
+            f"the fingers lie along {axis} of the palm {spec.palm!r}: its x should point towards them, z out of its "
+            "inner side.",
+        )
     body = tree.moving_ancestor(spec.hand_root)
     if tree.moving_ancestor(spec.palm) != body:
         yield (
@@ -368,8 +327,8 @@ def _frames(spec: RobotSpec) -> Problems:
             f"the palm {spec.palm!r} is not fixed to the hand's root {spec.hand_root!r}, but to "
             f"{tree.moving_ancestor(spec.palm)!r}. Fix it to the body that carries the fingers.",
         )
-    knuckles = [poses[_moving_links(tree, tip.link, body)[0]][:3, 3] for tip in spec.fingertips[1:]]
-    distance = min(float(np.linalg.norm(knuckle - palm[:3, 3])) for knuckle in knuckles) if knuckles else 0.0
+    knuckles = [(palm @ places[chain[0]])[:3, 3] for chain in _chains(spec, tree)[1:]]
+    distance = min(np.linalg.norm(knuckles, axis=1)) if knuckles else 0.0
     if distance > _PALM:
         yield (
             "error",
@@ -378,20 +337,15 @@ def _frames(spec: RobotSpec) -> Problems:
         )
 
 
-def _moving_links(tree: RobotTree, link: str, body: str) -> list[str]:
-    """Return the moving links from a rigid body to a link, the body's neighbor first."""
-    joints = {joint.child: joint for joint in tree.joints}
-    found = []
-    while link != body and link in joints:
-        if joints[link].type != "fixed":
-            found.insert(0, link)
-        link = joints[link].parent
-    return found
+def _chains(spec: RobotSpec, tree: RobotTree) -> list[list[str]]:
+    """Return for each fingertip the moving links from the hand's body to it, the body's neighbor first."""
+    inside = tree.below(tree.moving_ancestor(spec.hand_root))[1:]
+    moving = [joint.child for joint in tree.joints if joint.type != "fixed" and joint.child in inside]
+    return [[link for link in moving if tip.link in tree.below(link)] for tip in spec.fingertips]  # noqa: XR002
 
 
 def _fingers(spec: RobotSpec, tree: RobotTree) -> Problems:
-    body = tree.moving_ancestor(spec.hand_root)
-    chains = [_moving_links(tree, tip.link, body) for tip in spec.fingertips]
+    chains = _chains(spec, tree)
     shared = set(chains[0]).intersection(*chains)
     wrist = [joint.name for joint in tree.joints if joint.child in shared]
     if wrist and len(chains) > 1:
@@ -469,14 +423,11 @@ def _free_of_itself(spec: RobotSpec, kinematics: Kinematics, q: torch.Tensor) ->
         meetings = set()
         for configuration, pair in zip(near.configuration, near.links, strict=True):
             meetings.add((int(configuration), " and ".join(names[pair])))
-        pairs = Counter(pair for _, pair in meetings).most_common()
-        often = ", ".join(f"{pair} ({100 * count / len(q):.0f} %)" for pair, count in pairs[:_LISTED])
-        if len(pairs) > _LISTED:
-            often += f" and {len(pairs) - _LISTED} more pairs"
+        pairs = Counter(pair for _, pair in meetings).most_common(_LISTED)
+        often = ", ".join(f"{pair} ({100 * count / len(q):.0f} %)" for pair, count in pairs)
         text = (
             f"{share:.0f} % of the spread around home touches itself: {often}; episodes that start so are pushed "
-            "apart. "
-            "Move home away, spread less (home_std), or exclude what always meets."
+            "apart. Move home away, spread less (home_std), or exclude what always meets."
         )
         found.append(Finding("warning", topic, text))
     elif not found:
@@ -498,23 +449,6 @@ def _size(spec: RobotSpec) -> Finding:
         f" {len(balls.link_pairs) // 2} pairs of links; about {predicted_gigabytes(model):.1f} GB"
     )
     return Finding("ok", "retargeting", text)
-
-
-def _probe() -> ObjectSpec:
-    """A small box for the engines' scenes."""
-    import trimesh
-
-    half = 0.03
-    mesh = trimesh.creation.box([2 * half] * 3)
-    return ObjectSpec(
-        name="box",
-        pieces=(Shape(geometry=Geometry(kind="box", size=(half,) * 3)),),
-        mass=0.2,
-        com=np.zeros(3),
-        inertia=np.eye(3) * 0.2 * (2 * half) ** 2 / 6,
-        vertices=np.asarray(mesh.vertices),
-        faces=np.asarray(mesh.faces),
-    )
 
 
 def _links_disagree(spec: RobotSpec, engine: Backend) -> str | None:

@@ -1,35 +1,50 @@
-"""Turns what couples joints of an MJCF (equalities, tendons, closed loops) into joints that follow one driven joint."""
+"""Turns what couples joints of an MJCF (equalities, tendons, closed loops) into joints that follow one driven joint.
+
+MuJoCo states how far the equalities of a model are from being met. Each driven joint goes through its range, the
+positions of the joints that are coupled to it are solved for, and straight lines are fitted to them.
+"""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import mujoco
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.sparse.csgraph import connected_components
 
+SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
+"""Hinges and slides have this type or a larger one; ball joints and free joints a smaller one."""
 _SAMPLES = 25
-"""Positions of the driven joint in which a loop is closed and a curve is read."""
+"""Positions of the driven joint in which the others are solved for."""
 _OPEN = 3e-3
-"""[m] Gap that a loop may have when its joints follow straight lines."""
+"""[m] Gap that a closed loop may have when its joints follow straight lines."""
 _CURVED = 0.05
-"""[rad or m] By which a coupling by a curve may be off its straight line."""
-_MOST_LOOPS = 20
+"""[rad or m] By which two coupled joints may be off a straight line."""
 _STILL = 2e-3
-"""[rad or m] A joint of a loop that moves by less is fixed."""
-_GAP_WEIGHT = 1e4
-"""[1/m] Weight of a gap against springs, which then open a loop by hundredths of a millimetre."""
-_STAY = 1e-3
+"""[rad or m] A coupled joint that moves by less is fixed."""
 _DIGITS = 5
+_EQUALITY = 1e6
+_PULL = 1e3
+_LIMIT = 1e2
+_STAY = 1e-3
+"""Weights against each other: equalities are met, then tendons pull all their joints alike, then joints stay within
+their limits, then springs rest (with their stiffness), then joints stay where they were."""
+
+
+class Pull(NamedTuple):
+    """Joints that an actuator moves, by their numbers, and by how much its length changes with each."""
+
+    joints: list[int]
+    shares: list[float]
 
 
 class Line(NamedTuple):
-    """``joint = multiplier * source + offset``"""
+    """``position = multiplier * position of the source + offset``"""
 
-    joint: Any
-    source: Any
+    source: int
     multiplier: float
     offset: float
 
@@ -38,354 +53,164 @@ class Line(NamedTuple):
 class Couplings:
     """How joints of a model follow others; joints by their numbers."""
 
-    lines: list[Line] = field(default_factory=list)
-    """One line for each follower; sources follow nothing."""
+    lines: dict[int, Line] = field(default_factory=dict)
+    """Follower -> its line; sources follow nothing."""
     held: dict[int, float] = field(default_factory=dict)
     """Joints that do not move, and where they are."""
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
-    """What cannot be said by straight lines, each with a remedy."""
+    """What cannot be stated by straight lines, each with a remedy."""
 
-    def lever(self, joints: Iterable[int], shares: Iterable[float]) -> tuple[int, float]:
+    def lever(self, pull: Pull) -> tuple[int, float]:
         """Return the driven joint of an actuator, and by how much the actuator's length changes with it."""
-        lines = {line.joint: line for line in self.lines}
         lever = 0.0
-        source = -1
-        for joint, share in zip(joints, shares, strict=True):
-            line = lines.get(joint, Line(joint, joint, 1.0, 0.0))
+        source = pull.joints[0]
+        for joint, share in zip(pull.joints, pull.shares, strict=True):
+            line = self.lines.get(joint, Line(joint, 1.0, 0.0))
             source = line.source
             lever += share * line.multiplier
         return source, lever
 
 
-def resolved(lines: Sequence[Line], first: Iterable[Hashable] = ()) -> list[Line]:
-    """Return lines whose sources follow nothing, one for each follower.
+def read_couplings(model: mujoco.MjModel, pulls: Sequence[Pull]) -> Couplings:
+    """Return how the joints of a compiled model follow others.
 
     Args:
-        lines: may form chains; each can be read in either direction.
-        first: joints that become sources where possible, in this order; the others are those that follow nothing.
-
-    Raises:
-        ValueError: joints follow one another in a circle.
+        model: the model; its options change.
+        pulls: what its actuators move.
     """
-    neighbors = defaultdict(list)
-    for line in lines:
-        neighbors[line.source].append(line)
-        if line.multiplier:
-            inverse = 1 / line.multiplier
-            neighbors[line.joint].append(Line(line.source, line.joint, inverse, -line.offset * inverse))
-    followers = {line.joint for line in lines}
-    roots = [joint for joint in first if joint in neighbors]
-    roots += [line.source for line in lines if line.source not in followers]
-    found: dict[Any, Line] = {}
-    for root in roots:
-        if root in found:
-            continue
-        found[root] = Line(root, root, 1.0, 0.0)
-        stack = [root]
-        while stack:
-            here = found[stack.pop()]
-            for line in neighbors[here.joint]:
-                if line.joint not in found:
-                    offset = line.multiplier * here.offset + line.offset
-                    found[line.joint] = Line(line.joint, root, line.multiplier * here.multiplier, offset)
-                    stack.append(line.joint)
-    if left := [str(line.joint) for line in lines if line.joint not in found]:
-        raise ValueError(f"joints follow one another in a circle: {', '.join(left)}")
-    return [line for line in found.values() if line.joint != line.source]
-
-
-def tendon_joints(model: Any, mujoco: Any, tendon: int) -> tuple[list[int], list[float]] | None:
-    """Return the joints of a fixed tendon and their coefficients; None for a tendon that runs through space."""
-    wraps = range(int(model.tendon_adr[tendon]), int(model.tendon_adr[tendon] + model.tendon_num[tendon]))
-    if any(int(model.wrap_type[i]) != int(mujoco.mjtWrap.mjWRAP_JOINT) for i in wraps):
-        return None
-    return [int(model.wrap_objid[i]) for i in wraps], [float(model.wrap_prm[i]) for i in wraps]
-
-
-def read_couplings(model: Any, mujoco: Any) -> Couplings:
-    """Return how the joints of a compiled model follow others."""
     found = Couplings()
-    lines: list[Line] = []
-    driven = []
-    tendons = []
-    for actuator in range(model.nu):
-        kind = int(model.actuator_trntype[actuator])
-        target = int(model.actuator_trnid[actuator, 0])
-        if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
-            driven.append(target)
-        elif kind == int(mujoco.mjtTrn.mjTRN_TENDON):
-            tendons.append(target)
-        else:
-            found.notes.append(f"left out: the actuator {model.actuator(actuator).name!r}, which drives no joint")
-    try:
-        _read_equalities(model, mujoco, found, lines)
-        _read_tendons(model, mujoco, found, lines, driven, tendons)
-        found.lines = resolved(lines, driven)
-        loops = _loops(model, mujoco)
-        if len(loops) > _MOST_LOOPS:
-            found.problems.append(f"{len(loops)} closed loops, expected {_MOST_LOOPS} at most. Remove bars of linkages")
-        elif loops:
-            _close(model, mujoco, found, loops, driven)
-    except (ValueError, ZeroDivisionError) as error:
-        found.problems.append(f"equalities or tendons that cannot be read ({error}). Remove what couples these joints")
+    mechanism = _Mechanism(model, pulls)
+    for group in mechanism.groups():
+        mechanism.couple(group, found)
     return found
 
 
-def _name(model: Any, joint: int) -> str:
-    return repr(model.joint(joint).name or f"joint{joint}")
+class _Mechanism:
+    """The hinges and slides of a model (Q of them), and what couples them."""
 
+    def __init__(self, model: mujoco.MjModel, pulls: Sequence[Pull]) -> None:
+        model.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self.model = model
+        self.data = mujoco.MjData(model)
+        self.joints = np.flatnonzero(model.jnt_type >= SLIDE)
+        self.names = [repr(model.joint(joint).name or f"joint{joint}") for joint in self.joints]
+        self.address = model.jnt_qposadr[self.joints]
+        self.start = model.qpos0[self.address]
+        self.rest = model.qpos_spring[self.address]
+        self.stiffness = np.sqrt(model.jnt_stiffness[self.joints])
+        limited = model.jnt_limited[self.joints] > 0
+        self.lower = np.where(limited, model.jnt_range[self.joints, 0], self.start - np.pi)
+        self.upper = np.where(limited, model.jnt_range[self.joints, 1], self.start + np.pi)
+        self.driven = [int(np.searchsorted(self.joints, pull.joints[0])) for pull in pulls]
+        rows = [np.zeros(len(self.joints))]
+        for pull in pulls:
+            for joint, share in zip(pull.joints[1:], pull.shares[1:], strict=True):
+                row = np.zeros(len(self.joints))
+                row[self.joints == joint] = pull.shares[0]
+                row[self.joints == pull.joints[0]] = -share
+                rows.append(row)
+        self.shared = np.stack(rows)
+        """[S, Q] products with the positions are 0 where tendons pull all their joints alike."""
 
-def _limits(model: Any, joint: int) -> tuple[float, float]:
-    """Return the limits of a joint; half a turn to either side of where it is in the file if it has none."""
-    if model.jnt_limited[joint]:
-        low, high = model.jnt_range[joint].tolist()
-        return low, high
-    middle = float(model.qpos0[model.jnt_qposadr[joint]])
-    return middle - np.pi, middle + np.pi
+    def gaps(self, q: np.ndarray) -> np.ndarray:
+        """Return how far the equalities [E] are from being met at positions [Q]."""
+        self.data.qpos[self.address] = q
+        mujoco.mj_fwdPosition(self.model, self.data)
+        return self.data.efc_pos[: self.data.ne].copy()
 
+    def jacobian(self, q: np.ndarray) -> np.ndarray:
+        """[E, Q]"""
+        count = len(self.gaps(q))
+        dofs = self.model.jnt_dofadr[self.joints]
+        return self.data.efc_J.reshape(-1, self.model.nv)[:count, dofs]
 
-def _samples(model: Any, joint: int) -> np.ndarray:
-    low, high = _limits(model, joint)
-    return np.linspace(low, high, _SAMPLES)
+    def groups(self) -> list[np.ndarray]:
+        """Return joints that depend on each other, by their indices."""
+        if not len(self.joints):
+            return []
+        away = np.random.default_rng(0).uniform(0.01, 0.1, len(self.joints))
+        rows = np.abs(np.vstack((self.jacobian(self.start + away), self.shared))) > 1e-9
+        bound = rows.any(axis=0)
+        _, labels = connected_components(rows.T.astype(int) @ rows.astype(int))
+        return [np.flatnonzero((labels == label) & bound) for label in np.unique(labels[bound])]
 
-
-def _read_equalities(model: Any, mujoco: Any, found: Couplings, lines: list[Line]) -> None:
-    for number in range(model.neq):
-        if not model.eq_active0[number]:
-            continue
-        equality = model.equality(number)
-        name = equality.name or number
-        kind = mujoco.mjtEq(int(model.eq_type[number]))
-        first = int(model.eq_obj1id[number])
-        second = int(model.eq_obj2id[number])
-        if kind == mujoco.mjtEq.mjEQ_JOINT:
-            start = float(model.qpos0[model.jnt_qposadr[first]])
-            if second < 0:
-                found.held[first] = start + float(equality.data[0])
-                found.notes.append(f"{_name(model, first)} is fixed, because the equality {name!r} holds it in place")
-                continue
-            shift = float(model.qpos0[model.jnt_qposadr[second]])
-            curve = np.polynomial.Polynomial(equality.data[:5])
-            offset = float(equality.data[0])
-            multiplier = float(equality.data[1])
-            if np.abs(equality.data[2:5]).max() > 0:
-                x = _samples(model, second) - shift
-                multiplier, offset = np.polyfit(x, curve(x), 1).round(_DIGITS).tolist()
-                away = float(np.abs(offset + multiplier * x - curve(x)).max())
-                if away > _CURVED:
-                    found.problems.append(
-                        f"the equality {name!r}, which couples joints by a curve that is {away:.2g} rad (m) off a "
-                        "straight line. Give it a polycoef with two numbers"
-                    )
-                    continue
-                found.notes.append(f"the curve of the equality {name!r} is replaced by a line, {away:.2g} rad (m) off")
-            lines.append(Line(first, second, multiplier, offset + start - multiplier * shift))
-        elif kind == mujoco.mjtEq.mjEQ_TENDON:
-            joints, shares = tendon_joints(model, mujoco, first) or ([], [])
-            if second >= 0 or len(joints) != 2:
-                found.problems.append(
-                    f"the equality {name!r} of tendons. State it as equalities of two joints: "
-                    '<joint joint1="A" joint2="B" polycoef="0 1 0 0 0"/>'
-                )
-                continue
-            length = float(model.tendon_length0[first] + equality.data[0])
-            lines.append(Line(joints[1], joints[0], -shares[0] / shares[1], length / shares[1]))
-        elif kind != mujoco.mjtEq.mjEQ_CONNECT:
+    def couple(self, group: np.ndarray, found: Couplings) -> None:
+        """Add the lines of joints that depend on each other."""
+        drives = [joint for joint in dict.fromkeys(self.driven) if joint in group]
+        rows = np.abs(self.jacobian(self.start)[:, group]).max(axis=1, initial=0) > 1e-9
+        free_motions = len(group) - np.linalg.matrix_rank(self.jacobian(self.start)[:, group], tol=1e-6)
+        listed = ", ".join(self.names[i] for i in group)
+        if len(drives) > 1 and free_motions > 1:
+            names = ", ".join(self.names[i] for i in drives)
             found.problems.append(
-                f"the equality {name!r} of type {kind.name.removeprefix('mjEQ_').lower()}. If it welds two bodies, "
-                "put one into the other, without a joint"
+                f"the coupled joints {listed}, which {len(drives)} drives move ({names}), expected one. Use the "
+                "maker's URDF with mimic joints, or state the couplings as equalities of two joints"
             )
-
-
-def _read_tendons(
-    model: Any, mujoco: Any, found: Couplings, lines: list[Line], driven: list[int], tendons: list[int]
-) -> None:
-    """A tendon with an actuator moves its joints together, in proportion to their coefficients: each takes the
-    coefficient's share of the tendon's force."""
-    for tendon in range(model.ntendon):
-        name = model.tendon(tendon).name or tendon
-        parts = tendon_joints(model, mujoco, tendon)
-        if tendon not in tendons:
-            found.notes.append(f"left out: the tendon {name!r}, which no actuator pulls")
-        elif parts is None:
-            found.problems.append(
-                f"the tendon {name!r}, which runs through space. Drive its joint by a position actuator of its own, or "
-                "couple its joints by an equality"
-            )
-        else:
-            joints, shares = parts
-            source = joints[0]
-            driven.append(source)
-            for joint, share in zip(joints[1:], shares[1:], strict=True):
-                roots = {line.joint: line.source for line in resolved(lines)}
-                if roots.get(joint, joint) != roots.get(source, source):
-                    lines.append(Line(joint, source, share / shares[0], 0.0))
-                    found.notes.append(
-                        f"{_name(model, joint)} follows {_name(model, source)}, because the tendon {name!r} pulls both"
-                    )
-
-
-# Closed loops ---------------------------------------------------------------------------------------------------------
-
-
-class _Loop(NamedTuple):
-    """A point of one body that stays at a point of another."""
-
-    name: str
-    joints: frozenset[int]
-    """Joints that move one of the bodies and not the other."""
-    gap: Any
-    """Function of MuJoCo's data that returns the vector [3] between the points."""
-
-
-def _loops(model: Any, mujoco: Any) -> list[_Loop]:
-    loops = []
-    for number in range(model.neq):
-        if not model.eq_active0[number] or int(model.eq_type[number]) != int(mujoco.mjtEq.mjEQ_CONNECT):
-            continue
-        pair = (int(model.eq_obj1id[number]), int(model.eq_obj2id[number]))
-        sites = int(model.eq_objtype[number]) == int(mujoco.mjtObj.mjOBJ_SITE)
-        bodies = tuple(int(model.site_bodyid[i]) for i in pair) if sites else pair
-        anchors = (model.eq_data[number, :3].copy(), model.eq_data[number, 3:6].copy())
-
-        def gap(data: Any, pair: tuple = pair, anchors: tuple = anchors, sites: bool = sites) -> np.ndarray:
-            points = []
-            for i, anchor in zip(pair, anchors, strict=True):
-                points.append(data.site_xpos[i] if sites else data.xpos[i] + data.xmat[i].reshape(3, 3) @ anchor)
-            return points[0] - points[1]
-
-        first, second = (_joints_above(model, body) for body in bodies)
-        loops.append(_Loop(str(model.equality(number).name or number), frozenset(first ^ second), gap))
-    return loops
-
-
-def _joints_above(model: Any, body: int) -> set[int]:
-    joints = set()
-    while body:
-        first = int(model.body_jntadr[body])
-        joints |= set(range(first, first + int(model.body_jntnum[body])))
-        body = int(model.body_parentid[body])
-    return joints
-
-
-def _moving(loops: list[_Loop]) -> frozenset[int]:
-    return frozenset().union(*(loop.joints for loop in loops))
-
-
-def _close(model: Any, mujoco: Any, found: Couplings, loops: list[_Loop], driven: list[int]) -> None:
-    """Add lines for the joints of closed loops that nothing else drives."""
-    lines = {line.joint: line for line in found.lines}
-    for joint in driven:
-        lines.setdefault(joint, Line(joint, joint, 1.0, 0.0))
-    for line in found.lines:
-        lines.setdefault(line.source, Line(line.source, line.source, 1.0, 0.0))
-    groups: list[list[_Loop]] = []
-    for loop in loops:  # loops that share a joint without a drive are closed together
-        free = loop.joints - lines.keys()
-        apart = []
-        joined = [loop]
-        for group in groups:
-            if free & _moving(group):
-                joined += group
-            else:
-                apart.append(group)
-        groups = [*apart, joined]
-    for group in groups:
-        names = ", ".join(loop.name for loop in group)
-        joints = _moving(group)
-        free = sorted(joints - lines.keys() - found.held.keys())
-        sources = {lines[joint].source for joint in joints if joint in lines}
-        if not free:  # equalities of joints close it
-            continue
-        if len(sources) != 1:
-            drives = ", ".join(_name(model, joint) for joint in sources) or "none"
-            found.problems.append(
-                f"the closed loop {names!r}, which {len(sources)} drives move ({drives}), expected one. Use the "
-                "maker's URDF with mimic joints, or state the coupling as equalities of two joints"
-            )
-            continue
-        source = sources.pop()
-        values = _samples(model, source)
-        moved = {joint: line for joint, line in lines.items() if line.source == source}
-        positions = _closed(model, mujoco, group, free, moved, found.held, values)
-        fitted = []
-        for joint, track in zip(free, positions.T, strict=True):
-            if np.ptp(track) < _STILL:
-                fitted.append(Line(joint, source, 0.0, float(track.mean())))
-            else:
+            return
+        if len(group) == 1:
+            found.held[int(self.joints[group[0]])] = float(self.closed(group, None, 0.0, self.start)[0])
+            found.notes.append(f"{listed} is fixed, because an equality holds it in place")
+            return
+        source = drives[0] if drives else group[0]
+        followers = group[group != source]
+        values = np.linspace(self.lower[source], self.upper[source], _SAMPLES)
+        positions = []
+        before = self.start
+        for value in values:
+            before = before.copy()
+            before[followers] = self.closed(followers, source, value, before)
+            positions.append(before[followers])
+        lines = {}
+        straight = np.tile(self.start, (_SAMPLES, 1))
+        straight[:, source] = values
+        for follower, track in zip(followers, np.transpose(positions), strict=True):
+            multiplier = 0.0
+            offset = float(track.mean())
+            if np.ptp(track) > _STILL:
                 multiplier, offset = (np.polyfit(values, track, 1).round(_DIGITS) + 0.0).tolist()
-                fitted.append(Line(joint, source, multiplier, offset))
-        straight = np.stack([line.multiplier * values + line.offset for line in fitted], axis=1)
-        data = mujoco.MjData(model)
-        opened = 0.0
-        for value, row in zip(values, straight, strict=True):
-            _put(model, mujoco, data, moved, found.held, value, free, row)
-            opened = max(opened, *(float(np.linalg.norm(loop.gap(data))) for loop in group))
-        if opened > _OPEN:
+            straight[:, follower] = multiplier * values + offset
+            lines[int(self.joints[follower])] = Line(int(self.joints[source]), multiplier, offset)
+        gaps = np.max([np.abs(self.gaps(q)) for q in straight], axis=0, initial=0)
+        kinds = self.model.eq_type[self.data.efc_id[: len(gaps)]]
+        is_loop = np.isin(kinds, (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)))
+        opened = float(gaps[rows & is_loop].max(initial=0))
+        off = float(gaps[rows & ~is_loop].max(initial=0))
+        if opened > _OPEN or off > _CURVED:
             found.problems.append(
-                f"the closed loop {names!r}, whose joints do not move in proportion: as coupled joints they would open "
-                f"it by {1e3 * opened:.1f} mm. Remove the bar that closes the loop, or use the maker's URDF"
+                f"the coupled joints {listed}, which do not move in proportion: as straight lines they are "
+                f"{off:.2g} rad (m) off, and open closed loops by {1e3 * opened:.1f} mm. Give equalities a polycoef "
+                "with two numbers, remove the bar that closes a loop, or use the maker's URDF"
             )
-            continue
-        for line in fitted:
+            return
+        for joint, line in lines.items():
             if line.multiplier:
-                found.lines.append(line)
+                found.lines[joint] = line
             else:
-                found.held[line.joint] = line.offset
-        listed = ", ".join(_name(model, joint) for joint in free)
+                found.held[joint] = line.offset
+        names = ", ".join(self.names[i] for i in followers)
         found.notes.append(
-            f"the closed loop {names!r} is replaced by coupled joints ({listed} with {_name(model, source)}), which "
-            f"close it within {1e3 * opened:.2f} mm"
+            f"coupled joints: {names} with {self.names[source]}; closed loops stay closed within {1e3 * opened:.2f} mm"
         )
 
+    def closed(self, free: np.ndarray, source: int | None, value: float, start: np.ndarray) -> np.ndarray:
+        """Return positions of the free joints that meet what couples them, for a position of the source."""
+        q = start.copy()
+        if source is not None:
+            q[source] = value
 
-def _put(
-    model: Any,
-    mujoco: Any,
-    data: Any,
-    moved: dict[int, Line],
-    held: dict[int, float],
-    value: float,
-    free: Sequence[int],
-    positions: np.ndarray,
-) -> None:
-    for joint, line in moved.items():
-        data.qpos[model.jnt_qposadr[joint]] = line.multiplier * value + line.offset
-    for joint, position in held.items():
-        data.qpos[model.jnt_qposadr[joint]] = position
-    data.qpos[model.jnt_qposadr[free]] = positions
-    mujoco.mj_kinematics(model, data)
+        def cost(x: np.ndarray) -> np.ndarray:
+            q[free] = x
+            outside = x - np.clip(x, self.lower[free], self.upper[free])
+            return np.concatenate(
+                (
+                    _EQUALITY * self.gaps(q),
+                    _PULL * (self.shared @ q),
+                    _LIMIT * outside,
+                    self.stiffness[free] * (x - self.rest[free]),
+                    _STAY * (x - start[free]),
+                )
+            )
 
-
-def _closed(
-    model: Any,
-    mujoco: Any,
-    loops: list[_Loop],
-    free: list[int],
-    moved: dict[int, Line],
-    held: dict[int, float],
-    values: np.ndarray,
-) -> np.ndarray:
-    """[V, Q] positions of the free joints that close the loops, where springs rest as far as they can, for positions
-    [V] of the driven joint."""
-    data = mujoco.MjData(model)
-    address = model.jnt_qposadr[free]
-    stiffness = np.sqrt(model.jnt_stiffness[free])
-    rest = model.qpos_spring[address]
-    low, high = np.array([_limits(model, joint) for joint in free]).T
-    inside = 1e-6 * (high - low)
-    before = np.clip(model.qpos0[address], low + inside, high - inside)
-    rows = []
-    for value in values:
-        start = before
-
-        def cost(q: np.ndarray, value: float = value, start: np.ndarray = start) -> np.ndarray:
-            _put(model, mujoco, data, moved, held, value, free, q)
-            gaps = [_GAP_WEIGHT * loop.gap(data) for loop in loops]
-            return np.concatenate((*gaps, stiffness * (q - rest), _STAY * (q - start)))
-
-        solution = least_squares(cost, start, bounds=(low, high), xtol=1e-12, ftol=1e-12, max_nfev=400)
-        before = np.clip(solution.x, low + inside, high - inside)
-        rows.append(solution.x)
-    return np.array(rows)
+        return least_squares(cost, start[free], xtol=1e-12, ftol=1e-12, max_nfev=400).x

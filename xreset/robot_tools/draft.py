@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jinja2
@@ -14,66 +15,54 @@ from xreset.description import SCHEMA
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import urdf_text, write_meshes
-from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, MimicSpec, RobotSpec
+from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, RobotSpec
 
 _BASE = ((0.60, 1.00, 0.30), (0.7071068, 0.0, 0.0, -0.7071068))
 """Where the arm stands until `robots place` finds better: behind the table, on the person's side, its x towards the
 table."""
 
 
-def moving(tree: RobotTree, mimics: Sequence[MimicSpec]) -> list[str]:
+def moving(tree: RobotTree) -> list[str]:
     """Return the joints that need a drive, root first."""
-    followers = {mimic.joint for mimic in mimics}
-    return [joint.name for joint in tree.joints if joint.type != "fixed" and joint.name not in followers]
-
-
-def below(tree: RobotTree, root: str) -> list[str]:
-    """Return the link ``root`` and all links that it carries."""
-    found = {root}
-    for joint in tree.joints:
-        if joint.parent in found:
-            found.add(joint.child)
-    return [name for name in tree.link_names if name in found]
+    return [joint.name for joint in tree.joints if joint.type != "fixed" and joint.mimic is None]
 
 
 def draft_spec(
     tree: RobotTree,
-    mimics: Sequence[MimicSpec],
     hand_root: str,
     folder: Path,
     *,
     tips: Sequence[FingertipSpec] = (),
     keypoints: Sequence[KeypointSpec] = (),
-    home: dict[str, float] | None = None,
+    bent: Mapping[str, float] | None = None,
 ) -> RobotSpec:
-    """Write the URDF, and return the robot as far as it is known."""
-    (folder / "robot.urdf").write_text(urdf_text(tree, {}, mimics=mimics, comment="Written by xreset robots import."))
+    """Write the URDF, and return the robot as far as it is known; at home, joints are at 0, and bent from there."""
+    (folder / "robot.urdf").write_text(urdf_text(tree, "Written by xreset robots import."))
     write_meshes(tree, folder)
-    inside = {joint.name for joint in tree.joints if joint.child in set(below(tree, hand_root)) - {hand_root}}
-    joints = tuple(
-        JointSpec(
-            name=name,
-            group="hand" if name in inside else "arm",
-            drive=DriveSpec(kp=1.0, kd=0.1, effort=1.0),
-            home=(home or {}).get(name, float(np.clip(0.0, tree.joint(name).lower, tree.joint(name).upper))),
-        )
-        for name in moving(tree, mimics)
-    )
+    inside = set(tree.below(hand_root)[1:])
+    joints = []
+    for name in moving(tree):
+        joint = tree.joint(name)
+        home = float(np.clip(0.0, joint.lower, joint.upper)) + (bent or {}).get(name, 0.0)
+        lowest = math.ceil(joint.lower * 1e4) / 1e4
+        highest = math.floor(joint.upper * 1e4) / 1e4
+        home = float(np.clip(round(home, 4), lowest, highest))  # four digits get into the description
+        group = "hand" if joint.child in inside else "arm"
+        joints.append(JointSpec(name=name, group=group, drive=DriveSpec(kp=1.0, kd=0.1, effort=1.0), home=home))
+    links = [link.name for link in tree.links if link.collisions]
     return RobotSpec(
         name=tree.name,
         urdf=folder / "robot.urdf",
-        joints=joints,
-        mimics=tuple(mimics),
+        joints=tuple(joints),
+        mimics=tree.mimics,
         base_pos=_BASE[0],
         base_quat=_BASE[1],
         palm="palm_frame" if tips else hand_root,
         hand_root=hand_root,
         fingertips=tuple(tips),
         keypoints=tuple(keypoints),
-        self_collision_links=tuple(n for n in below(tree, hand_root) if tree.link(n).collisions),
-        table_exclude=tuple(
-            n for n in tree.link_names if tree.moving_ancestor(n) == tree.root and tree.link(n).collisions
-        ),
+        self_collision_links=tuple(name for name in links if name in (hand_root, *inside)),
+        table_exclude=tuple(name for name in links if tree.moving_ancestor(name) == tree.root),
     )
 
 

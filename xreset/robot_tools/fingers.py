@@ -4,7 +4,7 @@ which human keypoint."""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,9 +16,9 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import surface_of
 from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import fixed, frame
-from xreset.robot_tools.draft import below, draft_spec, link_places
+from xreset.robot_tools.draft import draft_spec, link_places
 from xreset.robot_tools.opposition import closing_range, opposition, opposition_scores
-from xreset.spec import FingertipSpec, KeypointSpec, MimicSpec, RobotSpec
+from xreset.spec import FingertipSpec, KeypointSpec, RobotSpec
 
 _FINGERS = ("index", "middle", "ring", "little")
 _WORDS = {
@@ -68,27 +68,101 @@ class Finger:
     """Links fixed to the last one."""
 
 
-def find_fingers(
-    tree: RobotTree, mimics: Sequence[MimicSpec], hand_root: str, folder: Path, thumb: str | None, notes: list[str]
-) -> list[Finger]:
+@dataclass(frozen=True, kw_only=True)
+class Hand:
+    """What is known of a hand."""
+
+    tree: RobotTree
+    """Its links, with frames for palm, wrist, fingertips and keypoints."""
+    root: str
+    """Link after which the fingers part."""
+    wrist: tuple[str, ...]
+    """Joints before it."""
+    palm: np.ndarray
+    """[4, 4] pose of the palm in the frame of the tree's root, with a straight wrist."""
+    palm_in_hand: np.ndarray
+    """[4, 4] pose of the palm in the frame of the hand's root."""
+    tips: tuple[FingertipSpec, ...]
+    """Thumb first."""
+    keypoints: tuple[KeypointSpec, ...]
+    bent: dict[str, float]
+    """Joint -> angle by which it is bent at home [rad]."""
+
+
+def find_hand(tree: RobotTree, folder: Path, thumb: str | None, notes: list[str]) -> Hand:
+    """Find palm and fingers of a hand.
+
+    Args:
+        tree: the hand.
+        folder: where its URDF is written.
+        thumb: a link or joint of the thumb.
+        notes: what is guessed is appended.
+    """
+    root, wrist = _palm_link(tree, notes)
+    spec = draft_spec(tree, root, folder)
+    straight = link_places(spec, {})
+    fingers = _find_fingers(spec, tree, straight, thumb, notes)
+    palm, bent = _find_palm(spec, tree, straight, fingers)
+    tree, tips, keypoints = _with_frames(tree, root, fingers, palm, straight)
+    return Hand(
+        tree=tree,
+        root=root,
+        wrist=tuple(wrist),
+        palm=np.linalg.inv(straight[tree.root]) @ palm,
+        palm_in_hand=palm,
+        tips=tuple(tips),
+        keypoints=tuple(keypoints),
+        bent=bent,
+    )
+
+
+def _carrier(tree: RobotTree, link: str) -> str:
+    """Return the first link from ``link`` on that has shapes, or more than one child."""
+    while not tree.link(link).collisions:
+        children = [joint for joint in tree.joints if joint.parent == link]
+        if len(children) != 1 or children[0].type != "fixed":
+            break
+        link = children[0].child
+    return link
+
+
+def _palm_link(tree: RobotTree, notes: list[str]) -> tuple[str, list[str]]:
+    """Return the link after which the fingers part, and the joints before it, which are those of a wrist."""
+    wrist = []
+    link = _carrier(tree, tree.root)
+    while True:
+        body = tree.moving_ancestor(link)
+        inside = tree.below(link)[1:]
+        first = [j for j in tree.joints if j.type != "fixed" and j.child in inside]
+        first = [joint for joint in first if tree.moving_ancestor(joint.parent) == body]
+        if len(first) != 1:
+            break
+        wrist.append(first[0].name)
+        link = _carrier(tree, first[0].child)
+    if wrist:
+        notes.append(
+            f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm. To keep a wrist still, make "
+            "its joints fixed in the hand's file"
+        )
+    return link, wrist
+
+
+def _find_fingers(spec: RobotSpec, tree: RobotTree, at: Poses, thumb: str | None, notes: list[str]) -> list[Finger]:
     """Return the hand's fingers, thumb first, then from the thumb's side on."""
-    spec = draft_spec(tree, mimics, hand_root, folder)
-    chains = _without_bars(spec, _chains(tree, hand_root), notes)
+    chains = _without_bars(spec, _chains(tree, spec.hand_root), notes)
     if len(chains) < 2:
         raise RobotError(
-            f"below {hand_root!r} there are {len(chains)} chains of moving links, expected a thumb and at least one "
-            "finger."
+            f"below {spec.hand_root!r} there are {len(chains)} chains of moving links, expected a thumb and at least "
+            "one finger."
         )
-    at = link_places(spec, {})
-    bases = np.array([at[chain.links[0]][:3, 3] for chain in chains])
     ends = np.array([_end(tree, chain, at) for chain in chains])
     stated = [_stated_finger(tree, chain) for chain in chains]
+    known = "; ".join(", ".join(chain.links) for chain in chains)  # noqa: XR002
     if thumb is None:
         marked = [i for i, name in enumerate(stated) if name == "thumb"]
     else:
         marked = [i for i, chain in enumerate(chains) if thumb in (*chain.links, *chain.joints, *chain.rest)]
         if len(marked) != 1:
-            known = "; ".join(", ".join(chain.links) for chain in chains)  # noqa: XR002
             raise RobotError(f"--thumb {thumb!r} is in {len(marked)} fingers; their links are {known}.")
     if len(marked) == 1:
         first = marked[0]
@@ -96,10 +170,9 @@ def find_fingers(
         tips = [_in_link(at[chain.links[-1]], end) for chain, end in zip(chains, ends, strict=True)]
         scores = opposition_scores(opposition(spec, [chain.links[-1] for chain in chains], np.array(tips)))
         first = int(scores.argmax())
-        why = "it can oppose the others"
-        if scores[first] == 0:
-            first = _farthest_back(bases, ends)
-            why = "its base is farthest back"
+        if scores[first] == 0 and len(chains) > 2:
+            raise RobotError(f"no finger can oppose the others. Name a link of the thumb with --thumb: {known}.")
+        why = "it can oppose the others" if scores[first] else "the two are alike"
         notes.append(f"the thumb is the finger of {', '.join(chains[first].links)}: {why} (--thumb says another)")
     others = [i for i in range(len(chains)) if i != first]
     named = {i: stated[i] for i in others}
@@ -108,6 +181,7 @@ def find_fingers(
             raise RobotError(
                 f"the hand has {len(others)} fingers beside the thumb; xreset knows {', '.join(_FINGERS)}."
             )
+        bases = np.array([at[chain.links[0]][:3, 3] for chain in chains])
         middle = bases[others].mean(axis=0)
         across = np.linalg.svd(bases[others] - middle)[2][0]
         across *= np.sign((ends[first] - middle) @ across) or 1.0
@@ -121,7 +195,7 @@ def find_fingers(
 
 def _chains(tree: RobotTree, hand_root: str) -> list[Finger]:
     by_child = {joint.child: joint for joint in tree.joints}
-    inside = below(tree, hand_root)
+    inside = tree.below(hand_root)
     moving = [name for name in inside if name != hand_root and by_child[name].type != "fixed"]
     carriers = {tree.moving_ancestor(by_child[name].parent) for name in moving}
     chains = []
@@ -140,8 +214,9 @@ def _chains(tree: RobotTree, hand_root: str) -> list[Finger]:
     return chains
 
 
-def _drives_of(finger: Finger, sources: Mapping[str, str]) -> set[str]:
+def _drives_of(finger: Finger, spec: RobotSpec) -> set[str]:
     """Return the joints with a drive that move a finger."""
+    sources = {mimic.joint: mimic.source for mimic in spec.mimics}
     return {sources.get(joint, joint) for joint in finger.joints}
 
 
@@ -151,8 +226,7 @@ def _without_bars(spec: RobotSpec, chains: list[Finger], notes: list[str]) -> li
     kinematics = Kinematics(spec, root=spec.hand_root)
     if not len(kinematics.joint_names):
         return chains
-    sources = {mimic.joint: mimic.source for mimic in spec.mimics}
-    drives = [_drives_of(chain, sources) for chain in chains]
+    drives = [_drives_of(chain, spec) for chain in chains]
     share = torch.linspace(0, 1, _PIN_SAMPLES, dtype=torch.float64)[:, None]
     poses = kinematics.link_poses(kinematics.lower + share * (kinematics.upper - kinematics.lower)).numpy()
     bars = {}
@@ -196,29 +270,11 @@ def _stated_finger(tree: RobotTree, chain: Finger) -> str:
     return ""
 
 
-def _farthest_back(bases: np.ndarray, ends: np.ndarray) -> int:
-    """Return the index of the finger whose base is farthest behind the others', or of two the one that points
-    elsewhere."""
-    directions = (ends - bases) / np.linalg.norm(ends - bases, axis=1, keepdims=True)
-    scores = []
-    for i in range(len(bases)):
-        ahead = np.delete(directions, i, axis=0).mean(axis=0)
-        if len(bases) > 2:
-            scores.append((bases[i] - np.delete(bases, i, axis=0).mean(axis=0)) @ ahead)
-        else:
-            scores.append(ahead @ directions[i])
-    return int(np.argmin(scores))
-
-
-def find_palm(
-    tree: RobotTree, mimics: Sequence[MimicSpec], hand_root: str, fingers: list[Finger], folder: Path
-) -> tuple[np.ndarray, Poses, dict[str, float]]:
-    """Return the palm's frame [4, 4] in the hand root's, poses of links with straight fingers, and how far each joint
-    is bent at home [rad]."""
-    spec = draft_spec(tree, mimics, hand_root, folder)
-    drive_of = {mimic.joint: mimic.source for mimic in mimics}
-    straight = link_places(spec, {})
-    drives = _drives_of(fingers[0], drive_of) | _drives_of(fingers[1], drive_of)
+def _find_palm(
+    spec: RobotSpec, tree: RobotTree, straight: Poses, fingers: list[Finger]
+) -> tuple[np.ndarray, dict[str, float]]:
+    """Return the palm's frame [4, 4] in the hand root's, and how far each joint is bent at home [rad]."""
+    drives = _drives_of(fingers[0], spec) | _drives_of(fingers[1], spec)
     is_jaw = len(fingers) == 2 and len(drives) == 1
     along = fingers if is_jaw else fingers[1:]
     bases = np.array([_on_axis(tree, finger.links[0], straight) for finger in along])
@@ -250,10 +306,10 @@ def find_palm(
     T = np.eye(4)
     T[:3, :3] = np.stack((x, np.cross(z, x), z), axis=1)
     T[:3, 3] = bases.mean(axis=0) - _PALM_BEHIND * x
-    return T, straight, bent
+    return T, bent
 
 
-def with_frames(
+def _with_frames(
     tree: RobotTree, hand_root: str, fingers: list[Finger], palm: np.ndarray, straight: Poses
 ) -> tuple[RobotTree, list[FingertipSpec], list[KeypointSpec]]:
     """Return the tree with frames for palm, wrist and fingertips, the fingertips, and which link follows which human

@@ -12,13 +12,12 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -27,11 +26,12 @@ from scipy.spatial.transform import Rotation
 
 from xreset.errors import RobotError
 from xreset.geometry.collision import height_above_table, table_points
-from xreset.geometry.rotations import matrix_to_quat
+from xreset.geometry.kinematics import Kinematics
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
+from xreset.robot_tools.homes import reach_near
 from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search
 from xreset.spec import RobotSpec, TableSpec
 from xreset.tensors import one_thread
@@ -46,8 +46,6 @@ _DRAWS = 1000
 """Times that a candidate is drawn until it is clear of wrists and objects; then the round goes without it."""
 _SHRINK = 0.6
 """Factor by which the spread of candidates about the best shrinks from round to round."""
-_HOME_STEPS = (-0.15, 0.0, 0.15)
-"""[m] Steps along each axis from the hand's pose at home to others that are tried."""
 _HOME_CLEAR = 0.02
 """[m] Least height above the table of a home of which only the joints are kept."""
 _FINALIST = 10
@@ -94,7 +92,7 @@ def place(
     trial = _Trial(robot=robot, config=config, tried=tried, kept=kept, paths=paths)
     found = [(own, trial.reach(own, 0))]
     effort = config.rounds * config.candidates + _FINALIST * (1 + config.elite)
-    with _mapper(trial, processes) as each:
+    with _mapper(processes) as each:
         for number in range(config.rounds):
             drawn = _candidates(robot, avoid, config, random, number, found[: config.elite])
             for begin in range(0, len(drawn), _WAVE):
@@ -102,14 +100,14 @@ def place(
                 least = 0
                 if len(found) >= config.elite:
                     least = found[config.elite - 1][1].rank[0]
-                found += zip(wave, each(_Trial.reach, wave, [least] * len(wave)), strict=True)
+                found += zip(wave, each(trial.reach, wave, [least] * len(wave)), strict=True)
                 found.sort(key=lambda pair: pair[1].rank, reverse=True)
                 progress((number * config.candidates + begin + len(wave)) / effort, found[0][1])
         chosen = [own]
         if config.rounds:
             chosen += [placement for placement, _ in found[: config.elite] if placement != own]
         finalists: list[Finalist] = []
-        for finalist in each(_Trial.finalist, chosen):
+        for finalist in each(trial.finalist, chosen):
             finalists.append(finalist)
             progress(1.0 - _FINALIST * (1 + config.elite - len(finalists)) / effort, found[0][1])
     frames = sum(int(path.annotated.sum()) for path in paths)
@@ -144,29 +142,20 @@ class _Trial:
         return Finalist(placement=placement, reach=reached, followed=valid / annotated, home=home, home_rule=rule)
 
 
-_own_trial: list[_Trial] = []
-"""In a process of the search: what it tries placements on."""
-
-
-def _begin(trial: _Trial) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends them at once, without a traceback of each
+def _begin() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a process at once, without a traceback of each
     torch.set_num_threads(1)
-    _own_trial.append(trial)
-
-
-def _call(method: Callable[..., Any], *args: Any) -> Any:
-    return method(_own_trial[0], *args)
 
 
 @contextmanager
-def _mapper(trial: _Trial, processes: int) -> Iterator[Callable[..., Iterable[Any]]]:
-    """``map`` of a method of the trial, here or in several processes."""
+def _mapper(processes: int) -> Iterator[Callable[..., Iterable[Any]]]:
+    """Yield ``map``, which calls a function here or in several processes."""
     if processes < 2:
-        yield lambda method, *args: map(partial(method, trial), *args)
+        yield map
         return
-    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin, (trial,))
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin)
     try:
-        yield lambda method, *args: pool.map(partial(_call, method), *args)
+        yield pool.map
     except BrokenProcessPool as error:
         raise RobotError(
             "a process that tried placements was killed; is there memory for all of them? Try fewer (--processes)."
@@ -265,14 +254,11 @@ def _placement(parameters: np.ndarray) -> Placement:
 
 def _parameters(placement: Placement) -> np.ndarray:
     """The inverse of :func:`_placement`."""
-    R = Rotation.from_quat(placement.quat, scalar_first=True).as_matrix()
-    tilt = np.arccos(np.clip(R[2, 2], -1.0, 1.0))
-    azimuth = 0.0
-    if np.sin(tilt) > 1e-6:
-        azimuth = np.arctan2(R[1, 2], R[0, 2])
-    back = Rotation.from_euler("ZY", (azimuth, tilt)).inv().as_matrix() @ R
-    spin = np.arctan2(back[1, 0], back[0, 0])
-    return np.array([*placement.pos, *np.degrees((azimuth, tilt, spin))])
+    turn = Rotation.from_quat(placement.quat, scalar_first=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of an upright base, whose azimuth is 0
+        spin, tilt, azimuth = turn.as_euler("zyz", degrees=True)
+    return np.array([*placement.pos, azimuth, tilt, spin])
 
 
 def _home(robot: RobotSpec, placement: Placement) -> tuple[tuple[float, ...] | None, str]:
@@ -281,36 +267,17 @@ def _home(robot: RobotSpec, placement: Placement) -> tuple[tuple[float, ...] | N
     The first of these that the arm can reach, clear of the table and of itself: the pose of the hand at the
     description's home; the nearest of poses beside and above it; the description's joints.
     """
-    described = robot.home[robot.arm_indices]
+    described = tuple(robot.home[robot.arm_indices].tolist())
     if placement == Placement(pos=robot.base_pos, quat=robot.base_quat):
-        return tuple(described.tolist()), "as described"
-    own = ArmModel(robot)
-    placed = ArmModel(_placed(robot, placement))
-    home = torch.as_tensor(robot.home)[None, None]
-    root = own.kinematics.link_poses(home, [robot.hand_root])[..., 0, :, :]
-    steps = torch.tensor(list(product(_HOME_STEPS, _HOME_STEPS, _HOME_STEPS)), dtype=root.dtype)
-    steps = steps[steps.norm(dim=1).argsort(stable=True)]
-    count = len(steps)
-    zero = torch.zeros(count, 1, dtype=root.dtype)
-    targets = ArmTargets(
-        root_pos=root[..., :3, 3] + steps[:, None],
-        root_quat=matrix_to_quat(root[..., :3, :3]).expand(count, 1, 4),
-        hand_joints=home[..., torch.as_tensor(own.hand.joint_indices)].expand(count, 1, -1),
-        annotated=torch.ones(count, 1, dtype=torch.bool),
-        hand_error=zero,
-        hand_clearance=zero,
-    )
-    for begin, end in ((0, 1), (1, count)):
-        joints, measures = track(placed, targets[torch.arange(begin, end)], Thresholds())
-        reached = np.flatnonzero(classify(measures, Thresholds())[:, 0] == 0)
-        if len(reached):
-            moved = 100 * steps[begin + reached[0]]
-            rule = "the hand where it was"
-            if moved.any():
-                rule = f"the hand moved by ({', '.join(f'{value:.0f}' for value in moved.tolist())}) cm"
-            return tuple(joints[reached[0], 0].tolist()), rule
-    support = table_points(robot, placed.kinematics)
-    points = placed.kinematics.points(home[0, 0], support.links, torch.tensor(support.points))
+        return described, "as described"
+    home = torch.as_tensor(robot.home)
+    placed = _placed(robot, placement)
+    found = reach_near(placed, Kinematics(robot).link_poses(home, [robot.hand_root])[0].numpy())
+    if found is not None:
+        return found.joints, "the hand where it was" + found.moved
+    kinematics = Kinematics(placed)
+    support = table_points(robot, kinematics)
+    points = kinematics.points(home, support.links, torch.tensor(support.points))
     if height_above_table(points, torch.tensor(support.radii), TableSpec()).min() > _HOME_CLEAR:
-        return tuple(described.tolist()), "the joints as they were"
+        return described, "the joints as they were"
     return None, ""

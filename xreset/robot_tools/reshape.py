@@ -62,8 +62,7 @@ def reshape(robot: str, shapes: Path, out: Path) -> tuple[str, ...]:
     comment = f"{spec.name} with the collision shapes of {shown_name}. Written by xreset robots reshape."
     name = json.dumps(out.name, ensure_ascii=False)
     with atomic_folder(out) as work:
-        efforts = read_source(spec.urdf).effort
-        (work / "robot.urdf").write_text(urdf_text(tree, efforts, mimics=spec.mimics, comment=comment))
+        (work / "robot.urdf").write_text(urdf_text(tree, comment))
         write_meshes(tree, work)
         met = always_meeting(replace(spec, urdf=work / "robot.urdf"))
         edits = [

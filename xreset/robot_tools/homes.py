@@ -1,0 +1,61 @@
+"""Finds arm joints that hold the hand at a place, clear of the table and of the robot itself: a home."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import torch
+
+from xreset.geometry.rotations import matrix_to_quat
+from xreset.retarget.arm.model import ArmModel, ArmTargets
+from xreset.retarget.arm.solve import track
+from xreset.retarget.validity import Thresholds, classify
+from xreset.spec import RobotSpec
+
+_STEPS = (-0.15, 0.0, 0.15)
+"""[m] Steps along each axis to other places that are tried."""
+_DIGITS = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Home:
+    """Arm joints that hold the hand."""
+
+    joints: tuple[float, ...]
+    """[rad or m], within the limits."""
+    moved: str
+    """Where the hand is instead of the wanted place; empty if it is there."""
+
+
+def reach_near(robot: RobotSpec, T_world_root: np.ndarray) -> Home | None:
+    """Return arm joints that hold the hand's root at a pose [4, 4], or at the nearest pose beside it; None if the arm
+    reaches none of them."""
+    model = ArmModel(robot)
+    steps = torch.tensor(list(product(_STEPS, _STEPS, _STEPS)), dtype=torch.float64)
+    steps = steps[steps.norm(dim=1).argsort(stable=True)]
+    count = len(steps)
+    root = torch.as_tensor(T_world_root)
+    hand = torch.as_tensor(robot.home[model.hand.joint_indices])
+    zero = torch.zeros(count, 1, dtype=torch.float64)
+    targets = ArmTargets(
+        root_pos=root[:3, 3] + steps[:, None],
+        root_quat=matrix_to_quat(root[:3, :3]).expand(count, 1, 4),
+        hand_joints=hand.expand(count, 1, -1),
+        annotated=torch.ones(count, 1, dtype=torch.bool),
+        hand_error=zero,
+        hand_clearance=zero,
+    )
+    for rows in (slice(0, 1), slice(1, count)):
+        joints, measures = track(model, targets[rows], Thresholds())
+        reached = np.flatnonzero(classify(measures, Thresholds())[:, 0] == 0)
+        if not len(reached):
+            continue
+        first = int(reached[0])
+        inside = [torch.ceil(model.lower * 10**_DIGITS), torch.floor(model.upper * 10**_DIGITS)]
+        rounded = torch.clamp(torch.round(joints[first, 0] * 10**_DIGITS), *inside) / 10**_DIGITS
+        step = (100 * steps[rows][first]).tolist()
+        moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
+        return Home(joints=tuple(rounded.tolist()), moved=moved)
+    return None

@@ -1,0 +1,255 @@
+"""Reads a robot, or a part of one, from an MJCF that MuJoCo has compiled."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+
+from xreset.errors import ObjectError, RobotError
+from xreset.geometry.shapes import hull
+from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree
+from xreset.geometry.urdf_writer import fixed, frame
+from xreset.robot_tools.couplings import SLIDE, Couplings, Pull, read_couplings
+from xreset.robot_tools.sources import Source
+from xreset.spec import Geometry, MimicSpec, Shape
+
+_LARGEST = {"hfield": ("nrow", "ncol"), "texture": ("width", "height"), "size": ("nkey",)}
+"""Elements whose numbers decide how much memory MuJoCo takes."""
+_ENTRIES = 2**24
+_COPIES = 1000
+_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "mesh": 0, "plane": 0}
+"""Numbers of a shape's size that count."""
+
+
+def read_mjcf(path: Path, root: ElementTree.Element) -> Source:
+    """Read an MJCF whose root element is ``root``.
+
+    Raises:
+        RobotError: it cannot be read, or uses what xreset does not have; the message names all of it.
+    """
+    _check_sizes(path, root)
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise RobotError(f"{path} is not valid MJCF: {error}") from error
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    if not np.isfinite(data.geom_xmat).all() or not np.isfinite(data.ximat).all():
+        raise RobotError(f"{path} has an orientation that is not finite.")
+    problems = _unsupported(model)
+    notes: list[str] = []
+    couplings = Couplings()
+    pulls = _pulls(model, problems, notes)
+    if not problems:
+        couplings = read_couplings(model, [*pulls.values()])
+    if problems := [*problems, *couplings.problems]:
+        raise RobotError(
+            f"{path} uses what xreset does not have:" + "".join(f"\n  - {problem}" for problem in problems)
+        )
+    tree = _tree(path, model, couplings)
+    stiffness = {}
+    rotors = {}
+    efforts = {}
+    for actuator, pull in pulls.items():
+        joint, lever = couplings.lever(pull)
+        lever = abs(lever * float(model.actuator_gear[actuator, 0]))
+        name = _joint_name(model, joint)
+        gain = float(model.actuator_gainprm[actuator, 0])
+        kp = -float(model.actuator_biasprm[actuator, 1])
+        limit = 0.0
+        if model.actuator_forcelimited[actuator]:
+            limit = lever * float(model.actuator_forcerange[actuator, 1])
+        elif kp == 0 and model.actuator_ctrllimited[actuator]:  # a motor: its control is a force
+            limit = abs(gain) * lever * float(model.actuator_ctrlrange[actuator, 1])
+        if limit <= 0 and model.jnt_actfrclimited[joint]:
+            limit = float(model.jnt_actfrcrange[joint, 1])
+        efforts[name] = max(limit, 0.0)
+        if gain > 0 and kp > 0 and lever > 0:
+            stiffness[name] = kp * lever**2
+            rotors[name] = float(model.dof_armature[model.jnt_dofadr[joint]])
+    joints = [replace(joint, effort=efforts.get(joint.name, 0.0)) for joint in tree.joints]
+    return Source(
+        tree=replace(tree, joints=tuple(joints)), stiffness=stiffness, rotors=rotors, notes=(*notes, *couplings.notes)
+    )
+
+
+def _check_sizes(path: Path, root: ElementTree.Element) -> None:
+    """Raise ``RobotError`` for a small file that takes much memory when MuJoCo reads it."""
+
+    def product(element: ElementTree.Element, names: Iterable[str]) -> float:
+        try:
+            return math.prod(float(element.get(name, 1)) for name in names)
+        except ValueError:
+            return 1.0  # MuJoCo says what is wrong
+
+    for tag, names in _LARGEST.items():
+        for element in root.iter(tag):
+            if product(element, names) > _ENTRIES:
+                raise RobotError(f"{path}: a {tag} has {product(element, names):.3g} entries, which is too many.")
+    copies = math.prod(product(element, ["count"]) for element in root.iter("replicate"))
+    if copies > _COPIES:
+        raise RobotError(f"{path} replicates up to {copies:.3g} times, which is too often.")
+
+
+def _unsupported(model: mujoco.MjModel) -> list[str]:
+    """Return every feature of a model that a robot of xreset cannot have."""
+    problems = []
+    for joint in map(model.joint, range(model.njnt)):
+        if joint.type[0] == int(mujoco.mjtJoint.mjJNT_BALL):
+            problems.append(f"the ball joint {joint.name!r}. Replace it by three hinges of the same body")
+    for geom in map(model.geom, range(model.ngeom)):
+        kind = _kind(geom)
+        if _is_solid(geom) and kind not in _SIZES:
+            body = model.body(geom.bodyid[0]).name
+            problems.append(
+                f"the {kind} {geom.name or geom.id!r} of body {body!r}. Replace it by a capsule, box or mesh"
+            )
+    if model.nflex:
+        problems.append("flexible bodies. Leave them out, or make them rigid")
+    return problems
+
+
+def _pulls(model: mujoco.MjModel, problems: list[str], notes: list[str]) -> dict[int, Pull]:
+    """Return which joints each actuator moves."""
+    pulls = {}
+    for actuator in range(model.nu):
+        kind = mujoco.mjtTrn(int(model.actuator_trntype[actuator]))
+        target = int(model.actuator_trnid[actuator, 0])
+        if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+            pulls[actuator] = Pull([target], [1.0])
+        elif kind == mujoco.mjtTrn.mjTRN_TENDON:
+            begin = model.tendon_adr[target]
+            wraps = slice(begin, begin + model.tendon_num[target])
+            pulls[actuator] = Pull(model.wrap_objid[wraps].tolist(), model.wrap_prm[wraps].tolist())
+            if (model.wrap_type[wraps] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
+                problems.append(
+                    f"the tendon {model.tendon(target).name!r}, which runs through space. Drive its joint by a "
+                    "position actuator of its own, or couple its joints by an equality"
+                )
+        else:
+            notes.append(f"left out: the actuator {model.actuator(actuator).name!r}, which drives no joint")
+    return pulls
+
+
+def _tree(path: Path, model: mujoco.MjModel, couplings: Couplings) -> RobotTree:
+    """Return links and joints of a model, from its poses where the joints are at 0 or held.
+
+    The frame of a link lies in its joint, which may be away from the body's origin.
+    """
+    names = [model.body(i).name or f"body{i}" for i in range(model.nbody)]
+    tops = [names[i] for i in range(1, model.nbody) if model.body_parentid[i] == 0]
+    if len(tops) != 1:
+        raise RobotError(f"{path}: expected one body in the world, found {', '.join(tops) or 'none'}.")
+    data = mujoco.MjData(model)
+    data.qpos[model.jnt_qposadr[model.jnt_type >= SLIDE]] = 0.0
+    for joint, position in couplings.held.items():
+        data.qpos[model.jnt_qposadr[joint]] = position
+    mujoco.mj_kinematics(model, data)
+    links = {}
+    joints = []
+    poses = {}
+    for number in range(1, model.nbody):
+        body = model.body(number)
+        moving = np.flatnonzero((model.jnt_bodyid == number) & (model.jnt_type >= SLIDE)).tolist()
+        above = names[int(body.parentid[0])]
+        if number == 1 and moving:
+            raise RobotError(f"{path}: the first body {body.name!r} has joints; put it into a body that does not move.")
+        T = np.eye(4)
+        T[:3, :3] = data.xmat[number].reshape(3, 3)
+        T[:3, 3] = data.xpos[number]
+        children = [*(f"{names[number]}_axis{i}" for i in range(len(moving) - 1)), names[number]]
+        for child, joint in zip(children, moving, strict=False):
+            T = T.copy()
+            T[:3, 3] = data.xanchor[joint]
+            poses[child] = T
+            links[child] = frame(child)
+            between = np.linalg.inv(poses[above]) @ T
+            joints.append(_joint(model, couplings, joint, above, child, between, T[:3, :3].T @ data.xaxis[joint]))
+            above = child
+        poses[names[number]] = T
+        if not moving and number > 1:
+            joints.append(fixed(above, names[number], np.linalg.inv(poses[above]) @ T))
+        R = T[:3, :3].T @ data.ximat[number].reshape(3, 3)
+        links[names[number]] = Link(
+            name=names[number],
+            mass=float(body.mass[0]),
+            com=T[:3, :3].T @ (data.xipos[number] - T[:3, 3]),
+            inertia=R @ np.diag(body.inertia) @ R.T,
+            collisions=tuple(_shapes(model, data, number, T)),
+        )
+    order = [tops[0], *(joint.child for joint in joints)]
+    return RobotTree(name=path.stem, root=tops[0], links=tuple(links[name] for name in order), joints=tuple(joints))
+
+
+def _joint(
+    model: mujoco.MjModel,
+    couplings: Couplings,
+    number: int,
+    parent: str,
+    child: str,
+    T_parent_child: np.ndarray,
+    axis: np.ndarray,
+) -> Joint:
+    lower = -math.inf
+    upper = math.inf
+    if model.jnt_limited[number]:
+        lower, upper = model.jnt_range[number].tolist()
+    name = _joint_name(model, number)
+    mimic = None
+    if line := couplings.lines.get(number):
+        source = _joint_name(model, line.source)
+        mimic = MimicSpec(joint=name, source=source, multiplier=line.multiplier, offset=line.offset)
+    kind = "prismatic" if model.jnt_type[number] == SLIDE else "revolute"
+    return Joint(
+        name=name,
+        type="fixed" if number in couplings.held else kind,
+        parent=parent,
+        child=child,
+        T_parent_joint=T_parent_child,
+        axis=axis,
+        lower=lower,
+        upper=upper,
+        velocity=math.inf,
+        mimic=mimic,
+    )
+
+
+def _joint_name(model: mujoco.MjModel, joint: int) -> str:
+    return model.joint(joint).name or f"joint{joint}"
+
+
+def _shapes(model: mujoco.MjModel, data: mujoco.MjData, body: int, T_world_link: np.ndarray) -> Iterator[Shape]:
+    """Yield the collision shapes of a body."""
+    for number in np.flatnonzero(model.geom_bodyid == body):
+        geom = model.geom(number)
+        kind = _kind(geom)
+        if not _is_solid(geom) or kind == "plane":
+            continue
+        T = np.eye(4)
+        T[:3, :3] = data.geom_xmat[number].reshape(3, 3)
+        T[:3, 3] = data.geom_xpos[number]
+        T = np.linalg.inv(T_world_link) @ T
+        geometry = Geometry(kind=kind, size=tuple(map(float, geom.size[: _SIZES[kind]])))  # pyright: ignore[reportArgumentType]
+        if kind == "mesh":
+            mesh = model.mesh(geom.dataid[0])
+            begin = int(mesh.vertadr[0])
+            vertices = model.mesh_vert[begin : begin + int(mesh.vertnum[0])].astype(float)
+            try:
+                geometry = hull(vertices, HULL_TOLERANCE).geometry
+            except ObjectError as error:
+                raise RobotError(f"the mesh {mesh.name!r} of a body cannot be used: {error}") from error
+        yield Shape(geometry=geometry, T_body_shape=T)
+
+
+def _kind(geom: mujoco._structs._MjModelGeomViews) -> str:
+    return mujoco.mjtGeom(int(geom.type[0])).name.removeprefix("mjGEOM_").lower()
+
+
+def _is_solid(geom: mujoco._structs._MjModelGeomViews) -> bool:
+    return bool(geom.contype[0] or geom.conaffinity[0])

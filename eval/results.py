@@ -19,7 +19,7 @@ from xreset.checks import Checked, NotNegative, Positive, Range, Share, from_dic
 from xreset.errors import FileFormatError
 from xreset.eval.rollout import Episode, Rollouts, Trace
 from xreset.eval.stats import bootstrap_ci95
-from xreset.eval.table import table_text
+from xreset.eval.table import METRICS, table_text
 from xreset.files import read_json, write_json
 from xreset.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
 
@@ -198,21 +198,20 @@ def measured(episodes: Table, metric: str) -> float | None:
     return None if np.isnan(value) else value
 
 
-def summarize(
-    rollouts: Rollouts,
-    *,
-    backend: str,
-    backend_version: str,
-    robot: str,
-    policy: str,
-    seed: int,
-    inputs: dict[str, str],
-    objects_folder: str | None,
-    unseen: tuple[str, ...] = (),
-) -> EvalResult:
-    """Return the means, intervals and faults of the episodes of one engine."""
+def means(episodes: Table) -> dict[str, float | None]:
+    """Return the mean of every metric of :data:`~xreset.eval.table.METRICS`; None where it was not measured."""
+    return {metric: measured(episodes, metric) for metric in METRICS}
+
+
+def summarize(rollouts: Rollouts, **about: Any) -> EvalResult:
+    """Return the means, intervals and faults of the episodes of one engine.
+
+    Args:
+        about: the fields of the result that do not follow from the episodes, such as ``backend`` and ``seed``.
+    """
     episodes = _table(rollouts.episodes)
-    success = measured(episodes, "published_success")
+    rates = _rates(episodes)
+    is_measured = rates["published_success_rate"] is not None
     per_demo = []
     for _, own in episodes.groupby("sequence", sort=False):
         first = own.iloc[0]
@@ -226,24 +225,17 @@ def summarize(
             )
         )
     return EvalResult(
-        backend=backend,
-        backend_version=backend_version,
-        robot=robot,
         objects=tuple(sorted(episodes["object"].unique())),
-        objects_folder=objects_folder,
-        policy=policy,
         episodes=len(episodes),
         episodes_per_demo=1 + int(episodes["repetition"].max()),
-        seed=seed,
         task_progress=TaskProgress(mean=mean(episodes, "task_progress"), ci95=_ci95(episodes, "task_progress")),
-        published_success_ci95=None if success is None else _ci95(episodes, "published_success"),
+        published_success_ci95=_ci95(episodes, "published_success") if is_measured else None,
         reorient_once_rate=mean(episodes, "reorient_once"),
         per_demo=tuple(per_demo),
         health=EpisodeFaults(**{f.name: int(episodes[f.name].sum()) for f in fields(EpisodeFaults)}),
         control_steps_per_second=round(rollouts.control_steps_per_second, 1),
-        inputs=inputs,
-        unseen=unseen,
-        **_rates(episodes),
+        **rates,
+        **about,
     )
 
 
@@ -253,11 +245,11 @@ def _ci95(episodes: Table, metric: str) -> tuple[float, float]:
 
 
 def _rates(episodes: Table) -> dict[str, Any]:
+    """Return the means that a result and each of its demonstrations state, by field."""
+    known = means(episodes)
     stages = ("approach", "grasp", "reorient", "published_success")
-    rates = {f"{stage}_rate": measured(episodes, stage) for stage in stages}
-    for name in ("reorientation_progress", "least_distance"):
-        rates[name] = measured(episodes, name)
-    return rates
+    others = {name: known[name] for name in ("reorientation_progress", "least_distance")}
+    return {f"{stage}_rate": known[stage] for stage in stages} | others
 
 
 def mesh_folder(given: Path | None, recorded: str | None) -> Path | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from math import isnan
 from typing import TYPE_CHECKING
 
 import rich.console
@@ -62,6 +63,17 @@ def _cell(text: str) -> Text:
     return Text(text.replace(" / ", "/").replace(" %", "\N{NO-BREAK SPACE}%"))
 
 
+METRICS = {
+    "task_progress": "task progress",
+    "approach": "approach",
+    "grasp": "grasp",
+    "reorient": "reorient",
+    "reorient_once": "at the goal at any time",
+    "reorientation_progress": "reorientation progress",
+    "published_success": "published success",
+    "least_distance": "published distance [cm]",
+}
+"""Column of the table of episodes -> its name in tables. Shares are shown in percent, and 100 times metres are cm."""
 VERSIONS = (
     "Published success and distance (mean of 64 surface points, least over the episode) are the published paper's. "
     "The others are its draft's."
@@ -80,13 +92,13 @@ def caption(policies: Iterable[str]) -> str:
 
 
 def success_text(share: float | None) -> str:
-    """Return the published success as text; None: an earlier version did not measure it."""
-    return "missing" if share is None else f"{share:.1%}"
+    """Return the published success as text; None or NaN: an earlier version did not measure it."""
+    return "missing" if share is None or isnan(share) else f"{share:.1%}"
 
 
 def distance_text(distance: float | None) -> str:
-    """Return the published distance [m] as text; None: an earlier version did not measure it."""
-    return "missing" if distance is None else f"{100 * distance:.1f} cm"
+    """Return the published distance [m] as text; None or NaN: an earlier version did not measure it."""
+    return "missing" if distance is None or isnan(distance) else f"{100 * distance:.1f} cm"
 
 
 @dataclass(frozen=True)

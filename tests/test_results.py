@@ -56,9 +56,9 @@ class ResultsTest(unittest.TestCase):
         table = evaluation.to_frame()
         self.assertEqual(table.groupby("engine")["least_distance"].count().to_dict(), {"mujoco": 0, "sapien": 4})
         found = {engine: score(own) for engine, own in table.groupby("engine")}
-        self.assertEqual((found["mujoco"].published_success, found["sapien"].published_success), (None, 0.25))
-        self.assertIsNone(found["mujoco"].least_distance)
-        self.assertAlmostEqual(found["sapien"].least_distance, 0.0775)
+        self.assertEqual((found["mujoco"]["published_success"], found["sapien"]["published_success"]), (None, 0.25))
+        self.assertIsNone(found["mujoco"]["least_distance"])
+        self.assertAlmostEqual(found["sapien"]["least_distance"], 0.0775)
 
     def test_nothing_was_evaluated(self):
         evaluation = read_evaluation(self.folder / "empty")

@@ -14,19 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from xreset.errors import RunError
 from xreset.eval.report.read import Training
 from xreset.eval.stats import wilson_ci95
-from xreset.learning.clock import SHARES, Lift, Passing
 
 X = Literal["minutes", "steps", "iterations"]
 """Horizontal axis of a learning curve."""
-SUCCESS = "task/success_from_home"
-"""The curve from which the passings of runs without ``lift.json`` are taken."""
 _SECONDS = ("speed/collect_seconds", "speed/learn_seconds")
 _STEPS_PER_SECOND = "speed/env_steps_per_second"
 _LIFT_FIELDS: dict[X, str] = {"minutes": "minutes", "steps": "env_steps", "iterations": "iteration"}
@@ -74,16 +71,6 @@ def amounts(training: Training, x: X) -> tuple[np.ndarray, np.ndarray]:
     return iteration, np.cumsum(each * np.diff(iteration, prepend=0))
 
 
-def processes(training: Training) -> int | None:
-    """Return the number of processes of a training, each with worlds of its own; None if it is not known."""
-    try:
-        iteration, steps = amounts(training, "steps")
-        per_process = training.facts["num_envs"].value * training.facts["ppo.horizon"].value
-    except (RunError, KeyError):
-        return None
-    return round(float(steps[-1]) / (float(iteration[-1]) * per_process))
-
-
 def line(members: Sequence[Training], tag: str, x: X) -> Line | None:
     """Return the curve of one training; or mean, minimum and maximum of several, where all of them have logged.
 
@@ -118,50 +105,16 @@ class Fate(NamedTuple):
     """How far the run came."""
 
 
-def lift_of(training: Training) -> Lift | None:
-    """Return when a training passed which share: from ``lift.json``, or from its learning curves; None if it has
-    neither."""
-    if training.lift is not None or SUCCESS not in training.scalars:
-        return training.lift
-    curve = training.scalars[SUCCESS]
-
-    def until(x: X) -> np.ndarray:
-        try:
-            return np.interp(curve.iteration, *amounts(training, x))
-        except RunError:
-            return np.full(len(curve.iteration), np.nan)
-
-    minutes = until("minutes")
-    steps = np.nan_to_num(until("steps"))
-
-    def progress(i: int) -> dict[str, Any]:
-        return {
-            "iteration": int(curve.iteration[i]),
-            "env_steps": round(steps[i]),
-            "minutes": float(minutes[i]),
-        }
-
-    passed = []
-    for share in SHARES:
-        above = curve.value >= share
-        if above.any():
-            passed.append(Passing(share=share, **progress(int(np.argmax(above)))))
-    return Lift(passed=tuple(passed), success_from_home=float(curve.value[-1]), **progress(-1))
-
-
 def fates(members: Sequence[Training], share: float, x: X) -> list[Fate]:
-    """Return the fates of the trainings for which they are known, in their order."""
+    """Return the fates of the trainings that have a lift clock, in their order."""
     field = _LIFT_FIELDS[x]
     found = []
     for training in members:
-        lift = lift_of(training)
-        if lift is None:
-            continue
-        end = float(getattr(lift, field))
-        passing = next((p for p in lift.passed if p.share == share), None)
-        at = end if passing is None else float(getattr(passing, field))
-        if end > 0:  # NaN and 0 where a training did not log its speed
-            found.append(Fate(at, passing is not None, max(at, end)))
+        end = float(getattr(training.lift, field, 0))
+        passed = training.lift.passed if training.lift else ()
+        at = [float(getattr(passing, field)) for passing in passed if passing.share == share]
+        if end > 0:  # 0: no iteration is done
+            found.append(Fate(at[0] if at else end, bool(at), max([end, *at])))
     return found
 
 
@@ -187,29 +140,3 @@ def share_of_runs(found: Sequence[Fate]) -> Line:
         rows.append(rows[-1])
     mean, low, high = np.array(rows).T
     return Line(x=times, mean=mean, low=low, high=high)
-
-
-def lift_notes(members: Sequence[Training], single: Sequence[Training]) -> list[str]:
-    """Return what a reader must know about the shares of runs; nothing if no training states when it lifted.
-
-    Args:
-        single: the members that are a group of their own.
-    """
-    trainings = [m for m in members if m.facts or m.scalars]
-    known = {m.label: lift_of(m) for m in trainings}
-    if not any(known.values()):
-        return []
-    notes = []
-    derived = [m.label for m in trainings if m.lift is None and known[m.label]]
-    if derived:
-        notes.append(f"No lift.json, so when they lifted is taken from the learning curves: {', '.join(derived)}.")
-    unknown = [label for label, lift in known.items() if lift is None]
-    if unknown:
-        notes.append(
-            f"When they lifted is not known, because they have neither lift.json nor the curve {SUCCESS}: "
-            f"{', '.join(unknown)}."
-        )
-    alone = [m.label for m in single if known.get(m.label)]
-    if alone:
-        notes.append(f"One run only, which says little about how surely another seed lifts: {', '.join(alone)}.")
-    return notes

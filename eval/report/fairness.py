@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from xreset.eval.report.groups import Group, Scores, members_of
+from xreset.eval.report.groups import Group, members_of
 from xreset.eval.report.read import Training, conditions, differences
 from xreset.eval.results import Table
 from xreset.text import short_name
@@ -104,17 +104,18 @@ def begun(trainings: Sequence[Training]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def health(found: Scores) -> tuple[str, ...]:
-    """Return a sentence for each score with episodes in which the engine broke down."""
+def health(found: Table) -> tuple[str, ...]:
+    """Return a sentence for each score (:func:`xreset.eval.report.groups.scores`) with episodes in which the engine
+    broke down."""
     sentences = []
-    for label, row in found.items():
-        for engine, s in row.items():
-            faults = {"stopped being finite": s.nonfinite, "dropped contacts": s.overflow}
-            for what, count in faults.items():
-                if count:
-                    sentences.append(
-                        f"{count} of {s.episodes} episodes of {label} in {engine} {what}: that figure means little."
-                    )
+    faults = {"nonfinite": "stopped being finite", "overflow": "dropped contacts"}
+    for row in found.to_dict("records"):
+        for fault, what in faults.items():
+            if row[fault]:
+                sentences.append(
+                    f"{row[fault]} of {row['episodes']} episodes of {row['group']} in {row['engine']} {what}: "
+                    "that figure means little."
+                )
     return tuple(sentences)
 
 
@@ -127,6 +128,7 @@ def missing(groups: Sequence[Group], tags: Sequence[str]) -> tuple[str, ...]:
         "No learning curves": [m for m in members if not m.scalars],
         "No evaluation results": [m for m in members if not m.results],
         "No run.json, so its configuration is not known": [m for m in members if not m.facts],
+        "No lift.json, so the first success from home is not known": [m for m in with_curves if m.lift is None],
     }
     for tag in tags:
         lacking[f"No curve {tag}"] = [m for m in with_curves if tag not in m.scalars]

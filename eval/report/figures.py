@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from xreset.eval.plots import COLORS, INK, percent_axis, picture, svg
 from xreset.eval.report.clips import Clip
 from xreset.eval.report.curves import Line, X, fates, line, share_of_runs
-from xreset.eval.report.groups import Group, Scores, engines_of
+from xreset.eval.report.groups import Group
 from xreset.eval.report.read import Curve
 from xreset.eval.results import EvalResult, Table
 from xreset.learning.clock import SHARES
@@ -20,6 +21,7 @@ from xreset.text import short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.container import BarContainer
     from matplotlib.figure import Figure
 
 STAGES = {"approach_rate": "approach", "grasp_rate": "grasp", "reorient_rate": "reorient"}
@@ -55,6 +57,28 @@ def color(index: int) -> str:
     return COLORS[index % len(COLORS)]
 
 
+def draw_bars(ax: Axes, mean: Table, low: Table, high: Table, *, width: float = 0.8) -> list[BarContainer]:
+    """Draw a group of bars for each row of a table and in it a bar for each column, in percent; NaN gives no bar.
+
+    Args:
+        low: lower ends of intervals; ``high``: their upper ends.
+        width: width of a group of bars; groups are 1 apart.
+
+    Returns:
+        The bars of each column.
+    """
+    each = width / len(mean.columns)
+    drawn = []
+    for i, column in enumerate(mean):
+        at = np.arange(len(mean)) + each * (i + 0.5) - width / 2
+        value = mean[column].to_numpy(float)
+        error = 100 * np.maximum([value - low[column], high[column] - value], 0)
+        look: dict[str, Any] = {"color": color(i), "label": f" {column}", "ecolor": INK}
+        drawn.append(ax.bar(at, 100 * value, width=0.9 * each, yerr=error, capsize=2, linewidth=0.8, **look))
+    ax.set_xticks(range(len(mean)), list(mean.index))
+    return drawn
+
+
 # Results of one policy ------------------------------------------------------------------------------------------------
 
 
@@ -68,9 +92,8 @@ def draw_progress(ax: Axes, results: Results) -> None:
     for i, s in enumerate(results):
         mean = s.task_progress.mean
         low, high = s.task_progress.ci95
-        ax.barh(i, 100 * mean, color=color(i), height=0.62)
         error = [[100 * max(mean - low, 0)], [100 * max(high - mean, 0)]]
-        ax.errorbar(100 * mean, i, xerr=error, color=INK, capsize=3, linewidth=1.2)
+        ax.barh(i, 100 * mean, color=color(i), height=0.62, xerr=error, ecolor=INK, capsize=3)
         ax.text(100 * high + 2, i, f"{mean:.0%}", va="center")
     ax.set_yticks(range(len(results)), [s.backend for s in results])
     ax.invert_yaxis()
@@ -81,13 +104,10 @@ def draw_progress(ax: Axes, results: Results) -> None:
 
 def draw_stages(ax: Axes, results: Results) -> None:
     """Draw the share of episodes that reach each stage, for each engine."""
-    width = 0.8 / len(results)
-    for i, s in enumerate(results):
-        at = np.arange(len(STAGES)) - 0.4 + width * (i + 0.5)
-        rates = [100 * getattr(s, key) for key in STAGES]
-        bars = ax.bar(at, rates, width=0.9 * width, color=color(i), label=s.backend)
+    rates = {s.backend: [getattr(s, key) for key in STAGES] for s in results}
+    table = pd.DataFrame(rates, index=list(STAGES.values()))
+    for bars in draw_bars(ax, table, table, table):
         ax.bar_label(bars, fmt="%.0f", fontsize="small", padding=1)
-    ax.set_xticks(range(len(STAGES)), list(STAGES.values()))
     percent_axis(ax, "y")
     ax.set_ylabel("episodes")
 
@@ -112,37 +132,33 @@ def draw_curve(ax: Axes, curve: Curve) -> None:
     curve_axes(ax, curve.label, "iteration", percent=percent)
 
 
-def figure_progress(results: Results) -> str:
-    """Return :func:`draw_progress` as SVG."""
-    return svg(lambda figure: draw_progress(figure.subplots(), results), (5.2, 0.9 + 0.42 * len(results)), "progress")
+def charts(results: Results, progress: Table, curves: Sequence[Curve]) -> dict[str, str]:
+    """Return the drawings of a report's page as SVG: progress, stages and, if there are any, objects and curves.
+
+    Args:
+        progress: :func:`object_progress`.
+    """
+    drawn = {"progress": _chart("progress", draw_progress, [results], (5.2, 0.9 + 0.42 * len(results)))}
+    drawn["stages"] = _chart("stages", draw_stages, [results], (5.2, 3.0), legend=True)
+    if len(progress) > 1:
+        drawn["objects"] = _chart("objects", draw_objects, [progress], (10.6, 1.3 + 0.36 * len(progress)), legend=True)
+    if curves:
+        drawn["curves"] = _chart("curves", draw_curve, curves, (10.6, 2.7))
+    return drawn
 
 
-def figure_stages(results: Results) -> str:
-    """Return :func:`draw_stages` as SVG."""
-    return _with_legend(draw_stages, results, (5.2, 3.0), "stages")
+def _chart(
+    name: str, draw: Callable[[Axes, Any], None], panels: Sequence[Any], size: tuple[float, float], legend: bool = False
+) -> str:
+    """Return panels side by side as SVG."""
 
-
-def figure_objects(progress: Table) -> str:
-    """Return :func:`draw_objects` as SVG."""
-    return _with_legend(draw_objects, progress, (10.6, 1.3 + 0.36 * len(progress)), "objects")
-
-
-def _with_legend(draw: Callable[[Axes, Any], None], data: Any, size: tuple[float, float], salt: str) -> str:
     def whole(figure: Figure) -> None:
-        draw(figure.subplots(), data)
-        figure.legend(loc="outside upper center", ncols=4, frameon=False, fontsize="small")
+        for ax, data in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+            draw(ax, data)
+        if legend:
+            figure.legend(loc="outside upper center", ncols=4, frameon=False, fontsize="small")
 
-    return svg(whole, size, salt)
-
-
-def figure_curves(curves: Sequence[Curve]) -> str:
-    """Return all learning curves as SVG, side by side."""
-
-    def draw(figure: Figure) -> None:
-        for ax, curve in zip(figure.subplots(1, len(curves), squeeze=False)[0], curves, strict=True):
-            draw_curve(ax, curve)
-
-    return svg(draw, (10.6, 2.7), "curves")
+    return svg(whole, size, name)
 
 
 def write_overview(path: Path, title: str, results: Results, clips: Sequence[Clip], caption: str) -> None:
@@ -219,54 +235,47 @@ def draw_lines(
         if (curve.high > curve.low).any():
             ax.fill_between(at, scale * curve.low, scale * curve.high, color=color(index), linewidth=0, **band)
         # Above the axis, because many curves stay at zero.
-        ax.plot(
-            at, scale * curve.mean, color=color(index), linestyle=_of(_STYLES, index), linewidth=1.5, zorder=3, **look
-        )
+        look |= {"color": color(index), "linestyle": _of(_STYLES, index), "linewidth": 1.5, "zorder": 3}
+        ax.plot(at, scale * curve.mean, **look)
     curve_axes(ax, title, AXES[x], percent=percent)
     ax.set_ylabel(of)
     ax.set_xlim(left=0)
 
 
-def draw_scores(ax: Axes, found: Scores, order: Sequence[str]) -> None:
+def draw_scores(ax: Axes, found: Table, order: Sequence[str]) -> None:
     """Draw task progress with its 95 % interval: engines side by side, in each a bar for every group, in the color of
     its curve."""
-    engines = engines_of(found)
-    width = min(0.84 / len(found), 0.28)
-    for i, (label, row) in enumerate(found.items()):
+    labels = list(found["group"].unique())
+    low = found["task_progress_ci95"].str[0]
+    high = found["task_progress_ci95"].str[1]
+    ends = found.assign(low=low, high=high).pivot(index="engine", columns="group")
+    values = (ends[name][labels] for name in ("task_progress", "low", "high"))
+    for label, bars in zip(labels, draw_bars(ax, *values, width=min(0.84, 0.28 * len(labels))), strict=True):
         index = order.index(label)
-        at = np.array([engines.index(engine) for engine in row]) + width * (i + 0.5 - len(found) / 2)
-        mean, low, high = 100 * np.array([(s.task_progress, *s.ci95) for s in row.values()]).T
-        look: dict[str, Any] = {"color": color(index), "hatch": _of(_HATCHES, index), "edgecolor": "white"}
-        ax.bar(at, mean, width=0.9 * width, linewidth=0, **look)
-        error = np.maximum([mean - low, high - mean], 0)
-        capsize = min(3.0, 60 * width / len(engines))
-        ax.errorbar(at, mean, yerr=error, fmt="none", ecolor=INK, capsize=capsize, linewidth=1.0)
-        if len(engines) * len(found) <= _MAX_NUMBERS:
-            for place, value, top in zip(at, mean, high, strict=True):
-                ax.text(place, max(top, value) + 1.5, f"{value:.0f}", ha="center", va="bottom", fontsize="small")
-    ax.set_xticks(range(len(engines)), engines)
+        for bar in bars:
+            bar.set(facecolor=color(index), hatch=_of(_HATCHES, index), edgecolor="white", linewidth=0)
+        if len(found) <= _MAX_NUMBERS:
+            ax.bar_label(bars, fmt="%.0f", fontsize="small", padding=2)
     ax.tick_params(axis="x", length=0)
-    ax.set_xlim(-0.5, len(engines) - 0.5)
+    ax.set_xlim(-0.5, found["engine"].nunique() - 0.5)
     percent_axis(ax, "y")
     ax.set_ylim(0, 109)
     ax.set_title("task progress from home, 95 % interval", fontsize="medium", loc="left")
 
 
-def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], found: Scores, x: X) -> None:
+def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], found: Table, x: X) -> None:
     """Write the picture of a comparison.
 
     Args:
         tags: curves that at least one training has, one panel each; may be empty if ``found`` is not.
-        found: scores; may be empty if ``tags`` is not.
+        found: :func:`xreset.eval.report.groups.scores`; may be empty if ``tags`` is not.
     """
     order = [group.label for group in groups]
     across = 3 if len(tags) % 3 == 0 else min(len(tags), 2)
     rows = -(-len(tags) // across) if tags else 0
     lifted = _lifted_lines(groups, x)
-    heights = []
-    if rows:
-        heights.append(_PANEL * rows)
-    heights += [_PANEL] * (bool(lifted) + bool(found))
+    heights = [_PANEL * rows] if rows else []
+    heights += [_PANEL] * (bool(lifted) + (not found.empty))
     labels_across = max(1, int(_WIDTH / (0.8 + 0.1 * max(map(len, order)))))
     legend_rows = -(-len(order) // labels_across)
     size = (_WIDTH, sum(heights) + 0.1 + 0.25 * legend_rows)
@@ -287,7 +296,7 @@ def write_picture(path: Path, groups: Sequence[Group], tags: Sequence[str], foun
                 title = f"runs past {100 * share:g} % from home"
                 draw_lines(ax, lines, title, x, order, percent=True, of="runs", steps=True)
                 ax.set_ylim(-2, 102)
-        if found:
+        if not found.empty:
             draw_scores(next(parts).subplots(), found, order)
         handles = [_legend_handle(group, i) for i, group in enumerate(groups)]
         columns = -(-len(order) // legend_rows)

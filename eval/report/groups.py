@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from os.path import commonprefix
+from typing import Any
 
 import pandas as pd
 
-from xreset.eval.report.curves import processes
 from xreset.eval.report.read import Training, conditions
-from xreset.eval.results import Table, mean, measured
+from xreset.eval.results import Table, mean, means
 from xreset.eval.stats import crossed_bootstrap_ci95
 
 
@@ -23,38 +23,6 @@ class Group:
     label: str
     members: tuple[Training, ...]
     """One training, or several that differ in their seed only."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Score:
-    """Means over all episodes of all trainings of a group, in [0, 1]; rounded as ``xreset eval`` does, so that both
-    show the same."""
-
-    task_progress: float
-    ci95: tuple[float, float]
-    """Interval of the mean task progress, as :func:`estimate` gives it."""
-    approach: float
-    grasp: float
-    reorient: float
-    reorient_once: float
-    """At the goal at any time."""
-    reorientation_progress: float
-    published_success: float | None
-    """None, as in the next two fields: an earlier version did not measure it in some of the episodes."""
-    published_success_ci95: tuple[float, float] | None
-    least_distance: float | None
-    """[m]"""
-    each: dict[str, float]
-    """Label of every training that was evaluated in the engine -> its mean task progress."""
-    nonfinite: int
-    """Episodes in which a number was not finite."""
-    overflow: int
-    """Episodes in which the engine dropped contacts."""
-    episodes: int
-
-
-Scores = Mapping[str, Mapping[str, Score]]
-"""Label of every evaluated group -> engine -> score."""
 
 
 def grouped(trainings: Sequence[Training]) -> tuple[tuple[Group, ...], tuple[str, ...]]:
@@ -110,8 +78,6 @@ def _difference(members: Sequence[Training]) -> str | None:
     for a, b in combinations(members, 2):
         if a.facts["seed"].value == b.facts["seed"].value:
             return f"{a.label} and {b.label} have the same seed, too"
-        if len({processes(a), processes(b)} - {None}) > 1:
-            return f"{a.label} was trained with {processes(a)} processes and {b.label} with {processes(b)}"
         for engine in a.results.keys() & b.results.keys():
             theirs = conditions(b.results[engine])
             for condition, value in conditions(a.results[engine]).items():
@@ -139,34 +105,33 @@ def _label(labels: Sequence[str]) -> str:
     return re.sub(r"[-_. ]+(seed|s)?[-_. ]*$", "", common) or " + ".join(labels)
 
 
-def scores(groups: Iterable[Group]) -> Scores:
-    """Return the score of every group in every engine, engines in order of name."""
-    found = {}
+def scores(groups: Iterable[Group]) -> Table:
+    """Return a row for each group and engine in which it was evaluated: group (its label), engine, and the entries of
+    :func:`score`."""
+    rows = []
     for group in groups:
         evaluated = [m.episodes for m in group.members if m.results]
-        if evaluated:
-            episodes: Table = pd.concat(evaluated)
-            found[group.label] = {str(engine): score(own) for engine, own in episodes.groupby("engine")}
-    return found
+        episodes: Table = pd.concat(evaluated) if evaluated else pd.DataFrame({"engine": []})
+        for engine, own in episodes.groupby("engine"):
+            rows.append({"group": group.label, "engine": engine} | score(own))
+    return pd.DataFrame(rows)
 
 
-def score(episodes: Table) -> Score:
-    """Return the score of a group in one engine, from the episodes of all its trainings there."""
-    task_progress, ci95 = estimate(episodes, "task_progress")
-    stages = ("approach", "grasp", "reorient", "reorient_once", "reorientation_progress")
-    success = measured(episodes, "published_success")
-    return Score(
-        task_progress=task_progress,
-        ci95=ci95,
-        **{name: mean(episodes, name) for name in stages},
-        published_success=success,
-        published_success_ci95=None if success is None else estimate(episodes, "published_success")[1],
-        least_distance=measured(episodes, "least_distance"),
-        each=episodes.groupby("run", sort=False)["task_progress"].mean().to_dict(),
-        nonfinite=int(episodes["nonfinite"].sum()),
-        overflow=int(episodes["overflow"].sum()),
-        episodes=len(episodes),
-    )
+def score(episodes: Table) -> dict[str, Any]:
+    """Return the score of a group in one engine, from the episodes of all its trainings there: the means of all
+    metrics; ``task_progress_ci95`` and ``published_success_ci95``, as :func:`estimate` gives them; ``each``, the mean
+    task progress of every training by its label; and the numbers of episodes, of those that were not finite
+    (``nonfinite``) and of those in which the engine dropped contacts (``overflow``)."""
+    found: dict[str, Any] = means(episodes)
+    for metric in ("task_progress", "published_success"):
+        if found[metric] is not None:
+            found[f"{metric}_ci95"] = estimate(episodes, metric)[1]
+    return found | {
+        "each": episodes.groupby("run", sort=False)["task_progress"].mean().to_dict(),
+        "nonfinite": int(episodes["nonfinite"].sum()),
+        "overflow": int(episodes["overflow"].sum()),
+        "episodes": len(episodes),
+    }
 
 
 def estimate(episodes: Table, metric: str) -> tuple[float, tuple[float, float]]:
@@ -179,8 +144,3 @@ def estimate(episodes: Table, metric: str) -> tuple[float, tuple[float, float]]:
     values = episodes[metric].to_numpy(float)
     runs = pd.factorize(episodes["run"])[0]
     return mean(episodes, metric), crossed_bootstrap_ci95(values, runs, episodes["sequence"].to_numpy())
-
-
-def engines_of(found: Scores) -> tuple[str, ...]:
-    """Return every engine in which anything was evaluated, in order of name."""
-    return tuple(sorted(set().union(*found.values())))

@@ -10,7 +10,6 @@ from xreset.description import load_robot
 from xreset.errors import RunError, XResetError
 from xreset.eval.pages import render
 from xreset.eval.report import clips as drawing
-from xreset.eval.report import curves as progress_of
 from xreset.eval.report import fairness, tables
 from xreset.eval.report.clips import Clip, Strip
 from xreset.eval.report.curves import X
@@ -158,9 +157,8 @@ def compare(
     groups, notes = (singles(trainings), ()) if apart else grouped(trainings)
     tags = choose_curves(trainings, curves)
     found = scores(groups)
-    alone = [g.members[0] for g in groups if len(g.members) == 1]
     captions = _captions(trainings, groups)
-    if any(map(progress_of.lift_of, trainings)):
+    if any(t.lift for t in trainings):
         captions.append(tables.LIFTED)
     made = Comparison(
         picture=out / "compare.png",
@@ -175,7 +173,6 @@ def compare(
             *fairness.begun(trainings),
             *fairness.health(found),
             *fairness.missing(groups, tags),
-            *progress_of.lift_notes(trainings, alone),
         ),
         captions=tuple(captions),
     )

@@ -357,17 +357,15 @@ def read_training(label: str, folder: Path, results: Path | None = None) -> Trai
 
 def _split(text: str) -> tuple[str, Path]:
     """Return label and folder of an argument. The name of a folder may contain an equals sign."""
-    label, equals, rest = text.partition("=")
-    if not equals or Path(text).is_dir():
-        label = ""
-        rest = text
-    elif not label:
-        raise RunError(f"{text!r} is not NAME=FOLDER: a name is missing.")
-    elif not rest:
-        raise RunError(f"{text!r} is not NAME=FOLDER: a folder is missing.")
-    folder = Path(rest)
-    if not folder.exists() and rest in shipped():
-        folder = results_folder(rest)
+    label = ""
+    name = text
+    if "=" in text and not Path(text).is_dir():
+        label, _, name = text.partition("=")
+        if not label or not name:
+            raise RunError(f"{text!r} is not NAME=FOLDER: a {'folder' if label else 'name'} is missing.")
+    folder = Path(name)
+    if not folder.exists() and name in shipped():
+        folder = results_folder(name)
     return label or name_of(folder), folder
 
 

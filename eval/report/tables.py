@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from xreset.errors import RunError
-from xreset.eval.report.curves import Fate, X, amounts, fates, processes, share_of_runs
-from xreset.eval.report.groups import Group, Score, Scores, engines_of, members_of
+from xreset.eval.report.curves import Fate, X, amounts, fates, share_of_runs
+from xreset.eval.report.groups import Group, members_of
 from xreset.eval.report.read import Fact, Training
+from xreset.eval.results import Table
 from xreset.eval.table import Rows, distance_text, success_text
 from xreset.learning.clock import SHARES
 
@@ -16,47 +18,59 @@ LIFTED = (
     "at home have been at the goal, and when that was first so in each. A run that ended without (>) counts until it "
     "ended (Kaplan-Meier); the interval is Wilson's, of as many runs as were watched so long."
 )
+_LENGTHS: dict[str, X] = {
+    "iterations trained": "iterations",
+    "million environment steps": "steps",
+    "minutes of training": "minutes",
+}
 _ABSENT = Fact(None, "-")
 
 
-def results(groups: Sequence[Group], found: Scores) -> Rows:
+def results(groups: Sequence[Group], found: Table) -> Rows:
     """Return five rows for each group (six for several trainings), one column for each engine; ``-`` where it was not
-    evaluated."""
-    engines = engines_of(found)
-    versions: dict[str, set[str]] = {engine: set() for engine in engines}
-    for member in members_of(groups):
-        for engine, result in member.results.items():
-            versions[engine].add(result.backend_version)
+    evaluated.
+
+    Args:
+        found: :func:`xreset.eval.report.groups.scores`.
+    """
+    if found.empty:
+        return Rows(title="evaluation", head=("", ""), body=())
+    engines = sorted(found["engine"].unique())
+    head = ["", ""]
+    for engine in engines:
+        versions = {m.results[engine].backend_version for m in members_of(groups) if engine in m.results}
+        head.append(f"{engine} {', '.join(sorted(versions))}")
     body = []
-    for label, row in found.items():
-        several = any(len(s.each) > 1 for s in row.values())
-        texts = {engine: _score_texts(s, several) for engine, s in row.items()}
-        names = next(iter(texts.values()))
-        for i, name in enumerate(names):
+    for label, own in found.groupby("group", sort=False):
+        several = bool((own["each"].map(len) > 1).any())
+        texts = {row["engine"]: _score_texts(row, several) for row in own.to_dict("records")}
+        for i, name in enumerate(next(iter(texts.values()))):
             cells = [texts[engine][name] if engine in texts else "-" for engine in engines]
-            body.append((label if i == 0 else "", name, *cells))
-    head = ("", "", *(f"{engine} {', '.join(sorted(versions[engine]))}" for engine in engines))
-    return Rows(title="evaluation", head=head, body=tuple(body))
+            body.append((str(label) if i == 0 else "", name, *cells))
+    return Rows(title="evaluation", head=tuple(head), body=tuple(body))
 
 
-def _score_texts(s: Score, several: bool) -> dict[str, str]:
+def _score_texts(s: dict[str, Any], several: bool) -> dict[str, str]:
     """Return name and text of the rows of one score."""
-    low, high = s.ci95
-    texts = {"task progress (95 % interval)": f"{_percent(s.task_progress, 1)} ({100 * low:.0f}-{100 * high:.0f})"}
+    progress = f"{_percent(s['task_progress'], 1)} {_interval(s['task_progress_ci95'])}"
+    texts = {"task progress (95 % interval)": progress}
     if several:
-        texts["task progress of each seed"] = ", ".join(f"{100 * x:.1f}" for x in s.each.values()) + " %"
-    stages = " / ".join(f"{100 * x:.0f}" for x in (s.approach, s.grasp, s.reorient))
+        texts["task progress of each seed"] = ", ".join(f"{100 * x:.1f}" for x in s["each"].values()) + " %"
+    stages = " / ".join(f"{100 * s[stage]:.0f}" for stage in ("approach", "grasp", "reorient"))
     texts["approach / grasp / reorient"] = f"{stages} %"
     texts["at the goal at any time; reorientation progress"] = (
-        f"{_percent(s.reorient_once)}; {_percent(s.reorientation_progress, 1)}"
+        f"{_percent(s['reorient_once'])}; {_percent(s['reorientation_progress'], 1)}"
     )
-    success = success_text(s.published_success)
-    if s.published_success_ci95 is not None:
-        low, high = s.published_success_ci95
-        success = f"{success.replace('%', ' %')} ({100 * low:.0f}-{100 * high:.0f})"
+    success = success_text(s["published_success"])
+    if success != "missing":
+        success = f"{_percent(s['published_success'], 1)} {_interval(s['published_success_ci95'])}"
     texts["published success (95 % interval)"] = success
-    texts["published distance"] = distance_text(s.least_distance)
+    texts["published distance"] = distance_text(s["least_distance"])
     return texts
+
+
+def _interval(ci95: tuple[float, float]) -> str:
+    return f"({100 * ci95[0]:.0f}-{100 * ci95[1]:.0f})"
 
 
 def lifted(groups: Sequence[Group], x: X) -> Rows:
@@ -76,8 +90,6 @@ def lifted(groups: Sequence[Group], x: X) -> Rows:
 
 
 def _lifted(found: Sequence[Fate], scale: float, digits: int) -> str:
-    if not found:
-        return "-"
     line = share_of_runs(found)
     share, low, high = (f"{100 * value[-1]:.0f}" for value in (line.mean, line.low, line.high))
     times = []
@@ -93,62 +105,38 @@ def different(groups: Sequence[Group]) -> Rows:
     Baselines, which have no configuration, have no column.
     """
     columns = [g for g in groups if g.members[0].facts or g.members[0].scalars]
-    configured = [m for m in members_of(columns) if m.facts]
+    facts = {member.label: member.facts | _lengths(member) for member in members_of(columns)}
+    configured = [member.facts for member in members_of(columns) if member.facts]
     names: dict[str, None] = {}
-    for member in configured:
-        names |= dict.fromkeys(member.facts)
-    body = []
+    for known in configured:
+        names |= dict.fromkeys(known)
+    rows = []
     for name in names:
-        values = [m.facts.get(name, _ABSENT).value for m in configured]
+        values = [known.get(name, _ABSENT).value for known in configured]
         if any(value != values[0] for value in values):
-            cells = []
-            for g in columns:
-                cells.append(_values(m.facts.get(name, _ABSENT).text for m in g.members))
-            body.append((name, *cells))
-    for name, cells in _lengths(columns):
-        body.append((name, *map(_values, cells)))
+            rows.append(name)
+    rows += [name for name in _LENGTHS if any(name in known for known in facts.values())]
+    body = []
+    for name in rows:
+        cells = []
+        for group in columns:
+            cells.append(_values(facts[member.label].get(name, _ABSENT).text for member in group.members))
+        body.append((name, *cells))
     head = ("", *(g.label for g in columns))
     return Rows(title="what differs between the trainings", head=head, body=tuple(body))
 
 
-def _lengths(columns: Sequence[Group]) -> Iterator[tuple[str, list[list[str]]]]:
-    """Yield how long was trained: name, and for each group the text of every training."""
-    kinds: dict[str, X] = {
-        "iterations trained": "iterations",
-        "million environment steps": "steps",
-        "minutes of training": "minutes",
-    }
-    for name, x in kinds.items():
-        cells = _cells(columns, lambda m, x=x: _amount(m, x))
-        if _distinct(cells) - {"-"}:
-            yield name, cells
-    cells = _cells(columns, lambda m: str(processes(m) or "-"))
-    if len(_distinct(cells) - {"-"}) > 1:
-        yield "processes", cells
-
-
-def _cells(columns: Sequence[Group], text: Callable[[Training], str]) -> list[list[str]]:
-    """Return the text of every training of every group."""
-    cells = []
-    for group in columns:
-        cells.append([text(member) for member in group.members])
-    return cells
-
-
-def _amount(member: Training, x: X) -> str:
-    if not member.scalars:
-        return "-"
-    try:
-        done = amounts(member, x)[1][-1]
-    except RunError:
-        return "-"
-    if x == "iterations":
-        return f"{done:,.0f}"
-    return f"{done / 1e6 if x == 'steps' else done:.1f}"
-
-
-def _distinct(cells: Sequence[Sequence[str]]) -> set[str]:
-    return set().union(*cells)
+def _lengths(member: Training) -> dict[str, Fact]:
+    """Return how long was trained; nothing that was not logged."""
+    lengths = {}
+    for name, x in _LENGTHS.items() if member.scalars else ():
+        try:
+            done = float(amounts(member, x)[1][-1])
+        except RunError:
+            continue
+        text = f"{done:,.0f}" if x == "iterations" else f"{done / 1e6 if x == 'steps' else done:.1f}"
+        lengths[name] = Fact(done, text)
+    return lengths
 
 
 def _values(texts: Iterable[str]) -> str:

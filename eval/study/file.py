@@ -32,18 +32,16 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from xreset.checks import Checked, Finite, Positive, Rule, from_dict, merged
 from xreset.errors import FileFormatError, RunError
-from xreset.eval.study.paper import METRICS, paper_tables
+from xreset.eval.study.paper import paper_tables
+from xreset.eval.table import METRICS
 from xreset.files import read_toml
-from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
-from xreset.retarget.arm.config import ArmConfig
-from xreset.retarget.hand.config import HandConfig
 from xreset.text import shown
 
 SCHEMA = "xreset-study/1"
@@ -63,20 +61,11 @@ def _are_seeds(seeds: tuple[int, ...]) -> bool:
 Axis = Literal["run", "object", "metric"]
 
 
-def _config_flags(**configs: type) -> set[str]:
-    """Return the command-line flags of configuration classes, such as ``--hand.jump-limit``."""
-    flags = set()
-    for group, config in configs.items():
-        flags |= {f"--{group}.{f.name}".replace("_", "-") for f in fields(config)}
-    return flags
-
-
 COMMAND_FLAGS = {
-    "retarget": _config_flags(hand=HandConfig, arm=ArmConfig) | {"--device"},
-    "resets": _config_flags(closing=ClosingConfig, filter=FilterConfig, squeeze=SqueezeConfig)
-    | {"--backend", "--device", "--num-envs"},
+    "retarget": ("--hand.", "--arm.", "--device"),
+    "resets": ("--closing.", "--filter.", "--squeeze.", "--backend", "--device", "--num-envs"),
 }
-"""Flags that a study file may give to a command. Flags that name files are not among them: a study writes only into
+"""Flags, and beginnings of flags, that a study file may give to a command. None names a file: a study writes only into
 ``--out``."""
 
 
@@ -100,10 +89,11 @@ class Data(Checked):
         for command, allowed in COMMAND_FLAGS.items():
             for text in getattr(self, command):
                 flag = text.partition("=")[0].replace("_", "-")
-                if text.startswith("-") and not _is_number(text) and flag not in allowed:
+                group = flag[: flag.find(".") + 1]
+                if text.startswith("-") and not _is_number(text) and (group or flag) not in allowed:
                     raise ValueError(
                         f"{command} holds the option {shown(text)}, which a study file may not give. "
-                        f"Choose from: {', '.join(sorted(allowed))}"
+                        f"Choose from: {', '.join(allowed)}"
                     )
 
 
@@ -165,8 +155,8 @@ class Runs(Checked):
     """Environment steps of all worlds. With minutes and steps, the first limit ends the training; with neither, the
     recipe's iterations."""
     weights: str | None = None
-    """Another run of the study, from whose networks this one begins: of the same seed, and of the same object if both
-    train alone."""
+    """An earlier run of the study, from whose networks this one begins: of the same seed, and of the same object if
+    both train alone."""
     backend: str = "mujoco-warp"
     device: Literal["cuda", "cpu"] = "cuda"
     gpus: Positive[int] = 1
@@ -259,19 +249,14 @@ def _problems(study: Study) -> Iterator[str]:
         if name != "eval" and not name.startswith("eval-"):
             yield f"the evaluation {name!r} is a folder in every run: call it 'eval', or begin its name with 'eval-'."
         yield from _unknown(f"evaluations.{name}.data", evaluation.data, study.data)
+    trained: list[str] = []
     for name, run in study.runs.items():
-        trained = [other for other, spec in study.runs.items() if other != name and spec.policy is None]
         yield from _unknown(f"runs.{name}.data", run.data, study.data)
         yield from _unknown(f"runs.{name}.weights", run.weights, trained)
         for evaluation in run.evaluations:
             yield from _unknown(f"runs.{name}.evaluations", evaluation, study.evaluations)
-    for name in study.runs:
-        chain = [name]
-        while (weights := study.runs[chain[-1]].weights) is not None:
-            chain.append(weights)
-            if chain.count(weights) > 1:
-                yield f"runs.{name}.weights lead back to themselves: {' -> '.join(chain)}."
-                return
+        if run.policy is None:
+            trained.append(name)
     papers = paper_tables()
     for i, table in enumerate(study.tables):
         where = f"tables[{i}]"

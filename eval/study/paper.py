@@ -12,17 +12,6 @@ from xreset.checks import from_dict
 from xreset.objects.catalogue import canonical_name
 
 FILE = Path(__file__).parent / "paper.toml"
-METRICS = {
-    "task_progress": "task progress",
-    "approach": "approach",
-    "grasp": "grasp",
-    "reorient": "reorient",
-    "reorient_once": "at the goal at any time",
-    "reorientation_progress": "reorientation progress",
-    "published_success": "published success",
-    "least_distance": "published distance [cm]",
-}
-"""Column of the table of episodes -> its name in tables. Shares are shown in percent, and 100 times metres are cm."""
 ALL = "all"
 """In place of an object: the mean over all of them."""
 
@@ -58,7 +47,7 @@ class PaperTable:
         Args:
             method: the paper's name of the method.
             object_name: official name of the object, or :data:`ALL`.
-            metric: one of :data:`METRICS`.
+            metric: one of :data:`xreset.eval.table.METRICS`.
         """
         key = {"method": method, "object": object_name, "metric": metric}
         row = key[self.rows]

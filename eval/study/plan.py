@@ -14,13 +14,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from xreset.checks import from_dict, merged
 from xreset.demos.archive import read_demos
-from xreset.errors import DemoError, FileFormatError, RunError, XResetError
+from xreset.errors import DemoError, FileFormatError, ObjectError, RunError
 from xreset.eval.study.file import Data, Evaluation, Runs, Study
 from xreset.eval.study.subset import Subset, refuse_other
 from xreset.files import file_hash, is_claimed
@@ -30,7 +29,7 @@ from xreset.learning.recipes import starting_config
 from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.objects.catalogue import canonical_names, object_names
 from xreset.plugins import backend_status
-from xreset.text import short_name, shown
+from xreset.text import short_name
 
 if TYPE_CHECKING:
     from xreset.eval.results import EvalResult
@@ -51,9 +50,9 @@ class Run:
     objects: tuple[str, ...]
     folder: Path
     subset: Subset
-    config: TrainConfig | None
+    config: TrainConfig | None = None
     """None: a baseline."""
-    weights: Path | None
+    weights: Path | None = None
 
     @property
     def name(self) -> str:
@@ -100,15 +99,10 @@ class Run:
         if self.config is None or not self.begun:
             return
         info = read_run(self.folder)
-        found = {
-            "robot": info.robot,
-            "backend": info.backend,
-            "num_envs": info.num_envs,
-            "seed": info.seed,
-            "stand-ins": info.objects is None,
-            "other networks to begin with": info.weights is not None,
-            "config": _without_length(info.config),
-        }
+        found: dict[str, Any] = {name: getattr(info, name) for name in ("robot", "backend", "num_envs", "seed")}
+        found["stand-ins"] = info.objects is None
+        found["other networks to begin with"] = info.weights is not None
+        found["config"] = _without_length(info.config)
         wanted = {
             "robot": self.runs.robot,
             "backend": self.runs.backend,
@@ -163,71 +157,73 @@ class Step:
 def bank_step(subset: Subset, robot: str) -> Step:
     """Return the step from demonstrations to a reset bank for one robot."""
     folder = subset.folder / Path(robot).name
+    motion = folder / "retargeted.npz"
+    bank = folder / "resets.npz"
+
+    def commands() -> list[list[str]]:
+        retarget = [*_XRESET, "retarget", str(subset.demos), "--robot", robot, "--out", str(motion)]
+        resets = [*_XRESET, "resets", str(motion), "--out", str(bank)]
+        if Path(robot).is_dir():
+            resets += ["--robot", robot]
+        resets += [*subset.mesh_options, *subset.data.resets]
+        if motion.is_file():
+            return [resets]
+        return [[*retarget, *subset.mesh_options, *subset.data.retarget], resets]
+
     return Step(
         name=f"data {subset.folder.name} {folder.name}",
         kind="data",
         writes=folder,
-        left=lambda: "" if (folder / "resets.npz").is_file() else "to do",
-        commands=partial(_bank_commands, subset, robot, folder),
+        left=lambda: "" if bank.is_file() else "to do",
+        commands=commands,
     )
-
-
-def _bank_commands(subset: Subset, robot: str, folder: Path) -> list[list[str]]:
-    motion = folder / "retargeted.npz"
-    commands = []
-    if not motion.is_file():
-        retarget = [*_XRESET, "retarget", str(subset.demos), "--robot", robot, "--out", str(motion)]
-        commands.append([*retarget, *subset.mesh_options, *subset.data.retarget])
-    resets = [*_XRESET, "resets", str(motion), "--out", str(folder / "resets.npz")]
-    if Path(robot).is_dir():
-        resets += ["--robot", robot]
-    return [*commands, [*resets, *subset.mesh_options, *subset.data.resets]]
 
 
 def train_step(run: Run, needs: tuple[str, ...]) -> Step:
     """Return the step of a training, from the beginning or from its newest checkpoint."""
+    spec = run.runs
+    config = run.config
+    assert config is not None
+
+    def commands() -> list[list[str]]:
+        options: dict[str, Any] = {"out": run.folder, "iterations": config.iterations}
+        if spec.minutes is not None:
+            options["minutes"] = f"{spec.minutes - run.trained().minutes:.4g}"
+        more = ["--resume"]
+        if not checkpoints(run.folder):
+            if run.begun:
+                raise RunError(
+                    f"{run.folder} cannot be continued: it has a policy and no checkpoint. "
+                    "Bring its checkpoints, or choose another --out."
+                )
+            options |= {
+                "robot": spec.robot,
+                "resets": run.bank,
+                "backend": spec.backend,
+                "device": spec.device,
+                "num-envs": spec.num_envs,
+                "seed": run.seed,
+                "like": spec.recipe,
+            }
+            if run.weights is not None:
+                options["weights"] = run.weights
+            more = [*run.subset.mesh_options, *config_flags(spec.config)]
+        start = _XRESET
+        if spec.gpus > 1:
+            processes = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(spec.gpus)]
+            start = [sys.executable, *processes, *_XRESET[1:]]
+        return [[*start, "train", *_options(options), *more]]
+
     return Step(
         name=f"train {run.name}",
         kind="train",
         writes=run.folder,
         left=run.left,
-        commands=partial(_train_commands, run),
+        commands=commands,
         needs=needs,
-        gpus=run.runs.gpus if run.runs.device == "cuda" else 0,
+        gpus=spec.gpus if spec.device == "cuda" else 0,
         run=run,
     )
-
-
-def _train_commands(run: Run) -> list[list[str]]:
-    spec = run.runs
-    assert run.config is not None
-    options = {"out": run.folder, "iterations": run.config.iterations}
-    if spec.minutes is not None:
-        options["minutes"] = f"{spec.minutes - run.trained().minutes:.4g}"
-    more = ["--resume"]
-    if not checkpoints(run.folder):
-        if run.begun:
-            raise RunError(
-                f"{run.folder} cannot be continued: it has a policy and no checkpoint. "
-                "Bring its checkpoints, or choose another --out."
-            )
-        options |= {
-            "robot": spec.robot,
-            "resets": run.bank,
-            "backend": spec.backend,
-            "device": spec.device,
-            "num-envs": spec.num_envs,
-            "seed": run.seed,
-            "like": spec.recipe,
-        }
-        if run.weights is not None:
-            options["weights"] = run.weights
-        more = [*run.subset.mesh_options, *config_flags(spec.config)]
-    start = _XRESET
-    if spec.gpus > 1:
-        processes = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(spec.gpus)]
-        start = [sys.executable, *processes, *_XRESET[1:]]
-    return [[*start, "train", *_options(options), *more]]
 
 
 def _options(values: dict[str, Any]) -> list[str]:
@@ -263,23 +259,19 @@ def eval_step(
     Raises:
         RunError: there are results of another evaluation under this name.
     """
+    folder = run.folder / key
     demos = subset.demos
     if run.runs.policy == "ik":
         demos = subset.folder / Path(run.runs.robot).name / "retargeted.npz"
-    folder = run.folder / key
+    wanted: dict[str, Any] = {
+        "robot": Path(run.runs.robot).name,
+        "seed": evaluation.seed,
+        "episodes_per_demo": evaluation.episodes,
+    }
     for engine in evaluation.engines:
         result = _result(folder, engine)
         if result is not None:
-            found = {
-                "robot": result.robot,
-                "seed": result.seed,
-                "episodes_per_demo": result.episodes_per_demo,
-            }
-            wanted = {
-                "robot": Path(run.runs.robot).name,
-                "seed": evaluation.seed,
-                "episodes_per_demo": evaluation.episodes,
-            }
+            found = {name: getattr(result, name) for name in wanted}
             if demos.is_file():
                 found["demos"] = result.inputs.get("demos", "")[:12]
                 wanted["demos"] = file_hash(demos)[:12]
@@ -331,7 +323,7 @@ def eval_step(
 
 
 def _result(folder: Path, engine: str) -> EvalResult | None:
-    from xreset.eval.results import read_result  # imports torch, which a job does not need
+    from xreset.eval.results import read_result  # imports torch, which the command's help must not wait for
 
     file = folder / f"{engine}.json"
     return read_result(file) if file.is_file() else None
@@ -356,7 +348,7 @@ class Plan:
     runs: list[Run] = field(default_factory=list)
     steps: dict[str, Step] = field(default_factory=dict)
     """Steps by name, in an order in which they can be done."""
-    subsets: dict[Path, Subset] = field(default_factory=dict)
+    subsets: list[Subset] = field(default_factory=list)
 
     def subset(self, name: str, objects: Iterable[str], per_object: int | None) -> Subset:
         """Return the subset with the given objects; equal ones are the same."""
@@ -365,12 +357,9 @@ class Plan:
         if data.demos is not None and chosen == self.objects[name]:
             chosen = ()
         made = Subset(name=name, data=data, given=self.given, out=self.out, objects=chosen, per_object=per_object)
-        first = self.subsets.setdefault(made.folder, made)
-        if first != made:
-            raise RunError(
-                f"data.{first.name} and data.{name} would both write {made.folder}. Give one of them another name."
-            )
-        return first
+        if made not in self.subsets:
+            self.subsets.append(made)
+        return made
 
     def add(self, step: Step) -> str:
         """Add a step, unless there is one of its name, and return the name."""
@@ -407,31 +396,34 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
     for group in study.runs:
         if not only or group in only:
             plan.runs += _runs(plan, group)
-    _check_folders(plan)
-    trained = {run.folder: f"train {run.name}" for run in plan.runs if run.config is not None}
-    for run in sorted(plan.runs, key=lambda run: run.weights is not None):
+    trained: dict[Path, str] = {}
+    for run in plan.runs:
         run.check()
         if run.config is not None:
             needs = [plan.add(bank_step(run.subset, run.runs.robot))]
             if run.weights in trained:
                 needs.append(trained[run.weights])
-            plan.add(train_step(run, tuple(needs)))
+            trained[run.folder] = plan.add(train_step(run, tuple(needs)))
     for run in plan.runs:
         for key in run.runs.evaluations or study.evaluations:
             _add_evaluation(plan, run, key, trained.get(run.folder))
-    for subset in plan.subsets.values():
+    _check_folders(plan)
+    for subset in plan.subsets:
         subset.check()
     return plan
 
 
 def _check_folders(plan: Plan) -> None:
-    """Raise ``RunError`` if two runs, or the banks of two robots, would have the same folder."""
-    owners = {plan.out / name: "the study" for name in ("data", "logs", "reports")}
-    for run in plan.runs:
-        for folder, owner in ((run.folder, f"runs.{run.group}"), (run.bank.parent, f"the robot {run.runs.robot}")):
-            first = owners.setdefault(folder, owner)
-            if first != owner:
-                raise RunError(f"{first} and {owner} would both write {folder}. Give one of them another name.")
+    """Raise ``RunError`` if two parts of the study would have the same folder."""
+    owned = [(plan.out / name, "the study") for name in ("data", "logs", "reports")]
+    owned += [(subset.folder, f"data.{subset.name}") for subset in plan.subsets]
+    owned += [(run.folder, f"runs.{run.group}") for run in plan.runs]
+    owned += [(run.bank.parent, f"the robot {run.runs.robot}") for run in plan.runs]
+    owners: dict[Path, str] = {}
+    for folder, owner in owned:
+        first = owners.setdefault(folder, owner)
+        if first != owner:
+            raise RunError(f"{first} and {owner} would both write {folder}. Give one of them another name.")
 
 
 def _add_evaluation(plan: Plan, run: Run, key: str, training: str | None) -> None:
@@ -439,7 +431,7 @@ def _add_evaluation(plan: Plan, run: Run, key: str, training: str | None) -> Non
     evaluation = plan.study.evaluations[key]
     data = evaluation.data or run.runs.data
     wanted = _official_names(f"evaluations.{key}", evaluation.objects, plan.objects[data])
-    objects = list(wanted) if evaluation.unseen else [name for name in run.objects if name in wanted]
+    objects = [name for name in wanted if evaluation.unseen or name in run.objects]
     if not objects:
         return
     per_object = evaluation.per_object
@@ -464,21 +456,14 @@ def _objects_of(name: str, data: Data, given: Path) -> tuple[str, ...]:
             raise FileFormatError(
                 f"there is no {given / file} (data.{name}.{key}). Put it there, or give its folder with --data."
             )
-    names = sorted(set(read_demos(given / data.demos).object_name.tolist()))
-    for object_name in names:
-        if "/" in object_name:
-            raise FileFormatError(
-                f"{given / data.demos} (data.{name}.demos) has the object {shown(object_name)}: "
-                "a name with a slash cannot become the name of a folder. Rename the object."
-            )
-    return tuple(names)
+    return tuple(sorted(set(read_demos(given / data.demos).object_name.tolist())))
 
 
 def _official_names(where: str, objects: tuple[str, ...], known: tuple[str, ...]) -> tuple[str, ...]:
     """Return the official names of objects; all known ones if none is given."""
     try:
         return canonical_names(objects, known) or known
-    except XResetError as error:
+    except ObjectError as error:
         raise DemoError(f"{where}.objects: {error}") from None
 
 
@@ -488,16 +473,7 @@ def _runs(plan: Plan, group: str) -> Iterator[Run]:
     objects = _official_names(f"runs.{group}", spec.objects, plan.objects[spec.data])
     if spec.policy is not None:
         subset = plan.subset(spec.data, objects, spec.per_object)
-        yield Run(
-            group=group,
-            runs=spec,
-            seed=0,
-            objects=objects,
-            folder=plan.out / group,
-            subset=subset,
-            config=None,
-            weights=None,
-        )
+        yield Run(group=group, runs=spec, seed=0, objects=objects, folder=plan.out / group, subset=subset)
         return
     changed = merged(asdict(starting_config(spec.recipe)), spec.config)
     config = from_dict(TrainConfig, changed, f"runs.{group}.config")
@@ -521,5 +497,5 @@ def _runs(plan: Plan, group: str) -> Iterator[Run]:
 def _folder(plan: Plan, group: str, objects: tuple[str, ...], seed: int) -> Path:
     parts = [group]
     if plan.study.runs[group].alone:
-        parts += [short_name(name, "_") for name in objects]
+        parts += [short_name(name, "_").replace("/", "_") for name in objects]
     return plan.out / "-".join([*parts, f"seed{seed}"])

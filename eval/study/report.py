@@ -8,6 +8,7 @@ from pathlib import Path
 
 from xreset.eval.pages import render
 from xreset.eval.report import fairness
+from xreset.eval.report.groups import Group, scores
 from xreset.eval.report.make import compare
 from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import paper_training
@@ -59,7 +60,7 @@ def write_page(plan: Plan, out: Path) -> Page:
     notes = [*_incomplete(plan)]
     for i, table in enumerate(tables, 1):
         notes += _unfair(plan, table, trained)
-        if table.cells:
+        if table.engines:
             draw(out / f"table-{i}.png", table)
     page = Page(
         path=out / "study.md",
@@ -94,7 +95,8 @@ def _unfair(plan: Plan, table: FilledTable, trained: dict[str, Lift]) -> Iterato
     trainings = table.trainings
     if not trainings:
         return
-    for note in (*fairness.notes(trainings), *fairness.health(table.scores())):
+    found = scores(Group(label=name, members=members) for name, members in table.members.items())
+    for note in (*fairness.notes(trainings), *fairness.health(found)):
         yield f"{table.title}: {note}"
     lengths = {}
     seeds = {}

@@ -1,4 +1,4 @@
-"""The demonstrations with which a study's runs are trained: some objects of its data."""
+"""Demonstrations of some objects of a study's data."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Subset:
     @property
     def folder(self) -> Path:
         """Folder of the subset, named after its content."""
-        parts = [self.name, "+".join(short_name(name, "_") for name in self.objects), str(self.per_object or "")]
-        return self.out / "data" / "-".join(filter(None, parts))
+        objects = "+".join(short_name(name, "_") for name in self.objects).replace("/", "_")
+        return self.out / "data" / "-".join(filter(None, [self.name, objects, str(self.per_object or "")]))
 
     @property
     def demos(self) -> Path:
@@ -73,19 +73,19 @@ class Subset:
 
     def make(self) -> None:
         """Write the archive, unless it exists."""
-        if self.demos.is_file() and (self.folder / "subset.json").is_file():
+        file = self.folder / "subset.json"
+        if self.demos.is_file() and file.is_file():
             return
-        self.folder.mkdir(parents=True, exist_ok=True)
         if self.data.demos:
             demos = read_demos(self.given / self.data.demos)
         else:
             demos = synthesize(self.objects or None, self.data.synthetic_per_object, self.data.synthetic_seed)
         chosen = demos.select(objects=self.objects or None, max_per_object=self.per_object)
         write_demos(self.demos, chosen, config=self.definition)
-        write_json(self.folder / "subset.json", {"schema": SUBSET_SCHEMA} | self.definition)
+        write_json(file, {"schema": SUBSET_SCHEMA} | self.definition)
 
 
-def refuse_other(problem: str, what: str, found: dict[str, Any], wanted: dict[str, Any], prefix: str = "") -> None:
+def refuse_other(problem: str, what: str, found: dict[str, Any], wanted: dict[str, Any]) -> None:
     """Refuse what has the study's name if it is not what the study describes.
 
     Raises:
@@ -95,9 +95,10 @@ def refuse_other(problem: str, what: str, found: dict[str, Any], wanted: dict[st
         old = found.get(name)
         new = wanted.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
-            refuse_other(problem, what, old, new, f"{prefix}{name}.")
+            nested = {f"{name}.{key}": value for key, value in old.items()}
+            refuse_other(problem, what, nested, {f"{name}.{key}": value for key, value in new.items()})
         elif old != new:
             raise RunError(
-                f"{problem}: {prefix}{name} is {shown(old)} there and {shown(new)} in the study. "
+                f"{problem}: {name} is {shown(old)} there and {shown(new)} in the study. "
                 f"Nothing was changed; give the {what} another name, or choose another --out."
             )

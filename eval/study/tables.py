@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pandas as pd
 
-from xreset.eval.plots import INK, percent_axis, picture
-from xreset.eval.report.figures import color
-from xreset.eval.report.groups import Group, Scores, estimate, scores
+from xreset.eval.plots import percent_axis, picture
+from xreset.eval.report.figures import draw_bars
+from xreset.eval.report.groups import estimate
 from xreset.eval.report.read import Training, read_training
 from xreset.eval.results import Table, measured
 from xreset.eval.study.file import TableSpec
-from xreset.eval.study.paper import ALL, METRICS, PaperTable, paper_tables
+from xreset.eval.study.paper import ALL, PaperTable, paper_tables
 from xreset.eval.study.plan import Plan
-from xreset.eval.table import Rows
+from xreset.eval.table import METRICS, Rows
 from xreset.objects.catalogue import canonical_name
 from xreset.text import short_name
 
@@ -27,47 +27,18 @@ Axis = tuple[str, list[str]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cell:
-    """A figure: a share, or a distance [m]."""
-
-    mean: float | None
-    """None: not evaluated, or not measured by an earlier version."""
-    ci95: tuple[float, float]
-    """95 % interval, as :func:`~xreset.eval.report.groups.estimate` gives it."""
-    paper: float | None
-    """The paper's figure, percent."""
-    paper_error: float | None = None
-    """Standard error of the paper's figure, percent."""
-
-    @property
-    def text(self) -> str:
-        """``93.2 (88-98), paper 90.8 ± 1.5``."""
-        text = "-"
-        if self.mean is not None:
-            text = f"{100 * self.mean:.1f} ({100 * self.ci95[0]:.0f}-{100 * self.ci95[1]:.0f})"
-        if self.paper is not None:
-            text += f", paper {self.paper:.1f}"
-        if self.paper_error is not None:
-            text += f" \N{PLUS-MINUS SIGN} {self.paper_error:.1f}"
-        return text
-
-
-@dataclass(frozen=True, kw_only=True)
 class FilledTable:
     """A table of the study with its figures."""
 
     title: str
-    rows: tuple[str, ...]
-    """Names of the rows, as they are shown."""
-    columns: tuple[str, ...]
-    """Names of the columns, as they are shown."""
-    cells: dict[str, list[list[Cell]]]
-    """Engine -> row -> column."""
+    cells: Table
+    """One row for each figure: engine, row and column (names as they are shown), mean, low and high (95 % interval;
+    shares, or m; NaN if it was not evaluated or measured), paper and paper_error (percent), text."""
     members: dict[str, tuple[Training, ...]]
     """Run of the study -> its seeds."""
     paper: bool
     """Whether it has figures of the paper."""
-    unit: str = "%"
+    unit: str
     """Unit of the cells, where their column does not state one."""
 
     @property
@@ -75,20 +46,24 @@ class FilledTable:
         """All seeds of all runs."""
         return list(chain(*self.members.values()))
 
+    @property
+    def engines(self) -> list[str]:
+        """Engines in which anything was evaluated."""
+        return list(self.cells["engine"].unique())
+
+    def wide(self, engine: str) -> Table:
+        """Return the cells of one engine: rows by columns, for each kind of value."""
+        own = self.cells[self.cells["engine"] == engine].drop(columns="engine")
+        return own.set_index(["row", "column"]).unstack(sort=False)
+
     def as_rows(self, engine: str) -> Rows:
         """Return the table of one engine."""
-        body = []
-        for name, cells in zip(self.rows, self.cells[engine], strict=True):
-            body.append((name, *(cell.text for cell in cells)))
-        return Rows(head=(self.unit, *self.columns), body=tuple(body))
+        text = self.wide(engine)["text"]
+        return Rows(head=(self.unit, *text.columns), body=tuple(text.itertuples(name=None)))
 
     def versions(self, engine: str) -> str:
         """Return the engine's versions in which the runs were evaluated."""
         return ", ".join(sorted({t.results[engine].backend_version for t in self.trainings if engine in t.results}))
-
-    def scores(self) -> Scores:
-        """Return the scores of the runs, which count the episodes in which an engine broke down."""
-        return scores(Group(label=name, members=members) for name, members in self.members.items())
 
 
 def fill(plan: Plan, table: TableSpec) -> FilledTable:
@@ -99,58 +74,71 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
     """
     members = {name: seeds_of(plan, name, table.evaluation) for name in table.runs}
     paper = paper_tables()[table.paper] if table.paper else None
-    (row_axis, row_names), (column_axis, column_names), fixed = _axes(plan, table, paper)
+    (row_axis, rows), (column_axis, columns), fixed = _axes(plan, table, paper)
     run_of = {shown: name for name, shown in table.runs.items()}
-
-    def cell(engine: str, key: Mapping[str, str]) -> Cell:
+    engines = sorted(set().union(*(t.results for t in chain(*members.values()))))
+    cells = []
+    for engine, row, column in product(engines, rows, columns):
+        key = fixed | {row_axis: row, column_axis: column}
         run = run_of[key["method"]]
-        objects = {key["object"]}
-        if key["object"] == ALL:
-            objects = set(objects_of(plan, run, table))
-        mean = None
-        ci95 = (0.0, 0.0)
+        objects = {key["object"]} if key["object"] != ALL else set(objects_of(plan, run, table))
         episodes = _episodes_with(members[run], engine, objects)
+        cell: dict[str, Any] = {"engine": engine, "row": _shown(row_axis, row), "column": _shown(column_axis, column)}
         if len(episodes) and measured(episodes, key["metric"]) is not None:
-            mean, ci95 = estimate(episodes, key["metric"])
-        figure, error = paper.figure(key["method"], key["object"], key["metric"]) if paper else (None, None)
-        return Cell(mean=mean, ci95=ci95, paper=figure, paper_error=error)
-
-    engines = set().union(*(t.results for t in chain(*members.values())))
-    cells: dict[str, list[list[Cell]]] = {}
-    for engine in sorted(engines):
-        cells[engine] = []
-        for row in row_names:
-            keys = [fixed | {row_axis: row, column_axis: column} for column in column_names]
-            cells[engine].append([cell(engine, key) for key in keys])
+            mean, (low, high) = estimate(episodes, key["metric"])
+            cell |= {"mean": mean, "low": low, "high": high}
+        if paper is not None:
+            cell["paper"], cell["paper_error"] = paper.figure(key["method"], key["object"], key["metric"])
+        cells.append(cell | {"text": _text(**cell)})
+    names = ["engine", "row", "column", "mean", "low", "high", "paper", "paper_error", "text"]
     return FilledTable(
         title=table.title or (paper.title if paper else METRICS[table.metric]),
-        rows=tuple(_shown(row_axis, name) for name in row_names),
-        columns=tuple(_shown(column_axis, name) for name in column_names),
-        cells=cells,
+        cells=pd.DataFrame(cells, columns=names).astype(dict.fromkeys(names[3:8], float)),
         members=members,
         paper=paper is not None,
         unit="cm" if fixed.get("metric") == "least_distance" else "%",
     )
 
 
+def _text(
+    *,
+    mean: float | None = None,
+    low: float = 0.0,
+    high: float = 0.0,
+    paper: float | None = None,
+    paper_error: float | None = None,
+    **_: str,
+) -> str:
+    """Return a cell: ``93.2 (88-98), paper 90.8 ± 1.5``."""
+    text = "-" if mean is None else f"{100 * mean:.1f} ({100 * low:.0f}-{100 * high:.0f})"
+    if paper is not None:
+        text += f", paper {paper:.1f}"
+    if paper_error is not None:
+        text += f" \N{PLUS-MINUS SIGN} {paper_error:.1f}"
+    return text
+
+
 def seeds_of(plan: Plan, group: str, evaluation: str) -> tuple[Training, ...]:
     """Return the evaluated trainings of a run of the study. Trainings of one seed, one for each object alone, are
-    joined."""
+    joined, and the demonstrations of all of them are numbered together."""
     by_seed: dict[int, list[Training]] = {}
     for run in plan.runs:
         folder = run.folder / evaluation
         if run.group == group and any(folder.glob("*.episodes.json")):
             by_seed.setdefault(run.seed, []).append(read_training(run.name, run.folder, folder))
-    return tuple(_joined(f"{group}-seed{seed}", parts) for seed, parts in by_seed.items())
+    seeds = [_joined(f"{group}-seed{seed}", parts) for seed, parts in by_seed.items()]
+    if seeds and plan.study.runs[group].alone:
+        every: Table = pd.concat([training.episodes for training in seeds], ignore_index=True)
+        every["sequence"] = every.groupby(["object", "sequence_name"]).ngroup()
+        seeds = [replace(t, episodes=every[every["run"] == t.label]) for t in seeds]
+    return tuple(seeds)
 
 
 def _joined(label: str, parts: Sequence[Training]) -> Training:
-    """Join trainings to one, and number their demonstrations consecutively."""
+    """Join trainings to one."""
     if len(parts) == 1:
         return parts[0]
-    episodes: Table = pd.concat([t.episodes for t in parts], ignore_index=True)
-    numbers = episodes.groupby(["object", "sequence_name"]).ngroup()
-    episodes = episodes.assign(run=label, sequence=numbers)
+    episodes: Table = pd.concat([t.episodes for t in parts], ignore_index=True).assign(run=label)
     results = {}
     for engine, own in episodes.groupby("engine"):
         mine = [t.results[str(engine)] for t in parts if engine in t.results]
@@ -164,13 +152,13 @@ def _episodes_with(members: Sequence[Training], engine: str, objects: set[str]) 
 
     Seeds that miss one of the objects are left out, because a mean over some of the objects is not comparable.
     """
-    tables = []
+    tables = [pd.DataFrame()]
     for member in members:
         own = member.episodes
         own = own[(own["engine"] == engine) & own["object"].isin(list(objects))]
         if set(own["object"]) == objects:
             tables.append(own)
-    return pd.concat(tables) if tables else pd.DataFrame()
+    return pd.concat(tables)
 
 
 def objects_of(plan: Plan, group: str, table: TableSpec) -> tuple[str, ...]:
@@ -192,14 +180,10 @@ def _axes(plan: Plan, table: TableSpec, paper: PaperTable | None) -> tuple[Axis,
         columns = [name for name in paper.names if name in names[paper.columns]]
         fixed = {"object": paper.object or ALL, "metric": paper.metric or "task_progress"}
         return (paper.rows, rows), (paper.columns, columns), fixed
+    one = canonical_name(table.object, known) if table.object else None
     if table.rows == "metric":
-        fixed = {"object": canonical_name(table.object, known) if table.object else ALL}
-        return ("metric", list(METRICS)), ("method", methods), fixed
-    objects = known
-    if table.object:
-        objects = [canonical_name(table.object, known)]
-    elif len(known) > 1:
-        objects = [*known, ALL]
+        return ("metric", list(METRICS)), ("method", methods), {"object": one or ALL}
+    objects = [one] if one else [*known, ALL] if len(known) > 1 else known
     fixed = {"metric": table.metric}
     if table.rows == "run":
         return ("method", methods), ("object", objects), fixed
@@ -216,25 +200,15 @@ def _shown(axis: str, name: str) -> str:
 
 def draw(path: Path, table: FilledTable) -> None:
     """Draw bars with intervals, a panel for each engine; the paper's figures are black lines across them."""
-    size = (max(7.0, 1.1 * len(table.rows) + 2), 2.6 * len(table.cells) + 0.4)
-    width = 0.8 / len(table.columns)
+    engines = table.engines
+    size = (max(7.0, 1.1 * table.cells["row"].nunique() + 2), 2.6 * len(engines) + 0.4)
     with picture(path, size, text_parse_math=False) as figure:
-        panels = figure.subplots(len(table.cells), 1, squeeze=False)[:, 0]
-        for ax, (engine, rows) in zip(panels, table.cells.items(), strict=True):
-            for j, column in enumerate(table.columns):
-                ax.bar(0, 0, color=color(j), label=" " + column)
-            for i, cells in enumerate(rows):
-                for j, cell in enumerate(cells):
-                    at = i + width * (j + 0.5) - 0.4
-                    if cell.mean is not None:
-                        low, high = cell.ci95
-                        error = 100 * np.maximum([[cell.mean - low], [high - cell.mean]], 0)
-                        ax.bar(at, 100 * cell.mean, width=0.9 * width, color=color(j))
-                        ax.errorbar(at, 100 * cell.mean, yerr=error, fmt="none", ecolor=INK, capsize=2, linewidth=0.8)
-                    if cell.paper is not None:
-                        ends = [at - 0.45 * width, at + 0.45 * width]
-                        ax.plot(ends, [cell.paper] * 2, color="black", linewidth=2)
-            ax.set_xticks(range(len(table.rows)), table.rows, fontsize="small")
+        panels = figure.subplots(len(engines), 1, squeeze=False)[:, 0]
+        for ax, engine in zip(panels, engines, strict=True):
+            wide = table.wide(engine)
+            draw_bars(ax, wide["mean"], wide["low"], wide["high"])
+            for bar, value in zip(ax.patches, wide["paper"].to_numpy().T.ravel(), strict=True):
+                ax.hlines(value, bar.get_x(), bar.get_x() + bar.get_width(), color="black", linewidth=2)
             if table.unit == "%":
                 percent_axis(ax, "y")
                 ax.set_ylim(0, 105)

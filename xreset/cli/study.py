@@ -19,15 +19,13 @@ def study(
     out: Path = Path("runs/studies"),
     run: Several = (),
     only: Literal["all", "data", "train", "eval", "tables"] = "all",
-    cluster: Literal["local", "slurm"] = "local",
     per_gpu: int = 1,
-    slurm: tuple[str, ...] = (),
     dry_run: bool = False,
 ) -> None:
     """Run the missing steps of a study: reset banks, trainings, evaluations, and tables next to the paper's.
 
     After a stop, the same command continues; finished steps are not repeated. Studies with the same --out share their
-    runs.
+    runs, and several may run at the same time, also as jobs of a cluster.
 
     Args:
         file: Study file, or name of a study that ships with xreset.
@@ -35,19 +33,9 @@ def study(
         out: Folder for all output.
         run: Only these runs of the study; give it again for more. Default: all.
         only: Which steps: reset banks, trainings, evaluations or tables.
-        cluster: Where trainings run: on this machine's GPUs, or as Slurm jobs.
         per_gpu: Number of simultaneous trainings on each GPU of this machine.
-        slurm: Options of sbatch as submitit names them, such as partition=gpu time=600 (minutes) cpus_per_task=16.
         dry_run: Print the plan and its commands, and do nothing.
     """
-    if slurm and cluster != "slurm":
-        raise RunError("--slurm needs --cluster slurm.")
-    if wrong := [text for text in slurm if "=" not in text]:
-        raise RunError(f"--slurm {wrong[0]} is not KEY=VALUE.")
-    options = {}
-    for text in slurm:
-        key, _, value = text.partition("=")
-        options[key] = int(value) if value.isdecimal() else value
     path = files.study_path(file)
     console = Console()
 
@@ -64,12 +52,9 @@ def study(
         return
     problems = []
     if only != "tables":
-        for subset in todo.subsets.values():
+        for subset in todo.subsets:
             subset.make()
-        problems = launch.launch(
-            todo, [step for step in wanted if not step.done()], cluster=cluster, per_gpu=per_gpu, options=options,
-            say=lambda line: console.print(line),
-        )  # fmt: skip
+        problems = launch.launch(todo, [step for step in wanted if not step.done()], per_gpu=per_gpu, say=console.print)
     if only in ("all", "tables"):
         page = report.write_page(planned(), out / "reports" / todo.name)
         for note in page.notes:

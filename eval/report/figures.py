@@ -104,8 +104,8 @@ def draw_progress(ax: Axes, results: Results) -> None:
 
 def draw_stages(ax: Axes, results: Results) -> None:
     """Draw the share of episodes that reach each stage, for each engine."""
-    rates = {s.backend: [getattr(s, key) for key in STAGES] for s in results}
-    table = pd.DataFrame(rates, index=list(STAGES.values()))
+    table = pd.DataFrame(map(vars, results), index=[s.backend for s in results])
+    table = table[list(STAGES)].rename(columns=STAGES).T
     for bars in draw_bars(ax, table, table, table):
         ax.bar_label(bars, fmt="%.0f", fontsize="small", padding=1)
     percent_axis(ax, "y")

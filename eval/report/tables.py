@@ -115,7 +115,7 @@ def different(groups: Sequence[Group]) -> Rows:
         values = [known.get(name, _ABSENT).value for known in configured]
         if any(value != values[0] for value in values):
             rows.append(name)
-    rows += [name for name in _LENGTHS if any(name in known for known in facts.values())]
+    rows += [name for name in _LENGTHS if name in set().union(*facts.values())]
     body = []
     for name in rows:
         cells = []

@@ -443,7 +443,7 @@ class TablesTest(InFolder):
                 ("a", "b", "c"),
             )
         rows = fill(plan, plan.study.tables[0]).as_rows("mujoco")
-        self.assertRegex(rows.body[0][3], r"^66\.5 \(33-100\)", "the same demonstration in both seeds")
+        self.assertRegex(rows.body[0][3], r"^66\.5 \(66-66\)", "the same demonstration in both seeds")
         self.assertRegex(rows.body[2][3], r"^49\.8 ", "seed 1 alone")
 
     def test_results_of_other_episodes_are_refused(self):

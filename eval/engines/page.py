@@ -1,5 +1,4 @@
-"""The support matrix: a page of what was measured of the engines, made from files of ``xreset engines check`` and ``...
-compare``.
+"""The support matrix: a page of what was measured of the engines, made from files of ``xreset engines check``.
 
 Nothing on the page is written by hand: every number is read from a file, and every file names the command that made it.
 """
@@ -16,7 +15,6 @@ from jinja2 import UndefinedError
 
 from xreset.backends.conformance.results import SCHEMA as CONFORMANCE
 from xreset.errors import FileFormatError, XResetError
-from xreset.eval.engines.agreement import SCHEMA as PARITY
 from xreset.eval.pages import render
 from xreset.eval.table import Rows, markdown
 from xreset.files import read_json
@@ -53,22 +51,16 @@ class Results:
     checks: dict[str, Checks] = field(default_factory=dict)
     """Checks by robot."""
     capabilities: dict[Column, set[str]] = field(default_factory=dict)
-    parities: list[Json] = field(default_factory=list)
-    """Comparisons of grasps, as in their files."""
 
     def add(self, data: Json) -> None:
         """Add the content of a file. A later check replaces one of the same engine, version, device and robot."""
         covers = []
-        for run in data.get("runs", ()):
+        for run in data["runs"]:
             column = Column(run["engine"], run["engine_version"], run["device"])
             found = self.checks.setdefault(run["robot"], {}).setdefault(column, {})
             found.update({check["check"]: check for check in run["checks"]})
             self.capabilities.setdefault(column, set()).update(run["capabilities"])
             covers.append(f"{column.engine} {column.version} with {run['robot']} on {column.device}")
-        if data["schema"] == PARITY:
-            engines = ", ".join(_column(engine).title for engine in data["engines"])
-            covers.append(f"grasps of {data['robot']}: {engines} against {_column(data['reference']).title}")
-            self.parities.append(data)
         command = data.get("command", "")
         self.commands.append(
             ("; ".join(covers), f"`{command}`" if command else "not recorded", data.get("xreset_version", ""))
@@ -79,35 +71,23 @@ def read(paths: Iterable[Path]) -> Results:
     """Read the files.
 
     Raises:
-        FileFormatError: a file is of neither kind, or incomplete.
+        FileFormatError: a file is of another kind, or incomplete.
         XResetError: there is no file.
     """
     results = Results()
     for path in paths:
-        data = read_json(path)
-        schema = data.get("schema")
-        if schema not in (CONFORMANCE, PARITY):
-            raise FileFormatError(
-                f"{path} has the schema {shown(schema)}, expected {CONFORMANCE} or {PARITY}. Make it again with --json."
-            )
+        data = read_json(path, CONFORMANCE)
         try:
             alone = Results()
             alone.add(data)
             page(alone)  # asks the file for everything that the page needs
         except (KeyError, TypeError, AttributeError, ValueError, IndexError, OverflowError, UndefinedError) as error:
             what = f"{type(error).__name__} {shown(str(error))}"
-            raise FileFormatError(f"{path} is no complete {schema}: {what}. Make it again.") from error
+            raise FileFormatError(f"{path} is no complete {CONFORMANCE}: {what}. Make it again.") from error
         results.add(data)
     if not results.commands:
-        raise XResetError(
-            "there is nothing to make a page of. Give files of xreset engines check --json, or of engines compare."
-        )
+        raise XResetError("there is nothing to make a page of. Give files of xreset engines check --json.")
     return results
-
-
-def _column(engine: Json) -> Column:
-    """The column of an engine in the file of a comparison."""
-    return Column(engine["backend"], engine["version"], engine["device"])
 
 
 def _order(columns: Iterable[Column]) -> list[Column]:
@@ -139,8 +119,6 @@ def page(results: Results) -> str:
         summaries={robot: _summary(checks) for robot, checks in results.checks.items()},
         known_differences=_table(measured, known),
         not_done=_table(("engine", "robot", "check", "", "why"), not_done),
-        parities=[_parity(data) for data in results.parities],
-        numbers={robot: _every_number(checks) for robot, checks in results.checks.items()},
     )
 
 
@@ -189,57 +167,6 @@ def _failures(check: Json) -> str:
         if m["verdict"] == "failed":
             parts.append(f"{m['what']}: {_amount(m['measured'], m)}, tolerance {_amount(m['tolerance'], m)}")
     return "; ".join(parts)
-
-
-def _parity(data: Json) -> dict[str, Any]:
-    columns = [data["floor"], *data["engines"]]
-    metrics = []
-    known: dict[str, Json] = {}
-    for engine in columns:
-        found = {m["metric"]: m for m in engine["metrics"]}
-        metrics.append(found)
-        known |= found
-    rows = []
-    for name, metric in known.items():
-        cells = [_metric(found.get(name)) for found in metrics]
-        rows.append((metric["claim"], f"{metric['sense']} {_amount(metric['target'], metric)}", *cells))
-    titles = [_column(engine).title for engine in columns]
-    return {
-        "robot": data["robot"],
-        "engines": titles[1:],
-        "closings": len(data["grasps"]["closing"]),
-        "holds": len(data["grasps"]["hold"]),
-        "objects": [thing["name"] for thing in data["objects"]],
-        "reference": _column(data["reference"]).title,
-        "floor": data["floor"]["backend"],
-        "source": data.get("command") or "a command that is not recorded",
-        "table": _table(("what is compared", "target", *titles), rows),
-    }
-
-
-def _metric(metric: Json | None) -> str:
-    if metric is None:
-        return _NONE
-    text = f"{_amount(metric['measured'], metric)} ({metric['n']})"
-    return text if metric["verdict"] == "met" else f"**missed: {text}**"
-
-
-def _every_number(checks: Checks) -> tuple[int, str]:
-    """Return the number of measures, and their table."""
-    columns = _order(checks)
-    rows = []
-    for name in _every_check(checks):
-        by_column = []
-        for column in columns:
-            measures = checks[column][name]["measures"] if name in checks[column] else ()
-            by_column.append({m["what"]: m for m in measures})
-        every: dict[str, Json] = {}
-        for measures in by_column:
-            every |= measures
-        for what, measure in every.items():
-            cells = [_number(measures[what]["measured"]) if what in measures else _NONE for measures in by_column]
-            rows.append((f"`{name}`", what, _amount(measure["tolerance"], measure), *cells))
-    return len(rows), _table(("check", "measure", "tolerance", *(column.title for column in columns)), rows)
 
 
 def _share(measure: Json) -> float:

@@ -19,8 +19,8 @@ def page(
     """Make a Markdown page of what was measured of the engines.
 
     Args:
-        source: File of `xreset engines check --json` or `xreset engines compare --json`; give it again for more. Of two
-            results of the same check, engine, device and robot, the later one counts.
+        source: File of `xreset engines check --json`; give it again for more. Of two results of the same check,
+            engine, device and robot, the later one counts.
         out: File to write; default: print it.
     """
     text = matrix.page(matrix.read(source))

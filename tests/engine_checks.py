@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench
-from xreset.backends.conformance.scene import gripper, objects, scene, shape, solid
+from xreset.backends.conformance.scene import gripper, objects, scene
 from xreset.backends.pool import PoolBackend
 from xreset.geometry.dynamics import mass_matrix
 from xreset.geometry.kinematics import Kinematics
@@ -49,52 +49,6 @@ class EngineChecks:
         state = grasp(Bench(self.backend_class, scene()))[0][[0]]
         backend.set_state(state)
         return backend, state
-
-    # Objects ----------------------------------------------------------------------------------------------------------
-
-    def test_a_hull_with_a_low_centre_of_mass_rests_at_its_height(self):
-        low = solid("low", 0.4, (shape("hull", (0.05, 0.06, 0.02)),), shift=(0.0, 0.0, -0.005))
-        backend = self.make(replace(scene(), objects=(low,)))
-        backend.step(120)
-        self.assertAlmostEqual(float(backend.state().object_pos[0, 2]), 0.02, delta=5e-5)
-
-    def test_an_uneven_body_turns_and_flies_under_a_wrench(self):
-        inertia = np.array([[4e-4, 1e-4, -5e-5], [1e-4, 6e-4, 2e-5], [-5e-5, 2e-5, 8e-4]])
-        com = np.array((0.01, -0.005, 0.004))
-        uneven = replace(solid("uneven", 0.4, (shape("hull", (0.02, 0.03, 0.04)),)), com=com, inertia=inertia)
-        backend = self.make(replace(scene(), objects=(uneven,)))
-        start = backend.state().clone()
-        start.object_pos[:] = torch.tensor([0.5, 0.2, 0.5])
-        start.object_quat[:] = torch.nn.functional.normalize(torch.tensor([[-0.5, 0.3, 0.6, 0.2]]))
-        start.object_linvel[:] = torch.tensor([0.3, 0.2, 1.0])
-        start.object_angvel[:] = torch.tensor([1.0, -4.0, 6.0])
-        backend.set_state(start)
-        force = np.array([0.5, -1.0, 2.0])
-        torque = np.array([0.002, -0.001, 0.0015])
-        backend.set_object_gravity(torch.tensor([0.5]))
-        backend.set_object_wrench(torch.tensor(force)[None], torch.tensor(torque)[None])
-        backend.step(24)
-
-        turn = Rotation.from_quat(start.object_quat[0].double().numpy(), scalar_first=True)
-        omega = start.object_angvel[0].double().numpy()
-        pos = start.object_pos[0].double().numpy() + turn.apply(com)
-        velocity = start.object_linvel[0].double().numpy() + np.cross(omega, turn.apply(com))
-        momentum = turn.apply(inertia @ turn.inv().apply(omega))
-        dt = 0.1 / 1000
-        for _ in range(1000):  # Euler's equations by the midpoint rule
-            middle = Rotation.from_rotvec(omega * dt / 2) * turn
-            momentum = momentum + torque * dt
-            omega = middle.apply(np.linalg.solve(inertia, middle.inv().apply(momentum)))
-            turn = Rotation.from_rotvec(omega * dt) * turn
-            velocity = velocity + (force / 0.4 - [0, 0, GRAVITY / 2]) * dt
-            pos = pos + velocity * dt
-        state = backend.state()
-        arm = turn.apply(com)
-        np.testing.assert_allclose(state.object_angvel[0], omega, atol=0.05)  # engines are of first order, at 7 rad/s
-        np.testing.assert_allclose(state.object_linvel[0], velocity - np.cross(omega, arm), atol=1e-3)
-        np.testing.assert_allclose(state.object_pos[0], pos - arm, atol=2e-3)
-        found = Rotation.from_quat(state.object_quat[0].double().numpy(), scalar_first=True)
-        self.assertLess((found * turn.inv()).magnitude(), 4e-3)
 
     # Joints -----------------------------------------------------------------------------------------------------------
 
@@ -140,15 +94,6 @@ class EngineChecks:
         force = (backend.contacts().tip_force[0] @ along).abs()
         # Both forces are equal, because the brick does not move: F + 1.1 F = drive.
         torch.testing.assert_close(force, torch.full((2,), drive / 2.1), rtol=0.03, atol=0.0)
-
-    def test_the_robot_falls_where_its_weight_is_not_compensated(self):
-        robot = with_drive(gripper(), "lift", kp=0.0, kd=0.0, armature=0.0)
-        for compensated in (True, False):
-            backend = self.make(scene(replace(robot, gravity_compensated=compensated)))
-            before = float(backend.links().linvel[0, 0, 2])
-            backend.step(24)
-            fall = before - float(backend.links().linvel[0, 0, 2])
-            self.assertAlmostEqual(fall, 0.0 if compensated else GRAVITY * 0.1, delta=0.03)
 
     # Contacts ---------------------------------------------------------------------------------------------------------
 

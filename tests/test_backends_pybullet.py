@@ -10,10 +10,8 @@ from unittest import mock
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from tests.engine_checks import JOINT, EngineChecks
-from xreset.backends.bullet_models import _origin
 from xreset.backends.conformance.scene import gripper, objects, scene, shape
 from xreset.backends.pybullet import PybulletBackend, PybulletWorld, _engine
 from xreset.backends.rigid import mechanism
@@ -36,18 +34,6 @@ class PybulletTest(EngineChecks, unittest.TestCase):
         # Mimic joints move with their source: M = S^T M_all S with q_all = S q + constant.
         S = np.stack([drives._joints.spread(q, e)[1] for e in np.eye(5)], axis=1)
         np.testing.assert_allclose(S.T @ full @ S, mass_matrix(robot, q), rtol=1e-6, atol=1e-9)
-
-    def test_roll_pitch_yaw(self):
-        rotations = [
-            *Rotation.random(50, random_state=0),
-            Rotation.from_euler("xyz", [0.3, np.pi / 2, -0.2]),
-            Rotation.identity(),
-        ]
-        for rotation in rotations:
-            T = np.eye(4)
-            T[:3, :3] = rotation.as_matrix()
-            rpy = [float(x) for x in _origin(T).split('rpy="')[1].split('"')[0].split()]
-            np.testing.assert_allclose(Rotation.from_euler("xyz", rpy).as_matrix(), T[:3, :3], atol=1e-7)
 
     def test_a_hull_touches_where_it_is(self):
         """Round pads hold a box, its hull, and the hulls of its halves, all off their frames' origins, alike."""

@@ -73,24 +73,20 @@ class PluginTest(unittest.TestCase):
             make_backend("someones", scene(), 1)
         self.assertRegex(backend_status("someones").reason or "", pattern)
 
-    def test_a_plugin_that_does_not_load_says_where(self):
-        self.plugin("import no_such_engine\n")
-        self.assert_unavailable(r"(?s)'someones' \(someones_engine:SomeonesBackend\) does not load.*no_such_engine")
-
-    def test_an_entry_point_that_names_nothing(self):
-        self.plugin("", value="someones_engine:Misspelt")
-        self.assert_unavailable("does not load.*Misspelt")
-
-    def test_an_entry_point_that_names_no_backend(self):
-        self.plugin("def SomeonesBackend(scene, num_worlds): return None\n")
-        self.assert_unavailable("expected a class that inherits from xreset.physics.Backend")
-
-    def test_a_plugin_that_says_what_to_install_is_quoted(self):
-        self.plugin(
-            "from xreset.errors import BackendUnavailableError\n"
-            "raise BackendUnavailableError('pip install their-engine')\n"
-        )
-        self.assert_unavailable("^pip install their-engine$")
+    def test_a_plugin_that_cannot_be_used_says_why(self):
+        backend = "SomeonesBackend"
+        install = "from xreset.errors import BackendUnavailableError as E\nraise E('pip install their-engine')\n"
+        for source, name, pattern in (
+            ("import nothing\n", backend, r"(?s)'someones' \(someones_engine:SomeonesBackend\) does not load.*nothing"),
+            ("", "Misspelt", "does not load.*Misspelt"),
+            (f"def {backend}(scene, num_worlds): ...\n", backend, "a class that inherits from xreset.physics.Backend"),
+            (install, backend, "^pip install their-engine$"),
+        ):
+            with self.subTest(source):
+                self.plugin(source, value=f"someones_engine:{name}")
+                with self.assertRaisesRegex(BackendUnavailableError, pattern):
+                    make_backend("someones", scene(), 1)
+                self.assertRegex(backend_status("someones").reason or "", pattern)
 
     def test_a_defect_of_one_plugin_does_not_hide_the_others(self):
         self.plugin(

@@ -4,6 +4,7 @@ import json
 import tempfile
 import unittest
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
@@ -15,6 +16,7 @@ from tests.test_cli import run
 from tests.toy_bank import toy_bank, toy_retargeted
 from xreset.accounts import accounts_path
 from xreset.geometry.kinematics import Kinematics
+from xreset.plugins import make_backend
 from xreset.resets.bank import read_bank, write_bank
 from xreset.resets.closing import closing_states, positions_between, rotations_between
 from xreset.resets.config import ClosingConfig, SqueezeConfig
@@ -228,6 +230,8 @@ class CommandTest(unittest.TestCase):
             self.skipTest(str(error))
         self.folder = Path(self.enterContext(tempfile.TemporaryDirectory()))
         self.enterContext(mock.patch("xreset.description.load_robot", lambda _: ROBOT))
+        in_this_process = partial(make_backend, workers=0)
+        self.enterContext(mock.patch("xreset.resets.probe.make_backend", in_this_process))
         self.enterContext(mock.patch("xreset.objects.catalogue.load_objects", lambda *_: (toy_grasp.brick(),)))
         write_retargeted(self.folder / "r.npz", grasp_and_lift(), config={}, inputs={})
 

@@ -23,7 +23,6 @@ from xreset.spec import Geometry, RobotSpec, TableSpec
 
 _RIM_POINTS = 16
 """Support points on each rim of a cylinder."""
-_POSES_PER_CHUNK = 4096
 
 
 def support_points(geometry: Geometry) -> tuple[np.ndarray, float]:
@@ -180,25 +179,19 @@ class SelfCollision:
         rows = []
         first, second = self._pairs.T
         reach = self._radius[first] + self._radius[second] + margin
-        for begin in range(0, len(link_poses) if len(self._pairs) else 0, _POSES_PER_CHUNK):
-            T = link_poses[begin : begin + _POSES_PER_CHUNK, self._link]  # [B, G, 4, 4]
-            centers = np.einsum("bgij,gj->bgi", T[..., :3, :3], self._center) + T[..., :3, 3]
-            gap = np.zeros((len(T), len(self._pairs)))
-            for axis in range(3):  # one axis at a time keeps the temporary arrays small
-                gap += (centers[:, first, axis] - centers[:, second, axis]) ** 2
-            for b, pair in np.argwhere(gap < reach**2):
-                arguments = []
-                for shape in self._pairs[pair]:
-                    pose = T[b, shape] @ self._T_link_shape[shape]
-                    arguments += [
-                        self._geometry[shape],
-                        self._coal.Transform3s(pose[:3, :3], pose[:3, 3]),
-                    ]
-                result.clear()
-                distance = self._coal.distance(*arguments, request, result)
-                if distance < margin:
-                    i, j = self._pairs[pair]
-                    rows.append((begin + b, self._link[i], self._link[j], distance))
+        T = link_poses[:, self._link]  # [B, G, 4, 4]
+        centers = np.einsum("bgij,gj->bgi", T[..., :3, :3], self._center) + T[..., :3, 3]
+        gap = np.linalg.norm(centers[:, first] - centers[:, second], axis=-1)
+        for b, pair in np.argwhere(gap < reach):
+            arguments = []
+            for shape in self._pairs[pair]:
+                pose = T[b, shape] @ self._T_link_shape[shape]
+                arguments += [self._geometry[shape], self._coal.Transform3s(pose[:3, :3], pose[:3, 3])]
+            result.clear()
+            distance = self._coal.distance(*arguments, request, result)
+            if distance < margin:
+                i, j = self._pairs[pair]
+                rows.append((b, self._link[i], self._link[j], distance))
         table = np.array(rows).reshape(-1, 4)
         return Approaches(table[:, 0].astype(np.int64), table[:, 1:3].astype(np.int64), table[:, 3])
 

@@ -286,6 +286,9 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual((info.weights, info.weights_hash), (str(given), file_hash(given)))
         content, before = newest(out), read_checkpoint(given)
         self.assertEqual((content["iteration"], content["env_steps"]), (1, 8 * 4))  # counters start at zero
+        runner = mock.Mock(device="cpu", train_config=CONFIG)
+        TrainingRunner.load_networks(runner, given)
+        self.assertEqual(runner.alg.learning_rate, before["learning_rate"])  # an adaptive rate goes on
         for networks in ("actor_state_dict", "critic_state_dict"):
             for name, value in before[networks].items():
                 if "normalizer" not in name:  # which goes on to learn
@@ -310,12 +313,6 @@ class TrainingTest(unittest.TestCase):
         self.assertEqual(file_hash(ensure_policy(out)), file_hash(self.folder / "first.onnx"))
         shutil.copy(out / "checkpoints" / "000002.pt", out / "checkpoints" / "000003.pt")
         self.assertIsNone(current_choice(out))
-
-    def test_an_adaptive_learning_rate_goes_on_with_the_networks(self):
-        runner = mock.Mock(device="cpu", train_config=CONFIG)
-        path = latest_checkpoint(self.out)
-        TrainingRunner.load_networks(runner, path)
-        self.assertEqual(runner.alg.learning_rate, read_checkpoint(path)["learning_rate"])
 
     def test_networks_that_do_not_fit_are_refused(self):
         with self.assertRaisesRegex(RunError, "is not a run folder"):
@@ -478,11 +475,8 @@ class TrainingTest(unittest.TestCase):
         good = json.loads((self.out / "run.json").read_text())
         for words, changes in (
             ("missing: resets", {"resets": None}),
-            ("missing: config", {"config": None}),
             (r"\(of xreset '9.9'\).*unknown: later", {"later": 1, "xreset": "9.9"}),
             ("num_envs is -5", {"num_envs": -5}),
-            ("seed is {}, expected int", {"seed": {}}),
-            ("device is 0.5, expected str", {"device": 0.5}),
             ("contract in which joint_names", {"contract": good["contract"] | {"joint_names": 3}}),
         ):
             optional = ("objects", "weights", "weights_hash")

@@ -38,9 +38,7 @@ class Tracker:
 
     def lasting(self) -> dict[str, Tensor]:
         """Return all buffers by name, for a snapshot."""
-        lasting = {}
-        if self._delays is not None:
-            lasting |= {"_poses.values": self._delays.values, "_poses.delay": self._delays.delay}
+        lasting = {} if self._delays is None else self._delays.lasting("_poses")
         for name in ("_bias", "_wait", "_last"):
             if (value := getattr(self, name)) is not None:
                 lasting[f"_tracker.{name}"] = value

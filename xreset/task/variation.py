@@ -99,9 +99,10 @@ class Variation:
         lasting = {f"_parameters.{name}": value for name, value in self.parameters.items()}
         if self.force_gain is not None:
             lasting["_force_gain"] = self.force_gain
-        for name in ("_commands", "_proprio"):
-            if (line := getattr(self, name)) is not None:
-                lasting |= {f"{name}.values": line.values, f"{name}.delay": line.delay}
+        if self._commands is not None:
+            lasting |= self._commands.lasting("_commands")
+        if self._proprio is not None:
+            lasting |= self._proprio.lasting("_proprio")
         if self._lost_actions is not None:
             lasting["_lost_actions"] = self._lost_actions
         if self.pushes is not None:

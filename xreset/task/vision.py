@@ -36,7 +36,7 @@ class Vision:
         """Return all buffers by name, for a snapshot."""
         lasting = self.cameras.lasting()
         if self._delay is not None:
-            lasting |= {"_views.values": self._delay.values, "_views.delay": self._delay.delay}
+            lasting |= self._delay.lasting("_views")
         return lasting
 
     def draw(self, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:

@@ -9,8 +9,9 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.pictures.render import Camera, Renderer
 from xreset.spec import RobotSpec, SceneSpec
 
-_SIDES = ((0.9, -1.0, 0.7), (-0.5, -0.9, -0.9))
-"""Directions of the close views of the hand: from above its thumb's side, and from below."""
+_SIDES = ((0.9, -1.0, 0.7), (-0.5, -0.9, -0.25))
+"""Directions of the close views of the hand: from above its thumb's side, and from the other side, above the
+table."""
 _PANEL = (480, 360)
 
 

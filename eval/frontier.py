@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from xreset.errors import DemoError
 from xreset.eval.policy_spec import PolicySpec
@@ -107,13 +108,13 @@ def try_policy(
 
 def by_stage(tried: list[StateOutcome]) -> list[dict[str, Any]]:
     """Return an entry for each stage with states: their number, and the shares that reached the goal and stayed."""
+    table = pd.DataFrame(tried)
     out = []
     for stage in STAGES:
-        mine = [t for t in tried if t.stage == stage]
-        if mine:
-            reached = round(float(np.mean([t.reached for t in mine])), 6)
-            stayed = round(float(np.mean([t.stayed for t in mine])), 6)
-            out.append({"stage": stage, "states": len(mine), "reached": reached, "stayed": stayed})
+        own = table[table["stage"] == stage]
+        if len(own):
+            shares = own[["reached", "stayed"]].mean().round(6)
+            out.append({"stage": stage, "states": len(own)} | shares.to_dict())
     return out
 
 

@@ -405,64 +405,52 @@ class PageTest(Reported):
         curves = (Curve(label="episode return", iteration=np.array([1, 50]), value=np.array([0.5, 2.0])),)
         return replace(collect(self.folder), curves=curves, **changes)
 
-    def test_needs_nothing_from_outside(self):
+    def test_the_page(self):
         text = page(self.data(), self.clips, self.strips)
+        self.assertEqual(text, page(self.data(), self.clips, self.strips), "the same results give the same page")
         outline = Outline(text)
-        for tag, attributes in outline.tags:
-            for name in ("src", "href", "xlink:href", "poster", "srcset", "action", "data"):
-                value = attributes.get(name)
-                if value is not None:
-                    self.assertRegex(value, "^(data:|#)", f"<{tag} {name}>")
-        styles = (
-            "".join(a.get("style") or "" for _, a in outline.tags)
-            + text[text.index("<style>") : text.index("</style>")]
-        )
-        self.assertNotIn("@import", styles)
-        for target in re.findall(r"url\(([^)]*)\)", styles):
-            self.assertTrue(target.startswith("#"), target)
-        policy = next(a["content"] for a in outline.of("meta") if a.get("http-equiv") == "Content-Security-Policy")
-        self.assertIn("default-src 'none'", policy)
-
-    def test_is_well_formed_and_its_identifiers_are_unique(self):
-        outline = Outline(page(self.data(), self.clips, self.strips))
-        self.assertEqual(outline.open, [])
-        names = [a["id"] for _, a in outline.tags if "id" in a]
-        self.assertEqual(len(names), len(set(names)))
-        targets = {a["xlink:href"][1:] for _, a in outline.tags if "xlink:href" in a}
-        self.assertLessEqual(targets, set(names))
-
-    def test_says_in_words_what_it_shows(self):
-        outline = Outline(page(self.data(), self.clips, self.strips))
-        self.assertEqual(len(outline.of("video")), 4)
-        charts = [a.get("aria-label") or "" for a in outline.of("figure") if a.get("role") == "img"]
-        for text in (*charts, *(a.get("aria-label") or "" for a in outline.of("video"))):
-            self.assertGreater(len(text), 20)
-        self.assertIn("object at its goal", outline.of("video")[0]["aria-label"])
-        self.assertIn("stopped being finite", outline.of("video")[3]["aria-label"])
-        (strip,) = outline.of("img")
-        self.assertRegex(strip["alt"], "at 0.0, 1.0, .* 5.0 s: .*demo_1: grasped and lifted, 50% of the way")
-        self.assertIn(
-            "Of 4 episodes in mujoco: 1 never near the object; 1 near it, but no grasp; 1 grasped, never at the goal.",
-            outline.text,
-        )
-        self.assertIn("mujoco-warp approach 75%, grasp 50%, reorient 25%", " ".join(charts))
-        self.assertEqual(outline.of("html")[0]["lang"], "en")
-        self.assertEqual(len(outline.of("caption")), 2)
-
-    def test_states_the_results_and_their_origin(self):
-        text = Outline(page(self.data(), self.clips, self.strips)).text
+        with self.subTest("well formed, with unique identifiers"):
+            self.assertEqual(outline.open, [])
+            names = [a["id"] for _, a in outline.tags if "id" in a]
+            self.assertEqual(len(names), len(set(names)))
+            targets = {a["xlink:href"][1:] for _, a in outline.tags if "xlink:href" in a}
+            self.assertLessEqual(targets, set(names))
+        with self.subTest("needs nothing from outside"):
+            for tag, attributes in outline.tags:
+                for name in ("src", "href", "xlink:href", "poster", "srcset", "action", "data"):
+                    if attributes.get(name) is not None:
+                        self.assertRegex(attributes[name], "^(data:|#)", f"<{tag} {name}>")
+            self.assertNotIn("@import", text)
+            for target in re.findall(r"url\(([^)]*)\)", text):
+                self.assertTrue(target.startswith("#"), target)
+            policy = next(a["content"] for a in outline.of("meta") if a.get("http-equiv") == "Content-Security-Policy")
+            self.assertIn("default-src 'none'", policy)
+        with self.subTest("says in words what it shows"):
+            charts = [a.get("aria-label") or "" for a in outline.of("figure") if a.get("role") == "img"]
+            films = [a.get("aria-label") or "" for a in outline.of("video")]
+            self.assertEqual((len(charts), len(films)), (4, 4))
+            for words in (*charts, *films):
+                self.assertGreater(len(words), 20)
+            self.assertIn("object at its goal", films[0])
+            self.assertIn("stopped being finite", films[3])
+            (strip,) = outline.of("img")
+            self.assertRegex(strip["alt"], "at 0.0, 1.0, .* 5.0 s: .*demo_1: grasped and lifted, 50% of the way")
+            self.assertIn("mujoco-warp approach 75%, grasp 50%, reorient 25%", " ".join(charts))
+            self.assertEqual(outline.of("html")[0]["lang"], "en")
+            self.assertEqual(len(outline.of("caption")), 2)
         for expected in (
             "zero on toy", "mujoco-warp 4.0.0 on cuda, 4,096 worlds", "50 of 500 iterations, seed 7", "49.8%", "33.0 to 66.5%", "37.5%",
             "tomato soup can", "demo_1", "4 in each engine: 2 demonstrations, 2 starts each", "trained here",
+            "Of 4 episodes in mujoco: 1 never near the object; 1 near it, but no grasp; 1 grasped, never at the goal.",
         ):  # fmt: skip
-            self.assertIn(expected, text)
-
-    def test_faults_of_an_engine_stand_out(self):
-        self.assertEqual(page(self.data(), []).count('<td class="bad">1</td>'), 2 * 4)
+            with self.subTest(expected):
+                self.assertIn(expected, outline.text)
 
     def test_without_clips_curves_and_run(self):
         self.write(engines=("pybullet",))
-        outline = Outline(page(collect(self.folder), []))
+        text = page(collect(self.folder), [])
+        self.assertEqual(text.count('<td class="bad">1</td>'), 2, "faults of an engine stand out")
+        outline = Outline(text)
         self.assertEqual((len(outline.of("video")), outline.open), (0, []))
         self.assertNotIn("Training", outline.text)
 
@@ -487,9 +475,6 @@ class PageTest(Reported):
             "40% in each of the 4 engines",
             headline(replace(data, results=tuple(replace(made[0], backend=n) for n in ENGINES))),
         )
-
-    def test_the_same_results_give_the_same_page(self):
-        self.assertEqual(page(self.data(), self.clips, self.strips), page(self.data(), self.clips, self.strips))
 
 
 class CommandTest(Reported):

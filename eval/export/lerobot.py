@@ -1,5 +1,6 @@
 """Recorded episodes as a LeRobot data set, format v3.0: parquet files, films and meta (github.com/huggingface/lerobot,
-``docs/source/lerobot-dataset-v3.mdx``). It is written without the package ``lerobot``, which reads it.
+``docs/source/lerobot-dataset-v3.mdx``). It is written without the package ``lerobot``, which reads it, because that
+package pins another torch and gymnasium than xreset needs, and knows no facts of an episode such as its engine.
 
 Shape letters: T frames of an episode, J actuated joints.
 """
@@ -100,7 +101,6 @@ def _write(
     offsets = recording.offsets
     features = _features(recording, videos, size)
     task_index, tasks = pd.factorize(recording.episodes["task"])
-    frames: dict[str, list[np.ndarray]] = {}
     samples: dict[str, list[np.ndarray]] = {}
     rows = []
     painters: dict[Any, Painter] = {}
@@ -129,8 +129,6 @@ def _write(
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
         }
-        for key, values in arrays.items():
-            frames.setdefault(key, []).append(values)
         for video in videos:
             chunk, file = divmod(i, _CHUNK)
             film = _draw(recording, i, video, painters, size)
@@ -148,10 +146,11 @@ def _write(
         rows.append(row)
 
     columns = {}
-    for key, parts in frames.items():
-        values = np.concatenate(parts)
-        flat = pa.array(values.reshape(-1).astype(features[key]["dtype"]))
-        columns[key] = flat if values.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+    whole = {key: np.concatenate(parts) for key, parts in samples.items()}
+    for key, values in whole.items():
+        if key not in videos:
+            flat = pa.array(values.reshape(-1).astype(features[key]["dtype"]))
+            columns[key] = flat if values.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
     columns["engine"] = pa.array(np.repeat(recording.episodes["engine"].tolist(), np.diff(offsets)))
     for name, table in (("data", pa.table(columns)), ("meta/episodes", pa.Table.from_pylist(rows))):
         path = root / name / _FIRST
@@ -160,7 +159,7 @@ def _write(
     pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(tasks, name="task")).to_parquet(
         root / "meta/tasks.parquet"
     )
-    write_json(root / "meta/stats.json", {key: _stats(key, np.concatenate(parts)) for key, parts in samples.items()})
+    write_json(root / "meta/stats.json", {key: _stats(key, values) for key, values in whole.items()})
     write_json(root / "meta/xreset.json", {"schema": SCHEMA})  # with the version of xreset
     write_json(root / "meta/info.json", _info(recording, len(tasks), features))
     progress(count, count)
@@ -188,12 +187,9 @@ def _info(recording: Recording, tasks: int, features: dict[str, Any]) -> dict[st
 
 def _features(recording: Recording, videos: tuple[str, ...], size: tuple[int, int]) -> dict[str, dict[str, Any]]:
     joints = list(recording.robot.joint_names)
+    vectors = {"observation.state": joints, "observation.environment_state": _ENVIRONMENT, "action": joints}
     features: dict[str, dict[str, Any]] = {}
-    for key, names in (
-        ("observation.state", joints),
-        ("observation.environment_state", _ENVIRONMENT),
-        ("action", joints),
-    ):
+    for key, names in vectors.items():
         features[key] = {"dtype": "float32", "shape": [len(names)], "names": names}
     width, height = size
     for video in videos:

@@ -59,6 +59,7 @@ def write_page(plan: Plan, out: Path) -> Page:
             every_metric.append(spec)
     notes = [*_incomplete(plan)]
     for i, table in enumerate(tables, 1):
+        notes += fairness.begun(table.trainings)
         notes += _unfair(plan, table, trained)
         if table.engines:
             draw(out / f"table-{i}.png", table)
@@ -102,9 +103,6 @@ def _unfair(plan: Plan, table: FilledTable, trained: dict[str, Lift]) -> Iterato
     seeds = {}
     for name, members in table.members.items():
         mine = [run for run in plan.runs if run.group == name and run.name in trained]
-        for run in mine:
-            if run.weights:
-                yield f"{run.name} began with the networks of {run.weights.name}, whose training counts, too."
         steps = [trained[run.name].env_steps * 1e-6 for run in mine if trained[run.name].env_steps]
         if steps:
             lengths[name] = sum(steps) / len(steps)

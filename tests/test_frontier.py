@@ -114,7 +114,10 @@ class FrontierTest(unittest.TestCase):
         self.assertEqual(few["tried"], tried, "the number of worlds changes nothing")
 
     def test_the_seed_chooses_among_the_states(self):
-        with mock.patch("xreset.eval.frontier.try_policy", return_value=[]) as tried:
+        outcome = StateOutcome(
+            state=0, sequence_name="a", frame=0, object=SOUP, stage=STAGES[0], reached=True, stayed=True
+        )
+        with mock.patch("xreset.eval.frontier.try_policy", return_value=[outcome]) as tried:
             self.run_frontier(self.resets, states=3)
         self.assertEqual(len(set(tried.call_args.args[3].tolist())), 3)
 

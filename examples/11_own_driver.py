@@ -49,7 +49,7 @@ def main(folder: Path, recording: Path, episode: int = 0) -> None:
             )
 
         def send(self, target):
-            self.errors.append(np.abs(target[0] - self.frames["joint_target"][self.row]).mean())
+            self.errors.append(np.abs(target - self.frames["joint_target"][self.row]).mean())
 
         def stop(self):
             print("the robot holds still")

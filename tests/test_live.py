@@ -37,9 +37,9 @@ class Scripted(Driver):
         self.time = max(self.time, moment)
 
     def read(self):
-        pos = self.sent[-1] if self.sent else np.zeros((1, 2), np.float32)
+        pos = self.sent[-1] if self.sent else np.zeros(2, np.float32)
         reading = Reading(
-            joint_pos=pos[0],
+            joint_pos=pos,
             joint_vel=np.zeros(2),
             joint_time=self.time,
             object_pos=np.array([0.5, 0.0, 0.1]),
@@ -94,7 +94,7 @@ class FaultTest(unittest.TestCase):
         outcome = Runner(controller or Steady(), driver).run(seconds=30)
         self.assertEqual(driver.stops, 1)
         self.assertLess(driver.time, 5, "it hangs")
-        moves = np.diff(np.concatenate(driver.sent), axis=0)
+        moves = np.diff(driver.sent, axis=0)
         self.assertLessEqual(np.abs(moves).max(), 0.0101)
         self.assertTrue((np.diff(moves[-12:, 0]) <= 1e-6).all())
         self.assertLess(abs(moves[-1, 0]), 0.001)

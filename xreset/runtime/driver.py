@@ -73,7 +73,7 @@ class Driver(ABC):
 
     @abstractmethod
     def send(self, target: Array) -> None:
-        """Send joint targets [J] (of N robots: [N, J])."""
+        """Send joint targets [J]; [N, J] if the readings have the axis N."""
 
     @abstractmethod
     def stop(self) -> None:

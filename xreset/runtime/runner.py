@@ -69,6 +69,7 @@ class Runner:
         self.outcome = Outcome(reasons=[None] * count, refused=np.zeros(count, dtype=int))
         self._stopped_at = np.full(count, np.inf)
         self._reading: Reading | None = None
+        self._one_robot = False  # whether the driver's arrays have no axis N
         self._refusals = ["no newer one has come"] * count
         self._sent = controller.target
         self._move = np.zeros_like(self._sent)
@@ -114,7 +115,7 @@ class Runner:
         slowed = np.clip(slowed, self.controller.lower, self.controller.upper)
         self._sent = np.where(going, target, slowed)
         try:
-            self.driver.send(self._sent)
+            self.driver.send(self._sent[0] if self._one_robot else self._sent)
         except Exception as error:
             self._stop_all(f"The driver could not send targets: {error}.")
             return False
@@ -123,7 +124,9 @@ class Runner:
     def _act(self, now: float) -> Array:
         """Return the policy's targets; where it cannot act, the last ones."""
         try:
-            self._take(self.driver.read().batched(), now)
+            reading = self.driver.read()
+            self._one_robot = np.ndim(reading.joint_pos) == 1
+            self._take(reading.batched(), now)
         except Exception as error:
             self._stop_all(f"The driver could not read: {error}.")
             return self._sent

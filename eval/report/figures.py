@@ -105,7 +105,8 @@ def draw_progress(ax: Axes, results: Results) -> None:
 def draw_stages(ax: Axes, results: Results) -> None:
     """Draw the share of episodes that reach each stage, for each engine."""
     table = pd.DataFrame(map(vars, results), index=[s.backend for s in results])
-    table = table[list(STAGES)].rename(columns=STAGES).T
+    table = table[list(STAGES)].T
+    table.index = pd.Index(STAGES.values())
     for bars in draw_bars(ax, table, table, table):
         ax.bar_label(bars, fmt="%.0f", fontsize="small", padding=1)
     percent_axis(ax, "y")

@@ -18,7 +18,7 @@ def main(out: Path) -> None:
     can = xreset.load_object("soup")  # a built-in stand-in; a folder of meshes is the second argument
     demos = xreset.synthesize([can.name], 2, seed=0)  # or xreset.read_demos("demos.npz")
     xreset.write_demos(out / "demos.npz", demos)
-    view = load_view(out / "demos.npz", demos=None, retargeted=None, robot=None, objects=None)
+    view = load_view(out / "demos.npz", demos=None, robot=None, objects=None)
     write_png(out / "demos.png", Drawer(view, smooth=True).draw(row=60))
 
     print(f"{robot.name}: {len(robot.joints)} joints, fingertips {', '.join(robot.fingertip_names)}")

@@ -10,14 +10,14 @@ from xreset.demos.keypoints import Convention, read_keypoints
 
 
 def record(file: Path) -> None:
-    """Stands for your tracker: 21 hand keypoints and the object's pose in each frame, millimetres and (x, y, z, w)."""
+    """Stands for your tracker: 21 hand keypoints and the object's pose in each frame, millimetres, quaternions (x, y, z, w)."""
     hand = xreset.synthesize(["005_tomato_soup_can"], 1, seed=0)
     seen = hand.hand_valid
     np.savez(
         file,
         keypoints=1e3 * hand.hand_keypoints[seen],  # [F, 21, 3] wrist, then each finger from base to tip, thumb first
         object_pos=1e3 * hand.object_pos[seen],  # [F, 3]
-        object_quat=np.roll(hand.object_quat_wxyz[seen], -1, axis=1),  # [F, 4]
+        object_quat_xyzw=np.roll(hand.object_quat_wxyz[seen], -1, axis=1),  # [F, 4]
     )
 
 
@@ -28,7 +28,6 @@ def main(out: Path) -> None:
         order="mediapipe",
         units="mm",
         frame="table",
-        quat="xyzw",
         fps=30.0,
         object_name="005_tomato_soup_can",
         side="right",

@@ -163,6 +163,8 @@ def _archive(path: Path, failure: str) -> Iterator[_Archive]:
         raise
     except Exception as error:
         reason = str(error) if isinstance(error, zipfile.BadZipFile | OSError | _BadArray) else "its content is broken"
+        if str(error).startswith("Object arrays"):  # numpy's refusal
+            raise FileFormatError(f"{path} {failure}: it holds Python objects, and objects are never read.") from error
         raise FileFormatError(f"{path} {failure}: {reason}. It is damaged or truncated, or not an npz file.") from error
 
 

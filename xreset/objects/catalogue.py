@@ -26,7 +26,7 @@ ALIASES = {
 _ALIAS_OF = {name: alias for alias, name in ALIASES.items()}
 
 
-def object_names(folder: Path | None = None) -> tuple[str, ...]:
+def object_names(folder: str | Path | None = None) -> tuple[str, ...]:
     """Official names of the built-in objects, or of the meshes in a folder."""
     if folder is None:
         return STAND_INS
@@ -79,7 +79,7 @@ def _key(name: str) -> str:
     return ALIASES.get(key, key)
 
 
-def load_object(name: str, folder: Path | None = None) -> ObjectSpec:
+def load_object(name: str, folder: str | Path | None = None) -> ObjectSpec:
     """Load an object by any of its names.
 
     Args:
@@ -102,7 +102,7 @@ def load_object(name: str, folder: Path | None = None) -> ObjectSpec:
     return import_mesh(files[full], name if name in STAND_INS else full)
 
 
-def load_objects(names: Iterable[str], folder: Path | None = None) -> tuple[ObjectSpec, ...]:
+def load_objects(names: Iterable[str], folder: str | Path | None = None) -> tuple[ObjectSpec, ...]:
     """Load several objects, in that order; see :func:`load_object`."""
     return tuple(load_object(name, folder) for name in names)
 

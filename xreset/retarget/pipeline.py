@@ -92,7 +92,7 @@ def retarget_demos(
     objects: Sequence[ObjectSpec],
     config: RetargetConfig | None = None,
     *,
-    progress: Progress = lambda done, total: None,
+    progress: Callable[[float, int], None] = lambda done, total: None,
     device: str = "cpu",
 ) -> Retargeted:
     """Retarget demonstrations. Sequences are independent of one another, and only the arguments decide the result.

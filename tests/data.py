@@ -7,11 +7,14 @@ import io
 import os
 import tempfile
 import unittest
+from importlib.util import find_spec
 from pathlib import Path
 
 from xreset.cli import main
 
 DEFAULT = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+PYBULLET = unittest.skipUnless(find_spec("pybullet"), "PyBullet is not installed: it has wheels for Python 3.11 only")
 
 
 def data_dir() -> Path:

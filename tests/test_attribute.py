@@ -12,6 +12,7 @@ import torch
 
 from tests import toy_grasp
 from tests.command import xreset
+from tests.data import PYBULLET
 from tests.toy_results import episodes
 from xreset.errors import XResetError
 from xreset.eval.engines.attribution import Attribution, Row, attribute, change_towards
@@ -116,6 +117,7 @@ class ProbesTest(unittest.TestCase):
             hand_stiffness=0.5, hand_damping=0.9, timestep=1 / 480, delay=1.0,
         )  # fmt: skip
 
+    @PYBULLET
     def test_engines_that_step_finer_are_seen(self):
         found = measure(engine("pybullet", workers=0), SCENE)
         self.assertAlmostEqual(found.timestep, 1 / 480, delta=1e-5)

@@ -11,6 +11,7 @@ from unittest import mock
 import numpy as np
 import torch
 
+from tests.data import PYBULLET
 from tests.engine_checks import JOINT, EngineChecks
 from xreset.backends.conformance.scene import gripper, objects, scene, shape
 from xreset.backends.pybullet import PybulletBackend, PybulletWorld, _engine
@@ -20,6 +21,7 @@ from xreset.geometry.dynamics import mass_matrix
 from xreset.spec import Geometry, Shape
 
 
+@PYBULLET
 class PybulletTest(EngineChecks, unittest.TestCase):
     backend_class = PybulletBackend
     one_step = mock.patch("xreset.backends.pybullet.INTERNAL_STEPS", 1)

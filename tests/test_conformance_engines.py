@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.data import PYBULLET
 from xreset.backends.conformance import CHECKS, CheckResult, run
 from xreset.geometry.dynamics import drive_inertia
 from xreset.plugins import backend_status, make_backend
@@ -84,12 +85,14 @@ class EveryBackend(unittest.TestCase):
             with self.subTest(backend=backend):
                 self.passes(backend)
 
+    @PYBULLET  # whose data package has the robot
     def test_a_robot_from_outside(self):
         robot_dependent = [c.name for c in CHECKS if c.group in ("state", "robot") and not c.own_robot_only]
         for backend in BACKENDS:
             with self.subTest(backend=backend):
                 self.passes(backend, robot=panda(), only=robot_dependent)
 
+    @PYBULLET
     def test_checks_that_need_the_suites_robot_are_skipped_with_another(self):
         own = [c.name for c in CHECKS if c.own_robot_only]
         results = run(make_local("mujoco"), robot=panda(), only=own)

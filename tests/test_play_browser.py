@@ -13,9 +13,6 @@ from tests.browser import Browser, find_chromium, wait_until
 from xreset.eval.play.session import Session
 from xreset.tensors import one_thread
 
-FOLDER = "[...document.querySelectorAll('.mantine-Paper-root')].find(e => e.textContent.trim() === '{label}')"
-HEIGHTS = "[...document.querySelectorAll('.u-wrap')].map(e => e.getBoundingClientRect().height)"
-
 
 @unittest.skipUnless(find_spec("viser"), "viser is not installed")
 class InTheBrowser(unittest.TestCase):
@@ -49,7 +46,7 @@ class InTheBrowser(unittest.TestCase):
             self.page.tick()
             return condition()
 
-        return wait_until(holds, what, seconds=90)
+        return wait_until(holds, what, seconds=300)
 
     def shows_the_object(self) -> bool:
         """Whether the page has pixels of the object's color."""
@@ -97,28 +94,6 @@ class InTheBrowser(unittest.TestCase):
         self.assertEqual(problems, [])
         self.browser.resize(390, 844, phone=True)
         self.assertLessEqual(self.browser.evaluate("document.documentElement.scrollWidth"), 390)
-
-    def test_rings_turn_the_goal_and_another_engine_goes_on(self):
-        session = self.session
-        self.pass_time(0.1)
-        before = session.env.goal_quat[0].numpy().copy()
-        rings = Rotation.from_quat(self.page._rings.wxyz, scalar_first=True)
-        arc = self.pixel_of(
-            self.page._goal.position + 0.61 * self.page._rings.scale * rings.apply((0.7071, 0.7071, 0.0))
-        )
-        self.browser.drag(arc, (arc[0] + 30, arc[1]))
-
-        def turned() -> float:
-            after = session.env.goal_quat[0].numpy()
-            return np.degrees(2 * np.arccos(min(1.0, abs(float(after @ before)))))
-
-        self.until(lambda: turned() > 5, "the goal to turn")
-        self.assertLess(turned(), 90)
-
-        self.browser.click(FOLDER.format(label="curves"))
-        self.until(lambda: len(h := self.browser.evaluate(HEIGHTS)) == 3 and min(h) > 100, "three curves to be drawn")
-        self.browser.choose("engine", "pybullet")
-        self.until(lambda: "pybullet:" in self.browser.text(), "another engine to play")
 
 
 if __name__ == "__main__":

@@ -107,7 +107,8 @@ def main() -> int:
         if outcome.failed:
             print(outcome.text, flush=True)
     for outcome in outcomes:
-        print(*outcome.skipped, sep="\n", end="\n" if outcome.skipped else "")
+        for line in outcome.skipped:
+            print(line)
     passed = sum(outcome.passed for outcome in outcomes)
     failed = sum(outcome.failed for outcome in outcomes)
     skipped = sum(len(outcome.skipped) for outcome in outcomes)

@@ -31,6 +31,7 @@ from xreset.files import claim_folder, write_json, write_whole
 from xreset.inputs import Data
 from xreset.live.engine import begin, make_controller
 from xreset.live.faults import Faults, FaultyDriver
+from xreset.physics import Capability
 from xreset.resets.distribution import Reset
 from xreset.runtime import OnnxActor, Runner
 from xreset.task.terminations import out_of_bounds
@@ -74,9 +75,14 @@ class Fault(Property):
     nominal: float = 0.0
 
 
-def _fault(name: str, unit: str, values: tuple[float, ...], make: Callable[[float], Faults]) -> Fault:
-    pushes_object = name in ("object push", "published faults")
-    return Fault(name=name, unit=unit, values=values, make=make, needs="object_wrench" if pushes_object else None)
+def _fault(
+    name: str,
+    unit: str,
+    values: tuple[float, ...],
+    make: Callable[[float], Faults],
+    needs: Capability | None = None,
+) -> Fault:
+    return Fault(name=name, unit=unit, values=values, make=make, needs=needs)
 
 
 LOOP = (
@@ -89,9 +95,9 @@ LOOP = (
     _fault("lost frames", "s", (0.25, 0.5), lambda x: _tracked(lost_frames=x)),
     _fault("action delay", "ms", (17, 33, 67, 133), lambda x: Faults(arm_delay=x / 1000, hand_delay=x / 1000)),
     _fault("missed deadlines", "% of the steps", (5, 20), lambda x: Faults(missed_deadlines=x / 100)),
-    _fault("object push", "m/s", (0.25, 0.5, 1.0), lambda x: Faults(object_push=x)),
+    _fault("object push", "m/s", (0.25, 0.5, 1.0), lambda x: Faults(object_push=x), needs="object_wrench"),
     _fault("arm push", "of the torque", (0.25, 0.5, 1.0), lambda x: Faults(arm_push=x)),
-    _fault("published faults", "times their ranges", (0.5, 1.0), _published),
+    _fault("published faults", "times their ranges", (0.5, 1.0), _published, needs="object_wrench"),
 )
 """Faults of the loop."""
 _PHYSICAL = {prop.name: prop for prop in SWEEPS}

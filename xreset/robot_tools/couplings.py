@@ -72,6 +72,11 @@ class Couplings:
         return source, lever
 
 
+def joint_name(model: mujoco.MjModel, joint: int) -> str:
+    """Return the name of a joint, or one made from its number."""
+    return model.joint(joint).name or f"joint{joint}"
+
+
 def read_couplings(model: mujoco.MjModel, pulls: Sequence[Pull]) -> Couplings:
     """Return how the joints of a compiled model follow others.
 
@@ -95,7 +100,7 @@ class _Mechanism:
         self.model = model
         self.data = mujoco.MjData(model)
         self.joints = np.flatnonzero(model.jnt_type >= SLIDE)
-        self.names = [repr(model.joint(joint).name or f"joint{joint}") for joint in self.joints]
+        self.names = [repr(joint_name(model, joint)) for joint in self.joints.tolist()]
         self.address = model.jnt_qposadr[self.joints]
         self.start = model.qpos0[self.address]
         self.rest = model.qpos_spring[self.address]
@@ -139,8 +144,9 @@ class _Mechanism:
     def couple(self, group: np.ndarray, found: Couplings) -> None:
         """Add the lines of joints that depend on each other."""
         drives = [joint for joint in dict.fromkeys(self.driven) if joint in group]
-        rows = np.abs(self.jacobian(self.start)[:, group]).max(axis=1, initial=0) > 1e-9
-        free_motions = len(group) - np.linalg.matrix_rank(self.jacobian(self.start)[:, group], tol=1e-6)
+        jacobian = self.jacobian(self.start)[:, group]
+        rows = np.abs(jacobian).max(axis=1, initial=0) > 1e-9
+        free_motions = len(group) - np.linalg.matrix_rank(jacobian, tol=1e-6)
         listed = ", ".join(self.names[i] for i in group)
         if len(drives) > 1 and free_motions > 1:
             names = ", ".join(self.names[i] for i in drives)
@@ -156,32 +162,22 @@ class _Mechanism:
         source = drives[0] if drives else group[0]
         followers = group[group != source]
         values = np.linspace(self.lower[source], self.upper[source], _SAMPLES)
-        positions = []
-        before = self.start
-        for value in values:
-            before = before.copy()
-            before[followers] = self.closed(followers, source, value, before)
-            positions.append(before[followers])
         lines = {}
         straight = np.tile(self.start, (_SAMPLES, 1))
         straight[:, source] = values
-        for follower, track in zip(followers, np.transpose(positions), strict=True):
+        for follower, track in zip(followers, self.tracks(followers, source, values).T, strict=True):
             multiplier = 0.0
             offset = float(track.mean())
             if np.ptp(track) > _STILL:
                 multiplier, offset = (np.polyfit(values, track, 1).round(_DIGITS) + 0.0).tolist()
             straight[:, follower] = multiplier * values + offset
             lines[int(self.joints[follower])] = Line(int(self.joints[source]), multiplier, offset)
-        gaps = np.max([np.abs(self.gaps(q)) for q in straight], axis=0, initial=0)
-        kinds = self.model.eq_type[self.data.efc_id[: len(gaps)]]
-        is_loop = np.isin(kinds, (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)))
-        opened = float(gaps[rows & is_loop].max(initial=0))
-        off = float(gaps[rows & ~is_loop].max(initial=0))
+        opened, off = self.misfit(straight, rows)
         if opened > _OPEN or off > _CURVED:
             found.problems.append(
-                f"the coupled joints {listed}, which do not move in proportion: as straight lines they are "
-                f"{off:.2g} rad (m) off, and open closed loops by {1e3 * opened:.1f} mm. Give equalities a polycoef "
-                "with two numbers, remove the bar that closes a loop, or use the maker's URDF"
+                f"the coupled joints {listed}, which do not move in proportion. Straight lines are "
+                f"{off:.2g} rad (m) off and leave gaps of {1e3 * opened:.1f} mm in closed loops. Give equalities a "
+                "polycoef with two numbers, remove the bar that closes a loop, or use the maker's URDF"
             )
             return
         for joint, line in lines.items():
@@ -193,6 +189,28 @@ class _Mechanism:
         found.notes.append(
             f"coupled joints: {names} with {self.names[source]}; closed loops stay closed within {1e3 * opened:.2f} mm"
         )
+
+    def tracks(self, followers: np.ndarray, source: int, values: np.ndarray) -> np.ndarray:
+        """Return positions of the followers [V, F] while the source goes through values [V]."""
+        positions = []
+        before = self.start
+        for value in values:
+            before = before.copy()
+            before[followers] = self.closed(followers, source, value, before)
+            positions.append(before[followers])
+        return np.array(positions)
+
+    def misfit(self, positions: np.ndarray, rows: np.ndarray) -> tuple[float, float]:
+        """Return the widest gap of a closed loop [m], and the most that another equality is off [rad or m].
+
+        Args:
+            positions: [V, Q] positions that are tried.
+            rows: [E] bool: the equalities that count.
+        """
+        gaps = np.max([np.abs(self.gaps(q)) for q in positions], axis=0, initial=0)
+        kinds = self.model.eq_type[self.data.efc_id[: len(gaps)]]
+        is_loop = np.isin(kinds, (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)))
+        return float(gaps[rows & is_loop].max(initial=0)), float(gaps[rows & ~is_loop].max(initial=0))
 
     def closed(self, free: np.ndarray, source: int | None, value: float, start: np.ndarray) -> np.ndarray:
         """Return positions of the free joints that meet what couples them, for a position of the source."""

@@ -15,7 +15,7 @@ from xreset.errors import ObjectError, RobotError
 from xreset.geometry.shapes import hull
 from xreset.geometry.urdf import HULL_TOLERANCE, Joint, Link, RobotTree
 from xreset.geometry.urdf_writer import fixed, frame
-from xreset.robot_tools.couplings import SLIDE, Couplings, Pull, read_couplings
+from xreset.robot_tools.couplings import SLIDE, Couplings, Pull, joint_name, read_couplings
 from xreset.robot_tools.sources import Source
 from xreset.spec import Geometry, MimicSpec, Shape
 
@@ -59,7 +59,7 @@ def read_mjcf(path: Path, root: ElementTree.Element) -> Source:
     for actuator, pull in pulls.items():
         joint, lever = couplings.lever(pull)
         lever = abs(lever * float(model.actuator_gear[actuator, 0]))
-        name = _joint_name(model, joint)
+        name = joint_name(model, joint)
         gain = float(model.actuator_gainprm[actuator, 0])
         kp = -float(model.actuator_biasprm[actuator, 1])
         limit = 0.0
@@ -200,10 +200,10 @@ def _joint(
     upper = math.inf
     if model.jnt_limited[number]:
         lower, upper = model.jnt_range[number].tolist()
-    name = _joint_name(model, number)
+    name = joint_name(model, number)
     mimic = None
     if line := couplings.lines.get(number):
-        source = _joint_name(model, line.source)
+        source = joint_name(model, line.source)
         mimic = MimicSpec(joint=name, source=source, multiplier=line.multiplier, offset=line.offset)
     kind = "prismatic" if model.jnt_type[number] == SLIDE else "revolute"
     return Joint(
@@ -218,10 +218,6 @@ def _joint(
         velocity=math.inf,
         mimic=mimic,
     )
-
-
-def _joint_name(model: mujoco.MjModel, joint: int) -> str:
-    return model.joint(joint).name or f"joint{joint}"
 
 
 def _shapes(model: mujoco.MjModel, data: mujoco.MjData, body: int, T_world_link: np.ndarray) -> Iterator[Shape]:

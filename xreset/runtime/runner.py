@@ -124,9 +124,9 @@ class Runner:
     def _act(self, now: float) -> Array:
         """Return the policy's targets; where it cannot act, the last ones."""
         try:
-            reading = self.driver.read()
-            self._one_robot = np.ndim(reading.joint_pos) == 1
-            self._take(reading.batched(), now)
+            newest = self.driver.read()
+            self._one_robot = np.ndim(newest.joint_pos) == 1
+            self._take(newest.batched(), now)
         except Exception as error:
             self._stop_all(f"The driver could not read: {error}.")
             return self._sent

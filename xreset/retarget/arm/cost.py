@@ -85,7 +85,7 @@ def system(model: ArmModel, frame: Frame, q: Tensor, config: ArmConfig) -> ArmSy
     origins, rot, linear, angular = model.kinematics.jacobian(model.full(q, 0.0), model.carriers)
     linear = linear[..., model.arm]  # [B, C, 3, n]
     angular = angular[..., model.arm]
-    position_scale = position_scale = config.position_weight**0.5
+    position_scale = config.position_weight**0.5
     orientation_scale = config.orientation_weight**0.5
     turn = quat_to_axis_angle(quat_multiply(matrix_to_quat(rot[:, 0]), quat_conjugate(frame.quat)))
     residuals = [

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import logging
+import pickle
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -68,6 +69,7 @@ def readers() -> Iterator[dict[str, Reader]]:
 
     from xreset.backends.conformance import SCHEMA as CONFORMANCE
     from xreset.demos.dexycb import _read_extrinsics, _read_meta, _read_npz
+    from xreset.demos.ho3d import _read_frame
     from xreset.demos.keypoints import read_keypoints, read_transform
     from xreset.demos.synth import synthesize
     from xreset.description import load_robot, read_description
@@ -230,6 +232,11 @@ def readers() -> Iterator[dict[str, Reader]]:
             path.write_bytes(content.encode() if isinstance(content, str) else content)
         (folder / "box.toml").write_text("mass = 0.1\ntolerance = 0.002\n")
         add("properties", "box.toml", lambda p: properties_of(p.with_suffix(".obj")), "text")
+        frame = {"handJoints3D": None, "objRot": np.zeros((3, 1)), "objTrans": np.zeros(3), "objName": SOUP}
+        path = add(
+            "pickle", "0000.pkl", lambda p: dict(zip(("joints", "pose"), _read_frame(p))), "bytes", ("joints", "pose")
+        )
+        path.write_bytes(pickle.dumps(frame, protocol=2))
 
         # several files that contradict each other
         may = ("hand_keypoints", "wrist_quat_wxyz", "hand_error", "wrist_error")

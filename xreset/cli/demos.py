@@ -1,4 +1,4 @@
-"""``xreset demos``: import, synth, select, split, merge, info."""
+"""``xreset demos``: import, synth, select, split, merge, mirror, info."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rich.table import Table
 from xreset.checks import Options
 from xreset.cli._common import Flat, Source, Sources
 from xreset.cli._terminal import Console, Progress
-from xreset.demos import archive, dexycb, keypoints, plausible, synth
+from xreset.demos import archive, dexycb, ho3d, keypoints, mirror, plausible, synth
 from xreset.errors import DemoError
 from xreset.files import file_hash
 
@@ -31,6 +31,20 @@ def import_dexycb(folder: Source, *, out: Path) -> None:
     with _progress("reading DexYCB") as progress:
         demos = dexycb.read_dexycb(folder, progress=progress)
     _save(demos, out, {"dataset": "dexycb"})
+
+
+def import_ho3d(folder: Source, *, out: Path, fps: float, cameras: Path) -> None:
+    """Read HO-3D (versions 2 and 3) in its own layout and write an archive of demonstrations. Not yet tried on the
+    original files.
+
+    Args:
+        folder: The folder that holds `train`.
+        out: Archive to write.
+        fps: Frames per second; the files do not state it.
+        cameras: File with the camera's pose in the table frame (4x4, metres, as text or npy; x right, y down, z
+            forward) for all sequences; or a folder with SEQUENCE.txt, where sequences without one are left out.
+    """
+    _save(ho3d.read_ho3d(folder, fps=fps, cameras=cameras), out, {"dataset": "ho3d", "fps": fps})
 
 
 def import_keypoints(
@@ -191,6 +205,33 @@ def merge(files: Sources, *, out: Path) -> None:
     _save(demos, out, {"merge": len(files)}, {f"demos {i}": file_hash(file) for i, file in enumerate(files)})
 
 
+def reflect(
+    file: Source,
+    *,
+    out: Path,
+    objects: Path | None = None,
+    tolerance: float = 0.004,
+) -> None:
+    """Mirror demonstrations of left hands, so that a right-handed robot can train on them.
+
+    Only objects that are their own mirror image within the tolerance can be mirrored; the others are
+    listed.
+
+    Args:
+        file: Archive with left hands.
+        out: Archive to write.
+        objects: Folder of real meshes; default: the built-in stand-ins.
+        tolerance: Largest distance between an object's surface and its reflection, over 95 % of it [m].
+    """
+    demos = archive.read_demos(file).select(sides=["left"])
+    symmetries = {name: mirror.symmetry(spec) for name, spec in archive.demo_objects(demos, objects).items()}
+    for name, found in sorted(symmetries.items()):
+        verdict = "mirrored" if found.deviation <= tolerance else "left out: not symmetric enough"
+        Console().print(f"{name}: {1e3 * found.deviation:.1f} mm from its reflection, {verdict}")
+    result = mirror.mirrored(demos, symmetries, tolerance=tolerance)
+    _save(result, out, {"mirrored": True, "tolerance": tolerance}, {"demos": file_hash(file)})
+
+
 def describe(file: Source) -> None:
     """Describe an archive of demonstrations, object by object, and warn of what looks wrong.
 
@@ -243,10 +284,12 @@ def _print_summary(demos: archive.Demos, path: Path) -> None:
 
 COMMAND = {
     "import dexycb": import_dexycb,
+    "import ho3d": import_ho3d,
     "import keypoints": import_keypoints,
     "synth": synthesize,
     "select": select,
     "split": split,
     "merge": merge,
+    "mirror": reflect,
     "info": describe,
 }

@@ -1,0 +1,170 @@
+"""HO-3D's layout, with small files made here; and pickles that want to do more than hold arrays."""
+
+import os
+import pickle
+import tracemalloc
+import unittest
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tests.data import InFolder
+from tests.test_keypoints import CAMERA, seen_from, written
+from xreset.demos.ho3d import read_ho3d
+from xreset.demos.pickles import array_of, read_pickle
+from xreset.demos.synth import synthesize
+from xreset.errors import DemoError
+
+OPENGL = np.diag([1.0, -1.0, -1.0])
+WRONG_ORDER = [0, 13, 14, 15, 16, *range(1, 13), *range(17, 21)]
+
+
+class Ho3d(InFolder):
+    """A synthetic demonstration as HO-3D would hold it comes back as it was."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.demos = synthesize(["soup"], per_object=1, seed=1, fps=10)
+
+    def setUp(self):
+        super().setUp()
+        self.cameras = self.folder / "cameras"
+        self.cameras.mkdir()
+        np.savetxt(self.cameras / "SM2.txt", CAMERA)
+        self.meta = self.folder / "ho3d/train/SM2/meta"
+        self.meta.mkdir(parents=True)
+
+    def write(self, leave_out=(), **changes):
+        points, pos, turn = seen_from(CAMERA, self.demos)
+        points = written(points, "mano") @ OPENGL
+        for i in range(self.demos.num_frames):
+            path = self.meta / f"{i:04d}.pkl"
+            path.unlink(missing_ok=True)
+            if i in leave_out:
+                continue
+            data = {
+                "handJoints3D": points[i] if self.demos.hand_valid[i] else None,
+                "objRot": Rotation.from_matrix(OPENGL @ turn[i].as_matrix()).as_rotvec()[:, None],
+                "objTrans": OPENGL @ pos[i],
+                "objName": str(self.demos.object_name[0]),
+                "handBeta": np.zeros(10),
+                "objLabel": np.int64(5),
+            }
+            data |= {name: change(i, data[name]) for name, change in changes.items()}
+            path.write_bytes(pickle.dumps(data, protocol=2))
+
+    def read(self, **options):
+        return read_ho3d(**{"root": self.folder / "ho3d", "fps": 10.0, "cameras": self.cameras, **options})
+
+    def refused(self, words, **options):
+        with self.subTest(words), self.assertRaisesRegex(DemoError, words):
+            self.read(**options)
+
+    def test_back_as_it_was(self):
+        self.write()
+        found = self.read()
+        np.testing.assert_allclose(found.hand_keypoints, self.demos.hand_keypoints, atol=1e-5)
+        np.testing.assert_allclose(found.object_pos, self.demos.object_pos, atol=1e-5)
+        same = np.abs((found.object_quat_wxyz * self.demos.object_quat_wxyz).sum(axis=1))
+        np.testing.assert_allclose(same, 1, atol=1e-5)
+        self.assertEqual((found.sequence_name[0], found.hand_side[0]), ("SM2", "right"))
+        self.assertEqual(found.object_name[0], self.demos.object_name[0])
+
+    def test_frames_that_are_missing_or_not_annotated(self):
+        self.write(leave_out=(7,), objRot=lambda i, value: None if i < 2 else value)
+        found = self.read()
+        self.assertEqual(found.num_frames, self.demos.num_frames - 2)  # cut off at the ends
+        middle = (self.demos.object_pos[6] + self.demos.object_pos[8]) / 2
+        np.testing.assert_allclose(found.object_pos[5], middle, atol=1e-5)  # interpolated between others
+
+    def test_refusals(self):
+        for words, changes in (
+            ("unknown in some frames", {"objTrans": lambda i, v: None if i == 5 else v}),
+            ("evaluation has the wrist alone", {"handJoints3D": lambda i, v: np.zeros(3)}),
+            ("objName is", {"objName": lambda i, v: ("thing",)}),
+            (r"objTrans is not an array of numbers \[3\]", {"objTrans": lambda i, v: np.zeros(2)}),
+            ("no frame with an object", {"objTrans": lambda i, v: v * np.nan}),
+            ("object changes", {"objName": lambda i, v: f"thing_{i}"}),
+            ("Use --order", {"handJoints3D": lambda i, v: None if v is None else v[WRONG_ORDER]}),
+        ):
+            self.write(**changes)
+            self.refused(words)
+        self.write()
+        self.refused("no camera pose for any sequence.*SM2.txt", cameras=self.folder / "ho3d")
+        self.refused("no HO-3D sequence", root=self.folder)
+        far = self.meta / f"{10**9 - 1}.pkl"
+        far.write_bytes((self.meta / "0000.pkl").read_bytes())
+        self.refused("more than 1000000 frames")
+        farther = far.rename(self.meta / f"{10**40}.pkl")
+        self.refused("not named by a frame's number")
+        farther.unlink()
+        np.savetxt(self.cameras / "SM2.txt", np.linalg.inv(CAMERA))
+        self.refused("inverse of what it should be")
+
+
+class Evil:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+class Pickles(InFolder):
+    def load(self, content):
+        path = self.folder / "x.pkl"
+        path.write_bytes(content)
+        return read_pickle(path)
+
+    def refused(self, words, content):
+        with self.subTest(words), self.assertRaisesRegex(DemoError, words):
+            self.load(content)
+
+    def test_arrays_of_every_protocol_and_order(self):
+        arrays = {
+            "c": np.arange(6.0).reshape(2, 3),
+            "f": np.asfortranarray(np.arange(6).reshape(2, 3)),
+            "big": np.array([1.5, 2.5], dtype=">f4"),
+        }
+        for protocol in range(6):
+            found = self.load(pickle.dumps(arrays, protocol=protocol))
+            for name, value in arrays.items():
+                with self.subTest(name, protocol=protocol):
+                    np.testing.assert_array_equal(array_of(found[name]), value)
+
+    def test_a_pickle_of_python_2(self):
+        kind = b"cnumpy\ndtype\n(S'f8'\nI0\nI1\ntR(I3\nS'<'\nNNNI-1\nI-1\nI0\ntb"
+        data = b"(dS'a'\ncnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR(I1\n(I1\nt" + kind
+        data += b"I00\nS'\\x00\\x00\\x00\\x00\\x00\\x00\\xf8?'\ntbs."
+        np.testing.assert_array_equal(array_of(self.load(data)["a"]), [1.5])
+
+    def test_nothing_that_a_pickle_names_is_called(self):
+        target = self.folder / "made"
+        self.refused("it asks for", pickle.dumps({"a": Evil(target)}))
+        self.refused("builtins.eval", b"cbuiltins\neval\n(S'1'\ntR.")
+        self.refused("it asks for", pickle.dumps({"a": np.array([Evil(target)], dtype=object)}))
+        self.refused("persistent", b"Pname\n.")
+        self.refused("expected a dictionary", pickle.dumps([1]))
+        self.refused("cannot be read", pickle.dumps({"a": np.zeros(100)})[:200])
+        for function in ("core.multiarray\nscalar", "lib.npyio\nload", "testing\nrundocs"):
+            call = f"(dS'a'\ncnumpy.{function}\n(S'{target}'\ntRs."
+            self.assertEqual(self.load(call.encode())["a"].arguments, (str(target),))
+        self.assertFalse(target.exists())
+
+    def test_an_array_that_is_none(self):
+        good = pickle.dumps({"a": np.zeros(3)}, protocol=2)
+        for wrong in (good.replace(b"K\x03\x85", b"J\xff\xff\xff\x7f\x85"), good.replace(b"f8", b"O8")):
+            with self.assertRaises(ValueError):
+                array_of(self.load(wrong)["a"])
+
+    def test_a_number_in_the_file_reserves_no_memory(self):
+        tracemalloc.start()
+        self.addCleanup(tracemalloc.stop)
+        self.load(b"\x80\x02}r\x00\x00\x00\x10.")  # a value that is stored under the number 2^28
+        self.refused("cannot be read", b"\x80\x05\x96" + (1 << 40).to_bytes(8, "little") + b".")  # a bytearray of 1 TiB
+        self.refused("more than a megabyte", pickle.dumps({"a": np.zeros(200_000)}))
+        self.assertLess(tracemalloc.get_traced_memory()[1], 8 << 20)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,83 @@
+"""Mirrored demonstrations: the plane of symmetry, and what becomes of object and hand."""
+
+import dataclasses
+import unittest
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from xreset.demos.mirror import mirrored, symmetry
+from xreset.demos.synth import synthesize
+from xreset.errors import DemoError
+from xreset.geometry.shapes import box, surface_of
+from xreset.objects.catalogue import load_object
+from xreset.spec import ObjectSpec, TableSpec
+
+
+def boxes(*parts: tuple[tuple[float, float, float], tuple[float, float, float]]) -> ObjectSpec:
+    """An object made of boxes (center, size)."""
+    pieces = tuple(box(center, size) for center, size in parts)
+    vertices, faces = surface_of(pieces)
+    return ObjectSpec(
+        name="block", pieces=pieces, mass=1.0, com=np.zeros(3), inertia=np.eye(3), vertices=vertices, faces=faces
+    )
+
+
+def reflect(points: np.ndarray) -> np.ndarray:
+    return points * [-1.0, 1.0, 1.0] + [2.0 * TableSpec().center[0], 0.0, 0.0]
+
+
+class MirrorTest(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.demos = synthesize(["mustard"], 1, 0, side="left")
+        cls.object = load_object("mustard")
+        cls.symmetries = {cls.object.name: symmetry(cls.object)}
+        cls.found = mirrored(cls.demos, cls.symmetries, tolerance=0.004)
+
+    def test_finds_the_plane_of_a_body_with_one(self):
+        """An L has one plane of symmetry only, here z = 0.01; a third arm out of the plane leaves none."""
+        arms = [((0, 0, 0.01), (0.12, 0.03, 0.04)), ((0.045, 0.05, 0.01), (0.03, 0.08, 0.04))]
+        found = symmetry(boxes(*arms))
+        self.assertLess(found.deviation, 0.001)
+        self.assertGreater(abs(found.normal[2]), 0.9999)
+        self.assertAlmostEqual(found.offset * np.sign(found.normal[2]), 0.01, delta=2e-4)
+        crooked = symmetry(boxes(*arms, ((0, 0, 0.06), (0.03, 0.03, 0.08))))
+        self.assertGreater(crooked.deviation, 0.008)
+
+    def test_the_object_and_the_hand_are_where_their_reflections_are(self):
+        for frame in (0, self.demos.num_frames // 2, self.demos.num_frames - 1):
+            placed = []
+            for demos in (self.demos, self.found):
+                turn = Rotation.from_quat(demos.object_quat_wxyz[frame], scalar_first=True)
+                self.assertAlmostEqual(float(np.linalg.det(turn.as_matrix())), 1.0, places=5)
+                placed.append(turn.apply(self.object.vertices) + demos.object_pos[frame])
+            distance, _ = cKDTree(placed[1]).query(reflect(placed[0]))
+            self.assertLess(np.percentile(distance, 95), 0.004)
+        np.testing.assert_allclose(self.found.hand_keypoints, reflect(self.demos.hand_keypoints), atol=1e-6)
+
+    def test_a_left_hand_becomes_a_right_hand(self):
+        """In the hand's own frame: a right hand's fingers point along -x, its thumb is on the +z side."""
+        self.assertEqual(self.found.hand_side.tolist(), ["right"])
+        turn = Rotation.from_quat(self.found.wrist_quat_wxyz[0], scalar_first=True)
+        local = turn.inv().apply(self.found.hand_keypoints[0] - self.found.hand_keypoints[0, 0])
+        self.assertLess(local[9, 0], -0.05)
+        self.assertGreater(local[5, 2], local[17, 2])
+
+    def test_twice_is_the_start_but_for_the_objects_own_symmetry(self):
+        again = mirrored(self.found, self.symmetries, tolerance=0.004)
+        np.testing.assert_allclose(again.hand_keypoints, self.demos.hand_keypoints, atol=1e-6)
+        np.testing.assert_allclose(again.object_pos, self.demos.object_pos, atol=1e-6)
+        turn = Rotation.from_quat(again.object_quat_wxyz, scalar_first=True)
+        own = Rotation.from_quat(self.demos.object_quat_wxyz, scalar_first=True)
+        self.assertLess((turn * own.inv()).magnitude().max(), 1e-5)
+
+    def test_an_object_that_is_not_symmetric_is_refused(self):
+        crooked = dataclasses.replace(self.symmetries[self.object.name], deviation=0.02)
+        with self.assertRaisesRegex(DemoError, r"mustard_bottle 20\.0 mm"):
+            mirrored(self.demos, {self.object.name: crooked}, tolerance=0.004)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -391,10 +391,26 @@ class Toy(WithFolder):
         self.assertRegex(back.to_say[0], "for fingers along its z axis: --rpy 0 -1.5708 0$")
         T = load_urdf(back.folder / "robot.urdf").joint("hand_base_fixed").T_parent_joint
         np.testing.assert_allclose(T[:3, 3], (0, 0, 0.08), atol=1e-9)
-        self.assertTrue(any("80 mm along z of 'l5'" in note for note in back.guessed), back.guessed)
+        self.assertTrue(any("80 mm along the flange's z axis" in note for note in back.guessed), back.guessed)
         stated = import_robot(self.arm, self.hand, self.folder / "stated", offset=(0, 0, 0.01), rpy=(0, np.pi / 2, 0))
         T = load_urdf(stated.folder / "robot.urdf").joint("hand_base_fixed").T_parent_joint
         np.testing.assert_allclose(T[:3, 3], (0, 0, 0.01), atol=1e-9)
+
+    def test_fingers_point_out_of_the_arm_whichever_axis_of_the_flange_does(self):
+        for rpy, axis in (("0 -1.5708 0", "x"), ("-1.5708 0 0", "-y"), ("0.7 0.7 0", "z")):
+            mount = (
+                f'<link name="tool0"/><joint name="mount" type="fixed"><origin xyz="0 0 0.02" rpy="{rpy}"/>'
+                '<parent link="l5"/><child link="tool0"/></joint></robot>'
+            )
+            arm = self.file("turned.urdf", ARM.replace("</robot>", mount))
+            made = import_robot(arm, self.hand, self.folder / f"mine{axis}")
+            spec = load_robot(made.folder)
+            palm, last = Kinematics(spec).link_poses(torch.tensor(spec.home), ["palm_frame", "l5"])
+            fingers = (last[:3, :3].T @ palm[:3, 0]).numpy()  # of the last link, whose joint turns about z
+            with self.subTest(axis):
+                self.assertIn(f"The angle about {axis} is yours to know", made.to_say[0])
+                if axis != "z":  # no axis of the flange points out of the arm
+                    np.testing.assert_allclose(fingers, (0, 0, 1), atol=0.06)
 
     def test_impossible_figures_are_replaced_and_told(self):
         heavy = HAND.replace('ixx="1e-5" iyy="1e-5" izz="1e-5"', 'ixx="0.1" iyy="0.1" izz="0.1"', 1).replace(

@@ -95,10 +95,10 @@ def import_(
         out: Folder to make.
         name: Name of the robot; default: the folder's.
         flange: Link of the arm that carries the hand; default: one that makers call so, or the arm's last link.
-        offset: Position of the hand's root link in the flange's frame [m]; default: the origin, or as far along z as
-            keeps the hand's body out of the arm.
+        offset: Position of the hand's root link in the flange's frame [m]; default: the origin, or as far out of the
+            arm as keeps the hand's body before the flange.
         rpy: Roll, pitch and yaw of the hand about the flange's fixed axes [rad]; default: as in the hand's file, or
-            turned so that the fingers point along the flange's z axis.
+            turned so that the fingers point out of the arm, along its last joint's axis.
         thumb: A link or joint of the thumb, if the import chooses another finger.
     """
     made = importer.import_robot(arm, hand, out, name=name, flange=flange, offset=offset, rpy=rpy, thumb=thumb)

@@ -81,9 +81,9 @@ def import_robot(
         name: name of the robot; default: the folder's.
         flange: link of the arm that carries the hand; default: its last one.
         offset: position of the hand's root link in the flange's frame [m]; default: the flange's origin, or as far
-            along its z axis as keeps the hand's body before the flange.
+            out of the arm as keeps the hand's body before the flange.
         rpy: roll, pitch and yaw of the hand's root link about the flange's fixed axes [rad]; default: as in the hand's
-            file, or turned so that the fingers point along the flange's z axis.
+            file, or turned so that the fingers point out of the arm.
         thumb: a link or joint of the thumb, where names and geometry do not tell.
 
     Raises:
@@ -97,20 +97,22 @@ def import_robot(
         flange = last_link(arm_source.tree)
         notes.append(f"the hand is carried by the arm's link {flange!r} (--flange says another)")
     arm_source = bare(arm_source, arm_source.tree.link(flange).name)
+    ahead = _out_of_flange(arm_source.tree, flange)
+    along = f"the flange's {_axis_name(ahead)} axis"
     hand_source = renamed(read_source(hand), arm_source.tree)
     with atomic_folder(out) as work:
         found = find_hand(hand_source.tree, work, thumb, notes)
         if rpy is None:
-            rpy = _upright(found.palm[:3, 0])
+            rpy = _turned(found.palm[:3, 0], ahead)
             if any(rpy):
-                angles = _angles(rpy)
-                notes.append(f"the hand is turned by --rpy {angles}: its fingers point along the flange's z axis")
+                notes.append(f"the hand is turned by --rpy {_angles(rpy)}: its fingers point along {along}")
         if offset is None:
-            offset = (0.0, 0.0, _stand_off(hand_source.tree, rpy))
-            if offset[2] > 0:
+            distance = _stand_off(hand_source.tree, rpy, ahead)
+            offset = tuple((distance * ahead).tolist())
+            if distance > 0:
                 notes.append(
-                    f"the hand's root lies {1e3 * offset[2]:.0f} mm along z of {flange!r}, so that its body begins "
-                    "there (--offset)"
+                    f"the hand's root lies {1e3 * distance:.0f} mm along {along}, so that its body begins there "
+                    "(--offset)"
                 )
         T = pose(offset, rpy=rpy)
         hand_source = replace(hand_source, tree=_with_rotors(found, hand_source.rotors, notes))
@@ -126,7 +128,7 @@ def import_robot(
         spec = replace(spec, collision_exclude=tuple(pairs))
         (work / DESCRIPTION).write_text(description_text(spec, notes))
         load_robot(work)
-    return Imported(folder=out, guessed=tuple(notes), to_say=(_mounting(flange, T, T @ found.palm), *_TO_SAY))
+    return Imported(folder=out, guessed=tuple(notes), to_say=(_mounting(flange, ahead, T, T @ found.palm), *_TO_SAY))
 
 
 _TO_SAY = (
@@ -137,26 +139,59 @@ _TO_SAY = (
 )
 
 
-def _mounting(flange: str, T_flange_hand: np.ndarray, T_flange_palm: np.ndarray) -> str:
-    """Return how the hand is mounted, and the angles that let its fingers point along the flange's z axis."""
-    ahead = T_flange_palm[:3, 0]
+def _out_of_flange(arm: RobotTree, flange: str) -> np.ndarray:
+    """[3] the axis of the flange's frame that points out of the arm: along the last joint's axis, away from the link
+    before that joint. It is z where the joint turns about none of the flange's axes."""
+    T = np.eye(4)  # pose of the flange in the frame of the link
+    link = flange
+    above = {joint.child: joint for joint in arm.joints}
+    while link in above and above[link].type == "fixed":
+        T = above[link].T_parent_joint @ T
+        link = above[link].parent
+    if link not in above:
+        return np.array((0.0, 0.0, 1.0))
+    joint = above[link]
+    axis = T[:3, :3].T @ joint.axis
+    if np.abs(axis).max() < _ALONG:
+        return np.array((0.0, 0.0, 1.0))
+    before = np.zeros(3)
+    if arm.link(joint.parent).collisions:
+        before = surface_of(arm.link(joint.parent).collisions)[0].mean(axis=0)
+    outward = (joint.T_parent_joint @ T)[:3, 3] - before
+    sign = np.sign(joint.T_parent_joint[:3, :3] @ joint.axis @ outward) or 1.0
+    return sign * axis.round() + 0.0
+
+
+def _axis_name(axis: np.ndarray) -> str:
+    return ("-" if axis.sum() < 0 else "") + "xyz"[int(np.abs(axis).argmax())]
+
+
+def _mounting(flange: str, ahead: np.ndarray, T_flange_hand: np.ndarray, T_flange_palm: np.ndarray) -> str:
+    """Return how the hand is mounted, and the angles that let its fingers point out of the arm."""
+    fingers = T_flange_palm[:3, 0]
     text = (
-        f"how the hand is mounted (--offset, --rpy): now its fingers point along ({_vector(ahead)}) of {flange!r}, "
+        f"how the hand is mounted (--offset, --rpy): now its fingers point along ({_vector(fingers)}) of {flange!r}, "
         f"its inner side along ({_vector(T_flange_palm[:3, 2])})"
     )
-    if ahead[2] > _ALONG:
-        return f"{text}. The angle about z is yours to know: --rpy turns the hand as it is mounted on your arm"
-    return f"{text}; for fingers along its z axis: --rpy {_angles(_upright(ahead, T_flange_hand[:3, :3]))}"
+    name = _axis_name(ahead)
+    if fingers @ ahead > _ALONG:
+        return f"{text}. The angle about {name} is yours to know: --rpy turns the hand as it is mounted on your arm"
+    angles = _turned(fingers, ahead, T_flange_hand[:3, :3])
+    return f"{text}; for fingers along its {name} axis: --rpy {_angles(angles)}"
 
 
-def _upright(ahead: np.ndarray, R: np.ndarray = np.eye(3)) -> tuple[float, float, float]:  # noqa: B008
-    """Return roll, pitch and yaw of a frame with rotation R after the shortest turn of the fingers' direction to the z
-    axis; zeros where they nearly point there."""
-    if ahead[2] > _ALONG:
+def _turned(
+    fingers: np.ndarray,
+    ahead: np.ndarray,
+    R: np.ndarray = np.eye(3),  # noqa: B008
+) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of a frame with rotation R after the shortest turn of the fingers' direction to the
+    one ahead; zeros where they nearly point there."""
+    if fingers @ ahead > _ALONG:
         return (0.0, 0.0, 0.0)
-    if np.abs(ahead).max() > 0.95:
-        ahead = ahead.round()  # along an axis, as far as fingers are straight
-    turn = Rotation.align_vectors([[0, 0, 1]], [ahead])[0]
+    if np.abs(fingers).max() > 0.95:
+        fingers = fingers.round()  # along an axis, as far as fingers are straight
+    turn = Rotation.align_vectors([ahead], [fingers])[0]
     roll, pitch, yaw = (np.round(roll_pitch_yaw(turn.as_matrix() @ R), 4) + 0.0).tolist()
     return roll, pitch, yaw
 
@@ -169,7 +204,7 @@ def _vector(values: np.ndarray) -> str:
     return ", ".join(f"{value:.2f}" for value in values.round(2) + 0.0)
 
 
-def _stand_off(hand: RobotTree, rpy: tuple[float, float, float]) -> float:
+def _stand_off(hand: RobotTree, rpy: tuple[float, float, float], ahead: np.ndarray) -> float:
     """Distance [m] by which a hand's body would reach behind the flange's origin if its root were there."""
     poses = {hand.root: pose((0, 0, 0), rpy=rpy)}
     for joint in hand.joints:  # parents come before children
@@ -179,7 +214,7 @@ def _stand_off(hand: RobotTree, rpy: tuple[float, float, float]) -> float:
     for name, T in poses.items():
         if hand.link(name).collisions:
             vertices, _ = surface_of(hand.link(name).collisions)
-            lowest.append(float((vertices @ T[2, :3] + T[2, 3]).min()))
+            lowest.append(float(((vertices @ T[:3, :3].T + T[:3, 3]) @ ahead).min()))
     return max(0.0, round(-min(lowest), 3))
 
 

@@ -10,6 +10,7 @@ import tempfile
 import unittest
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from xreset.geometry.urdf import load_urdf
 from xreset.geometry.urdf_writer import urdf_text, write_meshes
 from xreset.policy import check_contract, policy_contract
 from xreset.robot_tools import check as checks
+from xreset.robot_tools import homes
 from xreset.robot_tools.check import check_description, check_engine
 from xreset.robot_tools.importer import import_robot
 from xreset.robot_tools.reshape import reshape
@@ -172,6 +174,22 @@ class Toy(WithFolder):
         narrow = self.file("narrow.urdf", ARM.replace('lower="-2.9" upper="2.9"', 'lower="0.123446" upper="0.2"'))
         spec = load_robot(import_robot(narrow, self.hand, self.folder / "mine").folder)
         self.assertEqual(spec.home[spec.arm_indices].tolist(), [0.1235] * 6)
+
+    def test_strong_drives_of_light_joints_are_stable(self):
+        strong = self.file("strong.urdf", ARM.replace('effort="60"', 'effort="300"'))
+        spec, found = check_description(import_robot(strong, self.hand, self.folder / "mine").folder)
+        self.assertEqual([f.level for f in found if f.topic == "drives"], ["ok"])
+        self.assertEqual(spec.joints[0].drive.kp, 2000)
+
+    def test_home_keeps_off_the_table_where_it_can(self):
+        robot = load_robot("ur7e-sharpa")
+        with mock.patch.object(homes, "_CLEAR", 0.4):
+            T = Kinematics(robot).link_poses(torch.tensor(robot.home), [robot.hand_root])[0].numpy()
+            home = homes.reach_near(robot, T)
+        self.assertRegex(home.moved, r", moved by \(.*, 15\) cm")
+        q = torch.tensor(robot.home)
+        q[torch.as_tensor(robot.arm_indices)] = torch.tensor(home.joints, dtype=q.dtype)
+        self.assertGreater(float(homes.table_clearance(robot, q[None])), 0.4)
 
     def test_names_of_the_shadow_hand(self):
         shadow = HAND

@@ -7,15 +7,20 @@ from itertools import product
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from xreset.geometry.collision import height_above_table, table_points
+from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
-from xreset.spec import RobotSpec
+from xreset.spec import RobotSpec, TableSpec
 
 _STEPS = (-0.15, 0.0, 0.15)
 """[m] Steps along each axis to other places that are tried."""
+_CLEAR = 0.10
+"""[m] Height above the table that keeps the spread around a home clear of it."""
 _DIGITS = 4
 
 
@@ -29,9 +34,17 @@ class Home:
     """Where the hand is instead of the wanted place; empty if it is there."""
 
 
+def table_clearance(robot: RobotSpec, q: Tensor) -> Tensor:
+    """[B] lowest height of the robot's moving shapes above the table [m], at joint positions [B, J]."""
+    kinematics = Kinematics(robot)
+    support = table_points(robot, kinematics)
+    points = kinematics.points(q, support.links, torch.tensor(support.points))
+    return height_above_table(points, torch.tensor(support.radii), TableSpec()).amin(dim=-1)
+
+
 def reach_near(robot: RobotSpec, T_world_root: np.ndarray) -> Home | None:
     """Return arm joints that hold the hand's root at a pose [4, 4], or at the nearest pose beside it; None if the arm
-    reaches none of them."""
+    reaches none of them. A pose with 10 cm of room above the table is preferred."""
     model = ArmModel(robot)
     steps = torch.tensor(list(product(_STEPS, _STEPS, _STEPS)), dtype=torch.float64)
     steps = steps[steps.norm(dim=1).argsort(stable=True)]
@@ -47,15 +60,17 @@ def reach_near(robot: RobotSpec, T_world_root: np.ndarray) -> Home | None:
         hand_error=zero,
         hand_clearance=zero,
     )
+    inside = [torch.ceil(model.lower * 10**_DIGITS), torch.floor(model.upper * 10**_DIGITS)]
+    low = None
     for rows in (slice(0, 1), slice(1, count)):
         joints, measures = track(model, targets[rows], Thresholds())
-        reached = np.flatnonzero(classify(measures, Thresholds())[:, 0] == 0)
-        if not len(reached):
-            continue
-        first = int(reached[0])
-        inside = [torch.ceil(model.lower * 10**_DIGITS), torch.floor(model.upper * 10**_DIGITS)]
-        rounded = torch.clamp(torch.round(joints[first, 0] * 10**_DIGITS), *inside) / 10**_DIGITS
-        step = (100 * steps[rows][first]).tolist()
-        moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
-        return Home(joints=tuple(rounded.tolist()), moved=moved)
-    return None
+        height = table_clearance(robot, model.full(joints[:, 0], hand))
+        for index in np.flatnonzero(classify(measures, Thresholds())[:, 0] == 0).tolist():
+            rounded = torch.clamp(torch.round(joints[index, 0] * 10**_DIGITS), *inside) / 10**_DIGITS
+            step = (100 * steps[rows][index]).tolist()
+            moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
+            home = Home(joints=tuple(rounded.tolist()), moved=moved)
+            if height[index] > _CLEAR:
+                return home
+            low = low or home
+    return low

@@ -30,7 +30,7 @@ from xreset.robot_tools.draft import description_text, draft_spec
 from xreset.robot_tools.fingers import Hand, find_hand
 from xreset.robot_tools.homes import reach_near
 from xreset.robot_tools.sources import Source, bare, combined, last_link, read_source, renamed
-from xreset.spec import DriveSpec, RobotSpec
+from xreset.spec import DriveSpec, RobotSpec, SceneSpec
 
 _ROTOR = 1e-3
 """[kg m^2] Rotor inertia on the diagonal of moving hand links where none is stated: finger links alone are too light
@@ -41,6 +41,9 @@ _ARMATURE = 0.1
 _HAND_EFFORT = 1.0
 _ARM_EFFORT = 50.0
 """[N m] Where none is stated."""
+_STABLE = 0.8
+"""Share of the largest kp that is stable in engines that integrate drives explicitly: kd times the step stays below the
+inertia."""
 _ALWAYS = 0.9
 """Links that meet in this share of the hand's configurations are modelled so, and never collide."""
 _SAMPLES = 200
@@ -258,7 +261,7 @@ def _with_arm_home(spec: RobotSpec, T_hand_palm: np.ndarray, notes: list[str]) -
 def _with_drives(spec: RobotSpec, source: Source, notes: list[str]) -> RobotSpec:
     """Return the robot with drives as the files state them, else by the built-in robots' rule.
 
-    The rule: stiff enough that the effort is reached within 0.35 rad.
+    The rule: stiff enough that the effort is reached within 0.35 rad, and not too stiff for the step of the engines.
     """
     without = [joint.name for joint in spec.joints if not source.tree.joint(joint.name).effort]
     joints = []
@@ -276,8 +279,11 @@ def _with_drives(spec: RobotSpec, source: Source, notes: list[str]) -> RobotSpec
     damped = []
     for joint, inertia in zip(joints, drive_inertia(spec, spec.home), strict=True):
         factor = 2.0 if joint.group == "arm" else 1.8
-        kd = factor * np.sqrt(joint.drive.kp * inertia)
-        damped.append(replace(joint, drive=replace(joint.drive, kd=float(f"{kd:.3g}"))))
+        kp = joint.drive.kp
+        if joint.name not in source.stiffness:
+            kp = min(kp, float(f"{_STABLE * inertia / (factor * SceneSpec.timestep) ** 2:.3g}"))
+        kd = factor * np.sqrt(kp * inertia)
+        damped.append(replace(joint, drive=replace(joint.drive, kp=kp, kd=float(f"{kd:.3g}"))))
     if without:
         notes.append(
             f"no effort is stated for {', '.join(without)}; they get {_ARM_EFFORT:g} (arm) or {_HAND_EFFORT:g} N m "

@@ -25,15 +25,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from xreset.errors import RobotError
-from xreset.geometry.collision import height_above_table, table_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
-from xreset.robot_tools.homes import reach_near
+from xreset.robot_tools.homes import reach_near, table_clearance
 from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search
-from xreset.spec import RobotSpec, TableSpec
+from xreset.spec import RobotSpec
 from xreset.tensors import one_thread
 
 _LENGTH = 0.10
@@ -275,9 +274,6 @@ def _home(robot: RobotSpec, placement: Placement) -> tuple[tuple[float, ...] | N
     found = reach_near(placed, Kinematics(robot).link_poses(home, [robot.hand_root])[0].numpy())
     if found is not None:
         return found.joints, "the hand where it was" + found.moved
-    kinematics = Kinematics(placed)
-    support = table_points(robot, kinematics)
-    points = kinematics.points(home, support.links, torch.tensor(support.points))
-    if height_above_table(points, torch.tensor(support.radii), TableSpec()).min() > _HOME_CLEAR:
+    if table_clearance(placed, home[None]) > _HOME_CLEAR:
         return described, "the joints as they were"
     return None, ""

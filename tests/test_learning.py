@@ -306,6 +306,7 @@ class ExportTest(unittest.TestCase):
         export_onnx(model, file, contract | {"observation_layout": layout, "joint_names": list("abcde")})
 
     def test_exported_equals_eager_over_50_steps(self):
+        self.assertNotIn(b".py", self.file.read_bytes(), "nothing of the exporting machine is in the file")
         policy = OnnxPolicy(self.file)
         self.model.reset()
         with torch.no_grad():

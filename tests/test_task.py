@@ -679,7 +679,7 @@ class PolicyTest(WithRobot):
 
     def test_refusals_name_what_differs(self):
         self.refused("another robot: openarm, here it is toy.*--robot openarm", robot="openarm")
-        self.refused("schema 'xreset-policy/9', expected 'xreset-policy/1'", schema="xreset-policy/9")
+        self.refused("schema is 'xreset-policy/9', expected one of 'xreset-policy/1'", schema="xreset-policy/9")
         self.refused("another joint order", joint_names=list(reversed(self.robot.joint_names)))
         self.refused("another fingertips", fingertip_names=["index", "thumb"])
         self.refused("another version of 'toy'", robot_fingerprint="00")

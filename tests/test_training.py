@@ -477,7 +477,7 @@ class TrainingTest(unittest.TestCase):
             ("missing: resets", {"resets": None}),
             (r"\(of xreset '9.9'\).*unknown: later", {"later": 1, "xreset": "9.9"}),
             ("num_envs is -5", {"num_envs": -5}),
-            ("contract in which joint_names", {"contract": good["contract"] | {"joint_names": 3}}),
+            ("contract of it.joint_names is 3", {"contract": good["contract"] | {"joint_names": 3}}),
         ):
             optional = ("objects", "weights", "weights_hash")
             data = {name: x for name, x in (good | changes).items() if x is not None or name in optional}

@@ -7,15 +7,15 @@ and control rate. Running one needs neither warp nor rsl-rl.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.checks import from_dict
+from xreset.checks import Positive, parsed
 from xreset.errors import PolicyError, needs
 from xreset.files import max_bytes, parse_json
 from xreset.spec import RobotSpec
@@ -73,7 +73,7 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
     Raises:
         PolicyError: names the first thing that differs.
     """
-    check_contract_entries(source, contract)
+    trained = read_contract(source, contract).task
     here = policy_contract(robot, task, ())
     if robot.like and contract["robot_fingerprint"] == robot.like:
         here |= {key: contract[key] for key in ("robot", "robot_fingerprint")}
@@ -88,7 +88,6 @@ def check_contract(source: str, contract: dict[str, Any], robot: RobotSpec, task
             f"{source} was trained on another version of {robot.name!r}: its URDF or description has changed. "
             "Train again."
         )
-    trained = from_dict(TaskConfig, contract["task"], f"{source}: task")
     for what, of_policy, of_task in (
         ("another observation layout", _widths(contract), _widths(here)),
         ("another action mapping", asdict(trained.action), asdict(task.action)),
@@ -121,45 +120,27 @@ def _scales(task: TaskConfig) -> dict[str, Any]:
     return {name: value for name, value in asdict(task.observation).items() if name != "noise"}
 
 
-_ENTRIES: dict[str, type | tuple[type, ...]] = {
-    "robot": str,
-    "robot_fingerprint": str,
-    "joint_names": list,
-    "fingertip_names": list,
-    "objects": list,
-    "observation_layout": dict,
-    "control_dt": (int, float),
-    "task": dict,
-}
+@dataclass(frozen=True, kw_only=True)
+class Contract:
+    """What must agree between training and evaluation."""
+
+    schema: Literal["xreset-policy/1"]
+    robot: str
+    robot_fingerprint: str
+    joint_names: tuple[str, ...]
+    fingertip_names: tuple[str, ...]
+    objects: tuple[str, ...]
+    observation_layout: dict[str, dict[str, Positive[int]]]
+    control_dt: Positive[float]
+    task: TaskConfig
 
 
-def check_contract_entries(source: str, contract: dict[str, Any]) -> None:
-    """Refuse a contract that lacks an entry or holds one of another type; ``PolicyError``."""
-    if contract.get("schema") != SCHEMA:
-        raise PolicyError(
-            f"{source} has policy schema {shown(contract.get('schema'))}, expected {SCHEMA!r}. Export it again."
-        )
-    wrong = []
-    for name, kind in _ENTRIES.items():
-        value = contract.get(name)
-        is_right = isinstance(value, kind)
-        if is_right and isinstance(value, list):
-            is_right = all(isinstance(text, str) for text in value)
-        if is_right and name == "observation_layout":
-            is_right = _is_layout(contract[name])
-        if not is_right:
-            wrong.append(name)
-    if wrong:
-        raise PolicyError(
-            f"{source} states a contract in which {', '.join(wrong)} is missing or of another type. Export it again."
-        )
-
-
-def _is_layout(layout: dict[str, Any]) -> bool:
-    """Return whether a value maps groups to the widths of their terms."""
-    if not all(isinstance(terms, dict) for terms in layout.values()):
-        return False
-    return all(type(width) is int and width > 0 for width in _widths({"observation_layout": layout}).values())
+def read_contract(source: str, contract: Any) -> Contract:
+    """Return a contract with types; ``PolicyError`` if it lacks an entry or holds one of another type."""
+    typed, problems = parsed(Contract, contract, f"The contract of {source}")
+    if typed is None:
+        raise PolicyError(" ".join([*problems, "Export the policy again."]))
+    return typed
 
 
 def observation_shapes(contract: dict[str, Any], source: str) -> dict[str, tuple[int, ...]]:
@@ -168,24 +149,12 @@ def observation_shapes(contract: dict[str, Any], source: str) -> dict[str, tuple
     Raises:
         PolicyError: the contract, which is of ``source``, does not state the width of a group.
     """
-    task = from_dict(TaskConfig, contract["task"], f"{source}: task")
-    layout = contract["observation_layout"]
-    *flat, picture = task.policy_groups
-    if missing := [name for name in flat if name not in layout]:
+    typed = read_contract(source, contract)
+    *flat, picture = typed.task.policy_groups
+    if missing := [name for name in flat if name not in typed.observation_layout]:
         raise PolicyError(f"{source} does not state what it observes of {', '.join(missing)}. Export it again.")
-    widths = {name: (sum(layout[name].values()),) for name in flat}
-    return widths | {picture: task.picture_shape}
-
-
-def _read_contract(path: Path, metadata: dict[str, str]) -> dict[str, Any]:
-    if METADATA_KEY not in metadata:
-        raise PolicyError(f"{path} is an ONNX file without xreset's contract: it was not exported by xreset.")
-    try:
-        contract = parse_json(metadata[METADATA_KEY])
-    except ValueError as error:
-        raise PolicyError(f"{path} holds a contract that is not valid JSON ({error}). Export it again.") from error
-    check_contract_entries(str(path), contract)
-    return contract
+    widths = {name: (sum(typed.observation_layout[name].values()),) for name in flat}
+    return widths | {picture: typed.task.picture_shape}
 
 
 class OnnxPolicy:
@@ -220,12 +189,12 @@ class OnnxPolicy:
             raise PolicyError(
                 f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?"
             ) from error
-        self.contract = _read_contract(path, metadata)
-        inputs = tuple(given.name for given in self._session.get_inputs())
-        if inputs != INPUTS:
-            raise PolicyError(
-                f"{path} takes the inputs {shown(inputs)}; a policy takes {', '.join(INPUTS)}. Export it again."
-            )
+        if METADATA_KEY not in metadata:
+            raise PolicyError(f"{path} is an ONNX file without xreset's contract: it was not exported by xreset.")
+        try:
+            self.contract = parse_json(metadata[METADATA_KEY])
+        except ValueError as error:
+            raise PolicyError(f"{path} holds a contract that is not valid JSON ({error}). Export it again.") from error
         self._try_step(path)
         self.name = path.stem if path.stem != "policy" else path.resolve().parent.name
         self._state: list[np.ndarray] | None = None
@@ -241,16 +210,13 @@ class OnnxPolicy:
             state = (1, worlds, self._lstm_dim)
             shapes = ((worlds, sum(width for (width,) in flat)), (worlds, *picture), state, state)
             feed = {name: np.zeros(shape, np.float32) for name, shape in zip(INPUTS, shapes, strict=True)}
-            outputs: Any = self._session.run(None, feed)
+            outputs: Any = self._session.run(OUTPUTS, feed)
+            found = [f"{x.dtype} {x.shape}" for x in outputs]
         except Exception as error:
             raise PolicyError(f"{path} cannot act: {shown(str(error))}. Export it again.") from error
-        expected = [(worlds, len(self.contract["joint_names"])), state, state]
-        found = [f"{getattr(x, 'dtype', type(x).__name__)} {getattr(x, 'shape', '')}" for x in outputs]
-        if found != [f"float32 {shape}" for shape in expected]:
-            raise PolicyError(
-                f"{path} gives {', '.join(found)} for {worlds} worlds, expected float32 "
-                f"{', '.join(map(str, expected))}. Export it again."
-            )
+        expected = [f"float32 {shape}" for shape in ((worlds, len(self.contract["joint_names"])), state, state)]
+        if found != expected:
+            raise PolicyError(f"{path} gives {found} for {worlds} worlds, expected {expected}. Export it again.")
         if not all(np.isfinite(value).all() for value in outputs):
             raise PolicyError(
                 f"{path} gives numbers that are not finite: its training broke down, or the file is damaged."
@@ -268,7 +234,7 @@ class OnnxPolicy:
         if self._state is None or self._state[0].shape != shape:
             self._state = [np.zeros(shape, dtype=np.float32) for _ in range(2)]
         values = (flat.cpu().numpy(), observations[picture].cpu().numpy(), *self._state)
-        actions, h, c = self._session.run(None, dict(zip(INPUTS, values, strict=True)))
+        actions, h, c = self._session.run(OUTPUTS, dict(zip(INPUTS, values, strict=True)))
         self._state = [np.array(h), np.array(c)]
         return torch.as_tensor(actions, device=flat.device).clamp(-1.0, 1.0)
 

@@ -68,7 +68,7 @@ def read_run(folder: str | Path) -> RunInfo:
         RunError: the folder is not a run.
         FileFormatError: the file is damaged, or of another version of xreset.
     """
-    from xreset.policy import check_contract_entries  # imports torch, which --help must not wait for
+    from xreset.policy import read_contract  # imports torch, which --help must not wait for
 
     folder = Path(folder)
     if not os.path.isfile(folder / "run.json"):
@@ -79,7 +79,7 @@ def read_run(folder: str | Path) -> RunInfo:
     where = f"{folder / 'run.json'} (of xreset {shown(data.pop('xreset', None))})"
     info = from_dict(RunInfo, data, where)
     try:
-        check_contract_entries("it", info.contract)
+        read_contract("it", info.contract)
     except PolicyError as error:
         raise FileFormatError(f"{where}: {error}") from error
     return info

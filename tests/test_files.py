@@ -473,6 +473,16 @@ class TypedTest(unittest.TestCase):
             with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
                 from_dict(Outer, data)
 
+    def test_a_message_about_many_entries_is_short(self):
+        good = asdict(self.GOOD)
+        for words, data in (
+            (r"\nand 19980 more", good | {"widths": ["x"] * 20_000}),
+            ("and 19980 more", good | {f"{i}{'x' * 5000}": 1 for i in range(20_000)}),
+        ):
+            with self.subTest(words), self.assertRaisesRegex(FileFormatError, words) as caught:
+                from_dict(Outer, data)
+            self.assertLess(len(str(caught.exception)), 20_000)
+
 
 class BankTest(InFolder):
     def setUp(self):

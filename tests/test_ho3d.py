@@ -94,7 +94,7 @@ class Ho3d(InFolder):
         self.refused("no HO-3D sequence", root=self.folder)
         far = self.meta / f"{10**9 - 1}.pkl"
         far.write_bytes((self.meta / "0000.pkl").read_bytes())
-        self.refused("more than 1000000 frames")
+        self.refused("more than 100000 frames")
         farther = far.rename(self.meta / f"{10**40}.pkl")
         self.refused("not named by a frame's number")
         farther.unlink()

@@ -122,6 +122,8 @@ def is_rigid(T: np.ndarray) -> bool:
 # Reading from JSON and TOML -------------------------------------------------------------------------------------------
 
 _LARGEST = 2**63 - 1
+_MOST_NAMED = 20
+"""Number of problems, or of unknown entries, that a message names."""
 
 
 def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -154,7 +156,7 @@ def parsed(cls: type[T], data: Any, where: str) -> tuple[T | None, list[str]]:
     problems: list[str] = []
     value = _record(cls, data, where, problems)
     if problems:
-        return None, problems
+        return None, _first(problems)
     return value, []
 
 
@@ -177,7 +179,7 @@ def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
     unknown = sorted(set(data) - set(names))
     found = []
     if unknown:
-        found.append(f"unknown: {', '.join(_with_guess(name, names) for name in unknown)}")
+        found.append(f"unknown: {', '.join(_with_guess(name, names) for name in _first(unknown))}")
     if missing:
         found.append(f"missing: {', '.join(missing)}")
     if found:
@@ -195,9 +197,18 @@ def _record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
         return None
 
 
+def _first(texts: list[str]) -> list[str]:
+    """Return the first texts, and the number of the others: a file may have any number of entries."""
+    others = len(texts) - _MOST_NAMED
+    if others <= 0:
+        return texts
+    return [*texts[:_MOST_NAMED], f"and {others} more"]
+
+
 def _with_guess(name: str, names: list[str]) -> str:
-    guesses = get_close_matches(str(name), names, cutoff=0.75)
-    return f"{name} ({guesses[0]}?)" if guesses else str(name)
+    name = str(name)[:100]
+    guesses = get_close_matches(name, names, cutoff=0.75)
+    return f"{name} ({guesses[0]}?)" if guesses else name
 
 
 def _value(hint: Any, value: Any, where: str, problems: list[str]) -> Any:

@@ -33,7 +33,7 @@ def main(out: Path) -> None:
         description = description.replace(old, new)
     (folder / "robot.toml").write_text(description)
 
-    findings = check(folder, engines=False)  # everything that is wrong with it, at once; with engines, in physics too
+    findings = check(folder)  # everything that is wrong with it, at once
     for finding in findings:
         print(f"{finding.level:8} {finding.topic}: {finding.message}")
     robot = xreset.load_robot(str(folder))  # wherever a robot is asked for, a folder will do

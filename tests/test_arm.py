@@ -24,7 +24,7 @@ from xreset.retarget.arm.config import ArmConfig
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import splice, spread_over, track
 from xreset.retarget.validity import Thresholds, classify
-from xreset.robot_tools.check import check_description
+from xreset.robot_tools.check import check
 from xreset.robot_tools.placement import Finalist, PlaceConfig, Placement, Reach, Search, write_placement
 
 try:
@@ -318,7 +318,7 @@ class WritePlacementTest(unittest.TestCase):
         lines.insert(lines.index("[base]") + 1, figure)
         self.file.write_text("\n".join(lines))
         self.assertEqual(load(self.folder).fingerprint, stated)
-        findings = [finding.message for finding in check_description(self.folder)[1] if finding.topic == "placement"]
+        findings = [finding.message for finding in check(self.folder) if finding.topic == "placement"]
         self.assertEqual(findings, ["reaches 50.0% and follows 40.0% of 3 frames, says robot.toml: x"])
 
     def test_refusals(self):

@@ -170,17 +170,15 @@ class SelfCollisionTest(unittest.TestCase):
     def test_fingers_that_cross_are_found_and_neighbours_are_not(self):
         kinematics = Kinematics(self.robot)
         collision = SelfCollision(self.robot, kinematics)
-        indices = [kinematics.link_index(f"right_index_{part}") for part in ("MP", "DP")]
-        for pair in collision.link_pairs:
-            self.assertFalse(set(indices) <= set(pair))
+        self.assertNotIn(("right_index_MP", "right_index_DP"), collision.link_pairs)
         poses = kinematics.link_poses(torch.as_tensor(self.home_and(("right_index_MCP_AA", 0.35)))).numpy()
         clearance = collision.clearance(poses, 0.01)
         self.assertGreaterEqual(clearance[0], 0.0)
         self.assertLess(clearance[1], -0.002)
         near = collision.near(poses, 0.0)
-        self.assertEqual(set(near.configuration.tolist()), {1})
-        for pair in near.links.tolist():
-            self.assertTrue(any("right_index" in kinematics.link_names[i] for i in pair), pair)
+        for configuration, a, b in near:
+            self.assertEqual(configuration, 1)
+            self.assertIn("right_index", a + b)
 
     def test_self_collision_names_the_links(self):
         hand = Kinematics(self.robot, root=self.robot.hand_root)
@@ -192,8 +190,7 @@ class SelfCollisionTest(unittest.TestCase):
         fingers = [pair for pair in found if set(pair) <= names]
         self.assertTrue(fingers, found)
         self.assertEqual(set(found.values()), {1})
-        for a, b in fingers:
-            self.assertIn((hand.link_index(a), hand.link_index(b)), counted)
+        self.assertLessEqual(set(fingers), set(counted))
         result.reason = np.zeros(2)
         self.assertEqual(colliding_links(result, self.robot), {})  # pyright: ignore[reportArgumentType]
 

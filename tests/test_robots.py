@@ -16,13 +16,15 @@ import trimesh
 from xreset import plugins
 from xreset.cli import main
 from xreset.description import load_robot as load
-from xreset.errors import RobotError
+from xreset.errors import PolicyError, RobotError
 from xreset.geometry.dynamics import damping_ratio, mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import find_mesh, robot_tree
 from xreset.plugins import robot_folder, robot_names
-from xreset.robot_tools.check import check_description
+from xreset.policy import check_contract, policy_contract
+from xreset.robot_tools.check import check
 from xreset.robots import build
+from xreset.task.config import TaskConfig
 
 BUILT_IN = ("ur7e-sharpa", "openarm", "panda-allegro", "xarm7-leap", "iiwa14-sharpa", "ur7e-robotiq")
 
@@ -45,7 +47,7 @@ class BuiltIn(unittest.TestCase):
 
     def test_check_finds_nothing(self):
         for name in BUILT_IN:
-            _, findings = check_description(name)
+            findings = check(name)
             self.assertEqual([finding for finding in findings if finding.level in ("warning", "error")], [], name)
 
     def test_sharpa_is_a_right_hand_held_palm_down(self):
@@ -140,6 +142,19 @@ class Fingerprint(unittest.TestCase):
         self.assertTrue(after.has_fingerprint(after.fingerprint))
         self.assertTrue(after.has_fingerprint(of_0_1_0))
 
+    def test_a_robot_like_another_plays_its_policies(self):
+        robot = load("openarm")
+        folder = Path(self.enterContext(tempfile.TemporaryDirectory())) / "robot"
+        shutil.copytree(robot_folder("openarm"), folder)
+        text = (folder / "robot.toml").read_text()
+        text = text.replace('"openarm"', '"other"')
+        (folder / "robot.toml").write_text(f'like = "{robot.fingerprint}"\n{text}')
+        other = load(folder)
+        task = TaskConfig()
+        check_contract("p.onnx", policy_contract(robot, task, ()), other, task)
+        with self.assertRaisesRegex(PolicyError, "another robot: other, here it is openarm"):
+            check_contract("p.onnx", policy_contract(other, task, ()), robot, task)
+
 
 class Dynamics(unittest.TestCase):
     def test_mass_matrix_gives_the_kinetic_energy(self):
@@ -197,7 +212,7 @@ class Registry(unittest.TestCase):
         path.write_text(text.replace(old, new))
 
     def errors(self, level: str = "error") -> str:
-        return "\n".join(f"{f.topic}: {f.message}" for f in check_description(self.folder)[1] if f.level == level)
+        return "\n".join(f"{f.topic}: {f.message}" for f in check(self.folder) if f.level == level)
 
     def test_names_and_folders(self):
         self.assertLessEqual(set(BUILT_IN), set(robot_names()))
@@ -310,10 +325,10 @@ class Registry(unittest.TestCase):
 
     def test_command_fails_on_errors_only(self):
         with redirect_stdout(io.StringIO()):
-            main(["robots", "check", str(self.folder), "--no-engines"])
+            main(["robots", "check", str(self.folder)])
         self.edit("robot.toml", 'palm = "palm"', 'palm = "plam"')
         with redirect_stdout(io.StringIO()) as output, self.assertRaises(SystemExit) as caught:
-            main(["robots", "check", str(self.folder), "--no-engines"])
+            main(["robots", "check", str(self.folder)])
         self.assertEqual(caught.exception.code, 1)
         self.assertIn("'plam'", output.getvalue())
 

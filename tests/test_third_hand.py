@@ -23,7 +23,7 @@ from xreset.geometry.urdf import load_urdf
 from xreset.plugins import robot_names
 from xreset.resets.bank import read_bank
 from xreset.retarget.file import read_retargeted
-from xreset.robot_tools.check import check_description
+from xreset.robot_tools.check import check
 
 OBJECTS = ["005_tomato_soup_can", "010_potted_meat_can"]
 
@@ -54,7 +54,7 @@ class ThirdHandTest(unittest.TestCase):
 
     def test_the_plugin_is_found_and_nothing_is_wrong_with_it(self):
         self.assertIn(allegro_plugin.NAME, robot_names())
-        _, findings = check_description(allegro_plugin.NAME)
+        findings = check(allegro_plugin.NAME)
         self.assertEqual([f for f in findings if f.level in ("warning", "error")], [])
 
     def test_its_kinematics_are_the_package_s(self):

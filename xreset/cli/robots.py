@@ -1,4 +1,4 @@
-"""``xreset robots``: list, check, import, reshape, place and judge robots."""
+"""``xreset robots``: list, check, import, place and judge robots."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from xreset.robot_tools import importer, placement
 from xreset.robot_tools import judge as judging
 from xreset.robot_tools import picture as pictures
 from xreset.robot_tools import place as places
-from xreset.robot_tools import reshape as reshaping
 from xreset.robot_tools.placement import PlaceConfig
 
 
@@ -43,29 +42,21 @@ def list_robots() -> None:
     console.print(table)
 
 
-def check(
-    robot: RobotName,
-    /,
-    *,
-    picture: Path | None = None,
-    engines: bool = True,
-) -> None:
+def check(robot: RobotName, /, *, picture: Path | None = None) -> None:
     """Check a robot, and print all errors and warnings. Exits with 1 after an error.
+
+    `xreset engines check --robot ROBOT` tries it in the physics engines.
 
     Args:
         picture: PNG to write: the robot at home, with the frames of its palm, fingertips and joints.
-        engines: Also build the robot in every installed engine (the first time, mujoco-warp compiles for a minute or
-            two).
     """
     styles = {"ok": "green", "skipped": "dim", "warning": "yellow", "error": "bold red"}
-
-    def report(finding: checks.Finding) -> None:
+    findings = checks.check(robot)
+    for finding in findings:
         level = (f"{finding.level:8}", styles[finding.level])
         console.print(Text.assemble(level, f" {finding.topic}: {finding.message}"))
-
-    findings = checks.check(robot, report=report, engines=engines)
     levels = [finding.level for finding in findings]
-    if picture is not None and findings[0].level == "ok":
+    if picture is not None and findings[-1].topic not in ("description", "URDF"):
         render.write_png(picture, pictures.robot_picture(description.load_robot(robot)))
         console.print(f"wrote {picture}")
     console.print(f"{levels.count('error')} errors, {levels.count('warning')} warnings")
@@ -108,22 +99,7 @@ def import_(
         for line in lines:
             console.print(f"  - {line}")
     console.print(f"wrote {out / 'robot.toml'}, robot.urdf and robot.png; checking it")
-    check(str(out), engines=False)
-
-
-def reshape(robot: RobotName, /, *, shapes: Path, out: Path) -> None:
-    """Make a copy of a robot with the collision shapes of another URDF or MJCF.
-
-    Joints, masses, drives and frames stay the same, so policies of the robot play on the copy. Links are matched by
-    name.
-
-    Args:
-        shapes: URDF or MJCF with the new shapes, for example of the hand.
-        out: Folder to make; its name becomes the robot's name.
-    """
-    for note in reshaping.reshape(robot, shapes, out):
-        print(note)
-    check(str(out), engines=False)
+    check(str(out))
 
 
 def place(
@@ -241,4 +217,4 @@ def _digits(values: Sequence[float]) -> str:
     return ", ".join(f"{value:.4f}" for value in values)
 
 
-COMMAND = {"list": list_robots, "check": check, "import": import_, "reshape": reshape, "place": place, "judge": judge}
+COMMAND = {"list": list_robots, "check": check, "import": import_, "place": place, "judge": judge}

@@ -108,9 +108,8 @@ def hand_balls(robot: RobotSpec, hand: Kinematics, collision: SelfCollision) -> 
         first += len(own_radii)
     pairs = []
     for pair in collision.link_pairs:
-        names = [hand.link_names[index] for index in pair]
-        if set(names) <= set(links):
-            pairs.append([links.index(name) for name in names])
+        if set(pair) <= set(links):
+            pairs.append([links.index(name) for name in pair])
     both_ways = np.array([*pairs, *(pair[::-1] for pair in pairs)], dtype=np.int64)
     bound_centers, bound_radii = bounding_balls(centers, radii)
     return Balls(

@@ -84,17 +84,6 @@ def height_above_table(points: Tensor, radii: Tensor, table: TableSpec) -> Tenso
     return (z - radii).masked_fill(off_x | off_y, float("inf"))
 
 
-class Approaches(NamedTuple):
-    """Pairs of shapes that are near each other (length A)."""
-
-    configuration: np.ndarray
-    """[A] index of the configuration."""
-    links: np.ndarray
-    """[A, 2] indices of the two links in the kinematics' order."""
-    distance: np.ndarray
-    """[A] signed distance [m], negative where they overlap."""
-
-
 class SelfCollision:
     """Distances between the shapes of a robot's links."""
 
@@ -126,63 +115,57 @@ class SelfCollision:
                 f"Self-collision needs coal, which cannot be imported ({error}). Run: pip install 'xreset[retarget]'"
             ) from error
         self._coal = coal
-        names = kinematics.link_names
-        self._link: list[int] = []
+        self._link: list[str] = []
         self._geometry: list = []
         local = []
         centers = []
         radii = []
-        for index, name in enumerate(names):
+        for name in kinematics.link_names:
             if only is not None and name not in only:
                 continue
             for shape in kinematics.tree.link(name).collisions:
                 points, radius = support_points(shape.geometry)
                 center = (points.max(axis=0) + points.min(axis=0)) / 2
-                self._link.append(index)
+                self._link.append(name)
                 self._geometry.append(coal_geometry(coal, shape.geometry))
                 local.append(shape.T_body_shape)
                 centers.append(shape.T_body_shape[:3, :3] @ center + shape.T_body_shape[:3, 3])
                 radii.append(radius + float(np.linalg.norm(points - center, axis=1).max()))
+        self._index = [kinematics.link_index(name) for name in self._link]
         self._T_link_shape = np.array(local).reshape(-1, 4, 4)
         self._center = np.array(centers).reshape(-1, 3)
         self._radius = np.array(radii)
-
-        counted = set()
-        for a, b in combinations(dict.fromkeys(self._link), 2):
-            if _may_collide(robot, kinematics.tree, names[a], names[b], moved_by_arm):
-                counted.add((a, b))
-        self._pairs = self._shape_pairs(counted)
+        pairs = combinations(dict.fromkeys(self._link), 2)
+        counted = [pair for pair in pairs if _may_collide(robot, kinematics.tree, *pair, moved_by_arm)]
+        self._count(counted)
         home = kinematics.lower.new_tensor(robot.home[kinematics.joint_indices])
         overlapping = self.near(kinematics.link_poses(kinematics.clamp(home))[None].numpy(), 0.0)
-        at_home = {(a, b) for a, b in overlapping.links.tolist()}
-        self.overlapping_at_home: tuple[tuple[str, str], ...] = tuple((names[a], names[b]) for a, b in sorted(at_home))
+        self.overlapping_at_home = [pair for pair in counted if (0, *pair) in overlapping]
         """Pairs of links that do not count because they overlap at home."""
-        self._pairs = self._shape_pairs(counted - at_home)
+        self._count([pair for pair in counted if pair not in self.overlapping_at_home])
 
-    def _shape_pairs(self, links: set[tuple[int, int]]) -> np.ndarray:
-        """[A, 2] pairs of shapes of pairs of links."""
+    def _count(self, link_pairs: list[tuple[str, str]]) -> None:
+        """Let the shapes of these pairs of links count."""
+        self.link_pairs = link_pairs
+        """Pairs of links that count."""
         shapes = combinations(range(len(self._link)), 2)
-        pairs = [(i, j) for i, j in shapes if (self._link[i], self._link[j]) in links]
-        return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+        counted = set(link_pairs)
+        pairs = [(i, j) for i, j in shapes if (self._link[i], self._link[j]) in counted]
+        self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
-    @property
-    def link_pairs(self) -> list[tuple[int, int]]:
-        """Pairs of links that count, as indices in the kinematics' order."""
-        return list(dict.fromkeys((self._link[i], self._link[j]) for i, j in self._pairs))
-
-    def near(self, link_poses: np.ndarray, margin: float) -> Approaches:
-        """Find every pair of shapes nearer than ``margin`` [m], in link poses [B, L, 4, 4] of all links of the
-        kinematics."""
+    def near(self, link_poses: np.ndarray, margin: float) -> dict[tuple[int, str, str], float]:
+        """Return the signed distance [m], negative where they overlap, of every pair of links nearer than ``margin``
+        [m], by (configuration, link, link), in link poses [B, L, 4, 4] of all links of the kinematics."""
         request = self._coal.DistanceRequest()
         request.enable_signed_distance = True
         result = self._coal.DistanceResult()
-        rows = []
         first, second = self._pairs.T
         reach = self._radius[first] + self._radius[second] + margin
-        T = link_poses[:, self._link]  # [B, G, 4, 4]
+        T = link_poses[:, self._index]  # [B, G, 4, 4]
         centers = np.einsum("bgij,gj->bgi", T[..., :3, :3], self._center) + T[..., :3, 3]
         gap = np.linalg.norm(centers[:, first] - centers[:, second], axis=-1)
-        for b, pair in np.argwhere(gap < reach):
+        found: dict[tuple[int, str, str], float] = {}
+        for b, pair in np.argwhere(gap < reach).tolist():
             arguments = []
             for shape in self._pairs[pair]:
                 pose = T[b, shape] @ self._T_link_shape[shape]
@@ -191,15 +174,15 @@ class SelfCollision:
             distance = self._coal.distance(*arguments, request, result)
             if distance < margin:
                 i, j = self._pairs[pair]
-                rows.append((b, self._link[i], self._link[j], distance))
-        table = np.array(rows).reshape(-1, 4)
-        return Approaches(table[:, 0].astype(np.int64), table[:, 1:3].astype(np.int64), table[:, 3])
+                key = (b, self._link[i], self._link[j])
+                found[key] = min(distance, found.get(key, margin))
+        return found
 
     def clearance(self, link_poses: np.ndarray, margin: float) -> np.ndarray:
         """[B] smallest signed distance between two shapes, at most ``margin``; arguments as in :meth:`near`."""
-        near = self.near(link_poses, margin)
         clearance = np.full(len(link_poses), margin)
-        np.minimum.at(clearance, near.configuration, near.distance)
+        for (configuration, _, _), distance in self.near(link_poses, margin).items():
+            clearance[configuration] = min(clearance[configuration], distance)
         return clearance
 
 

@@ -33,14 +33,11 @@ def colliding_links(
     joints = torch.as_tensor(result.joint_pos[lost])
     whole = Kinematics(robot)
     hand = Kinematics(robot, root=robot.hand_root)
-    found: set[tuple[str, str, int]] = set()
+    found: set[tuple[int, str, str]] = set()
     for kinematics, collision in (
         (whole, SelfCollision(robot, whole, moved_by_arm=True)),
         (hand, SelfCollision(robot, hand, only=robot.self_collision_links)),
     ):
         poses = kinematics.link_poses(joints[:, torch.as_tensor(kinematics.joint_indices)])
-        near = collision.near(poses.numpy(), -depth)
-        names = kinematics.link_names
-        for frame, (a, b) in zip(near.configuration.tolist(), near.links.tolist(), strict=True):
-            found.add((names[a], names[b], frame))
-    return dict(Counter((a, b) for a, b, _ in sorted(found)).most_common())
+        found.update(collision.near(poses.numpy(), -depth))
+    return dict(Counter(sorted((a, b) for _, a, b in found)).most_common())

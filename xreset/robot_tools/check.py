@@ -1,9 +1,9 @@
-"""Checks a robot in one go: its description, its URDF, its physics, and how the engines build it."""
+"""Checks a robot in one go, without an engine: its description, its URDF and its drives."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,15 +12,12 @@ import numpy as np
 import torch
 
 from xreset.description import DESCRIPTION, load_robot
-from xreset.errors import BackendUnavailableError, XResetError
+from xreset.errors import XResetError
 from xreset.geometry.collision import SelfCollision, height_above_table, table_points
 from xreset.geometry.dynamics import damping_ratio, drive_inertia
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import surface_of
-from xreset.geometry.urdf import Link, RobotTree, robot_tree
-from xreset.objects.catalogue import load_object
-from xreset.physics import Backend
-from xreset.plugins import backend_names, make_backend, robot_folder
+from xreset.geometry.urdf import RobotTree, robot_tree
+from xreset.plugins import robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
 from xreset.robot_tools.draft import link_places
 from xreset.robot_tools.opposition import opposition, opposition_scores
@@ -34,19 +31,14 @@ MIN_CLEARANCE = 0.005
 _ROUNDING = 1e-3
 """Relative slack of the triangle inequality: published inertias are rounded."""
 _SAMPLES = 200
-_POSE_TOLERANCE = 1e-3
 _LIMIT_SLACK = 1e-3
 """[rad or m] By which a mimic joint's limits may fall short of its source's: published figures are rounded."""
-_OFF = 0.01
-"""[m] From the middle of a link's shapes: a centre of mass in the joint that is farther away is doubted."""
 _LISTED = 4
 """Pairs of links that are named, most frequent first."""
 _PALM = 0.12
 """[m] From the palm's frame to the nearest joint of a finger: a human palm is 10 cm long."""
 _LESS_OPPOSED = 0.75
 """Share of the best fingertip's opposition that a thumb has at least. Index fingers have up to 0.73 (Allegro)."""
-_HOLD_STEPS = 30
-_HOLD_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
@@ -60,18 +52,20 @@ class Finding:
     """What was found, what was expected, and what to do."""
 
 
-def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, list[Finding]]:
-    """Check everything that needs no engine.
+def check(name_or_folder: str | Path) -> list[Finding]:
+    """Check a robot without an engine; ``xreset engines check --robot`` tries it in physics.
+
+    Args:
+        name_or_folder: a registered name or a folder.
 
     Returns:
-        The robot, or None if its description or its URDF cannot be read; and the findings, one ``ok`` for each topic
-        without a problem.
+        At least one finding for each topic; an ``error`` of ``description`` or ``URDF`` is the last one.
     """
     try:
         folder = robot_folder(name_or_folder)
         spec = load_robot(name_or_folder)
     except XResetError as error:
-        return None, [Finding("error", "description", str(error))]
+        return [Finding("error", "description", str(error))]
     counts = (
         f"{len(spec.arm_indices)} arm joints, {len(spec.hand_indices)} hand joints, {len(spec.fingertips)} fingertips"
     )
@@ -79,7 +73,7 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
     try:
         tree = robot_tree(spec)
     except XResetError as error:
-        return None, [*found, Finding("error", "URDF", str(error))]
+        return [*found, Finding("error", "URDF", str(error))]
     shapes = sum(len(link.collisions) for link in tree.links)
     mass = sum(link.mass for link in tree.links)
     content = f"{len(tree.links)} links, {len(tree.joints)} joints, {shapes} collision shapes, {mass:.1f} kg"
@@ -90,68 +84,25 @@ def check_description(name_or_folder: str | Path) -> tuple[RobotSpec | None, lis
     found += _topic("links", _links(spec, tree), "palm, fingertips, keypoints and collision links exist")
     found += _topic("inertias", _inertias(tree), "masses are positive, inertias are those of solid bodies")
     if any(finding.level == "error" for finding in found):
-        return spec, [*found, Finding("skipped", "home", "fix the errors above first")]
-    ratio = damping_ratio(spec, spec.home)
-    found += _topic("drives", _drives(spec), f"damping ratios at home are {ratio.min():.2f}..{ratio.max():.2f}")
+        return [*found, Finding("skipped", "home", "fix the errors above first")]
+    q = _around_home(spec)
+    found += _topic("drives", _drives(spec), "damping ratios at home are between 0.5 and 5")
     found += _topic("frames", _frames(spec, tree), "the palm frame is in the palm, and looks along the fingers")
     found += _topic("fingers", _fingers(spec, tree), "the thumb can oppose every other fingertip")
-    found += _home(spec)
-    found.append(_size(spec))
+    found += _topic("home and table", _above_table(spec, q))
+    found += _topic("home and self", _free_of_itself(spec, q))
+    found += _topic("retargeting", _size(spec))
     if spec.placement is not None:
         place = spec.placement
         stated = f"reaches {place.reached:.1%} and follows {place.followed:.1%} of {place.frames} frames"
         found.append(Finding("ok", "placement", f"{stated}, says {DESCRIPTION}: {place.command}"))
-    return spec, found
-
-
-def check_engine(spec: RobotSpec, backend: str) -> Finding:
-    """Build the robot in an engine, compare its link poses with xreset's own kinematics, and let it hold its home
-    configuration."""
-    topic = f"engine {backend}"
-    try:
-        with make_backend(backend, SceneSpec(robot=spec, objects=(load_object("soup"),)), 1) as engine:
-            problem = _links_disagree(spec, engine) or _does_not_hold(spec, engine)
-    except BackendUnavailableError as error:
-        return Finding("skipped", topic, str(error))
-    except Exception as error:  # whatever an engine says about this robot is what its author needs to read
-        return Finding("error", topic, f"{type(error).__name__}: {error}")
-    if problem:
-        return Finding("error", topic, problem)
-    return Finding("ok", topic, f"link poses agree within {_POSE_TOLERANCE * 1e3:g} mm; home is held")
-
-
-def check(
-    name_or_folder: str | Path, *, report: Callable[[Finding], None] = lambda _: None, engines: bool = True
-) -> list[Finding]:
-    """Check a robot.
-
-    Args:
-        name_or_folder: a registered name or a folder.
-        report: called with each finding as soon as there is one (building a scene can take a minute in some engines).
-        engines: whether to build the robot in every installed engine.
-
-    Returns:
-        All findings.
-    """
-    spec, found = check_description(name_or_folder)
-    for finding in found:
-        report(finding)
-    if spec is None or not engines:
-        return found
-    if any(finding.level == "error" for finding in found):
-        found.append(Finding("skipped", "engines", "fix the errors above first"))
-        report(found[-1])
-        return found
-    for backend in backend_names():
-        found.append(check_engine(spec, backend))
-        report(found[-1])
     return found
 
 
 Problems = Iterator[tuple[Level, str]]
 
 
-def _topic(topic: str, problems: Problems, otherwise: str) -> list[Finding]:
+def _topic(topic: str, problems: Problems, otherwise: str = "") -> list[Finding]:
     found = [Finding(level, topic, message) for level, message in problems]
     return found or [Finding("ok", topic, otherwise)]
 
@@ -234,17 +185,6 @@ def _links(spec: RobotSpec, tree: RobotTree) -> Problems:
 
 
 def _inertias(tree: RobotTree) -> Problems:
-    at_joints = []
-    for link in tree.links:
-        if link.mass > 0 and link.collisions and not link.com.any() and _off_middle(link) > _OFF:
-            at_joints.append(link.name)
-    if at_joints:
-        yield (
-            "warning",
-            f"the centre of mass of {', '.join(at_joints)} lies in the joint, more than {1e3 * _OFF:.0f} mm from the "
-            "middle of the link's "
-            "shapes. Is it a placeholder?",
-        )
     moved = {joint.child for joint in tree.joints if joint.type != "fixed"}
     for link in tree.links:
         name = link.name
@@ -270,12 +210,6 @@ def _inertias(tree: RobotTree) -> Problems:
                 f"{largest_moment(link):.2g} at "
                 "most. Is it a placeholder? `xreset robots import` replaces such.",
             )
-
-
-def _off_middle(link: Link) -> float:
-    """Distance of a link's center of mass from the middle of its shapes' bounding box [m]."""
-    vertices, _ = surface_of(link.collisions)
-    return float(np.linalg.norm((vertices.min(axis=0) + vertices.max(axis=0)) / 2 - link.com))
 
 
 # Physics --------------------------------------------------------------------------------------------------------------
@@ -378,19 +312,17 @@ def _thumb(spec: RobotSpec) -> Problems:
         yield "ok", f"the thumb can meet {met[0]} pad to pad"
 
 
-def _home(spec: RobotSpec) -> list[Finding]:
-    """Check home, and configurations spread around it as at the start of episodes, against the table and the robot
-    itself."""
-    kinematics = Kinematics(spec)
+def _around_home(spec: RobotSpec) -> torch.Tensor:
+    """[1 + samples, J] home, and joint positions spread around it as at the start of episodes."""
     home = torch.tensor(spec.home)
     spread = torch.zeros_like(home)
     spread[spec.arm_indices], spread[spec.hand_indices] = spec.home_std
     noise = torch.randn(_SAMPLES, len(home), generator=torch.Generator().manual_seed(0), dtype=home.dtype)
-    q = torch.cat((home[None], kinematics.clamp(home + spread * noise)))
-    return [_above_table(spec, kinematics, q), *_free_of_itself(spec, kinematics, q)]
+    return torch.cat((home[None], Kinematics(spec).clamp(home + spread * noise)))
 
 
-def _above_table(spec: RobotSpec, kinematics: Kinematics, q: torch.Tensor) -> Finding:
+def _above_table(spec: RobotSpec, q: torch.Tensor) -> Problems:
+    kinematics = Kinematics(spec)
     support = table_points(spec, kinematics)
     points = kinematics.points(q, support.links, torch.tensor(support.points))
     height = height_above_table(points, torch.tensor(support.radii), TableSpec())
@@ -402,75 +334,38 @@ def _above_table(spec: RobotSpec, kinematics: Kinematics, q: torch.Tensor) -> Fi
     elif clearance < MIN_CLEARANCE or share > 1:
         level = "warning"
     link = support.links[int(lowest)]
-    text = f"lowest at {clearance * 1e3:.0f} mm above the table ({link}); {share:.0f} % of the spread below it"
-    return Finding(level, "home and table", text)
+    yield level, f"lowest at {clearance * 1e3:.0f} mm above the table ({link}); {share:.0f} % of the spread below it"
 
 
-def _free_of_itself(spec: RobotSpec, kinematics: Kinematics, q: torch.Tensor) -> list[Finding]:
-    topic = "home and self"
+def _free_of_itself(spec: RobotSpec, q: torch.Tensor) -> Problems:
+    kinematics = Kinematics(spec)
     try:
         collision = SelfCollision(spec, kinematics)
     except XResetError as error:
-        return [Finding("skipped", topic, str(error))]
-    found = []
+        yield "skipped", str(error)
+        return
     for pair in collision.overlapping_at_home:
-        text = f"{' and '.join(pair)} overlap at home: move home, or add the pair to collision.exclude."
-        found.append(Finding("error", topic, text))
+        yield "error", f"{' and '.join(pair)} overlap at home: move home, or add the pair to collision.exclude."
     near = collision.near(kinematics.link_poses(q).numpy(), 0.0)
-    share = 100 * len(np.unique(near.configuration)) / len(q)
+    share = 100 * len({configuration for configuration, _, _ in near}) / len(q)
     if share > 20:
-        names = np.array(kinematics.link_names)
-        meetings = set()
-        for configuration, pair in zip(near.configuration, near.links, strict=True):
-            meetings.add((int(configuration), " and ".join(names[pair])))
-        pairs = Counter(pair for _, pair in meetings).most_common(_LISTED)
+        pairs = Counter(f"{a} and {b}" for _, a, b in near).most_common(_LISTED)
         often = ", ".join(f"{pair} ({100 * count / len(q):.0f} %)" for pair, count in pairs)
         text = (
             f"{share:.0f} % of the spread around home touches itself: {often}; episodes that start so are pushed "
             "apart. Move home away, spread less (home_std), or exclude what always meets."
         )
-        found.append(Finding("warning", topic, text))
-    elif not found:
-        text = f"free at home; {share:.0f} % of the spread around it touches itself"
-        found.append(Finding("ok", topic, text))
-    return found
+        yield "warning", text
+    elif not collision.overlapping_at_home:
+        yield "ok", f"free at home; {share:.0f} % of the spread around it touches itself"
 
 
-def _size(spec: RobotSpec) -> Finding:
+def _size(spec: RobotSpec) -> Problems:
     """Say what retargeting makes of the collision shapes, and the memory that it will take."""
     try:
         model = HandModel(spec)
     except XResetError as error:
-        return Finding("skipped", "retargeting", str(error))
-    balls = model.balls
-    text = (
-        f"{len(balls.radii)} balls on {len(balls.links)} links of the hand, {len(balls.guards)} of them kept out of "
-        "other links in"
-        f" {len(balls.link_pairs) // 2} pairs of links; about {predicted_gigabytes(model):.1f} GB"
-    )
-    return Finding("ok", "retargeting", text)
-
-
-def _links_disagree(spec: RobotSpec, engine: Backend) -> str | None:
-    state = engine.state()
-    expected = Kinematics(spec).link_poses(state.joint_pos[0].double().cpu(), spec.tracked_links)[:, :3, 3]
-    away = (engine.links().pos[0].double().cpu() - expected).norm(dim=-1)
-    if bool(torch.isfinite(away).all()) and float(away.max()) < _POSE_TOLERANCE:
-        return None
-    link = spec.tracked_links[int(away.argmax())]
-    return f"at home {link!r} is {float(away.max()) * 1e3:.1f} mm from where xreset's kinematics has it."
-
-
-def _does_not_hold(spec: RobotSpec, engine: Backend) -> str | None:
-    home = torch.tensor(spec.home, dtype=torch.float32)
-    engine.set_joint_targets(home.to(engine.device)[None])
-    for _ in range(_HOLD_STEPS):
-        engine.step()
-    away = (engine.state().joint_pos[0].cpu() - home).abs()
-    if bool(torch.isfinite(away).all()) and float(away.max()) < _HOLD_TOLERANCE:
-        return None
-    joint = spec.joint_names[int(away.nan_to_num(torch.inf).argmax())]
-    return (
-        f"after {_HOLD_STEPS} control steps with home as the target {joint!r} is {float(away.max()):.3f} rad (m) away "
-        "from it."
-    )
+        yield "skipped", str(error)
+        return
+    size = f"{len(model.balls.radii)} balls on {len(model.balls.links)} links of the hand"
+    yield "ok", f"{size}; about {predicted_gigabytes(model):.1f} GB"

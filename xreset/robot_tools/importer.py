@@ -305,11 +305,7 @@ def always_meeting(spec: RobotSpec) -> dict[tuple[str, str], str]:
     draw = torch.rand(_SAMPLES, len(hand), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     q[:, hand] = kinematics.lower[hand] + draw * (kinematics.upper[hand] - kinematics.lower[hand])
     near = collision.near(kinematics.link_poses(q).numpy(), 0.0)
-    meetings = set()
-    for configuration, pair in zip(near.configuration, near.links, strict=True):
-        meetings.add((int(configuration), tuple(sorted(map(int, pair)))))
-    names = kinematics.link_names
-    for (a, b), count in Counter(pair for _, pair in meetings).items():
+    for pair, count in Counter((a, b) for _, a, b in near).items():
         if count >= _ALWAYS * _SAMPLES:
-            pairs[(names[a], names[b])] = "in nearly every position"
+            pairs[pair] = "in nearly every position"
     return pairs
